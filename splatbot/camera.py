@@ -1,0 +1,89 @@
+"""A camera: intrinsics, distortion and image size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.errors import CameraError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera; axes as OpenCV (x right, y down, z forward).
+
+    A point (x, y, z) [m] of the camera frame lands at u = fx·x/z + cx, v = fy·y/z + cy, where integer (u, v) is
+    the centre of a pixel. ``distortion`` are OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty when undistorted.
+
+    Raises:
+        CameraError: an intrinsic is not finite or not positive, or the number of coefficients is unknown.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("fx", "fy", "cx", "cy"):
+            if not np.isfinite(getattr(self, name)):
+                raise CameraError(f"is {getattr(self, name)}.", field=name, hint="give a finite value in pixels")
+        for name in ("fx", "fy", "width", "height"):
+            if getattr(self, name) <= 0:
+                raise CameraError(f"is {getattr(self, name)}, must be positive.", field=name, hint="check the unit: px")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise CameraError(
+                f"has {len(self.distortion)} coefficients.", field="distortion", hint="OpenCV's 4, 5 or 8, or none"
+            )
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """Intrinsic matrix (3, 3) for pixel centres at integers (OpenCV's convention)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def K_corner(self) -> NDArray[np.float64]:
+        """Intrinsic matrix (3, 3) for pixel centres at +0.5 (the rasterizer's and gsplat's convention)."""
+        K = self.K
+        K[:2, 2] += 0.5
+        return K
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera delivering images of another size [px]; pixel areas, not centres, scale."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+            width=width,
+            height=height,
+            distortion=self.distortion,
+        )
+
+    def project(self, points_camera: ArrayLike) -> NDArray[np.float64]:
+        """Pixels (..., 2) of points (..., 3) [m] of the camera frame with z > 0; distortion is not applied."""
+        p = np.asarray(points_camera, dtype=np.float64)
+        return np.stack([self.fx * p[..., 0] / p[..., 2] + self.cx, self.fy * p[..., 1] / p[..., 2] + self.cy], -1)
+
+    def backproject(self, depth: ArrayLike) -> NDArray[np.float32]:
+        """Points (H, W, 3) [m] of the camera frame of a depth image (H, W) [m]; depth 0 gives the origin.
+
+        Raises:
+            CameraError: the image is not of this camera's size.
+        """
+        z = np.asarray(depth, dtype=np.float32)
+        if z.shape != (self.height, self.width):
+            raise CameraError(
+                f"depth is {z.shape}, the camera is {(self.height, self.width)}.",
+                field="depth",
+                hint="pass the image that belongs to the camera, or Camera.resized",
+            )
+        x = ((np.arange(self.width) - self.cx) / self.fx).astype(np.float32)
+        y = ((np.arange(self.height) - self.cy) / self.fy).astype(np.float32)
+        return np.stack([z * x[None, :], z * y[:, None], z], axis=-1)

@@ -1,0 +1,73 @@
+"""One tree of errors. Each says what is wrong, where (file, field) and how to mend it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class SplatbotError(Exception):
+    """Base of every error that splatbot raises on purpose.
+
+    Args:
+        message: what is wrong, in one sentence.
+        file: the file at fault, if there is one.
+        field: the field, property, column or argument at fault.
+        hint: what the user can do about it.
+
+    ``http_status`` is what the service answers, ``exit_code`` what the command line returns and ``code`` the
+    nearest ``moveit_msgs/MoveItErrorCodes`` value (99999 is FAILURE).
+    """
+
+    http_status = 500
+    exit_code = 1
+    code = 99999
+
+    def __init__(
+        self, message: str, *, file: str | Path | None = None, field: str | None = None, hint: str | None = None
+    ) -> None:
+        self.message = message
+        self.file = str(file) if file is not None else None
+        self.field = field
+        self.hint = hint
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        where = ": ".join(part for part in (self.file, self.field) if part)
+        text = f"{where}: {self.message}" if where else self.message
+        return f"{text} Fix: {self.hint}" if self.hint else text
+
+
+class InputError(SplatbotError):
+    """What the user gave (an argument, a file, a request) cannot be used."""
+
+    http_status = 422
+    exit_code = 2
+
+
+class LogError(InputError):
+    """A recorded log, or one of its frames, cannot be read."""
+
+
+class CameraError(InputError):
+    """Camera intrinsics are missing or make no sense."""
+
+
+class FormatError(InputError):
+    """A map or trajectory file is damaged or of an unknown format."""
+
+
+class ConfigError(InputError):
+    """A configuration file, environment variable or flag is wrong."""
+
+
+class MapNotFoundError(SplatbotError):
+    """No map of that name."""
+
+    http_status = 404
+    exit_code = 2
+
+
+class NativeError(SplatbotError):
+    """The native module is missing or cannot run on this machine."""
+
+    http_status = 503

@@ -1,0 +1,133 @@
+"""SE(3), rotations and quaternions in float64. Quaternions are wxyz; T_a_b maps points of frame b to frame a."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Below this angle [rad] the closed forms lose digits in (1 - cos θ)/θ²; their Taylor series do not.
+_SMALL_ANGLE = 1e-4
+
+
+def skew(v: ArrayLike) -> Array:
+    """Cross-product matrix (3, 3) of a vector (3,): ``skew(v) @ w == cross(v, w)``."""
+    x, y, z = np.asarray(v, dtype=np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def so3_exp(omega: ArrayLike) -> Array:
+    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues)."""
+    w = np.asarray(omega, dtype=np.float64)
+    theta = float(np.linalg.norm(w))
+    W = skew(w)
+    if theta < _SMALL_ANGLE:
+        return np.eye(3) + W * (1.0 - theta**2 / 6.0) + W @ W * (0.5 - theta**2 / 24.0)
+    return np.eye(3) + W * (np.sin(theta) / theta) + W @ W * ((1.0 - np.cos(theta)) / theta**2)
+
+
+def so3_log(R: ArrayLike) -> Array:
+    """Rotation vector (3,) [rad] of a rotation matrix (3, 3), norm in [0, π]. Through the quaternion: exact near π."""
+    w, *xyz = rotation_to_quat(R)
+    v = np.asarray(xyz)
+    n = float(np.linalg.norm(v))
+    if n < _SMALL_ANGLE:
+        return v * (2.0 / w) * (1.0 - (n / w) ** 2 / 3.0)
+    return v * (2.0 * np.arctan2(n, w) / n)
+
+
+def se3_exp(xi: ArrayLike) -> Array:
+    """Pose (4, 4) of a twist (6,) = (translation [m], rotation [rad]) (Barfoot 2017, eq. 7.85)."""
+    x = np.asarray(xi, dtype=np.float64)
+    T = np.eye(4)
+    T[:3, :3] = so3_exp(x[3:])
+    T[:3, 3] = _left_jacobian(x[3:]) @ x[:3]
+    return T
+
+
+def se3_log(T: ArrayLike) -> Array:
+    """Twist (6,) = (translation [m], rotation [rad]) of a pose (4, 4); inverse of :func:`se3_exp`."""
+    M = np.asarray(T, dtype=np.float64)
+    omega = so3_log(M[:3, :3])
+    return np.concatenate([np.linalg.solve(_left_jacobian(omega), M[:3, 3]), omega])
+
+
+def _left_jacobian(omega: Array) -> Array:
+    theta = float(np.linalg.norm(omega))
+    W = skew(omega)
+    if theta < _SMALL_ANGLE:
+        return np.eye(3) + W * (0.5 - theta**2 / 24.0) + W @ W * (1.0 / 6.0 - theta**2 / 120.0)
+    a = (1.0 - np.cos(theta)) / theta**2
+    b = (theta - np.sin(theta)) / theta**3
+    return np.eye(3) + a * W + b * W @ W
+
+
+def inverse(T: ArrayLike) -> Array:
+    """Inverse (4, 4) of a rigid transform (4, 4)."""
+    M = np.asarray(T, dtype=np.float64)
+    out = np.eye(4)
+    out[:3, :3] = M[:3, :3].T
+    out[:3, 3] = -M[:3, :3].T @ M[:3, 3]
+    return out
+
+
+def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
+    """Points (..., 3) [m] of frame b in frame a."""
+    M = np.asarray(T_a_b, dtype=np.float64)
+    return np.asarray(points_b, dtype=np.float64) @ M[:3, :3].T + M[:3, 3]
+
+
+def quat_to_rotation(quat: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz of any positive norm.
+
+    Raises:
+        ValueError: a quaternion is zero or not finite.
+    """
+    q = np.asarray(quat, dtype=np.float64)
+    scale = np.max(np.abs(q), axis=-1, keepdims=True)
+    if not np.all(np.isfinite(scale)) or np.any(scale == 0.0):
+        raise ValueError("a quaternion is zero or not finite")
+    q = q / scale  # first by the largest entry: 1e-200 and 1e200 must not under- or overflow when squared
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+
+
+def rotation_to_quat(R: ArrayLike) -> Array:
+    """Quaternions (..., 4) wxyz, w >= 0, of rotation matrices (..., 3, 3) (Shepperd 1978, largest pivot)."""
+    M = np.asarray(R, dtype=np.float64)
+    xx, yy, zz = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
+    sums = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], -1)  # 4 q_i²
+    a, b, c = M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]
+    d, e, f = M[..., 1, 0] + M[..., 0, 1], M[..., 0, 2] + M[..., 2, 0], M[..., 2, 1] + M[..., 1, 2]
+    rows = np.stack(  # 4 q_i q_j
+        [
+            np.stack([sums[..., 0], a, b, c], -1),
+            np.stack([a, sums[..., 1], d, e], -1),
+            np.stack([b, d, sums[..., 2], f], -1),
+            np.stack([c, e, f, sums[..., 3]], -1),
+        ],
+        -2,
+    )
+    pivot = np.argmax(sums, axis=-1)
+    q = np.take_along_axis(rows, pivot[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def pose_from_quat(translation: ArrayLike, quat: ArrayLike) -> Array:
+    """Poses (..., 4, 4) of translations (..., 3) [m] and quaternions (..., 4) wxyz."""
+    t = np.asarray(translation, dtype=np.float64)
+    T = np.zeros((*t.shape[:-1], 4, 4))
+    T[..., :3, :3] = quat_to_rotation(quat)
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
