@@ -1,0 +1,50 @@
+"""splatbot: RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers a robot's questions."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from splatbot.camera import Camera
+    from splatbot.collision import GaussianCollisionField
+    from splatbot.config import load_config
+    from splatbot.errors import SplatbotError
+    from splatbot.frame import Frame
+    from splatbot.gaussians import GaussianModel
+    from splatbot.logs import open_log
+    from splatbot.rasterize import rasterization
+    from splatbot.slam import Slam
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Camera": "splatbot.camera",
+    "Frame": "splatbot.frame",
+    "GaussianModel": "splatbot.gaussians",
+    "GaussianCollisionField": "splatbot.collision",
+    "Slam": "splatbot.slam",
+    "SplatbotError": "splatbot.errors",
+    "load_config": "splatbot.config",
+    "open_log": "splatbot.logs",
+    "rasterization": "splatbot.rasterize",
+}
+
+__all__ = [
+    "Camera",
+    "Frame",
+    "GaussianCollisionField",
+    "GaussianModel",
+    "Slam",
+    "SplatbotError",
+    "load_config",
+    "open_log",
+    "rasterization",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names on first use: torch alone takes seconds, and `splatbot --help` needs none of it."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'splatbot' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME[name]), name)
