@@ -128,7 +128,7 @@ class GaussianModel:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics."""
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
+        return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
     def scales(self) -> Tensor:
