@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
-from splatbot.report.theme import BLUE, GREEN, INK, ORANGE, RED, SERIES, figure, png
+from splatbot.report.theme import BLUE, GREEN, INK, ORANGE, RED, SERIES, figure, png, styled
 from splatbot.results.folder import FrameRow
 from splatbot.results.scoring import TrajectoryScore
 from splatbot.trajectory import Trajectory
@@ -17,6 +17,7 @@ from splatbot.trajectory import Trajectory
 _BANDS = {"lost": (RED, "lost"), "degraded": (ORANGE, "degraded"), "skipped": (INK, "unreadable")}
 
 
+@styled
 def trajectory_plot(trajectory: Trajectory, track: TrajectoryScore | None) -> bytes | None:
     """The path from above and from the side; coloured by its error over the reference, where there is one."""
     if len(trajectory) == 0:
@@ -39,6 +40,7 @@ def trajectory_plot(trajectory: Trajectory, track: TrajectoryScore | None) -> by
     return png(fig)
 
 
+@styled
 def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes | None:
     """Position error of every tracked frame over time, with the frames that were lost or in doubt as bands."""
     stamps = [row.stamp for row in rows if row.stamp is not None]
@@ -47,7 +49,9 @@ def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes
     fig, (ax,) = figure()
     t0 = stamps[0]
     _bands(ax, rows, t0)
-    ax.plot(track.absolute.stamps - t0, 1e3 * track.absolute.errors, color=BLUE, linewidth=1.3, marker=".", markersize=4)
+    ax.plot(
+        track.absolute.stamps - t0, 1e3 * track.absolute.errors, color=BLUE, linewidth=1.3, marker=".", markersize=4
+    )
     ax.axhline(1e3 * track.absolute.rmse, color=GREEN, linewidth=1.2, linestyle="--", label="ATE RMSE")
     ax.set_ylim(bottom=0)
     ax.set_xlabel("time [s]")
@@ -56,6 +60,7 @@ def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes
     return png(fig)
 
 
+@styled
 def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
     """Milliseconds of every frame, stacked by stage; what no stage accounts for is "other"."""
     done = [row for row in rows if row.verdict != "skipped"]
@@ -80,6 +85,7 @@ def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
     return png(fig)
 
 
+@styled
 def gaussians_plot(rows: Sequence[FrameRow]) -> bytes | None:
     """Size of the map over the frames, keyframes marked."""
     done = [row for row in rows if row.verdict != "skipped"]
@@ -95,6 +101,7 @@ def gaussians_plot(rows: Sequence[FrameRow]) -> bytes | None:
     ax.set_ylim(bottom=0)
     ax.set_xlabel("frame")
     ax.set_ylabel("Gaussians")
+    ax.yaxis.set_major_formatter("{x:,.0f}")
     if key.any():
         ax.legend(loc="lower right")
     return png(fig)

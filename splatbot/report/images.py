@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_WIDTH = 420  # [px]; five such images stand in a row
+from splatbot.rasterize.views import colorize
+
+MAX_WIDTH = 360  # [px]; five such images stand in a row
 
 
 def colour_png(rgb: NDArray[np.uint8]) -> bytes:
@@ -21,22 +23,11 @@ def difference_png(a: NDArray[np.uint8], b: NDArray[np.uint8], *, gain: float = 
     return _encode(_fit(cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), cv2.INTER_AREA))
 
 
-def depth_png(depth: NDArray[np.float32], span: tuple[float, float]) -> bytes:
-    """Depth (H, W) [m] in colours over ``span``; missing depth (0) is transparent."""
-    near, far = span
-    grey = np.clip(255.0 * (depth - near) / max(far - near, 1e-6), 0, 255).astype(np.uint8)
-    bgr = cv2.applyColorMap(255 - grey, cv2.COLORMAP_TURBO)
-    rgba = np.dstack([cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.where(depth > 0, 255, 0).astype(np.uint8)])
-    return _encode(_fit(rgba, cv2.INTER_NEAREST))
-
-
-def depth_span(depth: NDArray[np.float32]) -> tuple[float, float]:
-    """The range [m] that holds the middle 96 % of the valid depths; (0, 1) without any."""
-    valid = depth[depth > 0]
-    if valid.size == 0:
-        return 0.0, 1.0
-    near, far = np.percentile(valid, (2, 98))
-    return float(near), float(far)
+def depth_png(depth: NDArray[np.float32], depth_range: tuple[float, float]) -> bytes:
+    """Depth (H, W) [m], red (near) to blue (far) over ``depth_range``; missing depth (0) is transparent."""
+    rgb = colorize(depth, "depth", depth_range=depth_range)
+    opaque = np.where(depth > 0, 255, 0).astype(np.uint8)
+    return _encode(_fit(np.dstack([rgb, opaque]), cv2.INTER_NEAREST))
 
 
 def _fit(image: NDArray[np.uint8], interpolation: int) -> NDArray[np.uint8]:

@@ -10,12 +10,13 @@ from importlib import metadata, resources
 from typing import Any
 
 from splatbot.config import Config
+from splatbot.rasterize.views import depth_limits
 from splatbot.report.figures import error_plot, gaussians_plot, stages_plot, trajectory_plot
-from splatbot.report.images import colour_png, depth_png, depth_span, difference_png
+from splatbot.report.images import colour_png, depth_png, difference_png
 from splatbot.report.theme import data_uri
-from splatbot.results.units import count, decibels, megabytes, metres, milliseconds, percent
 from splatbot.results.folder import FrameRow
 from splatbot.results.scoring import ShownView, TrajectoryScore, ViewScores
+from splatbot.results.units import count, decibels, megabytes, metres, milliseconds, percent
 from splatbot.trajectory import Trajectory
 
 _PACKAGES = ("splatbot", "torch", "numpy", "opencv-contrib-python-headless", "open3d")
@@ -59,7 +60,8 @@ def report_html(
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)} · splatbot</title>\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>\n{css}</style></head>\n'
-        f'<body><main>\n<h1>{html.escape(name)}</h1>\n<p class="sub">{source}</p>\n{"".join(parts)}</main></body></html>\n'
+        f'<body><main>\n<h1>{html.escape(name)}</h1>\n<p class="sub">{source}</p>\n'
+        f"{''.join(parts)}</main></body></html>\n"
     )
 
 
@@ -75,13 +77,14 @@ def _banner(metrics: Mapping[str, Any]) -> str:
 
 
 def _tiles(metrics: Mapping[str, Any]) -> str:
+    ms = metrics["ms_per_frame"]
     tiles = [
         (f"{metrics['tracked']}/{metrics['frames']}", "frames tracked"),
         (metres(metrics["ate_rmse_m"]), "ATE RMSE"),
         (metres(metrics["rpe_trans_rmse_m"]), "RPE per frame"),
         (decibels(metrics["psnr_holdout_db"]), "PSNR, held-out views"),
         (metres(metrics["depth_median_m"]), "median depth error"),
-        (milliseconds(metrics["ms_per_frame"]["p50"]), f"per frame (p95 {milliseconds(metrics['ms_per_frame']['p95'])})"),
+        (milliseconds(ms["p50"]), f"per frame (p95 {milliseconds(ms['p95'])})"),
         (count(metrics["gaussians"]), f"Gaussians, {megabytes(metrics['map_bytes'])}"),
         (megabytes(metrics["peak_rss_bytes"]), "peak memory"),
     ]
@@ -97,18 +100,17 @@ def _no_reference(track: TrajectoryScore | None) -> str:
 
 def _doubts(rows: Sequence[FrameRow]) -> str:
     doubts = Counter((row.verdict, reason) for row in rows if row.verdict != "ok" for reason in row.reasons or ("",))
-    return _table(("verdict", "reason", "frames"), [(v, r, str(n)) for (v, r), n in doubts.most_common(12)])
+    return _table(("verdict and reason", "frames"), [(f"{v}: {r}", str(n)) for (v, r), n in doubts.most_common(12)])
 
 
 def _view(view: ShownView) -> str:
-    span = depth_span(view.depth)
-    caption = f"colour of both: {span[0]:.2f} to {span[1]:.2f} m"
+    span = depth_limits(view.depth)
     images = [
         (colour_png(view.rgb), f"frame {view.score.index}"),
         (colour_png(view.rendered_rgb), f"map, {decibels(view.score.psnr_db)}"),
         (difference_png(view.rgb, view.rendered_rgb, gain=_GAIN), f"difference, times {_GAIN:g}"),
-        (depth_png(view.depth, span), f"sensor depth, {caption}"),
-        (depth_png(view.rendered_depth, span), f"map depth, median error {metres(view.score.depth_median_m)}"),
+        (depth_png(view.depth, span), f"sensor depth, {span[0]:.2f} to {span[1]:.2f} m"),
+        (depth_png(view.rendered_depth, span), f"map depth, off by {metres(view.score.depth_median_m)}"),
     ]
     figures = "".join(
         f"<figure>{_image(data, text)}<figcaption>{html.escape(text)}</figcaption></figure>" for data, text in images
@@ -121,8 +123,8 @@ def _views_note(metrics: Mapping[str, Any], views: ViewScores) -> str:
         return _note("No held-out view was scored.")
     return _note(
         f"Mean over {len(views.scores)} frames that were tracked but never mapped: PSNR "
-        f"{decibels(metrics['psnr_holdout_db'])} over whole images, depth L1 {metres(metrics['depth_l1_m'])} where both "
-        f"have depth; the map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
+        f"{decibels(metrics['psnr_holdout_db'])} over whole images, depth L1 {metres(metrics['depth_l1_m'])} where "
+        f"both have depth; the map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
     )
 
 

@@ -161,7 +161,7 @@ class RunFolder:
             FormatError: ``frames.jsonl`` and ``trajectory.tum`` do not belong together.
         """
         indices = [row.index for row in self.load_frames() if row.tracked]
-        poses = self.load_trajectory().T_world_camera if indices else []
+        poses = list(self.load_trajectory().T_world_camera) if indices else []
         if len(indices) != len(poses):
             raise FormatError(
                 f"has {len(poses)} poses, {self.frames.name} has {len(indices)} tracked frames.",

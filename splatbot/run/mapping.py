@@ -15,12 +15,12 @@ from splatbot.config import Config
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
-from splatbot.run.interrupts import Interrupts
 from splatbot.logs import Log
 from splatbot.report import report_html
 from splatbot.results.folder import FrameRow, RunFolder
 from splatbot.results.metrics import cost_metrics, without_nan
 from splatbot.results.scoring import TrajectoryScore, ViewScores, score_trajectory, score_views, trajectory_metrics
+from splatbot.run.interrupts import Interrupts
 from splatbot.slam import FrameResult, Slam
 from splatbot.trajectory import Trajectory
 
