@@ -43,3 +43,8 @@ def megabytes(value: float | None) -> str:
     if value is None:
         return NONE
     return f"{value / 1e9:.2f} GB" if value >= 1e9 else f"{value / 1e6:.1f} MB"
+
+
+def number(value: float | None, digits: int) -> str:
+    """A bare number with so many digits after the point."""
+    return NONE if value is None else f"{value:.{digits}f}"
