@@ -120,6 +120,7 @@ def map_log(
             interrupts=interrupts,
             model=mapping.slam.snapshot().model,
             rows=mapping.rows(),
+            costs=cost_metrics(mapping.rows()),
             trajectory=mapping.trajectory(),
             track=score_trajectory(mapping.trajectory(), truth),
         )
@@ -250,6 +251,7 @@ class _Outcome:
     interrupts: Interrupts
     model: GaussianModel
     rows: list[FrameRow]
+    costs: dict[str, Any]
     trajectory: Trajectory
     track: TrajectoryScore | None
     views: ViewScores = field(default_factory=ViewScores)
@@ -293,7 +295,7 @@ class _Outcome:
         """The contents of ``metrics.json``."""
         log, error = self.mapping.log, self.mapping.error
         values = {
-            **cost_metrics(self.rows),
+            **self.costs,
             **trajectory_metrics(self.track),
             **self.views.metrics(),
             "gaussians": len(self.model),
