@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from splatbot.services.problems import problem
-
-
-class _BodyTooLargeError(Exception):
-    """Carried from ``receive`` through the application to the middleware."""
 
 
 class BodyLimit:
@@ -24,36 +21,20 @@ class BodyLimit:
             await self.app(scope, receive, send)
             return
         told = dict(scope["headers"]).get(b"content-length", b"")
+        detail = f"The body has more than {self.max_bytes} bytes."
         if told.isdigit() and int(told) > self.max_bytes:
-            await self._refuse(scope, receive, send)
+            # The body is not read, so the connection cannot serve another request.
+            refusal = problem(413, detail, headers={"Connection": "close"})
+            await refusal(scope, receive, send)
             return
         taken = 0
-        started = False
 
         async def counted() -> Message:
             nonlocal taken
             message = await receive()
             taken += len(message.get("body", b""))
-            if taken > self.max_bytes:
-                raise _BodyTooLargeError
+            if taken > self.max_bytes:  # raised where the application reads the body, so its handlers answer
+                raise HTTPException(413, detail, headers={"Connection": "close"})
             return message
 
-        async def noted(message: Message) -> None:
-            nonlocal started
-            started = True
-            await send(message)
-
-        try:
-            await self.app(scope, counted, noted)
-        except _BodyTooLargeError:
-            if started:
-                raise
-            await self._refuse(scope, receive, send)
-
-    async def _refuse(self, scope: Scope, receive: Receive, send: Send) -> None:
-        detail = f"The body has more than {self.max_bytes} bytes."
-        # The rest of the body is not read, so the connection cannot serve another request.
-        refusal = problem(
-            413, detail, kind="too-large", headers={"Connection": "close"}, hint="send fewer points at once"
-        )
-        await refusal(scope, receive, send)
+        await self.app(scope, counted, send)

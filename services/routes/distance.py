@@ -24,7 +24,7 @@ _ANSWER = {"map_version": 12, "n_sigma": 2.0, "distance": [0.4, 31.7], "index": 
 
 @router.post("/{map_id}/distance", responses=example(_ANSWER) | problems(404, 413, 422, 503))
 def distance(served: Served, settings: Settings, request: Annotated[DistanceRequest, _BODY]) -> DistanceAnswer:
-    """The smallest Mahalanobis distance of each point to the map, which Gaussian attains it, and whether it is inside."""
+    """How many standard deviations each point is from the nearest Gaussian, which that is, and whether it is inside."""
     if len(request.points) > settings.max_points:
         raise TooLargeError(
             f"has {len(request.points)} rows, at most {settings.max_points} are answered at once.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Body, Query, Request, Response
@@ -25,7 +25,9 @@ router = APIRouter(prefix="/v1/maps", tags=["views"])
 # Version 3 of a map in this process is not version 3 in the next: tags of different processes must differ.
 _PROCESS = secrets.token_hex(4)
 
-_PNG = {200: {"content": {"image/png": {}}, "description": "PNG; X-Map-Version and ETag name the state that was drawn"}}
+_PNG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/png": {}}, "description": "PNG; X-Map-Version and ETag name the state that was drawn"}
+}
 _BODY = Body(
     openapi_examples={
         "default view": {"value": {"mode": "rgb"}},

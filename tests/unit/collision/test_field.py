@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -133,7 +135,9 @@ def test_adding_gaussians_or_widening_the_shell_never_frees_a_point() -> None:
 
 def test_the_shell_itself_is_in_collision() -> None:
     field = GaussianCollisionField(_model([0, 0, 0], 0.25), n_sigma=2.0)
-    np.testing.assert_array_equal(field.in_collision([[0.5, 0, 0], [0.501, 0, 0], [0, 0, 0]]), [True, False, True])
+    np.testing.assert_array_equal(
+        field.in_collision(np.array([[0.5, 0, 0], [0.501, 0, 0], [0, 0, 0]])), [True, False, True]
+    )
 
 
 def test_equal_gaussians_answer_with_the_lowest_index() -> None:
@@ -173,7 +177,8 @@ def test_numpy_and_torch_of_any_float_type_and_order_give_the_same_answer() -> N
     field = GaussianCollisionField(_random(30, rng))
     points = rng.uniform(-1, 1, (20, 3)).astype(np.float32)
     expected = field.mahalanobis(points).distance
-    for same in (points.astype(np.float64), np.asfortranarray(points), torch.from_numpy(points), points.tolist()):
+    same_points: list[Any] = [points.astype(np.float64), np.asfortranarray(points), torch.from_numpy(points)]
+    for same in [*same_points, points.tolist()]:
         np.testing.assert_array_equal(field.mahalanobis(same).distance, expected)
 
 
@@ -188,7 +193,7 @@ def test_numpy_and_torch_of_any_float_type_and_order_give_the_same_answer() -> N
 )
 def test_points_that_make_no_sense_are_named_instead_of_called_free(points: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        GaussianCollisionField(_model([0, 0, 0], 0.1)).in_collision(np.asarray(points))
+        GaussianCollisionField(_model([0, 0, 0], 0.1)).in_collision(np.asarray(points, dtype=np.float64))
 
 
 @pytest.mark.parametrize("column", ["means", "quats", "log_scales", "opacity_logits"])
