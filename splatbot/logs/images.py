@@ -59,8 +59,10 @@ def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
 def _decode(path: Path, field: str, flags: int) -> NDArray[Any]:
     try:
         data = path.read_bytes()
-    except OSError as error:
-        raise LogError(f"cannot be read ({error.strerror}).", file=path, field=field, hint=_AGAIN) from error
+    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
+        raise LogError(
+            f"cannot be read ({getattr(error, 'strerror', error)}).", file=path, field=field, hint=_AGAIN
+        ) from error
     damage = _damage(data)
     if damage:
         raise LogError(f"{damage}.", file=path, field=field, hint=_AGAIN)
