@@ -41,8 +41,8 @@ def render_view(
         model: the map; view-independent colour (the DC term) is drawn.
         camera: intrinsics and size; without distortion.
         T_world_camera: (4, 4) rigid.
-        mode: "rgb" (H, W, 3) in 0..1; "depth" (H, W) [m] along the optical axis, 0 where opacity < 0.5; "normal"
-            (H, W, 3) unit vectors in the camera frame that face the camera, 0 where opacity < 0.5; "alpha" (H, W) in 0..1.
+        mode: "rgb" (H, W, 3) in 0..1; "depth" (H, W) [m] along the optical axis; "normal" (H, W, 3) unit vectors in
+            the camera frame that face the camera; "alpha" (H, W) in 0..1. Depth and normal are 0 where alpha < 0.5.
         background: RGB in 0..1 behind the map ("rgb" only).
 
     Raises:
@@ -126,8 +126,8 @@ def colorize(
 ) -> NDArray[np.uint8]:
     """A view of :func:`render_view` as an image, (H, W, 3) RGB or, for "alpha", (H, W).
 
-    Depth runs from red (near) to blue (far) over ``depth_range`` [m], by default :func:`depth_limits`; unknown is black.
-    Normals are drawn as (x, -y, -z) → RGB, so that a surface facing the camera is light blue.
+    Depth runs from red (near) to blue (far) over ``depth_range`` [m], by default :func:`depth_limits`; unknown is
+    black. Normals are drawn as (x, -y, -z) → RGB, so that a surface facing the camera is light blue.
     """
     if mode == "depth":
         near, far = depth_range or depth_limits(view)

@@ -4,4 +4,5 @@
 NB_MODULE(_native, m) {
   m.doc() = "splatbot's C++ core";
   define_align(m);
+  define_mahalanobis(m);
 }
