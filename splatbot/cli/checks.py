@@ -59,12 +59,11 @@ def all_checks() -> list[Callable[[], list[Finding]]]:
 
 def check_python() -> list[Finding]:
     """The interpreter and the machine."""
-    version = platform.python_version()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    machine = Finding("ok", "platform", f"{platform.system()} {platform.machine()}, {cores} cores")
-    if sys.version_info < (3, 11):
-        return [Finding("fail", "python", version, "use Python 3.11 or later"), machine]
-    return [Finding("ok", "python", version), machine]
+    return [
+        Finding("ok", "python", platform.python_version()),
+        Finding("ok", "platform", f"{platform.system()} {platform.machine()}, {cores} cores"),
+    ]
 
 
 def check_packages() -> list[Finding]:
@@ -79,8 +78,10 @@ def _check_package(names: tuple[str, ...], loss: str) -> Finding:
         except metadata.PackageNotFoundError:
             continue
     fix = f"pip install {names[0]}"
-    return Finding("warn", names[0], f"missing: without it no {loss}", fix) if loss else Finding(
-        "fail", names[0], "missing", fix
+    return (
+        Finding("warn", names[0], f"missing: without it no {loss}", fix)
+        if loss
+        else Finding("fail", names[0], "missing", fix)
     )
 
 

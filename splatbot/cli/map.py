@@ -77,7 +77,7 @@ def map_log_command(
             on_progress=on_progress,
             on_bad_frame=on_bad_frame,
             max_frames=max_frames,
-            source={"uri": _absolute(log), "camera": _absolute(camera) if camera else None},
+            source={"camera": _lasting(camera) if camera else None},
         )
     if out is None:
         _link_latest(folder)
@@ -105,9 +105,9 @@ def _parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
     return values
 
 
-def _absolute(uri: str) -> str:
-    """A path that still holds when the run is scored from another folder; anything else as it is."""
-    return str(Path(uri).resolve()) if Path(uri).exists() else uri
+def _lasting(camera: str) -> str:
+    """A file's path that still holds when the run is scored from another folder; the name of a preset as it is."""
+    return str(Path(camera).resolve()) if Path(camera).exists() else camera
 
 
 def _slug(name: str) -> str:

@@ -31,14 +31,17 @@ def test_the_second_signal_raises() -> None:
 
 
 def test_nothing_raises_inside_a_held_block_but_it_does_right_after() -> None:
-    reached = False
-    with Interrupts() as interrupts:
-        with pytest.raises(KeyboardInterrupt), interrupts.held():
+    reached = []
+
+    def work(interrupts: Interrupts) -> None:
+        with interrupts.held():
             send()
             send()
-            send()
-            reached = True
-    assert reached
+            reached.append("end")
+
+    with Interrupts() as interrupts, pytest.raises(KeyboardInterrupt):
+        work(interrupts)
+    assert reached == ["end"]
 
 
 def test_a_single_signal_inside_a_held_block_is_a_request() -> None:

@@ -1,0 +1,99 @@
+"""map_log: a whole log through SLAM, saved, scored and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from splatbot.config import Config
+from splatbot.errors import InputError, LogError
+from splatbot.logs import Log
+from splatbot.results.folder import RunFolder
+from splatbot.results.metrics import cost_metrics
+from splatbot.results.scoring import score_trajectory
+from splatbot.run.interrupts import Interrupts
+from splatbot.run.loop import FrameLoop
+from splatbot.run.outcome import Outcome
+from splatbot.run.progress import Progress
+from splatbot.slam import Slam
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run: where it lies, its ``metrics.json``, and what ended it early, if anything did."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    error: InputError | None = None
+    signal: int | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0; or the error's, or 128 + signal as shells have it (130 for Ctrl-C)."""
+        if self.error is not None:
+            return self.error.exit_code
+        return 128 + self.signal if self.signal is not None else 0
+
+
+def map_log(
+    log: Log,
+    *,
+    out: str | Path,
+    config: Config | None = None,
+    slam: Slam | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    on_bad_frame: Literal["stop", "skip"] = "stop",
+    max_frames: int | None = None,
+    source: dict[str, Any] | None = None,
+    effects: Sequence[Mapping[str, Any]] = (),
+) -> RunResult:
+    """Map a log and write the run folder ``out``.
+
+    Every ``config.mapping.holdout_every``-th frame is tracked but kept out of the map, and the finished map is scored
+    against it. Ctrl-C, SIGTERM and an unreadable frame end the mapping early; what was mapped until then is saved,
+    scored and reported like a whole run. A second Ctrl-C gives up scoring and report.
+
+    Args:
+        log: the recording.
+        out: folder to write; files of an earlier run there are replaced once there is something to replace them with.
+        config: None takes that of ``slam``, or the defaults.
+        slam: the SLAM to run, fresh; None makes one from ``config``.
+        on_progress: called after every frame and at every phase.
+        on_bad_frame: what to do about a frame that cannot be read.
+        max_frames: read no more frames than this.
+        source: what else it takes to open the log again, kept beside its uri in ``metrics.json`` under "log".
+        effects: the account of the sensor effects that the log's frames went through; empty for a real sensor.
+
+    Raises:
+        LogError: the log is empty, or no frame could be read; nothing is written then.
+        InputError: ``out`` cannot be written.
+        KeyboardInterrupt: interrupted before the first frame was mapped.
+    """
+    config = config or (slam.config if slam else Config())
+    folder = RunFolder.create(out)
+    total = len(log) if max_frames is None else min(len(log), max_frames)
+    if total == 0:
+        raise LogError("has no frames.", file=log.name, hint="record the log again, or name another one")
+    truth = log.ground_truth  # now: a damaged file must not cost the user a whole run
+    loop = FrameLoop(log, slam or Slam(config), config, total, on_bad_frame, on_progress or (lambda _: None))
+    with Interrupts() as interrupts:
+        loop.run(interrupts)
+        if not loop.slam.results:
+            raise loop.crash or loop.error or loop.first_bad or KeyboardInterrupt()
+        outcome = Outcome(
+            loop=loop,
+            source=source or {},
+            effects=list(effects),
+            interrupts=interrupts,
+            model=loop.slam.snapshot().model,
+            rows=loop.rows(),
+            costs=cost_metrics(loop.rows()),
+            trajectory=loop.trajectory(),
+            track=score_trajectory(loop.trajectory(), truth),
+        )
+        outcome.save(folder)
+    if loop.crash is not None:
+        raise loop.crash
+    return RunResult(folder.path, outcome.metrics(), error=loop.error, signal=interrupts.requested)

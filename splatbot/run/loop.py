@@ -1,0 +1,146 @@
+"""The frames of a log, one after the other."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from splatbot.config import Config
+from splatbot.errors import InputError
+from splatbot.frame import Frame
+from splatbot.logs import Log
+from splatbot.results.folder import FrameRow
+from splatbot.run.interrupts import Interrupts
+from splatbot.run.progress import Phase, Progress
+from splatbot.slam import FrameResult, Slam
+from splatbot.trajectory import Trajectory
+
+
+@dataclass
+class FrameLoop:
+    """The loop over the frames, and what came of them.
+
+    Args:
+        log, slam, config: what is run.
+        total: frames to read.
+        on_bad_frame: "stop" or "skip".
+        tell: receives the progress.
+        ms: wall-clock milliseconds by frame.
+        held_out: frames that were kept out of the map.
+        skipped: why a frame could not be read, by frame.
+        keyframes, lost: counts so far.
+        error: the unreadable frame that ended the log.
+        crash: what broke unexpectedly.
+        first_bad: the first unreadable frame.
+        started: clock at the start [s].
+    """
+
+    log: Log
+    slam: Slam
+    config: Config
+    total: int
+    on_bad_frame: str
+    tell: Callable[[Progress], None]
+    ms: dict[int, float] = field(default_factory=dict)
+    held_out: set[int] = field(default_factory=set)
+    skipped: dict[int, str] = field(default_factory=dict)
+    keyframes: int = 0
+    lost: int = 0
+    error: InputError | None = None
+    crash: Exception | None = None
+    first_bad: InputError | None = None
+    started: float = field(default_factory=time.perf_counter)
+
+    def run(self, interrupts: Interrupts) -> None:
+        """Process the frames until they end, ``error``, ``crash`` or a signal; raises nothing."""
+        try:
+            for index in range(self.total):
+                if interrupts.requested is not None or not self._step(index):
+                    return
+            self.progress("refining")
+            self.slam.finish()
+        except KeyboardInterrupt:  # the second signal, or one raised by a callback
+            interrupts.requested = interrupts.requested or 2
+        except Exception as crash:  # a bug; it is raised again once the map is saved
+            self.crash = crash
+
+    def _step(self, index: int) -> bool:
+        """Read and process one frame; False when the log ends here."""
+        try:
+            frame = self.log[index]
+        except InputError as error:
+            self.first_bad = self.first_bad or error
+            if self.on_bad_frame == "stop":
+                self.error = error
+                return False
+            self.skipped[index] = str(error)
+            self.progress("mapping", done=index + 1, skipped=str(error))
+            return True
+        result = self._process(frame, index)
+        self.keyframes += result.keyframe
+        self.lost += result.verdict == "lost"
+        self.progress("mapping", done=index + 1, result=result)
+        return True
+
+    def _process(self, frame: Frame, index: int) -> FrameResult:
+        every = self.config.mapping.holdout_every
+        hold_out = every > 0 and index % every == every - 1
+        if hold_out:
+            self.held_out.add(index)
+        start = time.perf_counter()
+        result = self.slam.process(frame, hold_out=hold_out)
+        self.ms[index] = 1e3 * (time.perf_counter() - start)
+        return result
+
+    def progress(
+        self, phase: Phase, *, done: int | None = None, result: FrameResult | None = None, skipped: str = ""
+    ) -> None:
+        """Tell the caller where the run stands."""
+        results = self.slam.results
+        self.tell(
+            Progress(
+                phase=phase,
+                done=self.done if done is None else done,
+                total=self.total,
+                elapsed_s=time.perf_counter() - self.started,
+                result=result,
+                skipped=skipped,
+                keyframes=self.keyframes,
+                lost=self.lost,
+                gaussians=results[-1].gaussians if results else 0,
+            )
+        )
+
+    @property
+    def done(self) -> int:
+        """Frames read, or tried."""
+        return len(self.ms) + len(self.skipped)
+
+    def rows(self) -> list[FrameRow]:
+        """One row per frame, in the log's order."""
+        rows = [
+            FrameRow(
+                index=r.index,
+                stamp=r.stamp,
+                verdict=r.verdict,
+                reasons=tuple(r.reasons),
+                stage=r.stage,
+                ms=self.ms.get(r.index, 0.0),
+                stage_ms={name: float(ms) for name, ms in r.stage_ms.items()},
+                keyframe=bool(r.keyframe),
+                held_out=r.index in self.held_out,
+                gaussians=int(r.gaussians),
+            )
+            for r in self.slam.results
+        ]
+        rows += [FrameRow(index=i, stamp=None, verdict="skipped", reasons=(why,)) for i, why in self.skipped.items()]
+        return sorted(rows, key=lambda row: row.index)
+
+    def trajectory(self) -> Trajectory:
+        """The tracked poses."""
+        poses = [(r.stamp, r.T_world_camera) for r in self.slam.results if r.T_world_camera is not None]
+        stamps = np.array([stamp for stamp, _ in poses], dtype=np.float64)
+        return Trajectory(stamps, np.array([T for _, T in poses], dtype=np.float64).reshape(-1, 4, 4))

@@ -1,0 +1,90 @@
+"""What is done with a map when its frames are through: save, score, report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from splatbot import __version__
+from splatbot.gaussians import GaussianModel
+from splatbot.report import report_html
+from splatbot.results.folder import FrameRow, RunFolder
+from splatbot.results.metrics import without_nan
+from splatbot.results.scoring import TrajectoryScore, ViewScores, score_views, trajectory_metrics
+from splatbot.run.interrupts import Interrupts
+from splatbot.run.loop import FrameLoop
+from splatbot.trajectory import Trajectory
+
+
+@dataclass
+class Outcome:
+    """All that is known of a run once its frames are through."""
+
+    loop: FrameLoop
+    source: dict[str, Any]
+    effects: list[Any]
+    interrupts: Interrupts
+    model: GaussianModel
+    rows: list[FrameRow]
+    costs: dict[str, Any]
+    trajectory: Trajectory
+    track: TrajectoryScore | None
+    views: ViewScores = field(default_factory=ViewScores)
+
+    def save(self, folder: RunFolder) -> None:
+        """Save first; then score and report, which a signal may cut short without loss."""
+        self.loop.progress("saving")
+        with self.interrupts.held():
+            folder.save(
+                config=self.loop.config,
+                rows=self.rows,
+                trajectory=self.trajectory,
+                model=self.model,
+                metrics=self.metrics(),
+            )
+        self.interrupts.release()
+        try:
+            self._score_and_report(folder)
+        except KeyboardInterrupt:
+            folder.save_metrics(self.metrics())
+
+    def _score_and_report(self, folder: RunFolder) -> None:
+        self.loop.progress("scoring")
+        poses = {r.index: r.T_world_camera for r in self.loop.slam.results if r.T_world_camera is not None}
+        held_out = {i: poses[i] for i in sorted(self.loop.held_out) if i in poses}
+        self.views = score_views(self.loop.log, self.model, held_out)
+        folder.save_metrics(self.metrics())
+        self.loop.progress("reporting")
+        folder.save_report(
+            report_html(
+                rows=self.rows,
+                metrics=self.metrics(),
+                config=self.loop.config,
+                trajectory=self.trajectory,
+                track=self.track,
+                views=self.views,
+            )
+        )
+
+    def metrics(self) -> dict[str, Any]:
+        """The contents of ``metrics.json``."""
+        log, error = self.loop.log, self.loop.error or self.loop.crash
+        values = {
+            **self.costs,
+            **trajectory_metrics(self.track),
+            **self.views.metrics(),
+            "gaussians": len(self.model),
+            "map_bytes": self.model.nbytes,
+            "effects": self.effects,
+            "interrupted": self.interrupts.requested is not None,
+            "error": str(error) if error else None,
+            "log": {"name": log.name, "frames": len(log), "uri": _lasting(log.uri), **self.source},
+            "splatbot": __version__,
+        }
+        return without_nan(values)
+
+
+def _lasting(uri: str) -> str:
+    """A path that still holds when the run is scored from another folder; anything else as it is."""
+    return str(Path(uri).resolve()) if Path(uri).exists() else uri

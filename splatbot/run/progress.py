@@ -1,0 +1,37 @@
+"""Where a run stands, for displays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from splatbot.slam import FrameResult
+
+Phase = Literal["mapping", "refining", "saving", "scoring", "reporting"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands.
+
+    Args:
+        phase: what is being done.
+        done: frames read so far, of ``total``.
+        total: frames to read.
+        elapsed_s: time since the first frame [s].
+        result: what became of the latest frame; None when it could not be read, or after the last.
+        skipped: why the latest frame could not be read, "" otherwise.
+        keyframes: frames that entered the map so far.
+        lost: frames lost so far.
+        gaussians: size of the map.
+    """
+
+    phase: Phase
+    done: int
+    total: int
+    elapsed_s: float
+    result: FrameResult | None = None
+    skipped: str = ""
+    keyframes: int = 0
+    lost: int = 0
+    gaussians: int = 0

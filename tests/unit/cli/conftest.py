@@ -1,0 +1,61 @@
+"""The command line in this process, with the oracle in SLAM's place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from splatbot.cli import main
+from splatbot.config import Config
+from splatbot.logs import open_log
+from tests.unit.oracle import OracleSlam
+
+
+@dataclass
+class Answer:
+    code: int
+    out: str
+    err: str
+
+
+RunCommand = Callable[..., Answer]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> RunCommand:
+    """Runs `splatbot WORDS...` and returns its exit code and output."""
+
+    def call(*words: object) -> Answer:
+        capsys.readouterr()
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as exit_:  # tyro leaves so after --help and wrong usage
+            code = exit_.code if isinstance(exit_.code, int) else 1
+        captured = capsys.readouterr()
+        return Answer(code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def log_folder(make_log: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A sound log of 16 frames; SLAM is the oracle that knows its poses."""
+    folder = make_log(16)
+    truth = open_log(folder).ground_truth
+    assert truth is not None
+
+    def slam(config: Config) -> OracleSlam:
+        return OracleSlam(truth, config)
+
+    monkeypatch.setattr("splatbot.run.job.Slam", slam)
+    return folder
+
+
+@pytest.fixture
+def run_folder(run: RunCommand, log_folder: Path, tmp_path: Path) -> Path:
+    """The folder of a finished run of ``log_folder``."""
+    assert run("map", log_folder, "--out", tmp_path / "run", "--quiet").code == 0
+    return tmp_path / "run"

@@ -1,0 +1,110 @@
+"""The entry point: light, helpful, and errors as one line with the right exit code."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+import splatbot
+from splatbot.cli import COMMANDS
+from splatbot.errors import LogError, MapNotFoundError, SplatbotError
+from tests.unit.cli.conftest import RunCommand
+
+HEAVY = ("torch", "open3d", "cv2", "matplotlib", "mujoco", "fastapi", "numpy")
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["map", "--help"], ["render", "--help"], ["doctor", "-h"]])
+def test_help_imports_nothing_heavy(words: list[str]) -> None:
+    program = (
+        "import sys\nfrom splatbot.cli import main\n"
+        f"try:\n    main({words!r})\nexcept SystemExit:\n    pass\n"
+        f"print('HEAVY', [m for m in {HEAVY!r} if m in sys.modules])"
+    )
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert answer.stdout.splitlines()[-1] == "HEAVY []"
+
+
+def test_the_help_lists_every_command(run: RunCommand) -> None:
+    answer = run("--help")
+    assert answer.code == 0
+    for name, command in COMMANDS.items():
+        assert name in answer.out
+        assert command.summary.split()[0] in answer.out
+
+
+def test_no_words_at_all_show_the_help(run: RunCommand) -> None:
+    answer = run()
+    assert answer.code == 0
+    assert "subcommands" in answer.out
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("serve", "demo")])
+def test_every_command_shows_examples_and_explains_every_option(run: RunCommand, name: str) -> None:
+    answer = run(name, "--help")
+    assert answer.code == 0
+    assert f"splatbot {name}" in answer.out.split("Examples:")[1]
+    command = COMMANDS[name]
+    function = getattr(importlib.import_module(command.module), command.function)
+    documented = (inspect.getdoc(function) or "").partition("Args:")[2]
+    for parameter in inspect.signature(function).parameters:
+        assert f"{parameter}:" in documented
+
+
+def test_an_unknown_command_is_wrong_input_and_the_known_ones_are_named(run: RunCommand) -> None:
+    answer = run("mpa")
+    assert answer.code == 2
+    assert "map" in answer.err
+
+
+def test_the_version_is_that_of_the_package(run: RunCommand) -> None:
+    assert run("--version").out.strip() == splatbot.__version__
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (LogError("is cut off.", file="a.png", field="image", hint="copy it again"), 2),
+        (MapNotFoundError("is unknown.", field="map"), 2),
+        (SplatbotError("went wrong."), 1),
+    ],
+)
+def test_an_error_is_one_line_with_its_exit_code(
+    run: RunCommand, monkeypatch: pytest.MonkeyPatch, error: SplatbotError, code: int
+) -> None:
+    fail_with(monkeypatch, error)
+    answer = run("doctor")
+    assert (answer.code, answer.err) == (code, f"error: {error}\n")
+
+
+@pytest.mark.parametrize("how", ["flag", "environment"])
+def test_debug_adds_the_traceback(run: RunCommand, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    fail_with(monkeypatch, LogError("is cut off."))
+    if how == "environment":
+        monkeypatch.setenv("SPLATBOT_DEBUG", "1")
+    answer = run("doctor", *(["--debug"] if how == "flag" else []))
+    assert answer.code == 2
+    assert "Traceback" in answer.err
+    assert "error: is cut off." in answer.err
+
+
+def test_an_unexpected_exception_keeps_its_traceback(run: RunCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    fail_with(monkeypatch, ZeroDivisionError("a bug"))
+    with pytest.raises(ZeroDivisionError):  # Python prints it and exits with 1
+        run("doctor")
+
+
+def test_ctrl_c_exits_with_130(run: RunCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    fail_with(monkeypatch, KeyboardInterrupt())
+    assert run("doctor").code == 130
+
+
+def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def broken() -> Any:
+        raise error
+
+    monkeypatch.setattr("splatbot.cli.checks.all_checks", broken)

@@ -1,0 +1,191 @@
+"""`splatbot eval`, `render`, `info` and `doctor`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splatbot.cli import checks
+from splatbot.trajectory import Trajectory
+from tests.unit.cli.conftest import RunCommand
+
+
+def metrics_of(folder: Path) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
+    return values
+
+
+def test_eval_finds_the_log_by_itself_and_agrees_with_the_run(
+    run: RunCommand, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    answer = run("eval", run_folder, "--json")
+    assert answer.code == 0
+    scores = json.loads(answer.out)
+    for name in ("ate_rmse_m", "psnr_holdout_db", "depth_l1_m", "tracked", "gaussians"):
+        assert scores[name] == pytest.approx(metrics_of(run_folder)[name], abs=1e-9), name
+
+
+def test_eval_prints_a_table(run: RunCommand, run_folder: Path) -> None:
+    answer = run("eval", run_folder)
+    assert answer.code == 0
+    for text in ("16 of 16", "ATE RMSE", "over 16 frames", "PSNR", "SSIM", "depth error"):
+        assert text in answer.out
+
+
+def test_eval_takes_another_reference(run: RunCommand, run_folder: Path, tmp_path: Path) -> None:
+    estimate = Trajectory.load(run_folder / "trajectory.tum")
+    bent = estimate.T_world_camera.copy()
+    bent[8:, 1, 3] += 0.1
+    Trajectory(estimate.stamps, bent).save(tmp_path / "bent.tum")
+    answer = run("eval", run_folder, "--ground-truth", tmp_path / "bent.tum", "--json")
+    assert json.loads(answer.out)["ate_rmse_m"] > 0.01
+
+
+def test_eval_of_a_moved_log_says_what_to_do(run: RunCommand, run_folder: Path, log_folder: Path) -> None:
+    moved = log_folder.rename(log_folder.with_name("moved"))
+    answer = run("eval", run_folder)
+    assert answer.code == 2
+    assert str(log_folder) in answer.err
+    assert run("eval", run_folder, "--log", moved).code == 0
+
+
+def test_eval_of_something_else_is_refused(run: RunCommand, tmp_path: Path) -> None:
+    answer = run("eval", tmp_path)
+    assert answer.code == 2
+    assert "metrics.json" in answer.err
+    assert "splatbot map" in answer.err
+
+
+@pytest.mark.parametrize("mode", ["rgb", "depth", "normal", "alpha"])
+def test_render_writes_a_picture_of_the_asked_size(
+    run: RunCommand, run_folder: Path, tmp_path: Path, mode: str
+) -> None:
+    answer = run("render", run_folder, "--mode", mode, "--out", tmp_path / "view.png", "--size", "80x60")
+    assert answer.code == 0
+    image = cv2.imread(str(tmp_path / "view.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.shape[:2] == (60, 80)
+    assert image.max() > 0
+
+
+def test_render_without_out_names_the_picture_after_map_and_mode(
+    run: RunCommand, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("render", run_folder / "map.ply", "--mode", "depth").out.strip() == "map-depth.png"
+    assert (tmp_path / "map-depth.png").exists()
+
+
+def test_render_takes_a_pose_by_hand_or_by_index(run: RunCommand, run_folder: Path, tmp_path: Path) -> None:
+    pose = Trajectory.load(run_folder / "trajectory.tum").positions[6]
+    by_hand = run("render", run_folder, "--out", tmp_path / "a.png", "--pose", *pose, 1, 0, 0, 0)
+    by_index = run("render", run_folder, "--out", tmp_path / "b.png", "--index", 6)
+    assert (by_hand.code, by_index.code) == (0, 0)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    other = run("render", run_folder, "--out", tmp_path / "c.png", "--pose", -0.5, -0.2, -1, 1, 0, 0, 0)
+    assert other.code == 0
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "c.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "field"),
+    [
+        (["--size", "80"], "--size"),
+        (["--size", "0x60"], "--size"),
+        (["--fov", "200"], "fov"),
+        (["--index", "99"], "--index"),
+        (["--pose", "0", "0", "0", "0", "0", "0", "0"], "--pose"),
+        (["--pose", "0", "0", "0", "1", "0", "0", "0", "--index", "1"], "--pose"),
+    ],
+)
+def test_render_refuses_what_it_cannot_draw(run: RunCommand, run_folder: Path, words: list[str], field: str) -> None:
+    answer = run("render", run_folder, *words)
+    assert answer.code == 2
+    assert field in answer.err
+    assert "Fix:" in answer.err
+
+
+@pytest.mark.parametrize("command", ["render", "info"])
+def test_a_truncated_map_is_named(run: RunCommand, run_folder: Path, command: str) -> None:
+    path = run_folder / "map.ply"
+    path.write_bytes(path.read_bytes()[:-100])
+    answer = run(command, path)
+    assert answer.code == 2
+    assert "map.ply" in answer.err
+    assert "Fix:" in answer.err
+    assert "Traceback" not in answer.err
+
+
+def test_info_describes_a_log(run: RunCommand, log_folder: Path) -> None:
+    answer = run("info", log_folder)
+    assert answer.code == 0
+    lines = {line.strip().partition("  ")[0]: line for line in answer.out.splitlines()}
+    assert "16" in lines["frames"]
+    assert "30.0 Hz" in lines["rate"]
+    assert "64x48" in lines["image"]
+    assert "16, path 15.00 cm" in lines["reference poses"]
+    assert "99 %" in lines["valid depth"]  # 16 of 3072 pixels are a hole
+
+
+def test_info_describes_a_map_and_a_run_by_its_map(run: RunCommand, run_folder: Path) -> None:
+    by_run, by_map = run("info", run_folder), run("info", run_folder / "map.ply")
+    assert by_run.code == 0
+    assert by_run.out == by_map.out
+    assert f"{metrics_of(run_folder)['gaussians']:,}" in by_run.out
+    assert "4, 4, 4 mm" in by_run.out
+    assert "0.95, 0.95, 0.95" in by_run.out
+
+
+def test_info_of_nothing_is_named(run: RunCommand, tmp_path: Path) -> None:
+    answer = run("info", tmp_path / "absent")
+    assert answer.code == 2
+    assert "absent" in answer.err
+
+
+def test_doctor_fails_only_for_what_everything_needs(run: RunCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    warn = checks.Finding("warn", "EGL", "absent", "install it")
+    fail = checks.Finding("fail", "native module", "absent", "build it")
+    monkeypatch.setattr(checks, "all_checks", lambda: [lambda: [warn]])
+    answer = run("doctor")
+    assert answer.code == 0
+    assert "fix: install it" in answer.out
+    monkeypatch.setattr(checks, "all_checks", lambda: [lambda: [warn], lambda: [fail]])
+    assert run("doctor").code == 1
+
+
+def test_doctor_names_a_missing_package_and_how_to_get_it() -> None:
+    needed = checks._check_package(("no-such-distribution",), "")
+    optional = checks._check_package(("no-such-distribution",), "grippers")
+    assert (needed.state, optional.state) == ("fail", "warn")
+    assert needed.fix == optional.fix == "pip install no-such-distribution"
+    assert checks._check_package(("no-such-distribution", "numpy"), "").detail == np.__version__
+
+
+def test_doctor_survives_graphics_that_hang_or_crash(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hang(*args: Any, **kwargs: Any) -> Any:
+        raise subprocess.TimeoutExpired("python", 60.0)
+
+    monkeypatch.setattr(subprocess, "run", hang)
+    (finding,) = checks.check_egl()
+    assert (finding.state, "60 s" in finding.detail, "apt-get" in finding.fix) == ("warn", True, True)
+    crashed = subprocess.CompletedProcess([], -11, stdout="", stderr="boom\ngladLoadGL error")
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: crashed)
+    (finding,) = checks.check_egl()
+    assert finding.state == "warn"
+    assert "gladLoadGL error" in finding.detail
+
+
+def test_doctor_reports_a_broken_rasterizer_instead_of_breaking(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "rasterizer_error", lambda: 0.5)
+    assert checks.check_rasterizer()[0].state == "fail"
+    monkeypatch.setattr(checks, "rasterizer_error", lambda: 1e-7)
+    assert checks.check_rasterizer()[0].state == "ok"
