@@ -78,7 +78,9 @@ class SyntheticLog(LogBase):
 
     def _decode(self, index: int) -> Frame:
         rgb, depth = self._scene.render(self.camera, self.ground_truth.T_world_camera[index])
-        return Frame(float(self.ground_truth.stamps[index]), rgb, depth, self.camera, index, source=f"{self.uri}#{index}")
+        return Frame(
+            float(self.ground_truth.stamps[index]), rgb, depth, self.camera, index, source=f"{self.uri}#{index}"
+        )
 
 
 def orbit(t: float, arc: float) -> NDArray[np.float64]:

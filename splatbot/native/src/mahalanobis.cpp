@@ -5,8 +5,10 @@
 #include <cmath>
 #include <limits>
 
-// One source, compiled for three instruction sets; the loader picks one. Elsewhere the compiler's baseline serves.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && defined(__gnu_linux__)
+// One source, compiled for three instruction sets; the loader picks one. Elsewhere the compiler's baseline serves, and
+// under AddressSanitizer too, which is not up yet when the loader picks.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && defined(__gnu_linux__) && \
+    !defined(__SANITIZE_ADDRESS__)
 #define SPLATBOT_CLONES __attribute__((target_clones("default", "avx2", "avx512f")))
 #else
 #define SPLATBOT_CLONES

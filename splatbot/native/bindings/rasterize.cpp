@@ -1,0 +1,209 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+
+#include "splatbot/isa.hpp"
+#include "splatbot/rasterizer.hpp"
+#include "splatbot/threads.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+template <class T, class Shape>
+using Array = nb::ndarray<T, Shape, nb::c_contig, nb::device::cpu>;
+using In1 = Array<const float, nb::shape<-1>>;
+using In2 = Array<const float, nb::shape<-1, -1>>;
+using In3 = Array<const float, nb::shape<-1, -1, -1>>;
+using InN3 = Array<const float, nb::shape<-1, 3>>;
+using InN4 = Array<const float, nb::shape<-1, 4>>;
+using Out1 = Array<float, nb::shape<-1>>;
+using Out2 = Array<float, nb::shape<-1, -1>>;
+using Out3 = Array<float, nb::shape<-1, -1, -1>>;
+using Matrix3 = Array<const double, nb::shape<3, 3>>;
+using Matrix4 = Array<const double, nb::shape<4, 4>>;
+
+template <class A>
+auto span_of(const A& array) {
+  return std::span(array.data(), array.size());
+}
+
+template <class T, class A>
+std::span<T> span_of(const std::optional<A>& array) {
+  return array ? std::span<T>(array->data(), array->size()) : std::span<T>();
+}
+
+splatbot::Gaussians gaussians_of(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
+                                 const In2& colors) {
+  return {.count = means.shape(0),
+          .channels = static_cast<int>(colors.shape(1)),
+          .means = span_of(means),
+          .quats = span_of(quats),
+          .scales = span_of(scales),
+          .opacities = span_of(opacities),
+          .colors = span_of(colors)};
+}
+
+splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int width, int height) {
+  splatbot::View view{};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      view.rotation[3 * i + j] = static_cast<float>(viewmat(i, j));
+    }
+    view.translation[i] = static_cast<float>(viewmat(i, 3));
+  }
+  view.fx = static_cast<float>(K(0, 0));
+  view.fy = static_cast<float>(K(1, 1));
+  view.cx = static_cast<float>(K(0, 2));
+  view.cy = static_cast<float>(K(1, 2));
+  view.width = width;
+  view.height = height;
+  return view;
+}
+
+splatbot::DepthMode depth_mode(const std::string& name) {
+  if (name == "none") {
+    return splatbot::DepthMode::none;
+  }
+  if (name == "accumulated") {
+    return splatbot::DepthMode::accumulated;
+  }
+  if (name == "expected") {
+    return splatbot::DepthMode::expected;
+  }
+  throw std::invalid_argument("depth is '" + name + "', must be none, accumulated or expected");
+}
+
+// A render's leftovers for its backward pass and its meta.
+struct State {
+  splatbot::RasterStatePtr state;
+};
+
+nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities, const In2& colors,
+                   const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane, float far_plane,
+                   float radius_clip, float eps2d, const std::string& depth, bool plane_depth,
+                   const std::optional<In1>& background, const Out3& out_colors, const Out2& out_alphas) {
+  const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, opacities, colors);
+  const splatbot::View view = view_of(viewmat, K, width, height);
+  const splatbot::RasterOptions options = {.near_plane = near_plane,
+                                           .far_plane = far_plane,
+                                           .radius_clip = radius_clip,
+                                           .eps2d = eps2d,
+                                           .depth = depth_mode(depth),
+                                           .plane_depth = plane_depth};
+  State state;
+  std::optional<splatbot::Fault> fault;
+  {
+    const nb::gil_scoped_release release;
+    fault = splatbot::rasterize_forward(gaussians, view, options, span_of<const float>(background),
+                                        span_of(out_colors), span_of(out_alphas), state.state);
+  }
+  if (fault) {
+    return nb::make_tuple(nb::str(fault->field.data(), fault->field.size()), fault->row);
+  }
+  return nb::cast(std::move(state));
+}
+
+void backward(const State& state, const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
+              const In2& colors, const std::optional<In1>& background, const std::optional<In3>& grad_render,
+              const std::optional<In2>& grad_alphas, const std::optional<Out2>& grad_means,
+              const std::optional<Out2>& grad_quats, const std::optional<Out2>& grad_scales,
+              const std::optional<Out1>& grad_opacities, const std::optional<Out2>& grad_colors,
+              const std::optional<Array<double, nb::shape<12>>>& grad_viewmat,
+              const std::optional<Array<double, nb::shape<-1>>>& grad_background, bool accumulate) {
+  const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, opacities, colors);
+  const splatbot::Gradients out = {.means = span_of<float>(grad_means),
+                                   .quats = span_of<float>(grad_quats),
+                                   .scales = span_of<float>(grad_scales),
+                                   .opacities = span_of<float>(grad_opacities),
+                                   .colors = span_of<float>(grad_colors),
+                                   .viewmat = span_of<double>(grad_viewmat),
+                                   .background = span_of<double>(grad_background),
+                                   .accumulate = accumulate};
+  const nb::gil_scoped_release release;
+  splatbot::rasterize_backward(*state.state, gaussians, span_of<const float>(background),
+                               span_of<const float>(grad_render), span_of<const float>(grad_alphas), out);
+}
+
+template <class T>
+nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
+  auto held = std::make_unique<std::vector<T>>(std::move(values));
+  T* data = held->data();
+  nb::capsule owner(held.release(), [](void* p) noexcept { std::unique_ptr<std::vector<T>>(static_cast<std::vector<T>*>(p)); });
+  return nb::ndarray<nb::numpy, T>(data, shape, owner);
+}
+
+nb::dict describe(const State& state, const In1& opacities) {
+  const std::size_t n = opacities.size();
+  std::vector<float> means2d(2 * n), depths(n), conics(3 * n);
+  std::vector<std::int32_t> radii(2 * n), tiles(n);
+  {
+    const nb::gil_scoped_release release;
+    splatbot::describe_projections(*state.state, span_of(opacities), {means2d, depths, conics, radii, tiles});
+  }
+  nb::dict d;
+  d["means2d"] = owned(std::move(means2d), {n, 2});
+  d["depths"] = owned(std::move(depths), {n});
+  d["conics"] = owned(std::move(conics), {n, 3});
+  d["radii"] = owned(std::move(radii), {n, 2});
+  d["tiles_per_gauss"] = owned(std::move(tiles), {n});
+  return d;
+}
+
+nb::ndarray<nb::numpy, std::int64_t> visible(const State& state) {
+  const auto ids = splatbot::visible_ids(*state.state);
+  return owned(std::vector<std::int64_t>(ids.begin(), ids.end()), {ids.size()});
+}
+
+nb::dict tiles(const State& state) {
+  const splatbot::TileInfo info = splatbot::tile_info(*state.state);
+  nb::dict d;
+  d["tile_size"] = nb::make_tuple(info.tile_width, info.tile_height);
+  d["tile_width"] = info.columns;
+  d["tile_height"] = info.rows;
+  d["n_isects"] = info.pairs;
+  d["state_bytes"] = info.state_bytes;
+  return d;
+}
+
+}  // namespace
+
+void define_rasterize(nb::module_& m) {
+  nb::class_<State>(m, "RasterState", "What a render leaves for its backward pass.")
+      .def("describe", &describe, "opacities"_a.noconvert(), "Projections as a dict of arrays.")
+      .def("visible", &visible, "Indices (V,) of the Gaussians in view.")
+      .def("tiles", &tiles, "Tile grid, pairs and bytes held.");
+
+  m.def("rasterize_forward", &forward, "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(),
+        "opacities"_a.noconvert(), "colors"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a,
+        "height"_a, "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a,
+        nb::arg("background").noconvert().none(), "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(),
+        "Render one view into out_colors (H, W, X) and out_alphas (H, W). Returns a RasterState, or (field, row) of an "
+        "input that is not finite.");
+
+  m.def("rasterize_backward", &backward, "state"_a, "means"_a.noconvert(), "quats"_a.noconvert(),
+        "scales"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(),
+        nb::arg("background").noconvert().none(), nb::arg("grad_render").noconvert().none(),
+        nb::arg("grad_alphas").noconvert().none(), nb::arg("grad_means").noconvert().none(),
+        nb::arg("grad_quats").noconvert().none(), nb::arg("grad_scales").noconvert().none(),
+        nb::arg("grad_opacities").noconvert().none(), nb::arg("grad_colors").noconvert().none(),
+        nb::arg("grad_viewmat").noconvert().none(), nb::arg("grad_background").noconvert().none(), "accumulate"_a,
+        "Write (or add) the gradients whose arrays are given.");
+
+  m.def("isa", [] { return std::string(splatbot::isa()); }, "The kernels in use: v2, v3, v4 or baseline.");
+  m.def("available_isas", &splatbot::available_isas, "The kernels this CPU can run, the simplest first.");
+  m.def("set_isa", [](const std::string& name) { splatbot::set_isa(name); }, "name"_a,
+        "Use other kernels; an empty name returns to the default.");
+  m.def("num_threads", [] { return splatbot::thread_pool()->size(); }, "Threads that the kernels run on.");
+  m.def("set_num_threads", &splatbot::set_num_threads, "threads"_a, "Change that number; 0 returns to the default.");
+}

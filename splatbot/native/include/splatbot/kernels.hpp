@@ -1,0 +1,106 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "splatbot/raster_state.hpp"
+
+// The compute kernels, compiled once for each instruction set from the sources in src/kernels. They see plain pointers
+// only: an inline function of the standard library would be emitted in several copies of which the linker keeps any.
+namespace splatbot {
+
+inline constexpr float kAlphaMin = 1.0F / 255.0F;
+inline constexpr float kLog2AlphaMin = -7.994353436858858F;
+inline constexpr float kAlphaMax = 0.99F;
+inline constexpr float kTransmittanceMin = 1e-4F;
+inline constexpr float kMaxSigmas = 3.33F;
+inline constexpr float kExpectedDepthMin = 1e-10F;  // least sum of weights that expected depth is divided by
+inline constexpr float kFovMargin = 0.3F;           // of half the field of view, where the projection's slope is clamped
+
+struct ProjectArgs {
+  std::size_t count;
+  const float *means, *quats, *scales, *opacities, *colors;
+  int channels;
+  View view;
+  RasterOptions options;
+  int columns, rows;
+  const ChannelPass* passes;
+  int n_passes;
+  Record* records;
+  Placement* placements;
+  std::uint32_t* visible;
+  float* more_channels;
+};
+
+struct BlendArgs {
+  View view;
+  int columns;
+  const ChannelPass* pass;
+  DepthMode depth;
+  bool plane_depth;
+  bool write_alphas;
+  const Record* records;
+  const float* channels;  // of Gaussian 0; rows `channel_stride` apart
+  std::size_t channel_stride;
+  const std::uint32_t* tile_begin;
+  const Pair* pairs;
+  std::uint32_t* masks;
+  std::uint32_t* tile_done;
+  float* final_state;  // of this pass
+  const float* background;  // per channel of the pass, or null
+  float* out_colors;
+  int out_channels;
+  float* out_alphas;
+};
+
+struct BlendBackwardArgs {
+  BlendArgs forward;
+  const float* grad_colors;  // (H, W, out_channels) or null
+  const float* grad_alphas;  // (H, W) or null; null for all but the first pass
+  int channel_sums;          // how many channels' gradients are summed: 0, 1 (depth) or all
+  float* slots;              // (pairs, kSlot)
+};
+
+struct ProjectBackwardArgs {
+  ProjectArgs forward;
+  const ProjectedBlock* blocks;
+  const float* slots;
+  const ChannelPass* pass;
+  int channel_sums;
+  bool depth_in_pass;
+  float* carried;   // (N, kSlot) sums of earlier passes, or null if there is one pass only
+  bool first, last;
+  bool accumulate;  // add to the outputs
+  float *means, *quats, *scales, *opacities, *colors;  // outputs; null: not asked for
+  double* viewmat;                                     // (blocks, 12) partial sums, or null
+};
+
+struct Kernels {
+  const char* name;
+  void (*project)(const ProjectArgs&, std::size_t block, ProjectedBlock& out);
+  void (*blend)(const BlendArgs&, std::size_t tile);
+  void (*blend_backward)(const BlendBackwardArgs&, std::size_t tile);
+  void (*project_backward)(const ProjectBackwardArgs&, std::size_t block);
+};
+
+// The kernels in use (isa.cpp).
+const Kernels& kernels();
+
+#if defined(SPLATBOT_X86)
+namespace v2 {
+extern const Kernels kKernels;
+}
+namespace v3 {
+extern const Kernels kKernels;
+}
+namespace v4 {
+extern const Kernels kKernels;
+}
+#else
+namespace baseline {
+extern const Kernels kKernels;
+}
+#endif
+
+}  // namespace splatbot

@@ -1,0 +1,59 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <condition_variable>
+#include <cstddef>
+#include <memory>
+#include <mutex>
+#include <thread>
+#include <type_traits>
+#include <vector>
+
+namespace splatbot {
+
+// A fixed number of threads that sleep (never spin) until a loop is to be run. Tasks are handed out one by one, so
+// which thread runs a task is not determined: a task must depend on its index alone.
+class ThreadPool {
+ public:
+  explicit ThreadPool(unsigned threads);
+  ~ThreadPool();
+  ThreadPool(const ThreadPool&) = delete;
+  ThreadPool& operator=(const ThreadPool&) = delete;
+
+  unsigned size() const noexcept { return size_; }
+
+  // Calls task(i) for every i in [0, count) and returns when all are done. A pool busy with another caller's loop is
+  // not waited for: the caller then runs its tasks itself. The first exception of a task is rethrown here.
+  template <class Task>
+  void run(std::size_t count, Task&& task) {
+    using Plain = std::remove_reference_t<Task>;
+    run_erased(count, [](void* context, std::size_t i) { (*static_cast<Plain*>(context))(i); },
+               const_cast<void*>(static_cast<const void*>(&task)));
+  }
+
+ private:
+  using Function = void (*)(void*, std::size_t);
+  struct Loop;
+
+  void run_erased(std::size_t count, Function function, void* context);
+  void work();
+
+  unsigned size_;
+  std::mutex owner_;  // held by the caller whose loop is being run
+  std::mutex mutex_;
+  std::condition_variable wake_;
+  std::condition_variable idle_;
+  Loop* loop_ = nullptr;
+  unsigned long long generation_ = 0;
+  unsigned active_ = 0;
+  bool stop_ = false;
+  std::vector<std::thread> threads_;
+};
+
+// The pool all kernels share: SPLATBOT_NUM_THREADS threads, or as many as the process may run on.
+std::shared_ptr<ThreadPool> thread_pool();
+
+// Replaces the shared pool; 0 returns to the default. Throws std::invalid_argument above 1024.
+void set_num_threads(unsigned threads);
+
+}  // namespace splatbot

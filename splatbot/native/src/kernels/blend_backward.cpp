@@ -1,0 +1,177 @@
+// SPDX-License-Identifier: Apache-2.0
+// Gradient of blend(). Gaussian by Gaussian, front to back, with each pixel's transmittance T and the rest
+// R = sum over what is still to be blended of (channels . gradient) x weight + T_final x gradient of T_final, so that
+//   d loss / d alpha = T (channels . gradient) - R_after / (1 - alpha),
+// without a division by T and in the order and with the masks of the forward pass. The sums of one (Gaussian, tile) pair
+// go to a slot of their own: nothing is shared between threads and nothing depends on their number.
+#include "entry.hpp"
+#include "tile.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
+
+struct TileGradient {
+  alignas(64) float transmittance[kTilePixels];
+  alignas(64) float rest[kTilePixels];
+  alignas(64) float gradient[kRecordChannels][kTilePixels];
+};
+
+// Gradients to the sums that blend() had before the background was added and expected depth was divided.
+void load_pixel(const BlendBackwardArgs& args, std::size_t pixel, int i, const float* saved, TileGradient& state) {
+  const ChannelPass& pass = *args.forward.pass;
+  const float signed_t = saved[i];
+  const float t = signed_t < 0.0F ? -signed_t : signed_t;
+  float grad_t = args.grad_alphas != nullptr ? -args.grad_alphas[pixel] : 0.0F;
+  float rest = 0.0F;
+  const float* grads = args.grad_colors == nullptr
+                           ? nullptr
+                           : args.grad_colors + pixel * static_cast<std::size_t>(args.forward.out_channels);
+  for (int c = 0; c < pass.count; ++c) {
+    float g = grads == nullptr ? 0.0F : grads[pass.column[static_cast<std::size_t>(c)]];
+    const float sum = saved[(1 + static_cast<std::size_t>(c)) * kPlane + static_cast<std::size_t>(i)];
+    if (c == 0 && pass.depth_first) {
+      if (args.forward.depth == DepthMode::expected) {
+        const float covered = 1.0F - t;
+        const bool divided = covered > kExpectedDepthMin;
+        g /= divided ? covered : kExpectedDepthMin;
+        grad_t += divided ? g * sum / covered : 0.0F;
+      }
+    } else if (args.forward.background != nullptr) {
+      grad_t += args.forward.background[c] * g;
+    }
+    state.gradient[c][i] = g;
+    rest += sum * g;
+  }
+  state.transmittance[i] = 1.0F;
+  state.rest[i] = rest + grad_t * t;
+}
+
+template <int C>
+void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const float* saved, TileGradient& state) {
+  if (frame.width < kTileWidth || frame.height < kTileHeight || args.forward.pass->count < C) {
+    for (int i = 0; i < kTilePixels; ++i) {
+      state.transmittance[i] = -1.0F;
+      state.rest[i] = 0.0F;
+    }
+    for (int c = 0; c < C; ++c) {
+      std::memset(state.gradient[c], 0, sizeof(state.gradient[c]));
+    }
+  }
+  for (int y = 0; y < frame.height; ++y) {
+    const std::size_t line =
+        static_cast<std::size_t>(frame.y0 + y) * static_cast<std::size_t>(args.forward.view.width) +
+        static_cast<std::size_t>(frame.x0);
+    for (int x = 0; x < frame.width; ++x) {
+      load_pixel(args, line + static_cast<std::size_t>(x), pixel_index(x, y), saved, state);
+    }
+  }
+}
+
+// Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha); then weight times gradient for the first S channels.
+template <int C, int S>
+SB_INLINE void sum_pair(const Local& local, const float* channels, std::uint32_t mask, TileGradient& state, float* slot) {
+  F acc[16];
+#pragma GCC unroll 16
+  for (int i = 0; i < 16; ++i) {
+    acc[i] = set1(0.0F);
+  }
+  do {
+    const int block = __builtin_ctz(mask);
+    mask &= mask - 1;
+#pragma GCC unroll 4
+    for (int part = 0; part < kParts; ++part) {
+      const std::size_t first = static_cast<std::size_t>(block * kBlockPixels + part * W);
+      const Alpha a = alpha_at(load(kCenters.x + first), load(kCenters.y + first), &local.l11, &local.l21, &local.l22,
+                               &local.u0, &local.w0, &local.lo);
+      const F before = load(state.transmittance + first);
+      F transmittance = before;
+      const Step step = advance(a, transmittance);
+      const F weight = zero_unless(step.blended, step.weight);
+      F along = set1(0.0F);
+#pragma GCC unroll 8
+      for (int c = 0; c < C; ++c) {
+        const F g = load(state.gradient[c] + first);
+        along = fma(set1(channels[c]), g, along);
+        if (c < S) {
+          acc[kMoments + c] = fma(weight, g, acc[kMoments + c]);
+        }
+      }
+      const F rest = fnma(weight, along, load(state.rest + first));
+      store(state.transmittance + first, transmittance);
+      store(state.rest + first, rest);
+      // alpha x d loss / d alpha; none where the cap holds alpha.
+      const F other = a.alpha * rest * reciprocal(set1(1.0F) - a.alpha);
+      const M free = step.blended & (a.power <= set1(kAlphaMax));
+      const F v = zero_unless(free, fma(step.weight, along, -other));
+      const F vu = v * a.u;
+      const F vw = v * a.w;
+      acc[0] = acc[0] + v;
+      acc[1] = acc[1] + vu;
+      acc[2] = acc[2] + vw;
+      acc[3] = fma(vu, a.u, acc[3]);
+      acc[4] = fma(vu, a.w, acc[4]);
+      acc[5] = fma(vw, a.w, acc[5]);
+    }
+  } while (mask != 0);
+  store_sums<kMoments + S>(slot, acc);
+}
+
+template <int C, int S>
+void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
+  const BlendArgs& f = args.forward;
+  const std::uint32_t begin = f.tile_begin[tile];
+  const std::uint32_t end = f.tile_begin[tile + 1];
+  const std::uint32_t done = begin + f.tile_done[tile];
+  for (std::uint32_t at = begin; at < end; ++at) {
+    float* slot = args.slots + static_cast<std::size_t>(f.pairs[at].slot) * kSlot;
+    const std::uint32_t mask = at < done ? f.masks[at] : 0U;
+    if (mask == 0) {
+      std::memset(slot, 0, kSlot * sizeof(float));
+      continue;
+    }
+    constexpr std::uint32_t kAhead = 8;
+    if (at + kAhead < done) {
+      __builtin_prefetch(f.records + f.pairs[at + kAhead].id);
+      __builtin_prefetch(args.slots + static_cast<std::size_t>(f.pairs[at + kAhead].slot) * kSlot, 1);
+    }
+    const std::size_t id = f.pairs[at].id;
+    const Local local = localize(f.records[id], frame);
+    sum_pair<C, S>(local, f.channels + id * f.channel_stride, mask, state, slot);
+  }
+}
+
+template <int C>
+void backward_channels(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
+  load_tile<C>(args, frame, args.forward.final_state + tile * kFinalPlanes * kPlane, state);
+  if (args.channel_sums == 0) {
+    backward_lists<C, 0>(args, frame, tile, state);
+  } else if (args.channel_sums == 1) {
+    backward_lists<C, 1>(args, frame, tile, state);
+  } else {
+    backward_lists<C, C>(args, frame, tile, state);
+  }
+}
+
+}  // namespace
+
+void blend_backward(const BlendBackwardArgs& args, std::size_t tile) {
+  TileGradient state;
+  const TileFrame frame = tile_frame(args.forward.view, args.forward.columns, tile);
+  switch (args.forward.pass->count) {
+    case 1:
+      return backward_channels<1>(args, frame, tile, state);
+    case 2:
+    case 3:
+      return backward_channels<3>(args, frame, tile, state);
+    case 4:
+      return backward_channels<4>(args, frame, tile, state);
+    case 5:
+    case 6:
+      return backward_channels<6>(args, frame, tile, state);
+    default:
+      return backward_channels<8>(args, frame, tile, state);
+  }
+}
+
+}  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,14 @@
+// SPDX-License-Identifier: Apache-2.0
+// The functions that each instruction set's copy of the kernels defines.
+#pragma once
+
+#include "splatbot/kernels.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out);
+void blend(const BlendArgs& args, std::size_t tile);
+void blend_backward(const BlendBackwardArgs& args, std::size_t tile);
+void project_backward(const ProjectBackwardArgs& args, std::size_t block);
+
+}  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,138 @@
+// SPDX-License-Identifier: Apache-2.0
+// EWA projection of W Gaussians at once, shared by the forward and backward passes.
+#pragma once
+
+#include "simd.hpp"
+#include "splatbot/kernels.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+inline constexpr float kHalfLog2e = 0.72134752044448170F;   // log2(e) / 2
+inline constexpr float kRootHalfLog2e = 0.84932180028801904F;
+inline constexpr float kZeroQuat = 1e-30F;  // a quaternion whose largest entry is below has no direction
+
+struct GaussianLanes {
+  F mean[3], quat[4], scale[3];
+};
+
+struct CameraLanes {
+  F r[9], t[3], fx, fy, cx, cy, slope_min[2], slope_max[2];
+
+  SB_INLINE explicit CameraLanes(const View& view) {
+    for (int i = 0; i < 9; ++i) {
+      r[i] = set1(view.rotation[i]);
+    }
+    for (int i = 0; i < 3; ++i) {
+      t[i] = set1(view.translation[i]);
+    }
+    fx = set1(view.fx);
+    fy = set1(view.fy);
+    cx = set1(view.cx);
+    cy = set1(view.cy);
+    const auto width = static_cast<float>(view.width);
+    const auto height = static_cast<float>(view.height);
+    const float margin_x = kFovMargin * 0.5F * width / view.fx;
+    const float margin_y = kFovMargin * 0.5F * height / view.fy;
+    slope_min[0] = set1(-(view.cx / view.fx + margin_x));
+    slope_max[0] = set1((width - view.cx) / view.fx + margin_x);
+    slope_min[1] = set1(-(view.cy / view.fy + margin_y));
+    slope_max[1] = set1((height - view.cy) / view.fy + margin_y);
+  }
+};
+
+struct Projected {
+  F p[3];                   // in the camera frame
+  F slope[2];               // x/z, y/z, clamped to the widened field of view
+  M slope_free[2];          // where they are not clamped
+  F jx, jy;                 // fx/z, fy/z
+  F norm;                   // of the quaternion, 1 for a zero one
+  M quat_zero;
+  F unit[4];                // unit quaternion
+  F rotation[9];            // of the Gaussian
+  F a[9];                   // camera rotation x Gaussian rotation
+  F rows[2][3];             // a[0] - slope x a[2] and a[1] - slope y a[2]
+  F m[2][3];                // root of the 2D covariance: j x rows x scale
+  F c00, c01, c11, det;     // 2D covariance, blurred
+  F mx, my;                 // [px]
+};
+
+SB_INLINE F dot3(const F* a, const F* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
+
+SB_INLINE void rotate_gaussian(const GaussianLanes& g, const CameraLanes& cam, Projected& o) {
+  // By the largest entry first: the squares of 1e-20 and 1e20 leave the range of a float.
+  F largest = set1(0.0F);
+  for (int i = 0; i < 4; ++i) {
+    largest = max(largest, max(g.quat[i], -g.quat[i]));
+  }
+  o.quat_zero = largest < set1(kZeroQuat);
+  largest = select(o.quat_zero, set1(1.0F), largest);
+  F q[4];
+  for (int i = 0; i < 4; ++i) {
+    q[i] = g.quat[i] / largest;
+  }
+  const F length = sqrt(fma(q[0], q[0], fma(q[1], q[1], fma(q[2], q[2], q[3] * q[3]))));
+  const F inverse = set1(1.0F) / select(o.quat_zero, set1(1.0F), length);
+  o.norm = largest * select(o.quat_zero, set1(1.0F), length);
+  for (int i = 0; i < 4; ++i) {
+    o.unit[i] = select(o.quat_zero, set1(i == 0 ? 1.0F : 0.0F), q[i] * inverse);
+  }
+  const F w = o.unit[0], x = o.unit[1], y = o.unit[2], z = o.unit[3];
+  const F one = set1(1.0F), two = set1(2.0F);
+  o.rotation[0] = fnma(two, fma(y, y, z * z), one);
+  o.rotation[1] = two * fnma(w, z, x * y);
+  o.rotation[2] = two * fma(w, y, x * z);
+  o.rotation[3] = two * fma(w, z, x * y);
+  o.rotation[4] = fnma(two, fma(x, x, z * z), one);
+  o.rotation[5] = two * fnma(w, x, y * z);
+  o.rotation[6] = two * fnma(w, y, x * z);
+  o.rotation[7] = two * fma(w, x, y * z);
+  o.rotation[8] = fnma(two, fma(x, x, y * y), one);
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      o.a[3 * i + j] = fma(cam.r[3 * i], o.rotation[j],
+                           fma(cam.r[3 * i + 1], o.rotation[3 + j], cam.r[3 * i + 2] * o.rotation[6 + j]));
+    }
+  }
+}
+
+SB_INLINE void project_center(const GaussianLanes& g, const CameraLanes& cam, Projected& o) {
+  for (int i = 0; i < 3; ++i) {
+    o.p[i] = fma(cam.r[3 * i], g.mean[0], fma(cam.r[3 * i + 1], g.mean[1], fma(cam.r[3 * i + 2], g.mean[2], cam.t[i])));
+  }
+}
+
+// Everything after project_center(); lanes at z <= 0 hold no meaning.
+SB_INLINE void project_rest(const GaussianLanes& g, const CameraLanes& cam, F eps2d, Projected& o) {
+  rotate_gaussian(g, cam, o);
+  const F inverse_z = set1(1.0F) / o.p[2];
+  o.jx = cam.fx * inverse_z;
+  o.jy = cam.fy * inverse_z;
+  o.mx = fma(o.jx, o.p[0], cam.cx);
+  o.my = fma(o.jy, o.p[1], cam.cy);
+  for (int i = 0; i < 2; ++i) {
+    const F free = o.p[i] * inverse_z;
+    o.slope[i] = clamp(free, cam.slope_min[i], cam.slope_max[i]);
+    o.slope_free[i] = (free >= cam.slope_min[i]) & (free <= cam.slope_max[i]);
+  }
+  F normal[3];  // a^T (slope x, slope y, 1): the cross product of the two rows
+  for (int k = 0; k < 3; ++k) {
+    o.rows[0][k] = fnma(o.slope[0], o.a[6 + k], o.a[k]);
+    o.rows[1][k] = fnma(o.slope[1], o.a[6 + k], o.a[3 + k]);
+    o.m[0][k] = o.jx * o.rows[0][k] * g.scale[k];
+    o.m[1][k] = o.jy * o.rows[1][k] * g.scale[k];
+    normal[k] = fma(o.slope[0], o.a[k], fma(o.slope[1], o.a[3 + k], o.a[6 + k]));
+  }
+  const F s00 = dot3(o.m[0], o.m[0]);
+  const F s11 = dot3(o.m[1], o.m[1]);
+  o.c01 = dot3(o.m[0], o.m[1]);
+  o.c00 = s00 + eps2d;
+  o.c11 = s11 + eps2d;
+  // det(m m^T) as the sum of squared minors (Cauchy-Binet): c00 c11 - c01^2 loses all digits of a needle.
+  const F area = o.jx * o.jy;
+  const F n0 = area * normal[0] * g.scale[1] * g.scale[2];
+  const F n1 = area * normal[1] * g.scale[0] * g.scale[2];
+  const F n2 = area * normal[2] * g.scale[0] * g.scale[1];
+  o.det = fma(n0, n0, fma(n1, n1, fma(n2, n2, eps2d * (s00 + s11 + eps2d))));
+}
+
+}  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,290 @@
+// SPDX-License-Identifier: Apache-2.0
+// From the sums of blend_backward() to the gradients of the inputs, W Gaussians at once. The projection is computed
+// anew: cheaper than keeping it.
+#include "entry.hpp"
+#include "project.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
+
+struct LaneSums {
+  alignas(64) float moments[kMoments][W];
+  alignas(64) float depth[W];
+};
+
+struct LaneGradients {
+  F mean[3], quat[4], scale[3], opacity;
+  F rotation[9], translation[3];  // of the camera
+};
+
+// Sum of a Gaussian's slots in the order of its tiles, on top of what earlier passes left.
+SB_INLINE void sum_slots(const ProjectBackwardArgs& args, const ProjectedBlock& block, std::size_t id, float* sums) {
+  const Placement& place = args.forward.placements[id];
+  const float* slot = args.slots + (block.first_pair + place.slot) * kSlot;
+  const std::size_t pairs = std::size_t{place.nx} * place.ny;
+  constexpr int kVectors = kSlot / W;
+  F acc[kVectors];
+#pragma GCC unroll 4
+  for (int i = 0; i < kVectors; ++i) {
+    acc[i] = load(slot + i * W);
+  }
+  for (std::size_t p = 1; p < pairs; ++p) {
+#pragma GCC unroll 4
+    for (int i = 0; i < kVectors; ++i) {
+      acc[i] = acc[i] + load(slot + p * kSlot + static_cast<std::size_t>(i * W));
+    }
+  }
+#pragma GCC unroll 4
+  for (int i = 0; i < kVectors; ++i) {
+    store(sums + i * W, acc[i]);
+  }
+}
+
+SB_INLINE void put(float* to, float value, bool add) { *to = add ? *to + value : value; }
+
+void write_colors(const ProjectBackwardArgs& args, std::size_t id, const float* sums) {
+  const ChannelPass& pass = *args.pass;
+  const int depth = pass.depth_first ? 1 : 0;
+  float* to = args.colors + id * static_cast<std::size_t>(args.forward.channels) + pass.first_color;
+  for (int c = depth; c < pass.count; ++c) {
+    put(to + c - depth, sums[kMoments + c], args.accumulate);
+  }
+}
+
+// Gradient of the 2D mean and covariance into the Gaussian and the camera.
+void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, F l11, F l21, F l22,
+               const LaneSums& sums, LaneGradients& out) {
+  // With z = B d and log(alpha) = log(opacity) - |z|^2 / (2 k^2): d/d mean = B^T z / k^2 and
+  // d/d covariance = B^T z z^T B / (2 k^4).
+  const F su = load(sums.moments[1]), sw = load(sums.moments[2]);
+  const F suu = load(sums.moments[3]), suw = load(sums.moments[4]), sww = load(sums.moments[5]);
+  constexpr float kInverse = 1.0F / kHalfLog2e;
+  const F gmx = set1(kInverse) * l11 * su;
+  const F gmy = set1(kInverse) * fma(l21, su, l22 * sw);
+  const F half = set1(0.5F * kInverse * kInverse);
+  const F g00 = half * l11 * l11 * suu;
+  const F g01 = half * l11 * fma(l21, suu, l22 * suw);
+  const F g11 = half * fma(l21 * l21, suu, fma(set1(2.0F) * l21 * l22, suw, l22 * l22 * sww));
+
+  F gr[2][3], ga[9];
+  F gjx = set1(0.0F), gjy = set1(0.0F), gsx = set1(0.0F), gsy = set1(0.0F);
+  const F two = set1(2.0F);
+  for (int k = 0; k < 3; ++k) {
+    const F gm0 = two * fma(g00, o.m[0][k], g01 * o.m[1][k]);
+    const F gm1 = two * fma(g01, o.m[0][k], g11 * o.m[1][k]);
+    out.scale[k] = fma(o.jx * o.rows[0][k], gm0, o.jy * o.rows[1][k] * gm1);
+    gjx = fma(o.rows[0][k] * g.scale[k], gm0, gjx);
+    gjy = fma(o.rows[1][k] * g.scale[k], gm1, gjy);
+    gr[0][k] = o.jx * g.scale[k] * gm0;
+    gr[1][k] = o.jy * g.scale[k] * gm1;
+    gsx = fnma(o.a[6 + k], gr[0][k], gsx);
+    gsy = fnma(o.a[6 + k], gr[1][k], gsy);
+    ga[k] = gr[0][k];
+    ga[3 + k] = gr[1][k];
+    ga[6 + k] = -fma(o.slope[0], gr[0][k], o.slope[1] * gr[1][k]);
+  }
+
+  const F iz = set1(1.0F) / o.p[2];
+  gsx = zero_unless(o.slope_free[0], gsx);
+  gsy = zero_unless(o.slope_free[1], gsy);
+  // mx = jx px + cx, jx = fx / z, slope = p / z.
+  gjx = fma(gmx, o.p[0], gjx);
+  gjy = fma(gmy, o.p[1], gjy);
+  F gp[3];
+  gp[0] = fma(gmx, o.jx, gsx * iz);
+  gp[1] = fma(gmy, o.jy, gsy * iz);
+  const F along = fma(gjx, o.jx, fma(gjy, o.jy, fma(gsx, o.slope[0], gsy * o.slope[1])));
+  gp[2] = fnma(along, iz, load(sums.depth));
+
+  for (int i = 0; i < 3; ++i) {
+    out.mean[i] = fma(cam.r[i], gp[0], fma(cam.r[3 + i], gp[1], cam.r[6 + i] * gp[2]));
+    out.translation[i] = gp[i];
+    for (int j = 0; j < 3; ++j) {  // a = camera rotation x Gaussian rotation
+      const F turned = fma(ga[3 * i], o.rotation[3 * j],
+                           fma(ga[3 * i + 1], o.rotation[3 * j + 1], ga[3 * i + 2] * o.rotation[3 * j + 2]));
+      out.rotation[3 * i + j] = fma(gp[i], g.mean[j], turned);
+    }
+  }
+
+  F r[9];  // d loss / d Gaussian rotation
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      r[3 * i + j] = fma(cam.r[i], ga[j], fma(cam.r[3 + i], ga[3 + j], cam.r[6 + i] * ga[6 + j]));
+    }
+  }
+  const F w = o.unit[0], x = o.unit[1], y = o.unit[2], z = o.unit[3];
+  F q[4];
+  q[0] = two * fma(x, r[7] - r[5], fma(y, r[2] - r[6], z * (r[3] - r[1])));
+  q[1] = two * (fma(y, r[1] + r[3], fma(z, r[2] + r[6], w * (r[7] - r[5]))) - two * x * (r[4] + r[8]));
+  q[2] = two * (fma(x, r[1] + r[3], fma(z, r[5] + r[7], w * (r[2] - r[6]))) - two * y * (r[0] + r[8]));
+  q[3] = two * (fma(x, r[2] + r[6], fma(y, r[5] + r[7], w * (r[3] - r[1]))) - two * z * (r[0] + r[4]));
+  const F radial = fma(q[0], w, fma(q[1], x, fma(q[2], y, q[3] * z)));
+  const F zero = set1(0.0F);
+  for (int i = 0; i < 4; ++i) {
+    out.quat[i] = select(o.quat_zero, zero, fnma(radial, o.unit[i], q[i]) / o.norm);
+  }
+}
+
+template <int Width>
+SB_INLINE void gather_lanes(const float* rows, const std::uint32_t* ids, int n, F (&out)[Width]) {
+  alignas(64) float lanes[Width][W];
+  for (int i = 0; i < W; ++i) {
+    const float* row = rows + static_cast<std::size_t>(ids[i < n ? i : n - 1]) * Width;
+    for (int c = 0; c < Width; ++c) {
+      lanes[c][i] = row[c];
+    }
+  }
+  for (int c = 0; c < Width; ++c) {
+    out[c] = load(lanes[c]);
+  }
+}
+
+template <int Width>
+SB_INLINE void scatter_lanes(float* rows, const std::uint32_t* ids, int n, const F (&values)[Width], bool add) {
+  if (rows == nullptr) {
+    return;
+  }
+  alignas(64) float lanes[Width][W];
+  for (int c = 0; c < Width; ++c) {
+    store(lanes[c], values[c]);
+  }
+  for (int i = 0; i < n; ++i) {
+    float* row = rows + static_cast<std::size_t>(ids[i]) * Width;
+    for (int c = 0; c < Width; ++c) {
+      put(row + c, lanes[c][i], add);
+    }
+  }
+}
+
+struct CameraSums {
+  double lanes[12][W];
+};
+
+SB_INLINE void add_camera(const LaneGradients& g, int n, CameraSums& sums) {
+  alignas(64) float lanes[12][W];
+  for (int i = 0; i < 9; ++i) {
+    store(lanes[i], g.rotation[i]);
+  }
+  for (int i = 0; i < 3; ++i) {
+    store(lanes[9 + i], g.translation[i]);
+  }
+  for (int k = 0; k < 12; ++k) {
+    for (int i = 0; i < W; ++i) {
+      sums.lanes[k][i] += i < n ? static_cast<double>(lanes[k][i]) : 0.0;
+    }
+  }
+}
+
+void zero_rows(const ProjectBackwardArgs& args, std::size_t begin, std::size_t end) {
+  const auto clear = [&](float* rows, std::size_t width) {
+    if (rows != nullptr) {
+      std::memset(rows + begin * width, 0, (end - begin) * width * sizeof(float));
+    }
+  };
+  if (args.first) {
+    clear(args.colors, static_cast<std::size_t>(args.forward.channels));
+  }
+  if (args.last) {
+    clear(args.means, 3);
+    clear(args.quats, 4);
+    clear(args.scales, 3);
+    clear(args.opacities, 1);
+  }
+}
+
+// The sums of W Gaussians, lane by lane; colour gradients are written on the way.
+void collect(const ProjectBackwardArgs& args, const ProjectedBlock& block, const std::uint32_t* ids, int n,
+             LaneSums& lanes) {
+  alignas(64) float sums[kSlot];
+  for (int i = 0; i < W; ++i) {
+    if (i >= n) {
+      for (auto& moment : lanes.moments) {
+        moment[i] = 0.0F;
+      }
+      lanes.depth[i] = 0.0F;
+      continue;
+    }
+    const std::size_t id = ids[i];
+    sum_slots(args, block, id, sums);
+    if (args.colors != nullptr) {
+      write_colors(args, id, sums);
+    }
+    float depth = args.depth_in_pass && args.channel_sums > 0 ? sums[kMoments] : 0.0F;
+    if (args.carried != nullptr) {  // moments, then depth
+      float* carried = args.carried + id * kSlot;
+      if (!args.first) {
+        for (int k = 0; k < kMoments; ++k) {
+          sums[k] += carried[k];
+        }
+        depth += carried[kMoments];
+      }
+      for (int k = 0; k < kMoments; ++k) {
+        carried[k] = sums[k];
+      }
+      carried[kMoments] = depth;
+    }
+    for (int k = 0; k < kMoments; ++k) {
+      lanes.moments[k][i] = sums[k];
+    }
+    lanes.depth[i] = depth;
+  }
+}
+
+}  // namespace
+
+void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
+  const std::size_t begin = b * kProjectBlock;
+  const std::size_t end = begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
+  const ProjectedBlock& block = args.blocks[b];
+  const std::uint32_t* visible = args.forward.visible + begin;
+  if (!args.accumulate && block.visible < end - begin) {
+    zero_rows(args, begin, end);
+  }
+  CameraSums camera_sums{};
+  const CameraLanes cam(args.forward.view);
+  for (std::uint32_t at = 0; at < block.visible; at += W) {
+    const std::uint32_t* ids = visible + at;
+    const int n = block.visible - at < W ? static_cast<int>(block.visible - at) : W;
+    LaneSums sums;
+    collect(args, block, ids, n, sums);
+    if (!args.last) {
+      continue;
+    }
+    GaussianLanes g;
+    gather_lanes<3>(args.forward.means, ids, n, g.mean);
+    gather_lanes<4>(args.forward.quats, ids, n, g.quat);
+    gather_lanes<3>(args.forward.scales, ids, n, g.scale);
+    Projected o;
+    project_center(g, cam, o);
+    project_rest(g, cam, set1(args.forward.options.eps2d), o);
+    const F l22 = set1(kRootHalfLog2e) / sqrt(o.c11);
+    const F l11 = set1(kRootHalfLog2e) * sqrt(o.c11 / o.det);
+    const F l21 = -(l11 * o.c01 / o.c11);
+    LaneGradients grads;
+    pull_back(g, cam, o, l11, l21, l22, sums, grads);
+    scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
+    scatter_lanes<4>(args.quats, ids, n, grads.quat, args.accumulate);
+    scatter_lanes<3>(args.scales, ids, n, grads.scale, args.accumulate);
+    if (args.opacities != nullptr) {
+      F opacity[1];
+      gather_lanes<1>(args.forward.opacities, ids, n, opacity);
+      const F gradient[1] = {load(sums.moments[0]) / opacity[0]};
+      scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
+    }
+    if (args.viewmat != nullptr) {
+      add_camera(grads, n, camera_sums);
+    }
+  }
+  if (args.viewmat != nullptr && args.last) {
+    for (int k = 0; k < 12; ++k) {
+      double sum = 0.0;
+      for (int i = 0; i < W; ++i) {
+        sum += camera_sums.lanes[k][i];
+      }
+      args.viewmat[b * 12 + static_cast<std::size_t>(k)] = sum;
+    }
+  }
+}
+
+}  // namespace splatbot::SPLATBOT_KERNELS

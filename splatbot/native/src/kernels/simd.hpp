@@ -1,0 +1,353 @@
+// SPDX-License-Identifier: Apache-2.0
+// One vector type per instruction set: AVX-512 (16 lanes), AVX2 with FMA (8), else the compiler's own 4-lane vectors
+// (SSE4.2, NEON). F holds floats, I 32-bit integers, M one truth value a lane. Contraction is off for these files: a
+// product and a sum fuse where fma() says so and nowhere else, so that forward and backward round alike.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+#if defined(SPLATBOT_X86)
+#include <immintrin.h>
+#elif defined(__ARM_NEON)
+#include <arm_neon.h>
+#endif
+
+#define SB_INLINE inline __attribute__((always_inline))
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+#if SPLATBOT_SIMD == 512
+
+inline constexpr int W = 16;
+struct F {
+  __m512 v;
+};
+struct I {
+  __m512i v;
+};
+struct M {
+  __mmask16 v;
+};
+
+SB_INLINE F set1(float x) { return {_mm512_set1_ps(x)}; }
+SB_INLINE F load(const float* p) { return {_mm512_loadu_ps(p)}; }
+SB_INLINE void store(float* p, F a) { _mm512_storeu_ps(p, a.v); }
+SB_INLINE F operator+(F a, F b) { return {_mm512_add_ps(a.v, b.v)}; }
+SB_INLINE F operator-(F a, F b) { return {_mm512_sub_ps(a.v, b.v)}; }
+SB_INLINE F operator*(F a, F b) { return {_mm512_mul_ps(a.v, b.v)}; }
+SB_INLINE F operator/(F a, F b) { return {_mm512_div_ps(a.v, b.v)}; }
+SB_INLINE F fma(F a, F b, F c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
+SB_INLINE F fnma(F a, F b, F c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
+SB_INLINE F fma_if(M m, F a, F b, F c) { return {_mm512_mask3_fmadd_ps(a.v, b.v, c.v, m.v)}; }
+SB_INLINE F min(F a, F b) { return {_mm512_min_ps(a.v, b.v)}; }
+SB_INLINE F max(F a, F b) { return {_mm512_max_ps(a.v, b.v)}; }
+SB_INLINE F sqrt(F a) { return {_mm512_sqrt_ps(a.v)}; }
+SB_INLINE F floor(F a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+SB_INLINE F ceil(F a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
+SB_INLINE M operator<(F a, F b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
+SB_INLINE M operator<=(F a, F b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }
+SB_INLINE M operator>(F a, F b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+SB_INLINE M operator>=(F a, F b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+SB_INLINE M operator&(M a, M b) { return {static_cast<__mmask16>(a.v & b.v)}; }
+SB_INLINE M and_not(M a, M b) { return {static_cast<__mmask16>(a.v & ~b.v)}; }  // a and not b
+SB_INLINE F select(M m, F a, F b) { return {_mm512_mask_blend_ps(m.v, b.v, a.v)}; }
+SB_INLINE F zero_unless(M m, F a) { return {_mm512_maskz_mov_ps(m.v, a.v)}; }
+SB_INLINE F mul_zero_unless(M m, F a, F b) { return {_mm512_maskz_mul_ps(m.v, a.v, b.v)}; }
+SB_INLINE std::uint32_t bits(M m) { return m.v; }
+SB_INLINE F negative_if(M m, F a) {  // the sign bit set where m
+  const __m512i x = _mm512_castps_si512(a.v);
+  return {_mm512_castsi512_ps(_mm512_mask_or_epi32(x, m.v, x, _mm512_set1_epi32(INT32_MIN)))};
+}
+SB_INLINE std::uint32_t sign_bits(F a) { return _mm512_movepi32_mask(_mm512_castps_si512(a.v)); }
+SB_INLINE I to_int(F a) { return {_mm512_cvttps_epi32(a.v)}; }
+SB_INLINE F to_float(I a) { return {_mm512_cvtepi32_ps(a.v)}; }
+SB_INLINE I bit_cast_int(F a) { return {_mm512_castps_si512(a.v)}; }
+SB_INLINE F bit_cast_float(I a) { return {_mm512_castsi512_ps(a.v)}; }
+SB_INLINE I set1(int x) { return {_mm512_set1_epi32(x)}; }
+SB_INLINE void store(std::uint32_t* p, I a) { _mm512_storeu_si512(p, a.v); }
+SB_INLINE I operator+(I a, I b) { return {_mm512_add_epi32(a.v, b.v)}; }
+SB_INLINE I operator-(I a, I b) { return {_mm512_sub_epi32(a.v, b.v)}; }
+SB_INLINE I operator&(I a, I b) { return {_mm512_and_si512(a.v, b.v)}; }
+SB_INLINE I operator|(I a, I b) { return {_mm512_or_si512(a.v, b.v)}; }
+template <int N>
+SB_INLINE I shift_left(I a) {
+  return {_mm512_slli_epi32(a.v, N)};
+}
+template <int N>
+SB_INLINE I shift_right(I a) {  // arithmetic
+  return {_mm512_srai_epi32(a.v, N)};
+}
+SB_INLINE I shift_left(I a, I n) { return {_mm512_sllv_epi32(a.v, n.v)}; }
+SB_INLINE I zero_unless(M m, I a) { return {_mm512_maskz_mov_epi32(m.v, a.v)}; }
+SB_INLINE F reciprocal(F a) {  // one Newton step from 14 bits
+  const __m512 r = _mm512_rcp14_ps(a.v);
+  return {_mm512_mul_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(2.0F)))};
+}
+SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
+  whole = {_mm512_roundscale_ps(q.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)};
+  fraction = q - whole;
+}
+SB_INLINE F scale_exponent(F a, F whole) { return {_mm512_scalef_ps(a.v, whole.v)}; }
+
+#elif SPLATBOT_SIMD == 256
+
+inline constexpr int W = 8;
+struct F {
+  __m256 v;
+};
+struct I {
+  __m256i v;
+};
+struct M {
+  __m256 v;
+};
+
+SB_INLINE F set1(float x) { return {_mm256_set1_ps(x)}; }
+SB_INLINE F load(const float* p) { return {_mm256_loadu_ps(p)}; }
+SB_INLINE void store(float* p, F a) { _mm256_storeu_ps(p, a.v); }
+SB_INLINE F operator+(F a, F b) { return {_mm256_add_ps(a.v, b.v)}; }
+SB_INLINE F operator-(F a, F b) { return {_mm256_sub_ps(a.v, b.v)}; }
+SB_INLINE F operator*(F a, F b) { return {_mm256_mul_ps(a.v, b.v)}; }
+SB_INLINE F operator/(F a, F b) { return {_mm256_div_ps(a.v, b.v)}; }
+SB_INLINE F fma(F a, F b, F c) { return {_mm256_fmadd_ps(a.v, b.v, c.v)}; }
+SB_INLINE F fnma(F a, F b, F c) { return {_mm256_fnmadd_ps(a.v, b.v, c.v)}; }
+SB_INLINE F min(F a, F b) { return {_mm256_min_ps(a.v, b.v)}; }
+SB_INLINE F max(F a, F b) { return {_mm256_max_ps(a.v, b.v)}; }
+SB_INLINE F sqrt(F a) { return {_mm256_sqrt_ps(a.v)}; }
+SB_INLINE F floor(F a) { return {_mm256_floor_ps(a.v)}; }
+SB_INLINE F ceil(F a) { return {_mm256_ceil_ps(a.v)}; }
+SB_INLINE M operator<(F a, F b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_LT_OQ)}; }
+SB_INLINE M operator<=(F a, F b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_LE_OQ)}; }
+SB_INLINE M operator>(F a, F b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GT_OQ)}; }
+SB_INLINE M operator>=(F a, F b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
+SB_INLINE M operator&(M a, M b) { return {_mm256_and_ps(a.v, b.v)}; }
+SB_INLINE M and_not(M a, M b) { return {_mm256_andnot_ps(b.v, a.v)}; }
+SB_INLINE F select(M m, F a, F b) { return {_mm256_blendv_ps(b.v, a.v, m.v)}; }
+SB_INLINE F zero_unless(M m, F a) { return {_mm256_and_ps(m.v, a.v)}; }
+SB_INLINE F mul_zero_unless(M m, F a, F b) { return zero_unless(m, a * b); }
+SB_INLINE std::uint32_t bits(M m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(m.v)); }
+SB_INLINE F negative_if(M m, F a) { return {_mm256_or_ps(a.v, _mm256_and_ps(m.v, _mm256_set1_ps(-0.0F)))}; }
+SB_INLINE std::uint32_t sign_bits(F a) { return static_cast<std::uint32_t>(_mm256_movemask_ps(a.v)); }
+SB_INLINE I to_int(F a) { return {_mm256_cvttps_epi32(a.v)}; }
+SB_INLINE F to_float(I a) { return {_mm256_cvtepi32_ps(a.v)}; }
+SB_INLINE I bit_cast_int(F a) { return {_mm256_castps_si256(a.v)}; }
+SB_INLINE F bit_cast_float(I a) { return {_mm256_castsi256_ps(a.v)}; }
+SB_INLINE I set1(int x) { return {_mm256_set1_epi32(x)}; }
+SB_INLINE void store(std::uint32_t* p, I a) { _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), a.v); }
+SB_INLINE I operator+(I a, I b) { return {_mm256_add_epi32(a.v, b.v)}; }
+SB_INLINE I operator-(I a, I b) { return {_mm256_sub_epi32(a.v, b.v)}; }
+SB_INLINE I operator&(I a, I b) { return {_mm256_and_si256(a.v, b.v)}; }
+SB_INLINE I operator|(I a, I b) { return {_mm256_or_si256(a.v, b.v)}; }
+template <int N>
+SB_INLINE I shift_left(I a) {
+  return {_mm256_slli_epi32(a.v, N)};
+}
+template <int N>
+SB_INLINE I shift_right(I a) {
+  return {_mm256_srai_epi32(a.v, N)};
+}
+SB_INLINE I shift_left(I a, I n) { return {_mm256_sllv_epi32(a.v, n.v)}; }
+SB_INLINE I zero_unless(M m, I a) { return {_mm256_and_si256(_mm256_castps_si256(m.v), a.v)}; }
+SB_INLINE F reciprocal(F a) { return set1(1.0F) / a; }
+
+#else
+
+inline constexpr int W = 4;
+using Vf = float __attribute__((vector_size(16)));
+using Vi = std::int32_t __attribute__((vector_size(16)));
+struct F {
+  Vf v;
+};
+struct I {
+  Vi v;
+};
+struct M {
+  Vi v;
+};
+
+SB_INLINE F set1(float x) { return {Vf{x, x, x, x}}; }
+SB_INLINE I set1(int x) { return {Vi{x, x, x, x}}; }
+SB_INLINE F load(const float* p) {
+  F r;
+  std::memcpy(&r.v, p, sizeof(r.v));
+  return r;
+}
+SB_INLINE void store(float* p, F a) { std::memcpy(p, &a.v, sizeof(a.v)); }
+SB_INLINE void store(std::uint32_t* p, I a) { std::memcpy(p, &a.v, sizeof(a.v)); }
+SB_INLINE F operator+(F a, F b) { return {a.v + b.v}; }
+SB_INLINE F operator-(F a, F b) { return {a.v - b.v}; }
+SB_INLINE F operator*(F a, F b) { return {a.v * b.v}; }
+SB_INLINE F operator/(F a, F b) { return {a.v / b.v}; }
+#if defined(__ARM_NEON) && defined(__aarch64__)
+SB_INLINE F fma(F a, F b, F c) { return {reinterpret_cast<Vf>(vfmaq_f32(c.v, a.v, b.v))}; }
+SB_INLINE F fnma(F a, F b, F c) { return {reinterpret_cast<Vf>(vfmsq_f32(c.v, a.v, b.v))}; }
+#else
+SB_INLINE F fma(F a, F b, F c) { return {a.v * b.v + c.v}; }
+SB_INLINE F fnma(F a, F b, F c) { return {c.v - a.v * b.v}; }
+#endif
+SB_INLINE M operator<(F a, F b) { return {a.v < b.v}; }
+SB_INLINE M operator<=(F a, F b) { return {a.v <= b.v}; }
+SB_INLINE M operator>(F a, F b) { return {a.v > b.v}; }
+SB_INLINE M operator>=(F a, F b) { return {a.v >= b.v}; }
+SB_INLINE M operator&(M a, M b) { return {a.v & b.v}; }
+SB_INLINE M and_not(M a, M b) { return {a.v & ~b.v}; }
+SB_INLINE F select(M m, F a, F b) { return {m.v ? a.v : b.v}; }
+SB_INLINE F zero_unless(M m, F a) { return {reinterpret_cast<Vf>(m.v & reinterpret_cast<Vi>(a.v))}; }
+SB_INLINE I zero_unless(M m, I a) { return {m.v & a.v}; }
+SB_INLINE F mul_zero_unless(M m, F a, F b) { return zero_unless(m, a * b); }
+SB_INLINE F min(F a, F b) { return {a.v < b.v ? a.v : b.v}; }
+SB_INLINE F max(F a, F b) { return {a.v > b.v ? a.v : b.v}; }
+SB_INLINE F sqrt(F a) {
+  F r;
+  for (int i = 0; i < W; ++i) {
+    r.v[i] = __builtin_sqrtf(a.v[i]);
+  }
+  return r;
+}
+SB_INLINE F floor(F a) {
+  F r;
+  for (int i = 0; i < W; ++i) {
+    r.v[i] = __builtin_floorf(a.v[i]);
+  }
+  return r;
+}
+SB_INLINE F ceil(F a) {
+  F r;
+  for (int i = 0; i < W; ++i) {
+    r.v[i] = __builtin_ceilf(a.v[i]);
+  }
+  return r;
+}
+SB_INLINE std::uint32_t sign_bits(F a) {
+#if defined(SPLATBOT_X86)
+  return static_cast<std::uint32_t>(_mm_movemask_ps(a.v));
+#else
+  const Vi x = reinterpret_cast<Vi>(a.v);
+  std::uint32_t r = 0;
+  for (int i = 0; i < W; ++i) {
+    r |= (static_cast<std::uint32_t>(x[i]) >> 31) << i;
+  }
+  return r;
+#endif
+}
+SB_INLINE std::uint32_t bits(M m) { return sign_bits({reinterpret_cast<Vf>(m.v)}); }
+SB_INLINE F negative_if(M m, F a) {
+  return {reinterpret_cast<Vf>(reinterpret_cast<Vi>(a.v) | (m.v & set1(INT32_MIN).v))};
+}
+SB_INLINE I to_int(F a) { return {__builtin_convertvector(a.v, Vi)}; }
+SB_INLINE F to_float(I a) { return {__builtin_convertvector(a.v, Vf)}; }
+SB_INLINE I bit_cast_int(F a) { return {reinterpret_cast<Vi>(a.v)}; }
+SB_INLINE F bit_cast_float(I a) { return {reinterpret_cast<Vf>(a.v)}; }
+SB_INLINE I operator+(I a, I b) { return {a.v + b.v}; }
+SB_INLINE I operator-(I a, I b) { return {a.v - b.v}; }
+SB_INLINE I operator&(I a, I b) { return {a.v & b.v}; }
+SB_INLINE I operator|(I a, I b) { return {a.v | b.v}; }
+template <int N>
+SB_INLINE I shift_left(I a) {
+  return {a.v << N};
+}
+template <int N>
+SB_INLINE I shift_right(I a) {
+  return {a.v >> N};
+}
+SB_INLINE I shift_left(I a, I n) { return {a.v << n.v}; }
+SB_INLINE F reciprocal(F a) { return set1(1.0F) / a; }
+
+#endif
+
+#if SPLATBOT_SIMD != 512
+SB_INLINE F fma_if(M m, F a, F b, F c) { return select(m, fma(a, b, c), c); }
+// The nearest integer by adding 1.5 x 2^23; for |q| < 2^22 only, which callers ensure or mask out.
+SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
+  whole = q + set1(12582912.0F);
+  fraction = q - (whole - set1(12582912.0F));
+}
+SB_INLINE F scale_exponent(F a, F whole) { return bit_cast_float(bit_cast_int(a) + shift_left<23>(bit_cast_int(whole))); }
+#endif
+
+SB_INLINE F operator-(F a) { return set1(0.0F) - a; }
+SB_INLINE F clamp(F x, F low, F high) { return min(max(x, low), high); }
+SB_INLINE F square(F x) { return x * x; }
+
+// 2^q to 7.5e-8 relative (a minimax polynomial of degree 5 on [-1/2, 1/2]).
+SB_INLINE F exp2(F q) {
+  F x, whole;
+  split_exponent(q, x, whole);
+  F p = fma(set1(1.3276471e-3F), x, set1(9.6755413e-3F));
+  p = fma(p, x, set1(5.5507133e-2F));
+  p = fma(p, x, set1(2.4022120e-1F));
+  p = fma(p, x, set1(6.9314697e-1F));
+  p = fma(p, x, set1(1.0000001F));
+  return scale_exponent(p, whole);
+}
+
+// log2 of normal positive numbers, to 1e-7: mantissa in [1/sqrt 2, sqrt 2), then the series of atanh.
+SB_INLINE F log2(F a) {
+  const I shifted = bit_cast_int(a) - set1(0x3f3504f3);
+  const I exponent = shift_right<23>(shifted);
+  const F m = bit_cast_float((shifted & set1(0x007fffff)) + set1(0x3f3504f3));
+  const F s = (m - set1(1.0F)) / (m + set1(1.0F));
+  const F s2 = s * s;
+  F p = fma(s2, set1(0.3205989F), set1(0.4121986F));
+  p = fma(p, s2, set1(0.5770780F));
+  p = fma(p, s2, set1(0.9617967F));
+  return fma(s, fma(p, s2, set1(2.8853901F)), to_float(exponent));
+}
+
+// The 16 sums over lanes of acc[0..n-1], zero beyond n, in a fixed order.
+#if SPLATBOT_SIMD == 512
+SB_INLINE F add_pairs(F a, F b) {
+  return {_mm512_add_ps(_mm512_unpacklo_ps(a.v, b.v), _mm512_unpackhi_ps(a.v, b.v))};
+}
+SB_INLINE F add_quads(F ab, F cd) {
+  const __m512d x = _mm512_castps_pd(ab.v);
+  const __m512d y = _mm512_castps_pd(cd.v);
+  return F{_mm512_castpd_ps(_mm512_unpacklo_pd(x, y))} + F{_mm512_castpd_ps(_mm512_unpackhi_pd(x, y))};
+}
+template <int N>
+SB_INLINE F sums(const F (&acc)[16]) {
+  F q[4];
+#pragma GCC unroll 4
+  for (int i = 0; i < 4; ++i) {
+    if (4 * i + 2 < N) {
+      q[i] = add_quads(add_pairs(acc[4 * i], acc[4 * i + 1]), add_pairs(acc[4 * i + 2], acc[4 * i + 3]));
+    } else if (4 * i < N) {
+      q[i] = add_quads(add_pairs(acc[4 * i], acc[4 * i + 1]), set1(0.0F));
+    } else {
+      q[i] = set1(0.0F);
+    }
+  }
+  const F x = {_mm512_add_ps(_mm512_shuffle_f32x4(q[0].v, q[1].v, 0x44), _mm512_shuffle_f32x4(q[0].v, q[1].v, 0xEE))};
+  const F y = {_mm512_add_ps(_mm512_shuffle_f32x4(q[2].v, q[3].v, 0x44), _mm512_shuffle_f32x4(q[2].v, q[3].v, 0xEE))};
+  return {_mm512_add_ps(_mm512_shuffle_f32x4(x.v, y.v, 0x88), _mm512_shuffle_f32x4(x.v, y.v, 0xDD))};
+}
+template <int N>
+SB_INLINE void store_sums(float* out, const F (&acc)[16]) {
+  store(out, sums<N>(acc));
+}
+#elif SPLATBOT_SIMD == 256
+template <int N>
+SB_INLINE void store_sums(float* out, const F (&acc)[16]) {
+#pragma GCC unroll 4
+  for (int i = 0; i < 16; i += 4) {
+    __m128 s = _mm_setzero_ps();
+    if (i < N) {
+      const __m256 ab = _mm256_hadd_ps(acc[i].v, acc[i + 1].v);
+      const __m256 cd = _mm256_hadd_ps(acc[i + 2].v, acc[i + 3].v);
+      const __m256 quad = _mm256_hadd_ps(ab, cd);
+      s = _mm_add_ps(_mm256_castps256_ps128(quad), _mm256_extractf128_ps(quad, 1));
+    }
+    _mm_storeu_ps(out + i, s);
+  }
+}
+#else
+template <int N>
+SB_INLINE void store_sums(float* out, const F (&acc)[16]) {
+  for (int i = 0; i < 16; ++i) {
+    out[i] = i < N ? (acc[i].v[0] + acc[i].v[1]) + (acc[i].v[2] + acc[i].v[3]) : 0.0F;
+  }
+}
+#endif
+
+}  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,94 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the two blend passes share: a tile's geometry and the alpha of a Gaussian in W of its pixels.
+#pragma once
+
+#include "simd.hpp"
+#include "splatbot/kernels.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+inline constexpr int kParts = kBlockPixels / W;  // vectors to a block
+inline constexpr std::size_t kPlane = kTilePixels;
+inline constexpr std::size_t kFinalPlanes = 1 + kRecordChannels;
+
+struct TileFrame {
+  int x0, y0;          // first pixel
+  int width, height;  // pixels within the image
+};
+
+SB_INLINE TileFrame tile_frame(const View& view, int columns, std::size_t tile) {
+  const int x0 = static_cast<int>(tile % static_cast<std::size_t>(columns)) * kTileWidth;
+  const int y0 = static_cast<int>(tile / static_cast<std::size_t>(columns)) * kTileHeight;
+  const int width = view.width - x0 < kTileWidth ? view.width - x0 : kTileWidth;
+  const int height = view.height - y0 < kTileHeight ? view.height - y0 : kTileHeight;
+  return {x0, y0, width, height};
+}
+
+// Pixels of a tile are kept block by block, 16 to a block, row by row within it.
+SB_INLINE int pixel_index(int x, int y) {
+  return ((y / kBlock) * kBlockColumns + x / kBlock) * kBlockPixels + (y % kBlock) * kBlock + x % kBlock;
+}
+
+// Pixel centres of a tile relative to its corner, in the order of pixel_index.
+struct Centers {
+  alignas(64) float x[kTilePixels], y[kTilePixels];
+
+  constexpr Centers() : x{}, y{} {
+    for (int i = 0; i < kTilePixels; ++i) {
+      const int block = i / kBlockPixels, lane = i % kBlockPixels;
+      x[i] = static_cast<float>(block % kBlockColumns * kBlock + lane % kBlock) + 0.5F;
+      y[i] = static_cast<float>(block / kBlockColumns * kBlock + lane / kBlock) + 0.5F;
+    }
+  }
+};
+inline constexpr Centers kCenters{};
+
+// A Gaussian as a tile sees it: u and w at the tile's corner.
+struct Local {
+  float l11, l21, l22, u0, w0, lo;
+};
+
+SB_INLINE Local localize(const Record& record, const TileFrame& frame) {
+  const float dx = static_cast<float>(frame.x0) - record.mx;
+  const float dy = static_cast<float>(frame.y0) - record.my;
+  return {record.l11, record.l21, record.l22, record.l11 * dx + record.l21 * dy, record.l22 * dy, record.lo};
+}
+
+struct Alpha {
+  F u, w;
+  F power;  // opacity x falloff, before the cap
+  F alpha;
+  M counts;  // at least 1/255
+};
+
+// Both passes go through here, so that they decide alike which pixel a Gaussian counts in.
+SB_INLINE Alpha alpha_at(F x, F y, const float* l11, const float* l21, const float* l22, const float* u0,
+                         const float* w0, const float* lo) {
+  Alpha a;
+  a.u = fma(set1(*l11), x, fma(set1(*l21), y, set1(*u0)));
+  a.w = fma(set1(*l22), y, set1(*w0));
+  const F q = fnma(a.u, a.u, fnma(a.w, a.w, set1(*lo)));
+  a.counts = q >= set1(kLog2AlphaMin);
+  a.power = exp2(q);
+  a.alpha = min(a.power, set1(kAlphaMax));
+  return a;
+}
+
+// Transmittance is kept negative in pixels that are closed (and in those outside the image).
+struct Step {
+  F weight;  // alpha x transmittance
+  M blended;
+};
+
+SB_INLINE Step advance(const Alpha& a, F& transmittance) {
+  const F weight = a.alpha * transmittance;
+  const F next = transmittance - weight;
+  const M open = next > set1(kTransmittanceMin);
+  const M blended = a.counts & open;
+  transmittance = select(blended, next, negative_if(and_not(a.counts, open), transmittance));
+  return {weight, blended};
+}
+
+SB_INLINE F magnitude(F a) { return max(a, -a); }
+
+}  // namespace splatbot::SPLATBOT_KERNELS

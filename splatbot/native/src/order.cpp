@@ -1,0 +1,156 @@
+// SPDX-License-Identifier: Apache-2.0
+// Depth order by one radix sort of all Gaussians in view, then tile lists by a stable counting scatter: cheaper than
+// sorting (tile, depth) keys, and every list comes out in depth order. Both are stable, so the result is one and the
+// same for any division of the work.
+#include <algorithm>
+#include <array>
+#include <limits>
+#include <stdexcept>
+
+#include "splatbot/raster_state.hpp"
+#include "splatbot/threads.hpp"
+
+namespace splatbot {
+
+namespace {
+
+constexpr unsigned kDigitBits = 11;
+constexpr std::size_t kDigits = std::size_t{1} << kDigitBits;
+constexpr unsigned kPasses = 3;
+
+// A share of [0, size).
+struct Range {
+  std::size_t begin, end;
+};
+Range share(std::size_t size, std::size_t part, std::size_t parts) {
+  return {size * part / parts, size * (part + 1) / parts};
+}
+
+std::size_t parts_for(std::size_t size, const ThreadPool& pool) {
+  constexpr std::size_t kWorthwhile = 8192;
+  return std::clamp<std::size_t>(size / kWorthwhile, 1, pool.size());
+}
+
+std::size_t digit_of(std::uint32_t key, unsigned pass) { return (key >> (pass * kDigitBits)) & (kDigits - 1); }
+
+void radix_pass(const KeyedId* from, KeyedId* to, std::size_t size, unsigned pass, std::uint32_t* histogram,
+                std::size_t parts, ThreadPool& pool) {
+  pool.run(parts, [&](std::size_t part) {
+    std::uint32_t* counts = histogram + part * kDigits;
+    std::fill_n(counts, kDigits, 0U);
+    const auto [begin, end] = share(size, part, parts);
+    for (std::size_t i = begin; i < end; ++i) {
+      ++counts[digit_of(from[i].key, pass)];
+    }
+  });
+  std::uint32_t sum = 0;
+  for (std::size_t digit = 0; digit < kDigits; ++digit) {
+    for (std::size_t part = 0; part < parts; ++part) {
+      const std::uint32_t n = histogram[part * kDigits + digit];
+      histogram[part * kDigits + digit] = sum;
+      sum += n;
+    }
+  }
+  pool.run(parts, [&](std::size_t part) {
+    std::uint32_t* next = histogram + part * kDigits;
+    const auto [begin, end] = share(size, part, parts);
+    for (std::size_t i = begin; i < end; ++i) {
+      to[next[digit_of(from[i].key, pass)]++] = from[i];
+    }
+  });
+}
+
+// Brings the blocks' lists of visible ids together and numbers their pairs.
+void compact(RasterState& state, ThreadPool& pool) {
+  std::uint32_t visible = 0;
+  std::uint64_t pairs = 0;
+  for (ProjectedBlock& block : state.blocks) {
+    block.first_visible = visible;
+    block.first_pair = pairs;
+    visible += block.visible;
+    pairs += block.pairs;
+  }
+  if (pairs > std::numeric_limits<std::uint32_t>::max()) {
+    throw std::length_error("more than 2^32 (Gaussian, tile) pairs: the Gaussians are too large for this image");
+  }
+  state.ids.resize(visible);
+  state.order.resize(visible);
+  state.order_scratch.resize(visible);
+  state.pairs.resize(pairs);
+  state.masks.resize(pairs);
+  pool.run(state.blocks.size(), [&](std::size_t b) {
+    const ProjectedBlock& block = state.blocks[b];
+    const std::uint32_t* from = state.visible.data() + b * kProjectBlock;
+    for (std::uint32_t i = 0; i < block.visible; ++i) {
+      const std::uint32_t id = from[i];
+      state.ids[block.first_visible + i] = id;
+      state.order[block.first_visible + i] = {state.placements[id].depth_bits, id};
+    }
+  });
+}
+
+}  // namespace
+
+void order_by_depth(RasterState& state, ThreadPool& pool) {
+  compact(state, pool);
+  const std::size_t size = state.order.size();
+  const std::size_t parts = parts_for(size, pool);
+  state.histogram.resize(parts * kDigits);
+  KeyedId* from = state.order.data();
+  KeyedId* to = state.order_scratch.data();
+  for (unsigned pass = 0; pass < kPasses; ++pass) {
+    radix_pass(from, to, size, pass, state.histogram.data(), parts, pool);
+    std::swap(from, to);
+  }
+  static_assert(kPasses % 2 == 1, "the sorted list ends in order_scratch");
+}
+
+void list_tiles(RasterState& state, ThreadPool& pool) {
+  const std::size_t tiles = state.tiles();
+  const std::size_t size = state.order_scratch.size();
+  const std::size_t parts = parts_for(size, pool);
+  const auto columns = static_cast<std::size_t>(state.columns);
+  state.histogram.resize(parts * tiles);
+  state.tile_begin.resize(tiles + 1);
+  std::uint32_t* histogram = state.histogram.data();
+
+  pool.run(parts, [&](std::size_t part) {
+    std::uint32_t* counts = histogram + part * tiles;
+    std::fill_n(counts, tiles, 0U);
+    const auto [begin, end] = share(size, part, parts);
+    for (std::size_t i = begin; i < end; ++i) {
+      const Placement& p = state.placements[state.order_scratch[i].id];
+      for (std::size_t y = p.y0; y < std::size_t{p.y0} + p.ny; ++y) {
+        for (std::size_t x = p.x0; x < std::size_t{p.x0} + p.nx; ++x) {
+          ++counts[y * columns + x];
+        }
+      }
+    }
+  });
+  std::uint32_t sum = 0;
+  for (std::size_t tile = 0; tile < tiles; ++tile) {
+    state.tile_begin[tile] = sum;
+    for (std::size_t part = 0; part < parts; ++part) {
+      const std::uint32_t n = histogram[part * tiles + tile];
+      histogram[part * tiles + tile] = sum;
+      sum += n;
+    }
+  }
+  state.tile_begin[tiles] = sum;
+  pool.run(parts, [&](std::size_t part) {
+    std::uint32_t* next = histogram + part * tiles;
+    const auto [begin, end] = share(size, part, parts);
+    for (std::size_t i = begin; i < end; ++i) {
+      const std::uint32_t id = state.order_scratch[i].id;
+      const Placement& p = state.placements[id];
+      auto slot = static_cast<std::uint32_t>(state.blocks[id / kProjectBlock].first_pair) + p.slot;
+      for (std::size_t y = p.y0; y < std::size_t{p.y0} + p.ny; ++y) {
+        for (std::size_t x = p.x0; x < std::size_t{p.x0} + p.nx; ++x) {
+          state.pairs[next[y * columns + x]++] = {id, slot++};
+        }
+      }
+    }
+  });
+}
+
+}  // namespace splatbot

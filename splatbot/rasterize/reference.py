@@ -1,0 +1,205 @@
+"""The rasterizer's model in plain torch, in any float type: the oracle that the native kernels are tested against.
+
+Every Gaussian is evaluated at every pixel, so it is for small scenes only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from splatbot.errors import InputError
+
+ALPHA_MIN = 1.0 / 255.0
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4
+FOV_MARGIN = 0.3  # of half the field of view, where the slope of the projection is clamped
+
+
+@dataclass(frozen=True)
+class ReferenceMeta:
+    """What the reference found.
+
+    Args:
+        means2d: (C, N, 2) [px].
+        covars2d: (C, N, 2, 2) [px²], blurred by eps2d.
+        depths: (C, N) [m].
+        margins: (C, H, W) relative distance of each pixel from its nearest jump: an alpha at 1/255, a transmittance at
+            1e-4, an alpha at its cap. Rounding can put another implementation on the other side where it is tiny.
+    """
+
+    means2d: Tensor
+    covars2d: Tensor
+    depths: Tensor
+    margins: Tensor
+
+
+def rasterization_reference(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    eps2d: float = 0.3,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    *,
+    depth_mode: Literal["center", "plane"] = "center",
+) -> tuple[Tensor, Tensor, ReferenceMeta]:
+    """As :func:`splatbot.rasterize.rasterization`, computed in the type of ``means`` by torch alone.
+
+    Args and returns: see there; ``colors`` (N, D), (C, N, D) or None.
+
+    Raises:
+        InputError: an unknown render mode.
+    """
+    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
+        raise InputError(f"is {render_mode!r}.", field="render_mode", hint="one of RGB, D, ED, RGB+D, RGB+ED")
+    renders, alphas, metas = [], [], []
+    for i in range(len(viewmats)):
+        view_colors = None if colors is None or "RGB" not in render_mode else colors[i] if colors.ndim == 3 else colors
+        background = None if backgrounds is None or view_colors is None else backgrounds[i]
+        projected = _project(means, quats, scales, viewmats[i], Ks[i], width, height, eps2d, depth_mode)
+        keep = (projected.depth >= near_plane) & (projected.depth <= far_plane)
+        order = torch.argsort(projected.depth.detach().float(), stable=True)
+        order = order[keep[order]]
+        pixels = _pixel_centers(width, height, means)
+        weights, left, margin = _blend(projected, opacities, order, pixels)
+        channels = _channels(projected, view_colors, order, pixels, render_mode)
+        image = _composite(weights, channels, left, background, render_mode)
+        renders.append(image.reshape(height, width, -1))
+        alphas.append((1.0 - left).reshape(height, width, 1))
+        metas.append((projected.mean2d, projected.covar2d, projected.depth, margin.reshape(height, width)))
+    meta = ReferenceMeta(*(torch.stack(column) for column in zip(*metas, strict=True)))
+    return torch.stack(renders), torch.stack(alphas), meta
+
+
+@dataclass(frozen=True)
+class _Projected:
+    mean2d: Tensor  # (N, 2)
+    covar2d: Tensor  # (N, 2, 2)
+    depth: Tensor  # (N,)
+    slope: Tensor  # (N, 2) change of depth per pixel
+
+
+def _rotations(quats: Tensor) -> Tensor:
+    largest = quats.abs().amax(-1, keepdim=True)
+    zero = largest < 1e-30
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    q = torch.where(zero, identity, quats / torch.where(zero, torch.ones_like(largest), largest).detach())
+    w, x, y, z = torch.unbind(q / q.norm(dim=-1, keepdim=True), -1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def _project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    eps2d: float,
+    depth_mode: str,
+) -> _Projected:
+    """EWA splatting (Zwicker et al. 2001, eq. 24 and 29)."""
+    W, t = viewmat[:3, :3].to(means.dtype), viewmat[:3, 3].to(means.dtype)
+    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    p = means @ W.T + t
+    depth = p[:, 2]
+    z = torch.where(depth > 0, depth, torch.ones_like(depth))  # behind the camera nothing counts
+    margins = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
+    slope_x = (p[:, 0] / z).clamp(-(cx / fx + margins[0]), (width - cx) / fx + margins[0])
+    slope_y = (p[:, 1] / z).clamp(-(cy / fy + margins[1]), (height - cy) / fy + margins[1])
+    zero = torch.zeros_like(z)
+    J = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).reshape(-1, 2, 3)
+    axes = W @ _rotations(quats)  # columns: the Gaussian's axes in the camera frame
+    M = J @ axes * scales[:, None, :]
+    covar2d = M @ M.mT + eps2d * torch.eye(2, dtype=means.dtype)
+    mean2d = torch.stack([fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy], -1)
+    slope = torch.zeros_like(mean2d)
+    if depth_mode == "plane":
+        slope = _plane_slopes(p, axes, scales, covar2d, fx, fy).detach()
+    return _Projected(mean2d, covar2d, depth, slope)
+
+
+def _plane_slopes(p: Tensor, axes: Tensor, scales: Tensor, covar2d: Tensor, fx: float, fy: float) -> Tensor:
+    """d z / d (u, v) of the plane through p whose normal is the shortest axis; see the native project.cpp."""
+    s = scales.abs()
+    ordered = s.sort(-1).values
+    n = torch.gather(axes, 2, s.argmin(-1)[:, None, None].expand(-1, 3, 1))[..., 0]
+    fade = 1.0 - (ordered[:, 0] / ordered[:, 1].clamp_min(1e-30)) ** 2
+    along = (n * p).sum(-1)
+    least = 1e-6 * p[:, 2]
+    factor = -fade * p[:, 2] ** 2 / torch.where(along.abs() > least, along, least)
+    slope = torch.stack([factor * n[:, 0] / fx, factor * n[:, 1] / fy], -1)
+    own = 4.0 * ((axes[:, 2] * s) ** 2).sum(-1)
+    spread = (slope[:, None, :] @ covar2d @ slope[:, :, None])[:, 0, 0]
+    return slope * torch.where(spread > own, (own / spread.clamp_min(1e-30)).sqrt(), torch.ones_like(own))[:, None]
+
+
+def _pixel_centers(width: int, height: int, like: Tensor) -> Tensor:
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return torch.stack([u, v], -1).reshape(-1, 2).to(like.dtype) + 0.5
+
+
+def _blend(projected: _Projected, opacities: Tensor, order: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights (M, P) of the M Gaussians of ``order``, transmittance (P,) left, margins (P,)."""
+    d = pixels[None] - projected.mean2d[order][:, None]
+    conic = torch.linalg.inv(projected.covar2d[order])
+    sigma = 0.5 * torch.einsum("npi,nij,npj->np", d, conic, d)
+    power = opacities[order][:, None] * torch.exp(-sigma)
+    counts = power >= ALPHA_MIN
+    alpha = torch.where(counts, power.clamp_max(ALPHA_MAX), torch.zeros_like(power))
+    # Transmittance only falls, so whoever comes after a Gaussian that closes the pixel finds it closed as well.
+    after = torch.cumprod(1.0 - alpha, 0)
+    opened = after.detach() > TRANSMITTANCE_MIN
+    alpha = torch.where(opened, alpha, torch.zeros_like(alpha))
+    after_open = torch.cumprod(1.0 - alpha, 0)
+    before = torch.cat([torch.ones_like(after_open[:1]), after_open[:-1]])
+    left = after_open[-1] if len(order) else torch.ones(len(pixels), dtype=pixels.dtype)
+    return alpha * before, left, _margins(power.detach(), after.detach(), counts)
+
+
+def _margins(power: Tensor, after: Tensor, counts: Tensor) -> Tensor:
+    if len(power) == 0:
+        return power.new_full((power.shape[1],), torch.inf)
+    jumps = torch.stack([(power / ALPHA_MIN - 1).abs(), (power / ALPHA_MAX - 1).abs()]).amin(0)
+    closing = torch.where(counts, (after / TRANSMITTANCE_MIN - 1).abs(), torch.inf)
+    return torch.minimum(jumps, closing).amin(0)
+
+
+def _channels(
+    projected: _Projected, colors: Tensor | None, order: Tensor, pixels: Tensor, render_mode: str
+) -> list[Tensor]:
+    """Channels, each (M, 1) or (M, P)."""
+    columns = [] if colors is None else [c[:, None] for c in colors[order].unbind(-1)]
+    if "D" in render_mode:
+        d = pixels[None] - projected.mean2d[order][:, None]
+        columns.append(projected.depth[order][:, None] + (d * projected.slope[order][:, None]).sum(-1))
+    return columns
+
+
+def _composite(
+    weights: Tensor, channels: list[Tensor], left: Tensor, background: Tensor | None, render_mode: str
+) -> Tensor:
+    images = [(weights * channel).sum(0) for channel in channels]
+    if "ED" in render_mode:
+        images[-1] = images[-1] / (1.0 - left).clamp_min(1e-10)
+    if background is not None:
+        images = [image + left * b for image, b in zip(images, background, strict=False)] + images[len(background) :]
+    return torch.stack(images, -1)
