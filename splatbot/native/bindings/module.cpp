@@ -1,10 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <nanobind/nanobind.h>
-
-namespace nb = nanobind;
-
-// Each concept's bindings live in a file of their own and are entered here.
+#include "bindings.hpp"
 
 NB_MODULE(_native, m) {
   m.doc() = "splatbot's C++ core";
+  define_align(m);
 }
