@@ -26,7 +26,7 @@ def _model(
     n = len(m)
     return GaussianModel.from_activated(
         means=m,
-        scales=np.broadcast_to(np.asarray(scales, dtype=np.float64), (n, 3)),
+        scales=np.broadcast_to(np.asarray(scales, dtype=np.float64), (n, 3)).copy(),
         quats=np.tile([1.0, 0, 0, 0], (n, 1)) if quats is None else np.asarray(quats),
         opacities=np.full(n, 0.9) if opacities is None else np.asarray(opacities),
         colors=np.full((n, 3), 0.5),

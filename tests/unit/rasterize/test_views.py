@@ -120,7 +120,7 @@ def test_normals_are_the_flattest_axis_turned_to_the_camera_for_any_rotation() -
     rng = np.random.default_rng(0)
     n = 200
     model = GaussianModel.from_activated(
-        means=rng.normal(size=(n, 3)) + [0, 0, 4],
+        means=rng.normal(size=(n, 3)) + np.array([0, 0, 4]),
         quats=rng.normal(size=(n, 4)),
         scales=rng.uniform(0.01, 0.1, (n, 3)),
         opacities=np.full(n, 0.5),
@@ -149,7 +149,7 @@ def _visible(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.fl
 @pytest.mark.parametrize("fov_deg", [30.0, 60.0, 100.0])
 def test_the_default_view_shows_ninety_percent_and_is_no_farther_than_that_needs(fov_deg: float) -> None:
     rng = np.random.default_rng(4)
-    means = rng.normal(size=(2000, 3)) * [0.5, 0.3, 0.2] + [10, -5, 3]
+    means = rng.normal(size=(2000, 3)) * np.array([0.5, 0.3, 0.2]) + np.array([10, -5, 3])
     model = GaussianModel.from_activated(
         means=means,
         quats=np.tile([1.0, 0, 0, 0], (2000, 1)),
