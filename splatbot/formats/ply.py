@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError
-from splatbot.formats.atomic import atomic_write
 from splatbot.gaussians.model import OPACITY_MAX, OPACITY_MIN, SCALE_MIN, GaussianModel
 
 Table = NDArray[np.float32]

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError
-from splatbot.formats.atomic import atomic_write
 from splatbot.geometry import pose_from_quat, rotation_to_quat
 from splatbot.trajectory import Trajectory
 

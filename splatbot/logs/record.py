@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.atomic import atomic_write
 from splatbot.errors import LogError
-from splatbot.formats.atomic import atomic_write
 from splatbot.frame import Frame
 from splatbot.logs.base import Log
 from splatbot.trajectory import Trajectory

@@ -107,7 +107,7 @@ class TumLog(LogBase):
             "of rgb.txt).",
             file=self.folder / "depth.txt",
             field=f"after line {before[-1]}" if before else "first line",
-            hint="restore the missing line, or remove that image from rgb.txt",
+            hint='restore the missing line, remove that image from rgb.txt, or open the log with missing="skip"',
         )
 
     def _calibration(self, camera: str | Path | Calibration | None) -> Calibration:
