@@ -18,6 +18,7 @@ PYTEST_ARGS ?=
 
 TORCH_STAMP := $(VENV)/.torch
 INSTALL_STAMP := $(VENV)/.installed
+MODULES := $(VENV)/.modules
 NATIVE_SOURCES := $(shell find splatbot/native -name '*.cpp' -o -name '*.hpp' -o -name '*.h' -o -name CMakeLists.txt)
 
 .PHONY: help
@@ -67,7 +68,15 @@ $(TORCH_STAMP): .ci/system-deps.sh .ci/find-python.sh
 
 # The build tools come before the package, which is then built without isolation: CMake's cache in build/ survives, and
 # a change of one C++ file costs one compilation.
-$(INSTALL_STAMP): $(TORCH_STAMP) pyproject.toml $(NATIVE_SOURCES)
+$(INSTALL_STAMP): $(TORCH_STAMP) $(MODULES) pyproject.toml $(NATIVE_SOURCES)
 	$(PIP) install 'scikit-build-core>=0.11' 'nanobind>=2.4' 'cmake>=3.26' 'ninja>=1.11'
 	$(PIP) install --no-build-isolation --editable '.[dev]'
 	@touch $@
+
+# An editable install knows the modules by name: a new, moved or removed one needs a new install. Rewritten only then.
+$(MODULES): $(TORCH_STAMP) FORCE
+	@find -L splatbot -name '*.py' | LC_ALL=C sort > $@.now
+	@cmp -s $@.now $@ && rm $@.now || mv $@.now $@
+
+.PHONY: FORCE
+FORCE:
