@@ -17,10 +17,10 @@ FRAMES = 4
 
 def _slam_that_is_off_by(metres: float) -> type[OracleSlam]:
     reference = open_log(f"synthetic:tabletop?frames={FRAMES}").ground_truth
-    assert reference is not None
 
     class Shifted(OracleSlam):
         def __init__(self, config: Config) -> None:
+            assert reference is not None
             super().__init__(reference, config)
 
         def snapshot(self) -> Snapshot:

@@ -26,7 +26,7 @@ def _serving(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Cli
         assert process.stdout is not None
         url = re.search(r"http://\S+", process.stdout.readline())
         assert url, f"exit code {process.wait(10)}"
-        with httpx.Client(base_url=url[0], timeout=60, transport=httpx.HTTPTransport(retries=5)) as client:
+        with httpx.Client(base_url=url[0], timeout=60) as client:
             yield process, client
     finally:
         process.kill()

@@ -76,7 +76,7 @@ def test_moving_camera_and_map_together_leaves_every_view() -> None:
 def test_where_nothing_is_there_is_background_and_neither_depth_nor_normal() -> None:
     nothing = GaussianModel.empty()
     grey = render_view(nothing, CAMERA, np.eye(4), "rgb", background=(0.5, 0.25, 0.0))
-    np.testing.assert_array_equal(grey, np.broadcast_to(np.float32([0.5, 0.25, 0.0]), (48, 64, 3)))
+    np.testing.assert_array_equal(grey, np.broadcast_to(np.array([0.5, 0.25, 0.0], np.float32), (48, 64, 3)))
     assert not render_view(nothing, CAMERA, np.eye(4), "depth").any()
     assert not render_view(nothing, CAMERA, np.eye(4), "normal").any()
     assert not render_view(nothing, CAMERA, np.eye(4), "alpha").any()
