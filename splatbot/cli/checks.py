@@ -79,8 +79,10 @@ def _check_package(names: tuple[str, ...], loss: str) -> Finding:
         except metadata.PackageNotFoundError:
             continue
     fix = f"pip install {names[0]}"
-    return Finding("warn", names[0], f"missing: without it no {loss}", fix) if loss else Finding(
-        "fail", names[0], "missing", fix
+    return (
+        Finding("warn", names[0], f"missing: without it no {loss}", fix)
+        if loss
+        else Finding("fail", names[0], "missing", fix)
     )
 
 

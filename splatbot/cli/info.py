@@ -102,4 +102,3 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
         ("valid depth", percent(depths.size / sum(depth.size for _, depth in frames))),
         ("reference poses", f"{len(truth)}, path {metres(length)}" if truth is not None else "none"),
     ]
-

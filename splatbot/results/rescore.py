@@ -33,9 +33,11 @@ def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) ->
             hint="name the log that was mapped: --log LOG",
         )
     poses = folder.load_poses()
-    track = score_trajectory(
-        folder.load_trajectory(), reference if reference is not None else log.ground_truth
-    ) if poses else None
+    track = (
+        score_trajectory(folder.load_trajectory(), reference if reference is not None else log.ground_truth)
+        if poses
+        else None
+    )
     held_out = {row.index: poses[row.index] for row in rows if row.held_out and row.index in poses}
     model = GaussianModel.load(folder.map)
     views = score_views(log, model, held_out)

@@ -32,12 +32,11 @@ def test_the_second_signal_raises() -> None:
 
 def test_nothing_raises_inside_a_held_block_but_it_does_right_after() -> None:
     reached = False
-    with Interrupts() as interrupts:
-        with pytest.raises(KeyboardInterrupt), interrupts.held():
-            send()
-            send()
-            send()
-            reached = True
+    with Interrupts() as interrupts, pytest.raises(KeyboardInterrupt), interrupts.held():
+        send()
+        send()
+        send()
+        reached = True
     assert reached
 
 
