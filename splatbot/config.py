@@ -22,8 +22,12 @@ class _Section(BaseModel):
 class TrackingConfig(_Section):
     """Camera tracking."""
 
-    n_features: int = Field(2000, ge=100, description="ORB keypoints per frame")
+    min_depth: float = Field(0.2, gt=0, description="nearer depth is ignored: a gripper, or below the sensor's range [m]")
+    max_depth: float = Field(6.0, gt=0, description="farther depth is ignored [m]")
+    max_width: int = Field(640, ge=64, description="finest width used for alignment [px]")
+    n_levels: int = Field(3, ge=1, le=6, description="levels of the pyramid")
     n_pixels: int = Field(4800, ge=100, description="pixels per pyramid level in direct alignment: accuracy for time")
+    n_features: int = Field(2000, ge=100, description="ORB keypoints per frame")
 
 
 class MappingConfig(_Section):

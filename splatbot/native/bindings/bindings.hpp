@@ -1,0 +1,8 @@
+// SPDX-License-Identifier: Apache-2.0
+// What module.cpp enters into the Python module: one function a concept.
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+void define_align(nanobind::module_& m);
+void define_rasterize(nanobind::module_& m);

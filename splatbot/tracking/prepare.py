@@ -1,0 +1,100 @@
+"""From a raw frame to what tracking works on: a pyramid of grey and depth, without pixels that would mislead it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.config import TrackingConfig
+from splatbot.frame import Frame
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One pyramid level: grey (H, W) in 0..1, depth (H, W) [m] with 0 missing, and the camera of that size."""
+
+    gray: Image
+    depth: Image
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame and its pyramid, finest level first."""
+
+    frame: Frame
+    levels: tuple[Level, ...]
+
+
+def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
+    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide."""
+    depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
+    gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
+    level = Level(gray, depth, frame.camera)
+    while level.camera.width > config.max_width:
+        level = halve(level)
+    level = Level(cv2.GaussianBlur(level.gray, (0, 0), 0.7), level.depth, level.camera)
+    levels = [level]
+    for _ in range(config.n_levels - 1):
+        levels.append(halve(levels[-1]))
+    return PreparedFrame(frame, tuple(levels))
+
+
+def valid_depth(depth: Image, near: float, far: float) -> Image:
+    """Depth (H, W) [m] with implausible pixels set to 0: out of range, or flying between two surfaces.
+
+    A flying pixel is nearer than one neighbour and farther than the opposite one by more than 3 % of its range;
+    a single missing row of neighbours, as registration leaves in upsampled depth, does not count against a pixel.
+    """
+    z = np.where((depth >= near) & (depth <= far), depth, 0.0).astype(np.float32)
+    padded = np.pad(z, 1, mode="edge")
+    flying = np.zeros(z.shape, dtype=bool)
+    step = 0.03 * z
+    for before, after in ((padded[1:-1, :-2], padded[1:-1, 2:]), (padded[:-2, 1:-1], padded[2:, 1:-1])):
+        rises = (z - before > step) & (after - z > step) & (before > 0)
+        falls = (before - z > step) & (z - after > step) & (after > 0)
+        flying |= rises | falls
+    z[flying] = 0.0
+    return z
+
+
+def halve(level: Level) -> Level:
+    """The next coarser level: grey averaged, depth averaged over the pixels of the nearest surface of each 2x2 block."""
+    height, width = level.gray.shape[0] // 2, level.gray.shape[1] // 2
+    crop = level.gray[: 2 * height, : 2 * width]
+    gray = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
+    blocks = level.depth[: 2 * height, : 2 * width].reshape(height, 2, width, 2).transpose(1, 3, 0, 2).reshape(4, height, width)
+    nearest = np.where(blocks > 0, blocks, np.inf).min(axis=0)
+    same = (blocks > 0) & (blocks <= 1.05 * nearest)
+    count = same.sum(axis=0)
+    depth = np.where(count > 0, (blocks * same).sum(axis=0) / np.maximum(count, 1), 0.0).astype(np.float32)
+    camera = level.camera.resized(width, height) if level.gray.shape == (2 * height, 2 * width) else Camera(
+        fx=level.camera.fx / 2,
+        fy=level.camera.fy / 2,
+        cx=(level.camera.cx + 0.5) / 2 - 0.5,
+        cy=(level.camera.cy + 0.5) / 2 - 0.5,
+        width=width,
+        height=height,
+    )
+    return Level(gray, depth, camera)
+
+
+def normals_of(depth: Image, camera: Camera) -> Image:
+    """Unit normals (H, W, 3) towards the camera by central differences; zero where a neighbour is missing or far."""
+    points = camera.backproject(depth)
+    normals = np.zeros_like(points)
+    du = points[1:-1, 2:] - points[1:-1, :-2]
+    dv = points[2:, 1:-1] - points[:-2, 1:-1]
+    n = np.cross(dv, du)
+    length = np.linalg.norm(n, axis=-1)
+    z = depth[1:-1, 1:-1]
+    neighbours = np.stack([depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]])
+    good = (z > 0) & (neighbours.min(0) > 0) & (np.abs(neighbours - z).max(0) < 0.05 * z) & (length > 0)
+    normals[1:-1, 1:-1][good] = n[good] / length[good, None]
+    return normals

@@ -1,0 +1,58 @@
+"""What a frame is aligned against: points of one keyframe, at each pyramid level."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.tracking.prepare import Image, Level, normals_of
+
+
+@dataclass(frozen=True)
+class ReferencePoints:
+    """Sampled pixels of one level: points (N, 3) [m] and normals (N, 3) in the reference camera, grey (N,) in 0..1."""
+
+    points: Image
+    normals: Image
+    gray: Image
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A keyframe as seen by alignment; ``levels`` run from fine to coarse."""
+
+    T_world_camera: NDArray[np.float64]
+    levels: tuple[ReferencePoints, ...]
+
+
+def make_reference(levels: tuple[Level, ...], T_world_camera: NDArray[np.float64], n_pixels: int) -> Reference:
+    """Sample at most ``n_pixels`` pixels of every level."""
+    return Reference(T_world_camera, tuple(sample_level(level, n_pixels) for level in levels))
+
+
+def sample_level(level: Level, n_pixels: int) -> ReferencePoints:
+    """Pixels on smooth surface: half of them the strongest gradient of each tile, half on a regular grid.
+
+    Edges carry the photometric information, the grid the geometric; a pixel needs a normal, which keeps both off
+    occlusion boundaries, where colour belongs to one surface and depth to another.
+    """
+    normals = normals_of(level.depth, level.camera)
+    good = (normals**2).sum(-1) > 0.25
+    gx = cv2.Scharr(level.gray, cv2.CV_32F, 1, 0)
+    gy = cv2.Scharr(level.gray, cv2.CV_32F, 0, 1)
+    strength = np.where(good, np.hypot(gx, gy), -1.0)
+    height, width = level.gray.shape
+    tile = max(2, round(float(np.sqrt(2.0 * height * width / n_pixels))))
+    rows, columns = height // tile, width // tile
+    blocks = strength[: rows * tile, : columns * tile].reshape(rows, tile, columns, tile).transpose(0, 2, 1, 3)
+    flat = blocks.reshape(rows, columns, tile * tile)
+    best = flat.argmax(-1)
+    v = np.arange(rows)[:, None] * tile + best // tile
+    u = np.arange(columns)[None, :] * tile + best % tile
+    chosen = np.zeros_like(good)
+    chosen[v[flat.max(-1) >= 0], u[flat.max(-1) >= 0]] = True
+    chosen[tile // 2 :: tile, tile // 2 :: tile] |= good[tile // 2 :: tile, tile // 2 :: tile]
+    return ReferencePoints(level.camera.backproject(level.depth)[chosen], normals[chosen], level.gray[chosen])
