@@ -9,7 +9,7 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 inline constexpr int kParts = kBlockPixels / W;  // vectors to a block
 inline constexpr std::size_t kPlane = kTilePixels;
-inline constexpr std::size_t kFinalPlanes = 1 + kRecordChannels;
+inline constexpr std::size_t kFinalSize = kFinalPlanes * kPlane;  // of one tile
 
 struct TileFrame {
   int x0, y0;          // first pixel
@@ -52,6 +52,17 @@ SB_INLINE Local localize(const Record& record, const TileFrame& frame) {
   const float dx = static_cast<float>(frame.x0) - record.mx;
   const float dy = static_cast<float>(frame.y0) - record.my;
   return {record.l11, record.l21, record.l22, record.l11 * dx + record.l21 * dy, record.l22 * dy, record.lo};
+}
+
+// Depth over a Gaussian's footprint, from the tile's corner.
+struct PlaneDepth {
+  float slope_x, slope_y, corner;
+};
+
+SB_INLINE PlaneDepth plane_depth(const Record& record, const float* channels, const TileFrame& frame) {
+  const float sx = channels[kRecordChannels - 2], sy = channels[kRecordChannels - 1];
+  return {sx, sy, channels[0] - sx * (record.mx - static_cast<float>(frame.x0)) -
+                      sy * (record.my - static_cast<float>(frame.y0))};
 }
 
 struct Alpha {
