@@ -20,7 +20,8 @@ COMMAND = (sys.executable, "-m", "splatbot", "serve")
 
 
 @contextmanager
-def _serving(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
+def serving(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
+    """A running service and a client of it."""
     process = subprocess.Popen([*COMMAND, *arguments, "--port", "0"], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -49,7 +50,7 @@ def map_file(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("by", ["file", "run folder"])
 def test_a_map_is_served_until_sigterm_which_ends_cleanly(map_file: Path, by: str) -> None:
-    with _serving("--map", str(map_file if by == "file" else map_file.parent)) as (process, client):
+    with serving("--map", str(map_file if by == "file" else map_file.parent)) as (process, client):
         assert client.get("/readyz").json()["maps"] == {"default": 1}
         answer = client.post("/v1/maps/default/distance", json={"points": [[0, 0, 1.0], [0, 0, 0.5]]}).json()
         assert answer["inside"] == [True, False]
