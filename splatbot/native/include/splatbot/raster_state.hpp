@@ -34,7 +34,7 @@ inline constexpr int kMoments = 6;
 inline constexpr int kSlot = 16;
 static_assert(kMoments + kRecordChannels <= kSlot);
 
-// What a blend pass keeps of each pixel: transmittance (negative where closed), the channels' sums, the sum of weights.
+// What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
 inline constexpr int kFinalPlanes = 2 + kRecordChannels;
 inline constexpr int kWeightPlane = 1 + kRecordChannels;  // for expected depth only
 

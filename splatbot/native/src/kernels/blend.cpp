@@ -21,7 +21,8 @@ struct Chunk {
 };
 
 struct TileState {
-  alignas(64) float transmittance[kTilePixels];
+  alignas(64) float through[kTilePixels];        // see advance()
+  alignas(64) float transmittance[kTilePixels];  // what the Gaussians that count leave
   alignas(64) float channels[kRecordChannels][kTilePixels];
   alignas(64) float weights[kTilePixels];  // for expected depth, where 1 - transmittance has too few digits if small
 };
@@ -35,7 +36,8 @@ struct Extras {
 void start(const TileFrame& frame, int channels, TileState& state) {
   for (int i = 0; i < kTilePixels; ++i) {
     const bool inside = kCenters.x[i] < static_cast<float>(frame.width) && kCenters.y[i] < static_cast<float>(frame.height);
-    state.transmittance[i] = inside ? 1.0F : -1.0F;
+    state.through[i] = inside ? 1.0F : 0.0F;
+    state.transmittance[i] = 1.0F;
   }
   for (int c = 0; c < channels; ++c) {
     std::memset(state.channels[c], 0, sizeof(state.channels[c]));
@@ -79,6 +81,7 @@ SB_INLINE void load_chunk(const BlendArgs& args, const TileFrame& frame, const P
 template <int C, Extras E>
 SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_t first, TileState& state) {
   const F x = load(kCenters.x + first), y = load(kCenters.y + first);
+  F through = load(state.through + first);
   F transmittance = load(state.transmittance + first);
   F sum[C];
 #pragma GCC unroll 8
@@ -90,19 +93,21 @@ SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_
     const float* row = chunk.rows[__builtin_ctzll(members)];
     members &= members - 1;
     const Alpha a = alpha_at(x, y, row, row + 1, row + 2, row + 3, row + 4, row + 5);
-    const Step step = advance(a, transmittance);
+    const Step step = advance(a, through);
+    transmittance = select(step.open, through, transmittance);
 #pragma GCC unroll 8
     for (int c = 0; c < C; ++c) {
       F value = set1(row[kRowChannels + c]);
       if (E.plane && c == 0) {
         value = fma(set1(row[kRowSlopes]), x, fma(set1(row[kRowSlopes + 1]), y, set1(row[kRow - 1])));
       }
-      sum[c] = fma_if(step.blended, step.weight, value, sum[c]);
+      sum[c] = fma(step.weight, value, sum[c]);
     }
     if (E.weigh) {
-      weights = weights + zero_unless(step.blended, step.weight);
+      weights = weights + step.weight;
     }
   }
+  store(state.through + first, through);
   store(state.transmittance + first, transmittance);
 #pragma GCC unroll 8
   for (int c = 0; c < C; ++c) {
@@ -118,8 +123,7 @@ std::uint32_t live_blocks(const TileState& state) {
   for (int b = 0; b < kBlocks; ++b) {
     std::uint32_t open = 0;
     for (int part = 0; part < kParts; ++part) {
-      constexpr std::uint32_t kAll = (1U << W) - 1U;
-      open |= kAll & ~sign_bits(load(state.transmittance + b * kBlockPixels + part * W));
+      open |= bits(load(state.through + b * kBlockPixels + part * W) > set1(kTransmittanceMin));
     }
     live |= static_cast<std::uint32_t>(open != 0) << b;
   }
@@ -170,7 +174,7 @@ void write_tile(const BlendArgs& args, const TileFrame& frame, const TileState& 
                              static_cast<std::size_t>(frame.x0);
     for (int x = 0; x < frame.width; ++x) {
       const int i = pixel_index(x, y);
-      const float t = state.transmittance[i] < 0.0F ? -state.transmittance[i] : state.transmittance[i];
+      const float t = state.transmittance[i];
       float* to = args.out_colors + (line + static_cast<std::size_t>(x)) * static_cast<std::size_t>(args.out_channels);
       int c = 0;
       if (pass.depth_first) {

@@ -12,7 +12,7 @@ namespace splatbot::SPLATBOT_KERNELS {
 namespace {
 
 struct TileGradient {
-  alignas(64) float transmittance[kTilePixels];
+  alignas(64) float through[kTilePixels];  // see advance()
   alignas(64) float rest[kTilePixels];
   alignas(64) float gradient[kRecordChannels][kTilePixels];
 };
@@ -20,8 +20,7 @@ struct TileGradient {
 // Gradients to the sums that blend() had before the background was added and expected depth was divided.
 void load_pixel(const BlendBackwardArgs& args, std::size_t pixel, int i, const float* saved, TileGradient& state) {
   const ChannelPass& pass = *args.forward.pass;
-  const float signed_t = saved[i];
-  const float t = signed_t < 0.0F ? -signed_t : signed_t;
+  const float t = saved[i];
   float grad_t = args.grad_alphas != nullptr ? -args.grad_alphas[pixel] : 0.0F;
   float rest = 0.0F;
   const float* grads = args.grad_colors == nullptr
@@ -43,7 +42,7 @@ void load_pixel(const BlendBackwardArgs& args, std::size_t pixel, int i, const f
     state.gradient[c][i] = g;
     rest += sum * g;
   }
-  state.transmittance[i] = 1.0F;
+  state.through[i] = 1.0F;
   state.rest[i] = rest + grad_t * t;
 }
 
@@ -51,7 +50,7 @@ template <int C>
 void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const float* saved, TileGradient& state) {
   if (frame.width < kTileWidth || frame.height < kTileHeight || args.forward.pass->count < C) {
     for (int i = 0; i < kTilePixels; ++i) {
-      state.transmittance[i] = -1.0F;
+      state.through[i] = 0.0F;
       state.rest[i] = 0.0F;
     }
     for (int c = 0; c < C; ++c) {
@@ -85,10 +84,8 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
       const F x = load(kCenters.x + first), y = load(kCenters.y + first);
       const Alpha a = alpha_at(x, y, &local.l11, &local.l21, &local.l22,
                                &local.u0, &local.w0, &local.lo);
-      const F before = load(state.transmittance + first);
-      F transmittance = before;
-      const Step step = advance(a, transmittance);
-      const F weight = zero_unless(step.blended, step.weight);
+      F through = load(state.through + first);
+      const Step step = advance(a, through);
       F along = set1(0.0F);
 #pragma GCC unroll 8
       for (int c = 0; c < C; ++c) {
@@ -99,16 +96,16 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
         }
         along = fma(value, g, along);
         if (c < S) {
-          acc[kMoments + c] = fma(weight, g, acc[kMoments + c]);
+          acc[kMoments + c] = fma(step.weight, g, acc[kMoments + c]);
         }
       }
-      const F rest = fnma(weight, along, load(state.rest + first));
-      store(state.transmittance + first, transmittance);
+      const F rest = fnma(step.weight, along, load(state.rest + first));
+      store(state.through + first, through);
       store(state.rest + first, rest);
-      // alpha x d loss / d alpha; none where the cap holds alpha.
-      const F other = a.alpha * rest * reciprocal(set1(1.0F) - a.alpha);
-      const M free = step.blended & (a.power <= set1(kAlphaMax));
-      const F v = zero_unless(free, fma(step.weight, along, -other));
+      // alpha x d loss / d alpha; none where the cap holds alpha, nor in closed pixels.
+      const F other = a.alpha * reciprocal(a.left) * rest;
+      const M free = step.open & (a.power <= set1(kAlphaMax));
+      const F v = zero_unless(free, fms(step.weight, along, other));
       const F vu = v * a.u;
       const F vw = v * a.w;
       acc[0] = acc[0] + v;
