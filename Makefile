@@ -18,6 +18,9 @@ PYTEST_ARGS ?=
 
 TORCH_STAMP := $(VENV)/.torch
 INSTALL_STAMP := $(VENV)/.installed
+MODULES := $(VENV)/.modules
+BUILD_TOOLS := 'scikit-build-core>=0.11' 'nanobind>=2.4' 'cmake>=3.26' 'ninja>=1.11'
+NEW_DEPENDENCIES = $(filter pyproject.toml $(TORCH_STAMP),$?)
 NATIVE_SOURCES := $(shell find splatbot/native -name '*.cpp' -o -name '*.hpp' -o -name '*.h' -o -name CMakeLists.txt)
 
 .PHONY: help
@@ -66,8 +69,16 @@ $(TORCH_STAMP): .ci/system-deps.sh .ci/find-python.sh
 	@touch $@
 
 # The build tools come before the package, which is then built without isolation: CMake's cache in build/ survives, and
-# a change of one C++ file costs one compilation.
-$(INSTALL_STAMP): $(TORCH_STAMP) pyproject.toml $(NATIVE_SOURCES)
-	$(PIP) install 'scikit-build-core>=0.11' 'nanobind>=2.4' 'cmake>=3.26' 'ninja>=1.11'
-	$(PIP) install --no-build-isolation --editable '.[dev]'
+# a change of one C++ file costs one compilation. Dependencies are looked at again only when pyproject.toml changes.
+$(INSTALL_STAMP): $(TORCH_STAMP) pyproject.toml $(MODULES) $(NATIVE_SOURCES)
+	$(if $(NEW_DEPENDENCIES),$(PIP) install $(BUILD_TOOLS))
+	$(PIP) install --no-build-isolation $(if $(NEW_DEPENDENCIES),,--no-deps) --editable '.[dev]'
 	@touch $@
+
+# An editable install knows the modules by name: a new, moved or removed one needs a new install. Rewritten only then.
+$(MODULES): $(TORCH_STAMP) FORCE
+	@find -L splatbot -name '*.py' | LC_ALL=C sort > $@.now
+	@cmp -s $@.now $@ && rm $@.now || mv $@.now $@
+
+.PHONY: FORCE
+FORCE:

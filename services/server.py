@@ -47,6 +47,7 @@ def _listen(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        listener.listen(2048)  # now, so that who connects before the application is up waits instead of being refused
     except OSError as error:
         listener.close()
         raise InputError(

@@ -29,13 +29,14 @@ from splatbot.sim.effects.depth_noise import DepthNoise
 
 _START_S = 120.0  # the service imports torch first
 _TABLE_M = 1e-3  # a ray-cast point this near to z = 0 is on the table
+_TIP_M = 0.005  # radius of the fingertip that is asked about: a camera with 2 mm of noise cannot place a bare point
 
 
 def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
     """Record a synthetic table top, map it, serve the map and ask it what is free.
 
-    The table's top and the air above it are known exactly, so the answers are checked: exit code 1 if the map calls a
-    point of the table free, or a point of the air occupied.
+    May a fingertip of 1 cm touch here? Where the table is and where there is air is known exactly, so the answers are
+    checked: exit code 1 if the map calls a place on the table free, or one in the air occupied.
 
     Examples:
         splatbot demo
@@ -63,7 +64,7 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
     with _service(out / "map.ply", out / "service.log") as url:
         _say(f"3/4 serving the map on {url}")
         _say("4/4 asking it over HTTP: POST /v1/maps/default/distance")
-        answer = _ask(f"{url}/v1/maps/default/distance", {"points": [p.tolist() for p in question.points]})
+        answer = _ask(f"{url}/v1/maps/default/distance", {"points": _tips(question.places).tolist()})
     wrong = _judge(question, answer)
     _say(f"report: {out / 'report.html'}      serve it again: splatbot serve --map {out / 'map.ply'}")
     return 1 if wrong else 0
@@ -71,15 +72,15 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
 
 @dataclass(frozen=True)
 class _Question:
-    """Points (P, 3) [m, the map's world: the first camera], what they are, and whether they are inside something."""
+    """Places (P, 3) [m, the map's world: the first camera], what they are, and whether something is there."""
 
-    points: NDArray[np.float64]
+    places: NDArray[np.float64]
     names: tuple[str, ...]
-    inside: tuple[bool, ...]
+    occupied: tuple[bool, ...]
 
 
 def _question(scene: Log) -> _Question:
-    """A point of the table top and one half-way to it from the camera, which sees the table through it: free air."""
+    """A place on the table top and one half-way to it from the camera, which sees the table through it: free air."""
     first = scene.read(0)
     truth = scene.ground_truth
     if truth is None:
@@ -91,22 +92,33 @@ def _question(scene: Log) -> _Question:
     row, column = np.unravel_index(np.argmax(inner[1:-1, 1:-1]), table.shape)  # the farthest from any edge
     on_table = points[row, column]
     return _Question(
-        points=np.stack([on_table, 0.5 * on_table]),
-        names=("a point of the table top", "a point in the air, half-way to it from the camera"),
-        inside=(True, False),
+        places=np.stack([on_table, 0.5 * on_table]),
+        names=("on the table top", "in the air, half-way to there from the camera"),
+        occupied=(True, False),
     )
+
+
+def _tips(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (P·T, 3) that fill a fingertip at each of the places (P, 3), place by place."""
+    steps = np.linspace(-_TIP_M, _TIP_M, 5)
+    cube = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
+    ball = cube[np.linalg.norm(cube, axis=1) <= _TIP_M * (1 + 1e-9)]
+    return (places[:, None] + ball).reshape(-1, 3)
 
 
 def _judge(question: _Question, answer: dict[str, Any]) -> int:
     """Print each answer beside the truth; how many contradict it."""
     wrong = 0
-    rows = zip(question.names, question.points, question.inside, answer["inside"], answer["distance"], strict=True)
-    for name, point, truth, inside, distance in rows:
-        at = ", ".join(f"{x:+.3f}" for x in point)
-        verdict = "right" if inside == truth else f"WRONG: it is {'occupied' if truth else 'free'}"
+    touched = np.asarray(answer["inside"]).reshape(len(question.places), -1)
+    nearest = np.asarray(answer["distance"], dtype=np.float64).reshape(touched.shape).min(axis=1)
+    rows = zip(question.names, question.places, question.occupied, touched.sum(axis=1), nearest, strict=True)
+    for name, place, occupied, inside, distance in rows:
+        at = ", ".join(f"{x:+.3f}" for x in place)
         said = "occupied" if inside else "free"
-        _say(f"    {name} ({at}) m: {said}, {distance:.1f} standard deviations from the map  [{verdict}]")
-        wrong += inside != truth
+        verdict = "right" if bool(inside) == occupied else f"WRONG: it is {'occupied' if occupied else 'free'}"
+        _say(f"    a fingertip {name} ({at}) m: {said}  [{verdict}]")
+        _say(f"        {inside} of its {touched.shape[1]} points are inside, the nearest at {distance:.1f} sigma")
+        wrong += bool(inside) != occupied
     _say(f"    answered on map_version {answer['map_version']}")
     return wrong
 

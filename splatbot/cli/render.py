@@ -49,7 +49,7 @@ def render(
     width, height = _parse_size(size)
     file, path = _find_map(map_), trajectory or _own_trajectory(map_, index)
 
-    from splatbot.formats.atomic import atomic_write
+    from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel
     from splatbot.rasterize.views import default_view, render_view, to_png
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -36,10 +36,6 @@ class Inputs:
             self.backgrounds,
         )
 
-    def without_colors(self) -> Inputs:
-        """For modes that render depth alone."""
-        return replace(self, colors=self.means.new_zeros(len(self.means), 0), backgrounds=None)
-
 
 def check_inputs(
     means: Tensor,
@@ -53,7 +49,7 @@ def check_inputs(
     width: int,
     height: int,
 ) -> Inputs:
-    """Check and make contiguous.
+    """Check and make contiguous; ``colors`` None becomes (N, 0).
 
     Raises:
         InputError: naming the argument.
@@ -66,10 +62,13 @@ def check_inputs(
     c = len(poses)
     intrinsics = _floats("Ks", Ks, (c, 3, 3), double=True).detach().to(torch.float64)
     _check_camera(poses, intrinsics)
+    given = colors is not None
     if colors is None:
         colors = means.new_zeros(n, 0)
     shape = (n, None) if colors.ndim == 2 else (c, n, None)
     checked = _floats("colors", colors, shape)
+    if given and checked.shape[-1] == 0:
+        raise InputError("has no channels.", field="colors", hint="give colours (N, D), D >= 1")
     if backgrounds is not None:
         backgrounds = _floats("backgrounds", backgrounds, (c, checked.shape[-1]))
         if not torch.isfinite(backgrounds).all():

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import sh_to_rgb
-from splatbot.rasterize.inputs import Inputs, check_inputs
+from splatbot.rasterize.inputs import check_inputs
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import native
 
@@ -89,9 +89,11 @@ def rasterization(
         sh_degree: None, or 0.
         packed: has no effect on the result; accepted for gsplat's sake.
         tile_size: has no effect on the result; accepted for gsplat's sake.
-        backgrounds: (C, D) colours seen where transmittance is left.
+        backgrounds: (C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
         render_mode: RGB; D: depth summed with the blend weights [m]; ED: that, divided by the sum of weights; RGB+D
             and RGB+ED append it as the last channel.
+        rasterize_mode: "classic".
+        camera_model: "pinhole".
         channel_chunk: has no effect on the result; accepted for gsplat's sake.
         depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat); "plane" lets it vary over the
             footprint as that of the plane through the centre and normal to the Gaussian's shortest axis. Its gradient
@@ -108,10 +110,12 @@ def rasterization(
     _reject_unsupported(rasterize_mode, camera_model, covars, sparse_grad, absgrad, depth_mode, unsupported)
     if sh_degree is not None:
         colors = _from_harmonics(colors, sh_degree)
-    inputs = check_inputs(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width, height)
-    wants_color, depth = _parse_mode(render_mode, inputs)
+    wants_color, depth = _parse_mode(render_mode)
     if not wants_color:
-        inputs = inputs.without_colors()
+        colors, backgrounds = None, None
+    elif colors is None:
+        raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
+    inputs = check_inputs(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width, height)
     options = _Options(
         width=width,
         height=height,
@@ -190,7 +194,7 @@ class _Rasterize(torch.autograd.Function):
         if grad_renders is None and grad_alphas is None:
             return (None,) * 10
         for i, state in enumerate(ctx.states):
-            pose = torch.empty(12, dtype=torch.float64) if grad_viewmats is not None else None
+            pose = torch.zeros(12, dtype=torch.float64) if grad_viewmats is not None else None
             native().rasterize_backward(
                 state,
                 *geometry,
@@ -225,7 +229,8 @@ def _from_harmonics(colors: Tensor | None, sh_degree: int) -> Tensor:
     return sh_to_rgb(colors[:, 0]).clamp_min(0.0)
 
 
-def _parse_mode(render_mode: str, inputs: Inputs) -> tuple[bool, str]:
+def _parse_mode(render_mode: str) -> tuple[bool, str]:
+    """Whether colours are rendered, and what of depth."""
     modes = {
         "RGB": (True, "none"),
         "D": (False, "accumulated"),
@@ -235,10 +240,7 @@ def _parse_mode(render_mode: str, inputs: Inputs) -> tuple[bool, str]:
     }
     if render_mode not in modes:
         raise InputError(f"is {render_mode!r}.", field="render_mode", hint=f"one of {', '.join(modes)}")
-    wants_color, depth = modes[render_mode]
-    if wants_color and inputs.colors.shape[-1] == 0:
-        raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
-    return wants_color, depth
+    return modes[render_mode]
 
 
 def _reject_unsupported(

@@ -69,7 +69,9 @@ def rasterization_reference(
         view_colors = None if colors is None or "RGB" not in render_mode else colors[i] if colors.ndim == 3 else colors
         background = None if backgrounds is None or view_colors is None else backgrounds[i]
         projected = _project(means, quats, scales, viewmats[i], Ks[i], width, height, eps2d, depth_mode)
-        keep = (projected.depth >= near_plane) & (projected.depth <= far_plane)
+        # The kernels hold the planes in float32: a float32 Gaussian on the plane must be kept here as well.
+        near, far = (float(torch.tensor(plane, dtype=torch.float32)) for plane in (near_plane, far_plane))
+        keep = (projected.depth >= near) & (projected.depth <= far)
         order = torch.argsort(projected.depth.detach().float(), stable=True)
         order = order[keep[order]]
         pixels = _pixel_centers(width, height, means)

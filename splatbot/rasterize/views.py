@@ -151,7 +151,11 @@ def to_png(view: NDArray[np.float32], mode: Mode, *, depth_range: tuple[float, f
 
 
 def _splat(
-    model: GaussianModel, colors: Tensor, camera: Camera, T_camera_world: NDArray[np.float64], render_mode: str
+    model: GaussianModel,
+    colors: Tensor,
+    camera: Camera,
+    T_camera_world: NDArray[np.float64],
+    render_mode: Literal["RGB", "ED"],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Blended features (H, W, C) and opacity (H, W)."""
     with torch.no_grad():

@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.atomic import atomic_write
 from splatbot.config import Config, load_config
 from splatbot.errors import FormatError, InputError
-from splatbot.formats.atomic import atomic_write
 from splatbot.gaussians import GaussianModel
 from splatbot.trajectory import Trajectory
 

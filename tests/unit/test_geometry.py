@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import mpmath  # type: ignore[import-untyped]
+import mpmath
 import numpy as np
 import pytest
-from scipy.linalg import expm  # type: ignore[import-untyped]
-from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from splatbot.geometry import (
     inverse,

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <nanobind/nanobind.h>
+#include "bindings.hpp"
+
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/shared_ptr.h>

@@ -124,7 +124,7 @@ ProjectArgs project_args(RasterState& state, const Gaussians& g) {
 }
 
 BlendArgs blend_args(RasterState& state, std::size_t p, const float* background) {
-  const std::size_t plane = state.tiles() * (1 + kRecordChannels) * kTilePixels;
+  const std::size_t plane = state.tiles() * kFinalPlanes * kTilePixels;
   const bool first = p == 0;
   return {.view = state.view,
           .columns = state.columns,
@@ -173,7 +173,7 @@ void prepare(RasterState& state, const Gaussians& g, const View& view, const Ras
   state.visible.resize(g.count);
   state.more_channels.resize((state.passes.size() - 1) * g.count * kRecordChannels);
   state.tile_done.resize(state.tiles());
-  state.final_state.resize(state.passes.size() * state.tiles() * (1 + kRecordChannels) * kTilePixels);
+  state.final_state.resize(state.passes.size() * state.tiles() * kFinalPlanes * kTilePixels);
 }
 
 std::optional<Fault> find_fault(const RasterState& state) {
@@ -186,7 +186,7 @@ std::optional<Fault> find_fault(const RasterState& state) {
   return std::nullopt;
 }
 
-// Transmittance left behind a pixel, by tile; the sign only says whether the pixel was closed.
+// d render / d background is the transmittance left.
 void add_background_gradient(const RasterState& state, std::span<const float> grad_colors, std::span<double> out) {
   const auto width = static_cast<std::size_t>(state.view.width);
   const auto stride = static_cast<std::size_t>(state.out_channels);
@@ -196,7 +196,7 @@ void add_background_gradient(const RasterState& state, std::span<const float> gr
       const std::size_t in_y = y % kTileHeight, in_x = x % kTileWidth;
       const std::size_t i = ((in_y / kBlock) * kBlockColumns + in_x / kBlock) * kBlockPixels + in_y % kBlock * kBlock +
                             in_x % kBlock;
-      const double t = std::abs(static_cast<double>(state.final_state[tile * (1 + kRecordChannels) * kTilePixels + i]));
+      const double t = static_cast<double>(state.final_state[tile * kFinalPlanes * kTilePixels + i]);
       for (std::size_t c = 0; c < out.size(); ++c) {
         out[c] += t * static_cast<double>(grad_colors[(y * width + x) * stride + c]);
       }

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
+from splatbot._native import MahalanobisField
 from splatbot.collision import GaussianCollisionField
 from splatbot.collision.field import SCALE_FLOOR
 from splatbot.errors import InputError
@@ -26,7 +27,7 @@ def _model(
     n = len(m)
     return GaussianModel.from_activated(
         means=m,
-        scales=np.broadcast_to(np.asarray(scales, dtype=np.float64), (n, 3)),
+        scales=np.broadcast_to(np.asarray(scales, dtype=np.float64), (n, 3)).copy(),
         quats=np.tile([1.0, 0, 0, 0], (n, 1)) if quats is None else np.asarray(quats),
         opacities=np.full(n, 0.9) if opacities is None else np.asarray(opacities),
         colors=np.full((n, 3), 0.5),
@@ -215,3 +216,15 @@ def test_a_zero_quaternion_is_named() -> None:
 def test_a_shell_without_extent_is_refused(n_sigma: float) -> None:
     with pytest.raises(InputError, match="n_sigma"):
         GaussianCollisionField(_model([0, 0, 0], 0.1), n_sigma)
+
+
+def test_the_native_border_converts_nothing_silently() -> None:
+    means, whitening = np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[None]
+    field = MahalanobisField(means, whitening)
+    distance, index = np.zeros(1, np.float32), np.zeros(1, np.int32)
+    with pytest.raises(TypeError):
+        field.nearest(np.zeros((1, 3)), distance, index)  # float64
+    with pytest.raises(TypeError):
+        field.nearest(np.zeros((1, 6), np.float32)[:, ::2], distance, index)  # not contiguous
+    with pytest.raises(ValueError, match="length"):
+        field.nearest(np.zeros((2, 3), np.float32), distance, index)

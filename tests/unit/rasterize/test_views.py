@@ -76,7 +76,7 @@ def test_moving_camera_and_map_together_leaves_every_view() -> None:
 def test_where_nothing_is_there_is_background_and_neither_depth_nor_normal() -> None:
     nothing = GaussianModel.empty()
     grey = render_view(nothing, CAMERA, np.eye(4), "rgb", background=(0.5, 0.25, 0.0))
-    np.testing.assert_array_equal(grey, np.broadcast_to(np.float32([0.5, 0.25, 0.0]), (48, 64, 3)))
+    np.testing.assert_array_equal(grey, np.broadcast_to(np.array([0.5, 0.25, 0.0], np.float32), (48, 64, 3)))
     assert not render_view(nothing, CAMERA, np.eye(4), "depth").any()
     assert not render_view(nothing, CAMERA, np.eye(4), "normal").any()
     assert not render_view(nothing, CAMERA, np.eye(4), "alpha").any()
@@ -120,7 +120,7 @@ def test_normals_are_the_flattest_axis_turned_to_the_camera_for_any_rotation() -
     rng = np.random.default_rng(0)
     n = 200
     model = GaussianModel.from_activated(
-        means=rng.normal(size=(n, 3)) + [0, 0, 4],
+        means=rng.normal(size=(n, 3)) + np.array([0, 0, 4]),
         quats=rng.normal(size=(n, 4)),
         scales=rng.uniform(0.01, 0.1, (n, 3)),
         opacities=np.full(n, 0.5),
@@ -149,7 +149,7 @@ def _visible(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.fl
 @pytest.mark.parametrize("fov_deg", [30.0, 60.0, 100.0])
 def test_the_default_view_shows_ninety_percent_and_is_no_farther_than_that_needs(fov_deg: float) -> None:
     rng = np.random.default_rng(4)
-    means = rng.normal(size=(2000, 3)) * [0.5, 0.3, 0.2] + [10, -5, 3]
+    means = rng.normal(size=(2000, 3)) * np.array([0.5, 0.3, 0.2]) + np.array([10, -5, 3])
     model = GaussianModel.from_activated(
         means=means,
         quats=np.tile([1.0, 0, 0, 0], (2000, 1)),

@@ -34,6 +34,10 @@ inline constexpr int kMoments = 6;
 inline constexpr int kSlot = 16;
 static_assert(kMoments + kRecordChannels <= kSlot);
 
+// What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
+inline constexpr int kFinalPlanes = 2 + kRecordChannels;
+inline constexpr int kWeightPlane = 1 + kRecordChannels;  // for expected depth only
+
 // A projected Gaussian, one cache line. With d = pixel centre - (mx, my), u = l11 dx + l21 dy and w = l22 dy, it has
 // alpha = 2^(lo - u^2 - w^2): (l11 l21; 0 l22) is a root of the inverse 2D covariance times log2(e) / 2, so nothing
 // cancels for needles. It reaches the pixels with u^2 + w^2 <= reach^2; `lean` is w at its rightmost point.
@@ -97,7 +101,7 @@ struct RasterState {
   Buffer<Pair> pairs;                // by tile, front to back
   Buffer<std::uint32_t> masks;       // (pairs,), live blocks reached
   Buffer<std::uint32_t> tile_done;   // (tiles,): pairs looked at before the tile closed
-  Buffer<float> final_state;         // (passes, tiles, 1 + kRecordChannels, kTilePixels): transmittance, channels
+  Buffer<float> final_state;         // (passes, tiles, kFinalPlanes, kTilePixels)
 
   std::size_t tiles() const noexcept { return static_cast<std::size_t>(columns) * static_cast<std::size_t>(rows); }
   std::size_t bytes() const noexcept;

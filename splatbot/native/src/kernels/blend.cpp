@@ -8,8 +8,9 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
-// Rows of a chunk: Local, two unused, channels.
+// Rows of a chunk: Local, slopes of plane depth, channels.
 constexpr int kRow = 16;
+constexpr int kRowSlopes = 6;
 constexpr int kRowChannels = 8;
 
 struct Chunk {
@@ -20,18 +21,28 @@ struct Chunk {
 };
 
 struct TileState {
-  alignas(64) float transmittance[kTilePixels];
+  alignas(64) float through[kTilePixels];        // see advance()
+  alignas(64) float transmittance[kTilePixels];  // what the Gaussians that count leave
   alignas(64) float channels[kRecordChannels][kTilePixels];
+  alignas(64) float weights[kTilePixels];  // for expected depth, where 1 - transmittance has too few digits if small
+};
+
+// What a blend does besides summing channels.
+struct Extras {
+  bool plane;  // depth varies over a footprint
+  bool weigh;  // sum the weights
 };
 
 void start(const TileFrame& frame, int channels, TileState& state) {
   for (int i = 0; i < kTilePixels; ++i) {
     const bool inside = kCenters.x[i] < static_cast<float>(frame.width) && kCenters.y[i] < static_cast<float>(frame.height);
-    state.transmittance[i] = inside ? 1.0F : -1.0F;
+    state.through[i] = inside ? 1.0F : 0.0F;
+    state.transmittance[i] = 1.0F;
   }
   for (int c = 0; c < channels; ++c) {
     std::memset(state.channels[c], 0, sizeof(state.channels[c]));
   }
+  std::memset(state.weights, 0, sizeof(state.weights));
 }
 
 template <int C>
@@ -45,11 +56,10 @@ SB_INLINE void load_chunk(const BlendArgs& args, const TileFrame& frame, const P
     std::memcpy(row, &local, sizeof(local));
     std::memcpy(row + kRowChannels, channels, C * sizeof(float));
     if (slopes) {
-      row[6] = channels[kRecordChannels - 2];
-      row[7] = channels[kRecordChannels - 1];
-      // Depth at the tile's corner; C < 7 leaves the row's last place free.
-      row[15] = channels[0] - row[6] * (record.mx - static_cast<float>(frame.x0)) -
-                row[7] * (record.my - static_cast<float>(frame.y0));
+      const PlaneDepth plane = plane_depth(record, channels, frame);
+      row[kRowSlopes] = plane.slope_x;
+      row[kRowSlopes + 1] = plane.slope_y;
+      row[kRow - 1] = plane.corner;  // at most 6 channels leave it free
     }
     ChunkEllipses& e = chunk.ellipses;
     e.cx[j] = record.mx - static_cast<float>(frame.x0);
@@ -68,33 +78,43 @@ SB_INLINE void load_chunk(const BlendArgs& args, const TileFrame& frame, const P
   }
 }
 
-template <int C, bool Plane>
+template <int C, Extras E>
 SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_t first, TileState& state) {
   const F x = load(kCenters.x + first), y = load(kCenters.y + first);
+  F through = load(state.through + first);
   F transmittance = load(state.transmittance + first);
   F sum[C];
 #pragma GCC unroll 8
   for (int c = 0; c < C; ++c) {
     sum[c] = load(state.channels[c] + first);
   }
+  F weights = load(state.weights + first);
   while (members != 0) {
     const float* row = chunk.rows[__builtin_ctzll(members)];
     members &= members - 1;
     const Alpha a = alpha_at(x, y, row, row + 1, row + 2, row + 3, row + 4, row + 5);
-    const Step step = advance(a, transmittance);
+    const Step step = advance(a, through);
+    transmittance = select(step.open, through, transmittance);
 #pragma GCC unroll 8
     for (int c = 0; c < C; ++c) {
       F value = set1(row[kRowChannels + c]);
-      if (Plane && c == 0) {
-        value = fma(set1(row[6]), x, fma(set1(row[7]), y, set1(row[15])));
+      if (E.plane && c == 0) {
+        value = fma(set1(row[kRowSlopes]), x, fma(set1(row[kRowSlopes + 1]), y, set1(row[kRow - 1])));
       }
-      sum[c] = fma_if(step.blended, step.weight, value, sum[c]);
+      sum[c] = fma(step.weight, value, sum[c]);
+    }
+    if (E.weigh) {
+      weights = weights + step.weight;
     }
   }
+  store(state.through + first, through);
   store(state.transmittance + first, transmittance);
 #pragma GCC unroll 8
   for (int c = 0; c < C; ++c) {
     store(state.channels[c] + first, sum[c]);
+  }
+  if (E.weigh) {
+    store(state.weights + first, weights);
   }
 }
 
@@ -103,15 +123,14 @@ std::uint32_t live_blocks(const TileState& state) {
   for (int b = 0; b < kBlocks; ++b) {
     std::uint32_t open = 0;
     for (int part = 0; part < kParts; ++part) {
-      constexpr std::uint32_t kAll = (1U << W) - 1U;
-      open |= kAll & ~sign_bits(load(state.transmittance + b * kBlockPixels + part * W));
+      open |= bits(load(state.through + b * kBlockPixels + part * W) > set1(kTransmittanceMin));
     }
     live |= static_cast<std::uint32_t>(open != 0) << b;
   }
   return live;
 }
 
-template <int C, bool Plane>
+template <int C, Extras E>
 void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile, TileState& state) {
   Chunk chunk;
   const std::uint32_t begin = args.tile_begin[tile];
@@ -120,7 +139,7 @@ void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile
   std::uint32_t live = live_blocks(state);
   while (at < end && live != 0) {
     const int n = end - at < kChunk ? static_cast<int>(end - at) : kChunk;
-    load_chunk<C>(args, frame, args.pairs + at, n, Plane, chunk);
+    load_chunk<C>(args, frame, args.pairs + at, n, E.plane, chunk);
     for (std::uint32_t next = at + kChunk; next < at + 2 * kChunk && next < end; ++next) {
       __builtin_prefetch(args.records + args.pairs[next].id);
     }
@@ -138,7 +157,7 @@ void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile
       const std::uint64_t members = chunk.columns[block];
       if (members != 0) {
         for (int part = 0; part < kParts; ++part) {
-          blend_block<C, Plane>(chunk, members, static_cast<std::size_t>(block * kBlockPixels + part * W), state);
+          blend_block<C, E>(chunk, members, static_cast<std::size_t>(block * kBlockPixels + part * W), state);
         }
       }
     }
@@ -155,12 +174,11 @@ void write_tile(const BlendArgs& args, const TileFrame& frame, const TileState& 
                              static_cast<std::size_t>(frame.x0);
     for (int x = 0; x < frame.width; ++x) {
       const int i = pixel_index(x, y);
-      const float t = state.transmittance[i] < 0.0F ? -state.transmittance[i] : state.transmittance[i];
+      const float t = state.transmittance[i];
       float* to = args.out_colors + (line + static_cast<std::size_t>(x)) * static_cast<std::size_t>(args.out_channels);
       int c = 0;
       if (pass.depth_first) {
-        const float covered = 1.0F - t;
-        const float divisor = covered > kExpectedDepthMin ? covered : kExpectedDepthMin;
+        const float divisor = state.weights[i] > kExpectedDepthMin ? state.weights[i] : kExpectedDepthMin;
         to[pass.column[0]] = args.depth == DepthMode::expected ? state.channels[0][i] / divisor : state.channels[0][i];
         c = 1;
       }
@@ -178,15 +196,27 @@ void write_tile(const BlendArgs& args, const TileFrame& frame, const TileState& 
 template <int C>
 void blend_channels(const BlendArgs& args, const TileFrame& frame, std::size_t tile, TileState& state) {
   start(frame, C, state);
-  if (C < kRecordChannels && args.plane_depth && args.pass->depth_first) {
-    blend_lists<C < kRecordChannels ? C : 1, true>(args, frame, tile, state);
+  const bool depth = args.pass->depth_first;
+  const bool expected = depth && args.depth == DepthMode::expected;
+  if (depth && args.plane_depth) {
+    constexpr int kRoom = C < kRecordChannels ? C : 1;  // such a pass leaves two channels to the slopes
+    if (expected) {
+      blend_lists<kRoom, Extras{true, true}>(args, frame, tile, state);
+    } else {
+      blend_lists<kRoom, Extras{true, false}>(args, frame, tile, state);
+    }
+  } else if (expected) {
+    blend_lists<C, Extras{false, true}>(args, frame, tile, state);
   } else {
-    blend_lists<C, false>(args, frame, tile, state);
+    blend_lists<C, Extras{false, false}>(args, frame, tile, state);
   }
   write_tile(args, frame, state);
-  float* saved = args.final_state + tile * kFinalPlanes * kPlane;
+  float* saved = args.final_state + tile * kFinalSize;
   std::memcpy(saved, state.transmittance, sizeof(state.transmittance));
   std::memcpy(saved + kPlane, state.channels, C * sizeof(state.channels[0]));
+  if (expected) {
+    std::memcpy(saved + kWeightPlane * kPlane, state.weights, sizeof(state.weights));
+  }
 }
 
 }  // namespace

@@ -12,7 +12,7 @@ namespace splatbot::SPLATBOT_KERNELS {
 namespace {
 
 struct TileGradient {
-  alignas(64) float transmittance[kTilePixels];
+  alignas(64) float through[kTilePixels];  // see advance()
   alignas(64) float rest[kTilePixels];
   alignas(64) float gradient[kRecordChannels][kTilePixels];
 };
@@ -20,8 +20,7 @@ struct TileGradient {
 // Gradients to the sums that blend() had before the background was added and expected depth was divided.
 void load_pixel(const BlendBackwardArgs& args, std::size_t pixel, int i, const float* saved, TileGradient& state) {
   const ChannelPass& pass = *args.forward.pass;
-  const float signed_t = saved[i];
-  const float t = signed_t < 0.0F ? -signed_t : signed_t;
+  const float t = saved[i];
   float grad_t = args.grad_alphas != nullptr ? -args.grad_alphas[pixel] : 0.0F;
   float rest = 0.0F;
   const float* grads = args.grad_colors == nullptr
@@ -32,7 +31,7 @@ void load_pixel(const BlendBackwardArgs& args, std::size_t pixel, int i, const f
     const float sum = saved[(1 + static_cast<std::size_t>(c)) * kPlane + static_cast<std::size_t>(i)];
     if (c == 0 && pass.depth_first) {
       if (args.forward.depth == DepthMode::expected) {
-        const float covered = 1.0F - t;
+        const float covered = saved[kWeightPlane * kPlane + static_cast<std::size_t>(i)];
         const bool divided = covered > kExpectedDepthMin;
         g /= divided ? covered : kExpectedDepthMin;
         grad_t += divided ? g * sum / covered : 0.0F;
@@ -43,7 +42,7 @@ void load_pixel(const BlendBackwardArgs& args, std::size_t pixel, int i, const f
     state.gradient[c][i] = g;
     rest += sum * g;
   }
-  state.transmittance[i] = 1.0F;
+  state.through[i] = 1.0F;
   state.rest[i] = rest + grad_t * t;
 }
 
@@ -51,7 +50,7 @@ template <int C>
 void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const float* saved, TileGradient& state) {
   if (frame.width < kTileWidth || frame.height < kTileHeight || args.forward.pass->count < C) {
     for (int i = 0; i < kTilePixels; ++i) {
-      state.transmittance[i] = -1.0F;
+      state.through[i] = 0.0F;
       state.rest[i] = 0.0F;
     }
     for (int c = 0; c < C; ++c) {
@@ -69,8 +68,8 @@ void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const floa
 }
 
 // Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha); then weight times gradient for the first S channels.
-template <int C, int S>
-SB_INLINE void sum_pair(const Local& local, const float* channels, std::uint32_t mask, TileGradient& state, float* slot) {
+template <int C, int S, bool Plane>
+SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDepth& plane, std::uint32_t mask, TileGradient& state, float* slot) {
   F acc[16];
 #pragma GCC unroll 16
   for (int i = 0; i < 16; ++i) {
@@ -82,28 +81,31 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, std::uint32_t
 #pragma GCC unroll 4
     for (int part = 0; part < kParts; ++part) {
       const std::size_t first = static_cast<std::size_t>(block * kBlockPixels + part * W);
-      const Alpha a = alpha_at(load(kCenters.x + first), load(kCenters.y + first), &local.l11, &local.l21, &local.l22,
+      const F x = load(kCenters.x + first), y = load(kCenters.y + first);
+      const Alpha a = alpha_at(x, y, &local.l11, &local.l21, &local.l22,
                                &local.u0, &local.w0, &local.lo);
-      const F before = load(state.transmittance + first);
-      F transmittance = before;
-      const Step step = advance(a, transmittance);
-      const F weight = zero_unless(step.blended, step.weight);
+      F through = load(state.through + first);
+      const Step step = advance(a, through);
       F along = set1(0.0F);
 #pragma GCC unroll 8
       for (int c = 0; c < C; ++c) {
         const F g = load(state.gradient[c] + first);
-        along = fma(set1(channels[c]), g, along);
+        F value = set1(channels[c]);
+        if (Plane && c == 0) {
+          value = fma(set1(plane.slope_x), x, fma(set1(plane.slope_y), y, set1(plane.corner)));
+        }
+        along = fma(value, g, along);
         if (c < S) {
-          acc[kMoments + c] = fma(weight, g, acc[kMoments + c]);
+          acc[kMoments + c] = fma(step.weight, g, acc[kMoments + c]);
         }
       }
-      const F rest = fnma(weight, along, load(state.rest + first));
-      store(state.transmittance + first, transmittance);
+      const F rest = fnma(step.weight, along, load(state.rest + first));
+      store(state.through + first, through);
       store(state.rest + first, rest);
-      // alpha x d loss / d alpha; none where the cap holds alpha.
-      const F other = a.alpha * rest * reciprocal(set1(1.0F) - a.alpha);
-      const M free = step.blended & (a.power <= set1(kAlphaMax));
-      const F v = zero_unless(free, fma(step.weight, along, -other));
+      // alpha x d loss / d alpha; none where the cap holds alpha, nor in closed pixels.
+      const F other = a.alpha * reciprocal(a.left) * rest;
+      const M free = step.open & (a.power <= set1(kAlphaMax));
+      const F v = zero_unless(free, fms(step.weight, along, other));
       const F vu = v * a.u;
       const F vw = v * a.w;
       acc[0] = acc[0] + v;
@@ -117,7 +119,7 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, std::uint32_t
   store_sums<kMoments + S>(slot, acc);
 }
 
-template <int C, int S>
+template <int C, int S, bool Plane>
 void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
   const BlendArgs& f = args.forward;
   const std::uint32_t begin = f.tile_begin[tile];
@@ -137,19 +139,30 @@ void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::
     }
     const std::size_t id = f.pairs[at].id;
     const Local local = localize(f.records[id], frame);
-    sum_pair<C, S>(local, f.channels + id * f.channel_stride, mask, state, slot);
+    const float* channels = f.channels + id * f.channel_stride;
+    const PlaneDepth plane = Plane ? plane_depth(f.records[id], channels, frame) : PlaneDepth{};
+    sum_pair<C, S, Plane>(local, channels, plane, mask, state, slot);
+  }
+}
+
+template <int C, bool Plane>
+void backward_sums(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
+  if (args.channel_sums == 0) {
+    backward_lists<C, 0, Plane>(args, frame, tile, state);
+  } else if (args.channel_sums == 1) {
+    backward_lists<C, 1, Plane>(args, frame, tile, state);
+  } else {
+    backward_lists<C, C, Plane>(args, frame, tile, state);
   }
 }
 
 template <int C>
 void backward_channels(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
-  load_tile<C>(args, frame, args.forward.final_state + tile * kFinalPlanes * kPlane, state);
-  if (args.channel_sums == 0) {
-    backward_lists<C, 0>(args, frame, tile, state);
-  } else if (args.channel_sums == 1) {
-    backward_lists<C, 1>(args, frame, tile, state);
+  load_tile<C>(args, frame, args.forward.final_state + tile * kFinalSize, state);
+  if (args.forward.plane_depth && args.forward.pass->depth_first) {
+    backward_sums<C < kRecordChannels ? C : 1, true>(args, frame, tile, state);
   } else {
-    backward_lists<C, C>(args, frame, tile, state);
+    backward_sums<C, false>(args, frame, tile, state);
   }
 }
 

@@ -11,6 +11,7 @@ namespace {
 struct LaneSums {
   alignas(64) float moments[kMoments][W];
   alignas(64) float depth[W];
+  alignas(64) float slope_x[W], slope_y[W];  // of plane depth, else 0
 };
 
 struct LaneGradients {
@@ -60,8 +61,10 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   const F su = load(sums.moments[1]), sw = load(sums.moments[2]);
   const F suu = load(sums.moments[3]), suw = load(sums.moments[4]), sww = load(sums.moments[5]);
   constexpr float kInverse = 1.0F / kHalfLog2e;
-  const F gmx = set1(kInverse) * l11 * su;
-  const F gmy = set1(kInverse) * fma(l21, su, l22 * sw);
+  // Plane depth at a pixel falls by the slope as the centre moves.
+  const F gz = load(sums.depth);
+  const F gmx = fnma(load(sums.slope_x), gz, set1(kInverse) * l11 * su);
+  const F gmy = fnma(load(sums.slope_y), gz, set1(kInverse) * fma(l21, su, l22 * sw));
   const F half = set1(0.5F * kInverse * kInverse);
   const F g00 = half * l11 * l11 * suu;
   const F g01 = half * l11 * fma(l21, suu, l22 * suw);
@@ -95,7 +98,7 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   gp[0] = fma(gmx, o.jx, gsx * iz);
   gp[1] = fma(gmy, o.jy, gsy * iz);
   const F along = fma(gjx, o.jx, fma(gjy, o.jy, fma(gsx, o.slope[0], gsy * o.slope[1])));
-  gp[2] = fnma(along, iz, load(sums.depth));
+  gp[2] = fnma(along, iz, gz);
 
   for (int i = 0; i < 3; ++i) {
     out.mean[i] = fma(cam.r[i], gp[0], fma(cam.r[3 + i], gp[1], cam.r[6 + i] * gp[2]));
@@ -197,12 +200,13 @@ void zero_rows(const ProjectBackwardArgs& args, std::size_t begin, std::size_t e
 void collect(const ProjectBackwardArgs& args, const ProjectedBlock& block, const std::uint32_t* ids, int n,
              LaneSums& lanes) {
   alignas(64) float sums[kSlot];
+  const bool plane = args.forward.options.plane_depth && args.forward.options.depth != DepthMode::none;
   for (int i = 0; i < W; ++i) {
     if (i >= n) {
       for (auto& moment : lanes.moments) {
         moment[i] = 0.0F;
       }
-      lanes.depth[i] = 0.0F;
+      lanes.depth[i] = lanes.slope_x[i] = lanes.slope_y[i] = 0.0F;
       continue;
     }
     const std::size_t id = ids[i];
@@ -228,6 +232,8 @@ void collect(const ProjectBackwardArgs& args, const ProjectedBlock& block, const
       lanes.moments[k][i] = sums[k];
     }
     lanes.depth[i] = depth;
+    lanes.slope_x[i] = plane ? args.forward.records[id].channels[kRecordChannels - 2] : 0.0F;
+    lanes.slope_y[i] = plane ? args.forward.records[id].channels[kRecordChannels - 1] : 0.0F;
   }
 }
 

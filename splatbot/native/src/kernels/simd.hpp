@@ -39,7 +39,7 @@ SB_INLINE F operator*(F a, F b) { return {_mm512_mul_ps(a.v, b.v)}; }
 SB_INLINE F operator/(F a, F b) { return {_mm512_div_ps(a.v, b.v)}; }
 SB_INLINE F fma(F a, F b, F c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
 SB_INLINE F fnma(F a, F b, F c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
-SB_INLINE F fma_if(M m, F a, F b, F c) { return {_mm512_mask3_fmadd_ps(a.v, b.v, c.v, m.v)}; }
+SB_INLINE F fms(F a, F b, F c) { return {_mm512_fmsub_ps(a.v, b.v, c.v)}; }
 SB_INLINE F min(F a, F b) { return {_mm512_min_ps(a.v, b.v)}; }
 SB_INLINE F max(F a, F b) { return {_mm512_max_ps(a.v, b.v)}; }
 SB_INLINE F sqrt(F a) { return {_mm512_sqrt_ps(a.v)}; }
@@ -55,10 +55,7 @@ SB_INLINE F select(M m, F a, F b) { return {_mm512_mask_blend_ps(m.v, b.v, a.v)}
 SB_INLINE F zero_unless(M m, F a) { return {_mm512_maskz_mov_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return {_mm512_maskz_mul_ps(m.v, a.v, b.v)}; }
 SB_INLINE std::uint32_t bits(M m) { return m.v; }
-SB_INLINE F negative_if(M m, F a) {  // the sign bit set where m
-  const __m512i x = _mm512_castps_si512(a.v);
-  return {_mm512_castsi512_ps(_mm512_mask_or_epi32(x, m.v, x, _mm512_set1_epi32(INT32_MIN)))};
-}
+SB_INLINE F min_zero_unless(M m, F a, F b) { return {_mm512_maskz_min_ps(m.v, a.v, b.v)}; }
 SB_INLINE std::uint32_t sign_bits(F a) { return _mm512_movepi32_mask(_mm512_castps_si512(a.v)); }
 SB_INLINE I to_int(F a) { return {_mm512_cvttps_epi32(a.v)}; }
 SB_INLINE F to_float(I a) { return {_mm512_cvtepi32_ps(a.v)}; }
@@ -112,6 +109,7 @@ SB_INLINE F operator*(F a, F b) { return {_mm256_mul_ps(a.v, b.v)}; }
 SB_INLINE F operator/(F a, F b) { return {_mm256_div_ps(a.v, b.v)}; }
 SB_INLINE F fma(F a, F b, F c) { return {_mm256_fmadd_ps(a.v, b.v, c.v)}; }
 SB_INLINE F fnma(F a, F b, F c) { return {_mm256_fnmadd_ps(a.v, b.v, c.v)}; }
+SB_INLINE F fms(F a, F b, F c) { return {_mm256_fmsub_ps(a.v, b.v, c.v)}; }
 SB_INLINE F min(F a, F b) { return {_mm256_min_ps(a.v, b.v)}; }
 SB_INLINE F max(F a, F b) { return {_mm256_max_ps(a.v, b.v)}; }
 SB_INLINE F sqrt(F a) { return {_mm256_sqrt_ps(a.v)}; }
@@ -127,7 +125,7 @@ SB_INLINE F select(M m, F a, F b) { return {_mm256_blendv_ps(b.v, a.v, m.v)}; }
 SB_INLINE F zero_unless(M m, F a) { return {_mm256_and_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return zero_unless(m, a * b); }
 SB_INLINE std::uint32_t bits(M m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(m.v)); }
-SB_INLINE F negative_if(M m, F a) { return {_mm256_or_ps(a.v, _mm256_and_ps(m.v, _mm256_set1_ps(-0.0F)))}; }
+SB_INLINE F min_zero_unless(M m, F a, F b) { return zero_unless(m, min(a, b)); }
 SB_INLINE std::uint32_t sign_bits(F a) { return static_cast<std::uint32_t>(_mm256_movemask_ps(a.v)); }
 SB_INLINE I to_int(F a) { return {_mm256_cvttps_epi32(a.v)}; }
 SB_INLINE F to_float(I a) { return {_mm256_cvtepi32_ps(a.v)}; }
@@ -186,6 +184,7 @@ SB_INLINE F fnma(F a, F b, F c) { return {reinterpret_cast<Vf>(vfmsq_f32(c.v, a.
 SB_INLINE F fma(F a, F b, F c) { return {a.v * b.v + c.v}; }
 SB_INLINE F fnma(F a, F b, F c) { return {c.v - a.v * b.v}; }
 #endif
+SB_INLINE F fms(F a, F b, F c) { return {a.v * b.v - c.v}; }
 SB_INLINE M operator<(F a, F b) { return {a.v < b.v}; }
 SB_INLINE M operator<=(F a, F b) { return {a.v <= b.v}; }
 SB_INLINE M operator>(F a, F b) { return {a.v > b.v}; }
@@ -198,6 +197,7 @@ SB_INLINE I zero_unless(M m, I a) { return {m.v & a.v}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return zero_unless(m, a * b); }
 SB_INLINE F min(F a, F b) { return {a.v < b.v ? a.v : b.v}; }
 SB_INLINE F max(F a, F b) { return {a.v > b.v ? a.v : b.v}; }
+SB_INLINE F min_zero_unless(M m, F a, F b) { return zero_unless(m, min(a, b)); }
 SB_INLINE F sqrt(F a) {
   F r;
   for (int i = 0; i < W; ++i) {
@@ -232,9 +232,6 @@ SB_INLINE std::uint32_t sign_bits(F a) {
 #endif
 }
 SB_INLINE std::uint32_t bits(M m) { return sign_bits({reinterpret_cast<Vf>(m.v)}); }
-SB_INLINE F negative_if(M m, F a) {
-  return {reinterpret_cast<Vf>(reinterpret_cast<Vi>(a.v) | (m.v & set1(INT32_MIN).v))};
-}
 SB_INLINE I to_int(F a) { return {__builtin_convertvector(a.v, Vi)}; }
 SB_INLINE F to_float(I a) { return {__builtin_convertvector(a.v, Vf)}; }
 SB_INLINE I bit_cast_int(F a) { return {reinterpret_cast<Vi>(a.v)}; }
@@ -257,7 +254,6 @@ SB_INLINE F reciprocal(F a) { return set1(1.0F) / a; }
 #endif
 
 #if SPLATBOT_SIMD != 512
-SB_INLINE F fma_if(M m, F a, F b, F c) { return select(m, fma(a, b, c), c); }
 // The nearest integer by adding 1.5 x 2^23; for |q| < 2^22 only, which callers ensure or mask out.
 SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
   whole = q + set1(12582912.0F);

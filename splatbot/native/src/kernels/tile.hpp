@@ -9,7 +9,7 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 inline constexpr int kParts = kBlockPixels / W;  // vectors to a block
 inline constexpr std::size_t kPlane = kTilePixels;
-inline constexpr std::size_t kFinalPlanes = 1 + kRecordChannels;
+inline constexpr std::size_t kFinalSize = kFinalPlanes * kPlane;  // of one tile
 
 struct TileFrame {
   int x0, y0;          // first pixel
@@ -54,11 +54,22 @@ SB_INLINE Local localize(const Record& record, const TileFrame& frame) {
   return {record.l11, record.l21, record.l22, record.l11 * dx + record.l21 * dy, record.l22 * dy, record.lo};
 }
 
+// Depth over a Gaussian's footprint, from the tile's corner.
+struct PlaneDepth {
+  float slope_x, slope_y, corner;
+};
+
+SB_INLINE PlaneDepth plane_depth(const Record& record, const float* channels, const TileFrame& frame) {
+  const float sx = channels[kRecordChannels - 2], sy = channels[kRecordChannels - 1];
+  return {sx, sy, channels[0] - sx * (record.mx - static_cast<float>(frame.x0)) -
+                      sy * (record.my - static_cast<float>(frame.y0))};
+}
+
 struct Alpha {
   F u, w;
-  F power;  // opacity x falloff, before the cap
-  F alpha;
-  M counts;  // at least 1/255
+  F power;     // opacity x falloff, before the cap
+  F alpha;     // 0 below 1/255
+  F left;      // 1 - alpha
 };
 
 // Both passes go through here, so that they decide alike which pixel a Gaussian counts in.
@@ -68,27 +79,26 @@ SB_INLINE Alpha alpha_at(F x, F y, const float* l11, const float* l21, const flo
   a.u = fma(set1(*l11), x, fma(set1(*l21), y, set1(*u0)));
   a.w = fma(set1(*l22), y, set1(*w0));
   const F q = fnma(a.u, a.u, fnma(a.w, a.w, set1(*lo)));
-  a.counts = q >= set1(kLog2AlphaMin);
   a.power = exp2(q);
-  a.alpha = min(a.power, set1(kAlphaMax));
+  a.alpha = min_zero_unless(q >= set1(kLog2AlphaMin), a.power, set1(kAlphaMax));
+  a.left = set1(1.0F) - a.alpha;
   return a;
 }
 
-// Transmittance is kept negative in pixels that are closed (and in those outside the image).
 struct Step {
-  F weight;  // alpha x transmittance
-  M blended;
+  F weight;  // alpha x transmittance, 0 in pixels that are or have just been closed
+  M open;
 };
 
-SB_INLINE Step advance(const Alpha& a, F& transmittance) {
-  const F weight = a.alpha * transmittance;
-  const F next = transmittance - weight;
+// `through` is the product of (1 - alpha) over all Gaussians so far, those that came after the pixel was closed
+// included (0 outside the image): it only falls, so it is above the limit as long as the pixel is open, and the chain
+// of steps, of which each waits for the one before, is one multiplication long.
+SB_INLINE Step advance(const Alpha& a, F& through) {
+  const F next = through * a.left;
   const M open = next > set1(kTransmittanceMin);
-  const M blended = a.counts & open;
-  transmittance = select(blended, next, negative_if(and_not(a.counts, open), transmittance));
-  return {weight, blended};
+  const F weight = mul_zero_unless(open, a.alpha, through);
+  through = next;
+  return {weight, open};
 }
-
-SB_INLINE F magnitude(F a) { return max(a, -a); }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,79 @@
+"""`splatbot serve` as a process: starts, answers, ends; and says what is wrong with its arguments."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.contracts.conftest import wall
+
+COMMAND = (sys.executable, "-m", "splatbot", "serve")
+
+
+@contextmanager
+def serving(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
+    """A running service and a client of it."""
+    process = subprocess.Popen([*COMMAND, *arguments, "--port", "0"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        url = re.search(r"http://\S+", process.stdout.readline())
+        assert url, f"exit code {process.wait(10)}"
+        with httpx.Client(base_url=url[0], timeout=60) as client:
+            yield process, client
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+def _refused(*arguments: str) -> str:
+    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    path = tmp_path / "map.ply"
+    wall().model.save(path)
+    return path
+
+
+@pytest.mark.parametrize("by", ["file", "run folder"])
+def test_a_map_is_served_until_sigterm_which_ends_cleanly(map_file: Path, by: str) -> None:
+    with serving("--map", str(map_file if by == "file" else map_file.parent)) as (process, client):
+        assert client.get("/readyz").json()["maps"] == {"default": 1}
+        answer = client.post("/v1/maps/default/distance", json={"points": [[0, 0, 1.0], [0, 0, 0.5]]}).json()
+        assert answer["inside"] == [True, False]
+        assert client.get("/v1/maps/default").json()["source"] == "map.ply"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+
+
+def test_wrong_arguments_are_named_with_their_fix(map_file: Path, tmp_path: Path) -> None:
+    assert "--map" in _refused()
+    assert "--map" in _refused("--map", str(map_file), "--log", "synthetic:tabletop")
+    assert "none.ply" in _refused("--map", str(tmp_path / "none.ply"))
+    assert "nowhere" in _refused("--log", str(tmp_path / "nowhere"))
+
+
+def test_a_port_that_is_taken_is_named(map_file: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        assert port in _refused("--map", str(map_file), "--port", port)
+
+
+def test_a_damaged_map_is_named(map_file: Path) -> None:
+    map_file.write_bytes(map_file.read_bytes()[:-100])
+    assert "map.ply" in _refused("--map", str(map_file))

@@ -1,0 +1,172 @@
+"""Small random scenes for the tests of the rasterizer, and their comparison with the float64 reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatbot.rasterize import rasterization, rasterization_reference
+
+NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+
+
+@dataclass
+class Scene:
+    """Float32 inputs of a render of C views; ``backgrounds`` may be None."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+    backgrounds: Tensor | None = None
+
+    def render(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
+        """Through the native kernels."""
+        return rasterization(**self._arguments(), render_mode=render_mode, **options)  # type: ignore[arg-type]
+
+    def reference(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
+        """Through the float64 reference."""
+        return self.to(torch.float64).reference_leaves(render_mode, **options)
+
+    def reference_leaves(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
+        """Through the reference, with the tensors as they are, so that gradients reach them."""
+        return rasterization_reference(**self._arguments(), render_mode=render_mode, **options)
+
+    def to(self, dtype: torch.dtype, requires_grad: bool = False) -> Scene:
+        """A copy whose tensors are leaves of ``dtype``."""
+        tensors = {
+            name: None if value is None else value.detach().to(dtype).clone().requires_grad_(requires_grad)
+            for name in NAMES
+            for value in [getattr(self, name)]
+        }
+        return Scene(**tensors, Ks=self.Ks.to(dtype), width=self.width, height=self.height)  # type: ignore[arg-type]
+
+    def _arguments(self) -> dict[str, Any]:
+        return dict(vars(self))
+
+
+@dataclass
+class Comparison:
+    """Native against reference, over the pixels that rounding cannot throw over one of the model's jumps."""
+
+    forward: float  # largest absolute difference of colours, depth and alpha
+    gradients: dict[str, float]  # relative L2 by input
+    near_jumps: int  # pixels left out
+    pixels: int
+
+
+def compare(scene: Scene, render_mode: str, *, jump_margin: float = 2e-5, **options: Any) -> Comparison:
+    """Forward and gradients of a random loss, in the kernels and in float64, from the same float32 inputs.
+
+    A pixel that is nearer than ``jump_margin`` (relative) to a jump of the model (an alpha at 1/255 or at its cap, a
+    transmittance at 1e-4) is given no weight in either; the caller bounds how many there are.
+    """
+    sides = []
+    for render, dtype in ((rasterization_reference, torch.float64), (rasterization, torch.float32)):
+        leaves = scene.to(dtype, requires_grad=True)
+        call: Callable[..., tuple[Tensor, Tensor, Any]] = render
+        image, alpha, meta = call(**leaves._arguments(), render_mode=render_mode, **options)
+        sides.append((leaves, image, alpha, meta))
+    (exact, exact_image, exact_alpha, meta), (native, image, alpha, _) = sides
+    safe = (meta.margins > jump_margin)[..., None]
+    differences = [(exact_image - image.double()).abs() * safe, (exact_alpha - alpha.double()).abs() * safe]
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.randn(exact_image.shape, generator=generator, dtype=torch.float64).float() * safe
+    alpha_weights = torch.randn(exact_alpha.shape, generator=generator, dtype=torch.float64).float() * safe
+    ((exact_image * weights.double()).sum() + (exact_alpha * alpha_weights.double()).sum()).backward()
+    ((image * weights).sum() + (alpha * alpha_weights).sum()).backward()
+    gradients = {}
+    for name in NAMES:
+        want, got = (getattr(side, name) for side in (exact, native))
+        if want is not None and want.grad is not None:
+            gradients[name] = relative_l2(got.grad, want.grad)
+    return Comparison(
+        forward=max(float(d.detach().max()) for d in differences),
+        gradients=gradients,
+        near_jumps=int((~safe).sum()),
+        pixels=safe.numel(),
+    )
+
+
+def relative_l2(got: Tensor | None, want: Tensor) -> float:
+    """‖got - want‖ / ‖want‖ in float64; ‖got‖ where want is zero."""
+    assert got is not None
+    norm = float(want.double().norm())
+    return float((got.double() - want.double()).norm()) / (norm if norm > 0 else 1.0)
+
+
+def pinhole(width: int, height: int, focal: float | None = None, views: int = 1) -> Tensor:
+    """Intrinsics (views, 3, 3) with the principal point at the centre."""
+    f = 0.9 * width if focal is None else focal
+    K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
+    return K.expand(views, 3, 3).contiguous()
+
+
+def hard_scene(seed: int, n: int = 400, views: int = 1) -> Scene:
+    """Random Gaussians of which a tenth each is behind the camera, below 0.1 px, opaque (>= 0.999), off-screen."""
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g)
+
+    width, height, tenth = 75, 53, n // 10
+    means = normal(n, 3) * torch.tensor([1.0, 0.8, 1.0])
+    scales = 10 ** (uniform(n, 3) * 2.5 - 3)
+    opacities = uniform(n)
+    means[:tenth, 2] -= 6.0
+    scales[tenth : 2 * tenth] = 1e-3 * (0.1 + uniform(tenth, 3))  # at 2.5 m and f = 60 px below 0.03 px
+    opacities[2 * tenth : 3 * tenth] = 0.999 + 1e-3 * uniform(tenth)
+    means[3 * tenth : 4 * tenth, 0] += 6.0
+    viewmats = torch.eye(4).repeat(views, 1, 1)
+    for i in range(views):
+        angle = torch.tensor(0.2 + 0.15 * i)
+        viewmats[i, 0, 0] = viewmats[i, 2, 2] = angle.cos()
+        viewmats[i, 0, 2], viewmats[i, 2, 0] = angle.sin(), -angle.sin()
+        viewmats[i, :3, 3] = torch.tensor([0.1 * i, -0.05 * i, 2.5])
+    K = torch.tensor([[60.0, 0.0, 0.55 * width], [0.0, 55.0, 0.45 * height], [0.0, 0.0, 1.0]])
+    return Scene(
+        means=means,
+        quats=normal(n, 4),
+        scales=scales,
+        opacities=opacities,
+        colors=uniform(n, 3),
+        viewmats=viewmats,
+        Ks=K.repeat(views, 1, 1),
+        width=width,
+        height=height,
+        backgrounds=uniform(views, 3),
+    )
+
+
+def one_gaussian(
+    *,
+    mean: tuple[float, float, float] = (0.0, 0.0, 2.0),
+    scale: tuple[float, float, float] = (0.05, 0.05, 0.05),
+    opacity: float = 0.8,
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+    size: tuple[int, int] = (32, 24),
+) -> Scene:
+    """One orange Gaussian before an identity camera."""
+    return Scene(
+        means=torch.tensor([mean]),
+        quats=torch.tensor([quat]),
+        scales=torch.tensor([scale]),
+        opacities=torch.tensor([opacity]),
+        colors=torch.tensor([[1.0, 0.5, 0.25]]),
+        viewmats=torch.eye(4)[None],
+        Ks=pinhole(*size, focal=40.0),
+        width=size[0],
+        height=size[1],
+    )
