@@ -188,7 +188,9 @@ class _Rasterize(torch.autograd.Function):
         need = ctx.needs_input_grad
         geometry = [t.detach() for t in (means, quats, scales, opacities)]
         out = [torch.empty_like(t) if n else None for t, n in zip(geometry, need[:4], strict=True)]
-        grad_colors = torch.zeros(colors.shape, dtype=torch.float32) if need[4] else None
+        # Zeros only where the second view adds to rows that the first did not write.
+        new_colors = torch.empty if colors.ndim == 2 or len(ctx.states) == 1 else torch.zeros
+        grad_colors = new_colors(colors.shape, dtype=torch.float32) if need[4] else None
         grad_viewmats = torch.zeros(viewmats.shape, dtype=torch.float64) if need[5] else None
         grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[6] else None
         if grad_renders is None and grad_alphas is None:
