@@ -96,8 +96,9 @@ def rasterization(
         camera_model: "pinhole".
         channel_chunk: has no effect on the result; accepted for gsplat's sake.
         depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat); "plane" lets it vary over the
-            footprint as that of the plane through the centre and normal to the Gaussian's shortest axis. Its gradient
-            is that of the centre's depth, as if the slope were constant and the depth taken at the centre.
+            footprint as that of the plane through the centre and normal to the Gaussian's shortest axis, faded out as
+            the shortest axis nears the middle one and bounded where the plane is seen edge-on. Its gradient takes
+            the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them.
 
     Returns:
         render_colors (C, H, W, X), render_alphas (C, H, W, 1), meta: means2d, depths, conics, radii, opacities,

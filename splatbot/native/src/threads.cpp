@@ -150,8 +150,8 @@ void ThreadPool::run_erased(std::size_t count, Function function, void* context)
   }
 }
 
-// A scheduler that wakes a sleeping thread likes to put it where the waker runs. With the waker busy for the whole loop,
-// that worker would wait until the loop is over: two threads would be no faster than one.
+// A scheduler that wakes a sleeping thread likes to put it where the waker runs. With the waker busy for the whole
+// loop, that worker would wait until the loop is over: two threads would be no faster than one.
 void ThreadPool::keep_workers_off_this_cpu() {
 #if defined(__linux__)
   const int cpu = sched_getcpu();

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Runs the rasterizer through its hard corners, on every instruction set that this CPU has, for the sanitizers to watch,
-// and checks that the number of threads changes no bit. Prints what it did; exits 1 at the first broken promise.
+// Runs the rasterizer through its hard corners, on every instruction set that this CPU has, for the sanitizers to
+// watch, and checks that the number of threads changes no bit. Prints what it did; exits 1 at the first broken promise.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>

@@ -58,8 +58,8 @@ SB_INLINE void load_lanes(const float* rows, std::size_t first, int n, F (&out)[
 }
 
 // Change of depth per pixel over a Gaussian's footprint if its matter lies in the plane through its centre whose
-// normal n is its flattest axis: the ray of pixel (u, v) meets that plane at z(u, v), and d z/d u = -z^2 n_x / (fx n.p).
-// A Gaussian with no flattest axis has no plane, so the slope fades with (least scale / middle scale)^2; it is bounded
+// normal n is its flattest axis: the ray of pixel (u, v) meets that plane at z(u, v), and d z/d u is
+// -z^2 n_x / (fx n.p). A Gaussian with no flattest axis has no plane, so the slope fades with (least scale / middle scale)^2; it is bounded
 // where the plane is seen edge-on: over one footprint, depth varies by no more than twice the Gaussian's own.
 SB_INLINE void plane_slopes(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, F (&slope)[2]) {
   F s[3];

@@ -56,7 +56,6 @@ SB_INLINE F zero_unless(M m, F a) { return {_mm512_maskz_mov_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return {_mm512_maskz_mul_ps(m.v, a.v, b.v)}; }
 SB_INLINE std::uint32_t bits(M m) { return m.v; }
 SB_INLINE F min_zero_unless(M m, F a, F b) { return {_mm512_maskz_min_ps(m.v, a.v, b.v)}; }
-SB_INLINE std::uint32_t sign_bits(F a) { return _mm512_movepi32_mask(_mm512_castps_si512(a.v)); }
 SB_INLINE I to_int(F a) { return {_mm512_cvttps_epi32(a.v)}; }
 SB_INLINE F to_float(I a) { return {_mm512_cvtepi32_ps(a.v)}; }
 SB_INLINE I bit_cast_int(F a) { return {_mm512_castps_si512(a.v)}; }
@@ -81,11 +80,6 @@ SB_INLINE F reciprocal(F a) {  // one Newton step from 14 bits
   const __m512 r = _mm512_rcp14_ps(a.v);
   return {_mm512_mul_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(2.0F)))};
 }
-SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
-  whole = {_mm512_roundscale_ps(q.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)};
-  fraction = q - whole;
-}
-SB_INLINE F scale_exponent(F a, F whole) { return {_mm512_scalef_ps(a.v, whole.v)}; }
 
 #elif SPLATBOT_SIMD == 256
 
@@ -126,7 +120,6 @@ SB_INLINE F zero_unless(M m, F a) { return {_mm256_and_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return zero_unless(m, a * b); }
 SB_INLINE std::uint32_t bits(M m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(m.v)); }
 SB_INLINE F min_zero_unless(M m, F a, F b) { return zero_unless(m, min(a, b)); }
-SB_INLINE std::uint32_t sign_bits(F a) { return static_cast<std::uint32_t>(_mm256_movemask_ps(a.v)); }
 SB_INLINE I to_int(F a) { return {_mm256_cvttps_epi32(a.v)}; }
 SB_INLINE F to_float(I a) { return {_mm256_cvtepi32_ps(a.v)}; }
 SB_INLINE I bit_cast_int(F a) { return {_mm256_castps_si256(a.v)}; }
@@ -259,7 +252,9 @@ SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
   whole = q + set1(12582912.0F);
   fraction = q - (whole - set1(12582912.0F));
 }
-SB_INLINE F scale_exponent(F a, F whole) { return bit_cast_float(bit_cast_int(a) + shift_left<23>(bit_cast_int(whole))); }
+SB_INLINE F scale_exponent(F a, F whole) {
+  return bit_cast_float(bit_cast_int(a) + shift_left<23>(bit_cast_int(whole)));
+}
 #endif
 
 SB_INLINE F operator-(F a) { return set1(0.0F) - a; }
