@@ -1,0 +1,1 @@
+"""The HTTP service: reads snapshots of maps and answers questions about them."""

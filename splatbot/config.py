@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -22,20 +22,68 @@ class _Section(BaseModel):
 class TrackingConfig(_Section):
     """Camera tracking."""
 
-    min_depth: float = Field(0.2, gt=0, description="nearer depth is ignored: a gripper, or below the sensor's range [m]")
-    max_depth: float = Field(6.0, gt=0, description="farther depth is ignored [m]")
-    max_width: int = Field(640, ge=64, description="finest width used for alignment [px]")
-    n_levels: int = Field(3, ge=1, le=6, description="levels of the pyramid")
-    n_pixels: int = Field(4800, ge=100, description="pixels per pyramid level in direct alignment: accuracy for time")
-    n_features: int = Field(2000, ge=100, description="ORB keypoints per frame")
+    min_depth: float = Field(default=0.2, gt=0, description="nearer is ignored: a gripper, or too near to measure [m]")
+    max_depth: float = Field(default=6.0, gt=0, description="farther depth is ignored [m]")
+    max_width: int = Field(default=640, ge=64, description="finest width used for alignment [px]")
+    n_levels: int = Field(default=3, ge=1, le=6, description="levels of the pyramid")
+    n_pixels: int = Field(default=4800, ge=100, description="pixels per level in alignment: accuracy for time")
+    iterations: int = Field(default=5, ge=1, description="Gauss-Newton steps per level: accuracy for time")
+    reference_keyframes: int = Field(default=2, ge=1, description="keyframes that a frame is aligned to at once")
+    sigma_gray: float = Field(default=0.02, gt=0, description="noise of a grey value in 0..1")
+    sigma_depth_floor: float = Field(default=1e-3, gt=0, description="σ_z = floor + quad z² [m]")
+    sigma_depth_quad: float = Field(default=2e-3, ge=0, description="σ_z = floor + quad z² [1/m]")
+    gate: float = Field(default=0.05, gt=0, description="larger depth differences are another surface [m]")
+    dense_weight: float = Field(
+        default=0.03,
+        gt=0,
+        le=1,
+        description="weight of a dense residual against a feature's: neighbours are correlated",
+    )
+    features: Literal["always", "needed"] = Field(
+        default="always", description="match ORB features on every frame, or only when motion or residual is large"
+    )
+    n_features: int = Field(default=2000, ge=100, description="ORB keypoints per frame: accuracy for time")
+    match_keyframes: int = Field(default=3, ge=1, description="keyframes nearest to the prediction that are matched")
+    features_motion: float = Field(default=0.03, ge=0, description="predicted motion that calls for features [m]")
+    features_rotation: float = Field(default=0.05, ge=0, description="predicted rotation that calls for features [rad]")
+    min_valid: float = Field(default=0.02, ge=0, le=1, description="a first frame with less valid depth is refused")
+    min_overlap: float = Field(default=0.15, ge=0, le=1, description="a smaller share of the reference in view: lost")
+    min_inliers: float = Field(default=0.3, ge=0, le=1, description="a smaller share of residuals within 3 σ: lost")
+    min_eigen_ratio: float = Field(
+        default=1e-3, ge=0, description="a smaller ratio of the translation's information: degraded"
+    )
 
 
 class MappingConfig(_Section):
     """Fusion into Gaussians."""
 
-    max_gaussians: int = Field(150_000, ge=100, description="hard cap on the map's size")
-    refine_iterations: int = Field(8, ge=0, description="optimiser steps per keyframe: accuracy for time")
-    holdout_every: int = Field(8, ge=0, description="every n-th frame is tracked, not mapped, and scored; 0: none")
+    max_gaussians: int = Field(default=150_000, ge=100, description="hard cap on the map's size: accuracy for time")
+    max_width: int = Field(default=640, ge=64, description="width of the images that are fused [px]")
+    stride: int = Field(default=2, ge=1, description="one new Gaussian per so many pixels each way: accuracy for time")
+    footprint: float = Field(default=1.0, gt=0, description="size of a new Gaussian over the grid's half spacing")
+    thickness: float = Field(default=0.2, gt=0, le=1, description="thickness of a new Gaussian over its size")
+    new_opacity: float = Field(default=0.8, gt=0, lt=1, description="opacity of a new Gaussian")
+    new_alpha: float = Field(default=0.6, ge=0, le=1, description="pixels covered less than this are unexplained")
+    new_depth: float = Field(default=0.04, gt=0, description="depths that differ by this share are different surfaces")
+    solid_alpha: float = Field(default=0.9, ge=0, le=1, description="pixels covered more than this lend their depth")
+    keyframe_translation: float = Field(default=0.04, gt=0, description="a view this far from all others is new [m]")
+    keyframe_rotation: float = Field(
+        default=0.07, gt=0, description="a view turned so far from all others is new [rad]"
+    )
+    refine_iterations: int = Field(default=8, ge=0, description="optimiser steps per keyframe: accuracy for time")
+    final_iterations: int = Field(default=100, ge=0, description="optimiser steps once the log has ended")
+    window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")
+    depth_weight: float = Field(default=0.5, ge=0, description="weight of relative depth against colour")
+    rate_means: float = Field(default=2e-4, ge=0, description="learning rate of positions [m]")
+    rate_quats: float = Field(default=1e-3, ge=0, description="learning rate of orientations")
+    rate_scales: float = Field(default=5e-3, ge=0, description="learning rate of log-scales")
+    rate_opacities: float = Field(default=2e-2, ge=0, description="learning rate of opacity logits")
+    rate_sh: float = Field(default=2e-2, ge=0, description="learning rate of colour coefficients")
+    min_opacity: float = Field(default=0.05, ge=0, le=1, description="fainter Gaussians are pruned")
+    max_scale: float = Field(default=0.5, gt=0, description="larger Gaussians are pruned [m]")
+    holdout_every: int = Field(
+        default=8, ge=0, description="every n-th frame is tracked, not mapped, and scored; 0: none"
+    )
 
 
 class Config(_Section):
@@ -43,7 +91,7 @@ class Config(_Section):
 
     tracking: TrackingConfig = Field(default_factory=lambda: TrackingConfig())
     mapping: MappingConfig = Field(default_factory=lambda: MappingConfig())
-    seed: int = Field(0, description="seed of every random choice")
+    seed: int = Field(default=0, description="seed of every random choice")
 
     def to_yaml(self) -> str:
         """The configuration in force, as YAML that :func:`load_config` reads back."""

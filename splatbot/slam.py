@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from splatbot.config import Config
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
-
-Verdict = Literal["ok", "degraded", "lost"]
+from splatbot.mapping.mapper import Mapper
+from splatbot.tracking.health import Verdict
+from splatbot.tracking.prepare import PreparedFrame, prepare
+from splatbot.tracking.tracker import PoseEstimate, Tracker
 
 
 @dataclass(frozen=True)
@@ -40,20 +42,56 @@ class FrameResult:
 
 
 class Slam:
-    """Tracks and maps a stream; ``results`` holds one entry per processed frame."""
+    """Tracks and maps a stream; ``results`` holds one entry per processed frame.
+
+    Everything runs in the calling thread in a fixed order, so the same frames give the same map, bit for bit.
+    """
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
         self.results: list[FrameResult] = []
+        self._tracker = Tracker(self.config.tracking)
+        self._mapper = Mapper(self.config)
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """Track ``frame`` and, unless ``hold_out``, fuse it. Never raises for a frame that cannot be tracked."""
-        raise NotImplementedError
+        start = time.perf_counter()
+        prepared = prepare(frame, self.config.tracking)
+        prepared_at = time.perf_counter()
+        estimate = self._track(prepared)
+        tracked_at = time.perf_counter()
+        keyframe = not hold_out and estimate.verdict != "lost" and self._mapper.wants(estimate.T_world_camera)
+        if keyframe:
+            self._map(prepared, estimate)
+        stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
+        stage_ms["mapping"] = 1e3 * (time.perf_counter() - tracked_at)
+        result = FrameResult(
+            index=frame.index,
+            stamp=frame.stamp,
+            T_world_camera=None if estimate.verdict == "lost" else estimate.T_world_camera,
+            verdict=estimate.verdict,
+            reasons=estimate.reasons,
+            stage=estimate.stage,
+            stage_ms=stage_ms,
+            keyframe=keyframe,
+            gaussians=len(self._mapper.model),
+        )
+        self.results.append(result)
+        return result
 
     def finish(self) -> None:
         """Spend the last refinement on the map once the stream has ended."""
-        raise NotImplementedError
+        self._mapper.finish()
 
     def snapshot(self) -> Snapshot:
         """The map as it is now, immutable."""
-        raise NotImplementedError
+        return self._mapper.snapshot()
+
+    def _track(self, prepared: PreparedFrame) -> PoseEstimate:
+        if self._mapper.keyframes:
+            return self._tracker.track(prepared, self._mapper.keyframes)
+        return self._tracker.start(prepared)
+
+    def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
+        features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)
+        self._mapper.insert(prepared, estimate.T_world_camera, features)

@@ -1,0 +1,94 @@
+"""The `splatbot` command. Each subcommand is one module here, imported only when it is asked for."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+
+class _Command(NamedTuple):
+    module: str
+    function: str
+    summary: str
+
+
+# The summaries stand here, not in the modules: `splatbot --help` must not wait for torch or open3d.
+COMMANDS = {
+    "map": _Command("splatbot.cli.map", "map_log_command", "Turn an RGB-D log into a Gaussian map and a run folder."),
+    "eval": _Command("splatbot.cli.eval", "eval_run", "Score a run again: trajectory error and held-out views."),
+    "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
+    "info": _Command("splatbot.cli.info", "info", "Say what is in a map, a log or a run."),
+    "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
+    "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
+}
+
+_DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers a robot's questions.
+
+`splatbot COMMAND --help` explains a command with examples. Every command takes --debug (or SPLATBOT_DEBUG=1),
+which adds the traceback to an error. Exit codes: 0 done, 1 failed, 2 wrong input, 130 interrupted."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code. Errors of :mod:`splatbot.errors` become one line on stderr."""
+    from splatbot.errors import SplatbotError
+
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words or os.environ.get("SPLATBOT_DEBUG", "") not in ("", "0")
+    words = [word for word in words if word != "--debug"]
+    if words == ["--version"]:
+        from splatbot import __version__
+
+        print(__version__)
+        return 0
+    try:
+        return int(_dispatch(words) or 0)
+    except SplatbotError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `splatbot info ... | head` is no error; Python must not flush to the dead pipe again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _dispatch(words: list[str]) -> Any:
+    import tyro
+
+    if words and words[0] in COMMANDS:
+        command = COMMANDS[words[0]]
+        function = getattr(importlib.import_module(command.module), command.function)
+        return tyro.cli(
+            function,
+            prog=f"splatbot {words[0]}",
+            description=_description(function),
+            args=words[1:],
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    # No known command: tyro prints the help, or names the nearest command, and leaves.
+    outline = {name: _outline(command) for name, command in COMMANDS.items()}
+    return tyro.extras.subcommand_cli_from_dict(
+        outline, prog="splatbot", description=_DESCRIPTION, args=words or ["--help"]
+    )
+
+
+def _description(function: Callable[..., Any]) -> str:
+    """The docstring without its "Args:"; tyro alone would drop the examples."""
+    return inspect.cleandoc(function.__doc__ or "").split("\nArgs:")[0].rstrip()
+
+
+def _outline(command: _Command) -> Callable[[], None]:
+    def outline() -> None:
+        raise AssertionError("only its docstring is used")
+
+    outline.__doc__ = command.summary
+    return outline

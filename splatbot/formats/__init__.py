@@ -1,0 +1,47 @@
+"""Map and trajectory files. Readers go by content, writers by suffix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatbot.errors import FormatError
+
+if TYPE_CHECKING:  # torch takes seconds to import, and trajectories need none of it
+    from splatbot.gaussians import GaussianModel
+
+__all__ = ["load_gaussians", "save_gaussians"]
+
+_KNOWN = "3DGS PLY (.ply)"
+
+
+def load_gaussians(path: str | Path) -> GaussianModel:
+    """Read a map of any supported format.
+
+    Raises:
+        FormatError: the file is missing, damaged or of an unknown format.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            magic = file.read(4)
+    except OSError as error:
+        raise FormatError(f"cannot be read ({error.strerror}).", file=path, hint="give a map file") from error
+    if magic[:3] == b"ply":
+        from splatbot.formats.ply import load_ply
+
+        return load_ply(path)
+    what = f"begins with {magic!r}" if magic else "is empty"
+    raise FormatError(f"{what}: of no known format.", file=path, field="format", hint=f"known formats: {_KNOWN}")
+
+
+def save_gaussians(model: GaussianModel, path: str | Path) -> None:
+    """Write a map in the format that the suffix names; ``path`` is replaced only once the file is whole.
+
+    Raises:
+        FormatError: the suffix is unknown.
+    """
+    if Path(path).suffix.lower() != ".ply":
+        raise FormatError("the suffix names no known format.", file=path, field="format", hint=f"use {_KNOWN}")
+    from splatbot.formats.ply import save_ply
+
+    save_ply(model, path)

@@ -1,0 +1,51 @@
+"""Recorded and generated RGB-D streams."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from splatbot.errors import LogError
+from splatbot.logs.base import Log
+from splatbot.logs.calibration import Calibration
+from splatbot.logs.record import record
+from splatbot.logs.replica import ReplicaLog
+from splatbot.logs.tum import Missing, TumLog
+
+__all__ = ["Calibration", "Log", "open_log", "record"]
+
+_LOOKED_FOR = (
+    "looked for rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica); `synthetic:tabletop` needs no files"
+)
+
+
+def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None, missing: Missing = "auto") -> Log:
+    """Open the log that ``uri`` names; frames are decoded only when read.
+
+    Args:
+        uri: a folder in TUM or Replica layout, or `synthetic:SCENE?frames=N&width=W&height=H&arc=DEG&rate=HZ`.
+        camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration, instead of the log's own.
+        missing: what a colour image without depth means in a TUM log, see :class:`splatbot.logs.tum.TumLog`.
+
+    Raises:
+        LogError: nothing there, of unknown layout, or damaged.
+        CameraError: there are no usable intrinsics.
+    """
+    if str(uri).startswith("synthetic:"):
+        return _open_synthetic(str(uri), camera)
+    folder = Path(uri)
+    if not folder.is_dir():
+        what = "is a file, logs are folders" if folder.exists() else "does not exist"
+        raise LogError(f"{what}.", file=folder, field="log", hint="give the folder that holds the recording")
+    if any((folder / name).exists() for name in ("rgb.txt", "depth.txt")):
+        return TumLog(folder, camera=camera, missing=missing)
+    if (folder / "results").is_dir() and (folder / "traj.txt").exists():
+        return ReplicaLog(folder, camera=camera)
+    raise LogError("holds no log of a known layout.", file=folder, field="log", hint=_LOOKED_FOR)
+
+
+def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:
+    from splatbot.logs.synthetic import SyntheticLog  # imports open3d, which takes a second
+
+    if camera is not None:
+        raise LogError("a synthetic log has its own camera.", file=uri, field="camera", hint="leave --camera out")
+    return SyntheticLog(uri)

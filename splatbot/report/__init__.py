@@ -1,0 +1,5 @@
+"""A run as one self-contained HTML page."""
+
+from splatbot.report.page import report_html
+
+__all__ = ["report_html"]

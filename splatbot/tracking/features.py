@@ -55,7 +55,9 @@ def detect(rgb: NDArray[np.uint8], depth: Image, camera: Camera, n_features: int
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
     pixels = np.array([k.pt for k in keypoints], dtype=np.float32)
     z = _depth_at(depth, pixels)
-    rays = np.stack([(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(z))], 1)
+    rays = np.stack(
+        [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(z))], 1
+    )
     return Features(pixels, descriptors, rays * z[:, None])
 
 

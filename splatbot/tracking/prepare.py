@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -69,20 +70,34 @@ def halve(level: Level) -> Level:
     height, width = level.gray.shape[0] // 2, level.gray.shape[1] // 2
     crop = level.gray[: 2 * height, : 2 * width]
     gray = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
-    blocks = level.depth[: 2 * height, : 2 * width].reshape(height, 2, width, 2).transpose(1, 3, 0, 2).reshape(4, height, width)
-    nearest = np.where(blocks > 0, blocks, np.inf).min(axis=0)
-    same = (blocks > 0) & (blocks <= 1.05 * nearest)
-    count = same.sum(axis=0)
-    depth = np.where(count > 0, (blocks * same).sum(axis=0) / np.maximum(count, 1), 0.0).astype(np.float32)
-    camera = level.camera.resized(width, height) if level.gray.shape == (2 * height, 2 * width) else Camera(
-        fx=level.camera.fx / 2,
-        fy=level.camera.fy / 2,
-        cx=(level.camera.cx + 0.5) / 2 - 0.5,
-        cy=(level.camera.cy + 0.5) / 2 - 0.5,
-        width=width,
-        height=height,
-    )
-    return Level(gray, depth, camera)
+    c = level.camera
+    camera = Camera(c.fx / 2, c.fy / 2, (c.cx + 0.5) / 2 - 0.5, (c.cy + 0.5) / 2 - 0.5, width, height)
+    return Level(gray, halve_depth(level.depth), camera)
+
+
+def halve_depth(depth: Image) -> Image:
+    """Half the size of a depth image [m]: the mean over the nearest surface of each 2x2 block, 0 where none is valid."""
+    height, width = depth.shape[0] // 2, depth.shape[1] // 2
+    corners = [depth[v : 2 * height : 2, u : 2 * width : 2] for v in (0, 1) for u in (0, 1)]
+    nearest = np.full((height, width), np.inf, np.float32)
+    for corner in corners:
+        nearest = np.minimum(nearest, np.where(corner > 0, corner, np.float32(np.inf)))
+    total = np.zeros((height, width), np.float32)
+    count = np.zeros((height, width), np.float32)
+    for corner in corners:
+        same = (corner > 0) & (corner <= np.float32(1.05) * nearest)
+        total += np.where(same, corner, 0)
+        count += same
+    return total / np.maximum(count, 1)
+
+
+def with_depth(levels: Sequence[Level], depth: Image) -> tuple[Level, ...]:
+    """The same pyramid with another depth (H, W) [m] on its finest level, and what follows from it on the others."""
+    out = []
+    for level in levels:
+        out.append(Level(level.gray, depth, level.camera))
+        depth = halve_depth(depth)
+    return tuple(out)
 
 
 def normals_of(depth: Image, camera: Camera) -> Image:

@@ -5,4 +5,5 @@
 #include <nanobind/nanobind.h>
 
 void define_align(nanobind::module_& m);
+void define_mahalanobis(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);

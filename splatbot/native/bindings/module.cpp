@@ -5,5 +5,6 @@ NB_MODULE(_native, m) {
   m.doc() = "splatbot's C++ core";
   nanobind::set_leak_warnings(false);  // a render kept until the interpreter exits is no leak
   define_align(m);
+  define_mahalanobis(m);
   define_rasterize(m);
 }

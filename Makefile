@@ -1,0 +1,73 @@
+# Every target sets up what it needs: system libraries, the virtual environment .venv, torch, the native module.
+# Variables: PYTHON (the Python to build .venv with), TORCH_INDEX_URL (e.g. https://download.pytorch.org/whl/cpu),
+#            MAP, HOST, PORT (make serve), PYTEST_ARGS (make test, make test-long).
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+MAKEFLAGS += --no-print-directory
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+TORCH_INDEX_URL ?=
+MAP ?= runs/demo/map.ply
+HOST ?= 127.0.0.1
+PORT ?= 8000
+PYTEST_ARGS ?=
+
+TORCH_STAMP := $(VENV)/.torch
+INSTALL_STAMP := $(VENV)/.installed
+NATIVE_SOURCES := $(shell find splatbot/native -name '*.cpp' -o -name '*.hpp' -o -name '*.h' -o -name CMakeLists.txt)
+
+.PHONY: help
+help: ## this list
+	@echo "splatbot: RGB-D streams become a map of 3D Gaussians, on CPUs"
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-11s %s\n", $$1, $$2 }'
+
+.PHONY: demo
+demo: $(INSTALL_STAMP) ## record a synthetic table top, map it, serve it, ask it; then see runs/demo/report.html
+	$(BIN)/splatbot demo --out runs/demo
+
+.PHONY: serve
+serve: $(INSTALL_STAMP) ## HTTP service on a map (MAP=file.ply HOST=127.0.0.1 PORT=8000)
+	@test -e "$(MAP)" || { echo "error: $(MAP) does not exist. Fix: run 'make demo' first, or give MAP=path/to/map.ply"; exit 2; }
+	$(BIN)/splatbot serve --map $(MAP) --host $(HOST) --port $(PORT)
+
+.PHONY: test
+test: $(INSTALL_STAMP) ## the test suite without its long part (at most 12 minutes on 2 cores)
+	$(BIN)/python -m pytest -m "not long" $(PYTEST_ARGS)
+
+.PHONY: test-long
+test-long: $(INSTALL_STAMP) ## the long tests: end-to-end on real logs, load, sanitizers, wheel and sdist (at most 45 minutes)
+	$(BIN)/python -m pytest -m long $(PYTEST_ARGS)
+
+.PHONY: check
+check: $(INSTALL_STAMP) ## ruff, mypy, layering contract, and the native code with warnings as errors
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/cmake -S splatbot/native -B build/werror -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja \
+	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DSPLATBOT_WERROR=ON
+	$(BIN)/cmake --build build/werror
+
+.PHONY: clean
+clean: ## remove the virtual environment, build products and caches; runs/ is kept
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# torch comes first and alone, so that no later dependency decides which build of it is installed.
+$(TORCH_STAMP): .ci/system-deps.sh .ci/find-python.sh
+	@python=$$(.ci/find-python.sh) && .ci/system-deps.sh "$$python" && \
+	  { [ -x $(BIN)/python ] || { echo "creating $(VENV) with $$python"; "$$python" -m venv $(VENV); }; }
+	$(PIP) install --upgrade pip
+	$(PIP) install 'torch>=2.6,<2.14' $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
+	@touch $@
+
+# The build tools come before the package, which is then built without isolation: CMake's cache in build/ survives, and
+# a change of one C++ file costs one compilation.
+$(INSTALL_STAMP): $(TORCH_STAMP) pyproject.toml $(NATIVE_SOURCES)
+	$(PIP) install 'scikit-build-core>=0.11' 'nanobind>=2.4' 'cmake>=3.26' 'ninja>=1.11'
+	$(PIP) install --no-build-isolation --editable '.[dev]'
+	@touch $@

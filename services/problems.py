@@ -1,0 +1,114 @@
+"""Every error leaves the service as application/problem+json (RFC 9457)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from splatbot.errors import InputError, SplatbotError
+
+MEDIA_TYPE = "application/problem+json"
+_MAX_ERRORS = 10  # of a request with a hundred thousand wrong points, ten tell enough
+
+
+class TooLargeError(InputError):
+    """A request asks for more than one answer may cost."""
+
+    http_status = 413
+
+
+class MapNotReadyError(SplatbotError):
+    """The map exists and has no published state yet."""
+
+    http_status = 503
+
+
+class ProblemResponse(JSONResponse):
+    """A JSON response of the problem media type."""
+
+    media_type = MEDIA_TYPE
+
+
+def problem(
+    status: int,
+    detail: str,
+    *,
+    kind: str | None = None,
+    headers: Mapping[str, str] | None = None,
+    map_version: int | None = None,
+    **more: Any,
+) -> ProblemResponse:
+    """A problem document.
+
+    Args:
+        status: HTTP status.
+        detail: what is wrong, in one sentence.
+        kind: the end of the ``type`` URN; None where the status says it all ("about:blank").
+        map_version: the state of the map that was asked, where one was.
+        more: extension members; None is left out.
+    """
+    body = {
+        "type": f"urn:splatbot:problem:{kind}" if kind else "about:blank",
+        "title": HTTPStatus(status).phrase,
+        "status": status,
+        "detail": detail,
+        "map_version": map_version,
+        **more,
+    }
+    content = {name: value for name, value in body.items() if value is not None}
+    return ProblemResponse(content, status_code=status, headers=dict(headers or {}))
+
+
+def install_problem_handlers(app: FastAPI) -> None:
+    """Let every exception of ``app`` leave as a problem document."""
+    app.add_exception_handler(SplatbotError, _on_splatbot_error)
+    app.add_exception_handler(RequestValidationError, _on_invalid_request)
+    app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(Exception, _on_unexpected_error)
+
+
+def _on_splatbot_error(request: Request, error: Exception) -> ProblemResponse:
+    assert isinstance(error, SplatbotError)
+    kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", type(error).__name__.removesuffix("Error")).lower()
+    # Of a file only its name: where the server keeps its maps is nobody's business.
+    file = Path(error.file).name if error.file else None
+    return problem(
+        error.http_status,
+        f"{error.field}: {error.message}" if error.field else error.message,
+        kind=kind,
+        headers={"Retry-After": "1"} if error.http_status == 503 else None,
+        map_version=_version(request),
+        code=error.code,
+        file=file,
+        field=error.field,
+        hint=error.hint,
+    )
+
+
+def _on_invalid_request(request: Request, error: Exception) -> ProblemResponse:
+    assert isinstance(error, RequestValidationError)
+    found = error.errors()
+    errors = [{"field": ".".join(map(str, e["loc"])), "message": e["msg"]} for e in found[:_MAX_ERRORS]]
+    detail = f"{errors[0]['field']}: {errors[0]['message']}" + (f" (and {len(found) - 1} more)" if found[1:] else "")
+    return problem(422, detail, kind="validation", map_version=_version(request), errors=errors)
+
+
+def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
+    assert isinstance(error, HTTPException)
+    return problem(error.status_code, str(error.detail), headers=error.headers, map_version=_version(request))
+
+
+def _on_unexpected_error(request: Request, _error: Exception) -> ProblemResponse:
+    return problem(500, "The service failed on this request; its log says why.", map_version=_version(request))
+
+
+def _version(request: Request) -> int | None:
+    return getattr(request.state, "map_version", None)

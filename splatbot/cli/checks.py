@@ -1,0 +1,161 @@
+"""What `splatbot doctor` looks at. Each check gives lines of (state, what, detail, how to mend it)."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Literal
+
+EGL_TIMEOUT_S = 60.0
+SELF_CHECK_BOUND = 1e-4
+_APT = "apt-get install libegl1 libgl1 libegl-mesa0 libgl1-mesa-dri"
+
+# Distributions, any of which will do, and what is lost without them ("": nothing works).
+_PACKAGES: tuple[tuple[tuple[str, ...], str], ...] = (
+    (("torch",), ""),
+    (("numpy",), ""),
+    (("opencv-contrib-python-headless", "opencv-contrib-python"), ""),
+    (("open3d",), "synthetic logs"),
+    (("mujoco",), "the simulation"),
+    (("roboticstoolbox-python",), "robot models"),
+    (("depthai",), "OAK cameras"),
+    (("pyserial",), "serial grippers"),
+    (("fastapi",), "the service"),
+)
+
+# Runs apart: a broken graphics driver may crash or hang the process that asks for it.
+_EGL_PROGRAM = """
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 2'/><geom type='sphere' size='.3'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 48, 64) as renderer:
+    renderer.update_scene(data)
+    image = renderer.render()
+print("rendered" if image.any() else "black")
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's answer."""
+
+    state: Literal["ok", "warn", "fail"]
+    what: str
+    detail: str
+    fix: str = ""
+
+
+def all_checks() -> list[Callable[[], list[Finding]]]:
+    """The checks in the order in which they are shown."""
+    return [check_python, check_packages, check_native, check_rasterizer, check_egl, check_serial]
+
+
+def check_python() -> list[Finding]:
+    """The interpreter and the machine."""
+    version = platform.python_version()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    machine = Finding("ok", "platform", f"{platform.system()} {platform.machine()}, {cores} cores")
+    if sys.version_info < (3, 11):
+        return [Finding("fail", "python", version, "use Python 3.11 or later"), machine]
+    return [Finding("ok", "python", version), machine]
+
+
+def check_packages() -> list[Finding]:
+    """Versions of the libraries, read without importing them."""
+    return [_check_package(names, loss) for names, loss in _PACKAGES]
+
+
+def _check_package(names: tuple[str, ...], loss: str) -> Finding:
+    for name in names:
+        try:
+            return Finding("ok", name, metadata.version(name))
+        except metadata.PackageNotFoundError:
+            continue
+    fix = f"pip install {names[0]}"
+    return (
+        Finding("warn", names[0], f"missing: without it no {loss}", fix)
+        if loss
+        else Finding("fail", names[0], "missing", fix)
+    )
+
+
+def check_native() -> list[Finding]:
+    """The compiled kernels: present, and which of them this processor gets."""
+    try:
+        from splatbot import _native
+    except ImportError as error:
+        return [Finding("fail", "native module", str(error), "build it: pip install -e . (or make test)")]
+    return [Finding("ok", "native module", f"kernels {_native.isa()}, {_native.num_threads()} threads")]
+
+
+def check_rasterizer() -> list[Finding]:
+    """A few Gaussians rendered by the native kernels and by the float64 reference."""
+    try:
+        error = rasterizer_error()
+    except Exception as problem:  # whatever it is, the doctor names it and looks on
+        return [Finding("fail", "rasterizer", f"{type(problem).__name__}: {problem}", "rebuild: pip install -e .")]
+    detail = f"differs from the float64 reference by {error:.1e}"
+    if error > SELF_CHECK_BOUND:
+        return [Finding("fail", "rasterizer", detail, "try SPLATBOT_ISA=v2; if that helps, report this processor")]
+    return [Finding("ok", "rasterizer", detail)]
+
+
+def rasterizer_error() -> float:
+    """Largest difference of colour between kernels and reference for eight smooth Gaussians, 0..1."""
+    import torch
+
+    from splatbot.rasterize import rasterization
+    from splatbot.rasterize.reference import rasterization_reference
+
+    n, turn = 8, torch.arange(8) * (2 * torch.pi / 8)
+    scene = {
+        "means": torch.stack([0.4 * turn.cos(), 0.3 * turn.sin(), 2.0 + 0.1 * torch.arange(n)], dim=1),
+        "quats": torch.stack([turn.cos(), turn.sin(), 0.3 * torch.ones(n), 0.1 * turn], dim=1),
+        "scales": torch.tensor([0.08, 0.05, 0.02]).expand(n, 3).contiguous(),
+        "opacities": torch.linspace(0.3, 0.9, n),
+        "colors": torch.stack([turn / 7, 1 - turn / 7, 0.5 * torch.ones(n)], dim=1).clamp(0, 1),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[80.0, 0.0, 32.0], [0.0, 80.0, 24.0], [0.0, 0.0, 1.0]]]),
+    }
+    fast = rasterization(**scene, width=64, height=48)[0]
+    exact = rasterization_reference(**{k: v.double() for k, v in scene.items()}, width=64, height=48)[0]
+    return float((fast.double() - exact).abs().max())
+
+
+def check_egl() -> list[Finding]:
+    """Rendering without a display, as the simulated camera needs it."""
+    try:
+        answer = subprocess.run(
+            [sys.executable, "-c", _EGL_PROGRAM],
+            env={**os.environ, "MUJOCO_GL": "egl"},
+            capture_output=True,
+            text=True,
+            timeout=EGL_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return [Finding("warn", "EGL", f"no picture within {EGL_TIMEOUT_S:.0f} s", f"as root: {_APT}")]
+    if answer.returncode == 0 and "rendered" in answer.stdout:
+        return [Finding("ok", "EGL", "MuJoCo renders without a display")]
+    last = (answer.stderr.strip() or answer.stdout.strip() or f"exit {answer.returncode}").splitlines()[-1]
+    return [Finding("warn", "EGL", f"no simulated camera: {last}", f"as root: {_APT}")]
+
+
+def check_serial() -> list[Finding]:
+    """Ports at which a gripper could be."""
+    try:
+        from serial.tools import list_ports
+    except ImportError:
+        return [Finding("warn", "serial ports", "pyserial is missing", "pip install pyserial")]
+    ports = [port.device for port in list_ports.comports()]
+    closed = [port for port in ports if not os.access(port, os.R_OK | os.W_OK)]
+    if closed:
+        return [Finding("warn", "serial ports", f"no access to {', '.join(closed)}", "usermod -aG dialout $USER")]
+    return [Finding("ok", "serial ports", ", ".join(ports) or "none")]

@@ -1,0 +1,170 @@
+"""`splatbot demo`: a synthetic table top from camera to answer, checked against the scene's truth."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import SplatbotError
+from splatbot.frame import Frame
+from splatbot.geometry import transform_points
+from splatbot.logs import Log, open_log
+from splatbot.logs.record import record
+from splatbot.run import Progress, map_log
+from splatbot.sim.effects.depth_noise import DepthNoise
+
+_START_S = 120.0  # the service imports torch first
+_TABLE_M = 1e-3  # a ray-cast point this near to z = 0 is on the table
+
+
+def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
+    """Record a synthetic table top, map it, serve the map and ask it what is free.
+
+    The table's top and the air above it are known exactly, so the answers are checked: exit code 1 if the map calls a
+    point of the table free, or a point of the air occupied.
+
+    Examples:
+        splatbot demo
+        splatbot demo --out runs/demo --frames 80
+
+    Args:
+        out: folder for the recording (log/), the map, metrics and report.html; an earlier demo there is replaced.
+        frames: length of the recording.
+    """
+    scene = open_log(f"synthetic:tabletop?frames={frames}")
+    shutil.rmtree(out / "log", ignore_errors=True)
+    _say(f"1/4 recording {frames} frames of a synthetic table top, with a depth camera's noise → {out / 'log'}")
+    record(_noisy(scene), out / "log", ground_truth=scene.ground_truth)
+    _say("2/4 mapping the recording")
+    run = map_log(open_log(out / "log"), out=out, on_progress=_tell)
+    if run.exit_code:
+        _say(f"mapping ended early: {run.error or 'interrupted'}")
+        return run.exit_code
+    metrics = run.metrics
+    _say(
+        f"    {metrics['tracked']} of {metrics['frames']} frames tracked, {metrics['ms_per_frame']['p50']:.0f} ms each"
+    )
+    _say(f"    trajectory error {_mm(metrics['ate_rmse_m'])}, {metrics['gaussians']} Gaussians")
+    question = _question(scene)
+    with _service(out / "map.ply", out / "service.log") as url:
+        _say(f"3/4 serving the map on {url}")
+        _say("4/4 asking it over HTTP: POST /v1/maps/default/distance")
+        answer = _ask(f"{url}/v1/maps/default/distance", {"points": [p.tolist() for p in question.points]})
+    wrong = _judge(question, answer)
+    _say(f"report: {out / 'report.html'}      serve it again: splatbot serve --map {out / 'map.ply'}")
+    return 1 if wrong else 0
+
+
+@dataclass(frozen=True)
+class _Question:
+    """Points (P, 3) [m, the map's world: the first camera], what they are, and whether they are inside something."""
+
+    points: NDArray[np.float64]
+    names: tuple[str, ...]
+    inside: tuple[bool, ...]
+
+
+def _question(scene: Log) -> _Question:
+    """A point of the table top and one half-way to it from the camera, which sees the table through it: free air."""
+    first = scene.read(0)
+    truth = scene.ground_truth
+    if truth is None:
+        raise SplatbotError("has no ground truth.", field=scene.name)
+    points = first.camera.backproject(first.depth).astype(np.float64)
+    height = transform_points(truth.T_world_camera[0], points)[..., 2]
+    table = (np.abs(height) < _TABLE_M).astype(np.uint8)
+    inner = cv2.distanceTransform(cv2.copyMakeBorder(table, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0), cv2.DIST_L2, 5)
+    row, column = np.unravel_index(np.argmax(inner[1:-1, 1:-1]), table.shape)  # the farthest from any edge
+    on_table = points[row, column]
+    return _Question(
+        points=np.stack([on_table, 0.5 * on_table]),
+        names=("a point of the table top", "a point in the air, half-way to it from the camera"),
+        inside=(True, False),
+    )
+
+
+def _judge(question: _Question, answer: dict[str, Any]) -> int:
+    """Print each answer beside the truth; how many contradict it."""
+    wrong = 0
+    rows = zip(question.names, question.points, question.inside, answer["inside"], answer["distance"], strict=True)
+    for name, point, truth, inside, distance in rows:
+        at = ", ".join(f"{x:+.3f}" for x in point)
+        verdict = "right" if inside == truth else f"WRONG: it is {'occupied' if truth else 'free'}"
+        said = "occupied" if inside else "free"
+        _say(f"    {name} ({at}) m: {said}, {distance:.1f} standard deviations from the map  [{verdict}]")
+        wrong += inside != truth
+    _say(f"    answered on map_version {answer['map_version']}")
+    return wrong
+
+
+def _noisy(scene: Log) -> Iterator[Frame]:
+    effect = DepthNoise()
+    for frame in scene:
+        yield effect.apply(frame, np.random.default_rng([0, frame.index]))
+
+
+@contextmanager
+def _service(map_file: Path, log: Path) -> Iterator[str]:
+    """The service on a map as a process of its own, which writes ``log``; yields its base URL once it is ready."""
+    command = [sys.executable, "-m", "splatbot", "serve", "--map", str(map_file), "--port", "0"]
+    with log.open("w", encoding="utf-8") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        try:
+            yield _url(process, log)
+        finally:
+            process.terminate()
+            try:
+                process.communicate(timeout=20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _url(process: subprocess.Popen[str], log: Path) -> str:
+    assert process.stdout is not None
+    found = re.search(r"http://\S+", process.stdout.readline())
+    if found is None:
+        raise SplatbotError("the service did not start.", file=log, hint="that file says why")
+    deadline = time.monotonic() + _START_S
+    while time.monotonic() < deadline:
+        try:
+            with urllib.request.urlopen(f"{found[0]}/readyz", timeout=5):
+                return found[0]
+        except OSError:
+            time.sleep(0.1)
+    raise SplatbotError(f"the service was not ready within {_START_S:.0f} s.", file=log, hint="that file says why")
+
+
+def _ask(url: str, question: dict[str, Any]) -> dict[str, Any]:
+    request = urllib.request.Request(
+        url, data=json.dumps(question).encode(), headers={"content-type": "application/json"}
+    )
+    with urllib.request.urlopen(request, timeout=30) as response:
+        answer: dict[str, Any] = json.load(response)
+    return answer
+
+
+def _tell(progress: Progress) -> None:
+    if progress.phase == "mapping" and progress.done % 10 == 0:
+        _say(f"    frame {progress.done}/{progress.total}, {progress.gaussians} Gaussians")
+
+
+def _mm(metres: float | None) -> str:
+    return "unknown" if metres is None else f"{1000 * metres:.1f} mm"
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

@@ -1,0 +1,30 @@
+"""`splatbot doctor`."""
+
+from __future__ import annotations
+
+import sys
+
+
+def doctor() -> int:
+    """Check this installation and say how to mend it.
+
+    Looks at Python, the libraries, the compiled kernels (against a float64 reference), rendering without a display
+    and serial ports. Exits with 1 when something that everything needs is broken.
+
+    Examples:
+        splatbot doctor
+        SPLATBOT_ISA=v2 splatbot doctor
+    """
+    from splatbot.cli.checks import all_checks
+
+    colours = {"ok": "32", "warn": "33", "fail": "31"} if sys.stdout.isatty() else {}
+    broken = False
+    for check in all_checks():
+        for finding in check():
+            state = f"{finding.state:<4}"
+            shown = f"\033[{colours[finding.state]}m{state}\033[0m" if colours else state
+            print(f"{shown}  {finding.what}: {finding.detail}", flush=True)
+            if finding.fix:
+                print(f"      fix: {finding.fix}", flush=True)
+            broken |= finding.state == "fail"
+    return int(broken)

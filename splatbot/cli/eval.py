@@ -1,0 +1,75 @@
+"""`splatbot eval`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+
+def eval_run(
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    /,
+    log: Annotated[str | None, tyro.conf.arg(metavar="LOG")] = None,
+    camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
+    ground_truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Score a run again: its trajectory against the reference, its map against the held-out frames.
+
+    Trajectory errors are after rigid alignment without scale, as `evo_ape tum REFERENCE RUN/trajectory.tum -a` has
+    them. Held-out frames were tracked but never mapped; PSNR is over whole images.
+
+    Examples:
+        splatbot eval runs/latest
+        splatbot eval runs/desk --ground-truth better.tum
+        splatbot eval runs/desk --log /mnt/recordings/desk --json
+
+    Args:
+        run: a folder that `splatbot map` wrote.
+        log: where the recording is now, if it was moved.
+        camera: intrinsics instead of those that the run used.
+        ground_truth: TUM trajectory to compare with instead of the log's own.
+        as_json: print JSON instead of a table.
+    """
+    from splatbot.errors import FormatError
+    from splatbot.logs import open_log
+    from splatbot.results.folder import RunFolder
+    from splatbot.results.rescore import rescore
+    from splatbot.trajectory import Trajectory
+
+    folder = RunFolder(run)
+    source = folder.load_metrics().get("log", {})
+    uri = log or source.get("uri")
+    if uri is None:
+        raise FormatError("does not say where the log is.", file=folder.metrics, field="log.uri", hint="give --log LOG")
+    recording = open_log(uri, camera=camera or source.get("camera"))
+    reference = Trajectory.load(ground_truth) if ground_truth else None
+    scores = rescore(folder, recording, reference)
+    if as_json:
+        print(json.dumps(scores, indent=2, allow_nan=False))
+    else:
+        _print(str(run), scores)
+    return 0
+
+
+def _print(title: str, scores: dict[str, Any]) -> None:
+    from splatbot.cli.tables import print_table
+    from splatbot.results.units import count, decibels, metres, number, percent
+
+    rows = [
+        ("frames tracked", f"{scores['tracked']} of {scores['frames']}"),
+        ("ATE RMSE", f"{metres(scores['ate_rmse_m'])}  over {scores['ate_frames']} frames"),
+        ("ATE mean, median, max", ", ".join(metres(scores[f"ate_{k}_m"]) for k in ("mean", "median", "max"))),
+        ("RPE per frame", f"{metres(scores['rpe_trans_rmse_m'])}, {number(scores['rpe_rot_rmse_deg'], 3)} deg"),
+        ("held-out views", str(scores["held_out"])),
+        ("PSNR", decibels(scores["psnr_holdout_db"])),
+        ("SSIM", number(scores["ssim_holdout"], 3)),
+        ("depth error, mean", metres(scores["depth_l1_m"])),
+        ("depth error, median", metres(scores["depth_median_m"])),
+        ("depth covered", percent(scores["depth_coverage"])),
+        ("Gaussians", count(scores["gaussians"])),
+    ]
+    print_table(rows, title=title)

@@ -1,0 +1,104 @@
+"""`splatbot info`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from splatbot.logs import Log
+
+_N_SAMPLES = 10  # frames that are decoded to describe a log
+
+
+def info(
+    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|LOG")],
+    /,
+    camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
+) -> int:
+    """Say what is in a map, a log or a run.
+
+    A log's depth is described from ten frames spread over it.
+
+    Examples:
+        splatbot info recordings/desk
+        splatbot info runs/latest
+        splatbot info map.ply
+
+    Args:
+        path: a map file, a folder in TUM or Replica layout, synthetic:NAME, or a run folder (its map).
+        camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
+    """
+    from splatbot.cli.tables import print_table
+
+    place = Path(path)
+    if (place / "map.ply").is_file():
+        place = place / "map.ply"
+    if place.is_file():
+        print_table(describe_map(place), title=str(place))
+        return 0
+    from splatbot.logs import open_log
+
+    print_table(describe_log(open_log(path, camera=camera)), title=path)
+    return 0
+
+
+def describe_map(path: Path) -> list[tuple[str, str]]:
+    """What a map file holds, as names and values.
+
+    Raises:
+        FormatError: the file is damaged or of an unknown format.
+    """
+    import numpy as np
+
+    from splatbot.gaussians import GaussianModel
+    from splatbot.results.units import count, megabytes
+
+    model = GaussianModel.load(path)
+    rows = [
+        ("Gaussians", count(len(model))),
+        ("SH degree", str(model.sh_degree)),
+        ("file", megabytes(path.stat().st_size)),
+        ("in memory", megabytes(model.nbytes)),
+    ]
+    if not len(model):
+        return rows
+    low, high = model.means.amin(0).tolist(), model.means.amax(0).tolist()
+    rows += [(f"{axis} [m]", f"{a:.3f} to {b:.3f}") for axis, a, b in zip("xyz", low, high, strict=True)]
+    widest = 1e3 * model.scales.amax(1)
+    for name, values, unit in (("opacity", model.opacities, ""), ("largest scale", widest, " mm")):
+        p5, p50, p95 = np.percentile(values.numpy(), (5, 50, 95))
+        rows.append((f"{name} p5, p50, p95", f"{p5:.3g}, {p50:.3g}, {p95:.3g}{unit}"))
+    return rows
+
+
+def describe_log(log: Log) -> list[tuple[str, str]]:
+    """What a log holds, as names and values.
+
+    Raises:
+        LogError: a frame that was looked at is damaged.
+    """
+    import numpy as np
+
+    from splatbot.results.units import NONE, metres, percent
+
+    n = len(log)
+    picks = sorted({round(i) for i in np.linspace(0, n - 1, min(n, _N_SAMPLES))})
+    frames = [(frame.stamp, frame.depth) for frame in (log[i] for i in picks)]
+    duration = frames[-1][0] - frames[0][0]
+    depths = np.concatenate([depth[depth > 0] for _, depth in frames])
+    near, middle, far = (float(v) for v in np.percentile(depths, (2, 50, 98))) if depths.size else (None,) * 3
+    c, truth = log.camera, log.ground_truth
+    length = float(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).sum()) if truth is not None else None
+    return [
+        ("frames", str(n)),
+        ("duration", f"{duration:.2f} s"),
+        ("rate", f"{(n - 1) / duration:.1f} Hz" if duration > 0 else NONE),
+        ("image", f"{c.width}x{c.height}"),
+        ("fx, fy, cx, cy", f"{c.fx:.2f}, {c.fy:.2f}, {c.cx:.2f}, {c.cy:.2f}"),
+        ("depth p2, p50, p98", f"{metres(near)}, {metres(middle)}, {metres(far)}"),
+        ("valid depth", percent(depths.size / sum(depth.size for _, depth in frames))),
+        ("reference poses", f"{len(truth)}, path {metres(length)}" if truth is not None else "none"),
+    ]

@@ -1,0 +1,142 @@
+"""`splatbot map`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from splatbot.run import RunResult
+
+
+def map_log_command(
+    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")] = "",
+    /,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    overrides: Annotated[
+        tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction
+    ] = (),
+    camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
+    on_bad_frame: Literal["stop", "skip"] = "stop",
+    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    dump_config: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Turn an RGB-D log into a map of Gaussians.
+
+    Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml and report.html.
+    Ctrl-C saves what has been mapped so far; so does a frame that cannot be read.
+
+    Examples:
+        splatbot map recordings/desk
+        splatbot map recordings/desk --out runs/desk --set mapping.max_gaussians=50000
+        splatbot map rgbd_dataset_freiburg1_desk --camera tum_fr1
+        splatbot map "synthetic:tabletop?frames=40" --out runs/tabletop
+        splatbot map --dump-config > mine.yaml
+
+    Args:
+        log: a folder in TUM or Replica layout, or synthetic:NAME.
+        out: folder to write; by default runs/NAME-TIME, with a link runs/latest.
+        config: YAML file; environment variables (SPLATBOT_MAPPING__MAX_GAUSSIANS=...) and then --set override it.
+        overrides: one key of the configuration, as in mapping.max_gaussians=50000.
+        camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
+        on_bad_frame: what to do about a frame that cannot be read: save and stop, or leave it out.
+        max_frames: read only the first N frames.
+        dump_config: print the configuration in force and leave.
+        quiet: no progress and no summary, only errors.
+    """
+    from splatbot.config import load_config
+    from splatbot.errors import InputError
+
+    settings = load_config(config, overrides=_parse_overrides(overrides))
+    if dump_config:
+        print(settings.to_yaml(), end="")
+        return 0
+    if not log:
+        raise InputError("is missing.", field="LOG", hint="name a recording: splatbot map LOG")
+    if max_frames is not None and max_frames < 1:
+        raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
+
+    from splatbot.cli.progress import progress_display
+    from splatbot.logs import open_log
+    from splatbot.run import map_log
+
+    recording = open_log(log, camera=camera)
+    folder = out if out is not None else Path("runs") / f"{_slug(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
+    with progress_display(quiet=quiet) as on_progress:
+        result = map_log(
+            recording,
+            config=settings,
+            out=folder,
+            on_progress=on_progress,
+            on_bad_frame=on_bad_frame,
+            max_frames=max_frames,
+            source={"uri": _absolute(log), "camera": _absolute(camera) if camera else None},
+        )
+    if out is None:
+        _link_latest(folder)
+    if not quiet:
+        _print_summary(result)
+    if result.error is not None:
+        print(f"error: {result.error}", file=sys.stderr)
+    return result.exit_code
+
+
+def _parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
+    import yaml
+
+    from splatbot.errors import ConfigError
+
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"is {pair!r}.", field="--set", hint="write --set SECTION.KEY=VALUE")
+        try:
+            values[key.strip()] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{text!r} is not a YAML value.", field=f"--set {key}", hint="quote the value") from error
+    return values
+
+
+def _absolute(uri: str) -> str:
+    """A path that still holds when the run is scored from another folder; anything else as it is."""
+    return str(Path(uri).resolve()) if Path(uri).exists() else uri
+
+
+def _slug(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip("-.") or "run"
+
+
+def _link_latest(folder: Path) -> None:
+    link = folder.parent / "latest"
+    if link.exists() and not link.is_symlink():
+        return  # somebody's own folder
+    fresh = folder.parent / f".latest-{os.getpid()}"
+    fresh.symlink_to(folder.name)
+    fresh.replace(link)
+
+
+def _print_summary(result: RunResult) -> None:
+    from splatbot.cli.tables import print_table
+    from splatbot.results.units import count, decibels, megabytes, metres, milliseconds
+
+    m = result.metrics
+    ms = m["ms_per_frame"]
+    rows = [
+        ("frames tracked", f"{m['tracked']} of {m['frames']}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
+        ("ATE RMSE", metres(m["ate_rmse_m"])),
+        ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
+        ("depth error, median", metres(m["depth_median_m"])),
+        ("Gaussians", f"{count(m['gaussians'])}, {megabytes(m['map_bytes'])}"),
+        ("time per frame", f"{milliseconds(ms['p50'])} (p95 {milliseconds(ms['p95'])})"),
+        ("report", str(result.folder / "report.html")),
+    ]
+    title = "interrupted; saved" if m["interrupted"] else "stopped early; saved" if m["error"] else "mapped"
+    print_table(rows, title=f"{m['log']['name']}: {title}")

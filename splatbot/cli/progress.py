@@ -1,0 +1,115 @@
+"""Progress of a run on stderr: a live line on a terminal, a plain line every two seconds elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from splatbot.run import Progress
+
+PLAIN_EVERY_S = 2.0
+_RATE_FRAMES = 10  # frames that the shown rate looks back on
+_COLOURS = {"ok": "green", "degraded": "yellow", "lost": "red"}
+
+
+@contextmanager
+def progress_display(*, quiet: bool = False) -> Iterator[Callable[[Progress], None]]:
+    """A callback for :func:`splatbot.run.map_log` that shows progress while the block lasts."""
+    if quiet:
+        yield lambda progress: None
+    elif sys.stderr.isatty():
+        with _live() as show:
+            yield show
+    else:
+        yield PlainLines()
+
+
+class PlainLines:
+    """Writes a line when two seconds have passed, a phase begins, or a frame is lost or unreadable."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._due = 0.0
+        self._rate = FrameRate()
+        self._verdict = "ok"
+
+    def __call__(self, progress: Progress) -> None:
+        """Show where the run stands, if it is time."""
+        rate = self._rate.add(progress)
+        if progress.skipped:
+            print(f"skipped: {progress.skipped}", file=sys.stderr, flush=True)
+        verdict = progress.result.verdict if progress.result else self._verdict
+        news = progress.phase != "mapping" or (verdict == "lost") != (self._verdict == "lost")
+        self._verdict = verdict
+        if news or self._clock() >= self._due or progress.done == progress.total:
+            self._due = self._clock() + PLAIN_EVERY_S
+            print(describe(progress, rate), file=sys.stderr, flush=True)
+
+
+class FrameRate:
+    """Frames per second over the latest frames."""
+
+    def __init__(self) -> None:
+        self._times: deque[tuple[int, float]] = deque(maxlen=_RATE_FRAMES + 1)
+
+    def add(self, progress: Progress) -> float:
+        """The rate [1/s] with this frame counted; 0 before the second."""
+        self._times.append((progress.done, progress.elapsed_s))
+        frames = self._times[-1][0] - self._times[0][0]
+        seconds = self._times[-1][1] - self._times[0][1]
+        return frames / seconds if seconds > 0 else 0.0
+
+
+def describe(progress: Progress, rate: float) -> str:
+    """One line on where the run stands."""
+    if progress.phase != "mapping":
+        return f"{progress.phase} ..."
+    verdict = progress.result.verdict if progress.result else "skipped"
+    return (
+        f"frame {progress.done}/{progress.total}  {rate:.1f} fps  {progress.gaussians:,} Gaussians  "
+        f"{progress.keyframes} keyframes  {verdict}" + (f"  ({progress.lost} lost)" if progress.lost else "")
+    )
+
+
+@contextmanager
+def _live() -> Iterator[Callable[[Progress], None]]:
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    bars = Bars(
+        TextColumn("[bold]{task.fields[phase]}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TextColumn("{task.fields[numbers]}"),
+        TextColumn("[{task.fields[colour]}]{task.fields[verdict]}"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+    rate = FrameRate()
+    with bars:
+        task = bars.add_task("", total=None, phase="reading", numbers="", verdict="", colour="white")
+
+        def show(progress: Progress) -> None:
+            if progress.skipped:
+                bars.console.print(f"skipped: {progress.skipped}", style="yellow", markup=False)
+            fps = rate.add(progress)
+            verdict = progress.result.verdict if progress.result else ""
+            bars.update(
+                task,
+                total=progress.total,
+                completed=progress.done,
+                phase=progress.phase,
+                numbers=f"{fps:.1f} fps  {progress.gaussians:,} Gaussians  {progress.keyframes} keyframes"
+                + (f"  {progress.lost} lost" if progress.lost else ""),
+                verdict=verdict,
+                colour=_COLOURS.get(verdict, "white"),
+            )
+
+        yield show

@@ -1,0 +1,103 @@
+"""`splatbot render`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+Pose = tuple[float, float, float, float, float, float, float]
+
+
+def render(
+    map_: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")],
+    /,
+    mode: Literal["rgb", "depth", "normal", "alpha"] = "rgb",
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    pose: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
+    trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    index: Annotated[int | None, tyro.conf.arg(metavar="I")] = None,
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480",
+    fov: Annotated[float, tyro.conf.arg(metavar="DEG")] = 60.0,
+) -> int:
+    """Render a view of a map to a PNG.
+
+    Without a pose the camera backs off until it sees most of the map. Depth runs from red (near) to blue (far).
+
+    Examples:
+        splatbot render runs/latest
+        splatbot render map.ply --mode depth --out depth.png --size 1280x720
+        splatbot render map.ply --pose 0 0 -1.5 1 0 0 0
+        splatbot render runs/latest --index 30 --mode normal
+
+    Args:
+        map_: a map file, or a run folder.
+        mode: colour, depth, surface normals or opacity.
+        out: PNG to write; by default NAME-MODE.png here.
+        pose: T_world_camera: position [m] and quaternion (w x y z); camera axes x right, y down, z forward.
+        trajectory: TUM file to take the pose from, with --index. A run folder brings its own.
+        index: which pose of the trajectory, from 0; -1 is the last.
+        size: width and height of the image [px].
+        fov: horizontal field of view [deg].
+    """
+    width, height = _parse_size(size)
+    file, path = _find_map(map_), trajectory or _own_trajectory(map_, index)
+
+    from splatbot.formats.atomic import atomic_write
+    from splatbot.gaussians import GaussianModel
+    from splatbot.rasterize.views import default_view, render_view, to_png
+
+    given = _given_pose(pose, path, index)
+    model = GaussianModel.load(file)
+    camera, T_world_camera = default_view(model, width=width, height=height, fov_deg=fov)
+    view = render_view(model, camera, T_world_camera if given is None else given, mode)
+    target = out if out is not None else Path(f"{map_.resolve().name if map_.is_dir() else map_.stem}-{mode}.png")
+    with atomic_write(target) as image:
+        image.write(to_png(view, mode))
+    print(target)
+    return 0
+
+
+def _find_map(path: Path) -> Path:
+    return path / "map.ply" if path.is_dir() else path
+
+
+def _own_trajectory(path: Path, index: int | None) -> Path | None:
+    return path / "trajectory.tum" if path.is_dir() and index is not None else None
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    from splatbot.errors import InputError
+
+    match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
+    if not match or not all(1 <= int(part) <= 16384 for part in match.groups()):
+        raise InputError(f"is {text!r}.", field="--size", hint="write WIDTHxHEIGHT in pixels, as in 640x480")
+    return int(match[1]), int(match[2])
+
+
+def _given_pose(pose: Pose | None, path: Path | None, index: int | None) -> NDArray[np.float64] | None:
+    from splatbot.errors import InputError
+    from splatbot.geometry import pose_from_quat
+    from splatbot.trajectory import Trajectory
+
+    if pose is not None:
+        if path is not None:
+            raise InputError("excludes --trajectory and --index.", field="--pose", hint="give one of them")
+        try:
+            return pose_from_quat(pose[:3], pose[3:])
+        except ValueError as error:
+            raise InputError(f"{error}.", field="--pose", hint="QW QX QY QZ of no rotation are 1 0 0 0") from error
+    if path is None:
+        if index is not None:
+            raise InputError("needs a trajectory.", field="--index", hint="give --trajectory FILE, or a run folder")
+        return None
+    poses, chosen = Trajectory.load(path).T_world_camera, index or 0
+    if not -len(poses) <= chosen < len(poses):
+        raise InputError(f"is {index}, {path} has {len(poses)} poses.", field="--index", hint="count from 0")
+    return poses[chosen]

@@ -1,0 +1,109 @@
+"""What turns a log's images into metres: intrinsics and the unit of depth."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatbot.camera import Camera
+from splatbot.errors import CameraError
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera and the unit of its integer depth images.
+
+    Args:
+        camera: as recorded, so possibly distorted.
+        depth_scale: units per metre.
+        file: where it was read from (for messages).
+
+    Raises:
+        CameraError: the depth scale is not a positive number.
+    """
+
+    camera: Camera
+    depth_scale: float
+    file: str | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
+            raise CameraError(
+                f"is {self.depth_scale}, must be positive.",
+                file=self.file,
+                field="depth_scale",
+                hint="units per metre: 1000 for millimetres, 5000 for TUM",
+            )
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read `intrinsics.json`: fx, fy, cx, cy [px], width, height [px], depth_scale [units/m], optional distortion.
+
+    Other keys are ignored.
+
+    Raises:
+        CameraError: the file is missing or no JSON object, or a value is missing or makes no sense.
+    """
+    values = read_object(path)
+    distortion = values.get("distortion", [])
+    if not isinstance(distortion, list):
+        raise CameraError("is no list.", file=path, field="distortion", hint="OpenCV's [k1, k2, p1, p2, k3]")
+    named = {str(i): value for i, value in enumerate(distortion)}
+    return make_calibration(
+        path, values, scale_key="depth_scale", distortion=tuple(number(path, named, key) for key in named)
+    )
+
+
+def make_calibration(
+    path: str | Path,
+    values: dict[str, Any],
+    *,
+    scale_key: str,
+    size_keys: tuple[str, str] = ("width", "height"),
+    distortion: tuple[float, ...] = (),
+) -> Calibration:
+    """The calibration that ``values`` of the file ``path`` describe.
+
+    Raises:
+        CameraError: a value is missing or makes no sense.
+    """
+    fx, fy, cx, cy, scale = (number(path, values, key) for key in ("fx", "fy", "cx", "cy", scale_key))
+    width, height = (round(number(path, values, key)) for key in size_keys)
+    try:
+        camera = Camera(fx, fy, cx, cy, width, height, distortion)
+    except CameraError as error:
+        raise CameraError(error.message, file=path, field=error.field, hint=error.hint) from error
+    return Calibration(camera, scale, str(path))
+
+
+def read_object(path: str | Path) -> dict[str, Any]:
+    """The JSON object of a file.
+
+    Raises:
+        CameraError: the file is missing or holds none.
+    """
+    try:
+        values = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise CameraError(f"cannot be read ({error.strerror}).", file=path, hint="check the path") from error
+    except ValueError as error:
+        raise CameraError(f"is not JSON ({error}).", file=path, hint="mend the place it names") from error
+    if not isinstance(values, dict):
+        raise CameraError("is no JSON object.", file=path, hint='write {"fx": ..., "fy": ..., ...}')
+    return values
+
+
+def number(path: str | Path, values: dict[str, Any], key: str) -> float:
+    """``values[key]`` as a float.
+
+    Raises:
+        CameraError: it is missing or no number.
+    """
+    value = values.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        what = "is missing" if key not in values else f"is {value!r}, no number"
+        raise CameraError(f"{what}.", file=path, field=key, hint=f'add "{key}": a number')
+    return float(value)

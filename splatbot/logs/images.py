@@ -1,0 +1,100 @@
+"""Colour and depth files to arrays. What a decoder would paper over (a cut file, flipped bytes) is an error here."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import LogError
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_AGAIN = "copy or record the image again, or remove its line from the list"
+
+
+def read_color(path: Path) -> NDArray[np.uint8]:
+    """RGB (H, W, 3) of a PNG or JPEG; EXIF orientation is ignored, since intrinsics know nothing of it.
+
+    Raises:
+        LogError: no such file, truncated or corrupt.
+    """
+    image = _decode(path, "colour", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
+    """Depth (H, W) [m], 0 where missing, of a 16-bit PNG, or of a 32-bit float TIFF that is in metres already.
+
+    Raises:
+        LogError: no such file, truncated, corrupt, of another pixel type, or without a single valid depth.
+    """
+    image = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise LogError(
+            f"has {channels} channel(s) of {image.dtype}.",
+            file=path,
+            field="depth",
+            hint="write one channel: 16-bit PNG (units of depth_scale) or 32-bit float TIFF (metres)",
+        )
+    if image.dtype == np.uint16:
+        depth = image.astype(np.float32) / np.float32(units_per_metre)
+    else:
+        depth = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
+    if not depth.any():
+        raise LogError(
+            "has no valid depth: every pixel is 0 or NaN.",
+            file=path,
+            field="depth",
+            hint="remove the frame from rgb.txt and depth.txt, or check what the sensor wrote",
+        )
+    return depth
+
+
+def _decode(path: Path, field: str, flags: int) -> NDArray[Any]:
+    try:
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
+        raise LogError(
+            f"cannot be read ({getattr(error, 'strerror', error)}).", file=path, field=field, hint=_AGAIN
+        ) from error
+    damage = _damage(data)
+    if damage:
+        raise LogError(f"{damage}.", file=path, field=field, hint=_AGAIN)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # some damaged headers raise, others return None
+        image = None
+    if image is None:
+        raise LogError("is no image that can be decoded.", file=path, field=field, hint=_AGAIN)
+    return image
+
+
+def _damage(data: bytes) -> str:
+    if not data:
+        return "is empty"
+    if data.startswith(_PNG):
+        return _png_damage(data)
+    if data.startswith(_JPEG) and data.rfind(b"\xff\xd9") <= data.rfind(b"\xff\xda"):
+        return "is a truncated JPEG (no end marker)"
+    return ""
+
+
+def _png_damage(data: bytes) -> str:
+    """Why a PNG is not whole: its chunks (length, type, data, CRC) must follow one another up to IEND."""
+    at = len(_PNG)
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(memoryview(data)[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return f"is a corrupt PNG (checksum of the chunk at byte {at})"
+        if data[at + 4 : at + 8] == b"IEND":
+            return ""
+        at = end + 4
+    return f"is a truncated PNG ({len(data)} bytes)"

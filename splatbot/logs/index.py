@@ -1,0 +1,87 @@
+"""`rgb.txt` and `depth.txt` of the TUM layout: one `stamp path` a line; and which entries belong together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import LogError
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One image of a list: stamp [s], path relative to the log, line number."""
+
+    stamp: float
+    path: str
+    line: int
+
+
+def read_index(path: Path) -> list[Entry]:
+    """The entries of a list file in their order; ``#`` starts a comment.
+
+    The whole file is checked at once: a slip in it is mended in seconds now, after an hour of mapping it is a loss.
+
+    Raises:
+        LogError: the file is missing or empty, a line is malformed or the stamps do not increase.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    except OSError as error:
+        raise LogError(
+            f"cannot be read ({error.strerror}).", file=path, hint="write it: one line `stamp path` an image"
+        ) from error
+    entries: list[Entry] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        entry = _parse(path, number, line)
+        if entries and entry.stamp <= entries[-1].stamp:
+            raise LogError(
+                f"stamp {entry.stamp:.6f} is not after {entries[-1].stamp:.6f} of line {entries[-1].line}.",
+                file=path,
+                field=f"line {number}",
+                hint="sort the lines by stamp and drop doubles",
+            )
+        entries.append(entry)
+    if not entries:
+        raise LogError(
+            "the log is empty: no images are listed.", file=path, hint="write one line `stamp path` an image"
+        )
+    return entries
+
+
+def _parse(path: Path, number: int, line: str) -> Entry:
+    words = line.strip().split(maxsplit=1)
+    try:
+        stamp = float(words[0])
+    except ValueError:
+        stamp = math.nan
+    if len(words) != 2 or not math.isfinite(stamp):
+        raise LogError(
+            f"{line.strip()[:80]!r} is malformed.",
+            file=path,
+            field=f"line {number}",
+            hint="write `stamp path` (seconds, then the image's path inside the log) or remove the line",
+        )
+    return Entry(stamp, words[1], number)
+
+
+def associate(a: NDArray[np.float64], b: NDArray[np.float64], max_difference: float) -> list[tuple[int, int]]:
+    """Pairs of indices of increasing stamps (N,) and (M,) [s] that differ by less than ``max_difference``.
+
+    One to one, closest pairs first, as TUM's `associate.py` does it; returned in the order of ``a``.
+    """
+    first, last = np.searchsorted(b, a - max_difference, "left"), np.searchsorted(b, a + max_difference, "right")
+    near = [(abs(a[i] - b[j]), i, j) for i in range(len(a)) for j in range(first[i], last[i])]
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for difference, i, j in sorted(near):
+        if difference < max_difference and i not in pairs and j not in taken:
+            pairs[i] = j
+            taken.add(j)
+    return sorted(pairs.items())

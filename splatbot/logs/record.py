@@ -1,0 +1,100 @@
+"""Write frames as a TUM log that `open_log` reads back."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import LogError
+from splatbot.formats.atomic import atomic_write
+from splatbot.frame import Frame
+from splatbot.logs.base import Log
+from splatbot.trajectory import Trajectory
+
+Progress = Callable[[int], None]
+
+_log = logging.getLogger(__name__)
+
+
+def record(
+    frames: Log | Iterable[Frame],
+    folder: str | Path,
+    *,
+    ground_truth: Trajectory | None = None,
+    depth_scale: float = 5000.0,
+    progress: Progress | None = None,
+) -> Path:
+    """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics and poses; joints are not stored.
+
+    A frame is listed only once both of its images are on the disk, so what an interrupted recording leaves is a
+    shorter log, not a broken one.
+
+    Args:
+        frames: one camera's.
+        folder: is created; must hold no recording.
+        ground_truth: T_world_camera; None takes the log's own, where ``frames`` is a log that has one.
+        depth_scale: units per metre; depth beyond 65535 units is written as missing, and logged.
+        progress: called with the number of frames written so far.
+
+    Returns:
+        ``folder``.
+
+    Raises:
+        LogError: the folder holds a recording already, or the camera changes.
+    """
+    out = Path(folder)
+    if (out / "rgb.txt").exists():
+        raise LogError("holds a recording already.", file=out, field="rgb.txt", hint="choose another folder")
+    truth = ground_truth if ground_truth is not None else getattr(frames, "ground_truth", None)
+    for part in ("rgb", "depth"):
+        (out / part).mkdir(parents=True, exist_ok=True)
+    if truth is not None:
+        truth.save(out / "groundtruth.txt")
+    camera = None
+    with (out / "depth.txt").open("w") as depths, (out / "rgb.txt").open("w") as colors:
+        for number, frame in enumerate(frames):
+            if camera is None:
+                camera = frame.camera
+                _write_intrinsics(out, frame, depth_scale)
+            elif frame.camera != camera:
+                raise LogError("the camera changed.", file=frame.source, field="camera", hint="record two logs")
+            name = f"{number:06d}.png"
+            _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
+            _write_png(out / "depth" / name, _to_units(frame, depth_scale))
+            # Depth first: a depth image without colour is harmless, the other way round is an error.
+            for lines, part in ((depths, "depth"), (colors, "rgb")):
+                lines.write(f"{float(frame.stamp)!r} {part}/{name}\n")
+                lines.flush()
+            if progress is not None:
+                progress(number + 1)
+    return out
+
+
+def _to_units(frame: Frame, depth_scale: float) -> NDArray[np.uint16]:
+    units = np.rint(frame.depth.astype(np.float64) * depth_scale)
+    far = units > np.iinfo(np.uint16).max
+    if far.any():
+        limit = np.iinfo(np.uint16).max / depth_scale
+        _log.warning("%s: %d pixels beyond %.1f m written as missing", frame.source or frame.index, far.sum(), limit)
+    return np.where(far, 0, units).astype(np.uint16)
+
+
+def _write_png(path: Path, image: NDArray[Any]) -> None:
+    ok, data = cv2.imencode(".png", image)
+    if not ok:
+        raise LogError("could not be encoded.", file=path, field="image", hint="report this image as a bug")
+    path.write_bytes(data.tobytes())
+
+
+def _write_intrinsics(out: Path, frame: Frame, depth_scale: float) -> None:
+    camera = frame.camera
+    values = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    with atomic_write(out / "intrinsics.json") as file:
+        file.write(json.dumps(values | {"depth_scale": depth_scale}, indent=1).encode())

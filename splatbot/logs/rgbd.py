@@ -1,0 +1,77 @@
+"""A colour file and a depth file become a Frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.errors import InputError, LogError
+from splatbot.frame import Frame
+from splatbot.logs.calibration import Calibration
+from splatbot.logs.images import read_color, read_depth
+from splatbot.logs.undistort import Undistorter
+
+NEAR, FAR = 0.05, 50.0  # [m]; no RGB-D sensor's median depth lies outside
+_SCALES = (1.0, 100.0, 1000.0, 5000.0, 6553.5, 10000.0)  # units per metre in use
+_TYPICAL = 1.5  # [m]
+
+
+class RgbdReader:
+    """Reads the images of one calibrated camera; delivers them undistorted and in metres."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self._undistort = Undistorter(calibration.camera) if calibration.camera.distortion else None
+        self.camera: Camera = self._undistort.camera if self._undistort else calibration.camera
+
+    def read(self, index: int, stamp: float, color: Path, depth: Path) -> Frame:
+        """The frame of two files.
+
+        Raises:
+            LogError: a file is damaged, sizes differ, there is no valid depth, or (frame 0) its unit is implausible.
+        """
+        rgb = read_color(color)
+        z = read_depth(depth, self.calibration.depth_scale)
+        self._check_sizes(rgb, z, color, depth)
+        if index == 0:
+            self._check_unit(z, depth)
+        if self._undistort:
+            rgb, z = self._undistort.color(rgb), self._undistort.depth(z)
+        try:
+            return Frame(stamp, rgb, z, self.camera, index, source=str(color))
+        except InputError as error:
+            raise LogError(error.message, file=depth, field=error.field, hint=error.hint) from error
+
+    def _check_sizes(self, rgb: NDArray[np.uint8], z: NDArray[np.float32], color: Path, depth: Path) -> None:
+        seen, camera = (rgb.shape[1], rgb.shape[0]), self.calibration.camera
+        if seen != (z.shape[1], z.shape[0]):
+            raise LogError(
+                f"is {z.shape[1]}x{z.shape[0]}, its colour image {color.name} is {seen[0]}x{seen[1]}.",
+                file=depth,
+                field="depth size",
+                hint="register depth to colour, at the colour image's size",
+            )
+        if seen != (camera.width, camera.height):
+            where = self.calibration.file or "the intrinsics"
+            raise LogError(
+                f"is {seen[0]}x{seen[1]}, {where} says {camera.width}x{camera.height}.",
+                file=color,
+                field="image size",
+                hint="give the intrinsics of this image size (width, height and fx, fy, cx, cy with them)",
+            )
+
+    def _check_unit(self, z: NDArray[np.float32], depth: Path) -> None:
+        median = float(np.median(z[z > 0]))
+        if NEAR <= median <= FAR:
+            return
+        units = median * self.calibration.depth_scale
+        likely = min(_SCALES, key=lambda scale: abs(np.log(units / scale / _TYPICAL)))
+        raise LogError(
+            f"is {self.calibration.depth_scale:g}, which makes the median depth of {depth.name} {median:.4g} m.",
+            file=self.calibration.file or depth,
+            field="depth_scale",
+            hint=f"depth_scale is units per metre; {likely:g} would make it {units / likely:.3g} m",
+        )

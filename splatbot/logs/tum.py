@@ -1,0 +1,133 @@
+"""The TUM RGB-D layout: rgb.txt, depth.txt, groundtruth.txt and `intrinsics.json`."""
+
+from __future__ import annotations
+
+import logging
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from splatbot.camera import Camera
+from splatbot.errors import CameraError, LogError
+from splatbot.frame import Frame
+from splatbot.logs.base import LogBase
+from splatbot.logs.calibration import Calibration, read_calibration
+from splatbot.logs.index import Entry, associate, read_index
+from splatbot.logs.presets import PRESETS, find_calibration
+from splatbot.logs.rgbd import RgbdReader
+from splatbot.trajectory import Trajectory
+
+Missing = Literal["auto", "error", "skip"]
+
+MAX_DIFFERENCE = 0.02  # [s], as TUM's associate.py
+_LOCKSTEP = 1e-3  # [s]
+
+_log = logging.getLogger(__name__)
+
+
+class TumLog(LogBase):
+    """A recording in TUM layout; frames are the colour images, each with the depth image nearest in time.
+
+    A colour image without a depth image within 0.02 s is either left out or an error when it is read. ``missing``
+    says which: "skip", "error", or "auto", which looks at the others. Where all differ by less than 1 ms, colour and
+    depth were recorded in lockstep, so a lone colour image means that depth.txt lost a line: error. Otherwise the
+    sensor's two streams ran freely (as TUM's own), drop-outs are normal: skip. Either way they are counted in
+    ``unpaired`` and logged. A depth image without colour is never missed, only logged.
+
+    Raises:
+        LogError: a list is missing, empty or malformed, or nothing can be associated.
+        CameraError: there are no usable intrinsics.
+    """
+
+    def __init__(
+        self, folder: str | Path, *, camera: str | Path | Calibration | None = None, missing: Missing = "auto"
+    ) -> None:
+        self.folder = Path(folder)
+        self.uri = str(folder)
+        self.name = self.folder.resolve().name
+        colors, self._depths = read_index(self.folder / "rgb.txt"), read_index(self.folder / "depth.txt")
+        pairs = self._pair(colors)
+        self.unpaired = len(colors) - len(pairs)
+        if missing == "auto":
+            lockstep = all(abs(colors[i].stamp - depth.stamp) < _LOCKSTEP for i, depth in pairs.items())
+            missing = "error" if lockstep else "skip"
+        kept = [i for i in range(len(colors)) if i in pairs or missing == "error"]
+        self._frames: list[tuple[Entry, Entry | None]] = [(colors[i], pairs.get(i)) for i in kept]
+        self._reader = RgbdReader(self._calibration(camera))
+        self._report(len(colors), len(pairs))
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the delivered frames: undistorted."""
+        return self._reader.camera
+
+    @property
+    def stamps(self) -> list[float]:
+        """Times of the frames [s]."""
+        return [color.stamp for color, _ in self._frames]
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """Poses of groundtruth.txt as recorded, T_world_camera; None where there is no such file.
+
+        Raises:
+            FormatError: the file is damaged.
+        """
+        path = self.folder / "groundtruth.txt"
+        return Trajectory.load(path) if path.exists() else None
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def _decode(self, index: int) -> Frame:
+        color, depth = self._frames[index]
+        if depth is None:
+            raise self._no_partner(color)
+        return self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path)
+
+    def _pair(self, colors: list[Entry]) -> dict[int, Entry]:
+        a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))
+        pairs = {i: self._depths[j] for i, j in associate(a, b, MAX_DIFFERENCE)}
+        if not pairs:
+            raise LogError(
+                f"no stamp is within {MAX_DIFFERENCE} s of one in rgb.txt (colour {a[0]:.3f}..{a[-1]:.3f} s, "
+                f"depth {b[0]:.3f}..{b[-1]:.3f} s).",
+                file=self.folder / "depth.txt",
+                field="stamps",
+                hint="write both lists in seconds of the same clock",
+            )
+        return pairs
+
+    def _no_partner(self, color: Entry) -> LogError:
+        before = [entry.line for entry in self._depths if entry.stamp < color.stamp]
+        return LogError(
+            f"no depth image within {MAX_DIFFERENCE} s of stamp {color.stamp:.6f} ({color.path}, line {color.line} "
+            "of rgb.txt).",
+            file=self.folder / "depth.txt",
+            field=f"after line {before[-1]}" if before else "first line",
+            hint="restore the missing line, or remove that image from rgb.txt",
+        )
+
+    def _calibration(self, camera: str | Path | Calibration | None) -> Calibration:
+        if camera is not None:
+            return find_calibration(camera)
+        path = self.folder / "intrinsics.json"
+        if path.exists():
+            return read_calibration(path)
+        raise CameraError(
+            "the log has no intrinsics.",
+            file=path,
+            field="camera",
+            hint="write it with fx, fy, cx, cy, width, height [px] and depth_scale [units/m], or name the camera: "
+            f"--camera {'|'.join(PRESETS)} or --camera FILE",
+        )
+
+    def _report(self, colors: int, pairs: int) -> None:
+        if self.unpaired:
+            _log.warning("%s: %d of %d colour images have no depth image", self.uri, self.unpaired, colors)
+        if len(self._depths) > pairs:
+            _log.warning(
+                "%s: %d of %d depth images have no colour image", self.uri, len(self._depths) - pairs, len(self._depths)
+            )

@@ -1,0 +1,34 @@
+"""Images of a distorted camera to those of the pinhole camera with the same intrinsic matrix."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+
+
+class Undistorter:
+    """Resamples colour bilinearly and depth to the nearest pixel: depths across an edge must not be averaged.
+
+    Pixels that the sensor did not see repeat the border's colour (black would be an edge to track) and have no depth.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = replace(camera, distortion=())
+        size = (camera.width, camera.height)
+        coefficients = np.array(camera.distortion)
+        self._map = cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_32FC1)
+
+    def color(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) of the distorted camera to (H, W, 3) of ``camera``."""
+        out = cv2.remap(rgb, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(out, dtype=np.uint8)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(H, W) [m] of the distorted camera to (H, W) [m] of ``camera``."""
+        out = cv2.remap(depth, *self._map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return np.asarray(out, dtype=np.float32)

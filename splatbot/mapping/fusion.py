@@ -1,0 +1,147 @@
+"""From a keyframe to Gaussians: new ones where the map does not explain it, evidence for those already there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatbot.camera import Camera
+from splatbot.config import MappingConfig
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse, rotation_to_quat
+from splatbot.mapping.keyframes import Keyframe
+from splatbot.rasterize import rasterization
+from splatbot.tracking.prepare import normals_of
+
+
+@dataclass(frozen=True)
+class View:
+    """The map seen from a pose: colour (H, W, 3), depth (H, W) [m], alpha (H, W)."""
+
+    rgb: Tensor
+    depth: Tensor
+    alpha: Tensor
+
+
+@torch.no_grad()
+def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.float64]) -> View:
+    """Render the map; depth is that of the Gaussians' planes, which spares slanted surfaces the blend's bias."""
+    if len(model) == 0:
+        blank = torch.zeros(camera.height, camera.width)
+        return View(blank[..., None].repeat(1, 1, 3), blank, blank.clone())
+    renders, alphas, _ = rasterization(
+        model.means,
+        model.quats,
+        model.scales,
+        model.opacities,
+        model.colors,
+        torch.from_numpy(inverse(T_world_camera))[None],
+        torch.from_numpy(camera.K_corner)[None],
+        camera.width,
+        camera.height,
+        render_mode="RGB+ED",
+        depth_mode="plane",
+    )
+    return View(renders[0, ..., :3], renders[0, ..., 3], alphas[0, ..., 0])
+
+
+def model_depth(view: View, measured: NDArray[np.float32], config: MappingConfig) -> NDArray[np.float32]:
+    """Depth (H, W) [m] to track against: the map's where it is solid and does not contradict the measured one."""
+    depth = view.depth.numpy()
+    agrees = (measured == 0) | (np.abs(depth - measured) < config.new_depth * measured)
+    solid = (view.alpha.numpy() > config.solid_alpha) & agrees
+    return np.where(solid, depth, measured).astype(np.float32)
+
+
+def unexplained(view: View, depth: Tensor, config: MappingConfig) -> Tensor:
+    """Pixels (H, W) whose measured depth the map does not account for: nothing there, or something farther."""
+    measured = depth > 0
+    empty = view.alpha < config.new_alpha
+    in_front = depth < view.depth - config.new_depth * depth
+    return measured & (empty | in_front)
+
+
+def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> GaussianModel:
+    """One flat Gaussian for each chosen pixel on a grid of ``config.stride`` pixels.
+
+    Its disc covers the grid's footprint on the surface: σ = 0.5 stride · z / f across, stretched by the slant (at most
+    3) along it, ``config.thickness`` of that through it. A pixel without a normal faces the camera.
+    """
+    s = config.stride
+    grid = torch.zeros_like(where)
+    grid[s // 2 :: s, s // 2 :: s] = True
+    chosen = (where & grid).numpy()
+    camera = keyframe.camera
+    depth = keyframe.depth.numpy()
+    points = camera.backproject(depth)[chosen].astype(np.float64)
+    normals = normals_of(depth, camera)[chosen].astype(np.float64)
+    toward = -points / np.linalg.norm(points, axis=1, keepdims=True)
+    normals = np.where((normals**2).sum(1, keepdims=True) > 0.25, normals, toward)
+    cosine = np.abs((normals * toward).sum(1)).clip(1 / 3, 1.0)
+    across = 0.5 * s * points[:, 2] / camera.fx * config.footprint
+    R_world_camera = keyframe.T_world_camera[:3, :3]
+    scales = np.stack([across / cosine, across, across * config.thickness], axis=1)
+    return _with_anchor(
+        GaussianModel.from_activated(
+            means=points @ R_world_camera.T + keyframe.T_world_camera[:3, 3],
+            quats=_disc_quats(normals, toward, R_world_camera),
+            scales=scales,
+            opacities=np.full(len(points), config.new_opacity),
+            colors=keyframe.rgb.numpy()[chosen] / 255.0,
+        ),
+        keyframe.number,
+    )
+
+
+def _disc_quats(
+    normals: NDArray[np.float64], toward: NDArray[np.float64], R: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Orientations (N, 4) with z along the normal and x along the direction in which the slant stretches the footprint."""
+
+    x = toward - (toward * normals).sum(1, keepdims=True) * normals
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    spare = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    spare /= np.linalg.norm(spare, axis=1, keepdims=True)
+    x = np.where(length > 1e-3, x / np.maximum(length, 1e-12), spare)
+    y = np.cross(normals, x)
+    return rotation_to_quat(R @ np.stack([x, y, normals], axis=-1)) if len(x) else np.zeros((0, 4))
+
+
+def _with_anchor(model: GaussianModel, number: int) -> GaussianModel:
+    model.anchors.fill_(number)
+    return model
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a keyframe says of each Gaussian (N,): seen where measured depth puts it, or seen through."""
+
+    supported: Tensor
+    seen_through: Tensor
+
+
+def weigh(model: GaussianModel, keyframe: Keyframe, config: MappingConfig) -> Evidence:
+    """Compare every Gaussian's centre with the depth that the keyframe measured along its ray."""
+    T_camera_world = torch.from_numpy(inverse(keyframe.T_world_camera)).float()
+    points = model.means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    depth, inside = _sample(keyframe.depth, keyframe.camera, points)
+    measured = inside & (depth > 0)
+    tolerance = config.new_depth * depth
+    return Evidence(
+        supported=measured & ((points[:, 2] - depth).abs() < tolerance),
+        seen_through=measured & (points[:, 2] < depth - 2 * tolerance),
+    )
+
+
+def _sample(depth: Tensor, camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Nearest pixel's depth (N,) for points (N, 3) of the camera frame, and which lie inside the image."""
+    z = points[:, 2].clamp_min(1e-6)
+    u = torch.round(camera.fx * points[:, 0] / z + camera.cx)
+    v = torch.round(camera.fy * points[:, 1] / z + camera.cy)
+    inside = (points[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    row, column = torch.where(inside, v, 0).long(), torch.where(inside, u, 0).long()
+    return depth[row, column], inside

@@ -1,0 +1,79 @@
+"""Keyframes: the frames that the map is made of and that later frames are tracked against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatbot.camera import Camera
+from splatbot.config import MappingConfig, TrackingConfig
+from splatbot.frame import Frame
+from splatbot.geometry import inverse
+from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import Level, halve, valid_depth
+from splatbot.tracking.reference import Reference
+from splatbot.tracking.tracker import pose_distance
+
+
+@dataclass
+class Keyframe:
+    """One observation as the map keeps it.
+
+    Args:
+        number: position among the keyframes.
+        camera: of the images kept here.
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32 [m], 0 missing.
+        T_world_camera: (4, 4).
+        features: for matching later frames.
+        reference: for aligning later frames; its depth is the model's once the keyframe has been fused.
+    """
+
+    number: int
+    camera: Camera
+    rgb: Tensor
+    depth: Tensor
+    T_world_camera: NDArray[np.float64]
+    features: Features
+    reference: Reference
+
+    @property
+    def viewmat(self) -> Tensor:
+        """T_camera_world (1, 4, 4) float64, as the rasterizer takes it."""
+        return torch.from_numpy(inverse(self.T_world_camera))[None]
+
+    @property
+    def K(self) -> Tensor:
+        """(1, 3, 3) float64 for pixel centres at +0.5."""
+        return torch.from_numpy(self.camera.K_corner)[None]
+
+
+def mapping_images(
+    frame: Frame, config: MappingConfig, tracking: TrackingConfig
+) -> tuple[Camera, NDArray[np.uint8], NDArray[np.float32]]:
+    """Camera, colour and valid depth of a frame, halved until at most ``config.max_width`` wide."""
+    rgb = frame.rgb
+    level = Level(
+        np.zeros(frame.depth.shape, np.float32),
+        valid_depth(frame.depth, tracking.min_depth, tracking.max_depth),
+        frame.camera,
+    )
+    while level.camera.width > config.max_width:
+        level = halve(level)
+        rgb = cv2.resize(rgb, (level.camera.width, level.camera.height), interpolation=cv2.INTER_AREA)
+    return level.camera, rgb, level.depth
+
+
+def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Keyframe], config: MappingConfig) -> bool:
+    """Whether a view is new: farther or turned further from every keyframe than the configuration says."""
+    for keyframe in reversed(keyframes):
+        moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)
+        if moved < config.keyframe_translation and turned < config.keyframe_rotation:
+            return False
+    return True

@@ -1,0 +1,23 @@
+"""Which Gaussians leave the map."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from splatbot.config import MappingConfig
+from splatbot.gaussians import GaussianModel
+
+
+def worth_keeping(model: GaussianModel, config: MappingConfig) -> Tensor:
+    """Mask (N,) of finite, visible Gaussians of a sane size."""
+    finite = torch.isfinite(model.means).all(1) & torch.isfinite(model.log_scales).all(1)
+    finite &= torch.isfinite(model.quats).all(1) & torch.isfinite(model.opacity_logits)
+    sane = model.scales.amax(1) < config.max_scale
+    return finite & sane & (model.opacities > config.min_opacity)
+
+
+def fittest(model: GaussianModel, count: int) -> Tensor:
+    """Indices, ascending, of the ``count`` Gaussians with most evidence: observations first, opacity second."""
+    merit = model.observations.float() + model.opacities
+    return torch.argsort(merit, descending=True, stable=True)[:count].sort().values

@@ -1,0 +1,85 @@
+"""Refinement: a few steps of gradient descent on the map, over the latest keyframes and some old ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatbot.config import MappingConfig
+from splatbot.gaussians import GaussianModel
+from splatbot.gaussians.harmonics import sh_to_rgb
+from splatbot.mapping.keyframes import Keyframe
+from splatbot.optimize.adam import PARAMETERS, GaussianAdam
+from splatbot.optimize.losses import exposure_match, l1
+from splatbot.rasterize import rasterization
+
+
+class Refiner:
+    """Owns the optimiser; the mapper tells it when rows come and go."""
+
+    def __init__(self, config: MappingConfig, seed: int) -> None:
+        self.config = config
+        self.adam = GaussianAdam(
+            {
+                "means": config.rate_means,
+                "quats": config.rate_quats,
+                "log_scales": config.rate_scales,
+                "opacity_logits": config.rate_opacities,
+                "sh": config.rate_sh,
+            }
+        )
+        self._random = np.random.default_rng(seed)
+
+    def refine(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
+        """Spend ``iterations`` steps on the model, in place: the latest keyframe first, then at random.
+
+        Half of the random draws come from the latest ``config.window`` keyframes, half from all, against forgetting.
+        """
+        if len(model) == 0:
+            return
+        for i in range(iterations):
+            self.step(model, keyframes[-1] if i == 0 else self._draw(keyframes))
+
+    def refine_all(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
+        """Spend ``iterations`` steps on all keyframes alike."""
+        for _ in range(iterations if len(model) else 0):
+            self.step(model, keyframes[self._random.integers(len(keyframes))])
+
+    def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
+        pool = keyframes[-self.config.window :] if self._random.random() < 0.5 else keyframes
+        return pool[self._random.integers(len(pool))]
+
+    def step(self, model: GaussianModel, keyframe: Keyframe) -> float:
+        """One step on one keyframe; returns the loss before it."""
+        parameters = {name: getattr(model, name).detach().requires_grad_(True) for name in PARAMETERS}
+        renders, alphas, meta = rasterization(
+            parameters["means"],
+            parameters["quats"],
+            parameters["log_scales"].exp(),
+            torch.sigmoid(parameters["opacity_logits"]),
+            sh_to_rgb(parameters["sh"][:, 0]),
+            keyframe.viewmat,
+            keyframe.K,
+            keyframe.camera.width,
+            keyframe.camera.height,
+            render_mode="RGB+ED",
+        )
+        loss = self._loss(renders[0], alphas[0], keyframe)
+        grads = torch.autograd.grad(loss, list(parameters.values()))
+        visible = torch.zeros(len(model), dtype=torch.bool)
+        visible[meta["visible_ids"][0]] = True
+        self.adam.step(model, dict(zip(PARAMETERS, grads, strict=True)), visible)
+        return float(loss.detach())
+
+    def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
+        observed = keyframe.rgb.float() / 255.0
+        covered = alpha[..., 0].detach() > 0.5
+        gain, offset = exposure_match(render[..., :3].detach(), observed, covered)
+        color = l1(gain * render[..., :3] + offset, observed, covered[..., None])
+        depth = keyframe.depth[..., None]
+        ranged = (depth > 0) & covered[..., None]
+        relative = l1(render[..., 3:] / depth.clamp_min(0.1), depth / depth.clamp_min(0.1), ranged)
+        return color + self.config.depth_weight * relative

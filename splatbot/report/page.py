@@ -1,0 +1,170 @@
+"""The HTML of a run report: everything inline, nothing fetched."""
+
+from __future__ import annotations
+
+import html
+import platform
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import metadata, resources
+from typing import Any
+
+from splatbot.config import Config
+from splatbot.rasterize.views import depth_limits
+from splatbot.report.figures import error_plot, gaussians_plot, stages_plot, trajectory_plot
+from splatbot.report.images import colour_png, depth_png, difference_png
+from splatbot.report.theme import data_uri
+from splatbot.results.folder import FrameRow
+from splatbot.results.scoring import ShownView, TrajectoryScore, ViewScores
+from splatbot.results.units import count, decibels, megabytes, metres, milliseconds, percent
+from splatbot.trajectory import Trajectory
+
+_PACKAGES = ("splatbot", "torch", "numpy", "opencv-contrib-python-headless", "open3d")
+_GAIN = 3.0  # of difference images: errors of a third of the range are white
+
+
+def report_html(
+    *,
+    rows: Sequence[FrameRow],
+    metrics: Mapping[str, Any],
+    config: Config,
+    trajectory: Trajectory,
+    track: TrajectoryScore | None,
+    views: ViewScores,
+) -> str:
+    """The page of one run, as text.
+
+    Args:
+        rows: one per frame of the log.
+        metrics: the contents of ``metrics.json``.
+        config: what the run was told.
+        trajectory: the tracked poses.
+        track: the trajectory against its reference, where there is one.
+        views: the held-out views.
+    """
+    name = str(metrics["log"]["name"])
+    parts = [
+        _banner(metrics),
+        _tiles(metrics),
+        _section("Trajectory", _image(trajectory_plot(trajectory, track), "trajectory"), _no_reference(track)),
+        _section("Error over time", _image(error_plot(rows, track), "position error over time")),
+        _section("Frames in doubt", _doubts(rows)),
+        _section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
+        _section("Time per frame", _image(stages_plot(rows), "milliseconds per stage"), _stages(metrics)),
+        _section("Map", _image(gaussians_plot(rows), "Gaussians over frames")),
+        _details("Configuration", f"<pre>{html.escape(config.to_yaml())}</pre>"),
+        _details("Versions", _table(("", ""), _versions())),
+    ]
+    css = resources.files("splatbot.report").joinpath("style.css").read_text(encoding="utf-8")
+    source = html.escape(str(metrics["log"].get("uri", name)))
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)} · splatbot</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>\n{css}</style></head>\n'
+        f'<body><main>\n<h1>{html.escape(name)}</h1>\n<p class="sub">{source}</p>\n'
+        f"{''.join(parts)}</main></body></html>\n"
+    )
+
+
+def _banner(metrics: Mapping[str, Any]) -> str:
+    if metrics["error"]:
+        return f'<section class="banner"><b>The log ended early.</b> {html.escape(metrics["error"])}</section>\n'
+    if metrics["interrupted"]:
+        return (
+            f'<section class="banner warn"><b>Interrupted</b> after {metrics["frames"]} of '
+            f"{metrics['log']['frames']} frames; this is what was mapped until then.</section>\n"
+        )
+    return ""
+
+
+def _tiles(metrics: Mapping[str, Any]) -> str:
+    ms = metrics["ms_per_frame"]
+    tiles = [
+        (f"{metrics['tracked']}/{metrics['frames']}", "frames tracked"),
+        (metres(metrics["ate_rmse_m"]), "ATE RMSE"),
+        (metres(metrics["rpe_trans_rmse_m"]), "RPE per frame"),
+        (decibels(metrics["psnr_holdout_db"]), "PSNR, held-out views"),
+        (metres(metrics["depth_median_m"]), "median depth error"),
+        (milliseconds(ms["p50"]), f"per frame (p95 {milliseconds(ms['p95'])})"),
+        (count(metrics["gaussians"]), f"Gaussians, {megabytes(metrics['map_bytes'])}"),
+        (megabytes(metrics["peak_rss_bytes"]), "peak memory"),
+    ]
+    cells = "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in tiles)
+    return f'<div class="tiles">{cells}</div>\n'
+
+
+def _no_reference(track: TrajectoryScore | None) -> str:
+    if track is not None:
+        return _note("The estimate is aligned to the reference by a rigid motion (no scale); the dot is the start.")
+    return _note("No reference poses: there is no trajectory error to show. The dot is the start.")
+
+
+def _doubts(rows: Sequence[FrameRow]) -> str:
+    doubts = Counter((row.verdict, reason) for row in rows if row.verdict != "ok" for reason in row.reasons or ("",))
+    return _table(("verdict and reason", "frames"), [(f"{v}: {r}", str(n)) for (v, r), n in doubts.most_common(12)])
+
+
+def _view(view: ShownView) -> str:
+    span = depth_limits(view.depth)
+    images = [
+        (colour_png(view.rgb), f"frame {view.score.index}"),
+        (colour_png(view.rendered_rgb), f"map, {decibels(view.score.psnr_db)}"),
+        (difference_png(view.rgb, view.rendered_rgb, gain=_GAIN), f"difference, times {_GAIN:g}"),
+        (depth_png(view.depth, span), f"sensor depth, {span[0]:.2f} to {span[1]:.2f} m"),
+        (depth_png(view.rendered_depth, span), f"map depth, off by {metres(view.score.depth_median_m)}"),
+    ]
+    figures = "".join(
+        f"<figure>{_image(data, text)}<figcaption>{html.escape(text)}</figcaption></figure>" for data, text in images
+    )
+    return f'<div class="view">{figures}</div>\n'
+
+
+def _views_note(metrics: Mapping[str, Any], views: ViewScores) -> str:
+    if not views.scores:
+        return _note("No held-out view was scored.")
+    return _note(
+        f"Mean over {len(views.scores)} frames that were tracked but never mapped: PSNR "
+        f"{decibels(metrics['psnr_holdout_db'])} over whole images, depth L1 {metres(metrics['depth_l1_m'])} where "
+        f"both have depth; the map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
+    )
+
+
+def _stages(metrics: Mapping[str, Any]) -> str:
+    rows = [("frame", metrics["ms_per_frame"], metrics["frames"])]
+    rows += [(name, values, values["frames"]) for name, values in metrics["stages"].items()]
+    cells = [(name, *(milliseconds(v[p]) for p in ("p50", "p95", "p99")), str(n)) for name, v, n in rows]
+    return _table(("stage", "p50", "p95", "p99", "frames"), cells)
+
+
+def _versions() -> list[tuple[str, str]]:
+    found = [("python", platform.python_version()), ("platform", platform.platform())]
+    for package in _PACKAGES:
+        try:
+            found.append((package, metadata.version(package)))
+        except metadata.PackageNotFoundError:  # as when run from a checkout that is not installed
+            found.append((package, "not installed"))
+    return found
+
+
+def _section(title: str, *parts: str) -> str:
+    body = "".join(parts)
+    return f"<section><h2>{title}</h2>\n{body}</section>\n" if body else ""
+
+
+def _details(title: str, body: str) -> str:
+    return f"<section><details><summary>{title}</summary>{body}</details></section>\n"
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{text}</p>'
+
+
+def _image(data: bytes | None, text: str) -> str:
+    return f'<img alt="{html.escape(text)}" src="{data_uri(data)}">' if data is not None else ""
+
+
+def _table(head: Iterable[str], rows: Sequence[Iterable[str]]) -> str:
+    if not rows:
+        return ""
+    lines = ["".join(f"<th>{html.escape(cell)}</th>" for cell in head)]
+    lines += ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
+    return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"

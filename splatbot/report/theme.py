@@ -1,0 +1,70 @@
+"""Colours and figures that read well on a light and on a dark page."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+INK = "#838b96"  # grey of middling lightness: figures are transparent and must show on both pages
+GRID = "#838b9640"
+BLUE, ORANGE, GREEN, RED, PURPLE, TEAL = "#3f86d0", "#e0912f", "#3fa372", "#d9515f", "#8f74d1", "#2ba5a5"
+SERIES = (BLUE, ORANGE, GREEN, PURPLE, TEAL, "#c2699e", "#a3893c", "#6d9bb8", "#b3724f", "#7fa650")
+
+_STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 9.5,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GRID,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+}
+
+
+def styled(plot: Callable[P, R]) -> Callable[P, R]:
+    """A plotting function that runs in this theme, and leaves matplotlib's global settings as they were."""
+
+    @wraps(plot)
+    def inner(*args: P.args, **kwargs: P.kwargs) -> R:
+        with matplotlib.rc_context(_STYLE):
+            return plot(*args, **kwargs)
+
+    return inner
+
+
+def figure(columns: int = 1, *, width: float = 9.0, height: float = 3.0) -> tuple[Figure, list[Axes]]:
+    """A figure of ``columns`` plots side by side, ``width`` x ``height`` [inch]."""
+    fig = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(fig)
+    axes = [fig.add_subplot(1, columns, i + 1) for i in range(columns)]
+    for ax in axes:
+        ax.set_facecolor("none")
+        ax.grid(color=GRID, linewidth=0.6)
+        ax.set_axisbelow(True)
+    return fig, axes
+
+
+def png(fig: Figure, *, dpi: int = 140) -> bytes:
+    """The figure as PNG, its background transparent."""
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="png", dpi=dpi, transparent=True)
+    return buffer.getvalue()
+
+
+def data_uri(image: bytes) -> str:
+    """A PNG as the address of an inline image."""
+    return "data:image/png;base64," + base64.b64encode(image).decode()

@@ -1,0 +1,187 @@
+"""The folder that a run leaves behind: configuration, trajectory, frames, metrics, map and report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.config import Config, load_config
+from splatbot.errors import FormatError, InputError
+from splatbot.formats.atomic import atomic_write
+from splatbot.gaussians import GaussianModel
+from splatbot.trajectory import Trajectory
+
+_NOT_A_RUN = "give a folder that `splatbot map` wrote"
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One line of ``frames.jsonl``: what became of one frame of the log.
+
+    Args:
+        index: position in the log.
+        stamp: time [s]; None for a frame that could not be read.
+        verdict: as in :class:`splatbot.slam.FrameResult`, or "skipped" when the frame could not be read.
+        reasons: why it is not "ok".
+        stage: the tracking stage whose pose was taken.
+        ms: wall-clock milliseconds for tracking and mapping, without reading the file.
+        stage_ms: milliseconds by stage.
+        keyframe: whether the frame entered the map.
+        held_out: whether the frame was kept out of the map, to be scored against it.
+        gaussians: size of the map afterwards.
+    """
+
+    index: int
+    stamp: float | None
+    verdict: Literal["ok", "degraded", "lost", "skipped"]
+    reasons: tuple[str, ...] = ()
+    stage: str = ""
+    ms: float = 0.0
+    stage_ms: dict[str, float] = field(default_factory=dict)
+    keyframe: bool = False
+    held_out: bool = False
+    gaussians: int = 0
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the frame has a pose."""
+        return self.verdict in ("ok", "degraded")
+
+
+class RunFolder:
+    """Paths of a run's files, and reading and writing them. Every file is replaced as a whole."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.yaml"
+        self.trajectory = self.path / "trajectory.tum"
+        self.frames = self.path / "frames.jsonl"
+        self.metrics = self.path / "metrics.json"
+        self.map = self.path / "map.ply"
+        self.report = self.path / "report.html"
+
+    @classmethod
+    def create(cls, path: str | Path) -> RunFolder:
+        """The folder, made if need be; files of an earlier run stay until :meth:`save` replaces them.
+
+        Raises:
+            InputError: the folder cannot be made or written to.
+        """
+        folder = cls(path)
+        try:
+            folder.path.mkdir(parents=True, exist_ok=True)
+            probe = folder.path / ".writable"
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise InputError(
+                f"cannot be written ({error.strerror}).", file=path, field="--out", hint="name another folder"
+            ) from error
+        return folder
+
+    def save(
+        self,
+        *,
+        config: Config,
+        rows: Sequence[FrameRow],
+        trajectory: Trajectory,
+        model: GaussianModel,
+        metrics: Mapping[str, Any],
+    ) -> None:
+        """Write all but the report. An older report goes first: it would describe another map."""
+        self.report.unlink(missing_ok=True)
+        model.save(self.map)
+        self._save_trajectory(trajectory)
+        lines = [json.dumps(asdict(row)) for row in rows]
+        _write_text(self.frames, "\n".join([*lines, ""]))
+        _write_text(self.config, config.to_yaml())
+        self.save_metrics(metrics)
+
+    def save_metrics(self, metrics: Mapping[str, Any]) -> None:
+        """Write ``metrics.json``."""
+        _write_text(self.metrics, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+
+    def save_report(self, html: str) -> None:
+        """Write ``report.html``."""
+        _write_text(self.report, html)
+
+    def load_config(self) -> Config:
+        """The configuration that the run used; the present environment does not change it."""
+        self._require(self.config)
+        return load_config(self.config, environ={})
+
+    def load_metrics(self) -> dict[str, Any]:
+        """``metrics.json``.
+
+        Raises:
+            FormatError: the file is missing or damaged.
+        """
+        try:
+            metrics = json.loads(self._require(self.metrics).read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise FormatError(f"is not JSON: {error}.", file=self.metrics, hint="run `splatbot map` again") from error
+        if not isinstance(metrics, dict):
+            raise FormatError("is not a JSON object.", file=self.metrics, hint="run `splatbot map` again")
+        return metrics
+
+    def load_frames(self) -> list[FrameRow]:
+        """The rows of ``frames.jsonl``.
+
+        Raises:
+            FormatError: the file is missing or a line is damaged.
+        """
+        rows = []
+        for number, line in enumerate(self._require(self.frames).read_text(encoding="utf-8").splitlines(), 1):
+            try:
+                values = json.loads(line)
+                rows.append(FrameRow(**values | {"reasons": tuple(values["reasons"])}))
+            except (ValueError, TypeError, KeyError) as error:
+                raise FormatError(
+                    f"is not a frame ({error}).",
+                    file=self.frames,
+                    field=f"line {number}",
+                    hint="run `splatbot map` again",
+                ) from error
+        return rows
+
+    def load_trajectory(self) -> Trajectory:
+        """The poses of the tracked frames."""
+        return Trajectory.load(self._require(self.trajectory))
+
+    def load_poses(self) -> dict[int, NDArray[np.float64]]:
+        """T_world_camera (4, 4) of every tracked frame, by its position in the log.
+
+        Raises:
+            FormatError: ``frames.jsonl`` and ``trajectory.tum`` do not belong together.
+        """
+        indices = [row.index for row in self.load_frames() if row.tracked]
+        poses = list(self.load_trajectory().T_world_camera) if indices else []
+        if len(indices) != len(poses):
+            raise FormatError(
+                f"has {len(poses)} poses, {self.frames.name} has {len(indices)} tracked frames.",
+                file=self.trajectory,
+                hint="restore the file, or run `splatbot map` again",
+            )
+        return dict(zip(indices, poses, strict=True))
+
+    def _save_trajectory(self, trajectory: Trajectory) -> None:
+        if len(trajectory):
+            trajectory.save(self.trajectory)
+        else:
+            _write_text(self.trajectory, "# no frame was tracked\n")
+
+    def _require(self, path: Path) -> Path:
+        if not path.is_file():
+            raise FormatError("is missing.", file=path, hint=_NOT_A_RUN)
+        return path
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as file:
+        file.write(text.encode())

@@ -1,0 +1,50 @@
+"""Numbers as people read them; a dash where there is none."""
+
+from __future__ import annotations
+
+NONE = "-"
+
+
+def metres(value: float | None) -> str:
+    """A length [m] in mm, cm or m."""
+    if value is None:
+        return NONE
+    if abs(value) < 0.02:
+        return f"{1e3 * value:.2f} mm"
+    return f"{1e2 * value:.2f} cm" if abs(value) < 1.0 else f"{value:.2f} m"
+
+
+def milliseconds(value: float | None) -> str:
+    """A time [ms] in ms, or in s from ten seconds on."""
+    if value is None:
+        return NONE
+    if value >= 1e4:
+        return f"{value / 1e3:.1f} s"
+    return f"{value:.0f} ms" if value >= 100 else f"{value:.1f} ms"
+
+
+def decibels(value: float | None) -> str:
+    """A ratio [dB]."""
+    return NONE if value is None else f"{value:.1f} dB"
+
+
+def percent(value: float | None) -> str:
+    """A share 0..1 in %."""
+    return NONE if value is None else f"{100 * value:.0f} %"
+
+
+def count(value: int | None) -> str:
+    """A number with thousands set apart."""
+    return NONE if value is None else f"{value:,}"
+
+
+def megabytes(value: float | None) -> str:
+    """Bytes in MB (10⁶), or GB from a thousand on."""
+    if value is None:
+        return NONE
+    return f"{value / 1e9:.2f} GB" if value >= 1e9 else f"{value / 1e6:.1f} MB"
+
+
+def number(value: float | None, digits: int) -> str:
+    """A bare number with so many digits after the point."""
+    return NONE if value is None else f"{value:.{digits}f}"

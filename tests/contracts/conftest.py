@@ -1,0 +1,60 @@
+"""A real server on a real socket."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+
+from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.services.app import create_app
+from splatbot.services.settings import ServiceSettings
+from splatbot.services.store import MapStore
+
+
+@dataclass(frozen=True)
+class Service:
+    """A running service: what a client sees of it, and its store."""
+
+    client: httpx.Client
+    store: MapStore
+
+
+def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
+    """A red wall of flat Gaussians, 1 m square at depth ``z`` [m], facing the world's origin."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 51), np.linspace(-0.5, 0.5, 51)))
+    n = len(x)
+    model = GaussianModel.from_activated(
+        means=np.stack([x, y, np.full(n, z)], -1),
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        scales=np.tile([0.015, 0.015, 0.001], (n, 1)),
+        opacities=np.full(n, 0.95),
+        colors=np.tile([1.0, 0.2, 0.1], (n, 1)),
+    )
+    return Snapshot(model, version)
+
+
+@pytest.fixture
+def service() -> Iterator[Service]:
+    """The service on the map "wall", with small limits."""
+    store = MapStore()
+    store.add("wall", source="wall.ply", state="static", snapshot=wall())
+    settings = ServiceSettings(max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480)
+    config = uvicorn.Config(create_app(settings, store), host="127.0.0.1", port=0, log_level="warning")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive(), "the server did not start"
+        time.sleep(0.01)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+        yield Service(client, store)
+    server.should_exit = True
+    thread.join(10)

@@ -1,0 +1,115 @@
+"""A log that is mapped while it is served."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from splatbot.camera import Camera
+from splatbot.errors import LogError
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.services.live import LiveMapping
+from splatbot.services.store import MapStore
+from splatbot.slam import FrameResult
+
+CAMERA = Camera(10, 10, 1.5, 1.5, 4, 4)
+
+
+class _Log:
+    """Ten frames; reading ``broken`` raises ``error``."""
+
+    name = uri = "ten frames"
+    camera = CAMERA
+    ground_truth = None
+
+    def __init__(self, broken: int | None = None, error: Exception | None = None) -> None:
+        self.broken, self.error = broken, error
+        self.hold = threading.Event()
+        self.hold.set()
+
+    def __len__(self) -> int:
+        return 10
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self.read(i) for i in range(10))
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.read(index)
+
+    def read(self, index: int) -> Frame:
+        self.hold.wait(5)
+        if index == self.broken and self.error is not None:
+            raise self.error
+        return Frame(float(index), np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), np.float32), CAMERA, index=index)
+
+
+class _Mapper:
+    """Adds one Gaussian per even frame, which is a keyframe."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.keyframes = 0
+        self.finished = False
+
+    def process(self, frame: Frame) -> FrameResult:
+        keyframe = self.frames % 2 == 0
+        self.frames += 1
+        self.keyframes += keyframe
+        return FrameResult(frame.index, frame.stamp, np.eye(4), "ok", keyframe=keyframe)
+
+    def finish(self) -> None:
+        self.finished = True
+
+    def snapshot(self) -> Snapshot:
+        model = GaussianModel.empty()
+        version = self.keyframes + self.finished
+        ints = torch.zeros(version, dtype=torch.int32)
+        z = torch.zeros
+        quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(version, 1)
+        model = GaussianModel(z(version, 3), quats, z(version, 3), z(version), z(version, 1, 3), ints, ints)
+        return Snapshot(model, version)
+
+
+def _follow(log: _Log) -> tuple[MapStore, LiveMapping]:
+    store = MapStore()
+    store.add("live", source=log.name, state="mapping")
+    mapping = LiveMapping(store, "live", log, _Mapper())
+    mapping.start()
+    return store, mapping
+
+
+def test_the_map_grows_with_each_keyframe_and_stays_after_the_log_ends() -> None:
+    store, mapping = _follow(_Log())
+    assert mapping.wait(10)
+    served = store.get("live")
+    assert (served.state, served.map_version, len(served.ready.model)) == ("ended", 6, 6)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (LogError("is cut off.", file="/srv/logs/rgb/5.png", field="rgb"), "is cut off."),
+        (RuntimeError("a secret of the machine"), "unexpected error; the service's log says more"),
+    ],
+)
+def test_a_log_that_breaks_leaves_what_was_mapped_and_says_why(error: Exception, told: str) -> None:
+    store, mapping = _follow(_Log(broken=5, error=error))
+    assert mapping.wait(10)
+    served = store.get("live")
+    assert (served.state, served.detail, served.map_version) == ("failed", told, 3)
+    assert len(served.ready.model) == 3
+
+
+def test_stopping_ends_after_the_frame_in_work() -> None:
+    log = _Log()
+    log.hold.clear()
+    store, mapping = _follow(log)
+    threading.Timer(0.1, log.hold.set).start()
+    mapping.stop(timeout_s=10)
+    assert mapping.wait(0)
+    assert store.get("live").map_version <= 1

@@ -1,0 +1,302 @@
+"""map_log: what it keeps, what it scores, and that nothing computed is lost."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import signal
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatbot.config import Config, load_config
+from splatbot.errors import FormatError, InputError, LogError
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
+from splatbot.logs import Log, open_log
+from splatbot.results.folder import RunFolder
+from splatbot.results.rescore import rescore
+from splatbot.run import Progress, map_log
+from splatbot.trajectory import Trajectory
+from tests.unit.oracle import OracleSlam
+
+MakeLog = Callable[..., Path]
+
+DESIGN_NAMES = {
+    "frames", "tracked", "lost", "ate_rmse_m", "rpe_trans_rmse_m", "psnr_holdout_db", "depth_l1_m", "gaussians",
+    "map_bytes", "peak_rss_bytes", "ms_per_frame", "stages", "effects",
+}  # fmt: skip
+FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html"}
+
+
+@pytest.fixture
+def log(make_log: MakeLog) -> Log:
+    return open_log(make_log(16))
+
+
+def oracle(log: Log, **kwargs: Any) -> OracleSlam:
+    assert log.ground_truth is not None
+    return OracleSlam(log.ground_truth, **kwargs)
+
+
+def read(folder: Path) -> dict[str, Any]:
+    metrics: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
+    return metrics
+
+
+def truncate(path: Path, share: float = 0.5) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+
+
+def interrupt_at(frame: int, times: int = 1) -> Callable[[Progress], None]:
+    """A progress callback that acts as Ctrl-C once so many frames are done."""
+
+    def on_progress(progress: Progress) -> None:
+        if progress.phase == "mapping" and progress.done == frame:
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGINT)
+
+    return on_progress
+
+
+def test_a_run_leaves_every_file_and_every_documented_metric(log: Log, tmp_path: Path) -> None:
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log))
+    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES
+    assert read(tmp_path / "run") == result.metrics
+    assert set(result.metrics) >= DESIGN_NAMES
+    assert set(result.metrics["ms_per_frame"]) == {"p50", "p95", "p99"}
+    assert result.exit_code == 0
+    assert (result.metrics["frames"], result.metrics["tracked"], result.metrics["lost"]) == (16, 16, 0)
+    assert result.metrics["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    assert result.metrics["gaussians"] == len(GaussianModel.load(tmp_path / "run" / "map.ply"))
+    assert result.metrics["stages"]["track"]["p50"] == 2.0
+
+
+def test_held_out_frames_never_enter_the_map_and_are_scored(log: Log, tmp_path: Path) -> None:
+    slam = oracle(log)
+    result = map_log(log, out=tmp_path / "run", slam=slam)
+    assert [index for index, hold_out in slam.seen if hold_out] == [7, 15]
+    assert result.metrics["held_out"] == 2
+    assert result.metrics["psnr_holdout_db"] > 0
+    assert result.metrics["depth_median_m"] < 0.2  # the frames' planes lie within 15 cm
+
+
+def test_no_frame_is_held_out_when_told_so(log: Log, tmp_path: Path) -> None:
+    config = load_config(overrides={"mapping.holdout_every": 0}, environ={})
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log), config=config)
+    assert result.metrics["held_out"] == 0
+    assert result.metrics["psnr_holdout_db"] is None
+
+
+def test_the_trajectory_holds_the_tracked_frames_only(log: Log, tmp_path: Path) -> None:
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log, lost=(3, 4), degraded=(6,)))
+    assert (result.metrics["tracked"], result.metrics["lost"], result.metrics["degraded"]) == (14, 2, 1)
+    saved = Trajectory.load(tmp_path / "run" / "trajectory.tum")
+    assert len(saved) == 14
+    poses = RunFolder(tmp_path / "run").load_poses()
+    assert 3 not in poses
+    assert log.ground_truth is not None
+    np.testing.assert_allclose(poses[5], log.ground_truth.T_world_camera[5], atol=1e-9)
+
+
+def test_errors_are_null_without_a_reference(make_log: MakeLog, tmp_path: Path) -> None:
+    folder = make_log(8)
+    truth = open_log(folder).ground_truth
+    assert truth is not None
+    (folder / "groundtruth.txt").unlink()
+    metrics = map_log(open_log(folder), out=tmp_path / "run", slam=OracleSlam(truth)).metrics
+    assert metrics["ate_rmse_m"] is None
+    assert metrics["rpe_trans_rmse_m"] is None
+    assert metrics["psnr_holdout_db"] is not None
+
+
+def test_a_bad_frame_ends_the_run_and_what_was_mapped_is_saved(make_log: MakeLog, tmp_path: Path) -> None:
+    folder = make_log(12)
+    truncate(folder / "rgb" / "000009.png")
+    log = open_log(folder)
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log))
+    assert isinstance(result.error, LogError)
+    assert result.exit_code == 2
+    assert "000009.png" in str(read(tmp_path / "run")["error"])
+    assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 9
+    assert len(GaussianModel.load(tmp_path / "run" / "map.ply")) > 0
+    assert read(tmp_path / "run")["psnr_holdout_db"] is not None  # frame 7 was scored all the same
+    assert "000009.png" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_a_bad_frame_can_be_skipped(make_log: MakeLog, tmp_path: Path) -> None:
+    folder = make_log(12)
+    truncate(folder / "depth" / "000004.png")
+    log = open_log(folder)
+    told: list[str] = []
+    result = map_log(
+        log, out=tmp_path / "run", slam=oracle(log), on_bad_frame="skip", on_progress=lambda p: told.append(p.skipped)
+    )
+    assert result.exit_code == 0
+    assert (result.metrics["frames"], result.metrics["skipped"]) == (11, 1)
+    (skipped,) = [row for row in RunFolder(tmp_path / "run").load_frames() if row.verdict == "skipped"]
+    assert skipped.index == 4
+    assert "000004.png" in skipped.reasons[0]
+    assert sum("000004.png" in text for text in told) == 1
+
+
+def test_a_bad_first_frame_is_an_error_and_an_older_run_stays_as_it_was(make_log: MakeLog, tmp_path: Path) -> None:
+    good = open_log(make_log(8))
+    map_log(good, out=tmp_path / "run", slam=oracle(good))
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    folder = make_log(8, name="other")
+    truncate(folder / "rgb" / "000000.png")
+    with pytest.raises(LogError, match=r"000000\.png"):
+        map_log(open_log(folder), out=tmp_path / "run", slam=oracle(good))
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+
+
+def test_when_every_frame_is_bad_skipping_does_not_make_an_empty_run(make_log: MakeLog, tmp_path: Path) -> None:
+    folder = make_log(3)
+    for path in (folder / "rgb").iterdir():
+        truncate(path)
+    log = open_log(folder)
+    with pytest.raises(LogError, match=r"000000\.png"):
+        map_log(log, out=tmp_path / "run", slam=oracle(log), on_bad_frame="skip")
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_damaged_reference_is_found_before_the_run_not_after(make_log: MakeLog, tmp_path: Path) -> None:
+    folder = make_log(4)
+    truth = open_log(folder).ground_truth
+    assert truth is not None
+    (folder / "groundtruth.txt").write_text("0.0 1 2\n")
+    slam = OracleSlam(truth)
+    with pytest.raises(FormatError, match=r"groundtruth\.txt"):
+        map_log(open_log(folder), out=tmp_path / "run", slam=slam)
+    assert not slam.seen
+
+
+def test_ctrl_c_finishes_the_frame_and_saves_a_whole_run(log: Log, tmp_path: Path) -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=interrupt_at(10))
+    assert result.exit_code == 130
+    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES
+    metrics = read(tmp_path / "run")
+    assert metrics["interrupted"] is True
+    assert metrics["frames"] == 10
+    assert metrics["psnr_holdout_db"] is not None
+    assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 10
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_a_second_ctrl_c_at_once_still_saves_what_was_mapped(log: Log, tmp_path: Path) -> None:
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=interrupt_at(10, times=2))
+    assert result.exit_code == 130
+    assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 10
+    assert len(GaussianModel.load(tmp_path / "run" / "map.ply")) > 0
+
+
+def test_ctrl_c_while_scoring_keeps_the_map(log: Log, tmp_path: Path) -> None:
+    def on_progress(progress: Progress) -> None:
+        if progress.phase == "scoring":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=on_progress)
+    assert result.exit_code == 130
+    assert read(tmp_path / "run")["interrupted"] is True
+    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES - {"report.html"}
+    assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 16
+
+
+def test_ctrl_c_before_the_first_frame_is_just_an_interrupt(log: Log, tmp_path: Path) -> None:
+    class Stopped(OracleSlam):
+        def process(self, frame: Frame, *, hold_out: bool = False) -> Any:
+            raise KeyboardInterrupt
+
+    assert log.ground_truth is not None
+    with pytest.raises(KeyboardInterrupt):
+        map_log(log, out=tmp_path / "run", slam=Stopped(log.ground_truth))
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_crash_of_the_slam_is_raised_after_the_map_is_saved(log: Log, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="crashed on purpose"):
+        map_log(log, out=tmp_path / "run", slam=oracle(log, crash_at=6))
+    assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 6
+    assert len(GaussianModel.load(tmp_path / "run" / "map.ply")) > 0
+
+
+def test_a_folder_is_used_again_and_every_file_is_of_the_new_run(make_log: MakeLog, tmp_path: Path) -> None:
+    for frames in (12, 8):
+        log = open_log(make_log(frames, name=f"log{frames}"))
+        map_log(log, out=tmp_path / "run", slam=oracle(log))
+    assert len(RunFolder(tmp_path / "run").load_frames()) == 8
+    assert "log8" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_scoring_the_folder_again_gives_the_same_figures(log: Log, tmp_path: Path) -> None:
+    metrics = map_log(log, out=tmp_path / "run", slam=oracle(log, lost=(5,))).metrics
+    scores = rescore(RunFolder(tmp_path / "run"), log)
+    assert scores["tracked"] == 15
+    for name in ("ate_rmse_m", "rpe_trans_rmse_m", "psnr_holdout_db", "ssim_holdout", "depth_l1_m", "depth_median_m"):
+        assert scores[name] == pytest.approx(metrics[name], abs=1e-9), name
+
+
+def test_scoring_against_the_wrong_log_is_refused(log: Log, make_log: MakeLog, tmp_path: Path) -> None:
+    map_log(log, out=tmp_path / "run", slam=oracle(log))
+    with pytest.raises(FormatError, match="--log"):
+        rescore(RunFolder(tmp_path / "run"), open_log(make_log(4, name="short")))
+
+
+def test_a_lost_pose_file_is_noticed(log: Log, tmp_path: Path) -> None:
+    map_log(log, out=tmp_path / "run", slam=oracle(log))
+    lines = (tmp_path / "run" / "trajectory.tum").read_text().splitlines(keepends=True)
+    (tmp_path / "run" / "trajectory.tum").write_text("".join(lines[:-1]))
+    with pytest.raises(FormatError, match="15 poses"):
+        RunFolder(tmp_path / "run").load_poses()
+
+
+def test_memory_does_not_grow_with_the_log(log: Log, tmp_path: Path) -> None:
+    alive: list[weakref.ref[Frame]] = []
+    most = 0
+
+    class Watched(OracleSlam):
+        def process(self, frame: Frame, *, hold_out: bool = False) -> Any:
+            nonlocal most
+            alive.append(weakref.ref(frame))
+            gc.collect()
+            most = max(most, sum(ref() is not None for ref in alive))
+            return super().process(frame, hold_out=hold_out)
+
+    assert log.ground_truth is not None
+    map_log(log, out=tmp_path / "run", slam=Watched(log.ground_truth))
+    assert most <= 2
+
+
+def test_the_configuration_in_force_is_kept(log: Log, tmp_path: Path) -> None:
+    config = load_config(overrides={"mapping.max_gaussians": 12345, "mapping.holdout_every": 4}, environ={})
+    map_log(log, out=tmp_path / "run", slam=oracle(log), config=config)
+    assert RunFolder(tmp_path / "run").load_config() == config != Config()
+
+
+def test_max_frames_ends_the_run_early(log: Log, tmp_path: Path) -> None:
+    assert map_log(log, out=tmp_path / "run", slam=oracle(log), max_frames=5).metrics["frames"] == 5
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_anything_is_computed(log: Log, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    slam = oracle(log)
+    with pytest.raises(InputError, match="--out"):
+        map_log(log, out=tmp_path / "file", slam=slam)
+    assert not slam.seen
+
+
+def test_progress_counts_frames_keyframes_and_losses(log: Log, tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    map_log(log, out=tmp_path / "run", slam=oracle(log, lost=(2,)), on_progress=seen.append)
+    mapping = [p for p in seen if p.phase == "mapping"]
+    assert [p.done for p in mapping] == list(range(1, 17))
+    assert (mapping[-1].lost, mapping[-1].keyframes) == (1, 13)
+    assert [p.phase for p in seen[16:]] == ["refining", "saving", "scoring", "reporting"]
