@@ -15,7 +15,6 @@ from splatbot.rasterize.inputs import check_inputs
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import native
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 DepthMode = Literal["center", "plane"]
 
 
@@ -51,7 +50,7 @@ def rasterization(
     packed: bool = False,
     tile_size: int | None = None,
     backgrounds: Tensor | None = None,
-    render_mode: RenderMode = "RGB",
+    render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
