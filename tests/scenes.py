@@ -31,7 +31,7 @@ class Scene:
 
     def render(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
         """Through the native kernels."""
-        return rasterization(**self._arguments(), render_mode=render_mode, **options)  # type: ignore[arg-type]
+        return rasterization(**self._arguments(), render_mode=render_mode, **options)
 
     def reference(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
         """Through the float64 reference."""

@@ -15,7 +15,6 @@ from splatbot.rasterize.inputs import check_inputs
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import native
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 DepthMode = Literal["center", "plane"]
 
 
@@ -51,7 +50,7 @@ def rasterization(
     packed: bool = False,
     tile_size: int | None = None,
     backgrounds: Tensor | None = None,
-    render_mode: RenderMode = "RGB",
+    render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
@@ -96,8 +95,9 @@ def rasterization(
         camera_model: "pinhole".
         channel_chunk: has no effect on the result; accepted for gsplat's sake.
         depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat); "plane" lets it vary over the
-            footprint as that of the plane through the centre and normal to the Gaussian's shortest axis. Its gradient
-            is that of the centre's depth, as if the slope were constant and the depth taken at the centre.
+            footprint as that of the plane through the centre and normal to the Gaussian's shortest axis, faded out as
+            the shortest axis nears the middle one and bounded where the plane is seen edge-on. Its gradient takes
+            the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them.
 
     Returns:
         render_colors (C, H, W, X), render_alphas (C, H, W, 1), meta: means2d, depths, conics, radii, opacities,
@@ -188,7 +188,9 @@ class _Rasterize(torch.autograd.Function):
         need = ctx.needs_input_grad
         geometry = [t.detach() for t in (means, quats, scales, opacities)]
         out = [torch.empty_like(t) if n else None for t, n in zip(geometry, need[:4], strict=True)]
-        grad_colors = torch.zeros(colors.shape, dtype=torch.float32) if need[4] else None
+        # Zeros only where the second view adds to rows that the first did not write.
+        new_colors = torch.empty if colors.ndim == 2 or len(ctx.states) == 1 else torch.zeros
+        grad_colors = new_colors(colors.shape, dtype=torch.float32) if need[4] else None
         grad_viewmats = torch.zeros(viewmats.shape, dtype=torch.float64) if need[5] else None
         grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[6] else None
         if grad_renders is None and grad_alphas is None:

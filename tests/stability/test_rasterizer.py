@@ -206,3 +206,15 @@ def test_focal_lengths_that_differ_and_a_principal_point_outside_the_image() -> 
     scene = hard_scene(13)
     scene.Ks = torch.tensor([[[90.0, 0.0, -20.0], [0.0, 40.0, 70.0], [0.0, 0.0, 1.0]]])
     assert_within_bounds(scene)
+
+
+def test_plane_depth_of_a_disc_seen_edge_on_stays_within_the_disc() -> None:
+    half = 0.5**0.5
+    for tilt in (0.0, 1e-6, 1e-3, 0.05):
+        scene = one_gaussian(quat=(half, half + tilt, 0.0, 0.0), scale=(0.1, 0.1, 1e-5), opacity=0.99)
+        depth, alpha, _ = scene.render("ED", depth_mode="plane")
+        seen = alpha[..., 0] > 0
+        # Twice the disc's own spread in depth (0.1 m), over an extent of 3.33 standard deviations.
+        assert float((depth[..., 0][seen] - 2.0).abs().max()) <= 2 * 0.1 * 3.34
+        want = scene.reference("ED", depth_mode="plane")[0]
+        assert float((depth.double() - want)[seen].abs().max()) <= 2e-4

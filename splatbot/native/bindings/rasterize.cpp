@@ -140,7 +140,9 @@ template <class T>
 nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
   auto held = std::make_unique<std::vector<T>>(std::move(values));
   T* data = held->data();
-  nb::capsule owner(held.release(), [](void* p) noexcept { std::unique_ptr<std::vector<T>>(static_cast<std::vector<T>*>(p)); });
+  nb::capsule owner(held.release(), [](void* p) noexcept {
+    const std::unique_ptr<std::vector<T>> released(static_cast<std::vector<T>*>(p));
+  });
   return nb::ndarray<nb::numpy, T>(data, shape, owner);
 }
 

@@ -11,6 +11,7 @@
 #include <string_view>
 
 #if defined(__linux__)
+#include <pthread.h>
 #include <sched.h>
 #endif
 #if defined(__unix__) || defined(__APPLE__)
@@ -23,11 +24,25 @@ namespace {
 
 constexpr unsigned kMaxThreads = 1024;
 
+#if defined(__linux__)
+// The CPUs that the process might use at its first call; later the calling thread may itself be restricted.
+const cpu_set_t& process_cpus() {
+  static const cpu_set_t instance = [] {
+    cpu_set_t set;
+    CPU_ZERO(&set);
+    if (sched_getaffinity(getpid(), sizeof(set), &set) != 0) {
+      CPU_ZERO(&set);
+    }
+    return set;
+  }();
+  return instance;
+}
+#endif
+
 unsigned usable_cpus() {
 #if defined(__linux__)
-  cpu_set_t set;
-  if (sched_getaffinity(0, sizeof(set), &set) == 0) {
-    return std::max(1, CPU_COUNT(&set));
+  if (CPU_COUNT(&process_cpus()) > 0) {
+    return static_cast<unsigned>(CPU_COUNT(&process_cpus()));
   }
 #endif
   return std::max(1U, std::thread::hardware_concurrency());
@@ -118,6 +133,7 @@ void ThreadPool::run_erased(std::size_t count, Function function, void* context)
     }
     return;
   }
+  keep_workers_off_this_cpu();
   Loop loop{.function = function, .context = context, .count = count, .error = nullptr};
   {
     const std::lock_guard lock(mutex_);
@@ -132,6 +148,24 @@ void ThreadPool::run_erased(std::size_t count, Function function, void* context)
   if (loop.error) {
     std::rethrow_exception(loop.error);
   }
+}
+
+// A scheduler that wakes a sleeping thread likes to put it where the waker runs. With the waker busy for the whole
+// loop, that worker would wait until the loop is over: two threads would be no faster than one.
+void ThreadPool::keep_workers_off_this_cpu() {
+#if defined(__linux__)
+  const int cpu = sched_getcpu();
+  if (cpu < 0 || cpu == caller_cpu_ || size_ > usable_cpus()) {
+    return;
+  }
+  cpu_set_t others = process_cpus();
+  CPU_CLR(static_cast<std::size_t>(cpu), &others);
+  for (std::thread& thread : threads_) {
+    // Refused on some systems; then the scheduler decides.
+    static_cast<void>(pthread_setaffinity_np(thread.native_handle(), sizeof(others), &others));
+  }
+  caller_cpu_ = cpu;
+#endif
 }
 
 void ThreadPool::work() {

@@ -16,7 +16,7 @@ inline constexpr float kAlphaMax = 0.99F;
 inline constexpr float kTransmittanceMin = 1e-4F;
 inline constexpr float kMaxSigmas = 3.33F;
 inline constexpr float kExpectedDepthMin = 1e-10F;  // least sum of weights that expected depth is divided by
-inline constexpr float kFovMargin = 0.3F;           // of half the field of view, where the projection's slope is clamped
+inline constexpr float kFovMargin = 0.3F;           // of half the field of view, where slopes are clamped
 
 struct ProjectArgs {
   std::size_t count;

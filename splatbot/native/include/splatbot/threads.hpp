@@ -12,7 +12,8 @@
 namespace splatbot {
 
 // A fixed number of threads that sleep (never spin) until a loop is to be run. Tasks are handed out one by one, so
-// which thread runs a task is not determined: a task must depend on its index alone.
+// which thread runs a task is not determined: a task must depend on its index alone. Workers stay on the CPUs that the
+// process might use when the pool was made, and off the one that the caller is on.
 class ThreadPool {
  public:
   explicit ThreadPool(unsigned threads);
@@ -37,6 +38,7 @@ class ThreadPool {
 
   void run_erased(std::size_t count, Function function, void* context);
   void work();
+  void keep_workers_off_this_cpu();
 
   unsigned size_;
   std::mutex owner_;  // held by the caller whose loop is being run
@@ -46,6 +48,7 @@ class ThreadPool {
   Loop* loop_ = nullptr;
   unsigned long long generation_ = 0;
   unsigned active_ = 0;
+  int caller_cpu_ = -1;  // that the workers keep off
   bool stop_ = false;
   std::vector<std::thread> threads_;
 };

@@ -35,7 +35,8 @@ struct Extras {
 
 void start(const TileFrame& frame, int channels, TileState& state) {
   for (int i = 0; i < kTilePixels; ++i) {
-    const bool inside = kCenters.x[i] < static_cast<float>(frame.width) && kCenters.y[i] < static_cast<float>(frame.height);
+    const bool inside =
+        kCenters.x[i] < static_cast<float>(frame.width) && kCenters.y[i] < static_cast<float>(frame.height);
     state.through[i] = inside ? 1.0F : 0.0F;
     state.transmittance[i] = 1.0F;
   }

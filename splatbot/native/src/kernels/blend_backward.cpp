@@ -2,8 +2,8 @@
 // Gradient of blend(). Gaussian by Gaussian, front to back, with each pixel's transmittance T and the rest
 // R = sum over what is still to be blended of (channels . gradient) x weight + T_final x gradient of T_final, so that
 //   d loss / d alpha = T (channels . gradient) - R_after / (1 - alpha),
-// without a division by T and in the order and with the masks of the forward pass. The sums of one (Gaussian, tile) pair
-// go to a slot of their own: nothing is shared between threads and nothing depends on their number.
+// without a division by T and in the order and with the masks of the forward pass. The sums of one (Gaussian, tile)
+// pair go to a slot of their own: nothing is shared between threads and nothing depends on their number.
 #include "entry.hpp"
 #include "tile.hpp"
 
@@ -69,7 +69,8 @@ void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const floa
 
 // Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha); then weight times gradient for the first S channels.
 template <int C, int S, bool Plane>
-SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDepth& plane, std::uint32_t mask, TileGradient& state, float* slot) {
+SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDepth& plane, std::uint32_t mask,
+                        TileGradient& state, float* slot) {
   F acc[16];
 #pragma GCC unroll 16
   for (int i = 0; i < 16; ++i) {

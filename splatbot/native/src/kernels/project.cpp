@@ -58,8 +58,8 @@ SB_INLINE void load_lanes(const float* rows, std::size_t first, int n, F (&out)[
 }
 
 // Change of depth per pixel over a Gaussian's footprint if its matter lies in the plane through its centre whose
-// normal n is its flattest axis: the ray of pixel (u, v) meets that plane at z(u, v), and d z/d u = -z^2 n_x / (fx n.p).
-// A Gaussian with no flattest axis has no plane, so the slope fades with (least scale / middle scale)^2; it is bounded
+// normal n is its flattest axis: the ray of pixel (u, v) meets that plane at z(u, v), and d z/d u is
+// -z^2 n_x / (fx n.p). A Gaussian with no flattest axis has no plane, so the slope fades with (least scale / middle scale)^2; it is bounded
 // where the plane is seen edge-on: over one footprint, depth varies by no more than twice the Gaussian's own.
 SB_INLINE void plane_slopes(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, F (&slope)[2]) {
   F s[3];
@@ -96,25 +96,34 @@ SB_INLINE void plane_slopes(const GaussianLanes& g, const CameraLanes& cam, cons
 
 struct Lanes {
   alignas(64) float mx[W], my[W], l11[W], l21[W], l22[W], lo[W], reach[W], lean[W];
-  alignas(64) float z[W], slope_x[W], slope_y[W], x0[W], y0[W], x1[W], y1[W];
+  alignas(64) float z[W], slope_x[W], slope_y[W];
+  alignas(64) std::uint32_t corner[W], size[W];  // x in the low half, y in the high half
 };
 
-void write_channels(const ProjectArgs& args, std::size_t id, const Lanes& lanes, int lane) {
+// Rows of a few floats; a loop of unknown length would cost more than the copy.
+SB_INLINE void copy_few(float* to, const float* from, int n) {
+  switch (n) {
+    case 1:
+      return static_cast<void>(std::memcpy(to, from, 1 * sizeof(float)));
+    case 3:
+      return static_cast<void>(std::memcpy(to, from, 3 * sizeof(float)));
+    default:
+      for (int i = 0; i < n; ++i) {
+        to[i] = from[i];
+      }
+  }
+}
+
+SB_INLINE void write_channels(const ProjectArgs& args, std::size_t id, const Lanes& lanes, int lane) {
   for (int p = 0; p < args.n_passes; ++p) {
     const ChannelPass& pass = args.passes[p];
     float* to = p == 0 ? args.records[id].channels
                        : args.more_channels + (static_cast<std::size_t>(p - 1) * args.count + id) * kRecordChannels;
-    int c = 0;
-    if (pass.depth_first) {
-      to[c++] = lanes.z[lane];
-    }
+    const int depth = pass.depth_first ? 1 : 0;
     const float* from = args.colors + id * static_cast<std::size_t>(args.channels) + pass.first_color;
-    for (int k = 0; c < pass.count; ++c, ++k) {
-      to[c] = from[k];
-    }
-    for (; c < kRecordChannels; ++c) {
-      to[c] = 0.0F;
-    }
+    std::memset(to, 0, kRecordChannels * sizeof(float));
+    to[0] = lanes.z[lane];
+    copy_few(to + depth, from, pass.count - depth);
     if (pass.depth_first && args.options.plane_depth) {
       to[kRecordChannels - 2] = lanes.slope_x[lane];
       to[kRecordChannels - 1] = lanes.slope_y[lane];
@@ -122,7 +131,7 @@ void write_channels(const ProjectArgs& args, std::size_t id, const Lanes& lanes,
   }
 }
 
-void write_lane(const ProjectArgs& args, std::size_t id, const Lanes& lanes, int lane, ProjectedBlock& out) {
+SB_INLINE void write_lane(const ProjectArgs& args, std::size_t id, const Lanes& lanes, int lane, ProjectedBlock& out) {
   Record& record = args.records[id];
   record.mx = lanes.mx[lane];
   record.my = lanes.my[lane];
@@ -134,13 +143,14 @@ void write_lane(const ProjectArgs& args, std::size_t id, const Lanes& lanes, int
   record.lean = lanes.lean[lane];
   write_channels(args, id, lanes, lane);
   Placement& place = args.placements[id];
-  place.x0 = static_cast<std::uint16_t>(lanes.x0[lane]);
-  place.y0 = static_cast<std::uint16_t>(lanes.y0[lane]);
-  place.nx = static_cast<std::uint16_t>(lanes.x1[lane] - lanes.x0[lane] + 1.0F);
-  place.ny = static_cast<std::uint16_t>(lanes.y1[lane] - lanes.y0[lane] + 1.0F);
+  const std::uint32_t corner = lanes.corner[lane], size = lanes.size[lane];
+  place.x0 = static_cast<std::uint16_t>(corner);
+  place.y0 = static_cast<std::uint16_t>(corner >> 16);
+  place.nx = static_cast<std::uint16_t>(size);
+  place.ny = static_cast<std::uint16_t>(size >> 16);
   place.slot = static_cast<std::uint32_t>(out.pairs);
   std::memcpy(&place.depth_bits, &lanes.z[lane], sizeof(float));
-  out.pairs += std::uint64_t{place.nx} * place.ny;
+  out.pairs += std::uint64_t{size & 0xffffU} * (size >> 16);
 }
 
 // Extent of the ellipse in tiles, clamped to the image; a mask of lanes that reach it.
@@ -151,10 +161,12 @@ SB_INLINE M cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Lanes& 
   const F left = mx - rx, right = mx + rx, top = my - ry, bottom = my + ry;
   const F last_x = set1(static_cast<float>(args.columns - 1));
   const F last_y = set1(static_cast<float>(args.rows - 1));
-  store(lanes.x0, clamp(floor(left * set1(1.0F / kTileWidth)), zero, last_x));
-  store(lanes.x1, clamp(floor(right * set1(1.0F / kTileWidth)), zero, last_x));
-  store(lanes.y0, clamp(floor(top * set1(1.0F / kTileHeight)), zero, last_y));
-  store(lanes.y1, clamp(floor(bottom * set1(1.0F / kTileHeight)), zero, last_y));
+  const I x0 = to_int(clamp(floor(left * set1(1.0F / kTileWidth)), zero, last_x));
+  const I x1 = to_int(clamp(floor(right * set1(1.0F / kTileWidth)), zero, last_x));
+  const I y0 = to_int(clamp(floor(top * set1(1.0F / kTileHeight)), zero, last_y));
+  const I y1 = to_int(clamp(floor(bottom * set1(1.0F / kTileHeight)), zero, last_y));
+  store(lanes.corner, x0 | shift_left<16>(y0));
+  store(lanes.size, (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1)));
   return (right > zero) & (left < width) & (bottom > zero) & (top < height);
 }
 
@@ -177,31 +189,29 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
     Lanes lanes;
     const F lo = log2(max(opacity[0], set1(kAlphaMin)));
     const F reach = sqrt(max(lo - set1(kLog2AlphaMin), set1(0.0F)));
-    const F l22 = set1(kRootHalfLog2e) / sqrt(o.c11);
-    const F l11 = set1(kRootHalfLog2e) * sqrt(o.c11 / o.det);
-    const F l21 = -(l11 * o.c01 / o.c11);
+    const Root root = root_of_inverse(o);
     const F sigmas = reach * set1(1.0F / kRootHalfLog2e);
     const F sx = sqrt(o.c00);
     // A hair more than the reach: rounding must not lose a pixel at the rim.
     const F reach_safe = fma(reach, set1(1.00002F), set1(1e-5F));
     const F rx = reach_safe * set1(1.0F / kRootHalfLog2e) * sx;
-    const F ry = reach_safe / l22;
+    const F ry = reach_safe * set1(1.0F / kRootHalfLog2e) * root.sy;
     const F radius_x = ceil(min(sigmas, set1(kMaxSigmas)) * sx);
-    const F radius_y = ceil(min(sigmas, set1(kMaxSigmas)) * sqrt(o.c11));
+    const F radius_y = ceil(min(sigmas, set1(kMaxSigmas)) * root.sy);
     const F clip = set1(args.options.radius_clip);
     const F huge = set1(3e38F);
     keep = keep & cover_tiles(args, o.mx, o.my, rx, ry, lanes) & (o.det > set1(0.0F)) & (o.det < huge) &
            (o.c00 < huge) & (o.c11 < huge) & (max(radius_x, radius_y) > clip);
-    keep = keep & (l11 > set1(0.0F)) & (l11 < huge) & (l22 > set1(0.0F));
+    keep = keep & (root.l11 > set1(0.0F)) & (root.l11 < huge) & (root.l22 > set1(0.0F));
     kept = bits(keep) & wanted;
     store(lanes.mx, o.mx);
     store(lanes.my, o.my);
-    store(lanes.l11, l11);
-    store(lanes.l21, l21);
-    store(lanes.l22, l22);
+    store(lanes.l11, root.l11);
+    store(lanes.l21, root.l21);
+    store(lanes.l22, root.l22);
     store(lanes.lo, lo);
     store(lanes.reach, reach_safe);
-    store(lanes.lean, reach_safe * o.c01 / (sx * sqrt(o.c11)));
+    store(lanes.lean, reach_safe * o.c01 / (sx * root.sy));
     store(lanes.z, o.p[2]);
     if (args.options.plane_depth) {
       F slope[2];

@@ -66,9 +66,10 @@ SB_INLINE void rotate_gaussian(const GaussianLanes& g, const CameraLanes& cam, P
   }
   o.quat_zero = largest < set1(kZeroQuat);
   largest = select(o.quat_zero, set1(1.0F), largest);
+  const F shrink = set1(1.0F) / largest;
   F q[4];
   for (int i = 0; i < 4; ++i) {
-    q[i] = g.quat[i] / largest;
+    q[i] = g.quat[i] * shrink;
   }
   const F length = sqrt(fma(q[0], q[0], fma(q[1], q[1], fma(q[2], q[2], q[3] * q[3]))));
   const F inverse = set1(1.0F) / select(o.quat_zero, set1(1.0F), length);
@@ -99,6 +100,22 @@ SB_INLINE void project_center(const GaussianLanes& g, const CameraLanes& cam, Pr
   for (int i = 0; i < 3; ++i) {
     o.p[i] = fma(cam.r[3 * i], g.mean[0], fma(cam.r[3 * i + 1], g.mean[1], fma(cam.r[3 * i + 2], g.mean[2], cam.t[i])));
   }
+}
+
+// (l11 l21; 0 l22) of Record.
+struct Root {
+  F l11, l21, l22;
+  F sy;  // standard deviation in y [px]
+};
+
+SB_INLINE Root root_of_inverse(const Projected& o) {
+  Root r;
+  r.sy = sqrt(o.c11);
+  const F inverse = set1(1.0F) / r.sy;
+  r.l22 = set1(kRootHalfLog2e) * inverse;
+  r.l11 = set1(kRootHalfLog2e) * r.sy / sqrt(o.det);
+  r.l21 = -(r.l11 * o.c01 * inverse * inverse);
+  return r;
 }
 
 // Everything after project_center(); lanes at z <= 0 hold no meaning.

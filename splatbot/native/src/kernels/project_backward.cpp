@@ -54,8 +54,9 @@ void write_colors(const ProjectBackwardArgs& args, std::size_t id, const float* 
 }
 
 // Gradient of the 2D mean and covariance into the Gaussian and the camera.
-void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, F l11, F l21, F l22,
+void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, const Root& root,
                const LaneSums& sums, LaneGradients& out) {
+  const F l11 = root.l11, l21 = root.l21, l22 = root.l22;
   // With z = B d and log(alpha) = log(opacity) - |z|^2 / (2 k^2): d/d mean = B^T z / k^2 and
   // d/d covariance = B^T z z^T B / (2 k^4).
   const F su = load(sums.moments[1]), sw = load(sums.moments[2]);
@@ -264,11 +265,8 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
     Projected o;
     project_center(g, cam, o);
     project_rest(g, cam, set1(args.forward.options.eps2d), o);
-    const F l22 = set1(kRootHalfLog2e) / sqrt(o.c11);
-    const F l11 = set1(kRootHalfLog2e) * sqrt(o.c11 / o.det);
-    const F l21 = -(l11 * o.c01 / o.c11);
     LaneGradients grads;
-    pull_back(g, cam, o, l11, l21, l22, sums, grads);
+    pull_back(g, cam, o, root_of_inverse(o), sums, grads);
     scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
     scatter_lanes<4>(args.quats, ids, n, grads.quat, args.accumulate);
     scatter_lanes<3>(args.scales, ids, n, grads.scale, args.accumulate);

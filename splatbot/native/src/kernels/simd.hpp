@@ -56,7 +56,6 @@ SB_INLINE F zero_unless(M m, F a) { return {_mm512_maskz_mov_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return {_mm512_maskz_mul_ps(m.v, a.v, b.v)}; }
 SB_INLINE std::uint32_t bits(M m) { return m.v; }
 SB_INLINE F min_zero_unless(M m, F a, F b) { return {_mm512_maskz_min_ps(m.v, a.v, b.v)}; }
-SB_INLINE std::uint32_t sign_bits(F a) { return _mm512_movepi32_mask(_mm512_castps_si512(a.v)); }
 SB_INLINE I to_int(F a) { return {_mm512_cvttps_epi32(a.v)}; }
 SB_INLINE F to_float(I a) { return {_mm512_cvtepi32_ps(a.v)}; }
 SB_INLINE I bit_cast_int(F a) { return {_mm512_castps_si512(a.v)}; }
@@ -81,11 +80,6 @@ SB_INLINE F reciprocal(F a) {  // one Newton step from 14 bits
   const __m512 r = _mm512_rcp14_ps(a.v);
   return {_mm512_mul_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(2.0F)))};
 }
-SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
-  whole = {_mm512_roundscale_ps(q.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)};
-  fraction = q - whole;
-}
-SB_INLINE F scale_exponent(F a, F whole) { return {_mm512_scalef_ps(a.v, whole.v)}; }
 
 #elif SPLATBOT_SIMD == 256
 
@@ -126,7 +120,6 @@ SB_INLINE F zero_unless(M m, F a) { return {_mm256_and_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return zero_unless(m, a * b); }
 SB_INLINE std::uint32_t bits(M m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(m.v)); }
 SB_INLINE F min_zero_unless(M m, F a, F b) { return zero_unless(m, min(a, b)); }
-SB_INLINE std::uint32_t sign_bits(F a) { return static_cast<std::uint32_t>(_mm256_movemask_ps(a.v)); }
 SB_INLINE I to_int(F a) { return {_mm256_cvttps_epi32(a.v)}; }
 SB_INLINE F to_float(I a) { return {_mm256_cvtepi32_ps(a.v)}; }
 SB_INLINE I bit_cast_int(F a) { return {_mm256_castps_si256(a.v)}; }
@@ -259,13 +252,35 @@ SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
   whole = q + set1(12582912.0F);
   fraction = q - (whole - set1(12582912.0F));
 }
-SB_INLINE F scale_exponent(F a, F whole) { return bit_cast_float(bit_cast_int(a) + shift_left<23>(bit_cast_int(whole))); }
+SB_INLINE F scale_exponent(F a, F whole) {
+  return bit_cast_float(bit_cast_int(a) + shift_left<23>(bit_cast_int(whole)));
+}
 #endif
 
 SB_INLINE F operator-(F a) { return set1(0.0F) - a; }
 SB_INLINE F clamp(F x, F low, F high) { return min(max(x, low), high); }
 SB_INLINE F square(F x) { return x * x; }
 
+#if SPLATBOT_SIMD == 512
+alignas(64) inline constexpr float kRoots[32] = {  // 2^(k/32)
+    1.0F, 1.0218972F, 1.04427373F, 1.06714046F, 1.09050775F, 1.1143868F, 1.13878858F, 1.1637249F,
+    1.18920708F, 1.21524739F, 1.24185777F, 1.26905096F, 1.29683959F, 1.32523668F, 1.35425556F, 1.38390994F,
+    1.41421354F, 1.44518077F, 1.47682619F, 1.50916445F, 1.54221082F, 1.5759809F, 1.61049032F, 1.64575553F,
+    1.68179286F, 1.71861935F, 1.75625217F, 1.79470909F, 1.8340081F, 1.87416768F, 1.91520655F, 1.95714414F};
+
+// 2^q to 1.2e-7 relative: q = k/32 + n + x, |x| <= 1/64, with 2^(k/32) from a table in two registers and 2^x by a
+// minimax polynomial of degree 2. Fewer multiplications than a longer polynomial: those limit the blend loops.
+SB_INLINE F exp2(F q) {
+  const F magic = set1(393216.0F);  // 1.5 x 2^18: the last bit is worth 1/32, so t ends in k
+  const F t = q + magic;
+  const F whole = t - magic;  // n + k/32, of which scalef takes the floor
+  const F x = q - whole;
+  const __m512i k = _mm512_castps_si512(t.v);
+  const F root = {_mm512_permutex2var_ps(_mm512_load_ps(kRoots), k, _mm512_load_ps(kRoots + 16))};
+  const F p = fma(fma(set1(0.240224746F), x, set1(0.693157344F)), x, set1(1.0F));
+  return {_mm512_scalef_ps((p * root).v, whole.v)};
+}
+#else
 // 2^q to 7.5e-8 relative (a minimax polynomial of degree 5 on [-1/2, 1/2]).
 SB_INLINE F exp2(F q) {
   F x, whole;
@@ -278,6 +293,7 @@ SB_INLINE F exp2(F q) {
   return scale_exponent(p, whole);
 }
 
+#endif
 // log2 of normal positive numbers, to 1e-7: mantissa in [1/sqrt 2, sqrt 2), then the series of atanh.
 SB_INLINE F log2(F a) {
   const I shifted = bit_cast_int(a) - set1(0x3f3504f3);

@@ -1,0 +1,213 @@
+// SPDX-License-Identifier: Apache-2.0
+// Runs the rasterizer through its hard corners, on every instruction set that this CPU has, for the sanitizers to
+// watch, and checks that the number of threads changes no bit. Prints what it did; exits 1 at the first broken promise.
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <random>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "splatbot/isa.hpp"
+#include "splatbot/rasterizer.hpp"
+#include "splatbot/threads.hpp"
+
+namespace {
+
+using namespace splatbot;
+
+void check(bool ok, const std::string& promise) {
+  if (!ok) {
+    std::fprintf(stderr, "broken: %s\n", promise.c_str());
+    std::exit(1);
+  }
+}
+
+struct Scene {
+  int channels;
+  std::vector<float> means, quats, scales, opacities, colors;
+
+  Gaussians gaussians() const {
+    return {.count = opacities.size(),
+            .channels = channels,
+            .means = means,
+            .quats = quats,
+            .scales = scales,
+            .opacities = opacities,
+            .colors = colors};
+  }
+};
+
+// Gaussians before, behind and beside the camera, thin, huge, opaque and invisible, with odd quaternions.
+Scene make_scene(std::size_t n, int channels, unsigned seed) {
+  std::mt19937 random(seed);
+  std::normal_distribution<float> normal;
+  std::uniform_real_distribution<float> uniform(0.0F, 1.0F);
+  Scene s{.channels = channels, .means = {}, .quats = {}, .scales = {}, .opacities = {}, .colors = {}};
+  for (std::size_t i = 0; i < n; ++i) {
+    const float far_off = i % 11 == 0 ? 1e6F : 1.0F;
+    s.means.insert(s.means.end(), {far_off * normal(random), normal(random), 2.0F + 1.5F * normal(random)});
+    const float norm = i % 13 == 0 ? 0.0F : i % 7 == 0 ? 1e-20F : i % 5 == 0 ? 1e18F : 1.0F;
+    for (int k = 0; k < 4; ++k) {
+      s.quats.push_back(norm * normal(random));
+    }
+    for (int k = 0; k < 3; ++k) {
+      s.scales.push_back(i % 17 == 0 ? 1e4F : i % 19 == 0 ? 0.0F : std::pow(10.0F, -4.0F + 3.5F * uniform(random)));
+    }
+    s.opacities.push_back(i % 3 == 0 ? 1.0F : i % 23 == 0 ? 0.0F : uniform(random));
+    for (int c = 0; c < channels; ++c) {
+      s.colors.push_back(uniform(random));
+    }
+  }
+  return s;
+}
+
+View make_view(int width, int height) {
+  View view{};
+  view.rotation[0] = view.rotation[4] = view.rotation[8] = 1.0F;
+  view.fx = view.fy = 60.0F;
+  view.cx = 0.5F * static_cast<float>(width);
+  view.cy = 0.4F * static_cast<float>(height);
+  view.width = width;
+  view.height = height;
+  return view;
+}
+
+struct Result {
+  std::vector<float> image, alphas, means, quats, scales, opacities, colors;
+  std::vector<double> viewmat, background;
+
+  bool operator==(const Result& other) const {
+    const auto same = [](const auto& a, const auto& b) {
+      return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(a[0])) == 0);
+    };
+    return same(image, other.image) && same(alphas, other.alphas) && same(means, other.means) &&
+           same(quats, other.quats) && same(scales, other.scales) && same(opacities, other.opacities) &&
+           same(colors, other.colors) && same(viewmat, other.viewmat) && same(background, other.background);
+  }
+};
+
+Result render(const Scene& scene, const View& view, const RasterOptions& options) {
+  const Gaussians g = scene.gaussians();
+  const std::size_t pixels = static_cast<std::size_t>(view.width) * static_cast<std::size_t>(view.height);
+  const std::size_t columns =
+      static_cast<std::size_t>(scene.channels) + (options.depth != DepthMode::none ? 1U : 0U);
+  Result r;
+  r.image.resize(pixels * columns);
+  r.alphas.resize(pixels);
+  const std::vector<float> background(static_cast<std::size_t>(scene.channels), 0.25F);
+  RasterStatePtr state;
+  check(!rasterize_forward(g, view, options, background, r.image, r.alphas, state), "finite inputs are no fault");
+  for (const float alpha : r.alphas) {
+    check(alpha >= 0.0F && alpha <= 1.0F, "alpha lies in 0..1");
+  }
+  std::vector<float> grad_image(r.image.size());
+  for (std::size_t i = 0; i < grad_image.size(); ++i) {
+    grad_image[i] = static_cast<float>(i % 7) - 3.0F;
+  }
+  for (const float value : r.image) {
+    check(std::isfinite(value), "the image is finite");
+  }
+  const std::vector<float> grad_alphas(pixels, 0.5F);
+  r.means.resize(g.means.size());
+  r.quats.resize(g.quats.size());
+  r.scales.resize(g.scales.size());
+  r.opacities.resize(g.count);
+  r.colors.resize(g.colors.size());
+  r.viewmat.resize(12);
+  r.background.resize(background.size());
+  const Gradients out = {.means = r.means,
+                         .quats = r.quats,
+                         .scales = r.scales,
+                         .opacities = r.opacities,
+                         .colors = r.colors,
+                         .viewmat = r.viewmat,
+                         .background = r.background};
+  rasterize_backward(*state, g, background, grad_image, grad_alphas, out);
+  for (const auto* gradient : {&r.means, &r.quats, &r.scales, &r.opacities, &r.colors}) {
+    for (const float value : *gradient) {
+      check(std::isfinite(value), "gradients are finite");
+    }
+  }
+  std::vector<float> means2d(2 * g.count), depths(g.count), conics(3 * g.count);
+  std::vector<std::int32_t> radii(2 * g.count), tiles(g.count);
+  describe_projections(*state, g.opacities, {means2d, depths, conics, radii, tiles});
+  check(visible_ids(*state).size() <= g.count, "no more Gaussians are seen than there are");
+  return r;
+}
+
+void run_all(const std::string& isa) {
+  int renders = 0;
+  for (const auto& [width, height] : {std::pair{1, 1}, {3, 70}, {32, 16}, {97, 41}}) {
+    for (const std::size_t n : {std::size_t{0}, std::size_t{1}, std::size_t{63}, std::size_t{2500}}) {
+      for (const int channels : {0, 1, 3, 7, 11}) {
+        const Scene scene = make_scene(n, channels, 7);
+        for (const DepthMode depth : {DepthMode::none, DepthMode::accumulated, DepthMode::expected}) {
+          if (channels == 0 && depth == DepthMode::none) {
+            continue;
+          }
+          const RasterOptions options = {.depth = depth, .plane_depth = channels % 2 == 1};
+          set_num_threads(1);
+          const Result want = render(scene, make_view(width, height), options);
+          for (const unsigned threads : {2U, 8U}) {
+            set_num_threads(threads);
+            check(render(scene, make_view(width, height), options) == want, "threads change no bit");
+          }
+          ++renders;
+        }
+      }
+    }
+  }
+  std::printf("%s: %d renders, forward and backward, on 1, 2 and 8 threads\n", isa.c_str(), renders);
+}
+
+void check_errors() {
+  Scene scene = make_scene(5000, 3, 1);
+  scene.scales[3 * 4321 + 1] = std::nanf("");
+  std::vector<float> image(32 * 16 * 3), alphas(32 * 16);
+  RasterStatePtr state;
+  const auto fault = rasterize_forward(scene.gaussians(), make_view(32, 16), {}, {}, image, alphas, state);
+  check(fault && fault->field == "scales" && fault->row == 4321, "a NaN is found with its field and row");
+  bool thrown = false;
+  try {
+    rasterize_forward(make_scene(5, 3, 1).gaussians(), make_view(33, 16), {}, {}, image, alphas, state);
+  } catch (const std::invalid_argument&) {
+    thrown = true;
+  }
+  check(thrown, "an output of a wrong size is refused");
+}
+
+void check_pool() {
+  ThreadPool pool(4);
+  bool thrown = false;
+  try {
+    pool.run(1000, [](std::size_t i) {
+      if (i == 500) {
+        throw std::runtime_error("task");
+      }
+    });
+  } catch (const std::runtime_error&) {
+    thrown = true;
+  }
+  check(thrown, "a task's exception reaches the caller");
+  std::vector<int> done(1000, 0);
+  pool.run(done.size(), [&](std::size_t i) { ++done[i]; });
+  for (const int count : done) {
+    check(count == 1, "every task runs once, also after an exception");
+  }
+}
+
+}  // namespace
+
+int main() {
+  check_pool();
+  check_errors();
+  for (const std::string& isa : available_isas()) {
+    set_isa(isa);
+    run_all(isa);
+  }
+  std::puts("all promises kept");
+  return 0;
+}
