@@ -114,17 +114,19 @@ def rasterizer_error() -> float:
     from splatbot.rasterize.reference import rasterization_reference
 
     n, turn = 8, torch.arange(8) * (2 * torch.pi / 8)
-    scene = {
-        "means": torch.stack([0.4 * turn.cos(), 0.3 * turn.sin(), 2.0 + 0.1 * torch.arange(n)], dim=1),
-        "quats": torch.stack([turn.cos(), turn.sin(), 0.3 * torch.ones(n), 0.1 * turn], dim=1),
-        "scales": torch.tensor([0.08, 0.05, 0.02]).expand(n, 3).contiguous(),
-        "opacities": torch.linspace(0.3, 0.9, n),
-        "colors": torch.stack([turn / 7, 1 - turn / 7, 0.5 * torch.ones(n)], dim=1).clamp(0, 1),
-        "viewmats": torch.eye(4)[None],
-        "Ks": torch.tensor([[[80.0, 0.0, 32.0], [0.0, 80.0, 24.0], [0.0, 0.0, 1.0]]]),
-    }
-    fast = rasterization(**scene, width=64, height=48)[0]
-    exact = rasterization_reference(**{k: v.double() for k, v in scene.items()}, width=64, height=48)[0]
+    scene = (
+        torch.stack([0.4 * turn.cos(), 0.3 * turn.sin(), 2.0 + 0.1 * torch.arange(n)], dim=1),  # means
+        torch.stack([turn.cos(), turn.sin(), 0.3 * torch.ones(n), 0.1 * turn], dim=1),  # quats
+        torch.tensor([0.08, 0.05, 0.02]).expand(n, 3).contiguous(),  # scales
+        torch.linspace(0.3, 0.9, n),  # opacities
+        torch.stack([turn / 7, 1 - turn / 7, 0.5 * torch.ones(n)], dim=1).clamp(0, 1),  # colors
+        torch.eye(4)[None],  # viewmats
+        torch.tensor([[[80.0, 0.0, 32.0], [0.0, 80.0, 24.0], [0.0, 0.0, 1.0]]]),  # Ks
+    )
+    means, quats, scales, opacities, colors, viewmats, Ks = scene
+    fast = rasterization(means, quats, scales, opacities, colors, viewmats, Ks, 64, 48)[0]
+    means, quats, scales, opacities, colors, viewmats, Ks = (t.double() for t in scene)
+    exact = rasterization_reference(means, quats, scales, opacities, colors, viewmats, Ks, 64, 48)[0]
     return float((fast.double() - exact).abs().max())
 
 

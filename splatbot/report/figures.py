@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from splatbot.report.theme import BLUE, GREEN, INK, ORANGE, RED, SERIES, figure, png, styled
 from splatbot.results.folder import FrameRow
+from splatbot.results.metrics import stage_names
 from splatbot.results.scoring import TrajectoryScore
 from splatbot.trajectory import Trajectory
 
@@ -49,11 +50,10 @@ def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes
     fig, (ax,) = figure()
     t0 = stamps[0]
     _bands(ax, rows, t0)
-    ax.plot(
-        track.absolute.stamps - t0, 1e3 * track.absolute.errors, color=BLUE, linewidth=1.3, marker=".", markersize=4
-    )
-    ax.axhline(1e3 * track.absolute.rmse, color=GREEN, linewidth=1.2, linestyle="--", label="ATE RMSE")
-    ax.set_ylim(bottom=0)
+    ate = track.absolute
+    ax.plot(ate.stamps - t0, 1e3 * ate.errors, color=BLUE, linewidth=1.3, marker=".", markersize=4)
+    ax.axhline(1e3 * ate.rmse, color=GREEN, linewidth=1.2, linestyle="--", label="ATE RMSE")
+    ax.set_ylim(0.0, 1.2e3 * max(ate.max, 1e-6))  # the legend stands above the curve
     ax.set_xlabel("time [s]")
     ax.set_ylabel("position error [mm]")
     ax.legend(loc="upper left", ncols=4)
@@ -66,7 +66,7 @@ def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
     done = [row for row in rows if row.verdict != "skipped"]
     if not done:
         return None
-    names = list(dict.fromkeys(name for row in done for name in row.stage_ms))
+    names = stage_names(done)
     spent = np.array([[row.stage_ms.get(name, 0.0) for name in names] for row in done]).reshape(len(done), len(names))
     other = np.clip([row.ms for row in done] - spent.sum(axis=1), 0.0, None)
     fig, (ax,) = figure(height=3.4)

@@ -41,12 +41,19 @@ def percentiles(values: Sequence[float]) -> dict[str, float | None]:
 
 def stage_percentiles(rows: Sequence[FrameRow]) -> dict[str, dict[str, float | None]]:
     """By stage: percentiles [ms] over the frames in which it ran, their number and the sum [ms]."""
-    names = dict.fromkeys(name for row in rows for name in row.stage_ms)
-    spent = {name: [row.stage_ms[name] for row in rows if name in row.stage_ms] for name in names}
+    spent = {name: [row.stage_ms[name] for row in rows if name in row.stage_ms] for name in stage_names(rows)}
     return {
         name: {**percentiles(values), "frames": len(values), "total": float(sum(values))}
         for name, values in spent.items()
     }
+
+
+def stage_names(rows: Sequence[FrameRow]) -> list[str]:
+    """Names of all stages, in the order of the frame that ran the most of them."""
+    fullest = max(rows, key=lambda row: len(row.stage_ms), default=None)
+    return list(
+        dict.fromkeys([*(fullest.stage_ms if fullest else ()), *(name for row in rows for name in row.stage_ms)])
+    )
 
 
 def peak_rss_bytes() -> int:

@@ -18,7 +18,9 @@ from tests.unit.cli.conftest import RunCommand
 HEAVY = ("torch", "open3d", "cv2", "matplotlib", "mujoco", "fastapi", "numpy")
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"], ["map", "--help"], ["render", "--help"], ["doctor", "-h"]])
+@pytest.mark.parametrize(
+    "words", [["--help"], ["--version"], ["map", "--help"], ["render", "--help"], ["doctor", "-h"]]
+)
 def test_help_imports_nothing_heavy(words: list[str]) -> None:
     program = (
         "import sys\nfrom splatbot.cli import main\n"
