@@ -100,7 +100,7 @@ def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> G
 def _disc_quats(
     normals: NDArray[np.float64], toward: NDArray[np.float64], R: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Orientations (N, 4) with z along the normal and x along the direction in which the slant stretches the footprint."""
+    """Orientations (N, 4): z along the normal, x along the direction in which the slant stretches the footprint."""
 
     x = toward - (toward * normals).sum(1, keepdims=True) * normals
     length = np.linalg.norm(x, axis=1, keepdims=True)

@@ -66,7 +66,8 @@ def mapping_images(
     )
     while level.camera.width > config.max_width:
         level = halve(level)
-        rgb = cv2.resize(rgb, (level.camera.width, level.camera.height), interpolation=cv2.INTER_AREA)
+        half = cv2.resize(rgb, (level.camera.width, level.camera.height), interpolation=cv2.INTER_AREA)
+        rgb = np.asarray(half, dtype=np.uint8)
     return level.camera, rgb, level.depth
 
 

@@ -46,11 +46,11 @@ class Refiner:
     def refine_all(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
         """Spend ``iterations`` steps on all keyframes alike."""
         for _ in range(iterations if len(model) else 0):
-            self.step(model, keyframes[self._random.integers(len(keyframes))])
+            self.step(model, keyframes[int(self._random.integers(len(keyframes)))])
 
     def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
         pool = keyframes[-self.config.window :] if self._random.random() < 0.5 else keyframes
-        return pool[self._random.integers(len(pool))]
+        return pool[int(self._random.integers(len(pool)))]
 
     def step(self, model: GaussianModel, keyframe: Keyframe) -> float:
         """One step on one keyframe; returns the loss before it."""

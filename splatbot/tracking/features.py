@@ -50,7 +50,7 @@ class FeaturePose:
 def detect(rgb: NDArray[np.uint8], depth: Image, camera: Camera, n_features: int) -> Features:
     """ORB keypoints of an image, with 3-D points where a depth of the same surface lies within two pixels."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.ORB_create(nfeatures=n_features, fastThreshold=10).detectAndCompute(gray, None)
+    keypoints, descriptors = cv2.ORB.create(nfeatures=n_features, fastThreshold=10).detectAndCompute(gray, None)
     if descriptors is None:
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
     pixels = np.array([k.pt for k in keypoints], dtype=np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ def measure(
     )
 
 
-def _saturated(residuals: NDArray[np.float32]) -> float:
+def _saturated(residuals: NDArray[np.floating[Any]]) -> float:
     return float(np.minimum(np.nan_to_num(residuals, nan=_SATURATION), _SATURATION).mean())
 
 

@@ -40,7 +40,8 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     level = Level(gray, depth, frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
-    level = Level(cv2.GaussianBlur(level.gray, (0, 0), 0.7), level.depth, level.camera)
+    smooth = np.asarray(cv2.GaussianBlur(level.gray, (0, 0), 0.7), dtype=np.float32)
+    level = Level(smooth, level.depth, level.camera)
     levels = [level]
     for _ in range(config.n_levels - 1):
         levels.append(halve(levels[-1]))
@@ -66,17 +67,17 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
 
 
 def halve(level: Level) -> Level:
-    """The next coarser level: grey averaged, depth averaged over the pixels of the nearest surface of each 2x2 block."""
+    """The next coarser level: grey averaged, depth as :func:`halve_depth` has it."""
     height, width = level.gray.shape[0] // 2, level.gray.shape[1] // 2
     crop = level.gray[: 2 * height, : 2 * width]
-    gray = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
+    gray = np.asarray(cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
     c = level.camera
     camera = Camera(c.fx / 2, c.fy / 2, (c.cx + 0.5) / 2 - 0.5, (c.cy + 0.5) / 2 - 0.5, width, height)
     return Level(gray, halve_depth(level.depth), camera)
 
 
 def halve_depth(depth: Image) -> Image:
-    """Half the size of a depth image [m]: the mean over the nearest surface of each 2x2 block, 0 where none is valid."""
+    """Half the size of a depth image [m]: the mean over the nearest surface of each 2x2 block; 0 where none is."""
     height, width = depth.shape[0] // 2, depth.shape[1] // 2
     corners = [depth[v : 2 * height : 2, u : 2 * width : 2] for v in (0, 1) for u in (0, 1)]
     nearest = np.full((height, width), np.inf, np.float32)
@@ -88,7 +89,7 @@ def halve_depth(depth: Image) -> Image:
         same = (corner > 0) & (corner <= np.float32(1.05) * nearest)
         total += np.where(same, corner, 0)
         count += same
-    return total / np.maximum(count, 1)
+    return (total / np.maximum(count, 1)).astype(np.float32)
 
 
 def with_depth(levels: Sequence[Level], depth: Image) -> tuple[Level, ...]:
