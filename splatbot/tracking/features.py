@@ -58,7 +58,7 @@ def detect(rgb: NDArray[np.uint8], depth: Image, camera: Camera, n_features: int
     rays = np.stack(
         [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(z))], 1
     )
-    return Features(pixels, descriptors, rays * z[:, None])
+    return Features(pixels, np.asarray(descriptors, dtype=np.uint8), rays * z[:, None])
 
 
 def match_pose(
