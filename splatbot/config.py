@@ -59,7 +59,7 @@ class MappingConfig(_Section):
 
     max_gaussians: int = Field(default=150_000, ge=100, description="hard cap on the map's size: accuracy for time")
     max_width: int = Field(default=640, ge=64, description="width of the images that are fused [px]")
-    stride: int = Field(default=2, ge=1, description="one new Gaussian per so many pixels each way: accuracy for time")
+    stride: int = Field(default=3, ge=1, description="one new Gaussian per so many pixels each way: accuracy for time")
     footprint: float = Field(default=1.0, gt=0, description="size of a new Gaussian over the grid's half spacing")
     thickness: float = Field(default=0.2, gt=0, le=1, description="thickness of a new Gaussian over its size")
     new_opacity: float = Field(default=0.8, gt=0, lt=1, description="opacity of a new Gaussian")
@@ -70,8 +70,8 @@ class MappingConfig(_Section):
     keyframe_rotation: float = Field(
         default=0.07, gt=0, description="a view turned so far from all others is new [rad]"
     )
-    refine_iterations: int = Field(default=8, ge=0, description="optimiser steps per keyframe: accuracy for time")
-    final_iterations: int = Field(default=100, ge=0, description="optimiser steps once the log has ended")
+    refine_iterations: int = Field(default=15, ge=0, description="optimiser steps per keyframe: accuracy for time")
+    final_iterations: int = Field(default=200, ge=0, description="optimiser steps once the log has ended")
     window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")
     depth_weight: float = Field(default=0.5, ge=0, description="weight of relative depth against colour")
     rate_means: float = Field(default=2e-4, ge=0, description="learning rate of positions [m]")

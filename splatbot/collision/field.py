@@ -53,7 +53,7 @@ class GaussianCollisionField:
     Args:
         source: a model (``map_version`` 0) or a snapshot.
         n_sigma: where the surface of a Gaussian is taken to be.
-        min_opacity: Gaussians fainter than this are air.
+        min_opacity: Gaussians fainter than this are air, as are those without an observation.
 
     Raises:
         InputError: a mean, scale, opacity or quaternion is not finite, or a quaternion is zero (the message names the
@@ -75,14 +75,15 @@ class GaussianCollisionField:
         zero = np.flatnonzero(~quats.any(axis=1))
         if zero.size:
             raise InputError(f"row {zero[0]} is zero.", field="quats", hint="use (1, 0, 0, 0) for no rotation")
-        self._rows = np.flatnonzero(opacities >= min_opacity)
+        observed = model.observations.numpy() > 0  # a Gaussian that no depth supports only carries colour
+        self._rows = np.flatnonzero((opacities >= min_opacity) & observed)
         means, quats, scales = means[self._rows], quats[self._rows], scales[self._rows]
         self._centre = (means.min(axis=0) + means.max(axis=0)) / 2 if len(means) else np.zeros(3)
         whitening = quat_to_rotation(quats).swapaxes(-1, -2) / np.maximum(scales, SCALE_FLOOR)[:, :, None]
         self._field = MahalanobisField(self._local(means), np.ascontiguousarray(whitening, dtype=np.float32))
 
     def __len__(self) -> int:
-        """Number of Gaussians that count, after the gate on opacity."""
+        """Number of Gaussians that count, after the gates on opacity and observation."""
         return len(self._rows)
 
     def mahalanobis(self, points: ArrayLike | Tensor) -> MahalanobisResult:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -52,7 +53,9 @@ def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.flo
 def model_depth(view: View, measured: NDArray[np.float32], config: MappingConfig) -> NDArray[np.float32]:
     """Depth (H, W) [m] to track against: the map's where it is solid and does not contradict the measured one."""
     depth = view.depth.numpy()
-    agrees = (measured == 0) | (np.abs(depth - measured) < config.new_depth * measured)
+    agrees = (
+        np.abs(depth - measured) < config.new_depth * measured
+    )  # never where nothing was measured: it may be a guess
     solid = (view.alpha.numpy() > config.solid_alpha) & agrees
     return np.where(solid, depth, measured).astype(np.float32)
 
@@ -63,6 +66,30 @@ def unexplained(view: View, depth: Tensor, config: MappingConfig) -> Tensor:
     empty = view.alpha < config.new_alpha
     in_front = depth < view.depth - config.new_depth * depth
     return measured & (empty | in_front)
+
+
+def guess_depth(depth: Tensor) -> Tensor:
+    """Depth (H, W) [m] where none was measured: that of the nearest measured pixel; 0 elsewhere."""
+    missing = (depth == 0).numpy()
+    if missing.all() or not missing.any():
+        return torch.zeros_like(depth)
+    _, labels = cv2.distanceTransformWithLabels(
+        missing.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.zeros(labels.max() + 1, np.float32)
+    nearest[labels[~missing]] = depth.numpy()[~missing]
+    return torch.from_numpy(np.where(missing, nearest[labels], 0).astype(np.float32))
+
+
+def guessed_gaussians(view: View, keyframe: Keyframe, config: MappingConfig) -> GaussianModel:
+    """Gaussians that only carry colour where the sensor measured no depth and the map shows nothing.
+
+    Their depth is a guess, so they have no observation and count as air for collision until a keyframe supports them.
+    """
+    guess = guess_depth(keyframe.depth)
+    model = new_gaussians(replace(keyframe, depth=guess), (guess > 0) & (view.alpha < config.new_alpha), config)
+    model.observations.zero_()
+    return model
 
 
 def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> GaussianModel:

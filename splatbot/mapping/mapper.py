@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
-from splatbot.mapping.fusion import model_depth, new_gaussians, unexplained, view_of, weigh
+from splatbot.mapping.fusion import guessed_gaussians, model_depth, new_gaussians, unexplained, view_of, weigh
 from splatbot.mapping.keyframes import Keyframe, is_keyframe, mapping_images
 from splatbot.mapping.prune import fittest, worth_keeping
 from splatbot.mapping.refine import Refiner
@@ -73,15 +73,16 @@ class Mapper:
     def _weigh(self, keyframe: Keyframe) -> None:
         evidence = weigh(self.model, keyframe, self.config.mapping)
         self.model.observations += evidence.supported.int()
-        # Seen through once may be a wrong depth; its opacity halves, roughly, each time, until it is pruned.
+        # Seen through once may be a wrong depth; its opacity halves, roughly, each time, until it is pruned. A guess
+        # that is seen through was wrong.
         self.model.opacity_logits -= evidence.seen_through.float()
+        self.model.opacity_logits[evidence.seen_through & (self.model.observations == 0)] = -10.0
 
     def _add(self, keyframe: Keyframe) -> None:
-        where = unexplained(
-            view_of(self.model, keyframe.camera, keyframe.T_world_camera), keyframe.depth, self.config.mapping
-        )
-        fresh = new_gaussians(keyframe, where, self.config.mapping)
-        self.model = GaussianModel.concatenate([self.model, fresh])
+        view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
+        measured = new_gaussians(keyframe, unexplained(view, keyframe.depth, self.config.mapping), self.config.mapping)
+        guessed = guessed_gaussians(view, keyframe, self.config.mapping)
+        self.model = GaussianModel.concatenate([self.model, measured, guessed])
         self._refiner.adam.extend(self.model)
 
     def _prune(self) -> None:

@@ -38,9 +38,7 @@ class Refiner:
 
         Half of the random draws come from the latest ``config.window`` keyframes, half from all, against forgetting.
         """
-        if len(model) == 0:
-            return
-        for i in range(iterations):
+        for i in range(iterations if len(model) else 0):
             self.step(model, keyframes[-1] if i == 0 else self._draw(keyframes))
 
     def refine_all(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
@@ -53,7 +51,18 @@ class Refiner:
         return pool[int(self._random.integers(len(pool)))]
 
     def step(self, model: GaussianModel, keyframe: Keyframe) -> float:
-        """One step on one keyframe; returns the loss before it."""
+        """One step on one keyframe; returns the loss before it.
+
+        Torch's threads spin after each operation and so starve the rasterizer's; one is several times faster here.
+        """
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return self._step(model, keyframe)
+        finally:
+            torch.set_num_threads(threads)
+
+    def _step(self, model: GaussianModel, keyframe: Keyframe) -> float:
         parameters = {name: getattr(model, name).detach().requires_grad_(True) for name in PARAMETERS}
         renders, alphas, meta = rasterization(
             parameters["means"],

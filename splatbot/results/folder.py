@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from splatbot.atomic import atomic_write
 from splatbot.config import Config, load_config
 from splatbot.errors import FormatError, InputError
+from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
 from splatbot.trajectory import Trajectory
 
@@ -96,7 +97,7 @@ class RunFolder:
     ) -> None:
         """Write all but the report. An older report goes first: it would describe another map."""
         self.report.unlink(missing_ok=True)
-        model.save(self.map)
+        save_ply(model, self.map, bookkeeping=True)  # what was never observed must not collide later
         self._save_trajectory(trajectory)
         lines = [json.dumps(asdict(row)) for row in rows]
         _write_text(self.frames, "\n".join([*lines, ""]))
