@@ -13,7 +13,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.harmonics import sh_to_rgb
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
-from splatbot.optimize.losses import exposure_match, l1
+from splatbot.optimize.losses import l1
 from splatbot.rasterize import rasterization
 
 
@@ -86,8 +86,7 @@ class Refiner:
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         observed = keyframe.rgb.float() / 255.0
         covered = alpha[..., 0].detach() > 0.5
-        gain, offset = exposure_match(render[..., :3].detach(), observed, covered)
-        color = l1(gain * render[..., :3] + offset, observed, covered[..., None])
+        color = l1(render[..., :3], observed, covered[..., None])
         depth = keyframe.depth[..., None]
         ranged = (depth > 0) & covered[..., None]
         relative = l1(render[..., 3:] / depth.clamp_min(0.1), depth / depth.clamp_min(0.1), ranged)
