@@ -35,7 +35,7 @@ def _slam_that_is_off_by(metres: float) -> type[OracleSlam]:
 def test_the_demo_fails_exactly_when_the_map_contradicts_the_scene(
     metres: float, exit_code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("splatbot.run.mapping.Slam", _slam_that_is_off_by(metres))
+    monkeypatch.setattr("splatbot.run.job.Slam", _slam_that_is_off_by(metres))
     assert demo(out=tmp_path, frames=FRAMES) == exit_code
     said = capsys.readouterr().out
     assert said.count("[right]") == 2 - exit_code
