@@ -1,13 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "arrays.hpp"
 #include "bindings.hpp"
 
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#include <memory>
 #include <stdexcept>
 #include <string>
 #include <tuple>
@@ -20,57 +19,6 @@ namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
-
-template <class T, class Shape>
-using Array = nb::ndarray<T, Shape, nb::c_contig, nb::device::cpu>;
-using In1 = Array<const float, nb::shape<-1>>;
-using In2 = Array<const float, nb::shape<-1, -1>>;
-using In3 = Array<const float, nb::shape<-1, -1, -1>>;
-using InN3 = Array<const float, nb::shape<-1, 3>>;
-using InN4 = Array<const float, nb::shape<-1, 4>>;
-using Out1 = Array<float, nb::shape<-1>>;
-using Out2 = Array<float, nb::shape<-1, -1>>;
-using Out3 = Array<float, nb::shape<-1, -1, -1>>;
-using Matrix3 = Array<const double, nb::shape<3, 3>>;
-using Matrix4 = Array<const double, nb::shape<4, 4>>;
-
-template <class A>
-auto span_of(const A& array) {
-  return std::span(array.data(), array.size());
-}
-
-template <class T, class A>
-std::span<T> span_of(const std::optional<A>& array) {
-  return array ? std::span<T>(array->data(), array->size()) : std::span<T>();
-}
-
-splatbot::Gaussians gaussians_of(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
-                                 const In2& colors) {
-  return {.count = means.shape(0),
-          .channels = static_cast<int>(colors.shape(1)),
-          .means = span_of(means),
-          .quats = span_of(quats),
-          .scales = span_of(scales),
-          .opacities = span_of(opacities),
-          .colors = span_of(colors)};
-}
-
-splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int width, int height) {
-  splatbot::View view{};
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) {
-      view.rotation[3 * i + j] = static_cast<float>(viewmat(i, j));
-    }
-    view.translation[i] = static_cast<float>(viewmat(i, 3));
-  }
-  view.fx = static_cast<float>(K(0, 0));
-  view.fy = static_cast<float>(K(1, 1));
-  view.cx = static_cast<float>(K(0, 2));
-  view.cy = static_cast<float>(K(1, 2));
-  view.width = width;
-  view.height = height;
-  return view;
-}
 
 splatbot::DepthMode depth_mode(const std::string& name) {
   if (name == "none") {
@@ -134,16 +82,6 @@ void backward(const State& state, const InN3& means, const InN4& quats, const In
   const nb::gil_scoped_release release;
   splatbot::rasterize_backward(*state.state, gaussians, span_of<const float>(background),
                                span_of<const float>(grad_render), span_of<const float>(grad_alphas), out);
-}
-
-template <class T>
-nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
-  auto held = std::make_unique<std::vector<T>>(std::move(values));
-  T* data = held->data();
-  nb::capsule owner(held.release(), [](void* p) noexcept {
-    const std::unique_ptr<std::vector<T>> released(static_cast<std::vector<T>*>(p));
-  });
-  return nb::ndarray<nb::numpy, T>(data, shape, owner);
 }
 
 nb::dict describe(const State& state, const In1& opacities) {

@@ -61,7 +61,7 @@ void radix_pass(const KeyedId* from, KeyedId* to, std::size_t size, unsigned pas
 }
 
 // Brings the blocks' lists of visible ids together and numbers their pairs.
-void compact(RasterState& state, ThreadPool& pool) {
+void compact(TileLists& state, ThreadPool& pool) {
   std::uint32_t visible = 0;
   std::uint64_t pairs = 0;
   for (ProjectedBlock& block : state.blocks) {
@@ -91,7 +91,23 @@ void compact(RasterState& state, ThreadPool& pool) {
 
 }  // namespace
 
-void order_by_depth(RasterState& state, ThreadPool& pool) {
+void TileLists::resize(std::size_t count, const View& view) {
+  columns = (view.width + kTileWidth - 1) / kTileWidth;
+  rows = (view.height + kTileHeight - 1) / kTileHeight;
+  blocks.resize((count + kProjectBlock - 1) / kProjectBlock);
+  placements.resize(count);
+  visible.resize(count);
+  tile_done.resize(tiles());
+}
+
+std::size_t TileLists::bytes() const noexcept {
+  return placements.capacity_bytes() + visible.capacity_bytes() + ids.capacity_bytes() + order.capacity_bytes() +
+         order_scratch.capacity_bytes() + histogram.capacity_bytes() + tile_begin.capacity_bytes() +
+         pairs.capacity_bytes() + masks.capacity_bytes() + tile_done.capacity_bytes() +
+         blocks.capacity() * sizeof(ProjectedBlock);
+}
+
+void order_by_depth(TileLists& state, ThreadPool& pool) {
   compact(state, pool);
   const std::size_t size = state.order.size();
   const std::size_t parts = parts_for(size, pool);
@@ -105,7 +121,7 @@ void order_by_depth(RasterState& state, ThreadPool& pool) {
   static_assert(kPasses % 2 == 1, "the sorted list ends in order_scratch");
 }
 
-void list_tiles(RasterState& state, ThreadPool& pool) {
+void list_tiles(TileLists& state, ThreadPool& pool) {
   const std::size_t tiles = state.tiles();
   const std::size_t size = state.order_scratch.size();
   const std::size_t parts = parts_for(size, pool);

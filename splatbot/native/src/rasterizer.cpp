@@ -4,66 +4,17 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
-#include <mutex>
 #include <stdexcept>
 #include <string>
 
+#include "checks.hpp"
 #include "splatbot/kernels.hpp"
 #include "splatbot/threads.hpp"
+#include "state_store.hpp"
 
 namespace splatbot {
 
 namespace {
-
-// States whose render is done with, kept for the next one: their memory is warm.
-class StateStore {
- public:
-  std::unique_ptr<RasterState> take() {
-    const std::lock_guard lock(mutex_);
-    if (idle_.empty()) {
-      return std::make_unique<RasterState>();
-    }
-    std::unique_ptr<RasterState> state = std::move(idle_.back());
-    idle_.pop_back();
-    return state;
-  }
-
-  void give_back(std::unique_ptr<RasterState> state) noexcept {
-    constexpr std::size_t kMaxIdle = 2;
-    const std::lock_guard lock(mutex_);
-    if (idle_.size() < kMaxIdle) {
-      idle_.push_back(std::move(state));
-    }
-  }
-
-  static StateStore& instance() {
-    // Never destroyed: states may outlive static objects at the exit of the interpreter.
-    static StateStore& store = *std::make_unique<StateStore>().release();
-    return store;
-  }
-
-  StateStore() { idle_.reserve(2); }
-
- private:
-  std::mutex mutex_;
-  std::vector<std::unique_ptr<RasterState>> idle_;
-};
-
-RasterStatePtr new_state() {
-  return {StateStore::instance().take().release(),
-          [](RasterState* state) { StateStore::instance().give_back(std::unique_ptr<RasterState>(state)); }};
-}
-
-void require(bool ok, const char* what) {
-  if (!ok) {
-    throw std::invalid_argument(what);
-  }
-}
-
-template <class T>
-bool empty_or(std::span<T> span, std::size_t size) {
-  return span.empty() || span.size() == size;
-}
 
 void check_gaussians(const Gaussians& g) {
   require(g.count < (std::size_t{1} << 32) - 1 && g.channels >= 0, "too many Gaussians");
@@ -72,13 +23,6 @@ void check_gaussians(const Gaussians& g) {
   require(g.scales.size() == 3 * g.count, "scales is not (N, 3)");
   require(g.opacities.size() == g.count, "opacities is not (N,)");
   require(g.colors.size() == g.count * static_cast<std::size_t>(g.channels), "colors is not (N, channels)");
-}
-
-void check_view(const View& view) {
-  constexpr int kMaxTiles = 65535;
-  require(view.width > 0 && view.height > 0, "the image has no pixels");
-  require(view.width <= kMaxTiles * kTileWidth && view.height <= kMaxTiles * kTileHeight, "the image is too large");
-  require(static_cast<std::int64_t>(view.width) * view.height <= (std::int64_t{1} << 31), "the image is too large");
 }
 
 // Up to eight channels are blended at a time, depth with the first; plane depth needs room for its two slopes.
@@ -162,17 +106,12 @@ void prepare(RasterState& state, const Gaussians& g, const View& view, const Ras
   state.channels = g.channels;
   state.view = view;
   state.options = options;
-  state.columns = (view.width + kTileWidth - 1) / kTileWidth;
-  state.rows = (view.height + kTileHeight - 1) / kTileHeight;
   state.passes = plan_passes(g.channels, options);
   state.out_channels = g.channels + (options.depth != DepthMode::none ? 1 : 0);
   require(!state.passes.empty(), "nothing to render: no colours and no depth");
-  state.blocks.resize((g.count + kProjectBlock - 1) / kProjectBlock);
+  state.TileLists::resize(g.count, view);
   state.records.resize(g.count);
-  state.placements.resize(g.count);
-  state.visible.resize(g.count);
   state.more_channels.resize((state.passes.size() - 1) * g.count * kRecordChannels);
-  state.tile_done.resize(state.tiles());
   state.final_state.resize(state.passes.size() * state.tiles() * kFinalPlanes * kTilePixels);
 }
 
@@ -226,10 +165,8 @@ BackwardScratch& scratch() {
 }  // namespace
 
 std::size_t RasterState::bytes() const noexcept {
-  return records.capacity_bytes() + placements.capacity_bytes() + visible.capacity_bytes() + ids.capacity_bytes() +
-         more_channels.capacity_bytes() + order.capacity_bytes() + order_scratch.capacity_bytes() +
-         histogram.capacity_bytes() + tile_begin.capacity_bytes() + pairs.capacity_bytes() + masks.capacity_bytes() +
-         tile_done.capacity_bytes() + final_state.capacity_bytes();
+  return TileLists::bytes() + records.capacity_bytes() + more_channels.capacity_bytes() +
+         final_state.capacity_bytes();
 }
 
 std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, const RasterOptions& options,
@@ -238,7 +175,7 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
   check_gaussians(g);
   check_view(view);
   const std::size_t pixels = static_cast<std::size_t>(view.width) * static_cast<std::size_t>(view.height);
-  const RasterStatePtr shared = new_state();
+  const RasterStatePtr shared = new_state<RasterState>();
   RasterState& state = *shared;
   prepare(state, g, view, options);
   require(empty_or(background, static_cast<std::size_t>(g.channels)), "background is not (channels,)");

@@ -79,21 +79,14 @@ struct ChannelPass {
   std::array<int, kRecordChannels> column{};  // in the rendered image
 };
 
-struct RasterState {
-  std::size_t count = 0;
-  int channels = 0;  // input columns
-  int out_channels = 0;
-  View view{};
-  RasterOptions options;
+// Which tiles N projected things go to and in what order, whatever their shape.
+struct TileLists {
   int columns = 0, rows = 0;  // tiles
-  std::vector<ChannelPass> passes;
 
-  Buffer<Record> records;          // (N,), in the order of the map
   Buffer<Placement> placements;    // (N,)
   Buffer<std::uint32_t> visible;   // ids in view; block b's begin at b * kProjectBlock until compacted
   Buffer<std::uint32_t> ids;       // ids in view, ascending
   std::vector<ProjectedBlock> blocks;
-  Buffer<float> more_channels;     // (passes - 1, N, kRecordChannels)
 
   Buffer<KeyedId> order, order_scratch;
   Buffer<std::uint32_t> histogram;
@@ -101,15 +94,30 @@ struct RasterState {
   Buffer<Pair> pairs;                // by tile, front to back
   Buffer<std::uint32_t> masks;       // (pairs,), live blocks reached
   Buffer<std::uint32_t> tile_done;   // (tiles,): pairs looked at before the tile closed
-  Buffer<float> final_state;         // (passes, tiles, kFinalPlanes, kTilePixels)
 
   std::size_t tiles() const noexcept { return static_cast<std::size_t>(columns) * static_cast<std::size_t>(rows); }
+  void resize(std::size_t count, const View& view);
+  std::size_t bytes() const noexcept;
+};
+
+struct RasterState : TileLists {
+  std::size_t count = 0;
+  int channels = 0;  // input columns
+  int out_channels = 0;
+  View view{};
+  RasterOptions options;
+  std::vector<ChannelPass> passes;
+
+  Buffer<Record> records;       // (N,), in the order of the map
+  Buffer<float> more_channels;  // (passes - 1, N, kRecordChannels)
+  Buffer<float> final_state;    // (passes, tiles, kFinalPlanes, kTilePixels)
+
   std::size_t bytes() const noexcept;
 };
 
 // Depth order and tile lists (order.cpp).
 class ThreadPool;
-void order_by_depth(RasterState& state, ThreadPool& pool);
-void list_tiles(RasterState& state, ThreadPool& pool);
+void order_by_depth(TileLists& state, ThreadPool& pool);
+void list_tiles(TileLists& state, ThreadPool& pool);
 
 }  // namespace splatbot

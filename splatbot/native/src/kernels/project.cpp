@@ -1,31 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "entry.hpp"
+#include "lanes.hpp"
 #include "project.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
-
-// Index of the first value that is not finite, or n.
-std::size_t first_not_finite(const float* values, std::size_t n) {
-  std::uint32_t bad = 0;
-  for (std::size_t i = 0; i < n; ++i) {
-    std::uint32_t x;
-    std::memcpy(&x, values + i, sizeof(x));
-    bad |= static_cast<std::uint32_t>((x & 0x7f800000U) == 0x7f800000U);
-  }
-  if (bad == 0) {
-    return n;
-  }
-  for (std::size_t i = 0; i < n; ++i) {
-    std::uint32_t x;
-    std::memcpy(&x, values + i, sizeof(x));
-    if ((x & 0x7f800000U) == 0x7f800000U) {
-      return i;
-    }
-  }
-  return n;
-}
 
 bool find_fault(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
   const float* fields[] = {args.means, args.quats, args.scales, args.opacities, args.colors};
@@ -40,21 +20,6 @@ bool find_fault(const ProjectArgs& args, std::size_t begin, std::size_t end, Pro
     }
   }
   return false;
-}
-
-// Rows [first, first + n) of an (N, width) array, transposed; the last row is repeated to W.
-template <int Width>
-SB_INLINE void load_lanes(const float* rows, std::size_t first, int n, F (&out)[Width]) {
-  alignas(64) float lanes[Width][W];
-  for (int i = 0; i < W; ++i) {
-    const float* row = rows + (first + static_cast<std::size_t>(i < n ? i : n - 1)) * Width;
-    for (int c = 0; c < Width; ++c) {
-      lanes[c][i] = row[c];
-    }
-  }
-  for (int c = 0; c < Width; ++c) {
-    out[c] = load(lanes[c]);
-  }
 }
 
 // Change of depth per pixel over a Gaussian's footprint if its matter lies in the plane through its centre whose

@@ -2,6 +2,7 @@
 // From the sums of blend_backward() to the gradients of the inputs, W Gaussians at once. The projection is computed
 // anew: cheaper than keeping it.
 #include "entry.hpp"
+#include "lanes.hpp"
 #include "project.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
@@ -41,8 +42,6 @@ SB_INLINE void sum_slots(const ProjectBackwardArgs& args, const ProjectedBlock& 
     store(sums + i * W, acc[i]);
   }
 }
-
-SB_INLINE void put(float* to, float value, bool add) { *to = add ? *to + value : value; }
 
 void write_colors(const ProjectBackwardArgs& args, std::size_t id, const float* sums) {
   const ChannelPass& pass = *args.pass;
@@ -111,73 +110,9 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
     }
   }
 
-  F r[9];  // d loss / d Gaussian rotation
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) {
-      r[3 * i + j] = fma(cam.r[i], ga[j], fma(cam.r[3 + i], ga[3 + j], cam.r[6 + i] * ga[6 + j]));
-    }
-  }
-  const F w = o.unit[0], x = o.unit[1], y = o.unit[2], z = o.unit[3];
-  F q[4];
-  q[0] = two * fma(x, r[7] - r[5], fma(y, r[2] - r[6], z * (r[3] - r[1])));
-  q[1] = two * (fma(y, r[1] + r[3], fma(z, r[2] + r[6], w * (r[7] - r[5]))) - two * x * (r[4] + r[8]));
-  q[2] = two * (fma(x, r[1] + r[3], fma(z, r[5] + r[7], w * (r[2] - r[6]))) - two * y * (r[0] + r[8]));
-  q[3] = two * (fma(x, r[2] + r[6], fma(y, r[5] + r[7], w * (r[3] - r[1]))) - two * z * (r[0] + r[4]));
-  const F radial = fma(q[0], w, fma(q[1], x, fma(q[2], y, q[3] * z)));
-  const F zero = set1(0.0F);
-  for (int i = 0; i < 4; ++i) {
-    out.quat[i] = select(o.quat_zero, zero, fnma(radial, o.unit[i], q[i]) / o.norm);
-  }
-}
-
-template <int Width>
-SB_INLINE void gather_lanes(const float* rows, const std::uint32_t* ids, int n, F (&out)[Width]) {
-  alignas(64) float lanes[Width][W];
-  for (int i = 0; i < W; ++i) {
-    const float* row = rows + static_cast<std::size_t>(ids[i < n ? i : n - 1]) * Width;
-    for (int c = 0; c < Width; ++c) {
-      lanes[c][i] = row[c];
-    }
-  }
-  for (int c = 0; c < Width; ++c) {
-    out[c] = load(lanes[c]);
-  }
-}
-
-template <int Width>
-SB_INLINE void scatter_lanes(float* rows, const std::uint32_t* ids, int n, const F (&values)[Width], bool add) {
-  if (rows == nullptr) {
-    return;
-  }
-  alignas(64) float lanes[Width][W];
-  for (int c = 0; c < Width; ++c) {
-    store(lanes[c], values[c]);
-  }
-  for (int i = 0; i < n; ++i) {
-    float* row = rows + static_cast<std::size_t>(ids[i]) * Width;
-    for (int c = 0; c < Width; ++c) {
-      put(row + c, lanes[c][i], add);
-    }
-  }
-}
-
-struct CameraSums {
-  double lanes[12][W];
-};
-
-SB_INLINE void add_camera(const LaneGradients& g, int n, CameraSums& sums) {
-  alignas(64) float lanes[12][W];
-  for (int i = 0; i < 9; ++i) {
-    store(lanes[i], g.rotation[i]);
-  }
-  for (int i = 0; i < 3; ++i) {
-    store(lanes[9 + i], g.translation[i]);
-  }
-  for (int k = 0; k < 12; ++k) {
-    for (int i = 0; i < W; ++i) {
-      sums.lanes[k][i] += i < n ? static_cast<double>(lanes[k][i]) : 0.0;
-    }
-  }
+  F r[9];
+  pull_back_axes(cam, ga, r);
+  pull_back_rotation(o, r, out.quat);
 }
 
 void zero_rows(const ProjectBackwardArgs& args, std::size_t begin, std::size_t end) {
@@ -248,7 +183,7 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
   if (!args.accumulate && block.visible < end - begin) {
     zero_rows(args, begin, end);
   }
-  CameraSums camera_sums{};
+  CameraSums camera_sums;
   const CameraLanes cam(args.forward.view);
   for (std::uint32_t at = 0; at < block.visible; at += W) {
     const std::uint32_t* ids = visible + at;
@@ -277,17 +212,11 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
       scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
     }
     if (args.viewmat != nullptr) {
-      add_camera(grads, n, camera_sums);
+      camera_sums.add(grads.rotation, grads.translation, n);
     }
   }
   if (args.viewmat != nullptr && args.last) {
-    for (int k = 0; k < 12; ++k) {
-      double sum = 0.0;
-      for (int i = 0; i < W; ++i) {
-        sum += camera_sums.lanes[k][i];
-      }
-      args.viewmat[b * 12 + static_cast<std::size_t>(k)] = sum;
-    }
+    camera_sums.write(args.viewmat + b * 12);
   }
 }
 
