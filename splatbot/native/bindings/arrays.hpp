@@ -10,6 +10,8 @@
 #include <memory>
 #include <optional>
 #include <span>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "splatbot/rasterizer.hpp"
@@ -65,6 +67,19 @@ inline splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int widt
   view.width = width;
   view.height = height;
   return view;
+}
+
+inline splatbot::DepthMode depth_mode(const std::string& name) {
+  if (name == "none") {
+    return splatbot::DepthMode::none;
+  }
+  if (name == "accumulated") {
+    return splatbot::DepthMode::accumulated;
+  }
+  if (name == "expected") {
+    return splatbot::DepthMode::expected;
+  }
+  throw std::invalid_argument("depth is '" + name + "', must be none, accumulated or expected");
 }
 
 template <class T>

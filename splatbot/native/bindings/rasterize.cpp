@@ -20,19 +20,6 @@ using namespace nb::literals;
 
 namespace {
 
-splatbot::DepthMode depth_mode(const std::string& name) {
-  if (name == "none") {
-    return splatbot::DepthMode::none;
-  }
-  if (name == "accumulated") {
-    return splatbot::DepthMode::accumulated;
-  }
-  if (name == "expected") {
-    return splatbot::DepthMode::expected;
-  }
-  throw std::invalid_argument("depth is '" + name + "', must be none, accumulated or expected");
-}
-
 // A render's leftovers for its backward pass and its meta.
 struct State {
   splatbot::RasterStatePtr state;

@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "splatbot/raster_state.hpp"
+#include "splatbot/surfel_kernels.hpp"
 
 // The compute kernels, compiled once for each instruction set from the sources in src/kernels. They see plain pointers
 // only: an inline function of the standard library would be emitted in several copies of which the linker keeps any.
@@ -82,6 +83,7 @@ struct Kernels {
   void (*blend)(const BlendArgs&, std::size_t tile);
   void (*blend_backward)(const BlendBackwardArgs&, std::size_t tile);
   void (*project_backward)(const ProjectBackwardArgs&, std::size_t block);
+  SurfelKernels surfels;
 };
 
 // The kernels in use (isa.cpp).

@@ -27,6 +27,23 @@ inline std::size_t first_not_finite(const float* values, std::size_t n) {
   return n;
 }
 
+// The first input of Gaussians [begin, end) that is not finite, if there is one.
+template <class Args>
+bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
+  const float* fields[] = {args.means, args.quats, args.scales, args.opacities, args.colors};
+  const std::size_t widths[] = {3, 4, 3, 1, static_cast<std::size_t>(args.channels)};
+  for (int f = 0; f < 5; ++f) {
+    const std::size_t n = (end - begin) * widths[f];
+    const std::size_t bad = first_not_finite(fields[f] + begin * widths[f], n);
+    if (bad < n) {
+      out.fault_field = f;
+      out.fault_row = begin + bad / widths[f];
+      return true;
+    }
+  }
+  return false;
+}
+
 // Rows [first, first + n) of an (N, width) array, transposed; the last row is repeated to W.
 template <int Width>
 SB_INLINE void load_lanes(const float* rows, std::size_t first, int n, F (&out)[Width]) {

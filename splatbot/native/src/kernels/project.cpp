@@ -7,21 +7,6 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
-bool find_fault(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
-  const float* fields[] = {args.means, args.quats, args.scales, args.opacities, args.colors};
-  const std::size_t widths[] = {3, 4, 3, 1, static_cast<std::size_t>(args.channels)};
-  for (int f = 0; f < 5; ++f) {
-    const std::size_t n = (end - begin) * widths[f];
-    const std::size_t bad = first_not_finite(fields[f] + begin * widths[f], n);
-    if (bad < n) {
-      out.fault_field = f;
-      out.fault_row = begin + bad / widths[f];
-      return true;
-    }
-  }
-  return false;
-}
-
 // Change of depth per pixel over a Gaussian's footprint if its matter lies in the plane through its centre whose
 // normal n is its flattest axis: the ray of pixel (u, v) meets that plane at z(u, v), and d z/d u is
 // -z^2 n_x / (fx n.p). A Gaussian with no flattest axis has no plane, so the slope fades with (least scale / middle scale)^2; it is bounded

@@ -65,6 +65,7 @@ SB_INLINE void store(std::uint32_t* p, I a) { _mm512_storeu_si512(p, a.v); }
 SB_INLINE I operator+(I a, I b) { return {_mm512_add_epi32(a.v, b.v)}; }
 SB_INLINE I operator-(I a, I b) { return {_mm512_sub_epi32(a.v, b.v)}; }
 SB_INLINE I operator&(I a, I b) { return {_mm512_and_si512(a.v, b.v)}; }
+SB_INLINE M operator==(I a, I b) { return {_mm512_cmpeq_epi32_mask(a.v, b.v)}; }
 SB_INLINE I operator|(I a, I b) { return {_mm512_or_si512(a.v, b.v)}; }
 template <int N>
 SB_INLINE I shift_left(I a) {
@@ -129,6 +130,7 @@ SB_INLINE void store(std::uint32_t* p, I a) { _mm256_storeu_si256(reinterpret_ca
 SB_INLINE I operator+(I a, I b) { return {_mm256_add_epi32(a.v, b.v)}; }
 SB_INLINE I operator-(I a, I b) { return {_mm256_sub_epi32(a.v, b.v)}; }
 SB_INLINE I operator&(I a, I b) { return {_mm256_and_si256(a.v, b.v)}; }
+SB_INLINE M operator==(I a, I b) { return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(a.v, b.v))}; }
 SB_INLINE I operator|(I a, I b) { return {_mm256_or_si256(a.v, b.v)}; }
 template <int N>
 SB_INLINE I shift_left(I a) {
@@ -232,6 +234,7 @@ SB_INLINE F bit_cast_float(I a) { return {reinterpret_cast<Vf>(a.v)}; }
 SB_INLINE I operator+(I a, I b) { return {a.v + b.v}; }
 SB_INLINE I operator-(I a, I b) { return {a.v - b.v}; }
 SB_INLINE I operator&(I a, I b) { return {a.v & b.v}; }
+SB_INLINE M operator==(I a, I b) { return {a.v == b.v}; }
 SB_INLINE I operator|(I a, I b) { return {a.v | b.v}; }
 template <int N>
 SB_INLINE I shift_left(I a) {

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "entry.hpp"
+#include "surfel_entry.hpp"
 
 #define SB_TEXT(name) #name
 #define SB_EXPANDED_TEXT(name) SB_TEXT(name)
@@ -7,6 +8,7 @@
 namespace splatbot::SPLATBOT_KERNELS {
 
 extern const Kernels kKernels;
-const Kernels kKernels = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), project, blend, blend_backward, project_backward};
+const Kernels kKernels = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), project, blend, blend_backward, project_backward,
+                          {surfel_project, surfel_blend, surfel_blend_backward, surfel_project_backward}};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

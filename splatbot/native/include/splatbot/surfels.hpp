@@ -1,0 +1,69 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <span>
+
+#include "splatbot/rasterizer.hpp"
+
+namespace splatbot {
+
+// Colours that one surfel render takes; more are rendered by several.
+inline constexpr int kMaxSurfelChannels = 8;
+
+struct SurfelOptions {
+  float near_plane = 0.01F;
+  float far_plane = 1e10F;
+  float radius_clip = 0.0F;  // [px]; smaller surfels are left out
+  DepthMode depth = DepthMode::none;
+  bool distortion = false;
+};
+
+// Where a surfel render goes. `median` and `distortion` are (H, W), the latter empty if not asked for.
+struct SurfelImages {
+  std::span<float> colors;   // (H, W, channels [+ 1 when depth is asked for, last])
+  std::span<float> alphas;   // (H, W)
+  std::span<float> normals;  // (H, W, 3), world frame
+  std::span<float> median;
+  std::span<float> distortion;
+};
+
+struct SurfelState;
+using SurfelStatePtr = std::shared_ptr<SurfelState>;
+
+// Renders flat Gaussians (Huang et al. 2024, 2D Gaussian Splatting): discs in the plane of the first two axes, met by
+// each pixel's ray; the third scale is not looked at. A disc's response is exp(-(u^2 + v^2) / 2) at the hit, in standard
+// deviations, or, if that is more, exp(-d^2) d pixels from its projected centre. Depth is that of the hit, or of the
+// centre where the second response counts. Hits nearer than the near plane are none. Blending is that of
+// rasterize_forward().
+std::optional<Fault> surfels_forward(const Gaussians& surfels, const View& view, const SurfelOptions& options,
+                                     std::span<const float> background, const SurfelImages& out,
+                                     SurfelStatePtr& state);
+
+// Gradients of a loss to the images; an empty span is zero.
+struct SurfelImageGradients {
+  std::span<const float> colors, alphas, normals, median, distortion;
+};
+
+// As rasterize_backward(); `means2d` (N, 2) [per px] is the gradient to the projected centres.
+struct SurfelGradients : Gradients {
+  std::span<float> means2d;
+};
+void surfels_backward(const SurfelState& state, const Gaussians& surfels, std::span<const float> background,
+                      const SurfelImageGradients& grads, const SurfelGradients& out);
+
+// What projection found, one row a surfel; rows of surfels out of view are zero.
+struct SurfelProjections {
+  std::span<float> means2d;               // (N, 2) [px]
+  std::span<float> depths;                // (N,)
+  std::span<float> normals;               // (N, 3) world frame, facing the camera
+  std::span<std::int32_t> radii;          // (N, 2) [px]
+  std::span<std::int32_t> tiles_touched;  // (N,)
+};
+void describe_surfels(const SurfelState& state, const SurfelProjections& out);
+
+std::span<const std::uint32_t> visible_ids(const SurfelState& state);
+TileInfo tile_info(const SurfelState& state);
+
+}  // namespace splatbot

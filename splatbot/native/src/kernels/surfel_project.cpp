@@ -1,0 +1,212 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "surfel.hpp"
+#include "surfel_entry.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
+
+// What a surfel covers on the image: an ellipse, the low-pass filter's circle around its centre, and a box of both.
+struct Cover {
+  M bounded;  // the ellipse exists
+  F ex, ey, l11, l21, l22, lean;
+  F circle;
+  F left, right, top, bottom;
+  F radius_x, radius_y;
+};
+
+// The image of the disc |(u, v)| <= c. It is an ellipse if the disc stays in front of the camera's plane: with rows
+// A = J (s0 t0, s1 t1) of its linear image and b = (s0 t0z, s1 t1z) / z, w = 1 - c^2 |b|^2 > 0, centre
+// m - c^2 A b / w and "covariance" c^2 / w^2 (w A A^T + c^2 A b b^T A^T), whose determinant is c^4 det(A)^2 / w^3: all
+// sums of positive terms. Rounded up: rounding must not lose a pixel at the rim.
+SB_INLINE Cover cover(const Projected& o, const Surfel& s, const CameraLanes& cam, F reach2) {
+  constexpr float kMargin = 1e-3F;     // [px^2]
+  constexpr float kInflate = 1.0005F;
+  constexpr float kLeastW = 0.02F;     // nearer to the camera's plane, a box of the whole image is good enough
+  constexpr float kLargest = 1e15F;    // [px]
+  const F* a = o.a;
+  const F inverse_z = set1(1.0F) / o.p[2];
+  const F k0 = s.scale[0] * inverse_z, k1 = s.scale[1] * inverse_z;
+  const F ax0 = cam.fx * k0 * fnma(s.slope[0], a[6], a[0]), ax1 = cam.fx * k1 * fnma(s.slope[0], a[7], a[1]);
+  const F ay0 = cam.fy * k0 * fnma(s.slope[1], a[6], a[3]), ay1 = cam.fy * k1 * fnma(s.slope[1], a[7], a[4]);
+  const F b0 = k0 * a[6], b1 = k1 * a[7];
+  const F w = fnma(reach2, fma(b0, b0, b1 * b1), set1(1.0F));
+  const F xb = fma(ax0, b0, ax1 * b1), yb = fma(ay0, b0, ay1 * b1);
+  const F f = reach2 / w;
+  const F g = f / w;
+  const F inflate = set1(kInflate), margin = set1(kMargin);
+  const F c00 = inflate * g * fma(reach2, xb * xb, w * fma(ax0, ax0, ax1 * ax1));
+  const F c11 = inflate * g * fma(reach2, yb * yb, w * fma(ay0, ay0, ay1 * ay1));
+  const F c01 = inflate * g * fma(reach2, xb * yb, w * fma(ax0, ay0, ax1 * ay1));
+  const F area = cam.fx * cam.fy * k0 * k1 * s.kappa * inflate;
+  const F det = fma(f * f / w, area * area, margin * (c00 + c11 + margin));
+  const F s00 = c00 + margin, s11 = c11 + margin;
+  const F sx = sqrt(s00), sy = sqrt(s11);
+  Cover c;
+  c.bounded = (w > set1(kLeastW)) & (sx < set1(kLargest)) & (sy < set1(kLargest));
+  const F off_x = fnma(f, xb, set1(0.0F)), off_y = fnma(f, yb, set1(0.0F));
+  c.ex = s.mx + off_x;
+  c.ey = s.my + off_y;
+  c.l22 = set1(1.0F) / sy;
+  c.l11 = zero_unless(c.bounded, sy / sqrt(det));
+  c.l21 = -(c.l11 * c01 * c.l22 * c.l22);
+  c.lean = c01 / (sx * sy);
+  const F reach = sqrt(reach2);
+  c.circle = fma(reach, set1(0.70712F), set1(0.01F));
+  const F box_x = sx + set1(0.01F), box_y = sy + set1(0.01F);
+  const F huge = set1(1e30F);
+  c.left = select(c.bounded, min(c.ex - box_x, s.mx - c.circle), -huge);
+  c.right = select(c.bounded, max(c.ex + box_x, s.mx + c.circle), huge);
+  c.top = select(c.bounded, min(c.ey - box_y, s.my - c.circle), -huge);
+  c.bottom = select(c.bounded, max(c.ey + box_y, s.my + c.circle), huge);
+  c.radius_x = select(c.bounded, max(c.right - s.mx, s.mx - c.left), huge);
+  c.radius_y = select(c.bounded, max(c.bottom - s.my, s.my - c.top), huge);
+  // An ellipse that holds the circle makes it redundant; sqrt(det / trace) is at most its smaller half axis.
+  const F off = max(off_x, -off_x) + max(off_y, -off_y);
+  const M holds = c.bounded & (sqrt(det / (s00 + s11)) > c.circle + off);
+  c.circle = select(holds, set1(0.0F), c.circle);
+  return c;
+}
+
+struct Lanes {
+  alignas(64) float mx[W], my[W], b[4][W], kappa[W], hx[W], hy[W], z[W], lo[W], circle[W];
+  alignas(64) float ex[W], ey[W], l11[W], l21[W], l22[W], lean[W], radius_x[W], radius_y[W], normal[3][W];
+  alignas(64) std::uint32_t corner[W], size[W];  // x in the low half, y in the high half
+};
+
+// Tiles that the box meets, clamped to the image; a mask of lanes that reach it.
+SB_INLINE M cover_tiles(const SurfelProjectArgs& args, const Cover& c, Lanes& lanes) {
+  const F zero = set1(0.0F);
+  const F last_x = set1(static_cast<float>(args.columns - 1));
+  const F last_y = set1(static_cast<float>(args.rows - 1));
+  const I x0 = to_int(clamp(floor(c.left * set1(1.0F / kTileWidth)), zero, last_x));
+  const I x1 = to_int(clamp(floor(c.right * set1(1.0F / kTileWidth)), zero, last_x));
+  const I y0 = to_int(clamp(floor(c.top * set1(1.0F / kTileHeight)), zero, last_y));
+  const I y1 = to_int(clamp(floor(c.bottom * set1(1.0F / kTileHeight)), zero, last_y));
+  store(lanes.corner, x0 | shift_left<16>(y0));
+  store(lanes.size, (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1)));
+  return (c.right > zero) & (c.left < set1(static_cast<float>(args.view.width))) & (c.bottom > zero) &
+         (c.top < set1(static_cast<float>(args.view.height)));
+}
+
+void store_lanes(const Projected& o, const Surfel& s, const Cover& c, F lo, Lanes& lanes) {
+  store(lanes.mx, s.mx);
+  store(lanes.my, s.my);
+  for (int i = 0; i < 4; ++i) {
+    store(lanes.b[i], s.b[i]);
+  }
+  store(lanes.kappa, s.kappa);
+  store(lanes.hx, s.hx);
+  store(lanes.hy, s.hy);
+  store(lanes.z, o.p[2]);
+  store(lanes.lo, lo);
+  store(lanes.circle, c.circle);
+  store(lanes.ex, c.ex);
+  store(lanes.ey, c.ey);
+  store(lanes.l11, c.l11);
+  store(lanes.l21, c.l21);
+  store(lanes.l22, c.l22);
+  store(lanes.lean, c.lean);
+  store(lanes.radius_x, c.radius_x);
+  store(lanes.radius_y, c.radius_y);
+  for (int i = 0; i < 3; ++i) {
+    store(lanes.normal[i], -(s.flip * o.rotation[3 * i + 2]));
+  }
+}
+
+SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const Lanes& lanes, int lane,
+                          ProjectedBlock& out) {
+  SurfelRecord& r = args.records[id];
+  r.mx = lanes.mx[lane];
+  r.my = lanes.my[lane];
+  for (int i = 0; i < 4; ++i) {
+    r.b[i] = lanes.b[i][lane];
+  }
+  r.kappa = lanes.kappa[lane];
+  r.hx = lanes.hx[lane];
+  r.hy = lanes.hy[lane];
+  r.z = lanes.z[lane];
+  r.lo = lanes.lo[lane];
+  r.circle = lanes.circle[lane];
+  r.ex = lanes.ex[lane];
+  r.ey = lanes.ey[lane];
+  r.l11 = lanes.l11[lane];
+  r.l21 = lanes.l21[lane];
+  r.l22 = lanes.l22[lane];
+  r.lean = lanes.lean[lane];
+  r.radius_x = lanes.radius_x[lane];
+  r.radius_y = lanes.radius_y[lane];
+  for (int i = 0; i < 3; ++i) {
+    r.normal[i] = lanes.normal[i][lane];
+  }
+  const float* colors = args.colors + id * static_cast<std::size_t>(args.channels);
+  for (int c = 0; c < kMaxSurfelChannels; ++c) {
+    r.channels[c] = c < args.channels ? colors[c] : 0.0F;
+  }
+  Placement& place = args.placements[id];
+  const std::uint32_t corner = lanes.corner[lane], size = lanes.size[lane];
+  place.x0 = static_cast<std::uint16_t>(corner);
+  place.y0 = static_cast<std::uint16_t>(corner >> 16);
+  place.nx = static_cast<std::uint16_t>(size);
+  place.ny = static_cast<std::uint16_t>(size >> 16);
+  place.slot = static_cast<std::uint32_t>(out.pairs);
+  std::memcpy(&place.depth_bits, &lanes.z[lane], sizeof(float));
+  out.pairs += std::uint64_t{size & 0xffffU} * (size >> 16);
+}
+
+void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::size_t first, int n,
+                   std::uint32_t* visible, ProjectedBlock& out) {
+  GaussianLanes g;
+  F opacity[1];
+  load_lanes<3>(args.means, first, n, g.mean);
+  load_lanes<1>(args.opacities, first, n, opacity);
+  Projected o;
+  project_center(g, cam, o);
+  M keep = (o.p[2] >= set1(args.options.near_plane)) & (o.p[2] <= set1(args.options.far_plane)) &
+           (o.p[2] > set1(0.0F)) & (opacity[0] >= set1(kAlphaMin));
+  const std::uint32_t wanted = (1U << n) - 1U;
+  std::uint32_t kept = bits(keep) & wanted;
+  if (kept != 0) {
+    load_lanes<4>(args.quats, first, n, g.quat);
+    load_lanes<3>(args.scales, first, n, g.scale);
+    Surfel s;
+    project_surfel(g, cam, o, s);
+    const F lo = log2(max(opacity[0], set1(kAlphaMin)));
+    constexpr float kTwoLn2 = 1.3862944F;
+    const F reach2 = set1(kTwoLn2) * max(lo - set1(kLog2AlphaMin), set1(0.0F));
+    const Cover c = cover(o, s, cam, reach2);
+    Lanes lanes;
+    const F huge = set1(1e30F);
+    keep = keep & cover_tiles(args, c, lanes) & (s.mx > -huge) & (s.mx < huge) & (s.my > -huge) & (s.my < huge) &
+           (max(c.radius_x, c.radius_y) > set1(args.options.radius_clip));
+    kept = bits(keep) & wanted;
+    store_lanes(o, s, c, lo, lanes);
+    for (std::uint32_t left = kept; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      const std::size_t id = first + static_cast<std::size_t>(lane);
+      write_lane(args, id, lanes, lane, out);
+      visible[out.visible++] = static_cast<std::uint32_t>(id);
+    }
+  }
+  for (std::uint32_t left = wanted & ~kept; left != 0; left &= left - 1) {
+    args.placements[first + static_cast<std::size_t>(__builtin_ctz(left))] = Placement{};
+  }
+}
+
+}  // namespace
+
+void surfel_project(const SurfelProjectArgs& args, std::size_t block, ProjectedBlock& out) {
+  const std::size_t begin = block * kProjectBlock;
+  const std::size_t end = begin + kProjectBlock < args.count ? begin + kProjectBlock : args.count;
+  out = ProjectedBlock{};
+  if (find_fault(args, begin, end, out)) {
+    return;
+  }
+  const CameraLanes cam(args.view);
+  for (std::size_t first = begin; first < end; first += W) {
+    const std::size_t left = end - first;
+    project_lanes(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, out);
+  }
+}
+
+}  // namespace splatbot::SPLATBOT_KERNELS

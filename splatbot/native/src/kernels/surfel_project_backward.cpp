@@ -1,0 +1,199 @@
+// SPDX-License-Identifier: Apache-2.0
+// From the sums of surfel_blend_backward() to the gradients of the inputs, W surfels at once. The projection is
+// computed anew: cheaper than keeping it.
+#include "surfel.hpp"
+#include "surfel_entry.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
+
+constexpr int kLaneSums = kSumColor;  // geometry and normals
+
+struct LaneSums {
+  alignas(64) float of[kLaneSums][W];
+};
+
+struct LaneGradients {
+  F mean[3], quat[4], scale[3], point[2];
+  F rotation[9], translation[3];  // of the camera
+};
+
+// Sum of a surfel's slots in the order of its tiles.
+SB_INLINE void sum_slots(const SurfelProjectBackwardArgs& args, const ProjectedBlock& block, std::size_t id,
+                         float* sums) {
+  const Placement& place = args.forward.placements[id];
+  const float* slot = args.slots + (block.first_pair + place.slot) * kSurfelSlot;
+  const std::size_t pairs = std::size_t{place.nx} * place.ny;
+  const int used = args.sum_channels ? kSurfelSlot : kSumNormal;
+  for (int i = 0; i < used; i += W) {
+    F acc = load(slot + i);
+    for (std::size_t p = 1; p < pairs; ++p) {
+      acc = acc + load(slot + p * kSurfelSlot + static_cast<std::size_t>(i));
+    }
+    store(sums + i, acc);
+  }
+  for (int i = used; i < kSurfelSlot; ++i) {
+    sums[i] = 0.0F;
+  }
+}
+
+// The sums of W surfels, lane by lane; colour gradients are written on the way.
+void collect(const SurfelProjectBackwardArgs& args, const ProjectedBlock& block, const std::uint32_t* ids, int n,
+             LaneSums& lanes) {
+  alignas(64) float sums[kSurfelSlot];
+  for (int lane = 0; lane < W; ++lane) {
+    if (lane < n) {
+      const std::size_t id = ids[lane];
+      sum_slots(args, block, id, sums);
+      float* to = args.colors == nullptr ? nullptr : args.colors + id * static_cast<std::size_t>(args.forward.channels);
+      for (int c = 0; to != nullptr && c < args.forward.channels; ++c) {
+        put(to + c, sums[kSumColor + c], args.accumulate);
+      }
+    }
+    for (int k = 0; k < kLaneSums; ++k) {
+      lanes.of[k][lane] = lane < n ? sums[k] : 0.0F;
+    }
+  }
+}
+
+// d loss / d (t0, t1) and d loss / d p', z from those of b, kappa and h (see Surfel).
+struct DiscGradients {
+  F t0[3], t1[3], slope[2], z, scale[2];
+};
+
+SB_INLINE DiscGradients pull_back_disc(const Projected& o, const Surfel& s, const CameraLanes& cam,
+                                       const LaneSums& sums) {
+  const auto sum = [&](int k) { return load(sums.of[k]); };
+  const F* a = o.a;
+  const F ifx = set1(1.0F) / cam.fx, ify = set1(1.0F) / cam.fy;
+  const F px = s.slope[0], py = s.slope[1];
+  const F gb[4] = {sum(kSumU), sum(kSumU + 1), sum(kSumV), sum(kSumV + 1)};
+  const F hit_depth = sum(kSumHitDepth);
+  const F gkappa = fma(hit_depth, o.p[2], sum(kSumD + 2));
+  const F k0 = s.flip * o.p[2] / s.scale[0], k1 = s.flip * o.p[2] / s.scale[1];
+  const F e0 = gb[0] * k0 * ifx, e1 = gb[1] * k0 * ify, e2 = gb[2] * k1 * ifx, e3 = gb[3] * k1 * ify;
+  const F along0 = fma(s.b[0], gb[0], s.b[1] * gb[1]), along1 = fma(s.b[2], gb[2], s.b[3] * gb[3]);
+  DiscGradients g;
+  g.scale[0] = -(along0 / s.scale[0]);
+  g.scale[1] = -(along1 / s.scale[1]);
+  g.z = fma(hit_depth, s.kappa, sum(kSumCenterDepth)) + (along0 + along1) / o.p[2];
+  F n[3];  // d loss / d (t0 x t1)
+  n[0] = s.flip * fma(gkappa, px, sum(kSumD) * ifx);
+  n[1] = s.flip * fma(gkappa, py, sum(kSumD + 1) * ify);
+  n[2] = s.flip * gkappa;
+  g.t0[0] = fms(a[4], n[2], a[7] * n[1]) + e3;
+  g.t0[1] = fms(a[7], n[0], a[1] * n[2]) - e2;
+  g.t0[2] = fms(a[1], n[1], a[4] * n[0]) + fms(py, e2, px * e3);
+  g.t1[0] = fms(n[1], a[6], n[2] * a[3]) - e1;
+  g.t1[1] = fms(n[2], a[0], n[0] * a[6]) + e0;
+  g.t1[2] = fms(n[0], a[3], n[1] * a[0]) + fms(px, e1, py * e0);
+  g.slope[0] = fma(gkappa, s.n[0], fms(a[7], e1, a[6] * e3));
+  g.slope[1] = fma(gkappa, s.n[1], fms(a[6], e2, a[7] * e0));
+  return g;
+}
+
+void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, const Surfel& s,
+               const LaneSums& sums, LaneGradients& out) {
+  const auto sum = [&](int k) { return load(sums.of[k]); };
+  const F filter = set1(kFilter);
+  const F su = sum(kSumU + 2), sv = sum(kSumV + 2), sd = sum(kSumD + 2);
+  out.point[0] = fms(filter, sum(kSumPointX), fma(s.b[0], su, fma(s.b[2], sv, s.hx * sd)));
+  out.point[1] = fms(filter, sum(kSumPointY), fma(s.b[1], su, fma(s.b[3], sv, s.hy * sd)));
+  const DiscGradients d = pull_back_disc(o, s, cam, sums);
+  const F zero = set1(0.0F);
+  for (int i = 0; i < 2; ++i) {
+    const F signed_scale = select(g.scale[i] < zero, -d.scale[i], d.scale[i]);
+    out.scale[i] = zero_unless(s.scale_free[i], signed_scale);
+  }
+  out.scale[2] = zero;
+
+  const F inverse_z = set1(1.0F) / o.p[2];
+  const F gx = fma(out.point[0], cam.fx, d.slope[0]) * inverse_z;
+  const F gy = fma(out.point[1], cam.fy, d.slope[1]) * inverse_z;
+  const F gp[3] = {gx, gy, fnma(gx, s.slope[0], fnma(gy, s.slope[1], d.z))};
+  F ga[9];
+  for (int i = 0; i < 3; ++i) {
+    ga[3 * i] = d.t0[i];
+    ga[3 * i + 1] = d.t1[i];
+    ga[3 * i + 2] = zero;
+  }
+  for (int i = 0; i < 3; ++i) {
+    out.mean[i] = fma(cam.r[i], gp[0], fma(cam.r[3 + i], gp[1], cam.r[6 + i] * gp[2]));
+    out.translation[i] = gp[i];
+    for (int j = 0; j < 3; ++j) {
+      const F turned = fma(ga[3 * i], o.rotation[3 * j], ga[3 * i + 1] * o.rotation[3 * j + 1]);
+      out.rotation[3 * i + j] = fma(gp[i], g.mean[j], turned);
+    }
+  }
+  F r[9];
+  pull_back_axes(cam, ga, r);
+  for (int i = 0; i < 3; ++i) {
+    r[3 * i + 2] = fnma(s.flip, sum(kSumNormal + i), r[3 * i + 2]);
+  }
+  pull_back_rotation(o, r, out.quat);
+}
+
+void zero_rows(const SurfelProjectBackwardArgs& args, std::size_t begin, std::size_t end) {
+  const auto clear = [&](float* rows, std::size_t width) {
+    if (rows != nullptr) {
+      std::memset(rows + begin * width, 0, (end - begin) * width * sizeof(float));
+    }
+  };
+  clear(args.colors, static_cast<std::size_t>(args.forward.channels));
+  clear(args.means, 3);
+  clear(args.quats, 4);
+  clear(args.scales, 3);
+  clear(args.opacities, 1);
+}
+
+}  // namespace
+
+void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t b) {
+  const std::size_t begin = b * kProjectBlock;
+  const std::size_t end = begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
+  const ProjectedBlock& block = args.blocks[b];
+  const std::uint32_t* visible = args.forward.visible + begin;
+  if (!args.accumulate && block.visible < end - begin) {
+    zero_rows(args, begin, end);
+  }
+  if (args.means2d != nullptr) {  // of one view: never added to
+    std::memset(args.means2d + 2 * begin, 0, 2 * (end - begin) * sizeof(float));
+  }
+  CameraSums camera_sums;
+  const CameraLanes cam(args.forward.view);
+  for (std::uint32_t at = 0; at < block.visible; at += W) {
+    const std::uint32_t* ids = visible + at;
+    const int n = block.visible - at < W ? static_cast<int>(block.visible - at) : W;
+    LaneSums sums;
+    collect(args, block, ids, n, sums);
+    GaussianLanes g;
+    gather_lanes<3>(args.forward.means, ids, n, g.mean);
+    gather_lanes<4>(args.forward.quats, ids, n, g.quat);
+    gather_lanes<3>(args.forward.scales, ids, n, g.scale);
+    Projected o;
+    project_center(g, cam, o);
+    Surfel s;
+    project_surfel(g, cam, o, s);
+    LaneGradients grads;
+    pull_back(g, cam, o, s, sums, grads);
+    scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
+    scatter_lanes<4>(args.quats, ids, n, grads.quat, args.accumulate);
+    scatter_lanes<3>(args.scales, ids, n, grads.scale, args.accumulate);
+    scatter_lanes<2>(args.means2d, ids, n, grads.point, false);
+    if (args.opacities != nullptr) {
+      F opacity[1];
+      gather_lanes<1>(args.forward.opacities, ids, n, opacity);
+      const F gradient[1] = {load(sums.of[kSumAlpha]) / opacity[0]};
+      scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
+    }
+    if (args.viewmat != nullptr) {
+      camera_sums.add(grads.rotation, grads.translation, n);
+    }
+  }
+  if (args.viewmat != nullptr) {
+    camera_sums.write(args.viewmat + b * 12);
+  }
+}
+
+}  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,267 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "splatbot/surfels.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "checks.hpp"
+#include "splatbot/kernels.hpp"
+#include "splatbot/threads.hpp"
+#include "state_store.hpp"
+
+namespace splatbot {
+
+struct SurfelState : TileLists {
+  std::size_t count = 0;
+  int channels = 0;
+  View view{};
+  SurfelOptions options;
+  Buffer<SurfelRecord> records;  // (N,), in the order of the map
+  Buffer<float> final_state;     // (tiles, kSurfelPlanes, kTilePixels)
+};
+
+namespace {
+
+void check_surfels(const Gaussians& g) {
+  require(g.count < (std::size_t{1} << 32) - 1, "too many surfels");
+  require(g.channels >= 0 && g.channels <= kMaxSurfelChannels, "a surfel has at most 8 channels");
+  require(g.means.size() == 3 * g.count, "means is not (N, 3)");
+  require(g.quats.size() == 4 * g.count, "quats is not (N, 4)");
+  require(g.scales.size() == 3 * g.count, "scales is not (N, 3)");
+  require(g.opacities.size() == g.count, "opacities is not (N,)");
+  require(g.colors.size() == g.count * static_cast<std::size_t>(g.channels), "colors is not (N, channels)");
+}
+
+std::size_t pixels_of(const View& view) {
+  return static_cast<std::size_t>(view.width) * static_cast<std::size_t>(view.height);
+}
+
+std::size_t columns_of(const SurfelState& state) {
+  return static_cast<std::size_t>(state.channels) + (state.options.depth != DepthMode::none ? 1U : 0U);
+}
+
+void check_images(const SurfelState& state, const SurfelImages& out) {
+  const std::size_t pixels = pixels_of(state.view);
+  require(out.colors.size() == pixels * columns_of(state), "colors has a wrong size");
+  require(out.alphas.size() == pixels, "alphas has a wrong size");
+  require(out.normals.size() == 3 * pixels, "normals has a wrong size");
+  require(out.median.size() == pixels, "median has a wrong size");
+  require(out.distortion.size() == (state.options.distortion ? pixels : 0), "distortion has a wrong size");
+}
+
+void check_gradients(const SurfelState& state, const SurfelImageGradients& grads, const SurfelGradients& out) {
+  const std::size_t pixels = pixels_of(state.view), n = state.count;
+  const auto channels = static_cast<std::size_t>(state.channels);
+  require(empty_or(grads.colors, pixels * columns_of(state)) && empty_or(grads.alphas, pixels) &&
+              empty_or(grads.normals, 3 * pixels) && empty_or(grads.median, pixels) &&
+              empty_or(grads.distortion, state.options.distortion ? pixels : 0),
+          "a gradient of an image has a wrong size");
+  require(empty_or(out.means, 3 * n) && empty_or(out.quats, 4 * n) && empty_or(out.scales, 3 * n) &&
+              empty_or(out.opacities, n) && empty_or(out.colors, channels * n) && empty_or(out.means2d, 2 * n) &&
+              empty_or(out.viewmat, std::size_t{12}) && empty_or(out.background, channels),
+          "a gradient has a wrong size");
+}
+
+SurfelProjectArgs project_args(SurfelState& state, const Gaussians& g) {
+  return {.count = state.count,
+          .means = g.means.data(),
+          .quats = g.quats.data(),
+          .scales = g.scales.data(),
+          .opacities = g.opacities.data(),
+          .colors = g.colors.data(),
+          .channels = state.channels,
+          .view = state.view,
+          .options = state.options,
+          .columns = state.columns,
+          .rows = state.rows,
+          .records = state.records.data(),
+          .placements = state.placements.data(),
+          .visible = state.visible.data()};
+}
+
+SurfelBlendArgs blend_args(SurfelState& state, std::span<const float> background) {
+  return {.view = state.view,
+          .options = state.options,
+          .columns = state.columns,
+          .channels = state.channels,
+          .records = state.records.data(),
+          .tile_begin = state.tile_begin.data(),
+          .pairs = state.pairs.data(),
+          .masks = state.masks.data(),
+          .tile_done = state.tile_done.data(),
+          .final_state = state.final_state.data(),
+          .background = background.empty() ? nullptr : background.data(),
+          .colors = nullptr,
+          .alphas = nullptr,
+          .normals = nullptr,
+          .median = nullptr,
+          .distortion = nullptr};
+}
+
+std::optional<Fault> find_fault(const SurfelState& state) {
+  static constexpr std::string_view kFields[] = {"means", "quats", "scales", "opacities", "colors"};
+  for (const ProjectedBlock& block : state.blocks) {
+    if (block.fault_field >= 0) {
+      return Fault{kFields[block.fault_field], block.fault_row};
+    }
+  }
+  return std::nullopt;
+}
+
+// d render / d background is the transmittance left.
+void add_background_gradient(const SurfelState& state, std::span<const float> grad_colors, std::span<double> out) {
+  const auto width = static_cast<std::size_t>(state.view.width);
+  for (std::size_t y = 0; y < static_cast<std::size_t>(state.view.height); ++y) {
+    for (std::size_t x = 0; x < width; ++x) {
+      const std::size_t tile = y / kTileHeight * static_cast<std::size_t>(state.columns) + x / kTileWidth;
+      const std::size_t in_y = y % kTileHeight, in_x = x % kTileWidth;
+      const std::size_t i = ((in_y / kBlock) * kBlockColumns + in_x / kBlock) * kBlockPixels + in_y % kBlock * kBlock +
+                            in_x % kBlock;
+      const auto t = static_cast<double>(
+          state.final_state[(tile * kSurfelPlanes + kPlaneTransmittance) * kTilePixels + i]);
+      for (std::size_t c = 0; c < out.size(); ++c) {
+        out[c] += t * static_cast<double>(grad_colors[(y * width + x) * columns_of(state) + c]);
+      }
+    }
+  }
+}
+
+template <class T>
+T* pointer(std::span<T> span) {
+  return span.empty() ? nullptr : span.data();
+}
+
+struct BackwardScratch {
+  Buffer<float> slots;     // (pairs, kSurfelSlot)
+  Buffer<double> viewmat;  // (blocks, 12)
+};
+
+BackwardScratch& scratch() {
+  thread_local BackwardScratch instance;
+  return instance;
+}
+
+}  // namespace
+
+std::optional<Fault> surfels_forward(const Gaussians& g, const View& view, const SurfelOptions& options,
+                                     std::span<const float> background, const SurfelImages& out,
+                                     SurfelStatePtr& result) {
+  check_surfels(g);
+  check_view(view);
+  const SurfelStatePtr shared = new_state<SurfelState>();
+  SurfelState& state = *shared;
+  state.count = g.count;
+  state.channels = g.channels;
+  state.view = view;
+  state.options = options;
+  state.TileLists::resize(g.count, view);
+  state.records.resize(g.count);
+  state.final_state.resize(state.tiles() * kSurfelPlanes * kTilePixels);
+  require(empty_or(background, static_cast<std::size_t>(g.channels)), "background is not (channels,)");
+  check_images(state, out);
+
+  const Kernels& k = kernels();
+  const std::shared_ptr<ThreadPool> pool = thread_pool();
+  const SurfelProjectArgs project = project_args(state, g);
+  pool->run(state.blocks.size(), [&](std::size_t b) { k.surfels.project(project, b, state.blocks[b]); });
+  if (const std::optional<Fault> fault = find_fault(state)) {
+    return fault;
+  }
+  order_by_depth(state, *pool);
+  list_tiles(state, *pool);
+  SurfelBlendArgs blend = blend_args(state, background);
+  blend.colors = out.colors.data();
+  blend.alphas = out.alphas.data();
+  blend.normals = out.normals.data();
+  blend.median = out.median.data();
+  blend.distortion = pointer(out.distortion);
+  pool->run(state.tiles(), [&](std::size_t tile) { k.surfels.blend(blend, tile); });
+  result = shared;
+  return std::nullopt;
+}
+
+void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::span<const float> background,
+                      const SurfelImageGradients& grads, const SurfelGradients& out) {
+  check_surfels(g);
+  // Kernel arguments hold plain pointers for both passes; this one writes to none of the state's arrays.
+  auto& state = const_cast<SurfelState&>(const_state);
+  require(g.count == state.count && g.channels == state.channels, "the surfels are not those of the forward pass");
+  check_gradients(state, grads, out);
+  if (!out.accumulate) {
+    std::fill(out.viewmat.begin(), out.viewmat.end(), 0.0);
+    std::fill(out.background.begin(), out.background.end(), 0.0);
+  }
+  if (!out.background.empty() && !grads.colors.empty()) {
+    add_background_gradient(state, grads.colors, out.background);
+  }
+  if (out.means.empty() && out.quats.empty() && out.scales.empty() && out.opacities.empty() && out.viewmat.empty() &&
+      out.colors.empty() && out.means2d.empty()) {
+    return;
+  }
+
+  const Kernels& k = kernels();
+  const std::shared_ptr<ThreadPool> pool = thread_pool();
+  BackwardScratch& s = scratch();
+  s.slots.resize(state.pairs.size() * kSurfelSlot);
+  s.viewmat.resize(out.viewmat.empty() ? 0 : state.blocks.size() * 12);
+  const bool sum_channels = !out.colors.empty() || !out.quats.empty();
+  const SurfelBlendBackwardArgs blend = {.forward = blend_args(state, background),
+                                         .colors = pointer(grads.colors),
+                                         .alphas = pointer(grads.alphas),
+                                         .normals = pointer(grads.normals),
+                                         .median = pointer(grads.median),
+                                         .distortion = pointer(grads.distortion),
+                                         .sum_channels = sum_channels,
+                                         .slots = s.slots.data()};
+  pool->run(state.tiles(), [&](std::size_t tile) { k.surfels.blend_backward(blend, tile); });
+  const SurfelProjectBackwardArgs project = {.forward = project_args(state, g),
+                                             .blocks = state.blocks.data(),
+                                             .slots = s.slots.data(),
+                                             .sum_channels = sum_channels,
+                                             .accumulate = out.accumulate,
+                                             .means = pointer(out.means),
+                                             .quats = pointer(out.quats),
+                                             .scales = pointer(out.scales),
+                                             .opacities = pointer(out.opacities),
+                                             .colors = pointer(out.colors),
+                                             .means2d = pointer(out.means2d),
+                                             .viewmat = out.viewmat.empty() ? nullptr : s.viewmat.data()};
+  pool->run(state.blocks.size(), [&](std::size_t b) { k.surfels.project_backward(project, b); });
+  for (std::size_t b = 0; b < state.blocks.size() && !out.viewmat.empty(); ++b) {
+    for (std::size_t i = 0; i < 12; ++i) {
+      out.viewmat[i] += s.viewmat[b * 12 + i];
+    }
+  }
+}
+
+void describe_surfels(const SurfelState& state, const SurfelProjections& out) {
+  const std::size_t n = state.count;
+  require(out.means2d.size() == 2 * n && out.depths.size() == n && out.normals.size() == 3 * n &&
+              out.radii.size() == 2 * n && out.tiles_touched.size() == n,
+          "an output has a wrong size");
+  for (std::size_t i = 0; i < n; ++i) {
+    const Placement& place = state.placements[i];
+    static const SurfelRecord kNothing{};
+    const SurfelRecord& r = place.nx != 0 ? state.records[i] : kNothing;
+    out.means2d[2 * i] = r.mx;
+    out.means2d[2 * i + 1] = r.my;
+    out.depths[i] = r.z;
+    std::copy_n(r.normal, 3, &out.normals[3 * i]);
+    out.radii[2 * i] = static_cast<std::int32_t>(std::min(1e9, std::ceil(static_cast<double>(r.radius_x))));
+    out.radii[2 * i + 1] = static_cast<std::int32_t>(std::min(1e9, std::ceil(static_cast<double>(r.radius_y))));
+    out.tiles_touched[i] = std::int32_t{place.nx} * std::int32_t{place.ny};
+  }
+}
+
+std::span<const std::uint32_t> visible_ids(const SurfelState& state) { return state.ids.span(); }
+
+TileInfo tile_info(const SurfelState& state) {
+  return {kTileWidth,
+          kTileHeight,
+          state.columns,
+          state.rows,
+          state.pairs.size(),
+          state.TileLists::bytes() + state.records.capacity_bytes() + state.final_state.capacity_bytes()};
+}
+
+}  // namespace splatbot

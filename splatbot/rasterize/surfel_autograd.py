@@ -1,0 +1,134 @@
+"""The native passes of the surfel rasterizer as one differentiable function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatbot.errors import InputError
+from splatbot.rasterize.native import native
+
+
+@dataclass(frozen=True)
+class SurfelOptions:
+    """What a render is told besides tensors."""
+
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    depth: str
+    distortion: bool
+
+    def colors_only(self) -> SurfelOptions:
+        """The same render without depth and distortion."""
+        return replace(self, depth="none", distortion=False)
+
+
+class RasterizeSurfels(torch.autograd.Function):
+    """One view after the other. Returns colours, alphas, normals, median and, if asked for, distortion."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        viewmats: Tensor,
+        backgrounds: Tensor | None,
+        shift: Tensor,
+        Ks: Tensor,
+        options: SurfelOptions,
+        states: list[Any],
+    ) -> tuple[Tensor, ...]:
+        geometry = [t.detach() for t in (means, quats, scales, opacities)]
+        viewmats64 = viewmats.detach().to(torch.float64).contiguous()
+        images = _empty_images(len(viewmats), colors.shape[-1], options)
+        for i in range(len(viewmats)):
+            state = native().surfels_forward(
+                *geometry,
+                _of_view(colors, i),
+                viewmats64[i],
+                Ks[i],
+                options.width,
+                options.height,
+                options.near_plane,
+                options.far_plane,
+                options.radius_clip,
+                options.depth,
+                None if backgrounds is None else backgrounds[i].detach(),
+                images[0][i],
+                images[1][i, ..., 0],
+                images[2][i],
+                images[3][i, ..., 0],
+                images[4][i, ..., 0] if options.distortion else None,
+            )
+            if isinstance(state, tuple):
+                field, row = state
+                raise InputError(f"row {row} is not finite.", field=field, hint="find where the NaN or Inf comes from")
+            states.append(state)
+        ctx.states = tuple(states)
+        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmats, backgrounds)
+        ctx.set_materialize_grads(False)
+        return images
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        means, quats, scales, opacities, colors, viewmats, backgrounds = ctx.saved_tensors
+        need = ctx.needs_input_grad
+        if all(g is None for g in grads):
+            return (None,) * 11
+        geometry = [t.detach() for t in (means, quats, scales, opacities)]
+        out = [torch.empty_like(t) if n else None for t, n in zip(geometry, need[:4], strict=True)]
+        # Zeros only where the second view adds to rows that the first did not write.
+        new_colors = torch.empty if colors.ndim == 2 or len(ctx.states) == 1 else torch.zeros
+        grad_colors = new_colors(colors.shape, dtype=torch.float32) if need[4] else None
+        grad_viewmats = torch.zeros(viewmats.shape, dtype=torch.float64) if need[5] else None
+        grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[6] else None
+        grad_shift = torch.empty(len(ctx.states), len(means), 2) if need[7] else None
+        for i, state in enumerate(ctx.states):
+            pose = torch.zeros(12, dtype=torch.float64) if grad_viewmats is not None else None
+            native().surfels_backward(
+                state,
+                *geometry,
+                _of_view(colors, i),
+                None if backgrounds is None else backgrounds[i].detach(),
+                *_image_gradients(grads, i),
+                *out,
+                None if grad_colors is None else _of_view(grad_colors, i),
+                pose,
+                None if grad_backgrounds is None else grad_backgrounds[i],
+                None if grad_shift is None else grad_shift[i],
+                i > 0,
+            )
+            if grad_viewmats is not None and pose is not None:
+                grad_viewmats[i, :3, :3] = pose[:9].view(3, 3)
+                grad_viewmats[i, :3, 3] = pose[9:]
+        grad_viewmats = None if grad_viewmats is None else grad_viewmats.to(viewmats.dtype)
+        grad_backgrounds = None if grad_backgrounds is None else grad_backgrounds.to(torch.float32)
+        return (*out, grad_colors, grad_viewmats, grad_backgrounds, grad_shift, None, None, None)
+
+
+def _empty_images(views: int, channels: int, options: SurfelOptions) -> tuple[Tensor, ...]:
+    """Colours and depth, alphas, normals, median, distortion."""
+    columns = (channels + int(options.depth != "none"), 1, 3, 1, *([1] if options.distortion else []))
+    return tuple(torch.empty(views, options.height, options.width, n) for n in columns)
+
+
+def _image_gradients(grads: tuple[Tensor | None, ...], i: int) -> list[Tensor | None]:
+    """Of view i: (H, W, X) of colours and normals, (H, W) of the others; five, None for what has none."""
+    found: list[Tensor | None] = []
+    for k in range(5):
+        grad = grads[k] if k < len(grads) else None
+        found.append(None if grad is None else (grad[i] if k in (0, 2) else grad[i, ..., 0]).contiguous())
+    return found
+
+
+def _of_view(colors: Tensor, i: int) -> Tensor:
+    return (colors if colors.ndim == 2 else colors[i]).detach()
