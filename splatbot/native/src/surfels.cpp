@@ -239,16 +239,22 @@ void describe_surfels(const SurfelState& state, const SurfelProjections& out) {
   require(out.means2d.size() == 2 * n && out.depths.size() == n && out.normals.size() == 3 * n &&
               out.radii.size() == 2 * n && out.tiles_touched.size() == n,
           "an output has a wrong size");
+  static constexpr SurfelRecord kNothing{};
   for (std::size_t i = 0; i < n; ++i) {
     const Placement& place = state.placements[i];
-    static const SurfelRecord kNothing{};
-    const SurfelRecord& r = place.nx != 0 ? state.records[i] : kNothing;
-    out.means2d[2 * i] = r.mx;
-    out.means2d[2 * i + 1] = r.my;
+    const bool visible = place.nx != 0;
+    const SurfelRecord& r = visible ? state.records[i] : kNothing;
+    const float mx = r.mx + r.part_x, my = r.my + r.part_y;
+    out.means2d[2 * i] = mx;
+    out.means2d[2 * i + 1] = my;
     out.depths[i] = r.z;
     std::copy_n(r.normal, 3, &out.normals[3 * i]);
-    out.radii[2 * i] = static_cast<std::int32_t>(std::min(1e9, std::ceil(static_cast<double>(r.radius_x))));
-    out.radii[2 * i + 1] = static_cast<std::int32_t>(std::min(1e9, std::ceil(static_cast<double>(r.radius_y))));
+    const auto radius = [&](float offset, double extent) {
+      const double reach = std::max(static_cast<double>(r.circle), std::abs(static_cast<double>(offset)) + extent);
+      return static_cast<std::int32_t>(std::ceil(!visible ? 0.0 : r.l11 > 0.0F ? std::min(1e9, reach) : 1e9));
+    };
+    out.radii[2 * i] = radius(r.ex - mx, std::hypot(r.l21, r.l22) / (static_cast<double>(r.l11) * r.l22));
+    out.radii[2 * i + 1] = radius(r.ey - my, 1.0 / r.l22);
     out.tiles_touched[i] = std::int32_t{place.nx} * std::int32_t{place.ny};
   }
 }

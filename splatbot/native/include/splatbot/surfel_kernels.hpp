@@ -11,22 +11,22 @@ inline constexpr float kFilter = 2.0F;          // 1 / variance of the low-pass 
 inline constexpr float kLeastScale = 1e-6F;     // [px]; a thinner disc counts as this thick
 inline constexpr float kMedianLight = 0.5F;     // transmittance at which the median depth is
 
-// A projected surfel, two cache lines. With d = pixel centre - (mx, my) and D = kappa + h d, the ray meets the disc at
+// A projected surfel, two cache lines. Its centre is (mx + part_x, my + part_y), of which the first are whole pixels: a
+// float of a pixel's place in a large image has too few digits for a thin disc. With d = pixel centre - centre and D = kappa + h d, the ray meets the disc at
 // u = (b d)_0 / D, v = (b d)_1 / D [standard deviations] and depth z kappa / D.
 struct alignas(64) SurfelRecord {
-  float mx, my;
+  float mx, my, part_x, part_y;
   float b[4];    // row-major
-  float kappa;   // cosine-like, >= 0: normal . ray of the centre; 0 edge-on
+  float kappa;   // normal . ray of the centre, >= 0; 0 edge-on
   float hx, hy;
   float z;
   float lo;      // log2 of the opacity
   float circle;  // [px] that the low-pass filter reaches
   // The ellipse that the disc covers, as in Record, with a reach of 1; l11 = 0 if it has none and may cover anything.
   float ex, ey, l11, l21, l22, lean;
-  float radius_x, radius_y;  // [px]
-  float normal[3];           // world frame, facing the camera
+  float flip;       // -1 if t0 x t1 points towards the camera (see Surfel)
+  float normal[3];  // world frame, facing the camera
   float channels[kMaxSurfelChannels];
-  float unused;
 };
 static_assert(sizeof(SurfelRecord) == 128);
 

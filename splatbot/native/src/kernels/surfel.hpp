@@ -55,10 +55,74 @@ SB_INLINE void project_surfel(const GaussianLanes& g, const CameraLanes& cam, Pr
   s.my = fma(cam.fy, s.slope[1], cam.cy);
 }
 
+// The numbers of Surfel that a blend is sensitive to: thin and grazing discs magnify their rounding, so they are found
+// in double precision and rounded once.
+struct PreciseLanes {
+  alignas(64) float whole[2][W], part[2][W], b[4][W], kappa[W], h[2][W], flip[W];
+};
+
+SB_INLINE void project_precisely(const GaussianLanes& g, const View& view, PreciseLanes& out) {
+  alignas(64) float mean[3][W], quat[4][W], scale[2][W];
+  for (int k = 0; k < 4; ++k) {
+    store(quat[k], g.quat[k]);
+    store(mean[k % 3], g.mean[k % 3]);
+    store(scale[k % 2], g.scale[k % 2]);
+  }
+  const auto* r = view.rotation;
+  const double focal[2] = {view.fx, view.fy}, center[2] = {view.cx, view.cy};
+  for (int i = 0; i < W; ++i) {
+    double q[4], p[3], t[3][2];
+    double norm = 0.0;
+    for (int k = 0; k < 4; ++k) {
+      q[k] = quat[k][i];
+      norm += q[k] * q[k];
+    }
+    const bool zero = norm < static_cast<double>(kZeroQuat) * static_cast<double>(kZeroQuat);
+    const double two = zero ? 0.0 : 2.0 / norm;
+    const double w = q[0], x = q[1], y = q[2], z = q[3];
+    const double axes[3][2] = {{1.0 - two * (y * y + z * z), two * (x * y - w * z)},
+                               {two * (x * y + w * z), 1.0 - two * (x * x + z * z)},
+                               {two * (x * z - w * y), two * (y * z + w * x)}};
+    for (int k = 0; k < 3; ++k) {
+      const double r0 = r[3 * k], r1 = r[3 * k + 1], r2 = r[3 * k + 2];
+      p[k] = r0 * mean[0][i] + r1 * mean[1][i] + r2 * mean[2][i] + view.translation[k];
+      t[k][0] = r0 * axes[0][0] + r1 * axes[1][0] + r2 * axes[2][0];
+      t[k][1] = r0 * axes[0][1] + r1 * axes[1][1] + r2 * axes[2][1];
+    }
+    const double px = p[0] / p[2], py = p[1] / p[2];
+    const double nx = t[1][0] * t[2][1] - t[2][0] * t[1][1];
+    const double ny = t[2][0] * t[0][1] - t[0][0] * t[2][1];
+    const double nz = t[0][0] * t[1][1] - t[1][0] * t[0][1];
+    const double kappa = nx * px + ny * py + nz;
+    const double flip = kappa < 0.0 ? -1.0 : 1.0;
+    const double least = static_cast<double>(kLeastScale) * p[2] / focal[0];
+    double k[2];
+    for (int a = 0; a < 2; ++a) {
+      const double size = scale[a][i] < 0.0F ? -scale[a][i] : scale[a][i];
+      k[a] = flip * p[2] / (size > least ? size : least);
+    }
+    out.b[0][i] = static_cast<float>((t[1][1] - t[2][1] * py) * k[0] / focal[0]);
+    out.b[1][i] = static_cast<float>((t[2][1] * px - t[0][1]) * k[0] / focal[1]);
+    out.b[2][i] = static_cast<float>((t[2][0] * py - t[1][0]) * k[1] / focal[0]);
+    out.b[3][i] = static_cast<float>((t[0][0] - t[2][0] * px) * k[1] / focal[1]);
+    out.kappa[i] = static_cast<float>(flip * kappa);
+    out.h[0][i] = static_cast<float>(flip * nx / focal[0]);
+    out.h[1][i] = static_cast<float>(flip * ny / focal[1]);
+    out.flip[i] = static_cast<float>(flip);
+    const double m[2] = {px * focal[0] + center[0], py * focal[1] + center[1]};
+    for (int a = 0; a < 2; ++a) {
+      out.whole[a][i] = static_cast<float>(__builtin_floor(m[a]));
+      out.part[a][i] = static_cast<float>(m[a] - static_cast<double>(out.whole[a][i]));
+    }
+  }
+}
+
 // What a blend reads of a surfel, its centre from the tile's corner.
 enum SurfelRow : int {
   kRowX,
   kRowY,
+  kRowPartX,
+  kRowPartY,
   kRowB,
   kRowKappa = kRowB + 4,
   kRowHx,
@@ -68,13 +132,15 @@ enum SurfelRow : int {
   kRowLo,
   kRowNormal,
   kRowColor = kRowNormal + 3,
-  kSurfelRow = kRowColor + kMaxSurfelChannels + 1,
+  kSurfelRow = kRowColor + kMaxSurfelChannels,
 };
 
 template <int C>
 SB_INLINE void localize(const SurfelRecord& record, const TileFrame& frame, float* row) {
   row[kRowX] = record.mx - static_cast<float>(frame.x0);
   row[kRowY] = record.my - static_cast<float>(frame.y0);
+  row[kRowPartX] = record.part_x;
+  row[kRowPartY] = record.part_y;
   std::memcpy(row + kRowB, record.b, sizeof(record.b));
   row[kRowKappa] = record.kappa;
   row[kRowHx] = record.hx;
@@ -98,8 +164,8 @@ struct SurfelHit {
 // Both passes go through here, so that they decide alike.
 SB_INLINE SurfelHit hit_at(F x, F y, const float* row, F near) {
   SurfelHit h;
-  h.dx = x - set1(row[kRowX]);
-  h.dy = y - set1(row[kRowY]);
+  h.dx = x - set1(row[kRowX]) - set1(row[kRowPartX]);
+  h.dy = y - set1(row[kRowY]) - set1(row[kRowPartY]);
   const F d = fma(set1(row[kRowHx]), h.dx, fma(set1(row[kRowHy]), h.dy, set1(row[kRowKappa])));
   h.inverse = set1(1.0F) / d;
   h.u = fma(set1(row[kRowB]), h.dx, set1(row[kRowB + 1]) * h.dy) * h.inverse;

@@ -64,7 +64,7 @@ SB_INLINE void load_chunk(const SurfelBlendArgs& args, const TileFrame& frame, c
     set_ellipse(chunk.ellipses, j, bounded ? r.ex - x0 : 0.0F, bounded ? r.ey - y0 : 0.0F, bounded ? r.l11 : 1.0F,
                 bounded ? r.l21 : 0.0F, bounded ? r.l22 : 1.0F, 1.0F, bounded ? r.lean : 0.0F);
     // A circle of no reach is put out of the way: block_masks() widens it by a margin.
-    set_ellipse(chunk.circles, j, r.circle > 0.0F ? r.mx - x0 : -100.0F, r.my - y0, 1.0F, 0.0F, 1.0F, r.circle, 0.0F);
+    set_ellipse(chunk.circles, j, r.circle > 0.0F ? r.mx - x0 + r.part_x : -100.0F, r.my - y0 + r.part_y, 1.0F, 0.0F, 1.0F, r.circle, 0.0F);
   }
   const int padded = (n + W - 1) / W * W;
   for (int j = n; j < padded; ++j) {  // masked out later; any finite ellipse will do

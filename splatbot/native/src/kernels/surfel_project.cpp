@@ -69,8 +69,9 @@ SB_INLINE Cover cover(const Projected& o, const Surfel& s, const CameraLanes& ca
 }
 
 struct Lanes {
-  alignas(64) float mx[W], my[W], b[4][W], kappa[W], hx[W], hy[W], z[W], lo[W], circle[W];
-  alignas(64) float ex[W], ey[W], l11[W], l21[W], l22[W], lean[W], radius_x[W], radius_y[W], normal[3][W];
+  alignas(64) float z[W], lo[W], circle[W];
+  alignas(64) float ex[W], ey[W], l11[W], l21[W], l22[W], lean[W], rotated[3][W];
+  PreciseLanes precise;
   alignas(64) std::uint32_t corner[W], size[W];  // x in the low half, y in the high half
 };
 
@@ -89,15 +90,7 @@ SB_INLINE M cover_tiles(const SurfelProjectArgs& args, const Cover& c, Lanes& la
          (c.top < set1(static_cast<float>(args.view.height)));
 }
 
-void store_lanes(const Projected& o, const Surfel& s, const Cover& c, F lo, Lanes& lanes) {
-  store(lanes.mx, s.mx);
-  store(lanes.my, s.my);
-  for (int i = 0; i < 4; ++i) {
-    store(lanes.b[i], s.b[i]);
-  }
-  store(lanes.kappa, s.kappa);
-  store(lanes.hx, s.hx);
-  store(lanes.hy, s.hy);
+void store_lanes(const Projected& o, const Cover& c, F lo, Lanes& lanes) {
   store(lanes.z, o.p[2]);
   store(lanes.lo, lo);
   store(lanes.circle, c.circle);
@@ -107,24 +100,26 @@ void store_lanes(const Projected& o, const Surfel& s, const Cover& c, F lo, Lane
   store(lanes.l21, c.l21);
   store(lanes.l22, c.l22);
   store(lanes.lean, c.lean);
-  store(lanes.radius_x, c.radius_x);
-  store(lanes.radius_y, c.radius_y);
   for (int i = 0; i < 3; ++i) {
-    store(lanes.normal[i], -(s.flip * o.rotation[3 * i + 2]));
+    store(lanes.rotated[i], o.rotation[3 * i + 2]);
   }
 }
 
 SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const Lanes& lanes, int lane,
                           ProjectedBlock& out) {
   SurfelRecord& r = args.records[id];
-  r.mx = lanes.mx[lane];
-  r.my = lanes.my[lane];
+  const PreciseLanes& precise = lanes.precise;
+  r.mx = precise.whole[0][lane];
+  r.my = precise.whole[1][lane];
+  r.part_x = precise.part[0][lane];
+  r.part_y = precise.part[1][lane];
   for (int i = 0; i < 4; ++i) {
-    r.b[i] = lanes.b[i][lane];
+    r.b[i] = precise.b[i][lane];
   }
-  r.kappa = lanes.kappa[lane];
-  r.hx = lanes.hx[lane];
-  r.hy = lanes.hy[lane];
+  r.kappa = precise.kappa[lane];
+  r.hx = precise.h[0][lane];
+  r.hy = precise.h[1][lane];
+  r.flip = precise.flip[lane];
   r.z = lanes.z[lane];
   r.lo = lanes.lo[lane];
   r.circle = lanes.circle[lane];
@@ -134,10 +129,8 @@ SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const L
   r.l21 = lanes.l21[lane];
   r.l22 = lanes.l22[lane];
   r.lean = lanes.lean[lane];
-  r.radius_x = lanes.radius_x[lane];
-  r.radius_y = lanes.radius_y[lane];
   for (int i = 0; i < 3; ++i) {
-    r.normal[i] = lanes.normal[i][lane];
+    r.normal[i] = -r.flip * lanes.rotated[i][lane];
   }
   const float* colors = args.colors + id * static_cast<std::size_t>(args.channels);
   for (int c = 0; c < kMaxSurfelChannels; ++c) {
@@ -180,7 +173,10 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
     keep = keep & cover_tiles(args, c, lanes) & (s.mx > -huge) & (s.mx < huge) & (s.my > -huge) & (s.my < huge) &
            (max(c.radius_x, c.radius_y) > set1(args.options.radius_clip));
     kept = bits(keep) & wanted;
-    store_lanes(o, s, c, lo, lanes);
+    store_lanes(o, c, lo, lanes);
+    if (kept != 0) {
+      project_precisely(g, args.view, lanes.precise);
+    }
     for (std::uint32_t left = kept; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       const std::size_t id = first + static_cast<std::size_t>(lane);

@@ -134,6 +134,30 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   pull_back_rotation(o, r, out.quat);
 }
 
+// Replaces what the forward pass knew more precisely, and what must not differ between the passes.
+void recall(const SurfelRecord* records, const std::uint32_t* ids, int n, Surfel& s) {
+  alignas(64) float lanes[8][W];
+  for (int i = 0; i < W; ++i) {
+    const SurfelRecord& r = records[ids[i < n ? i : n - 1]];
+    const float values[8] = {r.b[0], r.b[1], r.b[2], r.b[3], r.kappa, r.hx, r.hy, r.flip};
+    for (int k = 0; k < 8; ++k) {
+      lanes[k][i] = values[k];
+    }
+  }
+  for (int k = 0; k < 4; ++k) {
+    s.b[k] = load(lanes[k]);
+  }
+  s.kappa = load(lanes[4]);
+  s.hx = load(lanes[5]);
+  s.hy = load(lanes[6]);
+  const F flip = load(lanes[7]);
+  const F turn = flip * s.flip;
+  for (F& n_i : s.n) {
+    n_i = n_i * turn;
+  }
+  s.flip = flip;
+}
+
 void zero_rows(const SurfelProjectBackwardArgs& args, std::size_t begin, std::size_t end) {
   const auto clear = [&](float* rows, std::size_t width) {
     if (rows != nullptr) {
@@ -175,6 +199,7 @@ void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t 
     project_center(g, cam, o);
     Surfel s;
     project_surfel(g, cam, o, s);
+    recall(args.forward.records, ids, n, s);
     LaneGradients grads;
     pull_back(g, cam, o, s, sums, grads);
     scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
