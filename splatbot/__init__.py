@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from splatbot.frame import Frame
     from splatbot.gaussians import GaussianModel
     from splatbot.logs import open_log
-    from splatbot.rasterize import rasterization
+    from splatbot.rasterize import rasterization, rasterization_2dgs
     from splatbot.slam import Slam
 
 __version__ = "0.1.0"
@@ -28,6 +28,7 @@ _HOME = {
     "load_config": "splatbot.config",
     "open_log": "splatbot.logs",
     "rasterization": "splatbot.rasterize",
+    "rasterization_2dgs": "splatbot.rasterize",
 }
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "load_config",
     "open_log",
     "rasterization",
+    "rasterization_2dgs",
 ]
 
 

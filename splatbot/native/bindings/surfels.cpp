@@ -13,7 +13,8 @@ using namespace nb::literals;
 
 namespace {
 
-struct State {
+// A render's leftovers for its backward pass and its meta.
+struct SurfelHandle {
   splatbot::SurfelStatePtr state;
 };
 
@@ -34,7 +35,7 @@ nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, con
                                       .normals = span_of(out_normals),
                                       .median = span_of(out_median),
                                       .distortion = span_of<float>(out_distortion)};
-  State state;
+  SurfelHandle state;
   std::optional<splatbot::Fault> fault;
   {
     const nb::gil_scoped_release release;
@@ -46,7 +47,7 @@ nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, con
   return nb::cast(std::move(state));
 }
 
-void backward(const State& state, const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
+void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
               const In2& colors, const std::optional<In1>& background, const std::optional<In3>& grad_colors,
               const std::optional<In2>& grad_alphas, const std::optional<In3>& grad_normals,
               const std::optional<In2>& grad_median, const std::optional<In2>& grad_distortion,
@@ -75,7 +76,7 @@ void backward(const State& state, const InN3& means, const InN4& quats, const In
   splatbot::surfels_backward(*state.state, surfels, span_of<const float>(background), grads, out);
 }
 
-nb::dict describe(const State& state, const In1& opacities) {
+nb::dict describe(const SurfelHandle& state, const In1& opacities) {
   const std::size_t n = opacities.size();
   std::vector<float> means2d(2 * n), depths(n), normals(3 * n);
   std::vector<std::int32_t> radii(2 * n), tiles(n);
@@ -92,12 +93,12 @@ nb::dict describe(const State& state, const In1& opacities) {
   return d;
 }
 
-nb::ndarray<nb::numpy, std::int64_t> visible(const State& state) {
+nb::ndarray<nb::numpy, std::int64_t> visible(const SurfelHandle& state) {
   const auto ids = splatbot::visible_ids(*state.state);
   return owned(std::vector<std::int64_t>(ids.begin(), ids.end()), {ids.size()});
 }
 
-nb::dict tiles(const State& state) {
+nb::dict tiles(const SurfelHandle& state) {
   const splatbot::TileInfo info = splatbot::tile_info(*state.state);
   nb::dict d;
   d["tile_size"] = nb::make_tuple(info.tile_width, info.tile_height);
@@ -111,7 +112,7 @@ nb::dict tiles(const State& state) {
 }  // namespace
 
 void define_surfels(nb::module_& m) {
-  nb::class_<State>(m, "SurfelState", "What a render of surfels leaves for its backward pass.")
+  nb::class_<SurfelHandle>(m, "SurfelState", "What a render of surfels leaves for its backward pass.")
       .def("describe", &describe, "opacities"_a.noconvert(), "Projections as a dict of arrays.")
       .def("visible", &visible, "Indices (V,) of the surfels in view.")
       .def("tiles", &tiles, "Tile grid, pairs and bytes held.");
