@@ -68,7 +68,7 @@ def compare_surfels(
     (exact, want, meta), (native, got, _) = sides
     assert set(want) == set(got)
     safe = (meta.margins > jump_margin)[..., None]
-    for leaves, images, _ in sides:
+    for _, images, _ in sides:
         loss(images, safe, of).backward()
     gradients = {}
     for name in NAMES:

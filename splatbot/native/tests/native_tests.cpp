@@ -12,6 +12,7 @@
 
 #include "splatbot/isa.hpp"
 #include "splatbot/rasterizer.hpp"
+#include "splatbot/surfels.hpp"
 #include "splatbot/threads.hpp"
 
 namespace {
@@ -138,6 +139,76 @@ Result render(const Scene& scene, const View& view, const RasterOptions& options
   return r;
 }
 
+// All images and gradients of a render of surfels, one after the other.
+std::vector<float> render_surfels(const Scene& scene, const View& view, const SurfelOptions& options) {
+  const Gaussians g = scene.gaussians();
+  const std::size_t pixels = static_cast<std::size_t>(view.width) * static_cast<std::size_t>(view.height);
+  const std::size_t columns =
+      static_cast<std::size_t>(scene.channels) + (options.depth != DepthMode::none ? 1U : 0U);
+  std::vector<float> colors(pixels * columns), alphas(pixels), normals(3 * pixels), median(pixels);
+  std::vector<float> distortion(options.distortion ? pixels : 0);
+  const std::vector<float> background(static_cast<std::size_t>(scene.channels), 0.25F);
+  SurfelStatePtr state;
+  check(!surfels_forward(g, view, options, background, {colors, alphas, normals, median, distortion}, state),
+        "finite inputs are no fault");
+  std::vector<float> grad_colors(colors.size());
+  for (std::size_t i = 0; i < grad_colors.size(); ++i) {
+    grad_colors[i] = static_cast<float>(i % 7) - 3.0F;
+  }
+  const std::vector<float> ones(3 * pixels, 1.0F);
+  const auto some = std::span<const float>(ones).first(pixels);
+  const auto distorted = some.first(distortion.size());
+  std::vector<float> means(g.means.size()), quats(g.quats.size()), scales(g.scales.size()), opacities(g.count);
+  std::vector<float> channels(g.colors.size()), means2d(2 * g.count);
+  std::vector<double> viewmat(12), behind(background.size());
+  SurfelGradients out;
+  out.means = means;
+  out.quats = quats;
+  out.scales = scales;
+  out.opacities = opacities;
+  out.colors = channels;
+  out.viewmat = viewmat;
+  out.background = behind;
+  out.means2d = means2d;
+  surfels_backward(*state, g, background, {grad_colors, some, ones, some, distorted}, out);
+  std::vector<float> depths(g.count), facing(3 * g.count);
+  std::vector<std::int32_t> radii(2 * g.count), tiles(g.count);
+  std::vector<float> centers(2 * g.count);
+  describe_surfels(*state, {centers, depths, facing, radii, tiles});
+  std::vector<float> all(viewmat.begin(), viewmat.end());
+  for (const auto* part : {&colors, &alphas, &normals, &median, &distortion, &means, &quats, &scales, &opacities,
+                           &channels, &means2d, &depths, &facing}) {
+    all.insert(all.end(), part->begin(), part->end());
+  }
+  for (const float value : all) {
+    check(std::isfinite(value), "images and gradients of surfels are finite");
+  }
+  return all;
+}
+
+void run_surfels(const std::string& isa) {
+  int renders = 0;
+  for (const auto& [width, height] : {std::pair{1, 1}, {3, 70}, {97, 41}}) {
+    for (const std::size_t n : {std::size_t{0}, std::size_t{1}, std::size_t{2500}}) {
+      for (const int channels : {0, 3, 8}) {
+        const Scene scene = make_scene(n, channels, 7);
+        const SurfelOptions options = {.depth = channels == 3 ? DepthMode::accumulated : DepthMode::expected,
+                                       .distortion = channels != 8};
+        set_num_threads(1);
+        const std::vector<float> want = render_surfels(scene, make_view(width, height), options);
+        for (const unsigned threads : {2U, 8U}) {
+          set_num_threads(threads);
+          const std::vector<float> got = render_surfels(scene, make_view(width, height), options);
+          check(got.size() == want.size() && std::memcmp(got.data(), want.data(), got.size() * sizeof(float)) == 0,
+                "threads change no bit of surfels");
+        }
+        ++renders;
+      }
+    }
+  }
+  std::printf("%s: %d renders of surfels, forward and backward, on 1, 2 and 8 threads\n", isa.c_str(), renders);
+}
+
 void run_all(const std::string& isa) {
   int renders = 0;
   for (const auto& [width, height] : {std::pair{1, 1}, {3, 70}, {32, 16}, {97, 41}}) {
@@ -207,6 +278,7 @@ int main() {
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);
+    run_surfels(isa);
   }
   std::puts("all promises kept");
   return 0;

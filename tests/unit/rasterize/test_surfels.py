@@ -56,7 +56,9 @@ def test_the_gradient_of_each_image_alone_equals_the_reference(image: str) -> No
     assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
 
 
-@pytest.mark.parametrize(("channels", "mode"), [(1, "RGB"), (2, "RGB+ED"), (5, "RGB"), (8, "RGB+D"), (9, "RGB"), (19, "RGB+ED")])
+@pytest.mark.parametrize(
+    ("channels", "mode"), [(1, "RGB"), (2, "RGB+ED"), (5, "RGB"), (8, "RGB+D"), (9, "RGB"), (19, "RGB+ED")]
+)
 def test_any_number_of_channels_equals_the_reference(channels: int, mode: str) -> None:
     scene = hard_surfels(4, n=80)
     scene.colors = torch.rand(80, channels, generator=torch.Generator().manual_seed(0))
@@ -133,10 +135,12 @@ def test_two_sheets_have_the_distortion_of_their_distance() -> None:
     d2 = 0.5 / 40.0**2  # squared slope of the ray through the pixel beside the centre
     front, back = (0.5 * math.exp(-0.5 * d2 * z * z) for z in (2.0, 3.0))
     assert float(images["distortion"][0, 12, 16, 0]) == pytest.approx(2.0 * front * (1.0 - front) * back, rel=1e-5)
-    assert float(images["median"][0, 12, 16, 0]) == pytest.approx(3.0, rel=1e-6)  # 0.5 and a little are left by the first
+    assert float(images["median"][0, 12, 16, 0]) == pytest.approx(
+        3.0, rel=1e-6
+    )  # 0.5 and a little are left by the first
 
 
-def test_rings_of_threads_change_no_bit() -> None:
+def test_the_number_of_threads_changes_no_bit() -> None:
     scene = hard_surfels(9, n=6000)
 
     def everything() -> dict[str, Tensor]:

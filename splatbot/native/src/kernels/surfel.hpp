@@ -58,7 +58,7 @@ SB_INLINE void project_surfel(const GaussianLanes& g, const CameraLanes& cam, Pr
 // The numbers of Surfel that a blend is sensitive to: thin and grazing discs magnify their rounding, so they are found
 // in double precision and rounded once.
 struct PreciseLanes {
-  alignas(64) float whole[2][W], part[2][W], b[4][W], kappa[W], h[2][W], flip[W];
+  alignas(64) float whole[2][W], part[2][W], slope[2][W], z[W], b[4][W], kappa[W], h[2][W], flip[W];
 };
 
 SB_INLINE void project_precisely(const GaussianLanes& g, const View& view, PreciseLanes& out) {
@@ -72,12 +72,14 @@ SB_INLINE void project_precisely(const GaussianLanes& g, const View& view, Preci
   const double focal[2] = {view.fx, view.fy}, center[2] = {view.cx, view.cy};
   for (int i = 0; i < W; ++i) {
     double q[4], p[3], t[3][2];
-    double norm = 0.0;
+    double norm = 0.0, largest = 0.0;
     for (int k = 0; k < 4; ++k) {
       q[k] = quat[k][i];
       norm += q[k] * q[k];
+      const double size = q[k] < 0.0 ? -q[k] : q[k];
+      largest = size > largest ? size : largest;
     }
-    const bool zero = norm < static_cast<double>(kZeroQuat) * static_cast<double>(kZeroQuat);
+    const bool zero = largest < static_cast<double>(kZeroQuat);
     const double two = zero ? 0.0 : 2.0 / norm;
     const double w = q[0], x = q[1], y = q[2], z = q[3];
     const double axes[3][2] = {{1.0 - two * (y * y + z * z), two * (x * y - w * z)},
@@ -105,6 +107,9 @@ SB_INLINE void project_precisely(const GaussianLanes& g, const View& view, Preci
     out.b[1][i] = static_cast<float>((t[2][1] * px - t[0][1]) * k[0] / focal[1]);
     out.b[2][i] = static_cast<float>((t[2][0] * py - t[1][0]) * k[1] / focal[0]);
     out.b[3][i] = static_cast<float>((t[0][0] - t[2][0] * px) * k[1] / focal[1]);
+    out.slope[0][i] = static_cast<float>(px);
+    out.slope[1][i] = static_cast<float>(py);
+    out.z[i] = static_cast<float>(p[2]);
     out.kappa[i] = static_cast<float>(flip * kappa);
     out.h[0][i] = static_cast<float>(flip * nx / focal[0]);
     out.h[1][i] = static_cast<float>(flip * ny / focal[1]);

@@ -6,6 +6,17 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
+// What a cover is found from, as the blend will have it.
+SB_INLINE void recall(const PreciseLanes& precise, Projected& o, Surfel& s) {
+  o.p[2] = load(precise.z);
+  for (int i = 0; i < 2; ++i) {
+    s.slope[i] = load(precise.slope[i]);
+  }
+  s.kappa = load(precise.kappa);
+  s.mx = load(precise.whole[0]) + load(precise.part[0]);
+  s.my = load(precise.whole[1]) + load(precise.part[1]);
+}
+
 // What a surfel covers on the image: an ellipse, the low-pass filter's circle around its centre, and a box of both.
 struct Cover {
   M bounded;  // the ellipse exists
@@ -69,7 +80,7 @@ SB_INLINE Cover cover(const Projected& o, const Surfel& s, const CameraLanes& ca
 }
 
 struct Lanes {
-  alignas(64) float z[W], lo[W], circle[W];
+  alignas(64) float lo[W], circle[W];
   alignas(64) float ex[W], ey[W], l11[W], l21[W], l22[W], lean[W], rotated[3][W];
   PreciseLanes precise;
   alignas(64) std::uint32_t corner[W], size[W];  // x in the low half, y in the high half
@@ -91,7 +102,6 @@ SB_INLINE M cover_tiles(const SurfelProjectArgs& args, const Cover& c, Lanes& la
 }
 
 void store_lanes(const Projected& o, const Cover& c, F lo, Lanes& lanes) {
-  store(lanes.z, o.p[2]);
   store(lanes.lo, lo);
   store(lanes.circle, c.circle);
   store(lanes.ex, c.ex);
@@ -120,7 +130,7 @@ SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const L
   r.hx = precise.h[0][lane];
   r.hy = precise.h[1][lane];
   r.flip = precise.flip[lane];
-  r.z = lanes.z[lane];
+  r.z = precise.z[lane];
   r.lo = lanes.lo[lane];
   r.circle = lanes.circle[lane];
   r.ex = lanes.ex[lane];
@@ -143,7 +153,7 @@ SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const L
   place.nx = static_cast<std::uint16_t>(size);
   place.ny = static_cast<std::uint16_t>(size >> 16);
   place.slot = static_cast<std::uint32_t>(out.pairs);
-  std::memcpy(&place.depth_bits, &lanes.z[lane], sizeof(float));
+  std::memcpy(&place.depth_bits, &r.z, sizeof(float));
   out.pairs += std::uint64_t{size & 0xffffU} * (size >> 16);
 }
 
@@ -167,16 +177,15 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
     const F lo = log2(max(opacity[0], set1(kAlphaMin)));
     constexpr float kTwoLn2 = 1.3862944F;
     const F reach2 = set1(kTwoLn2) * max(lo - set1(kLog2AlphaMin), set1(0.0F));
-    const Cover c = cover(o, s, cam, reach2);
     Lanes lanes;
+    project_precisely(g, args.view, lanes.precise);
+    recall(lanes.precise, o, s);
+    const Cover c = cover(o, s, cam, reach2);
     const F huge = set1(1e30F);
     keep = keep & cover_tiles(args, c, lanes) & (s.mx > -huge) & (s.mx < huge) & (s.my > -huge) & (s.my < huge) &
            (max(c.radius_x, c.radius_y) > set1(args.options.radius_clip));
     kept = bits(keep) & wanted;
     store_lanes(o, c, lo, lanes);
-    if (kept != 0) {
-      project_precisely(g, args.view, lanes.precise);
-    }
     for (std::uint32_t left = kept; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       const std::size_t id = first + static_cast<std::size_t>(lane);

@@ -135,22 +135,28 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
 }
 
 // Replaces what the forward pass knew more precisely, and what must not differ between the passes.
-void recall(const SurfelRecord* records, const std::uint32_t* ids, int n, Surfel& s) {
-  alignas(64) float lanes[8][W];
+void recall(const SurfelRecord* records, const std::uint32_t* ids, int n, const CameraLanes& cam, Projected& o,
+            Surfel& s) {
+  enum { kX, kY, kPartX, kPartY, kB, kKappa = kB + 4, kHx, kHy, kZ, kFlip, kValues };
+  alignas(64) float lanes[kValues][W];
   for (int i = 0; i < W; ++i) {
     const SurfelRecord& r = records[ids[i < n ? i : n - 1]];
-    const float values[8] = {r.b[0], r.b[1], r.b[2], r.b[3], r.kappa, r.hx, r.hy, r.flip};
-    for (int k = 0; k < 8; ++k) {
+    const float values[kValues] = {r.mx,   r.my,   r.part_x, r.part_y, r.b[0], r.b[1], r.b[2],
+                                   r.b[3], r.kappa, r.hx,     r.hy,     r.z,    r.flip};
+    for (int k = 0; k < kValues; ++k) {
       lanes[k][i] = values[k];
     }
   }
   for (int k = 0; k < 4; ++k) {
-    s.b[k] = load(lanes[k]);
+    s.b[k] = load(lanes[kB + k]);
   }
-  s.kappa = load(lanes[4]);
-  s.hx = load(lanes[5]);
-  s.hy = load(lanes[6]);
-  const F flip = load(lanes[7]);
+  s.kappa = load(lanes[kKappa]);
+  s.hx = load(lanes[kHx]);
+  s.hy = load(lanes[kHy]);
+  s.slope[0] = (load(lanes[kX]) - cam.cx + load(lanes[kPartX])) / cam.fx;
+  s.slope[1] = (load(lanes[kY]) - cam.cy + load(lanes[kPartY])) / cam.fy;
+  o.p[2] = load(lanes[kZ]);
+  const F flip = load(lanes[kFlip]);
   const F turn = flip * s.flip;
   for (F& n_i : s.n) {
     n_i = n_i * turn;
@@ -199,7 +205,7 @@ void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t 
     project_center(g, cam, o);
     Surfel s;
     project_surfel(g, cam, o, s);
-    recall(args.forward.records, ids, n, s);
+    recall(args.forward.records, ids, n, cam, o, s);
     LaneGradients grads;
     pull_back(g, cam, o, s, sums, grads);
     scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
