@@ -17,8 +17,10 @@ RENDERED = ("colors", "alphas", "normals", "distortion", "median")  # by the ker
 
 
 def hard_surfels(seed: int, n: int = 150, views: int = 1) -> Scene:
-    """``hard_scene`` with discs at most 30 times longer than wide: needles have a bound of their own."""
+    """``hard_scene``, halved, with discs at most 30 times longer than wide: needles have a bound of their own."""
     scene = hard_scene(seed, n=n, views=views)
+    scene.width, scene.height = scene.width // 2 + 1, scene.height // 2 + 1
+    scene.Ks[:, :2] *= 0.5
     scene.scales[:, :2] = torch.maximum(scene.scales[:, :2], scene.scales[:, :2].amax(1, keepdim=True) / 30.0)
     return scene
 

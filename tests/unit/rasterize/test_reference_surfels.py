@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,6 +14,14 @@ from tests.scenes import NAMES, Scene, hard_scene, one_gaussian
 from tests.surfels import RENDERED, loss, reference
 
 STEP = 1e-6
+
+
+@pytest.fixture(autouse=True)
+def _one_torch_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the reference's tensors are small: threads would only wait for each other
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("image", [*RENDERED, "surf_normals"])

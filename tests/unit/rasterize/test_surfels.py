@@ -24,7 +24,10 @@ GRADIENT_BOUND = 1e-4
 
 @pytest.fixture(autouse=True)
 def _restore() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the reference's tensors are small: threads would only wait for each other
     yield
+    torch.set_num_threads(threads)
     native().set_num_threads(0)
     native().set_isa("")
 
