@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatbot.config import TrackingConfig
 from splatbot.geometry import inverse
-from splatbot.tracking.align import DenseTerm
+from splatbot.tracking.align import residuals
 from splatbot.tracking.prepare import Level
 from splatbot.tracking.reference import Reference
 
@@ -46,11 +46,8 @@ def measure(
     T_camera_world = inverse(T_world_camera)
     photo, depth = [], []
     for reference in references:
-        term = DenseTerm(reference, level, index, config, config.gate)
-        for _ in range(2):
-            H, g, _, _ = term.linearize(T_camera_world, photometric=True, geometric=True)
-            term.exposure -= np.linalg.solve(H[6:, 6:] + 1e2 * np.eye(2), g[6:])
-        _, _, r_photo, r_depth = term.linearize(T_camera_world, photometric=True, geometric=True)
+        T_camera_reference = T_camera_world @ reference.T_world_camera
+        r_photo, r_depth = residuals(level, reference.levels[index], T_camera_reference, config)
         photo.append(np.abs(r_photo))
         depth.append(np.abs(r_depth))
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)

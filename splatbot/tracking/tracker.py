@@ -104,7 +104,7 @@ class Tracker:
     ) -> _Candidate:
         """Projective point-to-plane alignment on the coarse levels, from the predicted pose."""
         references = self._nearest(keyframes, T_world_camera)
-        T, information = align(
+        found = align(
             prepared.levels,
             references,
             T_world_camera,
@@ -113,11 +113,11 @@ class Tracker:
             finest=min(1, len(prepared.levels) - 1),
             gate=2 * self.config.gate,
         )
-        return _Candidate("geometric", T, information, references)
+        return _Candidate("geometric", found.T_world_camera, found.information, references)
 
     def _direct(self, prepared: PreparedFrame, start: _Candidate, matched: FeaturePose | None) -> _Candidate:
         """Photometric, depth and feature residuals together, down to the finest level."""
-        T, information = align(
+        found = align(
             prepared.levels,
             start.references,
             start.T_world_camera,
@@ -128,7 +128,7 @@ class Tracker:
             features=matched,
             camera=prepared.frame.camera,
         )
-        return _Candidate(f"{start.stage}+direct", T, information, start.references)
+        return _Candidate(f"{start.stage}+direct", found.T_world_camera, found.information, start.references)
 
     def _needs_features(self, prepared: PreparedFrame, candidate: _Candidate, T_predicted: Array) -> bool:
         if self.config.features == "always" or self._lost:

@@ -76,12 +76,36 @@ struct ProjectBackwardArgs {
   double* viewmat;                                     // (blocks, 12) partial sums, or null
 };
 
+inline constexpr int kLinearizeChunk = 256;
+
+// One chunk of at most kLinearizeChunk points against one image; see align.hpp for the terms.
+struct LinearizeArgs {
+  int width, height;
+  float fx, fy, cx, cy;
+  const float *gray, *depth;
+  int count;
+  const float *points, *normals, *gray_reference;
+  float T[12];  // T_current_reference, row-major
+  float gain, offset;
+  bool use_photometric, use_geometric;
+  float sigma_gray, sigma_depth_floor, sigma_depth_quad, gate, nu;
+  float *residual_photometric, *residual_geometric;  // or null
+};
+
+struct LinearizeSums {
+  double H[64];  // upper triangle
+  double g[8];
+  double cost;
+  std::size_t projected, photometric, geometric;
+};
+
 struct Kernels {
   const char* name;
   void (*project)(const ProjectArgs&, std::size_t block, ProjectedBlock& out);
   void (*blend)(const BlendArgs&, std::size_t tile);
   void (*blend_backward)(const BlendBackwardArgs&, std::size_t tile);
   void (*project_backward)(const ProjectBackwardArgs&, std::size_t block);
+  void (*linearize)(const LinearizeArgs&, LinearizeSums& sums);
 };
 
 // The kernels in use (isa.cpp).

@@ -10,5 +10,6 @@ void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out);
 void blend(const BlendArgs& args, std::size_t tile);
 void blend_backward(const BlendBackwardArgs& args, std::size_t tile);
 void project_backward(const ProjectBackwardArgs& args, std::size_t block);
+void linearize(const LinearizeArgs& args, LinearizeSums& sums);
 
 }  // namespace splatbot::SPLATBOT_KERNELS
