@@ -5,5 +5,7 @@
 #include <nanobind/nanobind.h>
 
 void define_align(nanobind::module_& m);
+void define_depth(nanobind::module_& m);
 void define_mahalanobis(nanobind::module_& m);
+void define_matching(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);
