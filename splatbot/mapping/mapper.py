@@ -43,6 +43,7 @@ class Mapper:
         self._add(keyframe)
         self._prune()
         self._refiner.refine(self.model, self.keyframes, self.config.mapping.refine_iterations)
+        self._prune()  # or what refinement made faint, huge or not finite would be rendered
         keyframe.reference = self._model_reference(prepared, keyframe)
         self._version += 1
         self._stamp = prepared.frame.stamp

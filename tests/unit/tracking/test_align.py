@@ -216,7 +216,7 @@ def test_marginalising_exposure_gives_the_step_of_the_whole_system(problem: Prob
     expected = -np.linalg.solve(whole, g)
     total = NormalEquations.zero()
     term.add_marginal(total, problem.T, 1.0, True)
-    step: Array = -np.linalg.solve(total.H, total.g)
+    step = np.asarray(-np.linalg.solve(total.H, total.g), dtype=np.float64)
     np.testing.assert_allclose(step, expected[:6], rtol=1e-6, atol=1e-12)
     term.update_exposure(step)
     np.testing.assert_allclose(term.exposure, [1 + expected[6], expected[7]], rtol=1e-6)
