@@ -68,8 +68,8 @@ def match_pose(
 ) -> FeaturePose | None:
     """Pose of ``current`` from 2D-3D matches with keyframes given as (features, T_world_camera).
 
-    EPnP-free: P3P in RANSAC (Gao et al. 2003), then Levenberg-Marquardt on the inliers; OpenCV's RANSAC is seeded alike
-    on every call, so the result is repeatable. None when too few matches agree.
+    P3P in RANSAC (Gao et al. 2003), then Levenberg-Marquardt on the inliers; OpenCV's RANSAC is seeded alike on every
+    call, so the result is repeatable. None when too few matches agree.
     """
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
     pixels, points = [], []

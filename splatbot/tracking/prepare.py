@@ -66,6 +66,11 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
     return z
 
 
+def valid_share(prepared: PreparedFrame) -> float:
+    """Share of the pixels that have a usable depth."""
+    return float((prepared.levels[0].depth > 0).mean())
+
+
 def halve(level: Level) -> Level:
     """The next coarser level: grey averaged, depth as :func:`halve_depth` has it."""
     height, width = level.gray.shape[0] // 2, level.gray.shape[1] // 2

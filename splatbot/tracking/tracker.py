@@ -17,10 +17,13 @@ from splatbot.tracking.align import align
 from splatbot.tracking.features import FeaturePose, Features, detect, match_pose
 from splatbot.tracking.health import Health, Verdict, measure, verdict_of
 from splatbot.tracking.predict import ConstantVelocity
-from splatbot.tracking.prepare import PreparedFrame, valid_depth
+from splatbot.tracking.prepare import PreparedFrame, valid_depth, valid_share
 from splatbot.tracking.reference import Reference
 
 Array = NDArray[np.float64]
+
+# A first image whose grey (0..1) varies less is a covered lens or a sensor not up yet: nothing to track against.
+_BLANK = 0.005
 
 
 class TrackedKeyframe(Protocol):
@@ -63,10 +66,12 @@ class Tracker:
         self._lost = False
 
     def start(self, prepared: PreparedFrame) -> PoseEstimate:
-        """The pose of the first frame, which defines the world; "lost" when it has too little depth to map."""
-        share = float((prepared.levels[0].depth > 0).mean())
+        """The pose of the first frame, which defines the world; "lost" when it has too little depth or is blank."""
+        share = valid_share(prepared)
         if share < self.config.min_valid:
             return PoseEstimate(np.eye(4), "lost", (f"only {share:.1%} of the pixels have a usable depth",), "start")
+        if float(prepared.levels[0].gray.std()) < _BLANK:
+            return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")
         self.motion.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
 

@@ -1,0 +1,122 @@
+"""Features: the pose of a rendered view is found to a bound, or honestly not at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.geometry import inverse, transform_points
+from splatbot.tracking.features import MIN_INLIERS, FeaturePose, Features, detect, match_pose
+from splatbot.tracking.tracker import pose_distance
+from tests.rgbd import CAMERA, Array, tabletop
+
+WIDTH = 320
+
+
+def view(index: int) -> tuple[Features, Array]:
+    frames, poses = tabletop(width=WIDTH)
+    frame = frames[index]
+    return detect(frame.rgb, frame.depth, frame.camera, 800), poses[index]
+
+
+def matched(current: Features, *keyframes: tuple[Features, Array]) -> FeaturePose | None:
+    return match_pose(current, keyframes, tabletop(width=WIDTH)[0][0].camera)
+
+
+def noise_image(seed: int) -> np.ndarray:
+    """Blocks of random grey: corners everywhere."""
+    small = np.random.default_rng(seed).integers(0, 256, (30, 40, 1), dtype=np.uint8)
+    return np.ascontiguousarray(np.kron(small, np.ones((4, 4, 3), np.uint8)))
+
+
+@pytest.mark.parametrize("last", [4, 11])
+def test_the_pose_between_two_rendered_views_is_found(last: int) -> None:
+    current, truth = view(last)
+    found = matched(current, view(0))
+    assert found is not None
+    moved, turned = pose_distance(truth, found.T_world_camera)
+    assert moved < 8e-3
+    assert turned < np.radians(0.6)
+    assert len(found.points) == len(found.pixels) >= MIN_INLIERS
+    assert found.matches >= len(found.points)
+
+
+def test_the_matches_that_are_kept_agree_with_the_pose_to_three_pixels() -> None:
+    found = matched(view(7)[0], view(0), view(3))
+    assert found is not None
+    camera = tabletop(width=WIDTH)[0][0].camera
+    pixels = camera.project(transform_points(inverse(found.T_world_camera), found.points))
+    errors = np.linalg.norm(pixels - found.pixels, axis=1)
+    assert np.median(errors) < 1.0
+    assert np.quantile(errors, 0.99) < 3.0  # all were within 3 px before the last refinement
+    assert errors.max() < 5.0
+
+
+def test_the_pose_is_the_same_bit_for_bit_when_asked_again() -> None:
+    first, second = (matched(view(6)[0], view(0), view(3)) for _ in range(2))
+    assert first is not None
+    assert second is not None
+    assert np.array_equal(first.T_world_camera, second.T_world_camera)
+    assert np.array_equal(first.points, second.points)
+
+
+def test_a_third_of_false_matches_changes_little() -> None:
+    features, T = view(0)
+    rng = np.random.default_rng(0)
+    points = features.points.copy()
+    wrong = np.flatnonzero(rng.random(len(points)) < 0.33)
+    points[wrong] = points[rng.permutation(wrong)]
+    current, truth = view(6)
+    found = matched(current, (replace(features, points=points), T))
+    assert found is not None
+    assert len(found.points) < 0.8 * found.matches
+    assert pose_distance(truth, found.T_world_camera)[0] < 8e-3
+
+
+def test_no_pose_is_made_up_from_an_unrelated_image_from_few_matches_or_from_nothing() -> None:
+    keyframe = view(0)
+    camera = tabletop(width=WIDTH)[0][0].camera
+    blank = detect(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32), CAMERA, 500)
+    assert len(blank) == 0
+    few = Features(*(getattr(view(5)[0], name)[: MIN_INLIERS - 1] for name in ("pixels", "descriptors", "points")))
+    other = detect(noise_image(0), np.ones((120, 160), np.float32), CAMERA, 500)
+    assert len(other) > 100
+    for current in (blank, few, other):
+        assert match_pose(current, [keyframe], camera) is None
+    assert match_pose(view(5)[0], [], camera) is None
+    assert match_pose(view(5)[0], [(blank, np.eye(4))], camera) is None
+
+
+def test_a_keyframe_without_depth_offers_nothing_to_match() -> None:
+    frames, poses = tabletop(width=WIDTH)
+    anchorless = detect(frames[0].rgb, np.zeros_like(frames[0].depth), frames[0].camera, 800)
+    assert len(anchorless) > 100
+    assert np.isnan(anchorless.points).all()
+    assert matched(view(5)[0], (anchorless, poses[0])) is None
+
+
+def test_points_project_to_their_pixels_at_the_measured_depth() -> None:
+    features, _ = view(2)
+    frame = tabletop(width=WIDTH)[0][2]
+    anchored = np.isfinite(features.points[:, 2])
+    assert anchored.mean() > 0.5
+    np.testing.assert_allclose(frame.camera.project(features.points[anchored]), features.pixels[anchored], atol=1e-3)
+    u, v = np.rint(features.pixels[anchored]).astype(int).T
+    # The window is two pixels wide and spans at most 5 % of the depth.
+    assert np.abs(features.points[anchored, 2] / frame.depth[v, u] - 1).max() < 0.05
+
+
+def test_keypoints_whose_window_spans_two_surfaces_have_no_point() -> None:
+    depth = np.full((120, 160), 1.0, np.float32)
+    depth[:, 80:] = 1.5
+    depth[:50] = 0.0
+    features = detect(noise_image(1), depth, CAMERA, 2000)
+    u, v = np.rint(features.pixels).astype(int).T
+    across = (np.abs(u - 79.5) < 2) & (v > 52)
+    missing = v < 47
+    clear = (np.abs(u - 79.5) > 3) & (v > 52)
+    assert min(across.sum(), missing.sum(), clear.sum()) >= 5
+    assert np.isnan(features.points[across | missing]).all()
+    np.testing.assert_allclose(features.points[clear, 2], np.where(u[clear] < 80, 1.0, 1.5))
