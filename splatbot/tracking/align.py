@@ -48,18 +48,26 @@ def settings_of(config: TrackingConfig, *, photometric: bool, gate: float) -> _n
     )
 
 
-def residuals(
-    level: Level, points: ReferencePoints, T_camera_reference: Array, config: TrackingConfig
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Residuals r/σ of grey and of depth (N,) each at a pose, NaN where a point has none; exposure is fitted."""
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of a reference at a pose, r/σ (N,) of grey and of depth, NaN where there is none; exposure fitted."""
+
+    photometric: NDArray[np.float32]
+    geometric: NDArray[np.float32]
+    gain: float
+    offset: float
+
+
+def residuals(level: Level, points: ReferencePoints, T_camera_reference: Array, config: TrackingConfig) -> Residuals:
+    """How well a pose explains a level; only exposure is fitted."""
     settings = settings_of(config, photometric=True, gate=config.gate)
+    arrays = (*_level_arrays(level), *_point_arrays(points), T_camera_reference)
     exposure = np.array([1.0, 0.0])
-    for _ in range(3):
-        H, g, _, _, photometric, geometric = _native.linearize_alignment(
-            *_level_arrays(level), *_point_arrays(points), T_camera_reference, *exposure, settings
-        )
+    for _ in range(2):
+        H, g, *_ = _native.linearize_alignment(*arrays, *exposure, settings)
         exposure -= np.linalg.solve(H[6:, 6:] + 1e2 * np.eye(2), g[6:])
-    return photometric, geometric
+    _, _, _, _, photometric, geometric = _native.linearize_alignment(*arrays, *exposure, settings)
+    return Residuals(photometric, geometric, *exposure)
 
 
 def align(

@@ -52,14 +52,13 @@ def measure(
     T_camera_world = inverse(T_world_camera)
     photo, depth, here, there = [], [], [], []
     for reference in references:
-        T_camera_reference = T_camera_world @ reference.T_world_camera
-        r_photo, r_depth = residuals(level, reference.levels[index], T_camera_reference, config)
-        photo.append(np.abs(r_photo))
-        depth.append(np.abs(r_depth))
-        gain, offset = term.exposure
-        seen = np.isfinite(r_photo)
-        there.append(term.points.gray[seen].astype(np.float64))
-        here.append(r_photo[seen] * config.sigma_gray + gain * there[-1] + offset)
+        points = reference.levels[index]
+        found = residuals(level, points, T_camera_world @ reference.T_world_camera, config)
+        photo.append(np.abs(found.photometric))
+        depth.append(np.abs(found.geometric))
+        seen = np.isfinite(found.photometric)
+        there.append(points.gray[seen].astype(np.float64))
+        here.append(found.photometric[seen] * config.sigma_gray + found.gain * there[-1] + found.offset)
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)
     seen, ranged = np.isfinite(r_photo), np.isfinite(r_depth)
     return Health(

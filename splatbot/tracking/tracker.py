@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from splatbot.config import TrackingConfig
 from splatbot.geometry import inverse, so3_log
 from splatbot.tracking.align import align
-from splatbot.tracking.features import FeaturePose, Features, detect, match_pose
+from splatbot.tracking.features import Expectation, FeaturePose, Features, detect, match_pose
 from splatbot.tracking.health import Health, Verdict, measure, verdict_of
 from splatbot.tracking.predict import ConstantVelocity
-from splatbot.tracking.prepare import PreparedFrame, valid_depth, valid_share
+from splatbot.tracking.prepare import PreparedFrame, valid_share
 from splatbot.tracking.reference import Reference
 
 Array = NDArray[np.float64]
@@ -85,7 +85,7 @@ class Tracker:
         if self._needs_features(prepared, candidate, T_predicted):
             with clock("features"):
                 features = self.detect(prepared)
-                matched = self._match(features, prepared, keyframes, T_predicted)
+                matched = self._match(features, prepared, keyframes, candidate.T_world_camera)
         with clock("direct"):
             candidates = [self._direct(prepared, candidate, matched)]
             if matched is not None:
@@ -100,9 +100,7 @@ class Tracker:
 
     def detect(self, prepared: PreparedFrame) -> Features:
         """Keypoints of a frame, with depth."""
-        frame = prepared.frame
-        depth = valid_depth(frame.depth, self.config.min_depth, self.config.max_depth)
-        return detect(frame.rgb, depth, frame.camera, self.config.n_features)
+        return detect(prepared.frame.rgb, prepared.depth, prepared.frame.camera, self.config.n_features)
 
     def _geometric(
         self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_world_camera: Array
@@ -145,13 +143,22 @@ class Tracker:
         return verdict_of(health, candidate.information, self.config)[0] != "ok"
 
     def _match(
-        self, features: Features, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_predicted: Array
+        self, features: Features, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_expected: Array
     ) -> FeaturePose | None:
-        """Match with the nearest keyframes, the latest and the first; when lost, with as many again."""
+        """Match with the nearest keyframes, the latest and the first: near to where they are expected, else anywhere.
+
+        When lost, with as many again, and anywhere at once.
+        """
         n = self.config.match_keyframes * (4 if self._lost else 1)
-        chosen = [*order_by_distance(keyframes, T_predicted)[:n], 0, len(keyframes) - 1]
+        chosen = [*order_by_distance(keyframes, T_expected)[:n], 0, len(keyframes) - 1]
         views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in sorted(set(chosen))]
-        return match_pose(features, views, prepared.frame.camera)
+        camera = prepared.frame.camera
+        if not self._lost:
+            expected = Expectation(T_expected, self.config.match_radius * camera.width)
+            near = match_pose(features, views, camera, expected)
+            if near is not None and len(near.points) >= self.config.match_enough:
+                return near
+        return match_pose(features, views, camera)
 
     def _nearest(self, keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[Reference]:
         order = order_by_distance(keyframes, T_world_camera)

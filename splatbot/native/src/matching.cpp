@@ -9,15 +9,19 @@
 #include <numeric>
 #include <vector>
 
+// Every CPU that runs the kernels counts bits in one instruction (isa.cpp asks for it).
+#if defined(__x86_64__)
+#define SB_POPCNT __attribute__((target("popcnt")))
+#else
+#define SB_POPCNT
+#endif
+
 namespace splatbot {
 namespace {
 
 using Words = std::array<std::uint64_t, 4>;
 
-#if defined(__x86_64__)
-__attribute__((target("popcnt")))
-#endif
-int hamming(const Words& a, const Words& b) {
+SB_POPCNT inline int hamming(const Words& a, const Words& b) {
   int bits = 0;
   for (std::size_t i = 0; i < a.size(); ++i) bits += static_cast<int>(__builtin_popcountll(a[i] ^ b[i]));
   return bits;
@@ -31,7 +35,7 @@ std::vector<Words> words(std::span<const std::uint8_t> descriptors) {
 
 }  // namespace
 
-void match_near(const Keypoints& expected, const Keypoints& found, float radius, int max_distance, float ratio,
+SB_POPCNT void match_near(const Keypoints& expected, const Keypoints& found, float radius, int max_distance, float ratio,
                 std::span<std::int32_t> out) {
   const std::size_t n = found.pixels.size() / 2;
   const std::vector<Words> want = words(expected.descriptors), have = words(found.descriptors);
