@@ -15,6 +15,8 @@ from splatbot.frame import Frame
 
 Image = NDArray[np.float32]
 
+_LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of one pixel is none
+
 
 @dataclass(frozen=True)
 class Level:
@@ -34,7 +36,10 @@ class PreparedFrame:
 
 
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
-    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide."""
+    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide.
+
+    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
+    """
     depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
     gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
     level = Level(gray, depth, frame.camera)
@@ -43,7 +48,7 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     smooth = np.asarray(cv2.GaussianBlur(level.gray, (0, 0), 0.7), dtype=np.float32)
     level = Level(smooth, level.depth, level.camera)
     levels = [level]
-    for _ in range(config.n_levels - 1):
+    while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
         levels.append(halve(levels[-1]))
     return PreparedFrame(frame, tuple(levels))
 

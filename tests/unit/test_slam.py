@@ -11,6 +11,7 @@ import torch
 
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
+from splatbot.logs import open_log
 from splatbot.rasterize.native import native
 from splatbot.slam import FrameResult, Slam
 from splatbot.tracking.tracker import pose_distance
@@ -169,6 +170,17 @@ def test_a_frame_without_depth_is_tracked_but_never_a_keyframe() -> None:
     for result in slam.results[4:]:
         assert result.T_world_camera is not None
         assert pose_distance(poses[result.index], result.T_world_camera)[0] < 6e-3
+
+
+@pytest.mark.parametrize("size", ["width=16&height=16", "width=33&height=17"])
+@pytest.mark.parametrize("levels", [1, 6])
+def test_images_too_small_to_track_well_do_not_raise(size: str, levels: int) -> None:
+    log = open_log(f"synthetic:tabletop?{size}&frames=3")
+    slam = run(list(log), tracking__n_levels=levels)
+    slam.finish()
+    assert len(slam.results) == 3
+    assert slam.results[0].verdict == "ok"
+    assert len(slam.snapshot().model) > 10
 
 
 def test_nothing_processed_has_an_empty_map() -> None:
