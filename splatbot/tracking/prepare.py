@@ -17,6 +17,7 @@ from splatbot.frame import Frame
 Image = NDArray[np.float32]
 
 _FLYING_STEP = 0.03  # share of its depth by which a flying pixel differs from both surfaces
+_LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of one pixel is none
 
 
 @dataclass(frozen=True)
@@ -38,15 +39,18 @@ class PreparedFrame:
 
 
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
-    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide."""
+    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide.
+
+    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
+    """
     depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
     gray = np.multiply(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.float32(1 / 255), dtype=np.float32)
     level = Level(gray, depth, frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
-    smooth = cv2.GaussianBlur(level.gray, (0, 0), 0.7)
-    levels = [Level(np.asarray(smooth, dtype=np.float32), level.depth, level.camera)]
-    for _ in range(config.n_levels - 1):
+    smooth = np.asarray(cv2.GaussianBlur(level.gray, (0, 0), 0.7), dtype=np.float32)
+    levels = [Level(smooth, level.depth, level.camera)]
+    while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
         levels.append(halve(levels[-1]))
     return PreparedFrame(frame, depth, tuple(levels))
 

@@ -146,12 +146,10 @@ def test_the_number_of_torch_threads_is_the_callers_again(make_keyframe: MakeKey
         torch.set_num_threads(threads)
 
 
-def drawn(
-    iterations: int, window: int, monkeypatch: pytest.MonkeyPatch, make: MakeKeyframe, seed: int = 0
-) -> list[int]:
-    """Numbers of the keyframes that a refinement over 20 of them visits."""
+def drawn(iterations: int, monkeypatch: pytest.MonkeyPatch, make: MakeKeyframe, seed: int = 0) -> list[int]:
+    """Numbers of the keyframes that a refinement over 20 of them visits, with a window of 4."""
     model = disturbed(make())
-    refiner = refiner_for(model, seed, mapping__window=window)
+    refiner = refiner_for(model, seed, mapping__window=4)
     visited: list[int] = []
     monkeypatch.setattr(refiner, "step", lambda _, keyframe: visited.append(keyframe.number))
     refiner.refine(model, [replace(make(), number=i) for i in range(20)], iterations)
@@ -161,7 +159,7 @@ def drawn(
 def test_the_latest_keyframe_comes_first_then_half_the_draws_from_the_window(
     monkeypatch: pytest.MonkeyPatch, make_keyframe: MakeKeyframe
 ) -> None:
-    visited = drawn(2001, 4, monkeypatch, make_keyframe)
+    visited = drawn(2001, monkeypatch, make_keyframe)
     assert visited[0] == 19
     counts = Counter(visited[1:])
     share = sum(counts[i] for i in range(16, 20)) / 2000
@@ -170,5 +168,5 @@ def test_the_latest_keyframe_comes_first_then_half_the_draws_from_the_window(
 
 
 def test_draws_are_those_of_the_seed(monkeypatch: pytest.MonkeyPatch, make_keyframe: MakeKeyframe) -> None:
-    first, again, other = (drawn(30, 4, monkeypatch, make_keyframe, seed) for seed in (1, 1, 2))
+    first, again, other = (drawn(30, monkeypatch, make_keyframe, seed) for seed in (1, 1, 2))
     assert first == again != other

@@ -10,8 +10,8 @@ import pytest
 
 from splatbot import _native
 from splatbot.camera import Camera
-from splatbot.geometry import se3_exp, transform_points
-from splatbot.tracking.align import DenseTerm, NormalEquations, add_features, align
+from splatbot.geometry import inverse, se3_exp, se3_log, transform_points
+from splatbot.tracking.align import align, residuals
 from splatbot.tracking.features import FeaturePose
 from splatbot.tracking.prepare import Level, prepare
 from splatbot.tracking.reference import Reference, ReferencePoints, make_reference
@@ -49,12 +49,7 @@ class Problem:
             self.T,
             self.gain,
             self.offset,
-            photometric,
-            geometric,
-            SIGMA_GRAY,
-            FLOOR,
-            QUAD,
-            GATE,
+            _native.AlignSettings(photometric, geometric, SIGMA_GRAY, FLOOR, QUAD, GATE),
         )
 
     def photometric(self, state: Array) -> Array:
@@ -79,6 +74,11 @@ def normal_equations(J: Array, r: Array, sigma: Array) -> tuple[Array, Array]:
     """H and g of Student-t weighted residuals."""
     w = (NU + 1) / (NU + (r / sigma) ** 2) / sigma**2
     return (J * w[:, None]).T @ J, J.T @ (w * r)
+
+
+def damped(H: Array) -> Array:
+    """H with the damping of a step."""
+    return np.asarray(H + 1e-5 * np.trace(H) / 6 * np.eye(6), dtype=np.float64)
 
 
 def assert_close(got: Array, want: Array, tolerance: float = 1e-5) -> None:
@@ -189,17 +189,29 @@ def test_feature_equations_equal_finite_differences_of_reprojection(rng: np.rand
     T_camera_world = se3_exp([0.02, 0.01, -0.03, 0.05, -0.02, 0.04])
     pixels = CAMERA.project(transform_points(T_camera_world, points)) + rng.normal(0, 2.0, (60, 2))
     features = FeaturePose(np.eye(4), np.vstack([points, [[0, 0, -1.0]]]), np.vstack([pixels, [[80, 60]]]), 61)
-    total = NormalEquations.zero()
-    add_features(total, T_camera_world, features, CAMERA)
+    blank = np.zeros((120, 160), np.float32)
+    found = align(
+        [Level(blank, blank, CAMERA)],
+        [],
+        inverse(T_camera_world),
+        CONFIG.model_copy(update={"iterations": 1}),
+        photometric=True,
+        finest=0,
+        gate=GATE,
+        features=features,
+        camera=CAMERA,
+    )
 
-    def residuals(twist: Array) -> Array:
+    def reprojection(twist: Array) -> Array:
         q = transform_points(se3_exp(twist) @ T_camera_world, points)
         return np.asarray((CAMERA.project(q) - pixels).ravel())
 
-    J, r = jacobian(residuals, np.zeros(6)), residuals(np.zeros(6))
+    J, r = jacobian(reprojection, np.zeros(6)), reprojection(np.zeros(6))
     w = np.repeat((NU + 1) / (NU + (r.reshape(-1, 2) ** 2).sum(1)), 2)
-    assert_close(total.H, (J * w[:, None]).T @ J)
-    assert_close(total.g, J.T @ (w * r))
+    H = (J * w[:, None]).T @ J
+    assert_close(found.information, H)
+    step = se3_log(inverse(found.T_world_camera) @ inverse(T_camera_world))
+    np.testing.assert_allclose(step, -np.linalg.solve(damped(H), J.T @ (w * r)), rtol=1e-6, atol=1e-10)
 
 
 def test_marginalising_exposure_gives_the_step_of_the_whole_system(problem: Problem) -> None:
@@ -209,17 +221,18 @@ def test_marginalising_exposure_gives_the_step_of_the_whole_system(problem: Prob
     sampled = ReferencePoints(
         *(a.astype(np.float32) for a in (problem.points, problem.normals, problem.reference_gray))
     )
-    term = DenseTerm(Reference(np.eye(4), (sampled,)), level, 0, CONFIG, GATE)
-    H, g, _, _ = term.linearize(problem.T, photometric=True, geometric=True)
+    problem.gain, problem.offset = 1.0, 0.0  # where alignment starts
+    H, g, *_ = problem.native(True, True)
     whole = H.copy()
     whole[6:, 6:] += 100 * np.eye(2)  # the weak anchor of exposure; its gradient vanishes at gain 1, offset 0
-    expected = -np.linalg.solve(whole, g)
-    total = NormalEquations.zero()
-    term.add_marginal(total, problem.T, 1.0, True)
-    step = np.asarray(-np.linalg.solve(total.H, total.g), dtype=np.float64)
-    np.testing.assert_allclose(step, expected[:6], rtol=1e-6, atol=1e-12)
-    term.update_exposure(step)
-    np.testing.assert_allclose(term.exposure, [1 + expected[6], expected[7]], rtol=1e-6)
+    marginal = whole[:6, :6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], whole[6:, :6])
+    gradient = g[:6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], g[6:])
+    config = CONFIG.model_copy(update={"iterations": 1, "dense_weight": 1.0})
+    reference = Reference(np.eye(4), (sampled,))
+    found = align([level], [reference], inverse(problem.T), config, photometric=True, finest=0, gate=GATE)
+    np.testing.assert_allclose(found.information, marginal, rtol=1e-6, atol=1e-6 * np.abs(marginal).max())
+    step = se3_log(inverse(found.T_world_camera) @ inverse(problem.T))
+    np.testing.assert_allclose(step, -np.linalg.solve(damped(marginal), gradient), rtol=1e-6, atol=1e-10)
 
 
 OFFSETS = {
@@ -233,7 +246,7 @@ def aligned(frame: Level | tuple[Level, ...], reference: Reference, T: Array, ph
     """The pose after the coarse and the fine pass, as the tracker runs them."""
     levels = frame if isinstance(frame, tuple) else (frame,)
     for _ in range(2):
-        T, _ = align(levels, [reference], T, CONFIG, photometric=photometric, finest=0, gate=GATE)
+        T = align(levels, [reference], T, CONFIG, photometric=photometric, finest=0, gate=GATE).T_world_camera
     return T
 
 
@@ -289,9 +302,9 @@ def test_an_image_without_information_leaves_the_pose_as_it_was(lacks: str, star
     frame = wall_frame(np.eye(4), textured=lacks != "everything")
     nothing = prepare(replace(frame, depth=np.zeros_like(frame.depth)), CONFIG).levels
     T = se3_exp(start)
-    found, information = align(nothing, [reference], T, CONFIG, photometric=lacks != "depth", finest=0, gate=GATE)
-    np.testing.assert_allclose(found, T, atol=1e-12)
-    assert np.isfinite(information).all()
+    found = align(nothing, [reference], T, CONFIG, photometric=lacks != "depth", finest=0, gate=GATE)
+    np.testing.assert_allclose(found.T_world_camera, T, atol=1e-12)
+    assert np.isfinite(found.information).all()
 
 
 def test_no_references_and_empty_references_leave_the_pose_as_it_was() -> None:
@@ -299,19 +312,19 @@ def test_no_references_and_empty_references_leave_the_pose_as_it_was() -> None:
     blind = tuple(Level(level.gray, np.zeros_like(level.depth), level.camera) for level in levels)
     for references in ([], [make_reference(blind, np.eye(4), 400)]):
         T = se3_exp(OFFSETS["both"])
-        found, information = align(levels, references, T, CONFIG, photometric=True, finest=0, gate=GATE)
-        np.testing.assert_allclose(found, T, atol=1e-12)
-        assert not information.any()
+        found = align(levels, references, T, CONFIG, photometric=True, finest=0, gate=GATE)
+        np.testing.assert_allclose(found.T_world_camera, T, atol=1e-12)
+        assert not found.information.any()
 
 
 def test_a_bare_wall_leaves_its_own_plane_unknown_and_does_not_move_in_it() -> None:
     reference = make_reference(prepare(wall_frame(np.eye(4), textured=False), CONFIG).levels, np.eye(4), 1200)
     truth = se3_exp([0, 0, 0.01, 0, 0, 0])
     levels = prepare(wall_frame(truth, textured=False), CONFIG).levels
-    found, information = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=GATE)
-    assert found[2, 3] == pytest.approx(0.01, abs=1e-4)
-    assert np.abs(found[:2, 3]).max() < 1e-4
-    eigenvalues = np.linalg.eigvalsh(information[:3, :3])
+    found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=GATE)
+    assert found.T_world_camera[2, 3] == pytest.approx(0.01, abs=1e-4)
+    assert np.abs(found.T_world_camera[:2, 3]).max() < 1e-4
+    eigenvalues = np.linalg.eigvalsh(found.information[:3, :3])
     assert eigenvalues[1] < 1e-6 * eigenvalues[2]
 
 
@@ -329,13 +342,7 @@ def test_images_too_small_to_interpolate_have_no_residuals(size: tuple[int, int]
     image = np.ones((height, width), np.float32)
     points = np.array([[0.0, 0.0, 1.0], [0.1, 0.1, 1.0]], np.float32)
     normals = np.tile(np.array([[0, 0, -1]], np.float32), (2, 1))
-    term = DenseTerm(
-        Reference(np.eye(4), (ReferencePoints(points, normals, np.ones(2, np.float32)),)),
-        Level(image, image, tiny),
-        0,
-        CONFIG,
-        GATE,
-    )
-    _, _, r_photo, _ = term.linearize(np.eye(4), photometric=True, geometric=True)
-    assert np.isnan(r_photo[0])
-    assert np.isfinite(r_photo[1]) == (size == (4, 4))  # lands on pixel (1, 1)
+    sampled = ReferencePoints(points, normals, np.ones(2, np.float32))
+    found = residuals(Level(image, image, tiny), sampled, np.eye(4), CONFIG)
+    assert np.isnan(found.photometric[0])
+    assert np.isfinite(found.photometric[1]) == (size == (4, 4))  # lands on pixel (1, 1)

@@ -117,8 +117,8 @@ def test_without_depth_colour_alone_decides() -> None:
 def test_a_bare_wall_is_degraded_for_its_translation_is_hardly_constrained() -> None:
     bare = wall_frame(np.eye(4), textured=False)
     reference, levels = reference_of(bare, np.eye(4)), prepare(bare, CONFIG).levels
-    T, information = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
-    verdict, reasons = verdict_of(health_at(bare, reference, T), information, CONFIG)
+    found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+    verdict, reasons = verdict_of(health_at(bare, reference, found.T_world_camera), found.information, CONFIG)
     assert verdict == "degraded"
     assert reasons == ("translation is hardly constrained in one direction",)
 
@@ -126,8 +126,8 @@ def test_a_bare_wall_is_degraded_for_its_translation_is_hardly_constrained() -> 
 def test_a_textured_wall_is_ok() -> None:
     wall = wall_frame(np.eye(4))
     reference, levels = reference_of(wall, np.eye(4)), prepare(wall, CONFIG).levels
-    T, information = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
-    assert verdict_of(health_at(wall, reference, T), information, CONFIG) == ("ok", ())
+    found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+    assert verdict_of(health_at(wall, reference, found.T_world_camera), found.information, CONFIG) == ("ok", ())
 
 
 @pytest.mark.parametrize("name", ["overlap", "photometric_inliers", "geometric_inliers", "contrast"])

@@ -137,6 +137,16 @@ def test_the_pyramid_halves_and_starts_at_most_as_wide_as_asked() -> None:
         assert level.camera.cx == pytest.approx((level.camera.width - 1) / 2)
 
 
+@pytest.mark.parametrize(("size", "levels"), [((160, 120), 4), ((64, 48), 3), ((30, 16), 1), ((1, 1), 1)])
+def test_the_pyramid_ends_before_its_levels_are_too_small_to_align(size: tuple[int, int], levels: int) -> None:
+    width, height = size
+    camera = Camera(50.0, 50.0, width / 2, height / 2, width, height)
+    frame = wall_frame(np.eye(4), camera=camera)
+    prepared = prepare(frame, small_config(tracking__n_levels=6).tracking)
+    assert len(prepared.levels) == levels
+    assert prepared.levels[0].gray.shape == (height, width)
+
+
 def test_a_frame_of_nan_depth_is_prepared_as_one_without_depth() -> None:
     frame = wall_frame(np.eye(4))
     lost = Frame(0.0, frame.rgb, np.full_like(frame.depth, np.nan), CAMERA)
