@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from splatbot.geometry import inverse, transform_points
-from splatbot.tracking.features import MIN_INLIERS, FeaturePose, Features, detect, match_pose
+from splatbot import _native
+from splatbot.geometry import inverse, se3_exp, transform_points
+from splatbot.tracking.features import MIN_INLIERS, Expectation, FeaturePose, Features, detect, match_pose
 from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import CAMERA, Array, tabletop
 
@@ -120,3 +122,52 @@ def test_keypoints_whose_window_spans_two_surfaces_have_no_point() -> None:
     assert min(across.sum(), missing.sum(), clear.sum()) >= 5
     assert np.isnan(features.points[across | missing]).all()
     np.testing.assert_allclose(features.points[clear, 2], np.where(u[clear] < 80, 1.0, 1.5))
+
+
+def matches_by_brute_force(
+    expected: Array, wanted: NDArray[np.uint8], found: Array, have: NDArray[np.uint8], radius: float
+) -> NDArray[np.int32]:
+    """Lowe's ratio test on Hamming distances within a radius; each found keypoint goes to whom it resembles most."""
+    bits = np.unpackbits(wanted[:, None] ^ have[None], axis=-1).sum(-1).astype(int)
+    bits[np.linalg.norm(expected[:, None] - found[None], axis=-1) > radius] = 257
+    out = np.full(len(wanted), -1, np.int32)
+    claims: dict[int, tuple[int, int]] = {}
+    for i, row in enumerate(bits):
+        order = np.argsort(row, kind="stable")
+        best, second = row[order[0]], row[order[1]]
+        if best <= 64 and best < 0.8 * second and best < claims.get(int(order[0]), (257, 0))[0]:
+            claims[int(order[0])] = (int(best), i)
+    for k, (_, i) in claims.items():
+        out[i] = k
+    return out
+
+
+@pytest.mark.parametrize("radius", [0.0, 5.0, 40.0, np.inf])
+def test_matches_near_to_their_place_are_those_of_brute_force(radius: float, rng: np.random.Generator) -> None:
+    found = rng.uniform([0, 0], [160, 120], (300, 2)).astype(np.float32)
+    have = rng.integers(0, 256, (300, 32), np.uint8)
+    chosen = rng.integers(0, 300, 200)  # some twice
+    flips = np.packbits(rng.random((200, 256)) < 0.15, axis=-1)
+    expected = (found[chosen] + rng.normal(0, 4, (200, 2))).astype(np.float32)
+    wanted = have[chosen] ^ flips
+    got = _native.match_near(expected, wanted, found, have, radius, 64, 0.8)
+    want = matches_by_brute_force(expected.astype(float), wanted, found.astype(float), have, radius)
+    np.testing.assert_array_equal(got, want)
+    assert (got >= 0).any() == (radius > 0)
+
+
+def test_a_place_that_is_not_finite_has_no_match() -> None:
+    have = np.zeros((3, 32), np.uint8)
+    places = np.array([[np.nan, 1], [np.inf, 1], [1, 1]], np.float32)
+    assert _native.match_near(places, have, places, have, 1e9, 64, 0.8)[:2].tolist() == [-1, -1]
+
+
+def test_matches_at_the_edge_of_the_search_are_not_believed() -> None:
+    camera = tabletop(width=WIDTH)[0][0].camera
+    current, truth = view(4)
+    views = [view(0)]
+    right = match_pose(current, views, camera, Expectation(truth, 12.0))
+    assert right is not None
+    assert pose_distance(right.T_world_camera, truth)[0] < 8e-3
+    shifted = truth @ se3_exp([0, 0, 0, 0, 10.0 / camera.fx, 0])  # everything is expected 10 px to one side
+    assert match_pose(current, views, camera, Expectation(shifted, 12.0)) is None
