@@ -172,6 +172,29 @@ def test_gaussians_that_went_bad_are_pruned_before_anyone_renders_them(monkeypat
             assert torch.isfinite(getattr(mapper.model, name)).all()
 
 
+def test_the_optimiser_drops_the_rows_that_the_model_drops_in_the_same_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = Mapper(small_config(mapping__max_gaussians=1500))
+    of_model: list[torch.Tensor] = []
+    of_adam: list[torch.Tensor] = []
+    select, adam_select = GaussianModel.select, mapper._refiner.adam.select
+
+    def recording(model: GaussianModel, index: torch.Tensor) -> GaussianModel:
+        of_model.append(index)
+        return select(model, index)
+
+    def recording_adam(index: torch.Tensor) -> None:
+        of_adam.append(index)
+        adam_select(index)
+
+    monkeypatch.setattr(GaussianModel, "select", recording)
+    monkeypatch.setattr(mapper._refiner.adam, "select", recording_adam)
+    for x in (0.0, 0.4):
+        T = se3_exp([x, 0, 0, 0, 0, 0])
+        insert(mapper, wall_frame(T), T)
+    assert len(of_model) == len(of_adam) >= 2
+    assert all(torch.equal(a, b) for a, b in zip(of_model, of_adam, strict=True))
+
+
 def test_the_reference_of_a_keyframe_lies_on_the_map() -> None:
     mapper = Mapper(small_config())
     insert(mapper, wall_frame(SIDE, normal=(0.2, 0.1, 0.97), distance=1.1), SIDE)

@@ -91,6 +91,15 @@ def test_no_pose_is_made_up_from_an_unrelated_image_from_few_matches_or_from_not
     assert match_pose(view(5)[0], [(blank, np.eye(4))], camera) is None
 
 
+def test_no_pose_is_made_up_from_many_matches_that_do_not_agree() -> None:
+    features, T = view(0)
+    anchored = np.flatnonzero(np.isfinite(features.points[:, 2]))
+    points = features.points.copy()
+    points[anchored] = np.random.default_rng(1).uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 2.0], (len(anchored), 3))
+    assert matched(features, (features, T)) is not None
+    assert matched(features, (replace(features, points=points), T)) is None
+
+
 def test_a_keyframe_without_depth_offers_nothing_to_match() -> None:
     frames, poses = tabletop(width=WIDTH)
     anchorless = detect(frames[0].rgb, np.zeros_like(frames[0].depth), frames[0].camera, 800)

@@ -58,6 +58,14 @@ def test_one_missing_row_costs_its_neighbours_nothing() -> None:
     assert np.array_equal(valid_depth(depth, NEAR, FAR), depth)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("near_first", [False, True])
+def test_a_pixel_between_a_step_and_a_missing_neighbour_stays(near_first: bool, mirrored: bool) -> None:
+    row = np.array([1.0, 1.0, 0.0, 1.0, 1.5, 1.5] if near_first else [1.5, 1.5, 0.0, 1.5, 1.0, 1.0], np.float32)
+    depth = np.tile(row[::-1] if mirrored else row, (5, 1))
+    assert np.array_equal(valid_depth(depth, NEAR, FAR), depth)
+
+
 def test_depth_out_of_range_is_missing_and_the_bounds_belong_to_the_range() -> None:
     depth = np.full((4, 5), 1.0, np.float32)
     depth[0] = [0.2, 0.199, 6.0, 6.001, 0.0]

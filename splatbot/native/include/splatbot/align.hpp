@@ -30,7 +30,7 @@ struct AlignSettings {
   double sigma_gray = 0.02;         // [intensity]
   double sigma_depth_floor = 1e-3;  // [m]
   double sigma_depth_quad = 2e-3;   // [1/m]: σ_z = floor + quad z²
-  double gate = 0.1;                // [m] largest depth difference that can be a correspondence
+  double gate = 0.1;                // [m] depths that differ by more, beyond 3 σ_z, are of another surface
   double nu = 4.0;                  // weight w = (ν + 1) / (ν + r²/σ²) (Student t; Kerl et al. 2013)
 };
 
