@@ -106,7 +106,7 @@ class SyntheticLog(LogBase):
     @cached_property
     def scene(self) -> Scene:
         """What is filmed."""
-        return self._kind.build(self.options.event)
+        return self.kind.build(self.options.event)
 
     def objects(self) -> dict[str, Trajectory]:
         """T_world_object of each moving object, at the stamps of the frames that arrive while it is there."""
@@ -139,13 +139,14 @@ class SyntheticLog(LogBase):
         return frame if i == index else replace(frame, index=index)
 
     @property
-    def _kind(self) -> SceneKind:
+    def kind(self) -> SceneKind:
+        """The scene's entry in the list of scenes."""
         return SCENES[self.name]
 
     def _path(self) -> Trajectory:
         o = self.options
         shooting = Shooting((o.frames - 1) / o.rate, o.rate, np.radians(o.arc), o.seed)
-        path = make_path(o.trajectory or self._kind.trajectory, self._kind.stage, shooting)
+        path = make_path(o.trajectory or self.kind.trajectory, self.kind.stage, shooting)
         stamps = np.arange(o.frames) / o.rate
         return Trajectory(stamps, np.array([path(float(t)) for t in stamps]))
 

@@ -19,9 +19,9 @@ RNG = np.random.default_rng(0)
 
 
 def rendered(log: SyntheticLog, trajectory: str, t: float, exposure: float) -> NDArray[np.float64]:
-    """The mean of 33 renderings while the shutter is open."""
-    path = make_path(trajectory, log._kind.stage, Shooting(2.0))
-    times = t + exposure * ((np.arange(33) + 0.5) / 33 - 0.5)
+    """The mean of 17 renderings while the shutter is open."""
+    path = make_path(trajectory, log.kind.stage, Shooting(2.0))
+    times = t + exposure * ((np.arange(17) + 0.5) / 17 - 0.5)
     return np.mean([log.scene.render(log.camera, path(float(s)))[0].astype(float) for s in times], axis=0)
 
 
