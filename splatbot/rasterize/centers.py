@@ -2,8 +2,8 @@
 
 The rasterizer pulls gradients back to the Gaussians without stopping at the image. So that ``retain_grad()``, hooks and
 losses on ``meta["means2d"]`` work all the same, that tensor is an input of the rasterizing node, which gives it the
-gradient of the centres; the part of its gradient that came so is taken out again on the way back, because the rasterizer
-has pulled it back already.
+gradient of the centres; the part of its gradient that came so is taken out again on the way back, because the
+rasterizer has pulled it back already.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class _Means2d(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor | None) -> tuple[Tensor | None, ...]:
         rest = None if gradient is None else ctx.centers.besides_rendering(gradient)
         if rest is None:
             return (None,) * 4

@@ -84,7 +84,7 @@ class Inputs:
 
     def detached(self) -> Inputs:
         """The same values outside the graph."""
-        return Inputs(self.layout, *(None if t is None else t.detach() for t in self.tensors()), self.masks)  # type: ignore[arg-type]
+        return Inputs(self.layout, *(t if t is None else t.detach() for t in self.tensors()), masks=self.masks)  # type: ignore[arg-type]
 
 
 def check_inputs(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Iterator, MutableMapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +17,14 @@ _PROJECTED = ("depths", "conics", "radii", "opacities")
 _PAIRS = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
 _IDS = ("batch_ids", "camera_ids", "gaussian_ids")
 _NATIVE = ("n_isects", "state_bytes")
+_FINDERS = (
+    {"means2d": "_find_projected", "visibility": "_find_visibility", "visible_ids": "_find_visibility"}
+    | dict.fromkeys(_PROJECTED, "_find_projected")
+    | dict.fromkeys(_PAIRS, "_find_pairs")
+    | dict.fromkeys(_IDS, "_find_ids")
+    | dict.fromkeys(_NATIVE, "_find_native")
+    | {"contributions": "_find_contributions"}
+)
 
 
 class RenderMeta(MutableMapping[str, Any]):
@@ -56,16 +63,11 @@ class RenderMeta(MutableMapping[str, Any]):
         self._centers = centers
         self._means2d: Tensor | None = means2d
         self._known: dict[str, Any] = self._plain()
-        finders: dict[str, Callable[[], None]] = {"means2d": self._find_projected}
-        finders |= dict.fromkeys(_PROJECTED, self._find_projected) | dict.fromkeys(_PAIRS, self._find_pairs)
-        finders |= dict.fromkeys(_NATIVE, self._find_native)
-        finders |= {"visibility": self._find_visibility, "visible_ids": self._find_visibility}
-        finders |= {"contributions": self._find_contributions} | dict.fromkeys(_IDS, self._find_ids)
-        self._finders = finders
+        self._to_find = dict(_FINDERS)
 
     def __getitem__(self, key: str) -> Any:
         if key not in self._known:
-            self._finders[key]()
+            getattr(self, self._to_find[key])()
         if key == "means2d":
             self._centers.exposed = True
         return self._known[key]
@@ -75,17 +77,17 @@ class RenderMeta(MutableMapping[str, Any]):
 
     def __delitem__(self, key: str) -> None:
         found = self._known.pop(key, self)
-        if self._finders.pop(key, None) is None and found is self:
+        if self._to_find.pop(key, None) is None and found is self:
             raise KeyError(key)
 
     def __contains__(self, key: object) -> bool:
-        return key in self._known or key in self._finders
+        return key in self._known or key in self._to_find
 
     def __iter__(self) -> Iterator[str]:
-        return iter(list(self._known) + [key for key in self._finders if key not in self._known])
+        return iter(list(self._known) + [key for key in self._to_find if key not in self._known])
 
     def __len__(self) -> int:
-        return len(set(self._known) | set(self._finders))
+        return len(set(self._known) | set(self._to_find))
 
     def _plain(self) -> dict[str, Any]:
         layout, options = self._layout, self._options
@@ -99,14 +101,17 @@ class RenderMeta(MutableMapping[str, Any]):
             "n_cameras": layout.n_cameras,
         }
 
-    def _stack(self, rows: list[np.ndarray], *, packed: bool) -> Tensor:
-        """Rows (N, ...) of each view in the layout of the meta."""
-        tail = rows[0].shape[1:] if rows else ()
-        n = self._layout.n_gaussians
-        all_rows = torch.from_numpy(np.stack(rows)) if rows else torch.zeros(0, n)
-        if packed and self._centers.ids is not None:
-            return all_rows.reshape(-1, *tail)[self._centers.ids]
-        return all_rows.reshape(*self._layout.views, n, *tail)
+    def _stack(self, rows: list[Any], like: Tensor) -> Tensor:
+        """Rows (N, ...) of each view, one after the other; ``like`` is how they look where there is no view."""
+        return torch.cat([like, *map(torch.from_numpy, rows)])
+
+    def _arranged(self, rows: Tensor) -> Tensor:
+        """Rows (views x N, ...) in the layout of the meta."""
+        ids = self._centers.ids
+        return self._dense(rows) if ids is None else rows[ids]
+
+    def _dense(self, rows: Tensor) -> Tensor:
+        return rows.reshape(*self._layout.views, self._layout.n_gaussians, *rows.shape[1:])
 
     def _find_ids(self) -> None:
         ids, n = self._centers.ids, max(self._layout.n_gaussians, 1)
@@ -120,13 +125,18 @@ class RenderMeta(MutableMapping[str, Any]):
 
     def _find_projected(self) -> None:
         views = [state.describe() for state in self._states]
-        for key in _PROJECTED:
-            self._known.setdefault(key, self._stack([view[key] for view in views], packed=True))
-        if self._means2d is not None:
-            self._means2d.detach().copy_(self._stack([view["means2d"] for view in views], packed=True))
-            self._known["means2d"], self._means2d = self._means2d, None
+        pairs, integers = torch.zeros(0, 2), torch.zeros(0, 2, dtype=torch.int32)
+        empty = {"means2d": pairs, "radii": integers, "conics": torch.zeros(0, 3)}
+        found = {}
+        for key in ("means2d", *_PROJECTED):
+            rows = self._stack([view[key] for view in views], empty.get(key, torch.zeros(0)))
+            found[key] = self._arranged(rows)
         if not self._options.antialiased:
-            self._known["opacities"] = self._plain_opacities()
+            found["opacities"] = self._plain_opacities()
+        if self._means2d is not None:
+            self._means2d.detach().copy_(found["means2d"])
+            found["means2d"], self._means2d = self._means2d, None
+        self._known = {**found, **self._known}
 
     def _plain_opacities(self) -> Tensor:
         layout = self._layout
@@ -170,4 +180,5 @@ class RenderMeta(MutableMapping[str, Any]):
         self._known["visibility"] = seen.reshape(*self._layout.views, -1)
 
     def _find_contributions(self) -> None:
-        self._known["contributions"] = self._stack([state.contributions() for state in self._states], packed=False)
+        rows = self._stack([state.contributions() for state in self._states], torch.zeros(0, dtype=torch.int32))
+        self._known["contributions"] = self._dense(rows)

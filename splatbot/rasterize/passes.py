@@ -13,7 +13,6 @@ from splatbot.rasterize.inputs import Inputs
 from splatbot.rasterize.native import native
 from splatbot.rasterize.options import Options
 
-
 _GEOMETRY = 5  # of the inputs, the first so many: means, quats, scales, covars, opacities
 
 

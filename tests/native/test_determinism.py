@@ -38,7 +38,9 @@ def render_all(scene: Scene, mode: str = "RGB+ED") -> dict[str, Tensor]:
     image, alpha, _ = leaves.render(mode, depth_mode="plane")
     weights = torch.linspace(-1.0, 1.0, image.numel()).reshape(image.shape)
     ((image * weights).sum() + (alpha**2).sum()).backward()
-    return {"image": image.detach(), "alpha": alpha.detach()} | {n: getattr(leaves, n).grad for n in NAMES if n != "covars"}
+    return {"image": image.detach(), "alpha": alpha.detach()} | {
+        n: getattr(leaves, n).grad for n in NAMES if n != "covars"
+    }
 
 
 @pytest.mark.parametrize("threads", [2, 3, 8])

@@ -202,7 +202,6 @@ Change = dict[str, Any]
         ({"backend": "cuda"}, "backend"),
         ({"distributed": True}, "distributed"),
         ({"rasterise_mode": "classic"}, "rasterise_mode"),
-        ({"viewmats": torch.eye(4)}, "viewmats"),
         ({"opacities": torch.zeros(1, 400)}, "opacities"),
         ({"with_ut": True}, "with_ut"),
         ({"depth_mode": "median"}, "depth_mode"),
