@@ -160,9 +160,10 @@ SB_INLINE void into_quat(const CameraLanes& cam, const Projected& o, const F (&g
   }
 }
 
-// Gradient of the 2D mean and covariance into the Gaussian and the camera.
+// Gradient of the 2D mean and covariance into the Gaussian and the camera; into the latter and the quaternion only if
+// wanted.
 void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, const ImageGradients& image,
-               bool of_covar, LaneGradients& out) {
+               bool of_covar, bool camera, bool quat, LaneGradients& out) {
   const RowGradients r = of_covar ? into_covar(o, image, out) : into_axes(g, o, image, out);
   F ga[9];
   F gsx = set1(0.0F), gsy = set1(0.0F);
@@ -181,12 +182,15 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   gsy = zero_unless(o.slope_free[1], gsy);
   const F gjx = fma(image.mx, o.p[0], r.jx);
   const F gjy = fma(image.my, o.p[1], r.jy);
-  // j x (a - slope a') has a derivative of a / z to the focal length where the slope is clamped: j x slope is constant.
-  const F clamped_x = dot3(o.a, r.rows[0]) / cam.fx, clamped_y = dot3(o.a + 3, r.rows[1]) / cam.fy;
-  out.intrinsics[0] = fma(image.mx * o.p[0], iz, select(o.slope_free[0], r.jx * iz, clamped_x));
-  out.intrinsics[1] = fma(image.my * o.p[1], iz, select(o.slope_free[1], r.jy * iz, clamped_y));
-  out.intrinsics[2] = image.mx - held_x / cam.fx;
-  out.intrinsics[3] = image.my - held_y / cam.fy;
+  if (camera) {
+    // j x (a - slope a') has a derivative of a / z to the focal length where the slope is clamped: j x slope is
+    // constant then.
+    const F clamped_x = dot3(o.a, r.rows[0]) / cam.fx, clamped_y = dot3(o.a + 3, r.rows[1]) / cam.fy;
+    out.intrinsics[0] = fma(image.mx * o.p[0], iz, select(o.slope_free[0], r.jx * iz, clamped_x));
+    out.intrinsics[1] = fma(image.my * o.p[1], iz, select(o.slope_free[1], r.jy * iz, clamped_y));
+    out.intrinsics[2] = image.mx - held_x / cam.fx;
+    out.intrinsics[3] = image.my - held_y / cam.fy;
+  }
   out.mean2d[0] = image.mx;
   out.mean2d[1] = image.my;
   F gp[3];
@@ -198,14 +202,14 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   for (int i = 0; i < 3; ++i) {
     out.mean[i] = fma(cam.r[i], gp[0], fma(cam.r[3 + i], gp[1], cam.r[6 + i] * gp[2]));
     out.translation[i] = gp[i];
-    for (int j = 0; j < 3; ++j) {  // a = camera rotation x Gaussian rotation, or the former alone
+    for (int j = 0; camera && j < 3; ++j) {  // a = camera rotation x Gaussian rotation, or the former alone
       const F turned = of_covar ? ga[3 * i + j]
                                 : fma(ga[3 * i], o.rotation[3 * j],
                                       fma(ga[3 * i + 1], o.rotation[3 * j + 1], ga[3 * i + 2] * o.rotation[3 * j + 2]));
       out.rotation[3 * i + j] = fma(gp[i], g.mean[j], turned);
     }
   }
-  if (!of_covar) {
+  if (quat) {
     into_quat(cam, o, ga, out);
   }
 }
@@ -404,7 +408,8 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
     project_rest(g, cam, set1(args.forward.options.eps2d), of_covar, o);
     const Root root = root_of_inverse(o);
     LaneGradients grads;
-    pull_back(g, cam, o, from_sums(sums, root, o, args.forward.options.antialiased), of_covar, grads);
+    pull_back(g, cam, o, from_sums(sums, root, o, args.forward.options.antialiased), of_covar,
+              args.camera != nullptr, args.quats != nullptr, grads);
     write_gradients(args, ids, n, grads, sums, root);
     if (args.camera != nullptr) {
       add_camera(grads, n, camera_sums);
