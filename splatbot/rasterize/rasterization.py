@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import sh_to_rgb
+from splatbot.rasterize.cameras import CameraModel, CameraSettings, RollingShutterType, lenses_of
 from splatbot.rasterize.inputs import check_inputs
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import native
@@ -30,6 +31,7 @@ class _Options:
     eps2d: float
     depth: str
     plane_depth: bool
+    lenses: list[Any] | None = None
 
 
 def rasterization(
@@ -55,10 +57,17 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     channel_chunk: int = 32,
-    camera_model: Literal["pinhole"] = "pinhole",
+    camera_model: CameraModel = "pinhole",
     covars: Tensor | None = None,
     *,
     depth_mode: DepthMode = "center",
+    with_ut: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    rolling_shutter: RollingShutterType | str = RollingShutterType.GLOBAL,
+    viewmats_rs: Tensor | None = None,
+    ut_params: Any = None,
     **unsupported: Any,
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render N Gaussians into C views; differentiable.
@@ -92,12 +101,28 @@ def rasterization(
         render_mode: RGB; D: depth summed with the blend weights [m]; ED: that, divided by the sum of weights; RGB+D
             and RGB+ED append it as the last channel.
         rasterize_mode: "classic".
-        camera_model: "pinhole".
+        camera_model: "pinhole"; "ortho": u = fx x + cx, with fx, fy in [px/m]; "fisheye": equidistant, a point's
+            distance from the principal point is f times its angle from the axis. Each is linearized at the Gaussian's
+            centre (EWA), the slopes of the pinhole clamped 0.3 half-images beyond the edge. In all of them depth is
+            z, and what is nearer than ``near_plane`` or behind the camera is not seen.
         channel_chunk: has no effect on the result; accepted for gsplat's sake.
         depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat); "plane" lets it vary over the
             footprint as that of the plane through the centre and normal to the Gaussian's shortest axis, faded out as
             the shortest axis nears the middle one and bounded where the plane is seen edge-on. Its gradient takes
-            the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them.
+            the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them. "plane" is for
+            the linearized pinhole.
+        with_ut: project by the unscented transform (Wu et al. 2024, 3DGUT): exact at seven sigma points, so that
+            distortion and rolling shutter are possible; slower. What is drawn is still an ellipse. A Gaussian of
+            which a sigma point is nearer to a pinhole than ``near_plane``, or where the distortion no longer grows, is left out.
+        radial_coeffs: OpenCV's (C, 6) k1..k6 of a pinhole or (C, 4) k1..k4 of a fisheye; needs ``with_ut``, as do:
+        tangential_coeffs: (C, 2) p1, p2 of a pinhole.
+        thin_prism_coeffs: (C, 4) s1..s4 of a pinhole.
+        rolling_shutter: order in which lines are read; the poses are then ``viewmats`` at the first line's centre and
+            ``viewmats_rs`` at the last's, in between rotation turns evenly and translation is linear. A point is seen
+            at the time its own, unrounded, line is read (gsplat rounds the line down). Depth is that half-way.
+            Poses receive no gradient and are refused if they ask for one.
+        viewmats_rs: (C, 4, 4), see there.
+        ut_params: spread of the sigma points, see :class:`UnscentedTransformParameters`.
 
     Returns:
         render_colors (C, H, W, X), render_alphas (C, H, W, 1), meta: means2d, depths, conics, radii, opacities,
@@ -107,7 +132,7 @@ def rasterization(
         InputError: a shape, type, device or option does not fit, or a value is not finite.
         NativeError: the C++ core is missing or cannot run here.
     """
-    _reject_unsupported(rasterize_mode, camera_model, covars, sparse_grad, absgrad, depth_mode, unsupported)
+    _reject_unsupported(rasterize_mode, covars, sparse_grad, absgrad, depth_mode, unsupported)
     if sh_degree is not None:
         colors = _from_harmonics(colors, sh_degree)
     wants_color, depth = _parse_mode(render_mode)
@@ -116,6 +141,20 @@ def rasterization(
     elif colors is None:
         raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
     inputs = check_inputs(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width, height)
+    settings = CameraSettings(
+        camera_model,
+        with_ut,
+        radial_coeffs,
+        tangential_coeffs,
+        thin_prism_coeffs,
+        rolling_shutter,
+        viewmats_rs,
+        ut_params,
+    )
+    lenses, poses = lenses_of(settings, inputs.viewmats, float(near_plane))
+    if lenses is not None and depth_mode == "plane":
+        raise InputError("'plane' needs a linearized pinhole.", field="depth_mode", hint="use 'center'")
+    inputs = replace(inputs, viewmats=poses)
     options = _Options(
         width=width,
         height=height,
@@ -125,6 +164,7 @@ def rasterization(
         eps2d=float(eps2d),
         depth=depth,
         plane_depth=depth_mode == "plane" and depth != "none",
+        lenses=lenses,
     )
     states: list[Any] = []
     renders, alphas = _Rasterize.apply(*inputs.tensors(), inputs.Ks, options, states)
@@ -171,6 +211,7 @@ class _Rasterize(torch.autograd.Function):
                 None if backgrounds is None else backgrounds[i].detach(),
                 renders[i],
                 alphas[i, ..., 0],
+                None if options.lenses is None else options.lenses[i],
             )
             if isinstance(state, tuple):
                 field, row = state
@@ -247,7 +288,6 @@ def _parse_mode(render_mode: str) -> tuple[bool, str]:
 
 def _reject_unsupported(
     rasterize_mode: str,
-    camera_model: str,
     covars: Tensor | None,
     sparse_grad: bool,
     absgrad: bool,
@@ -257,7 +297,6 @@ def _reject_unsupported(
     """An option that would change the result is refused, never ignored."""
     choices: Sequence[tuple[str, Any, tuple[Any, ...]]] = (
         ("rasterize_mode", rasterize_mode, ("classic",)),
-        ("camera_model", camera_model, ("pinhole",)),
         ("sparse_grad", sparse_grad, (False,)),
         ("absgrad", absgrad, (False,)),
         ("depth_mode", depth_mode, ("center", "plane")),

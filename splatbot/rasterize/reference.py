@@ -5,6 +5,7 @@ Every Gaussian is evaluated at every pixel, so it is for small scenes only.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,6 +38,19 @@ class ReferenceMeta:
     margins: Tensor
 
 
+@dataclass(frozen=True)
+class ReferenceProjection:
+    """What a camera makes of N Gaussians; one it does not see has depth -1."""
+
+    mean2d: Tensor  # (N, 2)
+    covar2d: Tensor  # (N, 2, 2)
+    depth: Tensor  # (N,)
+    slope: Tensor  # (N, 2) change of depth per pixel
+
+
+Projector = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, int, int, float], ReferenceProjection]
+
+
 def rasterization_reference(
     means: Tensor,
     quats: Tensor,
@@ -54,10 +68,12 @@ def rasterization_reference(
     render_mode: str = "RGB",
     *,
     depth_mode: Literal["center", "plane"] = "center",
+    project: Projector | None = None,
 ) -> tuple[Tensor, Tensor, ReferenceMeta]:
     """As :func:`splatbot.rasterize.rasterization`, computed in the type of ``means`` by torch alone.
 
-    Args and returns: see there; ``colors`` (N, D), (C, N, D) or None.
+    Args and returns: see there; ``colors`` (N, D), (C, N, D) or None. ``project``: another camera than the pinhole,
+    see ``reference_cameras``.
 
     Raises:
         InputError: an unknown render mode.
@@ -68,7 +84,10 @@ def rasterization_reference(
     for i in range(len(viewmats)):
         view_colors = None if colors is None or "RGB" not in render_mode else colors[i] if colors.ndim == 3 else colors
         background = None if backgrounds is None or view_colors is None else backgrounds[i]
-        projected = _project(means, quats, scales, viewmats[i], Ks[i], width, height, eps2d, depth_mode)
+        if project is None:
+            projected = _project(means, quats, scales, viewmats[i], Ks[i], width, height, eps2d, depth_mode)
+        else:
+            projected = project(means, quats, scales, viewmats[i], Ks[i], width, height, eps2d)
         # The kernels hold the planes in float32: a float32 Gaussian on the plane must be kept here as well.
         near, far = (float(torch.tensor(plane, dtype=torch.float32)) for plane in (near_plane, far_plane))
         keep = (projected.depth >= near) & (projected.depth <= far)
@@ -85,15 +104,7 @@ def rasterization_reference(
     return torch.stack(renders), torch.stack(alphas), meta
 
 
-@dataclass(frozen=True)
-class _Projected:
-    mean2d: Tensor  # (N, 2)
-    covar2d: Tensor  # (N, 2, 2)
-    depth: Tensor  # (N,)
-    slope: Tensor  # (N, 2) change of depth per pixel
-
-
-def _rotations(quats: Tensor) -> Tensor:
+def reference_rotations(quats: Tensor) -> Tensor:
     largest = quats.abs().amax(-1, keepdim=True)
     zero = largest < 1e-30
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
@@ -117,7 +128,7 @@ def _project(
     height: int,
     eps2d: float,
     depth_mode: str,
-) -> _Projected:
+) -> ReferenceProjection:
     """EWA splatting (Zwicker et al. 2001, eq. 24 and 29)."""
     W, t = viewmat[:3, :3].to(means.dtype), viewmat[:3, 3].to(means.dtype)
     fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
@@ -129,14 +140,14 @@ def _project(
     slope_y = (p[:, 1] / z).clamp(-(cy / fy + margins[1]), (height - cy) / fy + margins[1])
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).reshape(-1, 2, 3)
-    axes = W @ _rotations(quats)  # columns: the Gaussian's axes in the camera frame
+    axes = W @ reference_rotations(quats)  # columns: the Gaussian's axes in the camera frame
     M = J @ axes * scales[:, None, :]
     covar2d = M @ M.mT + eps2d * torch.eye(2, dtype=means.dtype)
     mean2d = torch.stack([fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy], -1)
     slope = torch.zeros_like(mean2d)
     if depth_mode == "plane":
         slope = _plane_slopes(p, axes, scales, covar2d, fx, fy).detach()
-    return _Projected(mean2d, covar2d, depth, slope)
+    return ReferenceProjection(mean2d, covar2d, depth, slope)
 
 
 def _plane_slopes(p: Tensor, axes: Tensor, scales: Tensor, covar2d: Tensor, fx: float, fy: float) -> Tensor:
@@ -159,7 +170,9 @@ def _pixel_centers(width: int, height: int, like: Tensor) -> Tensor:
     return torch.stack([u, v], -1).reshape(-1, 2).to(like.dtype) + 0.5
 
 
-def _blend(projected: _Projected, opacities: Tensor, order: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _blend(
+    projected: ReferenceProjection, opacities: Tensor, order: Tensor, pixels: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Weights (M, P) of the M Gaussians of ``order``, transmittance (P,) left, margins (P,)."""
     d = pixels[None] - projected.mean2d[order][:, None]
     conic = torch.linalg.inv(projected.covar2d[order])
@@ -186,7 +199,7 @@ def _margins(power: Tensor, after: Tensor, counts: Tensor) -> Tensor:
 
 
 def _channels(
-    projected: _Projected, colors: Tensor | None, order: Tensor, pixels: Tensor, render_mode: str
+    projected: ReferenceProjection, colors: Tensor | None, order: Tensor, pixels: Tensor, render_mode: str
 ) -> list[Tensor]:
     """Channels, each (M, 1) or (M, P)."""
     columns = [] if colors is None else [c[:, None] for c in colors[order].unbind(-1)]

@@ -7,3 +7,4 @@
 void define_align(nanobind::module_& m);
 void define_mahalanobis(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);
+void define_lens(nanobind::module_& m);

@@ -7,4 +7,5 @@ NB_MODULE(_native, m) {
   define_align(m);
   define_mahalanobis(m);
   define_rasterize(m);
+  define_lens(m);
 }

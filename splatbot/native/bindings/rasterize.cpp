@@ -93,9 +93,13 @@ struct State {
 nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities, const In2& colors,
                    const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane, float far_plane,
                    float radius_clip, float eps2d, const std::string& depth, bool plane_depth,
-                   const std::optional<In1>& background, const Out3& out_colors, const Out2& out_alphas) {
+                   const std::optional<In1>& background, const Out3& out_colors, const Out2& out_alphas,
+                   const splatbot::Lens* lens) {
   const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, opacities, colors);
-  const splatbot::View view = view_of(viewmat, K, width, height);
+  splatbot::View view = view_of(viewmat, K, width, height);
+  if (lens != nullptr) {
+    view.lens = *lens;
+  }
   const splatbot::RasterOptions options = {.near_plane = near_plane,
                                            .far_plane = far_plane,
                                            .radius_clip = radius_clip,
@@ -191,6 +195,7 @@ void define_rasterize(nb::module_& m) {
         "opacities"_a.noconvert(), "colors"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a,
         "height"_a, "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a,
         nb::arg("background").noconvert().none(), "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(),
+        nb::arg("lens").none() = nb::none(),
         "Render one view into out_colors (H, W, X) and out_alphas (H, W). Returns a RasterState, or (field, row) of an "
         "input that is not finite.");
 

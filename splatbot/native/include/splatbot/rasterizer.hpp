@@ -8,6 +8,8 @@
 #include <span>
 #include <string_view>
 
+#include "splatbot/lens.hpp"
+
 namespace splatbot {
 
 // N Gaussians in the world frame. Contiguous rows; colours have `channels` columns.
@@ -21,12 +23,13 @@ struct Gaussians {
   std::span<const float> colors;     // (N, channels)
 };
 
-// A pinhole camera; pixel (i, j) covers [i, i+1) x [j, j+1), its centre is at +0.5.
+// A camera, a pinhole unless its lens says otherwise; pixel (i, j) covers [i, i+1) x [j, j+1), its centre is at +0.5.
 struct View {
   float rotation[9];  // world to camera, row-major
   float translation[3];
   float fx, fy, cx, cy;  // [px]
   int width, height;     // [px]
+  Lens lens{};
 };
 
 enum class DepthMode : std::uint8_t {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "entry.hpp"
 #include "project.hpp"
+#include "unscented.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -170,6 +171,7 @@ SB_INLINE M cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Lanes& 
   return (right > zero) & (left < width) & (bottom > zero) & (top < height);
 }
 
+template <Projection P>
 void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t first, int n, std::uint32_t* visible,
                    ProjectedBlock& out) {
   GaussianLanes g;
@@ -185,7 +187,8 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
   if (kept != 0) {
     load_lanes<4>(args.quats, first, n, g.quat);
     load_lanes<3>(args.scales, first, n, g.scale);
-    project_rest(g, cam, set1(args.options.eps2d), o);
+    Affine lens;
+    project_image<P>(g, cam, args.view, set1(args.options.eps2d), o, lens);
     Lanes lanes;
     const F lo = log2(max(opacity[0], set1(kAlphaMin)));
     const F reach = sqrt(max(lo - set1(kLog2AlphaMin), set1(0.0F)));
@@ -231,6 +234,15 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
   }
 }
 
+template <Projection P>
+void project_all(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
+  const CameraLanes cam(args.view);
+  for (std::size_t first = begin; first < end; first += W) {
+    const std::size_t left = end - first;
+    project_lanes<P>(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, out);
+  }
+}
+
 }  // namespace
 
 void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out) {
@@ -240,10 +252,15 @@ void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out) {
   if (find_fault(args, begin, end, out)) {
     return;
   }
-  const CameraLanes cam(args.view);
-  for (std::size_t first = begin; first < end; first += W) {
-    const std::size_t left = end - first;
-    project_lanes(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, out);
+  switch (projection_of(args.view)) {
+    case Projection::pinhole:
+      return project_all<Projection::pinhole>(args, begin, end, out);
+    case Projection::ortho:
+      return project_all<Projection::ortho>(args, begin, end, out);
+    case Projection::fisheye:
+      return project_all<Projection::fisheye>(args, begin, end, out);
+    case Projection::unscented:
+      return project_all<Projection::unscented>(args, begin, end, out);
   }
 }
 

@@ -3,6 +3,7 @@
 // anew: cheaper than keeping it.
 #include "entry.hpp"
 #include "project.hpp"
+#include "unscented.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -53,9 +54,43 @@ void write_colors(const ProjectBackwardArgs& args, std::size_t id, const float* 
   }
 }
 
+// Through a pinhole.
+SB_INLINE void pull_back_pinhole(const GaussianLanes& g, const Projected& o, const ImageGradient& image,
+                                 CameraFrameGradient& out) {
+  F gr[2][3];
+  F gjx = set1(0.0F), gjy = set1(0.0F), gsx = set1(0.0F), gsy = set1(0.0F);
+  const F two = set1(2.0F);
+  for (int k = 0; k < 3; ++k) {
+    const F gm0 = two * fma(image.c00, o.m[0][k], image.c01 * o.m[1][k]);
+    const F gm1 = two * fma(image.c01, o.m[0][k], image.c11 * o.m[1][k]);
+    out.scale[k] = fma(o.jx * o.rows[0][k], gm0, o.jy * o.rows[1][k] * gm1);
+    gjx = fma(o.rows[0][k] * g.scale[k], gm0, gjx);
+    gjy = fma(o.rows[1][k] * g.scale[k], gm1, gjy);
+    gr[0][k] = o.jx * g.scale[k] * gm0;
+    gr[1][k] = o.jy * g.scale[k] * gm1;
+    gsx = fnma(o.a[6 + k], gr[0][k], gsx);
+    gsy = fnma(o.a[6 + k], gr[1][k], gsy);
+    out.a[k] = gr[0][k];
+    out.a[3 + k] = gr[1][k];
+    out.a[6 + k] = -fma(o.slope[0], gr[0][k], o.slope[1] * gr[1][k]);
+  }
+
+  const F iz = set1(1.0F) / o.p[2];
+  gsx = zero_unless(o.slope_free[0], gsx);
+  gsy = zero_unless(o.slope_free[1], gsy);
+  // mx = jx px + cx, jx = fx / z, slope = p / z.
+  gjx = fma(image.mx, o.p[0], gjx);
+  gjy = fma(image.my, o.p[1], gjy);
+  out.p[0] = fma(image.mx, o.jx, gsx * iz);
+  out.p[1] = fma(image.my, o.jy, gsy * iz);
+  const F along = fma(gjx, o.jx, fma(gjy, o.jy, fma(gsx, o.slope[0], gsy * o.slope[1])));
+  out.p[2] = fnma(along, iz, image.z);
+}
+
 // Gradient of the 2D mean and covariance into the Gaussian and the camera.
-void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, const Root& root,
-               const LaneSums& sums, LaneGradients& out) {
+template <Projection P>
+void pull_back(const GaussianLanes& g, const CameraLanes& cam, const View& view, const Projected& o,
+               const Affine& lens, const Root& root, const LaneSums& sums, LaneGradients& out) {
   const F l11 = root.l11, l21 = root.l21, l22 = root.l22;
   // With z = B d and log(alpha) = log(opacity) - |z|^2 / (2 k^2): d/d mean = B^T z / k^2 and
   // d/d covariance = B^T z z^T B / (2 k^4).
@@ -71,35 +106,21 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   const F g01 = half * l11 * fma(l21, suu, l22 * suw);
   const F g11 = half * fma(l21 * l21, suu, fma(set1(2.0F) * l21 * l22, suw, l22 * l22 * sww));
 
-  F gr[2][3], ga[9];
-  F gjx = set1(0.0F), gjy = set1(0.0F), gsx = set1(0.0F), gsy = set1(0.0F);
+  const ImageGradient image = {gmx, gmy, g00, g01, g11, gz};
+  CameraFrameGradient camera;
+  if constexpr (P == Projection::pinhole) {
+    pull_back_pinhole(g, o, image, camera);
+  } else if constexpr (P == Projection::unscented) {
+    pull_back_unscented(g, view, o, image, camera);
+  } else {
+    pull_back_affine<P>(g, cam, o, lens, image, camera);
+  }
+  const F(&gp)[3] = camera.p;
+  const F(&ga)[9] = camera.a;
   const F two = set1(2.0F);
   for (int k = 0; k < 3; ++k) {
-    const F gm0 = two * fma(g00, o.m[0][k], g01 * o.m[1][k]);
-    const F gm1 = two * fma(g01, o.m[0][k], g11 * o.m[1][k]);
-    out.scale[k] = fma(o.jx * o.rows[0][k], gm0, o.jy * o.rows[1][k] * gm1);
-    gjx = fma(o.rows[0][k] * g.scale[k], gm0, gjx);
-    gjy = fma(o.rows[1][k] * g.scale[k], gm1, gjy);
-    gr[0][k] = o.jx * g.scale[k] * gm0;
-    gr[1][k] = o.jy * g.scale[k] * gm1;
-    gsx = fnma(o.a[6 + k], gr[0][k], gsx);
-    gsy = fnma(o.a[6 + k], gr[1][k], gsy);
-    ga[k] = gr[0][k];
-    ga[3 + k] = gr[1][k];
-    ga[6 + k] = -fma(o.slope[0], gr[0][k], o.slope[1] * gr[1][k]);
+    out.scale[k] = camera.scale[k];
   }
-
-  const F iz = set1(1.0F) / o.p[2];
-  gsx = zero_unless(o.slope_free[0], gsx);
-  gsy = zero_unless(o.slope_free[1], gsy);
-  // mx = jx px + cx, jx = fx / z, slope = p / z.
-  gjx = fma(gmx, o.p[0], gjx);
-  gjy = fma(gmy, o.p[1], gjy);
-  F gp[3];
-  gp[0] = fma(gmx, o.jx, gsx * iz);
-  gp[1] = fma(gmy, o.jy, gsy * iz);
-  const F along = fma(gjx, o.jx, fma(gjy, o.jy, fma(gsx, o.slope[0], gsy * o.slope[1])));
-  gp[2] = fnma(along, iz, gz);
 
   for (int i = 0; i < 3; ++i) {
     out.mean[i] = fma(cam.r[i], gp[0], fma(cam.r[3 + i], gp[1], cam.r[6 + i] * gp[2]));
@@ -238,9 +259,8 @@ void collect(const ProjectBackwardArgs& args, const ProjectedBlock& block, const
   }
 }
 
-}  // namespace
-
-void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
+template <Projection P>
+void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
   const std::size_t begin = b * kProjectBlock;
   const std::size_t end = begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
   const ProjectedBlock& block = args.blocks[b];
@@ -264,9 +284,10 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
     gather_lanes<3>(args.forward.scales, ids, n, g.scale);
     Projected o;
     project_center(g, cam, o);
-    project_rest(g, cam, set1(args.forward.options.eps2d), o);
+    Affine lens;
+    project_image<P>(g, cam, args.forward.view, set1(args.forward.options.eps2d), o, lens);
     LaneGradients grads;
-    pull_back(g, cam, o, root_of_inverse(o), sums, grads);
+    pull_back<P>(g, cam, args.forward.view, o, lens, root_of_inverse(o), sums, grads);
     scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
     scatter_lanes<4>(args.quats, ids, n, grads.quat, args.accumulate);
     scatter_lanes<3>(args.scales, ids, n, grads.scale, args.accumulate);
@@ -288,6 +309,21 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
       }
       args.viewmat[b * 12 + static_cast<std::size_t>(k)] = sum;
     }
+  }
+}
+
+}  // namespace
+
+void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
+  switch (projection_of(args.forward.view)) {
+    case Projection::pinhole:
+      return project_backward_block<Projection::pinhole>(args, b);
+    case Projection::ortho:
+      return project_backward_block<Projection::ortho>(args, b);
+    case Projection::fisheye:
+      return project_backward_block<Projection::fisheye>(args, b);
+    case Projection::unscented:
+      return project_backward_block<Projection::unscented>(args, b);
   }
 }
 
