@@ -161,7 +161,7 @@ def _roll(lenses: list[Any], settings: CameraSettings, viewmats: Tensor) -> tupl
         )
     shutter = shutter_of(settings.rolling_shutter).value
     motions = [middle_pose(a, b) for a, b in zip(viewmats.double().numpy(), last.double().numpy(), strict=True)]
-    rolled = [lens.rolling(shutter, m.turn.tolist(), m.step.tolist()) for lens, m in zip(lenses, motions, strict=True)]
+    rolled = [lens.rolling(shutter, m.turn.tolist(), m.step.tolist(), m.middle[:3, 3].tolist()) for lens, m in zip(lenses, motions, strict=True)]
     return rolled, torch.from_numpy(np.stack([m.middle for m in motions]))
 
 

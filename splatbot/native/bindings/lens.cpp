@@ -47,13 +47,14 @@ splatbot::Lens unscented(const std::string& model, const std::array<double, 6>& 
 }
 
 splatbot::Lens rolling(splatbot::Lens lens, int shutter, const std::array<double, 3>& turn,
-                       const std::array<double, 3>& step) {
+                       const std::array<double, 3>& step, const std::array<double, 3>& pivot) {
   if (shutter < 0 || shutter > static_cast<int>(splatbot::Shutter::right_to_left)) {
     throw std::invalid_argument("shutter is not one of the five");
   }
   lens.shutter = static_cast<splatbot::Shutter>(shutter);
   std::copy(turn.begin(), turn.end(), lens.turn);
   std::copy(step.begin(), step.end(), lens.step);
+  std::copy(pivot.begin(), pivot.end(), lens.pivot);
   return lens;
 }
 
@@ -72,6 +73,6 @@ void define_lens(nb::module_& m) {
       .def_static("unscented", &unscented, "model"_a, "radial"_a, "tangential"_a, "thin_prism"_a, "limit"_a,
                   "nearest"_a, "sigma"_a,
                   "With distortion; sigma: spread, weight and excess of the unscented transform.")
-      .def("rolling", &rolling, "shutter"_a, "turn"_a, "step"_a,
+      .def("rolling", &rolling, "shutter"_a, "turn"_a, "step"_a, "pivot"_a,
            "A copy with a rolling shutter: 1 top to bottom, 2 left to right, 3 bottom to top, 4 right to left.");
 }

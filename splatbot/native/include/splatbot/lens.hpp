@@ -26,9 +26,9 @@ struct Lens {
   // The sigma points lie `spread` standard deviations from the centre and weigh `weight` each; `excess` is the centre's.
   double spread = 0.0, weight = 0.0, excess = 0.0;
   // Rolling shutter: at time s in -1/2..1/2 the camera has turned by the rotation vector s `turn` (its own axes at s = 0)
-  // and its translation has grown by s `step`; View holds the pose at s = 0.
+  // and its translation has grown by s `step`; View holds the pose at s = 0, whose translation is `pivot`.
   Shutter shutter = Shutter::global;
-  double turn[3] = {}, step[3] = {};
+  double turn[3] = {}, step[3] = {}, pivot[3] = {};
 };
 
 }  // namespace splatbot

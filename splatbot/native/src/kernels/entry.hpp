@@ -10,5 +10,8 @@ void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out);
 void blend(const BlendArgs& args, std::size_t tile);
 void blend_backward(const BlendBackwardArgs& args, std::size_t tile);
 void project_backward(const ProjectBackwardArgs& args, std::size_t block);
+void harmonics(const HarmonicsArgs& args, std::size_t block);
+void harmonics_backward(const HarmonicsBackwardArgs& args, std::size_t block);
+void contributions(const ContributionArgs& args, std::size_t tile);
 
 }  // namespace splatbot::SPLATBOT_KERNELS

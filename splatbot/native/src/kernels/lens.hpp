@@ -2,7 +2,8 @@
 // Affine approximation (EWA) of cameras other than the pinhole: the 2x3 derivative of the projection at the centre.
 #pragma once
 
-#include "project.hpp"
+#include "simd.hpp"
+#include "splatbot/kernels.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -81,107 +82,70 @@ SB_INLINE AngleRatio angle_ratio(F x, F y, F z) {
 struct Affine {
   F j[2][3];    // derivative of the projection
   F normal[3];  // cross product of its rows
+  F mx, my;     // the centre's pixel, from the principal point
   AngleRatio angle;
 };
 
 template <Projection P>
-SB_INLINE void linearize(const CameraLanes& cam, Projected& o, Affine& out) {
+SB_INLINE Affine affine_of(const F (&p)[3], F fx, F fy) {
+  Affine out;
   const F zero = set1(0.0F);
   if constexpr (P == Projection::ortho) {
-    out.j[0][0] = cam.fx;
-    out.j[1][1] = cam.fy;
+    out.j[0][0] = fx;
+    out.j[1][1] = fy;
     out.j[0][1] = out.j[0][2] = out.j[1][0] = out.j[1][2] = zero;
     out.normal[0] = out.normal[1] = zero;
-    out.normal[2] = cam.fx * cam.fy;
-    o.mx = fma(cam.fx, o.p[0], cam.cx);
-    o.my = fma(cam.fy, o.p[1], cam.cy);
+    out.normal[2] = fx * fy;
+    out.mx = fx * p[0];
+    out.my = fy * p[1];
   } else {
-    const F x = o.p[0], y = o.p[1], z = o.p[2];
-    const AngleRatio a = angle_ratio(x, y, z);
-    out.j[0][0] = cam.fx * fma(x * x, a.first, a.ratio);
-    out.j[0][1] = cam.fx * (x * y * a.first);
-    out.j[0][2] = -(cam.fx * x * a.inverse);
-    out.j[1][0] = cam.fy * (x * y * a.first);
-    out.j[1][1] = cam.fy * fma(y * y, a.first, a.ratio);
-    out.j[1][2] = -(cam.fy * y * a.inverse);
-    // Points of one ray meet in one pixel, so the normal lies along p.
-    const F size = cam.fx * cam.fy * a.ratio * a.inverse;
+    const F x = p[0], y = p[1];
+    const AngleRatio a = angle_ratio(x, y, p[2]);
+    const F mixed = x * y * a.first;
+    out.j[0][0] = fx * fma(x * x, a.first, a.ratio);
+    out.j[0][1] = fx * mixed;
+    out.j[0][2] = -(fx * x * a.inverse);
+    out.j[1][0] = fy * mixed;
+    out.j[1][1] = fy * fma(y * y, a.first, a.ratio);
+    out.j[1][2] = -(fy * y * a.inverse);
+    const F size = fx * fy * a.ratio * a.inverse;
     for (int i = 0; i < 3; ++i) {
-      out.normal[i] = size * o.p[i];
+      out.normal[i] = size * p[i];  // points of one ray meet in one pixel, so the normal lies along it
     }
-    o.mx = fma(cam.fx * x, a.ratio, cam.cx);
-    o.my = fma(cam.fy * y, a.ratio, cam.cy);
+    out.mx = fx * x * a.ratio;
+    out.my = fy * y * a.ratio;
     out.angle = a;
   }
+  return out;
 }
 
-// As project_rest(), of an affine camera.
-SB_INLINE void project_affine(const GaussianLanes& g, const Affine& lens, F eps2d, Projected& o) {
-  F minor[3];
-  for (int k = 0; k < 3; ++k) {
-    for (int i = 0; i < 2; ++i) {
-      o.rows[i][k] = fma(lens.j[i][0], o.a[k], fma(lens.j[i][1], o.a[3 + k], lens.j[i][2] * o.a[6 + k]));
-      o.m[i][k] = o.rows[i][k] * g.scale[k];
-    }
-    const F along = fma(lens.normal[0], o.a[k], fma(lens.normal[1], o.a[3 + k], lens.normal[2] * o.a[6 + k]));
-    minor[k] = along * g.scale[(k + 1) % 3] * g.scale[(k + 2) % 3];
-  }
-  const F s00 = dot3(o.m[0], o.m[0]);
-  const F s11 = dot3(o.m[1], o.m[1]);
-  o.c01 = dot3(o.m[0], o.m[1]);
-  o.c00 = s00 + eps2d;
-  o.c11 = s11 + eps2d;
-  o.det = fma(minor[0], minor[0], fma(minor[1], minor[1], fma(minor[2], minor[2], eps2d * (s00 + s11 + eps2d))));
-}
-
-// Gradients of the image of a Gaussian: 2D mean, 2D covariance (of its three entries), depth.
-struct ImageGradient {
-  F mx, my, c00, c01, c11, z;
-};
-
-// Gradients in the camera frame: of the centre, of the Gaussian's axes (Projected::a), of its scales.
-struct CameraFrameGradient {
-  F p[3], a[9], scale[3];
-};
-
+// From the gradients to the centre's pixel (mx, my), its depth and, through the covariance, the derivative j, to the
+// centre p in the camera frame.
 template <Projection P>
-SB_INLINE void pull_back_affine(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, const Affine& lens,
-                                const ImageGradient& image, CameraFrameGradient& out) {
-  const F two = set1(2.0F), zero = set1(0.0F);
-  F gj[2][3] = {{zero, zero, zero}, {zero, zero, zero}};
-  for (int k = 0; k < 3; ++k) {
-    const F m[2] = {two * fma(image.c00, o.m[0][k], image.c01 * o.m[1][k]),
-                    two * fma(image.c01, o.m[0][k], image.c11 * o.m[1][k])};
-    out.scale[k] = fma(o.rows[0][k], m[0], o.rows[1][k] * m[1]);
-    const F row[2] = {m[0] * g.scale[k], m[1] * g.scale[k]};
-    for (int c = 0; c < 3; ++c) {
-      out.a[3 * c + k] = fma(lens.j[0][c], row[0], lens.j[1][c] * row[1]);
-      for (int i = 0; i < 2; ++i) {
-        gj[i][c] = fma(row[i], o.a[3 * c + k], gj[i][c]);
-      }
-    }
-  }
+SB_INLINE void pull_back_affine(const Affine& lens, const F (&p)[3], F fx, F fy, F mx, F my, F z, F (&gj)[2][3],
+                                F (&out)[3]) {
   for (int c = 0; c < 3; ++c) {
-    out.p[c] = fma(image.mx, lens.j[0][c], image.my * lens.j[1][c]);
+    out[c] = fma(mx, lens.j[0][c], my * lens.j[1][c]);
   }
-  out.p[2] = out.p[2] + image.z;
+  out[2] = out[2] + z;
   if constexpr (P == Projection::fisheye) {
     const AngleRatio& t = lens.angle;
-    const F x = o.p[0], y = o.p[1], z = o.p[2], xy = x * y;
+    const F two = set1(2.0F);
+    const F x = p[0], y = p[1], xy = x * y;
     for (int c = 0; c < 3; ++c) {
-      gj[0][c] = gj[0][c] * cam.fx;
-      gj[1][c] = gj[1][c] * cam.fy;
+      gj[0][c] = gj[0][c] * fx;
+      gj[1][c] = gj[1][c] * fy;
     }
     const F cross = gj[0][1] + gj[1][0];
     const F g_ratio = gj[0][0] + gj[1][1];
     const F g_first = fma(x * x, gj[0][0], fma(xy, cross, y * y * gj[1][1]));
     const F g_inverse = -fma(x, gj[0][2], y * gj[1][2]);
-    // Of r: shared by ratio, first and inverse, whose derivatives by x and y are x and y times this.
-    const F radial = fma(g_ratio, t.first, fma(g_first, t.second, set1(-2.0F) * g_inverse * t.inverse * t.inverse));
-    out.p[0] = out.p[0] + fma(x, radial, fma(t.first, fma(two * x, gj[0][0], y * cross), -(t.inverse * gj[0][2])));
-    out.p[1] = out.p[1] + fma(y, radial, fma(t.first, fma(two * y, gj[1][1], x * cross), -(t.inverse * gj[1][2])));
     const F i2 = t.inverse * t.inverse;
-    out.p[2] = out.p[2] + fma(two * i2, fnma(z, g_inverse, g_first), -(t.inverse * g_ratio));
+    // Through r: the derivatives of ratio, first and inverse by x and y are x and y times those by r over r.
+    const F radial = fma(g_ratio, t.first, fma(g_first, t.second, -(two * g_inverse * i2)));
+    out[0] = out[0] + fma(x, radial, fma(t.first, fma(two * x, gj[0][0], y * cross), -(t.inverse * gj[0][2])));
+    out[1] = out[1] + fma(y, radial, fma(t.first, fma(two * y, gj[1][1], x * cross), -(t.inverse * gj[1][2])));
+    out[2] = out[2] + fma(two * i2, fnma(p[2], g_inverse, g_first), -(t.inverse * g_ratio));
   }
 }
 

@@ -7,6 +7,13 @@
 namespace splatbot::SPLATBOT_KERNELS {
 
 extern const Kernels kKernels;
-const Kernels kKernels = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), project, blend, blend_backward, project_backward};
+const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
+                          .project = project,
+                          .blend = blend,
+                          .blend_backward = blend_backward,
+                          .project_backward = project_backward,
+                          .harmonics = harmonics,
+                          .harmonics_backward = harmonics_backward,
+                          .contributions = contributions};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

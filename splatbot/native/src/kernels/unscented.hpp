@@ -4,7 +4,7 @@
 // fraction of a standard deviation apart, and what counts are second differences of their pixels.
 #pragma once
 
-#include "lens.hpp"
+#include "project.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -198,9 +198,9 @@ SB_INLINE Sight see_rolling(const View& view, const D (&p)[3]) {
     for (int i = 0; i < 3; ++i) {
       turned[i] = wide(0.0);
       for (int k = 0; k < 3; ++k) {
-        turned[i] += r[3 * i + k] * (p[k] - static_cast<double>(view.translation[k]));
+        turned[i] += r[3 * i + k] * (p[k] - lens.pivot[k]);
       }
-      q[i] = turned[i] + static_cast<double>(view.translation[i]) + s * lens.step[i];
+      q[i] = turned[i] + lens.pivot[i] + s * lens.step[i];
     }
     for (int i = 0; i < 3; ++i) {
       const int j = (i + 1) % 3, k = (i + 2) % 3;
@@ -283,52 +283,53 @@ SB_INLINE SigmaPoints sigma_points(const View& view, const GaussianLanes& g, con
 // centre's pixel + m and the covariance weight x sum e_i e_i^T + (beta - alpha^2) m m^T: the weights sum to one, so
 // the paper's large terms of opposite sign (-99 and 6 x 16.7 by default) cancel beforehand. A Gaussian of which a point
 // is not seen by the lens is left out (det 0).
-SB_INLINE void project_unscented(const GaussianLanes& g, const View& view, F eps2d, Projected& o) {
-  rotate_gaussian(g, CameraLanes(view), o);
-  alignas(64) float mx[W], my[W], c00[W], c01[W], c11[W], det[W];
-  alignas(64) float blur[W];
-  store(blur, eps2d);
+SB_INLINE void project_unscented(const GaussianLanes& g, const CameraLanes& cam, const View& view, F eps2d,
+                                 Projected& o) {
+  rotate_gaussian(g, cam, o);
+  alignas(64) float mx[W], my[W], s00[W], c01[W], s11[W], sharp[W], seen[W];
+  const double weight = view.lens.weight, excess = view.lens.excess;
   for (int half = 0; half < 2; ++half) {
     const SigmaPoints s = sigma_points(view, g, o, half);
-    D c[3];
-    const double excess = view.lens.excess;
-    const D eps = wide(static_cast<double>(blur[0]));
-    c[0] = excess * s.mean[0] * s.mean[0];
-    c[1] = excess * s.mean[0] * s.mean[1];
-    c[2] = excess * s.mean[1] * s.mean[1];
+    D c[3] = {excess * s.mean[0] * s.mean[0], excess * s.mean[0] * s.mean[1], excess * s.mean[1] * s.mean[1]};
     for (int k = 0; k < 3; ++k) {
       const Sight* const pair[2] = {&s.plus[k], &s.minus[k]};
       for (const Sight* point : pair) {
-        c[0] += view.lens.weight * point->u[0] * point->u[0];
-        c[1] += view.lens.weight * point->u[0] * point->u[1];
-        c[2] += view.lens.weight * point->u[1] * point->u[1];
+        c[0] += weight * point->u[0] * point->u[0];
+        c[1] += weight * point->u[0] * point->u[1];
+        c[2] += weight * point->u[1] * point->u[1];
       }
     }
     const D size = c[0] * c[2] - c[1] * c[1];
-    const D whole = d_select(size > 0.0, size, wide(0.0)) + eps * (c[0] + c[2] + eps);
     narrow(s.center.u[0] + s.mean[0], half, mx);
     narrow(s.center.u[1] + s.mean[1], half, my);
-    narrow(c[0] + eps, half, c00);
+    narrow(c[0], half, s00);
     narrow(c[1], half, c01);
-    narrow(c[2] + eps, half, c11);
-    narrow(d_select(s.seen, whole, wide(0.0)), half, det);
+    narrow(c[2], half, s11);
+    narrow(d_select(size > 0.0, size, wide(0.0)), half, sharp);
+    narrow(d_select(s.seen, wide(1.0), wide(0.0)), half, seen);
   }
   o.mx = load(mx);
   o.my = load(my);
-  o.c00 = load(c00);
+  o.s00 = load(s00);
   o.c01 = load(c01);
-  o.c11 = load(c11);
-  o.det = load(det);
+  o.s11 = load(s11);
+  o.det_sharp = load(sharp);
+  blur(eps2d, o);
+  o.det = zero_unless(load(seen) > set1(0.5F), o.det);
 }
 
+// Gradients in the camera frame: of the centre, of the Gaussian's axes (Projected::a), of its scales; `image` holds
+// those of its 2D mean, its depth, and of c00, twice c01 and c11.
+template <class ImageGradients>
 SB_INLINE void pull_back_unscented(const GaussianLanes& g, const View& view, const Projected& o,
-                                   const ImageGradient& image, CameraFrameGradient& out) {
+                                   const ImageGradients& image, F (&out_p)[3], F (&out_a)[9],
+                                   F (&out_scale)[3]) {
   const Lens& lens = view.lens;
   alignas(64) float to_p[3][W], to_a[9][W], to_scale[3][W];
   for (int half = 0; half < 2; ++half) {
     const SigmaPoints s = sigma_points(view, g, o, half);
     const D mean[2] = {widen(image.mx, half), widen(image.my, half)};
-    const D g00 = widen(image.c00, half), g01 = widen(image.c01, half), g11 = widen(image.c11, half);
+    const D g00 = widen(image.g00, half), g01 = widen(image.g01, half), g11 = widen(image.g11, half);
     // d loss / d e of a point at e: weight x (mean + 2 G (e + excess x m)).
     const auto of_point = [&](const Sight& point, D (&to)[3], D (&total)[2]) {
       const D e0 = point.u[0] + lens.excess * s.mean[0], e1 = point.u[1] + lens.excess * s.mean[1];
@@ -361,25 +362,21 @@ SB_INLINE void pull_back_unscented(const GaussianLanes& g, const View& view, con
     }
   }
   for (int c = 0; c < 3; ++c) {
-    out.p[c] = load(to_p[c]);
-    out.scale[c] = load(to_scale[c]);
+    out_p[c] = load(to_p[c]);
+    out_scale[c] = load(to_scale[c]);
   }
   for (int i = 0; i < 9; ++i) {
-    out.a[i] = load(to_a[i]);
+    out_a[i] = load(to_a[i]);
   }
 }
 
 template <Projection P>
-SB_INLINE void project_image(const GaussianLanes& g, const CameraLanes& cam, const View& view, F eps2d, Projected& o,
-                             Affine& lens) {
-  if constexpr (P == Projection::pinhole) {
-    project_rest(g, cam, eps2d, o);
-  } else if constexpr (P == Projection::unscented) {
-    project_unscented(g, view, eps2d, o);
+SB_INLINE void project_image(const GaussianLanes& g, const CameraLanes& cam, const View& view, F eps2d, bool of_covar,
+                             Projected& o, Affine& lens) {
+  if constexpr (P == Projection::unscented) {
+    project_unscented(g, cam, view, eps2d, o);
   } else {
-    rotate_gaussian(g, cam, o);
-    linearize<P>(cam, o, lens);
-    project_affine(g, lens, eps2d, o);
+    project_rest<P>(g, cam, eps2d, of_covar, o, lens);
   }
 }
 
