@@ -7,6 +7,7 @@
 #include <optional>
 #include <span>
 #include <string_view>
+#include <vector>
 
 #include "splatbot/lens.hpp"
 
@@ -84,6 +85,11 @@ std::optional<Fault> rasterize_forward(const Gaussians& gaussians, const View& v
                                        std::span<const float> background, const TileMask& mask,
                                        std::span<float> out_colors, std::span<float> out_alphas,
                                        RasterStatePtr& state);
+
+// The Gaussians that the view may see: those that rasterize_forward() would blend, hidden ones included. Their indices,
+// ascending, or the fault. Renders nothing; colours are not looked at.
+std::optional<Fault> find_visible(const Gaussians& gaussians, const View& view, const RasterOptions& options,
+                                  std::vector<std::uint32_t>& ids);
 
 // Where gradients go; an empty span is not computed. With `accumulate`, they are added to what is there.
 struct Gradients {

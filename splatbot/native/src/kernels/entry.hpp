@@ -13,5 +13,7 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t block);
 void harmonics(const HarmonicsArgs& args, std::size_t block);
 void harmonics_backward(const HarmonicsBackwardArgs& args, std::size_t block);
 void contributions(const ContributionArgs& args, std::size_t tile);
+void medians(const MedianArgs& args, std::size_t tile);
+void fronts(const FrontArgs& args, std::size_t tile);
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -14,6 +14,8 @@ const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
                           .project_backward = project_backward,
                           .harmonics = harmonics,
                           .harmonics_backward = harmonics_backward,
-                          .contributions = contributions};
+                          .contributions = contributions,
+                          .medians = medians,
+                          .fronts = fronts};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

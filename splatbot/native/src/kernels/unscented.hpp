@@ -6,6 +6,9 @@
 
 #include "project.hpp"
 
+// Long and called often: inlined everywhere, these would take the compiler minutes.
+#define SB_APART inline __attribute__((noinline))
+
 namespace splatbot::SPLATBOT_KERNELS {
 
 inline constexpr int kHalf = W / 2;
@@ -75,7 +78,7 @@ SB_INLINE void distort(const Lens& lens, D x, D y, D (&out)[2], D (&d)[2][2]) {
   d[1][1] = c + y * y * dc + 6.0 * p[0] * y + 2.0 * p[1] * x + y * py;
 }
 
-SB_INLINE Sight see_pinhole(const View& view, const D (&q)[3]) {
+SB_APART Sight see_pinhole(const View& view, const D (&q)[3]) {
   const Lens& lens = view.lens;
   const DMask before = (q[2] >= lens.nearest) & (q[2] > 0.0);
   const D iz = 1.0 / d_select(before, q[2], wide(1.0));
@@ -95,7 +98,7 @@ SB_INLINE Sight see_pinhole(const View& view, const D (&q)[3]) {
 }
 
 // OpenCV's fisheye: the angle t from the axis becomes t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
-SB_INLINE Sight see_fisheye(const View& view, const D (&q)[3]) {
+SB_APART Sight see_fisheye(const View& view, const D (&q)[3]) {
   const double* k = view.lens.radial;
   const D r2 = q[0] * q[0] + q[1] * q[1];
   const D d2 = r2 + q[2] * q[2];
@@ -121,7 +124,7 @@ SB_INLINE Sight see_fisheye(const View& view, const D (&q)[3]) {
   return sight;
 }
 
-SB_INLINE Sight see_ortho(const View& view, const D (&q)[3]) {
+SB_APART Sight see_ortho(const View& view, const D (&q)[3]) {
   Sight sight;
   sight.u[0] = static_cast<double>(view.fx) * q[0] + static_cast<double>(view.cx);
   sight.u[1] = static_cast<double>(view.fy) * q[1] + static_cast<double>(view.cy);
@@ -187,7 +190,7 @@ SB_INLINE void turn_by(const Lens& lens, D s, D (&r)[9]) {
 
 // Through a shutter that reads line after line: the pose is that of the time at which the pixel, which depends on the
 // pose, is read. Newton's method on the time; the derivative is that of the implicit function.
-SB_INLINE Sight see_rolling(const View& view, const D (&p)[3]) {
+SB_APART Sight see_rolling(const View& view, const D (&p)[3]) {
   constexpr int kSteps = 8;
   const Lens& lens = view.lens;
   const ShutterTime time(view);
@@ -245,7 +248,7 @@ struct SigmaPoints {
   DMask seen;
 };
 
-SB_INLINE SigmaPoints sigma_points(const View& view, const GaussianLanes& g, const Projected& o, int half) {
+SB_APART SigmaPoints sigma_points(const View& view, const GaussianLanes& g, const Projected& o, int half) {
   const Lens& lens = view.lens;
   const bool rolling = lens.shutter != Shutter::global;
   SigmaPoints s;
