@@ -67,7 +67,7 @@ class CameraSettings:
     radial_coeffs: Tensor | None = None
     tangential_coeffs: Tensor | None = None
     thin_prism_coeffs: Tensor | None = None
-    rolling_shutter: Any = RollingShutterType.GLOBAL
+    rolling_shutter: Any = None
     viewmats_rs: Tensor | None = None
     ut_params: Any = None
 
@@ -106,22 +106,30 @@ class CameraSettings:
 
 
 def shutter_of(value: Any) -> RollingShutterType:
-    """The shutter of that name; accepts gsplat's own enumeration.
+    """The shutter of that name, global if None; accepts gsplat's own enumeration.
 
     Raises:
         InputError: an unknown name.
     """
-    name = value if isinstance(value, str) else getattr(value, "name", None)
+    name = "GLOBAL" if value is None else value if isinstance(value, str) else getattr(value, "name", None)
     if name not in RollingShutterType.__members__:
         names = ", ".join(RollingShutterType.__members__)
         raise InputError(f"is {value!r}.", field="rolling_shutter", hint=f"one of {names}")
     return RollingShutterType[name]
 
 
-def lenses_of(settings: CameraSettings, viewmats: Tensor, near_plane: float) -> tuple[list[Any] | None, Tensor]:
-    """The native lens of each of C views, None for plain pinholes, and their poses (C, 4, 4).
+def lenses_of(
+    settings: CameraSettings, viewmats: Tensor, Ks: Tensor, near_plane: float
+) -> tuple[tuple[Any, ...] | None, Tensor]:
+    """The native lens of each view, None for plain pinholes, and the views' poses, of the shape of ``viewmats``.
 
     With a rolling shutter the pose returned is that half-way between the first and the last line, float64.
+
+    Args:
+        settings: of all views; tensors have the leading dimensions of ``viewmats``.
+        viewmats: (..., C, 4, 4) world to camera.
+        Ks: (..., C, 3, 3) [px].
+        near_plane: [m].
 
     Raises:
         InputError: options do not go together, or a shape or value does not fit.
@@ -129,40 +137,43 @@ def lenses_of(settings: CameraSettings, viewmats: Tensor, near_plane: float) -> 
     settings.check()
     if settings.plain:
         return None, viewmats
-    views = len(viewmats)
+    views = tuple(viewmats.shape[:-2])
     if not settings.with_ut:
-        return [native().Lens.affine(settings.model)] * views, viewmats
+        return (native().Lens.affine(settings.model),) * math.prod(views), viewmats
     params = UnscentedTransformParameters() if settings.ut_params is None else settings.ut_params
     sigma = UnscentedTransformParameters(params.alpha, params.beta, params.kappa).sigma()
     radial = _coefficients("radial_coeffs", settings.radial_coeffs, views, 4 if settings.model == "fisheye" else 6)
     tangential = _coefficients("tangential_coeffs", settings.tangential_coeffs, views, 2)
     thin_prism = _coefficients("thin_prism_coeffs", settings.thin_prism_coeffs, views, 4)
     limit = fisheye_limit if settings.model == "fisheye" else pinhole_limit
-    lenses = [
+    lenses = tuple(
         native().Lens.unscented(
             settings.model, [*k, *[0.0] * (6 - len(k))], p.tolist(), s.tolist(), limit(k), near_plane, list(sigma)
         )
         for k, p, s in zip(radial, tangential, thin_prism, strict=True)
-    ]
+    )
     if settings.viewmats_rs is None:
         return lenses, viewmats
+    for name, tensor in (("viewmats", viewmats), ("viewmats_rs", settings.viewmats_rs), ("Ks", Ks)):
+        if tensor.requires_grad:
+            hint = f"pass {name}.detach(), or a global shutter"
+            raise InputError("receives no gradient under a rolling shutter.", field=name, hint=hint)
     return _roll(lenses, settings, viewmats)
 
 
-def _roll(lenses: list[Any], settings: CameraSettings, viewmats: Tensor) -> tuple[list[Any], Tensor]:
+def _roll(lenses: tuple[Any, ...], settings: CameraSettings, viewmats: Tensor) -> tuple[tuple[Any, ...], Tensor]:
     last = settings.viewmats_rs
     if last is None or tuple(last.shape) != tuple(viewmats.shape) or not last.isfinite().all():
         raise InputError("does not fit viewmats.", field="viewmats_rs", hint="give finite poses of the same shape")
-    if viewmats.requires_grad or last.requires_grad:
-        raise InputError(
-            "receives no gradient under a rolling shutter.",
-            field="viewmats",
-            hint="pass viewmats.detach(), or a global shutter",
-        )
     shutter = shutter_of(settings.rolling_shutter).value
-    motions = [middle_pose(a, b) for a, b in zip(viewmats.double().numpy(), last.double().numpy(), strict=True)]
-    rolled = [lens.rolling(shutter, m.turn.tolist(), m.step.tolist(), m.middle[:3, 3].tolist()) for lens, m in zip(lenses, motions, strict=True)]
-    return rolled, torch.from_numpy(np.stack([m.middle for m in motions]))
+    firsts, lasts = (poses.reshape(-1, 4, 4).double().numpy() for poses in (viewmats, last))
+    motions = [middle_pose(a, b) for a, b in zip(firsts, lasts, strict=True)]
+    rolled = tuple(
+        lens.rolling(shutter, m.turn.tolist(), m.step.tolist(), m.middle[:3, 3].tolist())
+        for lens, m in zip(lenses, motions, strict=True)
+    )
+    middles = np.stack([m.middle for m in motions]) if motions else np.zeros((0, 4, 4))
+    return rolled, torch.from_numpy(middles).reshape(viewmats.shape)
 
 
 @dataclass(frozen=True)
@@ -215,12 +226,13 @@ def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     return float(real.min()) if len(real) else NO_LIMIT**2
 
 
-def _coefficients(name: str, given: Tensor | None, views: int, columns: int) -> NDArray[np.float64]:
+def _coefficients(name: str, given: Tensor | None, views: tuple[int, ...], columns: int) -> NDArray[np.float64]:
+    """Rows (V, columns) of all views."""
     if given is None:
-        return np.zeros((views, columns))
-    if tuple(given.shape) != (views, columns):
-        raise InputError(f"is {tuple(given.shape)}, expected ({views}, {columns}).", field=name)
-    values = given.detach().double().numpy()
+        return np.zeros((math.prod(views), columns))
+    if tuple(given.shape) != (*views, columns):
+        raise InputError(f"is {tuple(given.shape)}, expected {(*views, columns)}.", field=name)
+    values = given.detach().double().reshape(-1, columns).numpy()
     if not np.isfinite(values).all():
         raise InputError("is not finite.", field=name)
     return values

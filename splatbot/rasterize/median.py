@@ -16,23 +16,21 @@ def median_ids(states: tuple[Any, ...], height: int, width: int) -> Tensor:
     return ids
 
 
-def depth_of(ids: Tensor, means: Tensor, viewmats: Tensor) -> Tensor:
-    """Depths (C, H, W, 1) [m] of the Gaussians' centres, 0 where there is none; float32.
+def median_depth(ids: Tensor, means: Tensor, viewmats: Tensor) -> Tensor:
+    """Depths (V, H, W, 1) [m] of the Gaussians' centres, 0 where there is none; float32.
 
     Differentiable in means and poses: the choice of the Gaussian is taken as given.
 
     Args:
-        ids: (C, H, W), see :func:`median_ids`.
-        means: (N, 3), or (C, N, 3) [m], world frame.
-        viewmats: (C, 4, 4) world to camera.
+        ids: (V, H, W) of V = B C views, see :func:`median_ids`.
+        means: (B, N, 3) [m], world frame; of C views each.
+        viewmats: (V, 4, 4) world to camera.
     """
-    depths = []
+    cameras = len(ids) // max(len(means), 1)
+    images = []
     for i, view in enumerate(ids):
         found = view >= 0
-        points = means[i] if means.ndim == 3 else means
-        chosen = points.index_select(0, view[found].long()).double()
-        z = chosen @ viewmats[i, 2, :3].double() + viewmats[i, 2, 3].double()
-        depths.append(torch.zeros(view.shape, dtype=torch.float64).masked_scatter(found, z))
-    if not depths:
-        return torch.zeros(*ids.shape, 1)
-    return torch.stack(depths)[..., None].to(torch.float32)
+        points = means[i // cameras].index_select(0, view[found].long()).double()
+        z = points @ viewmats[i, 2, :3].double() + viewmats[i, 2, 3].double()
+        images.append(torch.zeros(view.shape, dtype=torch.float64).masked_scatter(found, z))
+    return torch.stack(images)[..., None].to(torch.float32) if images else torch.zeros(*ids.shape, 1)

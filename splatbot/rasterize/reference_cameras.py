@@ -12,6 +12,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from splatbot.errors import InputError
 from splatbot.rasterize.reference import Projector, ReferenceProjection, reference_rotations
 
 # Pixels (..., 2) of points (..., 3) of the camera frame; the intrinsics are (3, 3).
@@ -63,13 +64,21 @@ def affine_projector(camera: PointCamera) -> Projector:
     """EWA: the Gaussian's covariance through the derivative of the camera at its centre."""
 
     def project(
-        means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float
+        means: Tensor,
+        quats: Tensor | None,
+        scales: Tensor | None,
+        covars: Tensor | None,
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        eps2d: float,
     ) -> ReferenceProjection:
         p = _to_camera(means, viewmat)
         derivative = torch.func.vmap(torch.func.jacrev(lambda point: camera(point, K)))(p)
-        M = derivative @ viewmat[:3, :3] @ reference_rotations(quats) * scales[:, None, :]
-        covar2d = M @ M.mT + eps2d * torch.eye(2, dtype=means.dtype)
-        return ReferenceProjection(camera(p, K), covar2d, p[:, 2], torch.zeros_like(p[:, :2]))
+        J = derivative @ viewmat[:3, :3]
+        covar2d = J @ _covariances(quats, scales, covars) @ J.mT
+        return _projection(camera(p, K), covar2d, p[:, 2], eps2d)
 
     return project
 
@@ -94,8 +103,18 @@ def unscented_projector(
     """
 
     def project(
-        means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float
+        means: Tensor,
+        quats: Tensor | None,
+        scales: Tensor | None,
+        covars: Tensor | None,
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        eps2d: float,
     ) -> ReferenceProjection:
+        if quats is None or scales is None:
+            raise InputError("are missing.", field="quats, scales", hint="the unscented transform needs the axes")
         spread = alpha**2 * (3 + kappa)
         axes = (reference_rotations(quats) * scales[:, None, :]).mT * spread**0.5  # (N, 3 axes, 3)
         points = torch.cat([means[:, None], means[:, None] + axes, means[:, None] - axes], 1)
@@ -112,13 +131,29 @@ def unscented_projector(
             pixels, inside = _read(points, partial(camera, K=K), viewmat, last, LINES[shutter], width, height)
         mean2d = (weights[:, None] * pixels).sum(1)
         d = pixels - mean2d[:, None]
-        covar2d = torch.einsum("p,npi,npj->nij", covar_weights, d, d) + eps2d * torch.eye(2, dtype=means.dtype)
+        covar2d = torch.einsum("p,npi,npj->nij", covar_weights, d, d)
         depth = _to_camera(means, middle)[:, 2]
         if seen is not None:
             depth = torch.where(seen(inside).all(1), depth, -torch.ones_like(depth))
-        return ReferenceProjection(mean2d, covar2d, depth, torch.zeros_like(mean2d))
+        return _projection(mean2d, covar2d, depth, eps2d)
 
     return project
+
+
+def _covariances(quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -> Tensor:
+    """(N, 3, 3) [m²]; of given ones, the upper triangle counts."""
+    if covars is not None:
+        upper = covars.triu()
+        return upper + upper.triu(1).mT
+    if quats is None or scales is None:
+        raise InputError("are missing.", field="quats, scales", hint="give them, or covars")
+    M = reference_rotations(quats) * scales[:, None, :]
+    return M @ M.mT
+
+
+def _projection(mean2d: Tensor, sharp2d: Tensor, depth: Tensor, eps2d: float) -> ReferenceProjection:
+    covar2d = sharp2d + eps2d * torch.eye(2, dtype=mean2d.dtype)
+    return ReferenceProjection(mean2d, sharp2d, covar2d, depth, torch.zeros_like(mean2d))
 
 
 def _read(

@@ -106,7 +106,18 @@ def rasterize_tiles(
     _refuse(options, "masks")
     masks = _cells(at, width, height, tile_size)
     renders, alphas, meta = rasterization(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, masks=masks, tile_size=tile_size, **options
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        masks=masks,
+        tile_size=tile_size,
+        **options,
     )
     inside = torch.arange(tile_size)
     x = (at[..., 0, None] * tile_size + inside)[..., None, :]
@@ -209,7 +220,7 @@ def visible_gaussians(
         settings = CameraSettings(camera_model, **camera)
     except TypeError as error:
         raise InputError(f"are not all known ({error}).", field="options", hint="see rasterization") from error
-    lenses, poses = lenses_of(settings, inputs.viewmats, float(near_plane))
+    lenses, poses = lenses_of(settings, inputs.viewmats, inputs.Ks, float(near_plane))
     seen = torch.zeros(len(poses), len(means), dtype=torch.bool)
     for c in range(len(poses)):
         found = native().visible_gaussians(

@@ -287,6 +287,7 @@ void define_rasterize(nb::module_& m) {
   nb::class_<State>(m, "RasterState", "What a render leaves for its backward pass.")
       .def("describe", &describe, "Projections as a dict of arrays.")
       .def("contributions", &contributions, "In how many pixels (N,) each Gaussian counts.")
+      .def_prop_ro("n_visible", [](const State& state) { return splatbot::visible_ids(*state.state).size(); })
       .def("visible", &visible, "Indices (V,) of the Gaussians in view.")
       .def("tiles", &tiles, "Tile grid, pairs and bytes held.")
       .def("medians", &medians, "out"_a.noconvert(),

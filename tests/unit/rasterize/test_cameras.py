@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.geometry import se3_exp
+from splatbot.rasterize import rasterization
 from splatbot.rasterize.cameras import (
     RollingShutterType,
     UnscentedTransformParameters,
@@ -20,7 +21,7 @@ from splatbot.rasterize.cameras import (
     middle_pose,
     pinhole_limit,
 )
-from splatbot.rasterize.reference import Projector
+from splatbot.rasterize.reference import Projector, reference_rotations
 from splatbot.rasterize.reference_cameras import (
     LINES,
     affine_projector,
@@ -153,7 +154,7 @@ def test_a_rolling_shutter_equals_the_float64_reference(shutter: str) -> None:
     seen = partial(before_pinhole, 1e30)
     project = unscented_projector(pinhole_points, shutter=shutter, last=last[0].double(), seen=seen)
     options = {"with_ut": True, "rolling_shutter": shutter, "viewmats_rs": last}
-    assert_equal(scene, "RGB+ED", project, fixed=("viewmats",), **options)
+    assert_equal(scene, "RGB+ED", project, fixed=("viewmats", "Ks"), **options)
 
 
 def test_a_distorted_fisheye_with_a_rolling_shutter_equals_the_float64_reference() -> None:
@@ -168,7 +169,7 @@ def test_a_distorted_fisheye_with_a_rolling_shutter_equals_the_float64_reference
     )
     options = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
     options |= {"rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM, "viewmats_rs": last}
-    assert_equal(scene, "RGB", project, fixed=("viewmats",), **options)
+    assert_equal(scene, "RGB", project, fixed=("viewmats", "Ks"), **options)
 
 
 def test_a_rolling_shutter_that_does_not_move_is_a_global_one() -> None:
@@ -197,7 +198,7 @@ def tiny_gaussians(points: np.ndarray) -> Scene:
 
 def test_a_distorted_pinhole_puts_points_where_opencv_does() -> None:
     points = grid()
-    _, _, meta = tiny_gaussians(points).render("RGB", **distortion())
+    _, _, meta = tiny_gaussians(points).render("RGB", packed=False, **distortion())
     k1, k2, k3, k4, k5, k6, p1, p2, *s = PINHOLE
     K = np.array([[400.0, 0.0, 317.0], [0.0, 380.0, 245.0], [0.0, 0.0, 1.0]])
     want, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array([k1, k2, p1, p2, k3, k4, k5, k6, *s]))
@@ -210,7 +211,7 @@ def test_a_distorted_fisheye_puts_points_where_opencv_does() -> None:
     options = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
     scene = tiny_gaussians(points)
     scene.Ks[:, :2, :2] *= 0.6
-    _, _, meta = scene.render("RGB", **options)
+    _, _, meta = scene.render("RGB", packed=False, **options)
     K = scene.Ks[0].double().numpy()
     want, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, np.array(FISHEYE))
     assert len(meta["visible_ids"][0]) == len(points)
@@ -221,7 +222,7 @@ def test_the_affine_fisheye_puts_points_where_opencv_does() -> None:
     points = grid(widest=0.9)
     scene = tiny_gaussians(points)
     scene.Ks[:, :2, :2] *= 0.6
-    _, _, meta = scene.render("RGB", camera_model="fisheye")
+    _, _, meta = scene.render("RGB", packed=False, camera_model="fisheye")
     K = scene.Ks[0].double().numpy()
     want, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, np.zeros(4))
     assert float(np.abs(meta["means2d"][0].numpy() - want[:, 0]).max()) < 1e-3  # [px]
@@ -231,7 +232,7 @@ def test_the_unscented_transform_of_a_small_gaussian_is_the_affine_projection() 
     scene = hard_scene(8)
     scene.scales *= 0.01
     scene.means[:, :2] *= 0.5
-    want, got = (scene.render("RGB", **options)[2] for options in ({}, {"with_ut": True}))
+    want, got = (scene.render("RGB", packed=False, **options)[2] for options in ({}, {"with_ut": True}))
     ids = want["visible_ids"][0]
     assert torch.equal(got["visible_ids"][0], ids)
     assert float((got["means2d"] - want["means2d"]).abs().max()) < 5e-3  # [px]
@@ -289,6 +290,45 @@ def test_poses_that_ask_for_a_gradient_under_a_rolling_shutter_are_refused() -> 
     scene.viewmats.requires_grad_()
     with pytest.raises(InputError, match="no gradient"):
         scene.render(with_ut=True, rolling_shutter="ROLLING_LEFT_TO_RIGHT", viewmats_rs=scene.viewmats.detach())
+
+
+@pytest.mark.parametrize("model", ["ortho", "fisheye"])
+def test_covariances_antialiasing_and_harmonics_go_through_another_camera(model: str) -> None:
+    points = {"ortho": ortho_points, "fisheye": fisheye_points}[model]
+    scene = hard_scene(10, n=150, views=2)
+    scene.Ks[:, :2, :2] *= 0.45
+    scene.colors = 0.5 * torch.randn(150, 9, 3, generator=torch.Generator().manual_seed(0))
+    M = reference_rotations(scene.quats) * scene.scales[:, None]
+    scene.covars = (M @ M.mT).contiguous()
+    options = {"sh_degree": 2, "rasterize_mode": "antialiased"}
+    result = compare(
+        scene, "RGB", project=affine_projector(points), reference_extra=options, camera_model=model, **options
+    )
+    assert result.forward <= FORWARD_BOUND * 2
+    assert "covars" in result.gradients
+    assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
+
+
+def test_antialiasing_goes_through_the_unscented_transform() -> None:
+    scene = hard_scene(11, n=150)
+    extra = {"rasterize_mode": "antialiased"}
+    result = compare(scene, "RGB", project=distorted_pinhole(), reference_extra=extra, **distortion(), **extra)
+    assert result.forward <= FORWARD_BOUND * 2
+    assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
+
+
+def test_batches_of_scenes_go_through_cameras_of_their_own() -> None:
+    scenes = [hard_scene(seed, n=60, views=2) for seed in (12, 13)]
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+    together = {name: torch.stack([getattr(scene, name) for scene in scenes]) for name in names}
+    options = distortion(2)
+    options["radial_coeffs"] = options["radial_coeffs"] * torch.tensor([[1.0], [0.5]])
+    batched = {k: v if k == "with_ut" else torch.stack([v, 0.8 * v]) for k, v in options.items()}
+    image = rasterization(**together, width=75, height=53, **batched)[0]
+    for i, scene in enumerate(scenes):
+        scene.backgrounds = None
+        own = {k: v if k == "with_ut" else v[i] for k, v in batched.items()}
+        assert torch.equal(image[i], scene.render("RGB", **own)[0])
 
 
 def test_every_rolling_shutter_has_a_reference() -> None:

@@ -182,8 +182,10 @@ SB_INLINE void through_pinhole(const GaussianLanes& g, const CameraLanes& cam, c
   gsy = zero_unless(o.slope_free[1], gsy);
   const F gjx = fma(image.mx, o.p[0], r.jx);
   const F gjy = fma(image.my, o.p[1], r.jy);
-  out.intrinsics[0] = fma(gjx, iz, -(held_x * o.slope[0] / cam.fx));
-  out.intrinsics[1] = fma(gjy, iz, -(held_y * o.slope[1] / cam.fy));
+  // j x (a - slope a') has a derivative of a / z to the focal length where the slope is clamped: j x slope is constant.
+  const F clamped_x = dot3(o.a, r.rows[0]) / cam.fx, clamped_y = dot3(o.a + 3, r.rows[1]) / cam.fy;
+  out.intrinsics[0] = fma(image.mx * o.p[0], iz, select(o.slope_free[0], r.jx * iz, clamped_x));
+  out.intrinsics[1] = fma(image.my * o.p[1], iz, select(o.slope_free[1], r.jy * iz, clamped_y));
   out.intrinsics[2] = image.mx - held_x / cam.fx;
   out.intrinsics[3] = image.my - held_y / cam.fy;
   gp[0] = fma(image.mx, o.jx, gsx * iz);
