@@ -84,7 +84,8 @@ class Inputs:
 
     def detached(self) -> Inputs:
         """The same values outside the graph."""
-        return Inputs(self.layout, *(t if t is None else t.detach() for t in self.tensors()), masks=self.masks)  # type: ignore[arg-type]
+        tensors = (t if t is None else t.detach() for t in (*self.tensors(), self.masks))
+        return Inputs(self.layout, *tensors)  # type: ignore[arg-type]
 
 
 def check_inputs(

@@ -163,7 +163,7 @@ SB_INLINE void into_quat(const CameraLanes& cam, const Projected& o, const F (&g
 
 // Through a pinhole, to the centre and the axes in the camera frame.
 SB_INLINE void through_pinhole(const GaussianLanes& g, const CameraLanes& cam, const Projected& o,
-                               const ImageGradients& image, bool of_covar, F (&gp)[3], F (&ga)[9],
+                               const ImageGradients& image, bool of_covar, bool camera, F (&gp)[3], F (&ga)[9],
                                LaneGradients& out) {
   const RowGradients r = of_covar ? into_covar(o, image, out) : into_axes(g, o, image, out);
   F gsx = set1(0.0F), gsy = set1(0.0F);
@@ -182,12 +182,15 @@ SB_INLINE void through_pinhole(const GaussianLanes& g, const CameraLanes& cam, c
   gsy = zero_unless(o.slope_free[1], gsy);
   const F gjx = fma(image.mx, o.p[0], r.jx);
   const F gjy = fma(image.my, o.p[1], r.jy);
-  // j x (a - slope a') has a derivative of a / z to the focal length where the slope is clamped: j x slope is constant.
-  const F clamped_x = dot3(o.a, r.rows[0]) / cam.fx, clamped_y = dot3(o.a + 3, r.rows[1]) / cam.fy;
-  out.intrinsics[0] = fma(image.mx * o.p[0], iz, select(o.slope_free[0], r.jx * iz, clamped_x));
-  out.intrinsics[1] = fma(image.my * o.p[1], iz, select(o.slope_free[1], r.jy * iz, clamped_y));
-  out.intrinsics[2] = image.mx - held_x / cam.fx;
-  out.intrinsics[3] = image.my - held_y / cam.fy;
+  if (camera) {
+    // j x (a - slope a') has a derivative of a / z to the focal length where the slope is clamped: j x slope is
+    // constant then.
+    const F clamped_x = dot3(o.a, r.rows[0]) / cam.fx, clamped_y = dot3(o.a + 3, r.rows[1]) / cam.fy;
+    out.intrinsics[0] = fma(image.mx * o.p[0], iz, select(o.slope_free[0], r.jx * iz, clamped_x));
+    out.intrinsics[1] = fma(image.my * o.p[1], iz, select(o.slope_free[1], r.jy * iz, clamped_y));
+    out.intrinsics[2] = image.mx - held_x / cam.fx;
+    out.intrinsics[3] = image.my - held_y / cam.fy;
+  }
   gp[0] = fma(image.mx, o.jx, gsx * iz);
   gp[1] = fma(image.my, o.jy, gsy * iz);
   const F along = fma(gjx, o.jx, fma(gjy, o.jy, fma(gsx, o.slope[0], gsy * o.slope[1])));
@@ -221,20 +224,24 @@ SB_INLINE void into_intrinsics(const CameraLanes& cam, const Projected& o, const
   out.intrinsics[3] = image.my;
 }
 
-// Gradient of the 2D mean and covariance into the Gaussian and the camera.
+// Gradient of the 2D mean and covariance into the Gaussian and the camera; into the latter and the quaternion only if
+// wanted.
 template <Projection P>
 void pull_back(const GaussianLanes& g, const CameraLanes& cam, const View& view, const Projected& o,
-               const Affine& lens, const ImageGradients& image, bool of_covar, LaneGradients& out) {
+               const Affine& lens, const ImageGradients& image, bool of_covar, bool camera, bool quat,
+               LaneGradients& out) {
   F gp[3], ga[9];
   if constexpr (P == Projection::pinhole) {
-    through_pinhole(g, cam, o, image, of_covar, gp, ga, out);
+    through_pinhole(g, cam, o, image, of_covar, camera, gp, ga, out);
   } else {
     if constexpr (P == Projection::unscented) {
       pull_back_unscented(g, view, o, image, gp, ga, out.scale);
     } else {
       through_affine<P>(g, cam, o, lens, image, of_covar, gp, ga, out);
     }
-    into_intrinsics(cam, o, image, out);
+    if (camera) {
+      into_intrinsics(cam, o, image, out);
+    }
   }
   out.mean2d[0] = image.mx;
   out.mean2d[1] = image.my;
@@ -242,14 +249,14 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const View& view,
   for (int i = 0; i < 3; ++i) {
     out.mean[i] = fma(cam.r[i], gp[0], fma(cam.r[3 + i], gp[1], cam.r[6 + i] * gp[2]));
     out.translation[i] = gp[i];
-    for (int j = 0; j < 3; ++j) {  // a = camera rotation x Gaussian rotation, or the former alone
+    for (int j = 0; camera && j < 3; ++j) {  // a = camera rotation x Gaussian rotation, or the former alone
       const F turned = of_covar ? ga[3 * i + j]
                                 : fma(ga[3 * i], o.rotation[3 * j],
                                       fma(ga[3 * i + 1], o.rotation[3 * j + 1], ga[3 * i + 2] * o.rotation[3 * j + 2]));
       out.rotation[3 * i + j] = fma(gp[i], g.mean[j], turned);
     }
   }
-  if (!of_covar) {
+  if (quat) {
     into_quat(cam, o, ga, out);
   }
 }
@@ -430,7 +437,7 @@ void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
     const int n = block.visible - at < W ? static_cast<int>(block.visible - at) : W;
     LaneSums sums;
     collect(args, block, ids, n, sums);
-    if (!args.last) {
+    if (!args.last || !args.geometry) {
       continue;
     }
     GaussianLanes g;
@@ -449,7 +456,8 @@ void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
     const Root root = root_of_inverse(o);
     LaneGradients grads;
     const ImageGradients image = from_sums(sums, root, o, args.forward.options.antialiased);
-    pull_back<P>(g, cam, args.forward.view, o, lens, image, of_covar, grads);
+    pull_back<P>(g, cam, args.forward.view, o, lens, image, of_covar, args.camera != nullptr, args.quats != nullptr,
+                 grads);
     write_gradients(args, ids, n, grads, sums, root);
     if (args.camera != nullptr) {
       add_camera(grads, n, camera_sums);
