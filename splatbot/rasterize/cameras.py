@@ -112,7 +112,7 @@ def shutter_of(value: Any) -> RollingShutterType:
         InputError: an unknown name.
     """
     name = "GLOBAL" if value is None else value if isinstance(value, str) else getattr(value, "name", None)
-    if name not in RollingShutterType.__members__:
+    if not isinstance(name, str) or name not in RollingShutterType.__members__:
         names = ", ".join(RollingShutterType.__members__)
         raise InputError(f"is {value!r}.", field="rolling_shutter", hint=f"one of {names}")
     return RollingShutterType[name]

@@ -7,7 +7,6 @@ as they stand, and the time of a rolling shutter is found by repetition.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -128,7 +127,7 @@ def unscented_projector(
             pixels = camera(inside, K)
         else:
             middle = _pose_between(viewmat, last, torch.tensor(0.5, dtype=means.dtype))
-            pixels, inside = _read(points, partial(camera, K=K), viewmat, last, LINES[shutter], width, height)
+            pixels, inside = _read(points, lambda p: camera(p, K), viewmat, last, LINES[shutter], width, height)
         mean2d = (weights[:, None] * pixels).sum(1)
         d = pixels - mean2d[:, None]
         covar2d = torch.einsum("p,npi,npj->nij", covar_weights, d, d)

@@ -120,7 +120,7 @@ def test_beyond_the_range_of_its_distortion_a_lens_sees_nothing() -> None:
     scene.means = 2.0 * torch.stack([tangent, torch.zeros(200), torch.ones(200)], -1)
     scene.scales = torch.tensor([0.05, 0.02, 0.002]).repeat(200, 1)
     scene.Ks = torch.tensor([[[40.0, 0.0, 20.0], [0.0, 40.0, 26.0], [0.0, 0.0, 1.0]]])
-    options = {"with_ut": True, "radial_coeffs": torch.tensor([radial])}
+    options: dict[str, Any] = {"with_ut": True, "radial_coeffs": torch.tensor([radial])}
     visible = scene.render("RGB", **options)[2]["visibility"][0]
     assert not bool(visible[tangent > limit].any())
     assert bool(visible[(tangent < 0.99 * limit) & (scene.opacities > 0.01)].all())
@@ -142,7 +142,7 @@ def test_a_rolling_shutter_on_a_camera_that_turns_by_twenty_degrees() -> None:
     last = torch.from_numpy(se3_exp([0.2, -0.1, 0.1, 0.2, 0.25, 0.1])).float() @ scene.viewmats
     shutter = "ROLLING_TOP_TO_BOTTOM"
     project = unscented_projector(pinhole_points, shutter=shutter, last=last[0].double(), seen=before)
-    options = {"with_ut": True, "rolling_shutter": shutter, "viewmats_rs": last}
+    options: dict[str, Any] = {"with_ut": True, "rolling_shutter": shutter, "viewmats_rs": last}
     result = compare(scene, "RGB", project=project, fixed=("viewmats", "Ks"), **options)
     assert result.forward <= FORWARD_BOUND
     assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients

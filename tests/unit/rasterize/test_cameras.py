@@ -122,7 +122,7 @@ def test_the_unscented_transform_of_a_distorted_fisheye_equals_the_float64_refer
         partial(fisheye_points, coefficients=exact),
         seen=lambda p: torch.atan2(p[..., :2].norm(dim=-1), p[..., 2]) < limit,
     )
-    options = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
+    options: dict[str, Any] = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
     assert_equal(wide_scene(0), mode, project, **options)
 
 
@@ -153,7 +153,7 @@ def test_a_rolling_shutter_equals_the_float64_reference(shutter: str) -> None:
     last = second_pose(scene.viewmats)
     seen = partial(before_pinhole, 1e30)
     project = unscented_projector(pinhole_points, shutter=shutter, last=last[0].double(), seen=seen)
-    options = {"with_ut": True, "rolling_shutter": shutter, "viewmats_rs": last}
+    options: dict[str, Any] = {"with_ut": True, "rolling_shutter": shutter, "viewmats_rs": last}
     assert_equal(scene, "RGB+ED", project, fixed=("viewmats", "Ks"), **options)
 
 
@@ -167,7 +167,7 @@ def test_a_distorted_fisheye_with_a_rolling_shutter_equals_the_float64_reference
         last=last[0].double(),
         seen=lambda p: torch.atan2(p[..., :2].norm(dim=-1), p[..., 2]) < fisheye_limit(exact.numpy()),
     )
-    options = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
+    options: dict[str, Any] = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
     options |= {"rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM, "viewmats_rs": last}
     assert_equal(scene, "RGB", project, fixed=("viewmats", "Ks"), **options)
 
@@ -175,7 +175,7 @@ def test_a_distorted_fisheye_with_a_rolling_shutter_equals_the_float64_reference
 def test_a_rolling_shutter_that_does_not_move_is_a_global_one() -> None:
     scene = hard_scene(7)
     want = scene.render("RGB", with_ut=True)[0]
-    options = {"rolling_shutter": "ROLLING_TOP_TO_BOTTOM", "viewmats_rs": scene.viewmats}
+    options: dict[str, Any] = {"rolling_shutter": "ROLLING_TOP_TO_BOTTOM", "viewmats_rs": scene.viewmats}
     assert float((scene.render("RGB", with_ut=True, **options)[0] - want).abs().max()) <= FORWARD_BOUND
 
 
@@ -208,7 +208,7 @@ def test_a_distorted_pinhole_puts_points_where_opencv_does() -> None:
 
 def test_a_distorted_fisheye_puts_points_where_opencv_does() -> None:
     points = grid(widest=0.9)
-    options = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
+    options: dict[str, Any] = {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": torch.tensor([FISHEYE])}
     scene = tiny_gaussians(points)
     scene.Ks[:, :2, :2] *= 0.6
     _, _, meta = scene.render("RGB", packed=False, **options)
@@ -300,7 +300,7 @@ def test_covariances_antialiasing_and_harmonics_go_through_another_camera(model:
     scene.colors = 0.5 * torch.randn(150, 9, 3, generator=torch.Generator().manual_seed(0))
     M = reference_rotations(scene.quats) * scene.scales[:, None]
     scene.covars = (M @ M.mT).contiguous()
-    options = {"sh_degree": 2, "rasterize_mode": "antialiased"}
+    options: dict[str, Any] = {"sh_degree": 2, "rasterize_mode": "antialiased"}
     result = compare(
         scene, "RGB", project=affine_projector(points), reference_extra=options, camera_model=model, **options
     )
@@ -311,7 +311,7 @@ def test_covariances_antialiasing_and_harmonics_go_through_another_camera(model:
 
 def test_antialiasing_goes_through_the_unscented_transform() -> None:
     scene = hard_scene(11, n=150)
-    extra = {"rasterize_mode": "antialiased"}
+    extra: dict[str, Any] = {"rasterize_mode": "antialiased"}
     result = compare(scene, "RGB", project=distorted_pinhole(), reference_extra=extra, **distortion(), **extra)
     assert result.forward <= FORWARD_BOUND * 2
     assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
@@ -320,10 +320,10 @@ def test_antialiasing_goes_through_the_unscented_transform() -> None:
 def test_batches_of_scenes_go_through_cameras_of_their_own() -> None:
     scenes = [hard_scene(seed, n=60, views=2) for seed in (12, 13)]
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
-    together = {name: torch.stack([getattr(scene, name) for scene in scenes]) for name in names}
+    together: dict[str, Any] = {name: torch.stack([getattr(scene, name) for scene in scenes]) for name in names}
     options = distortion(2)
     options["radial_coeffs"] = options["radial_coeffs"] * torch.tensor([[1.0], [0.5]])
-    batched = {k: v if k == "with_ut" else torch.stack([v, 0.8 * v]) for k, v in options.items()}
+    batched: dict[str, Any] = {k: v if k == "with_ut" else torch.stack([v, 0.8 * v]) for k, v in options.items()}
     image = rasterization(**together, width=75, height=53, **batched)[0]
     for i, scene in enumerate(scenes):
         scene.backgrounds = None
