@@ -36,7 +36,7 @@ def exact_median(scene: Scene) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_median_depth_is_that_of_the_gaussian_that_takes_transmittance_to_one_half(seed: int) -> None:
-    scene = hard_scene(seed, n=150, views=2)
+    scene = hard_scene(seed, n=60, views=2)
     want, margin = exact_median(scene)
     image, _, meta = scene.render("RGB+MD")
     assert torch.equal(image[..., :3], scene.render("RGB")[0])
@@ -93,10 +93,10 @@ def test_median_depth_over_planes_is_refused() -> None:
 
 
 def test_normals_are_blended_shortest_axes_in_the_world_frame_that_face_the_camera() -> None:
-    scene = hard_scene(5, n=150, views=2)
+    scene = hard_scene(5, n=60, views=2)
     exact = scene.to(torch.float64)
     axes = reference_rotations(exact.quats)
-    shortest = axes[torch.arange(150), :, scene.scales.argmin(-1)]
+    shortest = axes[torch.arange(60), :, scene.scales.argmin(-1)]
     centers = -torch.linalg.solve(exact.viewmats[:, :3, :3], exact.viewmats[:, :3, 3:])[..., 0]
     away = ((exact.means - centers[:, None]) * shortest).sum(-1, keepdim=True) > 0
     want = torch.einsum("chwn,cnj->chwj", exact_weights(scene), torch.where(away, -shortest, shortest))
@@ -106,12 +106,12 @@ def test_normals_are_blended_shortest_axes_in_the_world_frame_that_face_the_came
 
 
 def test_the_gradient_of_normals_equals_the_float64_reference() -> None:
-    scene = hard_scene(6, n=150)
+    scene = hard_scene(6, n=60)
     normals = facing_axes(scene.means, scene.quats, scene.scales, scene.viewmats)
-    flipped = (normals[0] * reference_rotations(scene.quats)[torch.arange(150), :, scene.scales.argmin(-1)]).sum(-1)
+    flipped = (normals[0] * reference_rotations(scene.quats)[torch.arange(60), :, scene.scales.argmin(-1)]).sum(-1)
     weight = torch.randn(1, 53, 75, 3, generator=torch.Generator().manual_seed(0))
     exact = scene.to(torch.float64, requires_grad=True)
-    shortest = reference_rotations(exact.quats)[torch.arange(150), :, scene.scales.argmin(-1)]
+    shortest = reference_rotations(exact.quats)[torch.arange(60), :, scene.scales.argmin(-1)]
     exact.colors, exact.backgrounds = shortest * flipped.sign().double()[:, None], None
     image, _, meta = exact.reference_leaves("RGB")
     safe = (meta.margins > 2e-5)[..., None]
