@@ -21,6 +21,7 @@ from splatbot.rasterize.cameras import (
     middle_pose,
     pinhole_limit,
 )
+from splatbot.rasterize.native import native
 from splatbot.rasterize.reference import Projector, reference_rotations
 from splatbot.rasterize.reference_cameras import (
     LINES,
@@ -329,6 +330,19 @@ def test_batches_of_scenes_go_through_cameras_of_their_own() -> None:
         scene.backgrounds = None
         own = {k: v if k == "with_ut" else v[i] for k, v in batched.items()}
         assert torch.equal(image[i], scene.render("RGB", **own)[0])
+
+
+@pytest.mark.parametrize("isa", native().available_isas())
+@pytest.mark.parametrize("model", ["affine fisheye", "unscented pinhole"])
+def test_every_instruction_set_equals_the_reference_through_other_cameras(model: str, isa: str) -> None:
+    native().set_isa(isa)
+    try:
+        if model == "affine fisheye":
+            assert_equal(wide_scene(14), "RGB", affine_projector(fisheye_points), camera_model="fisheye")
+        else:
+            assert_equal(hard_scene(14), "RGB", distorted_pinhole(), **distortion())
+    finally:
+        native().set_isa("")
 
 
 def test_every_rolling_shutter_has_a_reference() -> None:
