@@ -2,7 +2,25 @@
 
 from __future__ import annotations
 
+from splatbot.rasterize.cameras import RollingShutterType, UnscentedTransformParameters
 from splatbot.rasterize.rasterization import rasterization
 from splatbot.rasterize.reference import rasterization_reference
+from splatbot.rasterize.sparse import (
+    Contributors,
+    contributing_gaussians,
+    rasterize_pixels,
+    rasterize_tiles,
+    visible_gaussians,
+)
 
-__all__ = ["rasterization", "rasterization_reference"]
+__all__ = [
+    "Contributors",
+    "RollingShutterType",
+    "UnscentedTransformParameters",
+    "contributing_gaussians",
+    "rasterization",
+    "rasterization_reference",
+    "rasterize_pixels",
+    "rasterize_tiles",
+    "visible_gaussians",
+]

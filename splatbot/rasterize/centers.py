@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from splatbot.errors import InputError
 from splatbot.rasterize.inputs import Inputs, Layout
 
 
@@ -26,12 +27,14 @@ class Centers:
         layout: of the render's inputs.
         states: of the views' passes, in packed layout; None: not packed.
         absgrad: whether absolute gradients are to be found.
+        pinhole: whether the views are plain pinholes; only then may a loss be put on the tensor itself.
     """
 
-    def __init__(self, layout: Layout, states: tuple[Any, ...] | None, *, absgrad: bool) -> None:
+    def __init__(self, layout: Layout, states: tuple[Any, ...] | None, *, absgrad: bool, pinhole: bool) -> None:
         self.layout = layout
         self._states = states
         self.absgrad = absgrad
+        self._pinhole = pinhole
         self.exposed = False  # whether somebody holds the tensor and may want its gradient
         self._tensor: weakref.ref[Tensor] | None = None
         self._rendered: tuple[int, Tensor] | None = None  # graph task, gradient from the rasterizing node
@@ -84,6 +87,8 @@ class Centers:
 
     def project(self, means: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
         """Pinhole projection [px] of the rows of the tensor, in float64."""
+        if not self._pinhole:
+            raise InputError("takes no loss of its own here.", field="means2d", hint="only of plain pinhole cameras")
         layout = self.layout
         lead = (layout.n_batches, layout.n_cameras)
         T = viewmats.reshape(*lead, 4, 4).double()

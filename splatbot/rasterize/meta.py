@@ -41,6 +41,8 @@ class RenderMeta(MutableMapping[str, Any]):
       flatten_ids, isect_offsets (..., C, tile_height, tile_width): see :mod:`splatbot.rasterize.intersections`.
     - visibility (..., C, N) bool: in view; contributions (..., C, N) int32: in how many pixels the Gaussian counts;
       visible_ids: a list of index tensors, one per view. Never packed.
+    - normals (..., C, H, W, 3), with ``return_normals``: in the graph. median_ids (..., C, H, W) int32, with median
+      depth: the Gaussian it is of, -1 where there is none.
     - n_isects, state_bytes: lists over the views, of the kernels' own (Gaussian, tile) pairs and memory.
     - width, height, n_batches, n_cameras.
 
@@ -64,6 +66,11 @@ class RenderMeta(MutableMapping[str, Any]):
         self._means2d: Tensor | None = means2d
         self._known: dict[str, Any] = self._plain()
         self._to_find = dict(_FINDERS)
+
+    @property
+    def states(self) -> tuple[Any, ...]:
+        """What the native pass of each view left."""
+        return self._states
 
     def __getitem__(self, key: str) -> Any:
         if key not in self._known:

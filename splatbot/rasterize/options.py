@@ -16,26 +16,20 @@ _MODES = {
     "ED": (False, "expected"),
     "RGB+D": (True, "accumulated"),
     "RGB+ED": (True, "expected"),
+    "MD": (False, "accumulated"),  # median depth is found afterwards; something must be blended
+    "RGB+MD": (True, "none"),
 }
 
 # gsplat's options that this rasterizer does not have, with the value that asks for nothing.
 _ABSENT: dict[str, Any] = {
     "distributed": False,
     "segmented": False,
-    "with_ut": False,
     "with_eval3d": False,
-    "return_normals": False,
     "global_z_order": True,
     "rays": None,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
     "ftheta_coeffs": None,
     "lidar_coeffs": None,
     "external_distortion_coeffs": None,
-    "rolling_shutter": None,
-    "viewmats_rs": None,
-    "ut_params": None,
     "extra_signals": None,
     "extra_signals_sh_degree": None,
     "renderer_config": None,
@@ -60,6 +54,7 @@ class Options:
     tile_size: int
     sparse_grad: bool
     absgrad: bool
+    lenses: tuple[Any, ...] | None = None  # native, of every view; None: plain pinholes
 
 
 def parse_mode(render_mode: str) -> tuple[bool, str]:
@@ -89,6 +84,5 @@ def refuse_absent(absent: dict[str, Any]) -> None:
         if name not in _ABSENT:
             raise InputError("is no option of rasterization().", field=name, hint="see its signature")
         nothing = _ABSENT[name]
-        is_global_shutter = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
-        if value is not None and value != nothing and not is_global_shutter:
+        if value is not None and value != nothing:
             raise InputError("is not supported.", field=name, hint="leave it out")

@@ -74,6 +74,7 @@ def run_forward(inputs: Inputs, options: Options) -> Rendered:
                 options.tile_size,
                 layout.view(renders, b, c),
                 layout.view(alphas, b, c)[..., 0],
+                None if options.lenses is None else options.lenses[b * layout.n_cameras + c],
             )
             if isinstance(state, tuple):
                 field, row = state

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.rasterize.autograd import attach
+from splatbot.rasterize.cameras import (
+    CameraModel,
+    CameraSettings,
+    RollingShutterType,
+    UnscentedTransformParameters,
+    lenses_of,
+)
 from splatbot.rasterize.centers import Centers
 from splatbot.rasterize.gsplat_backend import rasterization_gsplat
 from splatbot.rasterize.inputs import Inputs, check_inputs
+from splatbot.rasterize.median import median_depth, median_ids
 from splatbot.rasterize.meta import RenderMeta
+from splatbot.rasterize.normals import facing_axes
 from splatbot.rasterize.options import DEFAULT_TILE_SIZE, Options, check_choice, parse_mode, refuse_absent
 from splatbot.rasterize.passes import run_forward
 
@@ -42,12 +53,20 @@ def rasterization(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     channel_chunk: int = 32,
     distributed: bool = False,
-    camera_model: Literal["pinhole"] = "pinhole",
+    camera_model: CameraModel = "pinhole",
     segmented: bool = False,
     covars: Tensor | None = None,
     *,
     masks: Tensor | None = None,
     depth_mode: DepthMode = "center",
+    with_ut: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    rolling_shutter: RollingShutterType | str | None = None,
+    viewmats_rs: Tensor | None = None,
+    ut_params: UnscentedTransformParameters | None = None,
+    return_normals: bool = False,
     backend: Literal["native", "gsplat"] = "native",
     **absent: Any,
 ) -> tuple[Tensor, Tensor, RenderMeta]:
@@ -84,7 +103,9 @@ def rasterization(
         tile_size: side of the square tiles of ``masks`` and meta [px], 16 by default; no effect on the images.
         backgrounds: (..., C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
         render_mode: RGB; D: depth summed with the blend weights [m]; ED: that, divided by the sum of weights; RGB+D
-            and RGB+ED append it as the last channel.
+            and RGB+ED append it as the last channel. MD, RGB+MD: median depth, that of the centre of the Gaussian at
+            which transmittance falls to 1/2 or below, 0 where it stays above; its gradient goes to that Gaussian's
+            depth, the choice being taken as given.
         sparse_grad: gradients to means, quats, scales and covars as sparse COO tensors of the rows in view; packed
             and without batch dimensions only.
         absgrad: ``meta["means2d"].absgrad`` after backward: the sums over pixels of the absolute values of the
@@ -93,7 +114,10 @@ def rasterization(
             projected covariance Σ (Yu et al. 2024).
         channel_chunk: has no effect on the result; accepted for gsplat's sake.
         distributed: False.
-        camera_model: "pinhole".
+        camera_model: "pinhole"; "ortho": u = fx x + cx, with fx, fy in [px/m]; "fisheye": equidistant, a point's
+            distance from the principal point is f times its angle from the axis. Each is linearized at the Gaussian's
+            centre (EWA); the pinhole's slopes are clamped 0.3 half-images beyond the edge. In all of them depth is
+            z, and what is nearer than ``near_plane`` or behind the camera is not seen.
         segmented: has no effect on the result; accepted for gsplat's sake.
         covars: (..., N, 3, 3) [m²] in place of quats and scales; the upper triangle counts, and receives the gradient.
         masks: (..., C, tile_height, tile_width) bool; tiles that are False show the background alone and give no
@@ -101,7 +125,25 @@ def rasterization(
         depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat); "plane" lets it vary over the
             footprint as that of the plane through the centre and normal to the Gaussian's shortest axis, faded out as
             the shortest axis nears the middle one and bounded where the plane is seen edge-on. Its gradient takes
-            the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them.
+            the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them. "plane" is for
+            the linearized pinhole, and not for median depth.
+        with_ut: project by the unscented transform (Wu et al. 2024, 3DGUT): exact at seven sigma points, so that
+            distortion and rolling shutter are possible; slower. What is drawn is still an ellipse: ``with_eval3d`` is
+            refused. Needs quats and scales. A Gaussian of which a sigma point is nearer to a pinhole than
+            ``near_plane``, or where the distortion no longer grows, is left out.
+        radial_coeffs: OpenCV's (..., C, 6) k1..k6 of a pinhole or (..., C, 4) k1..k4 of a fisheye; needs ``with_ut``,
+            as do all that follow.
+        tangential_coeffs: (..., C, 2) p1, p2 of a pinhole.
+        thin_prism_coeffs: (..., C, 4) s1..s4 of a pinhole.
+        rolling_shutter: order in which lines are read; the poses are then ``viewmats`` at the first line's centre and
+            ``viewmats_rs`` at the last's, in between rotation turns evenly and translation is linear. A point is seen
+            when its own, unrounded, line is read (gsplat rounds the line down). Depth is that half-way. Poses and
+            Ks receive no gradient and are refused if they ask for one.
+        viewmats_rs: (..., C, 4, 4), see there.
+        ut_params: spread of the sigma points.
+        return_normals: ``meta["normals"]`` (..., C, H, W, 3): the Gaussians' shortest axes, unit vectors in the world
+            frame turned towards the camera, summed with the blend weights. Their gradient reaches quats and, through
+            the weights, all else. A pass of its own.
         backend: "gsplat" hands the call to gsplat.rasterization, for tensors on a CUDA device.
         absent: gsplat's other options, as long as they ask for nothing.
 
@@ -140,13 +182,64 @@ def rasterization(
     )
     if options.sparse_grad and inputs.layout.batch:
         raise InputError("is set beside batch dimensions.", field="sparse_grad", hint="render one scene at a time")
-    return _render(inputs, options)
+    settings = CameraSettings(camera_model, *(arguments[name] for name in _CAMERA))
+    lenses, poses = lenses_of(settings, inputs.viewmats, inputs.Ks, options.near_plane)
+    _check_camera_goes_with(settings, covars, depth_mode)
+    inputs, options = replace(inputs, viewmats=poses), replace(options, lenses=lenses)
+    renders, alphas, meta = _render(inputs, options)
+    if render_mode.endswith("MD"):
+        renders = _with_median(inputs, options, renders if wants_color else None, meta)
+    if return_normals:
+        meta["normals"] = _render_normals(inputs, options, parallel=camera_model == "ortho")
+    return renders, alphas, meta
+
+
+# Arguments of CameraSettings after the model, and what asks for nothing.
+_CAMERA = {
+    "with_ut": False,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+    "ut_params": None,
+}
+
+
+def _check_camera_goes_with(settings: CameraSettings, covars: Tensor | None, depth_mode: str) -> None:
+    if not settings.plain and depth_mode == "plane":
+        raise InputError("'plane' needs a linearized pinhole.", field="depth_mode", hint="use 'center'")
+    if settings.with_ut and covars is not None:
+        raise InputError("have no axes for the unscented transform.", field="covars", hint="give quats and scales")
+
+
+def _with_median(inputs: Inputs, options: Options, colors: Tensor | None, meta: RenderMeta) -> Tensor:
+    layout = inputs.layout
+    ids = median_ids(meta.states, options.height, options.width)
+    means = inputs.means.reshape(layout.n_batches, layout.n_gaussians, 3)
+    depth = median_depth(ids, means, inputs.viewmats.reshape(-1, 4, 4)).reshape(*layout.views, *ids.shape[1:], 1)
+    meta["median_ids"] = ids.reshape(*layout.views, *ids.shape[1:])
+    return depth if colors is None else torch.cat([colors, depth], -1)
+
+
+def _render_normals(inputs: Inputs, options: Options, *, parallel: bool) -> Tensor:
+    if inputs.quats is None or inputs.scales is None:
+        raise InputError("have no axes to be normals.", field="covars", hint="give quats and scales")
+    layout = inputs.layout
+    parts = (inputs.means, inputs.quats, inputs.scales, inputs.viewmats)
+    scenes = [facing_axes(*(layout.scene(t, b) for t in parts), parallel=parallel) for b in range(layout.n_batches)]
+    normals = torch.stack(scenes) if layout.batch else scenes[0]
+    inputs = replace(inputs, colors=normals, backgrounds=None, layout=replace(layout, view_colors=True))
+    options = replace(options, sh_degree=-1, depth="none", plane_depth=False, absgrad=False)
+    return _render(inputs, options)[0]
 
 
 def _render(inputs: Inputs, options: Options) -> tuple[Tensor, Tensor, RenderMeta]:
     layout = inputs.layout
     rendered = run_forward(inputs, options)
-    centers = Centers(layout, rendered.states if options.packed else None, absgrad=options.absgrad)
+    centers = Centers(
+        layout, rendered.states if options.packed else None, absgrad=options.absgrad, pinhole=options.lenses is None
+    )
     means2d = centers.new_tensor(inputs)
     renders, alphas = attach(inputs, options, rendered, centers, means2d)
     if layout.batch:
@@ -159,12 +252,13 @@ def _check_options(given: dict[str, Any]) -> Options:
     """An option that would change the result is refused, never ignored."""
     refuse_absent({**given["absent"], "distributed": given["distributed"]})
     check_choice("rasterize_mode", given["rasterize_mode"], ("classic", "antialiased"))
-    check_choice("camera_model", given["camera_model"], ("pinhole",))
     check_choice("depth_mode", given["depth_mode"], ("center", "plane"))
     if given["sparse_grad"] and not given["packed"]:
         raise InputError("needs packed=True.", field="sparse_grad", hint="set packed, or leave sparse_grad out")
     if given["covars"] is not None and given["depth_mode"] == "plane":
         raise InputError("is set beside depth_mode='plane'.", field="covars", hint="give quats and scales")
+    if given["render_mode"].endswith("MD") and given["depth_mode"] == "plane":
+        raise InputError("'plane' is not for median depth.", field="depth_mode", hint="use 'center'")
     wants_color, depth = parse_mode(given["render_mode"])
     sh_degree = given["sh_degree"] if wants_color else None
     return Options(
@@ -190,6 +284,9 @@ def _to_gsplat(given: dict[str, Any]) -> tuple[Tensor, Tensor, Any]:
     check_choice("depth_mode", given.pop("depth_mode"), ("center",))
     if given.pop("masks") is not None:
         raise InputError("is not known to gsplat.", field="masks", hint="use backend='native'")
+    for name, nothing in {**_CAMERA, "return_normals": False}.items():
+        if given[name] is None or given[name] is nothing:
+            del given[name]  # gsplat's own default asks for nothing too
     del given["backend"]
     absent = given.pop("absent")
     return rasterization_gsplat(**given, **absent)

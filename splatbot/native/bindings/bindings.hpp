@@ -9,3 +9,4 @@ void define_depth(nanobind::module_& m);
 void define_mahalanobis(nanobind::module_& m);
 void define_matching(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);
+void define_lens(nanobind::module_& m);

@@ -9,4 +9,5 @@ NB_MODULE(_native, m) {
   define_mahalanobis(m);
   define_matching(m);
   define_rasterize(m);
+  define_lens(m);
 }

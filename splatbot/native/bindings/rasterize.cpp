@@ -12,6 +12,7 @@
 #include <string>
 #include <tuple>
 
+#include "splatbot/fronts.hpp"
 #include "splatbot/isa.hpp"
 #include "splatbot/rasterizer.hpp"
 #include "splatbot/threads.hpp"
@@ -129,9 +130,12 @@ nb::object forward(const InN3& means, const std::optional<InN4>& quats, const st
                    const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane, float far_plane,
                    float radius_clip, float eps2d, const std::string& depth, bool plane_depth, bool antialiased,
                    const std::optional<In1>& background, const std::optional<InMask>& mask, int mask_size,
-                   const Out3& out_colors, const Out2& out_alphas) {
+                   const Out3& out_colors, const Out2& out_alphas, const splatbot::Lens* lens) {
   const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
-  const splatbot::View view = view_of(viewmat, K, width, height);
+  splatbot::View view = view_of(viewmat, K, width, height);
+  if (lens != nullptr) {
+    view.lens = *lens;
+  }
   const splatbot::RasterOptions options = {.near_plane = near_plane,
                                            .far_plane = far_plane,
                                            .radius_clip = radius_clip,
@@ -234,6 +238,49 @@ nb::dict tiles(const State& state) {
   return d;
 }
 
+nb::object find_visible(const InN3& means, const std::optional<InN4>& quats, const std::optional<InN3>& scales,
+                        const std::optional<InN33>& covars, const In1& opacities, const Matrix4& viewmat,
+                        const Matrix3& K, int width, int height, float near_plane, float far_plane, float radius_clip,
+                        float eps2d, bool antialiased, const splatbot::Lens* lens) {
+  splatbot::Gaussians gaussians = {.count = means.shape(0),
+                                   .means = span_of(means),
+                                   .quats = span_of<const float>(quats),
+                                   .scales = span_of<const float>(scales),
+                                   .covars = span_of<const float>(covars),
+                                   .opacities = span_of(opacities),
+                                   .colors = {}};
+  splatbot::View view = view_of(viewmat, K, width, height);
+  if (lens != nullptr) {
+    view.lens = *lens;
+  }
+  const splatbot::RasterOptions options = {.near_plane = near_plane,
+                                           .far_plane = far_plane,
+                                           .radius_clip = radius_clip,
+                                           .eps2d = eps2d,
+                                           .antialiased = antialiased};
+  std::vector<std::uint32_t> ids;
+  std::optional<splatbot::Fault> fault;
+  {
+    const nb::gil_scoped_release release;
+    fault = splatbot::find_visible(gaussians, view, options, ids);
+  }
+  if (fault) {
+    return nb::make_tuple(nb::str(fault->field.data(), fault->field.size()), fault->row);
+  }
+  return nb::cast(owned(std::vector<std::int64_t>(ids.begin(), ids.end()), {ids.size()}));
+}
+
+void medians(const State& state, const Array<std::int32_t, nb::shape<-1, -1>>& out) {
+  const nb::gil_scoped_release release;
+  splatbot::median_gaussians(*state.state, span_of(out));
+}
+
+void fronts(const State& state, const Array<const std::int64_t, nb::shape<-1>>& pixels,
+            const Array<std::int32_t, nb::shape<-1, -1>>& ids, const Out2& weights) {
+  const nb::gil_scoped_release release;
+  splatbot::front_gaussians(*state.state, span_of(pixels), ids.shape(1), span_of(ids), span_of(weights));
+}
+
 }  // namespace
 
 void define_rasterize(nb::module_& m) {
@@ -242,16 +289,26 @@ void define_rasterize(nb::module_& m) {
       .def("contributions", &contributions, "In how many pixels (N,) each Gaussian counts.")
       .def_prop_ro("n_visible", [](const State& state) { return splatbot::visible_ids(*state.state).size(); })
       .def("visible", &visible, "Indices (V,) of the Gaussians in view.")
-      .def("tiles", &tiles, "Tile grid, pairs and bytes held.");
+      .def("tiles", &tiles, "Tile grid, pairs and bytes held.")
+      .def("medians", &medians, "out"_a.noconvert(),
+           "Write to out (H, W) the Gaussian at which transmittance falls to 1/2, -1 where it does not.")
+      .def("fronts", &fronts, "pixels"_a.noconvert(), "ids"_a.noconvert(), "weights"_a.noconvert(),
+           "Write the front K Gaussians of pixels (P,), y W + x, to ids and weights (P, K).");
 
   m.def("rasterize_forward", &forward, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
         nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
         "colors"_a.noconvert(), "sh_degree"_a, "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a,
         "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a, "antialiased"_a,
         nb::arg("background").noconvert().none(), nb::arg("mask").noconvert().none(), "mask_size"_a,
-        "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(),
+        "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(), nb::arg("lens").none() = nb::none(),
         "Render one view into out_colors (H, W, X) and out_alphas (H, W). Returns a RasterState, or (field, row) of an "
         "input that is not finite.");
+
+  m.def("visible_gaussians", &find_visible, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
+        nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
+        "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near_plane"_a, "far_plane"_a,
+        "radius_clip"_a, "eps2d"_a, "antialiased"_a, nb::arg("lens").none() = nb::none(),
+        "Indices (V,) of the Gaussians that a view may see, or (field, row) of an input that is not finite.");
 
   m.def("rasterize_backward", &backward, "state"_a, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
         nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),

@@ -359,6 +359,28 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
   return std::nullopt;
 }
 
+std::optional<Fault> find_visible(const Gaussians& g, const View& view, const RasterOptions& options,
+                                  std::vector<std::uint32_t>& ids) {
+  check_gaussians(g);
+  check_view(view);
+  const RasterStatePtr shared = new_state();
+  RasterState& state = *shared;
+  RasterOptions depth_alone = options;
+  depth_alone.depth = DepthMode::accumulated;
+  prepare(state, g, view, depth_alone);
+  const Kernels& k = kernels();
+  const ProjectArgs project = project_args(state, g);
+  thread_pool()->run(state.blocks.size(), [&](std::size_t b) { k.project(project, b, state.blocks[b]); });
+  if (const std::optional<Fault> fault = find_fault(state)) {
+    return fault;
+  }
+  for (std::size_t b = 0; b < state.blocks.size(); ++b) {
+    const std::uint32_t* found = state.visible.data() + b * kProjectBlock;
+    ids.insert(ids.end(), found, found + state.blocks[b].visible);
+  }
+  return std::nullopt;
+}
+
 void rasterize_backward(const RasterState& const_state, const Gaussians& g, std::span<const float> background,
                         std::span<const float> grad_colors, std::span<const float> grad_alphas, const Gradients& out) {
   check_gaussians(g);

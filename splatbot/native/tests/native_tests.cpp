@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "promises.hpp"
 #include "splatbot/isa.hpp"
 #include "splatbot/rasterizer.hpp"
 #include "splatbot/threads.hpp"
@@ -288,6 +289,7 @@ int main() {
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);
+    check_cameras(isa);
     run_variants(isa);
   }
   std::puts("all promises kept");

@@ -131,6 +131,21 @@ struct LinearizeSums {
   std::size_t projected, photometric, geometric;
 };
 
+struct MedianArgs {
+  BlendArgs forward;
+  std::int32_t* ids;  // (H, W)
+};
+
+struct FrontArgs {
+  BlendArgs forward;
+  const std::uint32_t* tile_pixels;  // (tiles + 1,): where a tile's entries begin
+  const std::uint32_t* pixels;       // of each entry, within its tile
+  const std::uint32_t* rows;         // of each entry, in the outputs
+  std::size_t depth;                 // Gaussians to a row
+  std::int32_t* ids;
+  float* weights;
+};
+
 struct Kernels {
   const char* name;
   void (*project)(const ProjectArgs&, std::size_t block, ProjectedBlock& out);
@@ -141,6 +156,8 @@ struct Kernels {
   void (*harmonics)(const HarmonicsArgs&, std::size_t block);
   void (*harmonics_backward)(const HarmonicsBackwardArgs&, std::size_t block);
   void (*contributions)(const ContributionArgs&, std::size_t tile);
+  void (*medians)(const MedianArgs&, std::size_t tile);
+  void (*fronts)(const FrontArgs&, std::size_t tile);
 };
 
 // The kernels in use (isa.cpp).

@@ -7,6 +7,9 @@
 #include <optional>
 #include <span>
 #include <string_view>
+#include <vector>
+
+#include "splatbot/lens.hpp"
 
 namespace splatbot {
 
@@ -26,8 +29,8 @@ struct Gaussians {
   int coefficients = 0;              // harmonics held: at least (sh_degree + 1)^2
 };
 
-// A pinhole camera; pixel (i, j) covers [i, i+1) x [j, j+1), its centre is at +0.5. A world point x is at
-// rotation (x - origin) + translation: with the origin at the camera, nothing is lost far from the world's origin.
+// A camera, a pinhole unless its lens says otherwise; pixel (i, j) covers [i, i+1) x [j, j+1), its centre is at +0.5.
+// A world point x is at rotation (x - origin) + translation: with the origin at the camera, nothing is lost far from the world's origin.
 struct View {
   float rotation[9];  // world to camera, row-major
   float translation[3];
@@ -35,6 +38,7 @@ struct View {
   float center_low[3];   // the camera's centre less origin: what rounding the origin took from it
   float fx, fy, cx, cy;  // [px]
   int width, height;     // [px]
+  Lens lens{};
 };
 
 enum class DepthMode : std::uint8_t {
@@ -81,6 +85,11 @@ std::optional<Fault> rasterize_forward(const Gaussians& gaussians, const View& v
                                        std::span<const float> background, const TileMask& mask,
                                        std::span<float> out_colors, std::span<float> out_alphas,
                                        RasterStatePtr& state);
+
+// The Gaussians that the view may see: those that rasterize_forward() would blend, hidden ones included. Their indices,
+// ascending, or the fault. Renders nothing; colours are not looked at.
+std::optional<Fault> find_visible(const Gaussians& gaussians, const View& view, const RasterOptions& options,
+                                  std::vector<std::uint32_t>& ids);
 
 // Where gradients go; an empty span is not computed. With `accumulate`, they are added to what is there.
 struct Gradients {

@@ -14,5 +14,7 @@ void linearize(const LinearizeArgs& args, LinearizeSums& sums);
 void harmonics(const HarmonicsArgs& args, std::size_t block);
 void harmonics_backward(const HarmonicsBackwardArgs& args, std::size_t block);
 void contributions(const ContributionArgs& args, std::size_t tile);
+void medians(const MedianArgs& args, std::size_t tile);
+void fronts(const FrontArgs& args, std::size_t tile);
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "entry.hpp"
 #include "project.hpp"
+#include "unscented.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -190,6 +191,7 @@ SB_INLINE void load_covars(const float* rows, std::size_t first, int n, F (&out)
   }
 }
 
+template <Projection P>
 void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t first, int n, std::uint32_t* visible,
                    ProjectedBlock& out) {
   GaussianLanes g;
@@ -211,7 +213,8 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
       load_lanes<4>(args.quats, first, n, g.quat);
       load_lanes<3>(args.scales, first, n, g.scale);
     }
-    project_rest(g, cam, set1(args.options.eps2d), of_covar, o);
+    Affine lens;
+    project_image<P>(g, cam, args.view, set1(args.options.eps2d), of_covar, o, lens);
     if (args.options.antialiased) {
       opacity[0] = opacity[0] * sqrt(antialias_squared(o));
       keep = keep & (opacity[0] >= set1(kAlphaMin));
@@ -262,6 +265,15 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
   }
 }
 
+template <Projection P>
+void project_all(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
+  const CameraLanes cam(args.view);
+  for (std::size_t first = begin; first < end; first += W) {
+    const std::size_t left = end - first;
+    project_lanes<P>(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, out);
+  }
+}
+
 }  // namespace
 
 void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out) {
@@ -271,10 +283,15 @@ void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out) {
   if (find_fault(args, begin, end, out)) {
     return;
   }
-  const CameraLanes cam(args.view);
-  for (std::size_t first = begin; first < end; first += W) {
-    const std::size_t left = end - first;
-    project_lanes(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, out);
+  switch (projection_of(args.view)) {
+    case Projection::pinhole:
+      return project_all<Projection::pinhole>(args, begin, end, out);
+    case Projection::ortho:
+      return project_all<Projection::ortho>(args, begin, end, out);
+    case Projection::fisheye:
+      return project_all<Projection::fisheye>(args, begin, end, out);
+    case Projection::unscented:
+      return project_all<Projection::unscented>(args, begin, end, out);
   }
 }
 

@@ -2,6 +2,7 @@
 // EWA projection of W Gaussians at once, shared by the forward and backward passes.
 #pragma once
 
+#include "lens.hpp"
 #include "simd.hpp"
 #include "splatbot/kernels.hpp"
 
@@ -143,19 +144,29 @@ SB_INLINE void linearize(const CameraLanes& cam, Projected& o) {
   }
 }
 
-// Two rows of the linearisation, in the frame of the columns of a, and their cross product (a is orthonormal).
-SB_INLINE void rows_of(Projected& o, F (&normal)[3]) {
+// Two rows of the linearisation, in the frame of the columns of a, and their cross product (a is orthonormal). A pinhole's
+// are without its scale j; of other cameras j is 1.
+template <Projection P>
+SB_INLINE void rows_of(const Affine& lens, Projected& o, F (&normal)[3]) {
   for (int k = 0; k < 3; ++k) {
-    o.rows[0][k] = fnma(o.slope[0], o.a[6 + k], o.a[k]);
-    o.rows[1][k] = fnma(o.slope[1], o.a[6 + k], o.a[3 + k]);
-    normal[k] = fma(o.slope[0], o.a[k], fma(o.slope[1], o.a[3 + k], o.a[6 + k]));
+    if constexpr (P == Projection::pinhole) {
+      o.rows[0][k] = fnma(o.slope[0], o.a[6 + k], o.a[k]);
+      o.rows[1][k] = fnma(o.slope[1], o.a[6 + k], o.a[3 + k]);
+      normal[k] = fma(o.slope[0], o.a[k], fma(o.slope[1], o.a[3 + k], o.a[6 + k]));
+    } else {
+      const auto along = [&](const F (&v)[3]) { return fma(v[0], o.a[k], fma(v[1], o.a[3 + k], v[2] * o.a[6 + k])); };
+      o.rows[0][k] = along(lens.j[0]);
+      o.rows[1][k] = along(lens.j[1]);
+      normal[k] = along(lens.normal);
+    }
   }
 }
 
-SB_INLINE void spread_of_axes(const GaussianLanes& g, const CameraLanes& cam, Projected& o) {
+template <Projection P>
+SB_INLINE void spread_of_axes(const GaussianLanes& g, const CameraLanes& cam, const Affine& lens, Projected& o) {
   rotate_gaussian(g, cam, o);
   F normal[3];
-  rows_of(o, normal);
+  rows_of<P>(lens, o, normal);
   for (int k = 0; k < 3; ++k) {
     o.m[0][k] = o.jx * o.rows[0][k] * g.scale[k];
     o.m[1][k] = o.jy * o.rows[1][k] * g.scale[k];
@@ -177,12 +188,13 @@ SB_INLINE F minor(F a, F b, F c, F d) {
   return fms(a, b, cd) + fnma(c, d, cd);
 }
 
-SB_INLINE void spread_of_covar(const GaussianLanes& g, const CameraLanes& cam, Projected& o) {
+template <Projection P>
+SB_INLINE void spread_of_covar(const GaussianLanes& g, const CameraLanes& cam, const Affine& lens, Projected& o) {
   for (int i = 0; i < 9; ++i) {
     o.a[i] = cam.r[i];
   }
   F normal[3];
-  rows_of(o, normal);
+  rows_of<P>(lens, o, normal);
   const F* v = g.covar;
   F b[2][3];
   for (int k = 0; k < 3; ++k) {
@@ -215,12 +227,21 @@ SB_INLINE void blur(F eps2d, Projected& o) {
 }
 
 // Everything after project_center(); lanes at z <= 0 hold no meaning.
-SB_INLINE void project_rest(const GaussianLanes& g, const CameraLanes& cam, F eps2d, bool of_covar, Projected& o) {
-  linearize(cam, o);
-  if (of_covar) {
-    spread_of_covar(g, cam, o);
+template <Projection P>
+SB_INLINE void project_rest(const GaussianLanes& g, const CameraLanes& cam, F eps2d, bool of_covar, Projected& o,
+                            Affine& lens) {
+  if constexpr (P == Projection::pinhole) {
+    linearize(cam, o);
   } else {
-    spread_of_axes(g, cam, o);
+    lens = affine_of<P>(o.p, cam.fx, cam.fy);
+    o.mx = lens.mx + cam.cx;
+    o.my = lens.my + cam.cy;
+    o.jx = o.jy = set1(1.0F);
+  }
+  if (of_covar) {
+    spread_of_covar<P>(g, cam, lens, o);
+  } else {
+    spread_of_axes<P>(g, cam, lens, o);
   }
   blur(eps2d, o);
 }

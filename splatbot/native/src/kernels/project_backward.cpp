@@ -3,6 +3,7 @@
 // anew: cheaper than keeping it.
 #include "entry.hpp"
 #include "project.hpp"
+#include "unscented.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -160,12 +161,11 @@ SB_INLINE void into_quat(const CameraLanes& cam, const Projected& o, const F (&g
   }
 }
 
-// Gradient of the 2D mean and covariance into the Gaussian and the camera; into the latter and the quaternion only if
-// wanted.
-void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, const ImageGradients& image,
-               bool of_covar, bool camera, bool quat, LaneGradients& out) {
+// Through a pinhole, to the centre and the axes in the camera frame.
+SB_INLINE void through_pinhole(const GaussianLanes& g, const CameraLanes& cam, const Projected& o,
+                               const ImageGradients& image, bool of_covar, bool camera, F (&gp)[3], F (&ga)[9],
+                               LaneGradients& out) {
   const RowGradients r = of_covar ? into_covar(o, image, out) : into_axes(g, o, image, out);
-  F ga[9];
   F gsx = set1(0.0F), gsy = set1(0.0F);
   for (int k = 0; k < 3; ++k) {
     gsx = fnma(o.a[6 + k], r.rows[0][k], gsx);
@@ -191,13 +191,60 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
     out.intrinsics[2] = image.mx - held_x / cam.fx;
     out.intrinsics[3] = image.my - held_y / cam.fy;
   }
-  out.mean2d[0] = image.mx;
-  out.mean2d[1] = image.my;
-  F gp[3];
   gp[0] = fma(image.mx, o.jx, gsx * iz);
   gp[1] = fma(image.my, o.jy, gsy * iz);
   const F along = fma(gjx, o.jx, fma(gjy, o.jy, fma(gsx, o.slope[0], gsy * o.slope[1])));
   gp[2] = fnma(along, iz, image.z);
+}
+
+// Through another linearized camera.
+template <Projection P>
+SB_INLINE void through_affine(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, const Affine& lens,
+                              const ImageGradients& image, bool of_covar, F (&gp)[3], F (&ga)[9], LaneGradients& out) {
+  const RowGradients r = of_covar ? into_covar(o, image, out) : into_axes(g, o, image, out);
+  F gj[2][3];
+  for (int c = 0; c < 3; ++c) {
+    gj[0][c] = dot3(r.rows[0], o.a + 3 * c);
+    gj[1][c] = dot3(r.rows[1], o.a + 3 * c);
+    for (int k = 0; k < 3; ++k) {
+      ga[3 * c + k] = fma(lens.j[0][c], r.rows[0][k], lens.j[1][c] * r.rows[1][k]);
+    }
+  }
+  pull_back_affine<P>(lens, o.p, cam.fx, cam.fy, image.mx, image.my, image.z, gj, gp);
+}
+
+// Of a camera whose pixels are the focal lengths times something, plus the principal point.
+SB_INLINE void into_intrinsics(const CameraLanes& cam, const Projected& o, const ImageGradients& image,
+                               LaneGradients& out) {
+  const F two = set1(2.0F);
+  const F mixed = image.g01 * o.c01;
+  out.intrinsics[0] = fma(image.mx, o.mx - cam.cx, two * fma(image.g00, o.s00, mixed)) / cam.fx;
+  out.intrinsics[1] = fma(image.my, o.my - cam.cy, two * fma(image.g11, o.s11, mixed)) / cam.fy;
+  out.intrinsics[2] = image.mx;
+  out.intrinsics[3] = image.my;
+}
+
+// Gradient of the 2D mean and covariance into the Gaussian and the camera; into the latter and the quaternion only if
+// wanted.
+template <Projection P>
+void pull_back(const GaussianLanes& g, const CameraLanes& cam, const View& view, const Projected& o,
+               const Affine& lens, const ImageGradients& image, bool of_covar, bool camera, bool quat,
+               LaneGradients& out) {
+  F gp[3], ga[9];
+  if constexpr (P == Projection::pinhole) {
+    through_pinhole(g, cam, o, image, of_covar, camera, gp, ga, out);
+  } else {
+    if constexpr (P == Projection::unscented) {
+      pull_back_unscented(g, view, o, image, gp, ga, out.scale);
+    } else {
+      through_affine<P>(g, cam, o, lens, image, of_covar, gp, ga, out);
+    }
+    if (camera) {
+      into_intrinsics(cam, o, image, out);
+    }
+  }
+  out.mean2d[0] = image.mx;
+  out.mean2d[1] = image.my;
 
   for (int i = 0; i < 3; ++i) {
     out.mean[i] = fma(cam.r[i], gp[0], fma(cam.r[3 + i], gp[1], cam.r[6 + i] * gp[2]));
@@ -373,9 +420,8 @@ void collect(const ProjectBackwardArgs& args, const ProjectedBlock& block, const
   }
 }
 
-}  // namespace
-
-void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
+template <Projection P>
+void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
   const std::size_t begin = b * kProjectBlock;
   const std::size_t end = begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
   const ProjectedBlock& block = args.blocks[b];
@@ -405,11 +451,13 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
     }
     Projected o;
     project_center(g, cam, o);
-    project_rest(g, cam, set1(args.forward.options.eps2d), of_covar, o);
+    Affine lens;
+    project_image<P>(g, cam, args.forward.view, set1(args.forward.options.eps2d), of_covar, o, lens);
     const Root root = root_of_inverse(o);
     LaneGradients grads;
-    pull_back(g, cam, o, from_sums(sums, root, o, args.forward.options.antialiased), of_covar,
-              args.camera != nullptr, args.quats != nullptr, grads);
+    const ImageGradients image = from_sums(sums, root, o, args.forward.options.antialiased);
+    pull_back<P>(g, cam, args.forward.view, o, lens, image, of_covar, args.camera != nullptr, args.quats != nullptr,
+                 grads);
     write_gradients(args, ids, n, grads, sums, root);
     if (args.camera != nullptr) {
       add_camera(grads, n, camera_sums);
@@ -423,6 +471,21 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
       }
       args.camera[b * kCameraSums + static_cast<std::size_t>(k)] = sum;
     }
+  }
+}
+
+}  // namespace
+
+void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
+  switch (projection_of(args.forward.view)) {
+    case Projection::pinhole:
+      return project_backward_block<Projection::pinhole>(args, b);
+    case Projection::ortho:
+      return project_backward_block<Projection::ortho>(args, b);
+    case Projection::fisheye:
+      return project_backward_block<Projection::fisheye>(args, b);
+    case Projection::unscented:
+      return project_backward_block<Projection::unscented>(args, b);
   }
 }
 

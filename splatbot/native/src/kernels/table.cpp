@@ -15,6 +15,8 @@ const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
                           .linearize = linearize,
                           .harmonics = harmonics,
                           .harmonics_backward = harmonics_backward,
-                          .contributions = contributions};
+                          .contributions = contributions,
+                          .medians = medians,
+                          .fronts = fronts};
 
 }  // namespace splatbot::SPLATBOT_KERNELS
