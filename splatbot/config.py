@@ -44,9 +44,17 @@ class TrackingConfig(_Section):
     )
     n_features: int = Field(default=2000, ge=100, description="ORB keypoints per frame: accuracy for time")
     match_keyframes: int = Field(default=3, ge=1, description="keyframes nearest to the prediction that are matched")
+    match_radius: float = Field(
+        default=0.06, gt=0, le=1, description="features are looked for this near to their expected place [image width]"
+    )
+    match_enough: int = Field(
+        default=60, ge=20, description="with fewer matches near to their expected place all are matched with all"
+    )
     features_motion: float = Field(default=0.03, ge=0, description="predicted motion that calls for features [m]")
     features_rotation: float = Field(default=0.05, ge=0, description="predicted rotation that calls for features [rad]")
-    min_valid: float = Field(default=0.02, ge=0, le=1, description="a first frame with less valid depth is refused")
+    min_valid: float = Field(
+        default=0.02, ge=0, le=1, description="a frame with less valid depth begins no map and is no keyframe"
+    )
     min_overlap: float = Field(default=0.15, ge=0, le=1, description="a smaller share of the reference in view: lost")
     min_inliers: float = Field(default=0.3, ge=0, le=1, description="a smaller share of residuals within 3 σ: lost")
     min_eigen_ratio: float = Field(

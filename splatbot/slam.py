@@ -54,13 +54,17 @@ class Slam:
         self._mapper = Mapper(self.config)
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
-        """Track ``frame`` and, unless ``hold_out``, fuse it. Never raises for a frame that cannot be tracked."""
+        """Track ``frame`` and, unless ``hold_out``, fuse it. Never raises for a frame that cannot be tracked.
+
+        A frame held out before the map has begun is lost: there is no world yet to place it in.
+        """
         start = time.perf_counter()
         prepared = prepare(frame, self.config.tracking)
         prepared_at = time.perf_counter()
-        estimate = self._track(prepared)
+        estimate = self._track(prepared, hold_out)
         tracked_at = time.perf_counter()
-        keyframe = not hold_out and estimate.verdict != "lost" and self._mapper.wants(estimate.T_world_camera)
+        placed = estimate.verdict != "lost"
+        keyframe = placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
         if keyframe:
             self._map(prepared, estimate)
         stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
@@ -87,9 +91,11 @@ class Slam:
         """The map as it is now, immutable."""
         return self._mapper.snapshot()
 
-    def _track(self, prepared: PreparedFrame) -> PoseEstimate:
+    def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
         if self._mapper.keyframes:
             return self._tracker.track(prepared, self._mapper.keyframes)
+        if hold_out:
+            return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:

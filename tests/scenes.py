@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from splatbot.rasterize import rasterization, rasterization_reference
+from splatbot.rasterize.reference import Projector
 
-NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+NAMES = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks", "backgrounds")
 
 
 @dataclass
 class Scene:
-    """Float32 inputs of a render of C views; ``backgrounds`` may be None."""
+    """Float32 inputs of a render of C views; ``backgrounds`` may be None, and so may quats and scales or covars."""
 
     means: Tensor
     quats: Tensor
@@ -28,6 +29,7 @@ class Scene:
     width: int
     height: int
     backgrounds: Tensor | None = None
+    covars: Tensor | None = None
 
     def render(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
         """Through the native kernels."""
@@ -48,7 +50,7 @@ class Scene:
             for name in NAMES
             for value in [getattr(self, name)]
         }
-        return Scene(**tensors, Ks=self.Ks.to(dtype), width=self.width, height=self.height)  # type: ignore[arg-type]
+        return Scene(**tensors, width=self.width, height=self.height)  # type: ignore[arg-type]
 
     def _arguments(self) -> dict[str, Any]:
         return dict(vars(self))
@@ -64,17 +66,32 @@ class Comparison:
     pixels: int
 
 
-def compare(scene: Scene, render_mode: str, *, jump_margin: float = 2e-5, **options: Any) -> Comparison:
+def compare(
+    scene: Scene,
+    render_mode: str,
+    *,
+    jump_margin: float = 2e-5,
+    project: Projector | None = None,
+    reference_extra: dict[str, Any] | None = None,
+    fixed: tuple[str, ...] = (),
+    **options: Any,
+) -> Comparison:
     """Forward and gradients of a random loss, in the kernels and in float64, from the same float32 inputs.
 
     A pixel that is nearer than ``jump_margin`` (relative) to a jump of the model (an alpha at 1/255 or at its cap, a
-    transmittance at 1e-4) is given no weight in either; the caller bounds how many there are.
+    transmittance at 1e-4) is given no weight in either; the caller bounds how many there are. ``project`` is the
+    reference's camera, which takes ``reference_extra`` besides; the options are then the kernels' alone. Inputs named
+    in ``fixed`` ask for no gradient.
     """
+    reference_options = options if project is None else {"project": project, **(reference_extra or {})}
     sides = []
     for render, dtype in ((rasterization_reference, torch.float64), (rasterization, torch.float32)):
         leaves = scene.to(dtype, requires_grad=True)
+        for name in fixed:
+            getattr(leaves, name).requires_grad_(False)
         call: Callable[..., tuple[Tensor, Tensor, Any]] = render
-        image, alpha, meta = call(**leaves._arguments(), render_mode=render_mode, **options)
+        given = reference_options if call is rasterization_reference else options
+        image, alpha, meta = call(**leaves._arguments(), render_mode=render_mode, **given)
         sides.append((leaves, image, alpha, meta))
     (exact, exact_image, exact_alpha, meta), (native, image, alpha, _) = sides
     safe = (meta.margins > jump_margin)[..., None]

@@ -57,7 +57,7 @@ class DepthNoise:
         kernel = np.ones((2 * self.edge_reach + 1,) * 2, np.uint8)
         near = np.asarray(cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), kernel))
         far = np.asarray(cv2.dilate(depth, kernel))
-        return np.asarray(far > (1.0 + self.edge_jump) * near, dtype=np.bool_)
+        return np.asarray(far / (1.0 + self.edge_jump) > near, dtype=np.bool_)
 
 
 def axial_sigma(depth: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ def info(
         splatbot info map.ply
 
     Args:
-        path: a map file, a folder in TUM or Replica layout, synthetic:NAME, or a run folder (its map).
+        path: a map file, a folder in TUM or Replica layout, synthetic:SCENE, or a run folder (its map).
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
     """
     from splatbot.cli.tables import print_table
@@ -101,4 +101,5 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
         ("depth p2, p50, p98", f"{metres(near)}, {metres(middle)}, {metres(far)}"),
         ("valid depth", percent(depths.size / sum(depth.size for _, depth in frames))),
         ("reference poses", f"{len(truth)}, path {metres(length)}" if truth is not None else "none"),
+        *(("simulated effect", f"{effect['name']} ({effect['why']})") for effect in log.effects),
     ]

@@ -57,11 +57,14 @@ def _parse(path: str | Path, number: int, line: str) -> list[float]:
     return row
 
 
-def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
-    """Write a TUM trajectory: stamps exact, the rest with 12 digits; of an empty one, the heading only."""
+def save_trajectory(trajectory: Trajectory, path: str | Path, *, what: str = "T_world_camera") -> None:
+    """Write a TUM trajectory: stamps exact, the rest with 12 digits; of an empty one, the heading only.
+
+    ``what`` names the poses in the heading, where they are not a camera's.
+    """
     quats = rotation_to_quat(trajectory.T_world_camera[:, :3, :3])
     values = np.hstack([trajectory.positions, quats[:, [1, 2, 3, 0]]])
     with atomic_write(path) as file:
-        file.write(b"# timestamp tx ty tz qx qy qz qw (T_world_camera)\n")
+        file.write(f"# timestamp tx ty tz qx qy qz qw ({what})\n".encode())
         for stamp, row in zip(trajectory.stamps, values, strict=True):
             file.write(f"{float(stamp)!r} {' '.join(f'{v:.12g}' for v in row)}\n".encode())

@@ -22,7 +22,8 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
     """Open the log that ``uri`` names; frames are decoded only when read.
 
     Args:
-        uri: a folder in TUM or Replica layout, or `synthetic:SCENE?frames=N&width=W&height=H&arc=DEG&rate=HZ`.
+        uri: a folder in TUM or Replica layout, or `synthetic:SCENE?trajectory=NAME&frames=N&effects=SPEC;SPEC&...`
+            with the keys of :class:`splatbot.logs.synthetic.Options`.
         camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration, instead of the log's own.
         missing: what a colour image without depth means in a TUM log, see :class:`splatbot.logs.tum.TumLog`.
 

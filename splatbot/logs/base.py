@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
@@ -41,6 +41,11 @@ class Log(Protocol):
         """
         ...
 
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        """The account of the simulated sensor effects that the frames go through; empty for a real sensor."""
+        ...
+
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
@@ -58,7 +63,12 @@ class Log(Protocol):
 
 
 class LogBase:
-    """The sequence protocol on top of ``__len__`` and ``_decode``."""
+    """The sequence protocol on top of ``__len__`` and ``_decode``; frames are a real sensor's unless told otherwise."""
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        """None; see :class:`Log`."""
+        return []
 
     def __len__(self) -> int:
         raise NotImplementedError

@@ -27,11 +27,11 @@ def read_color(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
+def read_depth(path: Path, units_per_metre: float, *, empty: bool = False) -> NDArray[np.float32]:
     """Depth (H, W) [m], 0 where missing, of a 16-bit PNG, or of a 32-bit float TIFF that is in metres already.
 
     Raises:
-        LogError: no such file, truncated, corrupt, of another pixel type, or without a single valid depth.
+        LogError: no such file, truncated, corrupt, of another pixel type, or (unless ``empty``) without a valid depth.
     """
     image = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
@@ -46,7 +46,7 @@ def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
         depth = image.astype(np.float32) / np.float32(units_per_metre)
     else:
         depth = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
-    if not depth.any():
+    if not (empty or depth.any()):
         raise LogError(
             "has no valid depth: every pixel is 0 or NaN.",
             file=path,

@@ -20,10 +20,16 @@ _TYPICAL = 1.5  # [m]
 
 
 class RgbdReader:
-    """Reads the images of one calibrated camera; delivers them undistorted and in metres."""
+    """Reads the images of one calibrated camera; delivers them undistorted and in metres.
 
-    def __init__(self, calibration: Calibration) -> None:
+    Args:
+        calibration: the camera and the unit of its depth.
+        empty_depth: a depth image without a single valid pixel is meant so (a simulated blackout), no error.
+    """
+
+    def __init__(self, calibration: Calibration, *, empty_depth: bool = False) -> None:
         self.calibration = calibration
+        self._empty_depth = empty_depth
         self._undistort = Undistorter(calibration.camera) if calibration.camera.distortion else None
         self.camera: Camera = self._undistort.camera if self._undistort else calibration.camera
 
@@ -34,9 +40,9 @@ class RgbdReader:
             LogError: a file is damaged, sizes differ, there is no valid depth, or (frame 0) its unit is implausible.
         """
         rgb = read_color(color)
-        z = read_depth(depth, self.calibration.depth_scale)
+        z = read_depth(depth, self.calibration.depth_scale, empty=self._empty_depth)
         self._check_sizes(rgb, z, color, depth)
-        if index == 0:
+        if index == 0 and z.any():
             self._check_unit(z, depth)
         if self._undistort:
             rgb, z = self._undistort.color(rgb), self._undistort.depth(z)

@@ -25,6 +25,12 @@ class Mesh:
         """Turned about z by ``yaw`` [rad], then moved by ``at`` (3,) [m]."""
         return Mesh(self.vertices @ so3_exp([0.0, 0.0, yaw]).T + np.asarray(at), self.triangles)
 
+    def normals(self) -> NDArray[np.float64]:
+        """Unit normals (T, 3) of the triangles; 0 for one without area."""
+        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
+        n = np.cross(b - a, c - a)
+        return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
 
 def box(size: ArrayLike) -> Mesh:
     """Box of ``size`` (3,) [m]; standing on z = 0, centred in x and y."""

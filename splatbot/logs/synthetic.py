@@ -1,23 +1,24 @@
-"""`synthetic:SCENE?frames=N&...`: a ray-cast scene on an exactly known path; frames are free of noise."""
+"""`synthetic:SCENE?frames=N&...`: a ray-cast scene on an exactly known path, through the effects asked for."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, quote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import LogError
+from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
-from splatbot.logs.scenes import SCENES, Scene
+from splatbot.logs.effects import Account, FrameEffects, make_effects
+from splatbot.logs.scenes import SCENES, Scene, SceneKind
+from splatbot.logs.trajectories import Shooting, make_path
 from splatbot.trajectory import Trajectory
 
 PREFIX = "synthetic:"
-_PERIOD = 8.0  # [s] there and back along the arc: 0.5° and 8 mm per frame at the fastest
 
 
 @dataclass(frozen=True)
@@ -25,27 +26,43 @@ class Options:
     """What the query of a synthetic log may set.
 
     Args:
-        frames: how many.
+        trajectory: how the camera moves, see :mod:`splatbot.logs.trajectories`; empty for the scene's own.
+        frames: how many the sensor takes; an effect may lose some.
         width, height: [px]; the field of view stays 62.8° across.
-        arc: angle [deg] over which the camera swings about the scene.
         rate: frames per second [Hz].
+        arc: angle [deg] over which an orbit swings.
+        event: when something moves or goes in a scene where something does [s].
+        seed: of everything random: a hand's jitter, the effects.
+        effects: what the frames go through, `name:option=value,...` with semicolons between them.
     """
 
+    trajectory: str = ""
     frames: int = 120
     width: int = 640
     height: int = 480
-    arc: float = 40.0
     rate: float = 30.0
+    arc: float = 40.0
+    event: float = 2.0
+    seed: int = 0
+    effects: str = ""
 
 
-_BOUNDS = {"frames": (1, 100_000), "width": (16, 4096), "height": (16, 4096), "arc": (0, 120), "rate": (0.1, 1000)}
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "frames": (1, 100_000),
+    "width": (16, 4096),
+    "height": (16, 4096),
+    "rate": (0.1, 1000),
+    "arc": (0, 120),
+    "event": (0, 1e6),
+    "seed": (0, 2**32 - 1),
+}
 
 
 class SyntheticLog(LogBase):
-    """Frames of a scene, rendered when read; the same ``uri`` gives the same bits.
+    """Frames of a scene, rendered when read and kept by nobody; the same ``uri`` gives the same bits.
 
     Raises:
-        LogError: the scene or an option is unknown, or a value is out of range.
+        LogError: the scene, the trajectory, an effect or an option is unknown, or a value is out of range.
     """
 
     def __init__(self, uri: str) -> None:
@@ -56,6 +73,16 @@ class SyntheticLog(LogBase):
                 f"there is no scene {self.name!r}.", file=uri, field="scene", hint=f"scenes: {', '.join(SCENES)}"
             )
         self.options = _parse(uri, query)
+        try:
+            self.ground_truth = self._path()
+            self._effects = self._make_effects()
+        except InputError as error:
+            raise LogError(error.message, file=uri, field=error.field, hint=error.hint) from error
+        self._kept = (
+            list(range(self.options.frames)) if self._effects is None else self._effects.kept(self.options.frames)
+        )
+        if not self._kept:
+            raise LogError("no frame is left.", file=uri, field="effects", hint="drop fewer frames, or take more")
 
     @cached_property
     def camera(self) -> Camera:
@@ -63,53 +90,98 @@ class SyntheticLog(LogBase):
         f, w, h = 525.0 * self.options.width / 640.0, self.options.width, self.options.height
         return Camera(f, f, (w - 1) / 2, (h - 1) / 2, w, h)
 
+    ground_truth: Trajectory
+    """The exact poses T_world_camera of all frames that the sensor took; z is up."""
+
+    @property
+    def effects(self) -> list[Account]:
+        """The account of what the frames went through so far."""
+        return self._effects.report() if self._effects is not None else []
+
+    @property
+    def blanks_depth(self) -> bool:
+        """Whether a frame may be without any depth."""
+        return self._effects is not None and self._effects.blanks_depth
+
     @cached_property
-    def ground_truth(self) -> Trajectory:
-        """The exact poses T_world_camera; z is up, the table's top is z = 0."""
-        stamps = np.arange(len(self)) / self.options.rate
-        return Trajectory(stamps, np.array([orbit(t, np.radians(self.options.arc)) for t in stamps]))
+    def scene(self) -> Scene:
+        """What is filmed."""
+        return self.kind.build(self.options.event)
 
-    def __len__(self) -> int:
-        return self.options.frames
+    def objects(self) -> dict[str, Trajectory]:
+        """T_world_object of each moving object, at the stamps of the frames that arrive while it is there."""
+        found: dict[str, tuple[list[float], list[NDArray[np.float64]]]] = {}
+        for i in self._kept:
+            t = float(self.ground_truth.stamps[i])
+            for name, T in self.scene.objects(t).items():
+                stamps, poses = found.setdefault(name, ([], []))
+                stamps.append(t)
+                poses.append(T)
+        return {name: Trajectory(np.array(stamps), np.array(poses)) for name, (stamps, poses) in found.items()}
 
-    @cached_property
-    def _scene(self) -> Scene:
-        return SCENES[self.name]()
-
-    def _decode(self, index: int) -> Frame:
-        rgb, depth = self._scene.render(self.camera, self.ground_truth.T_world_camera[index])
-        return Frame(
-            float(self.ground_truth.stamps[index]), rgb, depth, self.camera, index, source=f"{self.uri}#{index}"
+    def moving_mask(self, index: int) -> NDArray[np.bool_]:
+        """Pixels (H, W) of frame ``index`` that show a moving object."""
+        i = self._kept[index]
+        return self.scene.moving_mask(
+            self.camera, self.ground_truth.T_world_camera[i], float(self.ground_truth.stamps[i])
         )
 
+    def __len__(self) -> int:
+        return len(self._kept)
 
-def orbit(t: float, arc: float) -> NDArray[np.float64]:
-    """T_world_camera (4, 4) at time ``t`` [s]: swings over ``arc`` [rad] before the scene, bobbing."""
-    azimuth = -np.pi / 2 + 0.5 * arc * np.sin(2 * np.pi * t / _PERIOD)
-    radius = 0.80 + 0.06 * np.sin(2 * np.pi * t / 5.3)
-    eye = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), 0.50 + 0.05 * np.sin(2 * np.pi * t / 6.7)])
-    target = np.array([-0.02, 0.03 * np.sin(2 * np.pi * t / 4.1), 0.04])
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    T[:3, 3] = eye
-    return T
+    def _decode(self, index: int) -> Frame:
+        i = self._kept[index]
+        stamp = float(self.ground_truth.stamps[i])
+        rgb, depth = self.scene.render(self.camera, self.ground_truth.T_world_camera[i], stamp)
+        frame = Frame(stamp, rgb, depth, self.camera, i, source=f"{self.uri}#{i}")
+        if self._effects is not None:
+            frame = self._effects(frame)
+        return frame if i == index else replace(frame, index=index)
+
+    @property
+    def kind(self) -> SceneKind:
+        """The scene's entry in the list of scenes."""
+        return SCENES[self.name]
+
+    def _path(self) -> Trajectory:
+        o = self.options
+        shooting = Shooting((o.frames - 1) / o.rate, o.rate, np.radians(o.arc), o.seed)
+        path = make_path(o.trajectory or self.kind.trajectory, self.kind.stage, shooting)
+        stamps = np.arange(o.frames) / o.rate
+        return Trajectory(stamps, np.array([path(float(t)) for t in stamps]))
+
+    def _make_effects(self) -> FrameEffects | None:
+        specs = [spec.strip() for spec in self.options.effects.split(";") if spec.strip()]
+        if not specs:
+            return None
+        return make_effects(specs, seed=self.options.seed).along(self.ground_truth)
+
+
+def synthetic_uri(scene: str, options: Options) -> str:
+    """What opens a scene with ``options``; those at their defaults are left out."""
+    plain = asdict(Options())
+    query = [
+        f"{key}={quote(str(value), safe=':;,=. ')}" for key, value in asdict(options).items() if value != plain[key]
+    ]
+    return PREFIX + scene + ("?" + "&".join(query) if query else "")
 
 
 def _parse(uri: str, query: str) -> Options:
     kinds = {name: type(value) for name, value in asdict(Options()).items()}
-    values: dict[str, float] = {}
+    values: dict[str, float | str] = {}
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key not in kinds:
             raise LogError("is unknown.", file=uri, field=key, hint=f"options: {', '.join(kinds)}")
-        low, high = _BOUNDS[key]
-        try:
-            value = kinds[key](text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise LogError(f"is {text!r}.", file=uri, field=key, hint=f"give a number in {low}..{high}")
-        values[key] = value
+        values[key] = _number(uri, key, text, kinds[key]) if key in _BOUNDS else text
     return Options(**values)  # type: ignore[arg-type]
+
+
+def _number(uri: str, key: str, text: str, kind: type) -> float:
+    low, high = _BOUNDS[key]
+    try:
+        value: float = kind(text)
+    except ValueError:
+        value = low - 1
+    if not low <= value <= high:
+        raise LogError(f"is {text!r}.", file=uri, field=key, hint=f"give a number in {low:g}..{high:g}")
+    return value

@@ -21,21 +21,29 @@ class Texture:
 
     Args:
         period: [m], size of a blob, or of two checker squares.
+        kind: "blobs" and "checker" have hard edges and a fine grain, so corners that ORB finds; "soft" fades from one
+            colour to the other over ``period`` and has no corner; "plain" is ``light`` alone.
         seed: shifts the pattern.
     """
 
     light: Rgb
     dark: Rgb
     period: float = 0.03
-    kind: Literal["blobs", "checker"] = "blobs"
+    kind: Literal["blobs", "checker", "soft", "plain"] = "blobs"
     seed: int = 0
 
     def albedo(self, points: Points) -> NDArray[np.float64]:
         """Colours (N, 3) in 0..1 at points (N, 3) [m]."""
+        if self.kind == "plain":
+            return np.broadcast_to(np.array(self.light), points.shape)
+        if self.kind == "soft":
+            return self._mixed(value_noise(points / self.period + self.seed * 3.7))
         mix = self._checker(points) if self.kind == "checker" else self._blobs(points)
         fine = 0.85 + 0.3 * (value_noise(points / (0.35 * self.period) + 11.0) - 0.5)
-        colors = np.array(self.dark) + mix[:, None] * (np.array(self.light) - np.array(self.dark))
-        return np.clip(colors * fine[:, None], 0.0, 1.0)
+        return np.clip(self._mixed(mix) * fine[:, None], 0.0, 1.0)
+
+    def _mixed(self, mix: Points) -> Points:
+        return np.array(self.dark) + mix[:, None] * (np.array(self.light) - np.array(self.dark))
 
     def _blobs(self, points: Points) -> Points:
         return _step(value_noise(points / self.period + self.seed * 3.7), 0.5, 0.08)

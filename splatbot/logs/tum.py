@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from splatbot.errors import CameraError, LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration, read_calibration
+from splatbot.logs.effects import read_account
 from splatbot.logs.index import Entry, associate, read_index
 from splatbot.logs.presets import PRESETS, find_calibration
 from splatbot.logs.rgbd import RgbdReader
@@ -37,7 +38,7 @@ class TumLog(LogBase):
     ``unpaired`` and logged. A depth image without colour is never missed, only logged.
 
     Raises:
-        LogError: a list is missing, empty or malformed, or nothing can be associated.
+        LogError: a list is missing, empty or malformed, nothing can be associated, or `effects.json` is damaged.
         CameraError: there are no usable intrinsics.
     """
 
@@ -55,13 +56,19 @@ class TumLog(LogBase):
             missing = "error" if lockstep else "skip"
         kept = [i for i in range(len(colors)) if i in pairs or missing == "error"]
         self._frames: list[tuple[Entry, Entry | None]] = [(colors[i], pairs.get(i)) for i in kept]
-        self._reader = RgbdReader(self._calibration(camera))
+        self._effects, blanks_depth = read_account(self.folder)
+        self._reader = RgbdReader(self._calibration(camera), empty_depth=blanks_depth)
         self._report(len(colors), len(pairs))
 
     @property
     def camera(self) -> Camera:
         """Camera of the delivered frames: undistorted."""
         return self._reader.camera
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        """The account in `effects.json`, which `splatbot simulate` writes; empty for a real sensor."""
+        return self._effects
 
     @property
     def stamps(self) -> list[float]:

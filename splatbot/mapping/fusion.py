@@ -53,9 +53,8 @@ def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.flo
 def model_depth(view: View, measured: NDArray[np.float32], config: MappingConfig) -> NDArray[np.float32]:
     """Depth (H, W) [m] to track against: the map's where it is solid and does not contradict the measured one."""
     depth = view.depth.numpy()
-    agrees = (
-        np.abs(depth - measured) < config.new_depth * measured
-    )  # never where nothing was measured: it may be a guess
+    # Strictly less: never true where nothing was measured, for the map may hold a guess there.
+    agrees = np.abs(depth - measured) < config.new_depth * measured
     solid = (view.alpha.numpy() > config.solid_alpha) & agrees
     return np.where(solid, depth, measured).astype(np.float32)
 
@@ -128,7 +127,6 @@ def _disc_quats(
     normals: NDArray[np.float64], toward: NDArray[np.float64], R: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Orientations (N, 4): z along the normal, x along the direction in which the slant stretches the footprint."""
-
     x = toward - (toward * normals).sum(1, keepdims=True) * normals
     length = np.linalg.norm(x, axis=1, keepdims=True)
     spare = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))

@@ -66,8 +66,9 @@ def mapping_images(
     )
     while level.camera.width > config.max_width:
         level = halve(level)
-        half = cv2.resize(rgb, (level.camera.width, level.camera.height), interpolation=cv2.INTER_AREA)
-        rgb = np.asarray(half, dtype=np.uint8)
+        width, height = level.camera.width, level.camera.height
+        even = rgb[: 2 * height, : 2 * width]  # as `halve` crops, or an odd size would shift colour against depth
+        rgb = np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
     return level.camera, rgb, level.depth
 
 

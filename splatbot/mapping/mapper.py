@@ -13,7 +13,7 @@ from splatbot.mapping.keyframes import Keyframe, is_keyframe, mapping_images
 from splatbot.mapping.prune import fittest, worth_keeping
 from splatbot.mapping.refine import Refiner
 from splatbot.tracking.features import Features
-from splatbot.tracking.prepare import PreparedFrame, with_depth
+from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
 from splatbot.tracking.reference import Reference, make_reference
 
 
@@ -29,8 +29,10 @@ class Mapper:
         self._version = 0
         self._stamp = 0.0
 
-    def wants(self, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether a frame at this pose would be a keyframe."""
+    def wants(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> bool:
+        """Whether a frame at this pose would be a keyframe: a new view, with depth for later frames to align to."""
+        if valid_share(prepared) < self.config.tracking.min_valid:
+            return False
         return is_keyframe(T_world_camera, self.keyframes, self.config.mapping)
 
     def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> Keyframe:
@@ -41,6 +43,7 @@ class Mapper:
         self._add(keyframe)
         self._prune()
         self._refiner.refine(self.model, self.keyframes, self.config.mapping.refine_iterations)
+        self._prune()  # or what refinement made faint, huge or not finite would be rendered
         keyframe.reference = self._model_reference(prepared, keyframe)
         self._version += 1
         self._stamp = prepared.frame.stamp

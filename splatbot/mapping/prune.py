@@ -13,6 +13,7 @@ def worth_keeping(model: GaussianModel, config: MappingConfig) -> Tensor:
     """Mask (N,) of finite, visible Gaussians of a sane size."""
     finite = torch.isfinite(model.means).all(1) & torch.isfinite(model.log_scales).all(1)
     finite &= torch.isfinite(model.quats).all(1) & torch.isfinite(model.opacity_logits)
+    finite &= torch.isfinite(model.sh).flatten(1).all(1)
     sane = model.scales.amax(1) < config.max_scale
     return finite & sane & (model.opacities > config.min_opacity)
 

@@ -18,7 +18,7 @@ from splatbot.rasterize.reference import (
     TRANSMITTANCE_MIN,
     _margins,
     _pixel_centers,
-    _rotations,
+    reference_rotations,
 )
 
 FILTER = 2.0  # 1 / variance of the screen-space low-pass filter [px⁻²]
@@ -82,13 +82,13 @@ def rasterization_2dgs_reference(
     for i in range(len(viewmats)):
         R, t = viewmats[i, :3, :3], viewmats[i, :3, 3]
         centers = means @ R.T + t
-        axes = R @ _rotations(quats)
+        axes = R @ reference_rotations(quats)
         z = centers[:, 2]
         order = torch.argsort(z.detach().float(), stable=True)
         order = order[((z >= near) & (z <= far))[order]]
         hits = _hit(centers[order], axes[order], scales[order], opacities[order], Ks[i], pixels, near)
         facing = torch.where((axes[..., 2] * centers).sum(-1, keepdim=True) < 0, 1.0, -1.0).detach()
-        normals = _rotations(quats)[..., 2] * facing
+        normals = reference_rotations(quats)[..., 2] * facing
         shown = None if colors is None or "RGB" not in render_mode else colors[i] if colors.ndim == 3 else colors
         background = None if backgrounds is None or shown is None else backgrounds[i]
         images = _composite(
@@ -113,10 +113,11 @@ def _hit(
     the planes x M₃ - M₁ and y M₃ - M₂ of the disc's frame; their line meets the disc at (u, v).
     """
     z = centers[:, 2]
-    least = LEAST_SCALE * z.detach() / float(K[0, 0])
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]  # the other entries are no parameters
+    least = LEAST_SCALE * (z / fx).detach()
     s = torch.maximum(scales[:, :2].abs(), least[:, None])
     H = torch.stack([axes[:, :, 0] * s[:, :1], axes[:, :, 1] * s[:, 1:], centers], -1)
-    M = K @ H
+    M = torch.stack([fx * H[:, 0] + cx * H[:, 2], fy * H[:, 1] + cy * H[:, 2], H[:, 2]], 1)
     x, y = pixels[None, :, :1], pixels[None, :, 1:]
     cross = torch.linalg.cross(x * M[:, None, 2] - M[:, None, 0], y * M[:, None, 2] - M[:, None, 1], dim=-1)
     meets = cross[..., 2].abs() > 1e-300

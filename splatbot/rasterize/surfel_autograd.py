@@ -41,21 +41,21 @@ class RasterizeSurfels(torch.autograd.Function):
         opacities: Tensor,
         colors: Tensor,
         viewmats: Tensor,
+        Ks: Tensor,
         backgrounds: Tensor | None,
         shift: Tensor,
-        Ks: Tensor,
         options: SurfelOptions,
         states: list[Any],
     ) -> tuple[Tensor, ...]:
         geometry = [t.detach() for t in (means, quats, scales, opacities)]
-        viewmats64 = viewmats.detach().to(torch.float64).contiguous()
+        viewmats64, Ks64 = (t.detach().to(torch.float64).contiguous() for t in (viewmats, Ks))
         images = _empty_images(len(viewmats), colors.shape[-1], options)
         for i in range(len(viewmats)):
             state = native().surfels_forward(
                 *geometry,
                 _of_view(colors, i),
                 viewmats64[i],
-                Ks[i],
+                Ks64[i],
                 options.width,
                 options.height,
                 options.near_plane,
@@ -74,13 +74,13 @@ class RasterizeSurfels(torch.autograd.Function):
                 raise InputError(f"row {row} is not finite.", field=field, hint="find where the NaN or Inf comes from")
             states.append(state)
         ctx.states = tuple(states)
-        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmats, backgrounds)
+        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
         ctx.set_materialize_grads(False)
         return images
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        means, quats, scales, opacities, colors, viewmats, backgrounds = ctx.saved_tensors
+        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = ctx.saved_tensors
         need = ctx.needs_input_grad
         if all(g is None for g in grads):
             return (None,) * 11
@@ -90,10 +90,11 @@ class RasterizeSurfels(torch.autograd.Function):
         new_colors = torch.empty if colors.ndim == 2 or len(ctx.states) == 1 else torch.zeros
         grad_colors = new_colors(colors.shape, dtype=torch.float32) if need[4] else None
         grad_viewmats = torch.zeros(viewmats.shape, dtype=torch.float64) if need[5] else None
-        grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[6] else None
-        grad_shift = torch.empty(len(ctx.states), len(means), 2) if need[7] else None
+        grad_Ks = torch.zeros(Ks.shape, dtype=torch.float64) if need[6] else None
+        grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[7] else None
+        grad_shift = torch.empty(len(ctx.states), len(means), 2) if need[8] else None
         for i, state in enumerate(ctx.states):
-            pose = torch.zeros(12, dtype=torch.float64) if grad_viewmats is not None else None
+            camera = torch.zeros(16, dtype=torch.float64) if need[5] or need[6] else None
             native().surfels_backward(
                 state,
                 *geometry,
@@ -102,17 +103,20 @@ class RasterizeSurfels(torch.autograd.Function):
                 *_image_gradients(grads, i),
                 *out,
                 None if grad_colors is None else _of_view(grad_colors, i),
-                pose,
+                camera,
                 None if grad_backgrounds is None else grad_backgrounds[i],
                 None if grad_shift is None else grad_shift[i],
                 i > 0,
             )
-            if grad_viewmats is not None and pose is not None:
-                grad_viewmats[i, :3, :3] = pose[:9].view(3, 3)
-                grad_viewmats[i, :3, 3] = pose[9:]
+            if grad_viewmats is not None and camera is not None:
+                grad_viewmats[i, :3, :3] = camera[:9].view(3, 3)
+                grad_viewmats[i, :3, 3] = camera[9:12]
+            if grad_Ks is not None and camera is not None:
+                grad_Ks[i, (0, 1, 0, 1), (0, 1, 2, 2)] = camera[12:]
         grad_viewmats = None if grad_viewmats is None else grad_viewmats.to(viewmats.dtype)
+        grad_Ks = None if grad_Ks is None else grad_Ks.to(Ks.dtype)
         grad_backgrounds = None if grad_backgrounds is None else grad_backgrounds.to(torch.float32)
-        return (*out, grad_colors, grad_viewmats, grad_backgrounds, grad_shift, None, None, None)
+        return (*out, grad_colors, grad_viewmats, grad_Ks, grad_backgrounds, grad_shift, None, None)
 
 
 def _empty_images(views: int, channels: int, options: SurfelOptions) -> tuple[Tensor, ...]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
-from splatbot.gaussians.harmonics import sh_to_rgb
 from splatbot.rasterize.depth_normals import depth_to_normal
+from splatbot.rasterize.harmonics import harmonics_basis
 from splatbot.rasterize.inputs import Inputs, check_inputs
 from splatbot.rasterize.native import native
 from splatbot.rasterize.surfel_autograd import RasterizeSurfels, SurfelOptions
@@ -62,17 +63,17 @@ def rasterization_2dgs(
         quats: (N, 4) wxyz, any norm; a zero quaternion counts as no rotation and receives no gradient.
         scales: (N, 3) standard deviations [m]; the third is not looked at.
         opacities: (N,) in 0..1.
-        colors: (N, D) or (C, N, D), any number of channels; with ``sh_degree=0`` (N, 1, 3) DC coefficients; None in
-            the modes D and ED.
+        colors: (N, D) or (C, N, D), any number of channels; with ``sh_degree`` coefficients (N, K, 3) or
+            (C, N, K, 3); None in the modes D and ED.
         viewmats: (C, 4, 4) world to camera; float32 or float64.
-        Ks: (C, 3, 3) [px]. Receives no gradient.
+        Ks: (C, 3, 3) [px]; float32 or float64. Its focal lengths and principal point receive gradients.
         width: of the image [px].
         height: of the image [px].
         near_plane: surfels whose centre is nearer than this are left out, and nearer hits [m].
         far_plane: surfels farther than this are left out [m].
         radius_clip: surfels whose extent is at most this are left out [px].
         eps2d: has no effect on the result (the low-pass filter is fixed); accepted for gsplat's sake.
-        sh_degree: None, or 0.
+        sh_degree: None, or 0 to 4: colours are max(harmonics + 1/2, 0), seen from the camera's centre.
         packed: has no effect on the result; accepted for gsplat's sake.
         tile_size: has no effect on the result; accepted for gsplat's sake.
         backgrounds: (C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
@@ -106,9 +107,25 @@ def rasterization_2dgs(
         colors, backgrounds = None, None
     elif colors is None:
         raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
-    elif sh_degree is not None:
-        colors = _from_harmonics(colors, sh_degree)
-    inputs = check_inputs(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width, height)
+    inputs = check_inputs(
+        means,
+        quats,
+        scales,
+        None,
+        opacities,
+        colors,
+        sh_degree if wants_color else None,
+        viewmats,
+        Ks,
+        backgrounds,
+        None,
+        (width, height),
+        1,
+    )
+    if inputs.layout.batch:
+        raise InputError("has batch dimensions.", field="means", hint="render surfels of one scene at a time")
+    if wants_color and sh_degree is not None:
+        inputs = replace(inputs, colors=_shade(inputs, sh_degree))
     options = SurfelOptions(
         width=width,
         height=height,
@@ -137,12 +154,12 @@ def _render(inputs: Inputs, shift: Tensor, options: SurfelOptions, states: list[
     """All channels: the first with everything else, further ones for their colours alone."""
     most = native().MAX_SURFEL_CHANNELS
     channels = inputs.colors.shape[-1]
-    geometry = inputs.tensors()[:4]
+    geometry = (inputs.means, inputs.quats, inputs.scales, inputs.opacities)
 
     def part(first: int, options: SurfelOptions, states: list[Any]) -> tuple[Tensor, ...]:
         colors = inputs.colors[..., first : first + most].contiguous()
         behind = None if inputs.backgrounds is None else inputs.backgrounds[:, first : first + most].contiguous()
-        tensors = (*geometry, colors, inputs.viewmats, behind, shift, inputs.Ks)
+        tensors = (*geometry, colors, inputs.viewmats, inputs.Ks, behind, shift)
         images: tuple[Tensor, ...] = RasterizeSurfels.apply(*tensors, options, states)
         return images
 
@@ -158,14 +175,16 @@ def _expected(depth: Tensor, alphas: Tensor, kind: str) -> Tensor:
     return depth if kind == "expected" else depth / alphas.clamp_min(1e-10)
 
 
-def _from_harmonics(colors: Tensor, sh_degree: int) -> Tensor:
-    if sh_degree != 0:
-        raise InputError(f"is {sh_degree}.", field="sh_degree", hint="pass colours, or coefficients with sh_degree=0")
-    if colors.ndim != 3 or colors.shape[1] < 1 or colors.shape[2] != 3:
-        raise InputError(
-            f"is {tuple(colors.shape)}.", field="colors", hint="with sh_degree give coefficients (N, K, 3)"
-        )
-    return sh_to_rgb(colors[:, 0]).clamp_min(0.0)
+def _shade(inputs: Inputs, degree: int) -> Tensor:
+    """Colours (C, N, 3) of coefficients (N, K, 3) or (C, N, K, 3), each view's from its camera's centre."""
+    colors = []
+    for c, pose in enumerate(inputs.viewmats):
+        coefficients = inputs.colors[c] if inputs.layout.view_colors else inputs.colors
+        center = -torch.linalg.solve(pose[:3, :3], pose[:3, 3]).to(inputs.means.dtype)
+        basis = harmonics_basis(torch.nn.functional.normalize(inputs.means - center, dim=-1), degree)
+        shaded = torch.einsum("nk,nkc->nc", basis, coefficients[:, : basis.shape[-1]])
+        colors.append((0.5 + shaded).clamp_min(0.0))
+    return torch.stack(colors)
 
 
 def _reject_unsupported(sparse_grad: bool, absgrad: bool, depth_mode: str) -> None:

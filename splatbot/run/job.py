@@ -47,7 +47,7 @@ def map_log(
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: int | None = None,
     source: dict[str, Any] | None = None,
-    effects: Sequence[Mapping[str, Any]] = (),
+    effects: Sequence[Mapping[str, Any]] | None = None,
 ) -> RunResult:
     """Map a log and write the run folder ``out``.
 
@@ -64,7 +64,7 @@ def map_log(
         on_bad_frame: what to do about a frame that cannot be read.
         max_frames: read no more frames than this.
         source: what else it takes to open the log again, kept beside its uri in ``metrics.json`` under "log".
-        effects: the account of the sensor effects that the log's frames went through; empty for a real sensor.
+        effects: the account of the sensor effects that the log's frames went through; None takes the log's own.
 
     Raises:
         LogError: the log is empty, or no frame could be read; nothing is written then.
@@ -85,7 +85,7 @@ def map_log(
         outcome = Outcome(
             loop=loop,
             source=source or {},
-            effects=list(effects),
+            effects=list(log.effects if effects is None else effects),
             interrupts=interrupts,
             model=loop.slam.snapshot().model,
             rows=loop.rows(),

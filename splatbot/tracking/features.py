@@ -9,14 +9,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot import _native
 from splatbot.camera import Camera
 from splatbot.geometry import inverse, transform_points
 from splatbot.tracking.prepare import Image
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 # Minimal trust in a pose from features: fewer inliers than this, or a smaller share, happens by chance.
 MIN_INLIERS = 20
 _MAX_REPROJECTION = 3.0  # [px]
 _MATCH_RATIO = 0.8  # Lowe's ratio test
+_MATCH_BITS = 64  # descriptors that differ in more of their 256 bits are strangers
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,7 @@ class Features:
 
     pixels: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
-    points: NDArray[np.float64]
+    points: Array
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -41,9 +46,9 @@ class Features:
 class FeaturePose:
     """T_world_camera (4, 4) from features, and the matches that agree with it: points (M, 3) [m] and pixels (M, 2)."""
 
-    T_world_camera: NDArray[np.float64]
-    points: NDArray[np.float64]
-    pixels: NDArray[np.float64]
+    T_world_camera: Array
+    points: Array
+    pixels: Array
     matches: int
 
 
@@ -54,41 +59,70 @@ def detect(rgb: NDArray[np.uint8], depth: Image, camera: Camera, n_features: int
     if descriptors is None:
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
     pixels = np.array([k.pt for k in keypoints], dtype=np.float32)
-    z = _depth_at(depth, pixels)
+    z = np.asarray(_native.depth_around(depth, pixels))
     rays = np.stack(
         [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(z))], 1
     )
     return Features(pixels, np.asarray(descriptors, dtype=np.uint8), rays * z[:, None])
 
 
+@dataclass(frozen=True)
+class Expectation:
+    """Where a frame should be, T_world_camera (4, 4), and how far its features may lie from there: ``radius`` [px]."""
+
+    T_world_camera: Array
+    radius: float
+
+
 def match_pose(
     current: Features,
-    keyframes: Sequence[tuple[Features, NDArray[np.float64]]],
+    keyframes: Sequence[tuple[Features, Array]],
     camera: Camera,
+    expected: Expectation | None = None,
 ) -> FeaturePose | None:
     """Pose of ``current`` from 2D-3D matches with keyframes given as (features, T_world_camera).
 
-    EPnP-free: P3P in RANSAC (Gao et al. 2003), then Levenberg-Marquardt on the inliers; OpenCV's RANSAC is seeded alike
-    on every call, so the result is repeatable. None when too few matches agree.
+    A keyframe's points are looked for near to where they are expected, or everywhere. Then P3P in RANSAC (Gao et al.
+    2003) and Levenberg-Marquardt on the inliers; OpenCV's RANSAC is seeded alike on every call, so the result is
+    repeatable. None when too few matches agree, or when those that do pile up at the edge of the search: then the true
+    matches lie outside, and what was found inside is a choice that agrees with the expectation.
     """
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
     pixels, points = [], []
     for features, T_world_keyframe in keyframes:
         anchored = np.flatnonzero(np.isfinite(features.points[:, 2]))
-        if len(anchored) < 8 or len(current) < 8:
-            continue
-        pairs = [
-            (first.queryIdx, anchored[first.trainIdx])
-            for first, second in matcher.knnMatch(current.descriptors, features.descriptors[anchored], k=2)
-            if first.distance < _MATCH_RATIO * second.distance
-        ]
-        if pairs:
-            query, train = np.array(pairs).T
-            pixels.append(current.pixels[query])
-            points.append(transform_points(T_world_keyframe, features.points[train]))
+        world = transform_points(T_world_keyframe, features.points[anchored])
+        if expected is None:
+            places, radius = np.zeros((len(anchored), 2), np.float32), np.inf
+        else:
+            seen = transform_points(inverse(expected.T_world_camera), world)
+            ahead = seen[:, 2] > 1e-3
+            anchored, world = anchored[ahead], world[ahead]
+            places, radius = camera.project(seen[ahead]).astype(np.float32), expected.radius
+        query, train = _match(current, features.descriptors[anchored], places, radius)
+        pixels.append(current.pixels[query])
+        points.append(world[train])
     if not pixels:
         return None
-    image, world = np.concatenate(pixels).astype(np.float64), np.concatenate(points)
+    found = _pose_from_matches(np.concatenate(pixels).astype(np.float64), np.concatenate(points), camera)
+    if found is None or expected is None:
+        return found
+    shift = camera.project(transform_points(inverse(expected.T_world_camera), found.points)) - found.pixels
+    return found if np.percentile(np.linalg.norm(shift, axis=1), 80) < 0.5 * expected.radius else None
+
+
+def _match(
+    current: Features, descriptors: NDArray[np.uint8], expected: NDArray[np.float32], radius: float
+) -> tuple[Index, Index]:
+    """Indices of current keypoints, and of those expected at pixels (M, 2) with descriptors (M, 32) that they match."""
+    found = _native.match_near(
+        expected, descriptors, current.pixels, current.descriptors, radius, _MATCH_BITS, _MATCH_RATIO
+    )
+    train = np.flatnonzero(found >= 0)
+    return found[train].astype(np.intp), train
+
+
+def _pose_from_matches(image: Array, world: Array, camera: Camera) -> FeaturePose | None:
+    """PnP of pixels (M, 2) and points (M, 3)."""
     if len(image) < MIN_INLIERS:
         return None
     found, r, t, inliers = cv2.solvePnPRansac(
@@ -111,20 +145,3 @@ def match_pose(
     if not np.isfinite(T_camera_world).all():
         return None
     return FeaturePose(inverse(T_camera_world), world[agree], image[agree], len(image))
-
-
-def _depth_at(depth: Image, pixels: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Median depth (N,) of the 5x5 pixels around each pixel; NaN where none is valid or they span two surfaces."""
-    padded = np.pad(depth, 2)
-    u = np.clip(np.rint(pixels[:, 0]).astype(int), 0, depth.shape[1] - 1)
-    v = np.clip(np.rint(pixels[:, 1]).astype(int), 0, depth.shape[0] - 1)
-    du, dv = np.meshgrid(np.arange(5), np.arange(5))
-    window = padded[v[:, None] + dv.ravel(), u[:, None] + du.ravel()].astype(np.float64)
-    window[window == 0] = np.nan
-    z = np.full(len(pixels), np.nan)
-    seen = np.isfinite(window).any(1)
-    z[seen] = np.nanmedian(window[seen], axis=1)
-    spread = np.zeros(len(pixels))
-    spread[seen] = np.nanmax(window[seen], axis=1) - np.nanmin(window[seen], axis=1)
-    z[spread > 0.05 * np.nan_to_num(z)] = np.nan
-    return z

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatbot.config import TrackingConfig
 from splatbot.geometry import inverse
-from splatbot.tracking.align import DenseTerm
+from splatbot.tracking.align import residuals
 from splatbot.tracking.prepare import Level
 from splatbot.tracking.reference import Reference
 
@@ -20,6 +20,9 @@ Verdict = Literal["ok", "degraded", "lost"]
 
 _SATURATION = 6.0  # a residual of this many σ, or none at all, counts as an outlier
 _INLIER = 3.0  # [σ]
+# A frame of less contrast than this share of the reference's shows nothing: a covered lens, the dark, a lost image. The
+# exposure fit would explain it by a gain near 0, at any pose.
+_MIN_CONTRAST = 0.1
 
 
 @dataclass(frozen=True)
@@ -31,12 +34,15 @@ class Health:
         photometric_inliers: share of those whose grey agrees within 3 σ.
         geometric_inliers: share of those with depth whose depth agrees within 3 σ; 1 where none has depth.
         score: mean residual [σ], saturated; smaller is better, comparable between poses of one frame.
+        contrast: standard deviation of the frame's grey at those points over that of the reference's; 1 where the
+            reference has none.
     """
 
     overlap: float
     photometric_inliers: float
     geometric_inliers: float
     score: float
+    contrast: float
 
 
 def measure(
@@ -44,15 +50,15 @@ def measure(
 ) -> Health:
     """Score a pose of a frame against references on one level; only exposure is fitted."""
     T_camera_world = inverse(T_world_camera)
-    photo, depth = [], []
+    photo, depth, here, there = [], [], [], []
     for reference in references:
-        term = DenseTerm(reference, level, index, config, config.gate)
-        for _ in range(2):
-            H, g, _, _ = term.linearize(T_camera_world, photometric=True, geometric=True)
-            term.exposure -= np.linalg.solve(H[6:, 6:] + 1e2 * np.eye(2), g[6:])
-        _, _, r_photo, r_depth = term.linearize(T_camera_world, photometric=True, geometric=True)
-        photo.append(np.abs(r_photo))
-        depth.append(np.abs(r_depth))
+        points = reference.levels[index]
+        found = residuals(level, points, T_camera_world @ reference.T_world_camera, config)
+        photo.append(np.abs(found.photometric))
+        depth.append(np.abs(found.geometric))
+        seen = np.isfinite(found.photometric)
+        there.append(points.gray[seen].astype(np.float64))
+        here.append(found.photometric[seen] * config.sigma_gray + found.gain * there[-1] + found.offset)
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)
     seen, ranged = np.isfinite(r_photo), np.isfinite(r_depth)
     return Health(
@@ -60,6 +66,7 @@ def measure(
         photometric_inliers=float((r_photo[seen] < _INLIER).mean()) if seen.any() else 0.0,
         geometric_inliers=float((r_depth[ranged] < _INLIER).mean()) if ranged.any() else 1.0,
         score=float(np.mean([_saturated(r_photo), _saturated(r_depth)])) if len(seen) else _SATURATION,
+        contrast=_contrast(np.concatenate(here), np.concatenate(there)),
     )
 
 
@@ -67,17 +74,33 @@ def _saturated(residuals: NDArray[np.floating[Any]]) -> float:
     return float(np.minimum(np.nan_to_num(residuals, nan=_SATURATION), _SATURATION).mean())
 
 
+def _contrast(gray: Array, reference_gray: Array) -> float:
+    """Ratio of the standard deviations of grey values (N,); 1 where the reference is of one colour."""
+    spread = float(reference_gray.std()) if len(reference_gray) else 0.0
+    return float(gray.std()) / spread if spread > 1e-6 else 1.0
+
+
 def verdict_of(health: Health, information: Array, config: TrackingConfig) -> tuple[Verdict, tuple[str, ...]]:
     """The verdict and what speaks against the pose."""
     lost, doubts = [], []
-    if health.overlap < config.min_overlap:
+    # Comparisons are written so that NaN speaks against the pose.
+    if not health.overlap >= config.min_overlap:
         lost.append(f"only {health.overlap:.0%} of the reference is seen")
-    inliers = min(health.photometric_inliers, health.geometric_inliers)
-    if inliers < config.min_inliers:
+    inliers = float(np.min([health.photometric_inliers, health.geometric_inliers]))
+    if not inliers >= config.min_inliers:
         lost.append(f"only {inliers:.0%} of the residuals are inliers")
-    eigenvalues = np.linalg.eigvalsh(information[:3, :3])
-    if not eigenvalues[0] > config.min_eigen_ratio * eigenvalues[2]:
+    if not health.contrast >= _MIN_CONTRAST:
+        lost.append(f"the image is blank: {health.contrast:.0%} of the reference's contrast")
+    if not np.isfinite(information).all():
+        lost.append("the alignment is not finite")
+    elif not _is_constrained(information, config.min_eigen_ratio):
         doubts.append("translation is hardly constrained in one direction")
     if lost:
         return "lost", tuple(lost + doubts)
     return ("degraded", tuple(doubts)) if doubts else ("ok", ())
+
+
+def _is_constrained(information: Array, min_ratio: float) -> bool:
+    """Whether the translation is known in its weakest direction, against its strongest."""
+    eigenvalues = np.linalg.eigvalsh(information[:3, :3])
+    return bool(eigenvalues[0] > min_ratio * eigenvalues[2])

@@ -9,11 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot import _native
 from splatbot.camera import Camera
 from splatbot.config import TrackingConfig
 from splatbot.frame import Frame
 
 Image = NDArray[np.float32]
+
+_FLYING_STEP = 0.03  # share of its depth by which a flying pixel differs from both surfaces
+_LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of one pixel is none
 
 
 @dataclass(frozen=True)
@@ -27,25 +31,28 @@ class Level:
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame and its pyramid, finest level first."""
+    """A frame, its plausible depth (H, W) [m] at full size, and its pyramid, finest level first."""
 
     frame: Frame
+    depth: Image
     levels: tuple[Level, ...]
 
 
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
-    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide."""
+    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide.
+
+    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
+    """
     depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
-    gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
+    gray = np.multiply(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.float32(1 / 255), dtype=np.float32)
     level = Level(gray, depth, frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
     smooth = np.asarray(cv2.GaussianBlur(level.gray, (0, 0), 0.7), dtype=np.float32)
-    level = Level(smooth, level.depth, level.camera)
-    levels = [level]
-    for _ in range(config.n_levels - 1):
+    levels = [Level(smooth, level.depth, level.camera)]
+    while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
         levels.append(halve(levels[-1]))
-    return PreparedFrame(frame, tuple(levels))
+    return PreparedFrame(frame, depth, tuple(levels))
 
 
 def valid_depth(depth: Image, near: float, far: float) -> Image:
@@ -54,16 +61,12 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
     A flying pixel is nearer than one neighbour and farther than the opposite one by more than 3 % of its range;
     a single missing row of neighbours, as registration leaves in upsampled depth, does not count against a pixel.
     """
-    z = np.where((depth >= near) & (depth <= far), depth, 0.0).astype(np.float32)
-    padded = np.pad(z, 1, mode="edge")
-    flying = np.zeros(z.shape, dtype=bool)
-    step = 0.03 * z
-    for before, after in ((padded[1:-1, :-2], padded[1:-1, 2:]), (padded[:-2, 1:-1], padded[2:, 1:-1])):
-        rises = (z - before > step) & (after - z > step) & (before > 0)
-        falls = (before - z > step) & (z - after > step) & (after > 0)
-        flying |= rises | falls
-    z[flying] = 0.0
-    return z
+    return np.asarray(_native.valid_depth(np.ascontiguousarray(depth), near, far, _FLYING_STEP))
+
+
+def valid_share(prepared: PreparedFrame) -> float:
+    """Share of the pixels that have a usable depth."""
+    return float((prepared.levels[0].depth > 0).mean())
 
 
 def halve(level: Level) -> Level:
@@ -78,18 +81,7 @@ def halve(level: Level) -> Level:
 
 def halve_depth(depth: Image) -> Image:
     """Half the size of a depth image [m]: the mean over the nearest surface of each 2x2 block; 0 where none is."""
-    height, width = depth.shape[0] // 2, depth.shape[1] // 2
-    corners = [depth[v : 2 * height : 2, u : 2 * width : 2] for v in (0, 1) for u in (0, 1)]
-    nearest = np.full((height, width), np.inf, np.float32)
-    for corner in corners:
-        nearest = np.minimum(nearest, np.where(corner > 0, corner, np.float32(np.inf)))
-    total = np.zeros((height, width), np.float32)
-    count = np.zeros((height, width), np.float32)
-    for corner in corners:
-        same = (corner > 0) & (corner <= np.float32(1.05) * nearest)
-        total += np.where(same, corner, 0)
-        count += same
-    return (total / np.maximum(count, 1)).astype(np.float32)
+    return np.asarray(_native.halve_depth(np.ascontiguousarray(depth)))
 
 
 def with_depth(levels: Sequence[Level], depth: Image) -> tuple[Level, ...]:

@@ -29,7 +29,7 @@ class Reference:
 
 
 def make_reference(levels: tuple[Level, ...], T_world_camera: NDArray[np.float64], n_pixels: int) -> Reference:
-    """Sample at most ``n_pixels`` pixels of every level."""
+    """Sample about ``n_pixels`` pixels of every level, fewer where surface is missing."""
     return Reference(T_world_camera, tuple(sample_level(level, n_pixels) for level in levels))
 
 

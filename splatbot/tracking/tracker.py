@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 from splatbot.config import TrackingConfig
 from splatbot.geometry import inverse, so3_log
 from splatbot.tracking.align import align
-from splatbot.tracking.features import FeaturePose, Features, detect, match_pose
+from splatbot.tracking.features import Expectation, FeaturePose, Features, detect, match_pose
 from splatbot.tracking.health import Health, Verdict, measure, verdict_of
 from splatbot.tracking.predict import ConstantVelocity
-from splatbot.tracking.prepare import PreparedFrame, valid_depth
+from splatbot.tracking.prepare import PreparedFrame, valid_share
 from splatbot.tracking.reference import Reference
 
 Array = NDArray[np.float64]
+
+# A first image whose grey (0..1) varies less is a covered lens or a sensor not up yet: nothing to track against.
+_BLANK = 0.005
 
 
 class TrackedKeyframe(Protocol):
@@ -63,10 +66,12 @@ class Tracker:
         self._lost = False
 
     def start(self, prepared: PreparedFrame) -> PoseEstimate:
-        """The pose of the first frame, which defines the world; "lost" when it has too little depth to map."""
-        share = float((prepared.levels[0].depth > 0).mean())
+        """The pose of the first frame, which defines the world; "lost" when it has too little depth or is blank."""
+        share = valid_share(prepared)
         if share < self.config.min_valid:
             return PoseEstimate(np.eye(4), "lost", (f"only {share:.1%} of the pixels have a usable depth",), "start")
+        if float(prepared.levels[0].gray.std()) < _BLANK:
+            return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")
         self.motion.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
 
@@ -80,7 +85,7 @@ class Tracker:
         if self._needs_features(prepared, candidate, T_predicted):
             with clock("features"):
                 features = self.detect(prepared)
-                matched = self._match(features, prepared, keyframes, T_predicted)
+                matched = self._match(features, prepared, keyframes, candidate.T_world_camera)
         with clock("direct"):
             candidates = [self._direct(prepared, candidate, matched)]
             if matched is not None:
@@ -95,16 +100,14 @@ class Tracker:
 
     def detect(self, prepared: PreparedFrame) -> Features:
         """Keypoints of a frame, with depth."""
-        frame = prepared.frame
-        depth = valid_depth(frame.depth, self.config.min_depth, self.config.max_depth)
-        return detect(frame.rgb, depth, frame.camera, self.config.n_features)
+        return detect(prepared.frame.rgb, prepared.depth, prepared.frame.camera, self.config.n_features)
 
     def _geometric(
         self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_world_camera: Array
     ) -> _Candidate:
         """Projective point-to-plane alignment on the coarse levels, from the predicted pose."""
         references = self._nearest(keyframes, T_world_camera)
-        T, information = align(
+        found = align(
             prepared.levels,
             references,
             T_world_camera,
@@ -113,11 +116,11 @@ class Tracker:
             finest=min(1, len(prepared.levels) - 1),
             gate=2 * self.config.gate,
         )
-        return _Candidate("geometric", T, information, references)
+        return _Candidate("geometric", found.T_world_camera, found.information, references)
 
     def _direct(self, prepared: PreparedFrame, start: _Candidate, matched: FeaturePose | None) -> _Candidate:
         """Photometric, depth and feature residuals together, down to the finest level."""
-        T, information = align(
+        found = align(
             prepared.levels,
             start.references,
             start.T_world_camera,
@@ -128,7 +131,7 @@ class Tracker:
             features=matched,
             camera=prepared.frame.camera,
         )
-        return _Candidate(f"{start.stage}+direct", T, information, start.references)
+        return _Candidate(f"{start.stage}+direct", found.T_world_camera, found.information, start.references)
 
     def _needs_features(self, prepared: PreparedFrame, candidate: _Candidate, T_predicted: Array) -> bool:
         if self.config.features == "always" or self._lost:
@@ -140,13 +143,22 @@ class Tracker:
         return verdict_of(health, candidate.information, self.config)[0] != "ok"
 
     def _match(
-        self, features: Features, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_predicted: Array
+        self, features: Features, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_expected: Array
     ) -> FeaturePose | None:
-        """Match with the nearest keyframes, the latest and the first; when lost, with as many again."""
+        """Match with the nearest keyframes, the latest and the first: near to where they are expected, else anywhere.
+
+        When lost, with as many again, and anywhere at once.
+        """
         n = self.config.match_keyframes * (4 if self._lost else 1)
-        chosen = [*order_by_distance(keyframes, T_predicted)[:n], 0, len(keyframes) - 1]
+        chosen = [*order_by_distance(keyframes, T_expected)[:n], 0, len(keyframes) - 1]
         views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in sorted(set(chosen))]
-        return match_pose(features, views, prepared.frame.camera)
+        camera = prepared.frame.camera
+        if not self._lost:
+            expected = Expectation(T_expected, self.config.match_radius * camera.width)
+            near = match_pose(features, views, camera, expected)
+            if near is not None and len(near.points) >= self.config.match_enough:
+                return near
+        return match_pose(features, views, camera)
 
     def _nearest(self, keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[Reference]:
         order = order_by_distance(keyframes, T_world_camera)

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import NAMES, Scene, hard_scene, one_gaussian
-from tests.surfels import RENDERED, compare_surfels, hard_surfels, loss, reference, render
+from tests.scenes import Scene, hard_scene, one_gaussian
+from tests.surfels import NAMES, RENDERED, compare_surfels, hard_surfels, loss, reference, render
 
 FORWARD_BOUND = 1e-5
 GRADIENT_BOUND = 1e-4

@@ -1,10 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
-
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <array>
+#include <optional>
+#include <tuple>
+#include <utility>
 #include <vector>
 
 #include "bindings.hpp"
@@ -19,10 +26,19 @@ using Image = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::devi
 using Rows3 = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Vector = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Pixels = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Information = nb::ndarray<const double, nb::shape<6, 6>, nb::c_contig, nb::device::cpu>;
+using Intrinsics = std::array<double, 4>;
 
 template <typename A>
 auto view(const A& a) {
   return std::span(a.data(), a.size());
+}
+
+template <std::size_t N, typename A>
+auto fixed(const A& a) {
+  return std::span<const double, N>(a.data(), N);
 }
 
 nb::object copy(std::span<const double> values, std::initializer_list<std::size_t> shape) {
@@ -37,42 +53,96 @@ nb::object take(std::vector<float>&& values) {
   return nb::cast(nb::ndarray<nb::numpy, float>(data->data(), {data->size()}, owner));
 }
 
+splatbot::AlignImage image_of(const Image& gray, const Image& depth, const Intrinsics& k) {
+  if (gray.shape(0) != depth.shape(0) || gray.shape(1) != depth.shape(1))
+    throw nb::value_error("gray and depth differ in size");
+  return {static_cast<int>(gray.shape(1)), static_cast<int>(gray.shape(0)), k[0], k[1], k[2], k[3], view(gray), view(depth)};
+}
+
+splatbot::AlignPoints points_of(const Rows3& points, const Rows3& normals, const Vector& gray) {
+  if (points.shape(0) != gray.size() || normals.shape(0) != gray.size())
+    throw nb::value_error("points, normals, gray differ in length");
+  return {view(points), view(normals), view(gray)};
+}
+
+// What Python holds: the arrays stay alive through the call because the caller's tuples do.
+using LevelArrays = std::tuple<Image, Image, Intrinsics>;
+using PointArrays = std::tuple<Rows3, Rows3, Vector>;
+using ReferenceArrays = std::pair<Pose, std::vector<PointArrays>>;
+using MatchArrays = std::tuple<Points, Pixels, Intrinsics>;
+using PriorArrays = std::pair<Pose, Information>;
+
 }  // namespace
 
 void define_align(nb::module_& m) {
+  nb::class_<splatbot::AlignSettings>(m, "AlignSettings")
+      .def(
+          "__init__",
+          [](splatbot::AlignSettings* self, bool photometric, bool geometric, double sigma_gray,
+             double sigma_depth_floor, double sigma_depth_quad, double gate) {
+            new (self) splatbot::AlignSettings{.use_photometric = photometric,
+                                               .use_geometric = geometric,
+                                               .sigma_gray = sigma_gray,
+                                               .sigma_depth_floor = sigma_depth_floor,
+                                               .sigma_depth_quad = sigma_depth_quad,
+                                               .gate = gate};
+          },
+          "photometric"_a, "geometric"_a, "sigma_gray"_a, "sigma_depth_floor"_a, "sigma_depth_quad"_a, "gate"_a);
   m.def(
       "linearize_alignment",
-      [](Image gray, Image depth, std::array<double, 4> intrinsics, Rows3 points, Rows3 normals, Vector gray_reference,
-         Pose T_current_reference, double gain, double offset, bool photometric, bool geometric, double sigma_gray,
-         double sigma_depth_floor, double sigma_depth_quad, double gate) {
-        const std::size_t n = gray_reference.size();
-        if (points.shape(0) != n || normals.shape(0) != n) throw nb::value_error("points, normals, gray differ in length");
-        if (gray.shape(0) != depth.shape(0) || gray.shape(1) != depth.shape(1))
-          throw nb::value_error("gray and depth differ in size");
-        const auto [fx, fy, cx, cy] = intrinsics;
-        const splatbot::AlignImage image{static_cast<int>(gray.shape(1)), static_cast<int>(gray.shape(0)), fx, fy, cx,
-                                         cy, view(gray), view(depth)};
-        const splatbot::AlignPoints reference{view(points), view(normals), view(gray_reference)};
-        splatbot::AlignSettings settings;
-        settings.use_photometric = photometric;
-        settings.use_geometric = geometric;
-        settings.sigma_gray = sigma_gray;
-        settings.sigma_depth_floor = sigma_depth_floor;
-        settings.sigma_depth_quad = sigma_depth_quad;
-        settings.gate = gate;
-        std::vector<float> residual_photometric(n), residual_geometric(n);
-        const std::span<const double, 16> T(T_current_reference.data(), 16);
+      [](Image gray, Image depth, Intrinsics intrinsics, Rows3 points, Rows3 normals, Vector gray_reference,
+         Pose T_current_reference, double gain, double offset, const splatbot::AlignSettings& settings) {
+        const splatbot::AlignImage image = image_of(gray, depth, intrinsics);
+        const splatbot::AlignPoints reference = points_of(points, normals, gray_reference);
+        std::vector<float> residual_photometric(gray_reference.size()), residual_geometric(gray_reference.size());
         splatbot::AlignSums sums;
         {
           nb::gil_scoped_release release;
-          sums = splatbot::linearize_alignment(image, reference, T, gain, offset, settings, residual_photometric,
-                                               residual_geometric);
+          sums = splatbot::linearize_alignment(image, reference, fixed<16>(T_current_reference), gain, offset, settings,
+                                               residual_photometric, residual_geometric);
         }
         return nb::make_tuple(copy(sums.H, {8, 8}), copy(sums.g, {8}), sums.cost, sums.projected,
                               take(std::move(residual_photometric)), take(std::move(residual_geometric)));
       },
       "gray"_a.noconvert(), "depth"_a.noconvert(), "intrinsics"_a, "points"_a.noconvert(), "normals"_a.noconvert(),
-      "gray_reference"_a.noconvert(), "T_current_reference"_a.noconvert(), "gain"_a, "offset"_a, "photometric"_a,
-      "geometric"_a, "sigma_gray"_a, "sigma_depth_floor"_a, "sigma_depth_quad"_a, "gate"_a,
+      "gray_reference"_a.noconvert(), "T_current_reference"_a.noconvert(), "gain"_a, "offset"_a, "settings"_a,
       "Normal equations of one alignment step: (H (8, 8), g (8,), cost, projected, r_photo (N,), r_geo (N,)).");
+  m.def(
+      "align",
+      [](const std::vector<LevelArrays>& levels, const std::vector<ReferenceArrays>& references,
+         const std::optional<MatchArrays>& matches, Pose T_camera_world, const splatbot::AlignSettings& settings,
+         double dense_weight, int iterations, std::size_t finest, const std::optional<PriorArrays>& prior) {
+        std::vector<splatbot::AlignImage> images;
+        for (const auto& [gray, depth, intrinsics] : levels) images.push_back(image_of(gray, depth, intrinsics));
+        std::vector<splatbot::AlignReference> known;
+        for (const auto& [pose, points] : references) {
+          if (points.size() != levels.size()) throw nb::value_error("a reference lacks levels of the frame");
+          splatbot::AlignReference& reference = known.emplace_back();
+          std::copy_n(pose.data(), 16, reference.T_world_reference.begin());
+          for (const auto& [p, n, g] : points) reference.levels.push_back(points_of(p, n, g));
+        }
+        splatbot::AlignMatches match;
+        if (matches) {
+          const auto& [points, pixels, k] = *matches;
+          if (points.shape(0) != pixels.shape(0)) throw nb::value_error("points and pixels differ in length");
+          match = {.fx = k[0], .fy = k[1], .cx = k[2], .cy = k[3], .points = view(points), .pixels = view(pixels)};
+        }
+        splatbot::AlignPlan plan{.settings = settings, .dense_weight = dense_weight, .iterations = iterations, .finest = finest};
+        if (prior) {
+          std::copy_n(prior->first.data(), 16, plan.T_prior_camera_world.begin());
+          std::copy_n(prior->second.data(), 36, plan.prior_information.begin());
+        }
+        splatbot::AlignResult result;
+        {
+          nb::gil_scoped_release release;
+          result = splatbot::align(images, known, match, fixed<16>(T_camera_world), plan);
+        }
+        return nb::make_tuple(copy(result.T_camera_world, {4, 4}), copy(result.H, {6, 6}), result.dense_cost,
+                              result.dense_residuals, result.pixel_iterations);
+      },
+      "levels"_a, "references"_a, "matches"_a.none(), "T_camera_world"_a.noconvert(), "settings"_a, "dense_weight"_a,
+      "iterations"_a, "finest"_a, "prior"_a.none(),
+      "Gauss-Newton over the levels (gray, depth, (fx, fy, cx, cy)), fine to coarse, against references (T_world_reference, "
+      "[(points, normals, gray)] per level) and matches (points, pixels, (fx, fy, cx, cy)); prior: (T_camera_world, "
+      "information (6, 6)). Returns (T_camera_world, H (6, 6), dense cost, dense residuals, pixel-iterations).");
 }

@@ -6,6 +6,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
+#include <cstdint>
 #include <initializer_list>
 #include <memory>
 #include <optional>
@@ -20,12 +21,15 @@ namespace nb = nanobind;
 
 template <class T, class Shape>
 using Array = nb::ndarray<T, Shape, nb::c_contig, nb::device::cpu>;
+using InAny = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using OutAny = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using InMask = Array<const std::uint8_t, nb::shape<-1, -1>>;
 using In1 = Array<const float, nb::shape<-1>>;
+using InN33 = Array<const float, nb::shape<-1, 3, 3>>;
 using In2 = Array<const float, nb::shape<-1, -1>>;
 using In3 = Array<const float, nb::shape<-1, -1, -1>>;
 using InN3 = Array<const float, nb::shape<-1, 3>>;
 using InN4 = Array<const float, nb::shape<-1, 4>>;
-using Out1 = Array<float, nb::shape<-1>>;
 using Out2 = Array<float, nb::shape<-1, -1>>;
 using Out3 = Array<float, nb::shape<-1, -1, -1>>;
 using Matrix3 = Array<const double, nb::shape<3, 3>>;
@@ -41,24 +45,32 @@ std::span<T> span_of(const std::optional<A>& array) {
   return array ? std::span<T>(array->data(), array->size()) : std::span<T>();
 }
 
-inline splatbot::Gaussians gaussians_of(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
-                                 const In2& colors) {
-  return {.count = means.shape(0),
-          .channels = static_cast<int>(colors.shape(1)),
-          .means = span_of(means),
-          .quats = span_of(quats),
-          .scales = span_of(scales),
-          .opacities = span_of(opacities),
-          .colors = span_of(colors)};
-}
-
+// The camera's centre is -R^-1 t; x -> R (x - origin) + translation, all in float64 before rounding.
 inline splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int width, int height) {
   splatbot::View view{};
+  const auto r = [&](int i, int j) { return viewmat(i % 3, j % 3); };
+  double determinant = 0.0, center[3] = {};
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) {
+      const double cofactor = r(i + 1, j + 1) * r(i + 2, j + 2) - r(i + 1, j + 2) * r(i + 2, j + 1);
+      center[j] -= cofactor * viewmat(i, 3);
+      determinant += i == 0 ? cofactor * viewmat(0, j) : 0.0;
       view.rotation[3 * i + j] = static_cast<float>(viewmat(i, j));
     }
-    view.translation[i] = static_cast<float>(viewmat(i, 3));
+  }
+  if (determinant == 0.0) {
+    throw std::invalid_argument("the rotation of viewmat has no inverse");
+  }
+  for (int j = 0; j < 3; ++j) {
+    view.origin[j] = static_cast<float>(center[j] / determinant);
+    view.center_low[j] = static_cast<float>(center[j] / determinant - static_cast<double>(view.origin[j]));
+  }
+  for (int i = 0; i < 3; ++i) {
+    double shift = viewmat(i, 3);
+    for (int j = 0; j < 3; ++j) {
+      shift += viewmat(i, j) * static_cast<double>(view.origin[j]);
+    }
+    view.translation[i] = static_cast<float>(shift);
   }
   view.fx = static_cast<float>(K(0, 0));
   view.fy = static_cast<float>(K(1, 1));

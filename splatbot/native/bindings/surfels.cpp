@@ -18,12 +18,24 @@ struct SurfelHandle {
   splatbot::SurfelStatePtr state;
 };
 
+splatbot::Gaussians surfels_of(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
+                               const In2& colors) {
+  return {.count = means.shape(0),
+          .channels = static_cast<int>(colors.shape(1)),
+          .means = span_of(means),
+          .quats = span_of(quats),
+          .scales = span_of(scales),
+          .covars = {},
+          .opacities = span_of(opacities),
+          .colors = span_of(colors)};
+}
+
 nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities, const In2& colors,
                    const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane, float far_plane,
                    float radius_clip, const std::string& depth, const std::optional<In1>& background,
                    const Out3& out_colors, const Out2& out_alphas, const Out3& out_normals, const Out2& out_median,
                    const std::optional<Out2>& out_distortion) {
-  const splatbot::Gaussians surfels = gaussians_of(means, quats, scales, opacities, colors);
+  const splatbot::Gaussians surfels = surfels_of(means, quats, scales, opacities, colors);
   const splatbot::View view = view_of(viewmat, K, width, height);
   const splatbot::SurfelOptions options = {.near_plane = near_plane,
                                            .far_plane = far_plane,
@@ -52,23 +64,23 @@ void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, c
               const std::optional<In2>& grad_alphas, const std::optional<In3>& grad_normals,
               const std::optional<In2>& grad_median, const std::optional<In2>& grad_distortion,
               const std::optional<Out2>& out_means, const std::optional<Out2>& out_quats,
-              const std::optional<Out2>& out_scales, const std::optional<Out1>& out_opacities,
-              const std::optional<Out2>& out_colors, const std::optional<Array<double, nb::shape<12>>>& out_viewmat,
+              const std::optional<Out2>& out_scales, const std::optional<Array<float, nb::shape<-1>>>& out_opacities,
+              const std::optional<Out2>& out_colors, const std::optional<Array<double, nb::shape<16>>>& out_camera,
               const std::optional<Array<double, nb::shape<-1>>>& out_background,
               const std::optional<Out2>& out_means2d, bool accumulate) {
-  const splatbot::Gaussians surfels = gaussians_of(means, quats, scales, opacities, colors);
+  const splatbot::Gaussians surfels = surfels_of(means, quats, scales, opacities, colors);
   const splatbot::SurfelImageGradients grads = {.colors = span_of<const float>(grad_colors),
                                                 .alphas = span_of<const float>(grad_alphas),
                                                 .normals = span_of<const float>(grad_normals),
                                                 .median = span_of<const float>(grad_median),
                                                 .distortion = span_of<const float>(grad_distortion)};
-  splatbot::SurfelGradients out;
+  splatbot::Gradients out;
   out.means = span_of<float>(out_means);
   out.quats = span_of<float>(out_quats);
   out.scales = span_of<float>(out_scales);
   out.opacities = span_of<float>(out_opacities);
   out.colors = span_of<float>(out_colors);
-  out.viewmat = span_of<double>(out_viewmat);
+  out.camera = span_of<double>(out_camera);
   out.background = span_of<double>(out_background);
   out.means2d = span_of<float>(out_means2d);
   out.accumulate = accumulate;
@@ -133,7 +145,7 @@ void define_surfels(nb::module_& m) {
         nb::arg("grad_median").noconvert().none(), nb::arg("grad_distortion").noconvert().none(),
         nb::arg("out_means").noconvert().none(), nb::arg("out_quats").noconvert().none(),
         nb::arg("out_scales").noconvert().none(), nb::arg("out_opacities").noconvert().none(),
-        nb::arg("out_colors").noconvert().none(), nb::arg("out_viewmat").noconvert().none(),
+        nb::arg("out_colors").noconvert().none(), nb::arg("out_camera").noconvert().none(),
         nb::arg("out_background").noconvert().none(), nb::arg("out_means2d").noconvert().none(), "accumulate"_a,
         "Write (or add) the gradients whose arrays are given; that of means2d is never added to.");
 }

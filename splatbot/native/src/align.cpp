@@ -1,116 +1,274 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "splatbot/align.hpp"
 
+#include <algorithm>
 #include <cmath>
-#include <limits>
+
+#include "splatbot/kernels.hpp"
 
 namespace splatbot {
 namespace {
 
-struct Vec3 {
-  double x, y, z;
-};
+using Mat4 = std::array<double, 16>;
+using Vec6 = std::array<double, 6>;
+using Mat6 = std::array<double, 36>;
 
-double dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+// Exposure is anchored weakly to gain 1 and offset 0, so that a blank image leaves it defined.
+constexpr double kExposurePrior = 1e2;
+constexpr double kStepDone = 1e-5;  // [m] and [rad]
+constexpr double kDamping = 1e-5;   // share of the mean diagonal
 
-Vec3 load(std::span<const float> values, std::size_t i) { return {values[3 * i], values[3 * i + 1], values[3 * i + 2]}; }
-
-Vec3 rotate(std::span<const double, 16> T, Vec3 v) {
-  return {T[0] * v.x + T[1] * v.y + T[2] * v.z, T[4] * v.x + T[5] * v.y + T[6] * v.z,
-          T[8] * v.x + T[9] * v.y + T[10] * v.z};
+Mat4 multiply(std::span<const double, 16> A, std::span<const double, 16> B) {
+  Mat4 C{};
+  for (int i = 0; i < 4; ++i)
+    for (int j = 0; j < 4; ++j)
+      for (int k = 0; k < 4; ++k) C[4 * i + j] += A[4 * i + k] * B[4 * k + j];
+  return C;
 }
 
-// Value and gradient of the bilinear interpolant, the gradient from central differences one pixel apart.
-struct Sample {
-  double value, du, dv;
-};
-
-Sample sample_gray(const AlignImage& image, double u, double v) {
-  const int x = static_cast<int>(u), y = static_cast<int>(v);
-  const double a = u - x, b = v - y;
-  const float* p = image.gray.data() + static_cast<std::size_t>(y) * image.width + x;
-  const int w = image.width;
-  const auto bilinear = [&](const float* q) {
-    return (1 - b) * ((1 - a) * q[0] + a * q[1]) + b * ((1 - a) * q[w] + a * q[w + 1]);
-  };
-  return {bilinear(p), 0.5 * (bilinear(p + 1) - bilinear(p - 1)), 0.5 * (bilinear(p + w) - bilinear(p - w))};
-}
-
-// Depth between pixels, refused where the four neighbours are not one surface.
-double sample_depth(const AlignImage& image, double u, double v) {
-  const int x = static_cast<int>(u), y = static_cast<int>(v);
-  const double a = u - x, b = v - y;
-  const float* q = image.depth.data() + static_cast<std::size_t>(y) * image.width + x;
-  const float d0 = q[0], d1 = q[1], d2 = q[image.width], d3 = q[image.width + 1];
-  const float low = std::fmin(std::fmin(d0, d1), std::fmin(d2, d3));
-  const float high = std::fmax(std::fmax(d0, d1), std::fmax(d2, d3));
-  if (!(low > 0.0f) || high - low > 0.05f * low) return 0.0;
-  return (1 - b) * ((1 - a) * d0 + a * d1) + b * ((1 - a) * d2 + a * d3);
-}
-
-// Adds one residual with its Jacobian over the first `n` states.
-void accumulate(AlignSums& sums, const double* J, int n, double r, double sigma, double nu) {
-  const double s = r / sigma;
-  const double w = (nu + 1.0) / (nu + s * s) / (sigma * sigma);
-  for (int i = 0; i < n; ++i) {
-    for (int j = i; j < n; ++j) sums.H[8 * i + j] += w * J[i] * J[j];
-    sums.g[i] += w * J[i] * r;
+// Exponential of a twist (t, ω); the series stand in where θ is small.
+Mat4 se3_exp(const Vec6& xi) {
+  const double wx = xi[3], wy = xi[4], wz = xi[5];
+  const double theta2 = wx * wx + wy * wy + wz * wz, theta = std::sqrt(theta2);
+  const bool small = theta < 1e-4;
+  const double half = 0.5 * theta;
+  const double a = small ? 1.0 - theta2 / 6.0 : std::sin(theta) / theta;
+  const double b = small ? 0.5 - theta2 / 24.0 : 0.5 * std::pow(std::sin(half) / half, 2);
+  const double c = small ? 1.0 / 6.0 - theta2 / 120.0 : (1.0 - a) / theta2;
+  const double K[9] = {0, -wz, wy, wz, 0, -wx, -wy, wx, 0};
+  double K2[9] = {};
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      for (int k = 0; k < 3; ++k) K2[3 * i + j] += K[3 * i + k] * K[3 * k + j];
+  Mat4 T{};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      const double unit = i == j ? 1.0 : 0.0;
+      T[4 * i + j] = unit + a * K[3 * i + j] + b * K2[3 * i + j];
+      T[4 * i + 3] += (unit + b * K[3 * i + j] + c * K2[3 * i + j]) * xi[j];
+    }
   }
-  sums.cost += 0.5 * (nu + 1.0) * std::log1p(s * s / nu);
+  T[15] = 1.0;
+  return T;
+}
+
+// Logarithm of the rotation and translation of a small motion: (t, ω) to first order in t, exact in the angle.
+Vec6 small_motion(const Mat4& T) {
+  const double x = 0.5 * (T[9] - T[6]), y = 0.5 * (T[2] - T[8]), z = 0.5 * (T[4] - T[1]);
+  const double sine = std::sqrt(x * x + y * y + z * z);
+  const double angle = std::atan2(sine, 0.5 * (T[0] + T[5] + T[10] - 1.0));
+  const double scale = sine > 1e-12 ? angle / sine : 1.0;
+  return {T[3], T[7], T[11], scale * x, scale * y, scale * z};
+}
+
+Mat4 inverse(std::span<const double, 16> T) {
+  Mat4 out{};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      out[4 * i + j] = T[4 * j + i];
+      out[4 * i + 3] -= T[4 * j + i] * T[4 * j + 3];
+    }
+  }
+  out[15] = 1.0;
+  return out;
+}
+
+struct Normal {
+  Mat6 H{};
+  Vec6 g{};
+
+  // Damped Gauss-Newton step by LDLᵀ; zero where there is no information.
+  Vec6 solve() const {
+    double trace = 0.0;
+    for (int i = 0; i < 6; ++i) trace += H[7 * i];
+    Vec6 x{};
+    if (!(trace > 0.0)) return x;
+    Mat6 L = H;
+    for (int i = 0; i < 6; ++i) L[7 * i] += kDamping * trace / 6.0;
+    for (int j = 0; j < 6; ++j) {
+      for (int k = 0; k < j; ++k) L[7 * j] -= L[6 * j + k] * L[6 * j + k] * L[7 * k];
+      for (int i = j + 1; i < 6; ++i) {
+        for (int k = 0; k < j; ++k) L[6 * i + j] -= L[6 * i + k] * L[6 * j + k] * L[7 * k];
+        L[6 * i + j] /= L[7 * j];
+      }
+    }
+    for (int i = 0; i < 6; ++i) {
+      x[i] = -g[i];
+      for (int k = 0; k < i; ++k) x[i] -= L[6 * i + k] * x[k];
+    }
+    for (int i = 0; i < 6; ++i) x[i] /= L[7 * i];
+    for (int i = 5; i >= 0; --i)
+      for (int k = i + 1; k < 6; ++k) x[i] -= L[6 * k + i] * x[k];
+    return x;
+  }
+};
+
+// One reference on one level, with that pair's own exposure (a, b).
+class DenseTerm {
+ public:
+  DenseTerm(const AlignImage& image, const AlignPoints& points, std::span<const double, 16> T_world_reference)
+      : image_(image), points_(points), T_world_reference_(T_world_reference) {}
+
+  // Add this term, exposure marginalised (Schur complement); remember how exposure would follow a step.
+  void add(std::span<const double, 16> T_camera_world, const AlignPlan& plan, Normal& total, AlignResult& result) {
+    const Mat4 T = multiply(T_camera_world, T_world_reference_);
+    const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, plan.settings, {}, {});
+    const double A00 = s.H[54] + kExposurePrior, A01 = s.H[55], A11 = s.H[63] + kExposurePrior;
+    const double det = A00 * A11 - A01 * A01;
+    inverse_ = {A11 / det, -A01 / det, A00 / det};
+    residual_ = {s.g[6] + kExposurePrior * (a_ - 1.0), s.g[7] + kExposurePrior * b_};
+    for (int i = 0; i < 6; ++i) {
+      coupling_[2 * i] = s.H[8 * i + 6];
+      coupling_[2 * i + 1] = s.H[8 * i + 7];
+    }
+    for (int i = 0; i < 6; ++i) {
+      const double c0 = coupling_[2 * i], c1 = coupling_[2 * i + 1];
+      const double k0 = c0 * inverse_[0] + c1 * inverse_[1], k1 = c0 * inverse_[1] + c1 * inverse_[2];
+      for (int j = 0; j < 6; ++j)
+        total.H[6 * i + j] += plan.dense_weight * (s.H[8 * i + j] - k0 * coupling_[2 * j] - k1 * coupling_[2 * j + 1]);
+      total.g[i] += plan.dense_weight * (s.g[i] - k0 * residual_[0] - k1 * residual_[1]);
+    }
+    result.dense_cost += s.cost;
+    result.dense_residuals += s.photometric + s.geometric;
+    result.pixel_iterations += points_.gray.size();
+  }
+
+  // Back-substitute the exposure that belongs to a twist step.
+  void follow(const Vec6& step) {
+    double r0 = residual_[0], r1 = residual_[1];
+    for (int i = 0; i < 6; ++i) {
+      r0 += coupling_[2 * i] * step[i];
+      r1 += coupling_[2 * i + 1] * step[i];
+    }
+    a_ -= inverse_[0] * r0 + inverse_[1] * r1;
+    b_ -= inverse_[1] * r0 + inverse_[2] * r1;
+  }
+
+ private:
+  const AlignImage& image_;
+  const AlignPoints& points_;
+  std::span<const double, 16> T_world_reference_;
+  double a_ = 1.0, b_ = 0.0;
+  std::array<double, 3> inverse_{};
+  std::array<double, 2> residual_{};
+  std::array<double, 12> coupling_{};
+};
+
+// Reprojection residuals, σ = 1 px, Student-t weights.
+void add_matches(const AlignMatches& m, std::span<const double, 16> T, Normal& total) {
+  for (std::size_t i = 0; i < m.points.size() / 3; ++i) {
+    const double *p = &m.points[3 * i], *pixel = &m.pixels[2 * i];
+    const double x = T[0] * p[0] + T[1] * p[1] + T[2] * p[2] + T[3];
+    const double y = T[4] * p[0] + T[5] * p[1] + T[6] * p[2] + T[7];
+    const double z = T[8] * p[0] + T[9] * p[1] + T[10] * p[2] + T[11];
+    if (!(z > 1e-3)) continue;
+    const double iz = 1.0 / z;
+    const double ru = m.fx * x * iz + m.cx - pixel[0], rv = m.fy * y * iz + m.cy - pixel[1];
+    const double w = 5.0 / (4.0 + ru * ru + rv * rv);
+    const double ux = m.fx * iz, uz = -m.fx * x * iz * iz, vy = m.fy * iz, vz = -m.fy * y * iz * iz;
+    const double Ju[6] = {ux, 0.0, uz, uz * y, ux * z - uz * x, -ux * y};
+    const double Jv[6] = {0.0, vy, vz, vz * y - vy * z, -vz * x, vy * x};
+    for (int a = 0; a < 6; ++a) {
+      for (int b = 0; b < 6; ++b) total.H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
+      total.g[a] += w * (Ju[a] * ru + Jv[a] * rv);
+    }
+  }
+}
+
+// ½ ξᵀ Λ ξ of the twist ξ between the prior's pose and this one.
+void add_prior(const AlignPlan& plan, std::span<const double, 16> T_camera_world, Normal& total) {
+  if (std::all_of(plan.prior_information.begin(), plan.prior_information.end(), [](double v) { return v == 0.0; })) {
+    return;
+  }
+  const Vec6 xi = small_motion(multiply(T_camera_world, inverse(plan.T_prior_camera_world)));
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j < 6; ++j) {
+      total.H[6 * i + j] += plan.prior_information[6 * i + j];
+      total.g[i] += plan.prior_information[6 * i + j] * xi[j];
+    }
+  }
 }
 
 }  // namespace
 
-AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& reference,
-                              std::span<const double, 16> T, double gain, double offset,
-                              const AlignSettings& settings, std::span<float> residual_photometric,
-                              std::span<float> residual_geometric) {
-  AlignSums sums;
+AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& reference, std::span<const double, 16> T,
+                              double gain, double offset, const AlignSettings& settings,
+                              std::span<float> residual_photometric, std::span<float> residual_geometric) {
+  const auto f = [](double value) { return static_cast<float>(value); };
+  LinearizeSums sums{};
+  LinearizeArgs args{.width = image.width,
+                     .height = image.height,
+                     .fx = f(image.fx),
+                     .fy = f(image.fy),
+                     .cx = f(image.cx),
+                     .cy = f(image.cy),
+                     .gray = image.gray.data(),
+                     .depth = image.depth.data(),
+                     .count = 0,
+                     .points = nullptr,
+                     .normals = nullptr,
+                     .gray_reference = nullptr,
+                     .T = {},
+                     .gain = f(gain),
+                     .offset = f(offset),
+                     .use_photometric = settings.use_photometric,
+                     .use_geometric = settings.use_geometric,
+                     .sigma_gray = f(settings.sigma_gray),
+                     .sigma_depth_floor = f(settings.sigma_depth_floor),
+                     .sigma_depth_quad = f(settings.sigma_depth_quad),
+                     .gate = f(settings.gate),
+                     .nu = f(settings.nu),
+                     .residual_photometric = nullptr,
+                     .residual_geometric = nullptr};
+  std::transform(T.begin(), T.begin() + 12, args.T, f);
+  std::fill(residual_photometric.begin(), residual_photometric.end(), std::nanf(""));
+  std::fill(residual_geometric.begin(), residual_geometric.end(), std::nanf(""));
   const std::size_t n = reference.gray.size();
-  const float nan = std::numeric_limits<float>::quiet_NaN();
-  for (std::size_t i = 0; i < n; ++i) {
-    residual_photometric[i] = residual_geometric[i] = nan;
-    const Vec3 p = load(reference.points, i);
-    Vec3 q = rotate(T, p);
-    q = {q.x + T[3], q.y + T[7], q.z + T[11]};
-    if (!(q.z > 1e-3)) continue;
-    const double iz = 1.0 / q.z;
-    const double u = image.fx * q.x * iz + image.cx, v = image.fy * q.y * iz + image.cy;
-    // The gradient reads one pixel further on each side. Written so that NaN fails.
-    if (!(u >= 1.0 && v >= 1.0 && u < image.width - 2 && v < image.height - 2)) continue;
-    ++sums.projected;
-    const double depth = sample_depth(image, u, v);
-    const double sigma_z = settings.sigma_depth_floor + settings.sigma_depth_quad * q.z * q.z;
-    // A point far behind or before what the camera sees is occluded or gone: its colour tells nothing either.
-    if (depth > 0.0 && std::abs(depth - q.z) > settings.gate + 3.0 * sigma_z) continue;
+  for (std::size_t first = 0; first < n; first += kLinearizeChunk) {
+    args.count = static_cast<int>(std::min<std::size_t>(kLinearizeChunk, n - first));
+    args.points = reference.points.data() + 3 * first;
+    args.normals = reference.normals.data() + 3 * first;
+    args.gray_reference = reference.gray.data() + first;
+    args.residual_photometric = residual_photometric.empty() ? nullptr : residual_photometric.data() + first;
+    args.residual_geometric = residual_geometric.empty() ? nullptr : residual_geometric.data() + first;
+    kernels().linearize(args, sums);
+  }
+  AlignSums out;
+  for (int i = 0; i < 8; ++i) {
+    for (int j = 0; j < 8; ++j) out.H[8 * i + j] = sums.H[8 * std::min(i, j) + std::max(i, j)];
+    out.g[i] = sums.g[i];
+  }
+  out.cost = sums.cost;
+  out.projected = sums.projected;
+  out.photometric = sums.photometric;
+  out.geometric = sums.geometric;
+  return out;
+}
 
-    if (settings.use_photometric) {
-      const Sample s = sample_gray(image, u, v);
-      const double r = s.value - (gain * reference.gray[i] + offset);
-      const double gx = s.du * image.fx * iz, gy = s.dv * image.fy * iz, gz = -(gx * q.x + gy * q.y) * iz;
-      const double J[8] = {gx, gy, gz, gz * q.y - gy * q.z, gx * q.z - gz * q.x, gy * q.x - gx * q.y,
-                           -reference.gray[i], -1.0};
-      accumulate(sums, J, 8, r, settings.sigma_gray, settings.nu);
-      residual_photometric[i] = static_cast<float>(r / settings.sigma_gray);
-      ++sums.photometric;
+AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,
+                  const AlignMatches& matches, std::span<const double, 16> T_start, const AlignPlan& plan) {
+  AlignResult result;
+  std::copy(T_start.begin(), T_start.end(), result.T_camera_world.begin());
+  for (std::size_t level = levels.size(); level-- > plan.finest;) {
+    std::vector<DenseTerm> terms;
+    for (const AlignReference& reference : references) {
+      terms.emplace_back(levels[level], reference.levels[level], reference.T_world_reference);
     }
-    const Vec3 normal = rotate(T, load(reference.normals, i));
-    if (settings.use_geometric && depth > 0.0 && dot(normal, normal) > 0.25) {
-      // Point to plane: n · (P - q) with P the observed point on the same ray, P = q · depth / q.z.
-      const double n_q = dot(normal, q);
-      const double r = n_q * (depth * iz - 1.0);
-      const double cosine = std::abs(n_q) / std::sqrt(dot(q, q));
-      const double sigma = settings.sigma_depth_floor + sigma_z * cosine;
-      const double J[6] = {-normal.x, -normal.y, -normal.z, normal.y * q.z - normal.z * q.y,
-                           normal.z * q.x - normal.x * q.z, normal.x * q.y - normal.y * q.x};
-      accumulate(sums, J, 6, r, sigma, settings.nu);
-      residual_geometric[i] = static_cast<float>(r / sigma);
-      ++sums.geometric;
+    for (int iteration = 0; iteration < plan.iterations; ++iteration) {
+      Normal total;
+      result.dense_cost = 0.0;
+      result.dense_residuals = 0;
+      for (DenseTerm& term : terms) term.add(result.T_camera_world, plan, total, result);
+      add_matches(matches, result.T_camera_world, total);
+      add_prior(plan, result.T_camera_world, total);
+      result.H = total.H;
+      const Vec6 step = total.solve();
+      result.T_camera_world = multiply(se3_exp(step), result.T_camera_world);
+      for (DenseTerm& term : terms) term.follow(step);
+      if (std::all_of(step.begin(), step.end(), [](double s) { return std::abs(s) < kStepDone; })) break;
     }
   }
-  for (int i = 0; i < 8; ++i)
-    for (int j = 0; j < i; ++j) sums.H[8 * i + j] = sums.H[8 * j + i];
-  return sums;
+  return result;
 }
 
 }  // namespace splatbot

@@ -3,8 +3,11 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <span>
 #include <stdexcept>
+#include <string_view>
+#include <vector>
 
 #include "splatbot/raster_state.hpp"
 
@@ -26,6 +29,16 @@ inline void check_view(const View& view) {
   require(view.width > 0 && view.height > 0, "the image has no pixels");
   require(view.width <= kMaxTiles * kTileWidth && view.height <= kMaxTiles * kTileHeight, "the image is too large");
   require(static_cast<std::int64_t>(view.width) * view.height <= (std::int64_t{1} << 31), "the image is too large");
+}
+
+inline std::optional<Fault> find_fault(const std::vector<ProjectedBlock>& blocks) {
+  static constexpr std::string_view kFields[] = {"means", "quats", "scales", "covars", "opacities", "colors"};
+  for (const ProjectedBlock& block : blocks) {
+    if (block.fault_field >= 0) {
+      return Fault{kFields[block.fault_field], block.fault_row};
+    }
+  }
+  return std::nullopt;
 }
 
 }  // namespace splatbot

@@ -2,6 +2,7 @@
 #include "splatbot/surfels.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 #include "checks.hpp"
@@ -28,6 +29,7 @@ void check_surfels(const Gaussians& g) {
   require(g.means.size() == 3 * g.count, "means is not (N, 3)");
   require(g.quats.size() == 4 * g.count, "quats is not (N, 4)");
   require(g.scales.size() == 3 * g.count, "scales is not (N, 3)");
+  require(g.covars.empty() && g.sh_degree < 0, "surfels have quaternions, scales and plain colours");
   require(g.opacities.size() == g.count, "opacities is not (N,)");
   require(g.colors.size() == g.count * static_cast<std::size_t>(g.channels), "colors is not (N, channels)");
 }
@@ -49,7 +51,7 @@ void check_images(const SurfelState& state, const SurfelImages& out) {
   require(out.distortion.size() == (state.options.distortion ? pixels : 0), "distortion has a wrong size");
 }
 
-void check_gradients(const SurfelState& state, const SurfelImageGradients& grads, const SurfelGradients& out) {
+void check_gradients(const SurfelState& state, const SurfelImageGradients& grads, const Gradients& out) {
   const std::size_t pixels = pixels_of(state.view), n = state.count;
   const auto channels = static_cast<std::size_t>(state.channels);
   require(empty_or(grads.colors, pixels * columns_of(state)) && empty_or(grads.alphas, pixels) &&
@@ -58,7 +60,7 @@ void check_gradients(const SurfelState& state, const SurfelImageGradients& grads
           "a gradient of an image has a wrong size");
   require(empty_or(out.means, 3 * n) && empty_or(out.quats, 4 * n) && empty_or(out.scales, 3 * n) &&
               empty_or(out.opacities, n) && empty_or(out.colors, channels * n) && empty_or(out.means2d, 2 * n) &&
-              empty_or(out.viewmat, std::size_t{12}) && empty_or(out.background, channels),
+              empty_or(out.camera, std::size_t{kCameraSums}) && empty_or(out.background, channels),
           "a gradient has a wrong size");
 }
 
@@ -98,16 +100,6 @@ SurfelBlendArgs blend_args(SurfelState& state, std::span<const float> background
           .distortion = nullptr};
 }
 
-std::optional<Fault> find_fault(const SurfelState& state) {
-  static constexpr std::string_view kFields[] = {"means", "quats", "scales", "opacities", "colors"};
-  for (const ProjectedBlock& block : state.blocks) {
-    if (block.fault_field >= 0) {
-      return Fault{kFields[block.fault_field], block.fault_row};
-    }
-  }
-  return std::nullopt;
-}
-
 // d render / d background is the transmittance left.
 void add_background_gradient(const SurfelState& state, std::span<const float> grad_colors, std::span<double> out) {
   const auto width = static_cast<std::size_t>(state.view.width);
@@ -131,9 +123,23 @@ T* pointer(std::span<T> span) {
   return span.empty() ? nullptr : span.data();
 }
 
+// The passes turn about the view's origin: R (x - origin) + translation = R x + t.
+void add_camera_gradient(const SurfelState& state, std::span<const double> blocks, std::span<double> out) {
+  std::array<double, kCameraSums> sums{};
+  for (std::size_t i = 0; i < blocks.size(); ++i) {
+    sums[i % kCameraSums] += blocks[i];
+  }
+  for (std::size_t i = 0; i < kCameraSums; ++i) {
+    out[i] += sums[i];
+  }
+  for (std::size_t i = 0; i < 9; ++i) {
+    out[i] += sums[9 + i / 3] * static_cast<double>(state.view.origin[i % 3]);
+  }
+}
+
 struct BackwardScratch {
   Buffer<float> slots;     // (pairs, kSurfelSlot)
-  Buffer<double> viewmat;  // (blocks, 12)
+  Buffer<double> camera;  // (blocks, kCameraSums)
 };
 
 BackwardScratch& scratch() {
@@ -164,7 +170,7 @@ std::optional<Fault> surfels_forward(const Gaussians& g, const View& view, const
   const std::shared_ptr<ThreadPool> pool = thread_pool();
   const SurfelProjectArgs project = project_args(state, g);
   pool->run(state.blocks.size(), [&](std::size_t b) { k.surfels.project(project, b, state.blocks[b]); });
-  if (const std::optional<Fault> fault = find_fault(state)) {
+  if (const std::optional<Fault> fault = find_fault(state.blocks)) {
     return fault;
   }
   order_by_depth(state, *pool);
@@ -181,20 +187,20 @@ std::optional<Fault> surfels_forward(const Gaussians& g, const View& view, const
 }
 
 void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::span<const float> background,
-                      const SurfelImageGradients& grads, const SurfelGradients& out) {
+                      const SurfelImageGradients& grads, const Gradients& out) {
   check_surfels(g);
   // Kernel arguments hold plain pointers for both passes; this one writes to none of the state's arrays.
   auto& state = const_cast<SurfelState&>(const_state);
   require(g.count == state.count && g.channels == state.channels, "the surfels are not those of the forward pass");
   check_gradients(state, grads, out);
   if (!out.accumulate) {
-    std::fill(out.viewmat.begin(), out.viewmat.end(), 0.0);
+    std::fill(out.camera.begin(), out.camera.end(), 0.0);
     std::fill(out.background.begin(), out.background.end(), 0.0);
   }
   if (!out.background.empty() && !grads.colors.empty()) {
     add_background_gradient(state, grads.colors, out.background);
   }
-  if (out.means.empty() && out.quats.empty() && out.scales.empty() && out.opacities.empty() && out.viewmat.empty() &&
+  if (out.means.empty() && out.quats.empty() && out.scales.empty() && out.opacities.empty() && out.camera.empty() &&
       out.colors.empty() && out.means2d.empty()) {
     return;
   }
@@ -203,7 +209,7 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
   const std::shared_ptr<ThreadPool> pool = thread_pool();
   BackwardScratch& s = scratch();
   s.slots.resize(state.pairs.size() * kSurfelSlot);
-  s.viewmat.resize(out.viewmat.empty() ? 0 : state.blocks.size() * 12);
+  s.camera.resize(out.camera.empty() ? 0 : state.blocks.size() * kCameraSums);
   const bool sum_channels = !out.colors.empty() || !out.quats.empty();
   const SurfelBlendBackwardArgs blend = {.forward = blend_args(state, background),
                                          .colors = pointer(grads.colors),
@@ -225,12 +231,10 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
                                              .opacities = pointer(out.opacities),
                                              .colors = pointer(out.colors),
                                              .means2d = pointer(out.means2d),
-                                             .viewmat = out.viewmat.empty() ? nullptr : s.viewmat.data()};
+                                             .camera = out.camera.empty() ? nullptr : s.camera.data()};
   pool->run(state.blocks.size(), [&](std::size_t b) { k.surfels.project_backward(project, b); });
-  for (std::size_t b = 0; b < state.blocks.size() && !out.viewmat.empty(); ++b) {
-    for (std::size_t i = 0; i < 12; ++i) {
-      out.viewmat[i] += s.viewmat[b * 12 + i];
-    }
+  if (!out.camera.empty()) {
+    add_camera_gradient(state, s.camera.span(), out.camera);
   }
 }
 

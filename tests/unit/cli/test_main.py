@@ -19,7 +19,8 @@ HEAVY = ("torch", "open3d", "cv2", "matplotlib", "mujoco", "fastapi", "numpy")
 
 
 @pytest.mark.parametrize(
-    "words", [["--help"], ["--version"], ["map", "--help"], ["render", "--help"], ["doctor", "-h"]]
+    "words",
+    [["--help"], ["--version"], ["map", "--help"], ["render", "--help"], ["simulate", "--help"], ["doctor", "-h"]],
 )
 def test_help_imports_nothing_heavy(words: list[str]) -> None:
     program = (

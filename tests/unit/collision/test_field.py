@@ -154,6 +154,25 @@ def test_faint_gaussians_are_air_and_indices_still_name_rows_of_the_model() -> N
     assert GaussianCollisionField(model, min_opacity=0.0).in_collision([[1.0, 0, 0]]).all()
 
 
+def test_a_guess_that_no_depth_supports_is_no_obstacle_until_it_is_observed() -> None:
+    model = _model([[0, 0, 0], [1, 0, 0], [2, 0, 0]], 0.1)
+    model.observations[1] = 0
+    field = GaussianCollisionField(model)
+    assert len(field) == 2
+    np.testing.assert_array_equal(field.in_collision([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]), [True, False, True])
+    np.testing.assert_array_equal(field.mahalanobis([[1.0, 0, 0], [1.9, 0, 0]]).index, [0, 2])
+    model.observations[1] = 1
+    assert GaussianCollisionField(model).in_collision([[1.0, 0, 0]]).all()
+
+
+def test_a_map_of_guesses_alone_is_free_everywhere() -> None:
+    model = _model([[0, 0, 0], [1, 0, 0]], 0.1)
+    model.observations.zero_()
+    answer = GaussianCollisionField(model).mahalanobis([[0.0, 0, 0]])
+    assert answer.distance[0] == np.inf
+    assert answer.index[0] == -1
+
+
 def test_an_empty_map_is_free_everywhere() -> None:
     answer = GaussianCollisionField(GaussianModel.empty()).mahalanobis([[0.0, 0, 0]])
     assert answer.distance[0] == np.inf

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from splatbot.geometry import quat_to_rotation
-from tests.scenes import NAMES, Scene, hard_scene, one_gaussian
-from tests.surfels import RENDERED, loss, reference
+from tests.scenes import Scene, hard_scene, one_gaussian
+from tests.surfels import NAMES, RENDERED, loss, reference
 
 STEP = 1e-6
 

@@ -14,9 +14,10 @@ import splatbot
 from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.rasterize import rasterization_2dgs
+from splatbot.rasterize.harmonics import harmonics_basis
 from splatbot.rasterize.native import native
-from tests.scenes import NAMES, Scene, one_gaussian, relative_l2
-from tests.surfels import RENDERED, compare_surfels, hard_surfels, loss, reference, render, wall
+from tests.scenes import Scene, one_gaussian, relative_l2
+from tests.surfels import NAMES, RENDERED, arguments, compare_surfels, hard_surfels, loss, reference, render, wall
 
 FORWARD_BOUND = 1e-5
 GRADIENT_BOUND = 1e-4
@@ -162,7 +163,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    "wanted", [("viewmats",), ("means",), ("colors",), ("opacities",), ("scales", "quats"), ("backgrounds",)]
+    "wanted", [("viewmats",), ("Ks",), ("means",), ("colors",), ("opacities",), ("scales", "quats"), ("backgrounds",)]
 )
 def test_gradients_asked_for_alone_equal_those_asked_for_together(wanted: tuple[str, ...]) -> None:
     def gradients(names: tuple[str, ...]) -> dict[str, Tensor | None]:
@@ -244,6 +245,31 @@ def test_sh_degree_zero_is_the_colour_of_its_coefficients() -> None:
     assert float((got["colors"] - want["colors"]).abs().max()) < 1e-5
 
 
+@pytest.mark.parametrize("degree", [1, 4])
+def test_harmonics_are_shaded_from_each_camera(degree: int) -> None:
+    scene = hard_surfels(19, views=2)
+    scene.colors = torch.randn(150, 25, 3, generator=torch.Generator().manual_seed(0)) * 0.3
+    got, _ = render(scene, sh_degree=degree)
+    for i in range(2):
+        basis = harmonics_basis(
+            torch.nn.functional.normalize(scene.means + scene.viewmats[i, :3, :3].T @ scene.viewmats[i, :3, 3], dim=-1),
+            degree,
+        )
+        alone = Scene(**vars(scene))
+        alone.viewmats, alone.Ks = scene.viewmats[i : i + 1], scene.Ks[i : i + 1]
+        assert scene.backgrounds is not None
+        alone.backgrounds = scene.backgrounds[i : i + 1]
+        alone.colors = (0.5 + torch.einsum("nk,nkc->nc", basis, scene.colors[:, : (degree + 1) ** 2])).clamp_min(0.0)
+        assert float((render(alone)[0]["colors"][0] - got["colors"][i]).abs().max()) < 1e-5
+
+
+def test_batch_dimensions_are_refused() -> None:
+    given = arguments(hard_surfels(20))
+    batched: dict[str, Any] = {n: t[None] if isinstance(t, Tensor) else t for n, t in given.items()}
+    with pytest.raises(InputError, match="batch"):
+        rasterization_2dgs(**batched)
+
+
 def test_options_without_effect_are_taken_and_have_none() -> None:
     scene = hard_surfels(13)
     want, _ = render(scene)
@@ -258,7 +284,7 @@ def test_radius_clip_leaves_small_surfels_out() -> None:
 
 
 def test_distortion_and_surf_normals_are_none_unless_asked_for() -> None:
-    images = rasterization_2dgs(**vars(hard_surfels(14)))
+    images = rasterization_2dgs(**arguments(hard_surfels(14)))
     assert images[3] is None
     assert images[4] is None
 
@@ -270,7 +296,7 @@ def test_distortion_and_surf_normals_are_none_unless_asked_for() -> None:
         ({"absgrad": True}, "absgrad"),
         ({"sparse_grad": True}, "sparse_grad"),
         ({"depth_mode": "mean"}, "depth_mode"),
-        ({"sh_degree": 5}, "sh_degree"),
+        ({"sh_degree": 5}, "colors"),
     ],
 )
 def test_what_is_not_supported_is_refused_by_name(options: dict[str, Any], field: str) -> None:
@@ -287,10 +313,10 @@ def test_a_value_that_is_not_finite_is_named_with_its_row(name: str) -> None:
 
 
 def test_colours_are_needed_to_render_them() -> None:
-    arguments = vars(hard_surfels(17)) | {"colors": None}
+    given = arguments(hard_surfels(17)) | {"colors": None}
     with pytest.raises(InputError, match="colors"):
-        rasterization_2dgs(**arguments)
-    assert rasterization_2dgs(**arguments, render_mode="ED")[0].shape[-1] == 1
+        rasterization_2dgs(**given)
+    assert rasterization_2dgs(**given, render_mode="ED")[0].shape[-1] == 1
 
 
 def test_it_is_a_public_name() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ class _Log:
     name = uri = "ten frames"
     camera = CAMERA
     ground_truth = None
+    effects: ClassVar[list[dict[str, Any]]] = []
 
     def __init__(self, broken: int | None = None, error: Exception | None = None) -> None:
         self.broken, self.error = broken, error

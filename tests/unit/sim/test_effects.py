@@ -8,18 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatbot.camera import Camera
 from splatbot.errors import InputError
-from splatbot.frame import Frame
 from splatbot.sim.effects.base import Effects
 from splatbot.sim.effects.depth_noise import DepthNoise
-
-CAMERA = Camera(200.0, 200.0, 99.5, 74.5, 200, 150)
-
-
-def frame_at(depth: float | np.ndarray, index: int = 0) -> Frame:
-    z = np.broadcast_to(np.asarray(depth, np.float32), (150, 200)).copy()
-    return Frame(index / 30, np.full((150, 200, 3), 90, np.uint8), z, CAMERA, index)
+from tests.unit.sim.frames import frame_at
 
 
 @pytest.mark.parametrize("z", [0.4, 1.0, 2.5])

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Normal equations of rigid RGB-D alignment: reference points against one image of the current frame.
+// Rigid RGB-D alignment: reference points against images of the current frame, by Gauss-Newton.
 #pragma once
 
 #include <array>
 #include <cstddef>
 #include <span>
+#include <vector>
 
 namespace splatbot {
 
@@ -29,7 +30,7 @@ struct AlignSettings {
   double sigma_gray = 0.02;         // [intensity]
   double sigma_depth_floor = 1e-3;  // [m]
   double sigma_depth_quad = 2e-3;   // [1/m]: σ_z = floor + quad z²
-  double gate = 0.1;                // [m] largest point-to-plane distance that can be a correspondence
+  double gate = 0.1;                // [m] depths that differ by more, beyond 3 σ_z, are of another surface
   double nu = 4.0;                  // weight w = (ν + 1) / (ν + r²/σ²) (Student t; Kerl et al. 2013)
 };
 
@@ -43,11 +44,46 @@ struct AlignSums {
   std::size_t photometric = 0, geometric = 0;
 };
 
-// T_current_reference is row-major (4, 4). residual_photometric and residual_geometric, (N,) each, receive r/σ, NaN where
-// a point has none.
+// One linearisation. T_current_reference is row-major (4, 4). residual_photometric and residual_geometric, (N,) each or
+// empty, receive r/σ, NaN where a point has none. The sums run over fixed chunks in fixed order.
 AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& reference,
                               std::span<const double, 16> T_current_reference, double gain, double offset,
                               const AlignSettings& settings, std::span<float> residual_photometric,
                               std::span<float> residual_geometric);
+
+// A keyframe to align to: its points on each level, and where it stands.
+struct AlignReference {
+  std::array<double, 16> T_world_reference;
+  std::vector<AlignPoints> levels;  // fine to coarse
+};
+
+// World points matched with pixels of the current frame, and the intrinsics of those pixels.
+struct AlignMatches {
+  double fx = 1, fy = 1, cx = 0, cy = 0;
+  std::span<const double> points;  // (M, 3) [m]
+  std::span<const double> pixels;  // (M, 2)
+};
+
+struct AlignPlan {
+  AlignSettings settings;
+  double dense_weight = 1.0;  // of a dense residual against a match's, whose σ is 1 px: neighbours are correlated
+  int iterations = 5;         // per level, at most
+  std::size_t finest = 0;     // level to end on
+  std::array<double, 36> prior_information{};  // (6, 6) of the twist that takes T_prior to the pose; zero: none
+  std::array<double, 16> T_prior_camera_world{};
+};
+
+struct AlignResult {
+  std::array<double, 16> T_camera_world;
+  std::array<double, 36> H{};  // (6, 6) information of the last linearisation, prior included
+  double dense_cost = 0.0;     // of the last linearisation
+  std::size_t dense_residuals = 0;
+  std::size_t pixel_iterations = 0;  // points looked at, over all iterations: the work done
+};
+
+// Gauss-Newton over the levels, coarse to fine. Each reference has its own exposure, which is marginalised (Schur
+// complement) and follows the step; it starts neutral on every level.
+AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,
+                  const AlignMatches& matches, std::span<const double, 16> T_camera_world, const AlignPlan& plan);
 
 }  // namespace splatbot

@@ -17,12 +17,14 @@ inline constexpr float kAlphaMax = 0.99F;
 inline constexpr float kTransmittanceMin = 1e-4F;
 inline constexpr float kMaxSigmas = 3.33F;
 inline constexpr float kExpectedDepthMin = 1e-10F;  // least sum of weights that expected depth is divided by
+inline constexpr float kMinAntialias = 0.005F;      // least factor on opacity
 inline constexpr float kFovMargin = 0.3F;           // of half the field of view, where slopes are clamped
 
 struct ProjectArgs {
   std::size_t count;
-  const float *means, *quats, *scales, *opacities, *colors;
+  const float *means, *quats, *scales, *covars, *opacities, *colors;
   int channels;
+  int sh_degree, coefficients;  // degree -1: colours are colours
   View view;
   RasterOptions options;
   int columns, rows;
@@ -50,6 +52,8 @@ struct BlendArgs {
   std::uint32_t* tile_done;
   float* final_state;  // of this pass
   const float* background;  // per channel of the pass, or null
+  const std::uint8_t* mask;  // of square tiles of mask_size pixels, or null
+  int mask_size, mask_columns;
   float* out_colors;
   int out_channels;
   float* out_alphas;
@@ -60,6 +64,8 @@ struct BlendBackwardArgs {
   const float* grad_colors;  // (H, W, out_channels) or null
   const float* grad_alphas;  // (H, W) or null; null for all but the first pass
   int channel_sums;          // how many channels' gradients are summed: 0, 1 (depth) or all
+  bool geometry;             // not the colours' gradients alone
+  bool absolute;             // sum absolute gradients of the centre as well
   float* slots;              // (pairs, kSlot)
 };
 
@@ -73,8 +79,72 @@ struct ProjectBackwardArgs {
   float* carried;   // (N, kSlot) sums of earlier passes, or null if there is one pass only
   bool first, last;
   bool accumulate;  // add to the outputs
-  float *means, *quats, *scales, *opacities, *colors;  // outputs; null: not asked for
-  double* viewmat;                                     // (blocks, 12) partial sums, or null
+  bool accumulate_colors;
+  bool geometry;  // not the colours' gradients alone
+  // Outputs; null: not asked for.
+  float *means, *quats, *scales, *covars, *opacities, *colors, *means2d, *absolute2d;
+  double* camera;  // (blocks, kCameraSums) partial sums
+};
+
+// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy.
+inline constexpr int kCameraSums = 16;
+
+struct HarmonicsArgs {
+  ProjectArgs forward;
+  const ProjectedBlock* blocks;
+  int first_channel;  // of the colours in a record
+};
+
+struct HarmonicsBackwardArgs {
+  HarmonicsArgs forward;
+  const float* colors;  // (N, 3): gradient to the colours of what is in view
+  bool accumulate;      // add to the coefficients' gradient
+  float* coefficients;  // output, or null
+  float* means;         // output, always added to, or null
+  double* center;       // (blocks, 3): gradient to the camera's centre, or null
+};
+
+struct ContributionArgs {
+  BlendArgs forward;
+  std::uint32_t* counts;  // (pairs,), by slot
+};
+
+inline constexpr int kLinearizeChunk = 256;
+
+// One chunk of at most kLinearizeChunk points against one image; see align.hpp for the terms.
+struct LinearizeArgs {
+  int width, height;
+  float fx, fy, cx, cy;
+  const float *gray, *depth;
+  int count;
+  const float *points, *normals, *gray_reference;
+  float T[12];  // T_current_reference, row-major
+  float gain, offset;
+  bool use_photometric, use_geometric;
+  float sigma_gray, sigma_depth_floor, sigma_depth_quad, gate, nu;
+  float *residual_photometric, *residual_geometric;  // or null
+};
+
+struct LinearizeSums {
+  double H[64];  // upper triangle
+  double g[8];
+  double cost;
+  std::size_t projected, photometric, geometric;
+};
+
+struct MedianArgs {
+  BlendArgs forward;
+  std::int32_t* ids;  // (H, W)
+};
+
+struct FrontArgs {
+  BlendArgs forward;
+  const std::uint32_t* tile_pixels;  // (tiles + 1,): where a tile's entries begin
+  const std::uint32_t* pixels;       // of each entry, within its tile
+  const std::uint32_t* rows;         // of each entry, in the outputs
+  std::size_t depth;                 // Gaussians to a row
+  std::int32_t* ids;
+  float* weights;
 };
 
 struct Kernels {
@@ -83,6 +153,12 @@ struct Kernels {
   void (*blend)(const BlendArgs&, std::size_t tile);
   void (*blend_backward)(const BlendBackwardArgs&, std::size_t tile);
   void (*project_backward)(const ProjectBackwardArgs&, std::size_t block);
+  void (*linearize)(const LinearizeArgs&, LinearizeSums& sums);
+  void (*harmonics)(const HarmonicsArgs&, std::size_t block);
+  void (*harmonics_backward)(const HarmonicsBackwardArgs&, std::size_t block);
+  void (*contributions)(const ContributionArgs&, std::size_t tile);
+  void (*medians)(const MedianArgs&, std::size_t tile);
+  void (*fronts)(const FrontArgs&, std::size_t tile);
   SurfelKernels surfels;
 };
 

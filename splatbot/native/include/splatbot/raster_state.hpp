@@ -29,10 +29,11 @@ inline constexpr int kChunk = 64;
 
 inline constexpr int kRecordChannels = 8;
 
-// Gradient sums of one pair: six moments of the blend exponent, then the channels.
+// Gradient sums of one pair: six moments of the blend exponent, then the channels, then absolute gradients.
 inline constexpr int kMoments = 6;
 inline constexpr int kSlot = 16;
-static_assert(kMoments + kRecordChannels <= kSlot);
+inline constexpr int kAbsolute = 14;
+static_assert(kMoments + kRecordChannels <= kAbsolute && kAbsolute + 2 <= kSlot);
 
 // What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
 inline constexpr int kFinalPlanes = 2 + kRecordChannels;
@@ -59,7 +60,7 @@ struct alignas(64) ProjectedBlock {
   std::uint64_t pairs = 0;
   std::uint64_t first_pair = 0;
   std::uint32_t first_visible = 0;
-  int fault_field = -1;  // means, quats, scales, opacities, colors
+  int fault_field = -1;  // means, quats, scales, covars, opacities, colors
   std::size_t fault_row = 0;
 };
 
@@ -83,9 +84,9 @@ struct ChannelPass {
 struct TileLists {
   int columns = 0, rows = 0;  // tiles
 
-  Buffer<Placement> placements;    // (N,)
-  Buffer<std::uint32_t> visible;   // ids in view; block b's begin at b * kProjectBlock until compacted
-  Buffer<std::uint32_t> ids;       // ids in view, ascending
+  Buffer<Placement> placements;   // (N,)
+  Buffer<std::uint32_t> visible;  // ids in view; block b's begin at b * kProjectBlock until compacted
+  Buffer<std::uint32_t> ids;      // ids in view, ascending
   std::vector<ProjectedBlock> blocks;
 
   Buffer<KeyedId> order, order_scratch;
@@ -111,6 +112,8 @@ struct RasterState : TileLists {
   Buffer<Record> records;       // (N,), in the order of the map
   Buffer<float> more_channels;  // (passes - 1, N, kRecordChannels)
   Buffer<float> final_state;    // (passes, tiles, kFinalPlanes, kTilePixels)
+  Buffer<std::uint8_t> mask;    // of square tiles of mask_size pixels; empty: none
+  int mask_size = 0, mask_columns = 0;
 
   std::size_t bytes() const noexcept;
 };

@@ -103,7 +103,7 @@ struct SurfelProjectBackwardArgs {
   bool sum_channels;
   bool accumulate;  // add to the outputs
   float *means, *quats, *scales, *opacities, *colors, *means2d;  // outputs; null: not asked for
-  double* viewmat;                                               // (blocks, 12) partial sums, or null
+  double* camera;                                                // (blocks, kCameraSums) partial sums, or null
 };
 
 struct SurfelKernels {

@@ -46,12 +46,9 @@ struct SurfelImageGradients {
   std::span<const float> colors, alphas, normals, median, distortion;
 };
 
-// As rasterize_backward(); `means2d` (N, 2) [per px] is the gradient to the projected centres.
-struct SurfelGradients : Gradients {
-  std::span<float> means2d;
-};
+// As rasterize_backward(); gradients of covariances and absolute values are none.
 void surfels_backward(const SurfelState& state, const Gaussians& surfels, std::span<const float> background,
-                      const SurfelImageGradients& grads, const SurfelGradients& out);
+                      const SurfelImageGradients& grads, const Gradients& out);
 
 // What projection found, one row a surfel; rows of surfels out of view are zero.
 struct SurfelProjections {

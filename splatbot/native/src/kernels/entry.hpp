@@ -10,5 +10,11 @@ void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out);
 void blend(const BlendArgs& args, std::size_t tile);
 void blend_backward(const BlendBackwardArgs& args, std::size_t tile);
 void project_backward(const ProjectBackwardArgs& args, std::size_t block);
+void linearize(const LinearizeArgs& args, LinearizeSums& sums);
+void harmonics(const HarmonicsArgs& args, std::size_t block);
+void harmonics_backward(const HarmonicsBackwardArgs& args, std::size_t block);
+void contributions(const ContributionArgs& args, std::size_t tile);
+void medians(const MedianArgs& args, std::size_t tile);
+void fronts(const FrontArgs& args, std::size_t tile);
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -27,12 +27,14 @@ inline std::size_t first_not_finite(const float* values, std::size_t n) {
   return n;
 }
 
-// The first input of Gaussians [begin, end) that is not finite, if there is one.
-template <class Args>
-bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
-  const float* fields[] = {args.means, args.quats, args.scales, args.opacities, args.colors};
-  const std::size_t widths[] = {3, 4, 3, 1, static_cast<std::size_t>(args.channels)};
-  for (int f = 0; f < 5; ++f) {
+// Finds the first value of rows [begin, end) of several arrays that is not finite; null arrays are passed over.
+template <int N>
+bool find_bad_row(const float* const (&fields)[N], const std::size_t (&widths)[N], std::size_t begin, std::size_t end,
+                ProjectedBlock& out) {
+  for (int f = 0; f < N; ++f) {
+    if (fields[f] == nullptr) {
+      continue;
+    }
     const std::size_t n = (end - begin) * widths[f];
     const std::size_t bad = first_not_finite(fields[f] + begin * widths[f], n);
     if (bad < n) {
@@ -93,18 +95,21 @@ SB_INLINE void scatter_lanes(float* rows, const std::uint32_t* ids, int n, const
   }
 }
 
-// Gradients of the camera's rotation and translation, lane by lane until the end.
+// Gradients of a camera, lane by lane until the end.
 class CameraSums {
  public:
-  SB_INLINE void add(const F (&rotation)[9], const F (&translation)[3], int n) {
-    alignas(64) float lanes[12][W];
+  SB_INLINE void add(const F (&rotation)[9], const F (&translation)[3], const F (&intrinsics)[4], int n) {
+    alignas(64) float lanes[kCameraSums][W];
     for (int i = 0; i < 9; ++i) {
       store(lanes[i], rotation[i]);
     }
     for (int i = 0; i < 3; ++i) {
       store(lanes[9 + i], translation[i]);
     }
-    for (int k = 0; k < 12; ++k) {
+    for (int i = 0; i < 4; ++i) {
+      store(lanes[12 + i], intrinsics[i]);
+    }
+    for (int k = 0; k < kCameraSums; ++k) {
       for (int i = 0; i < W; ++i) {
         sums_[k][i] += i < n ? static_cast<double>(lanes[k][i]) : 0.0;
       }
@@ -112,7 +117,7 @@ class CameraSums {
   }
 
   void write(double* to) const {
-    for (int k = 0; k < 12; ++k) {
+    for (int k = 0; k < kCameraSums; ++k) {
       to[k] = 0.0;
       for (int i = 0; i < W; ++i) {
         to[k] += sums_[k][i];
@@ -121,7 +126,7 @@ class CameraSums {
   }
 
  private:
-  double sums_[12][W] = {};
+  double sums_[kCameraSums][W] = {};
 };
 
 // From d loss / d a, a = camera rotation x Gaussian rotation, to d loss / d Gaussian rotation.

@@ -61,14 +61,14 @@ struct PreciseLanes {
   alignas(64) float whole[2][W], part[2][W], slope[2][W], z[W], b[4][W], kappa[W], h[2][W], flip[W];
 };
 
-SB_INLINE void project_precisely(const GaussianLanes& g, const View& view, PreciseLanes& out) {
+SB_INLINE void project_precisely(const F (&means)[3], const GaussianLanes& g, const View& view, PreciseLanes& out) {
   alignas(64) float mean[3][W], quat[4][W], scale[2][W];
   for (int k = 0; k < 4; ++k) {
     store(quat[k], g.quat[k]);
-    store(mean[k % 3], g.mean[k % 3]);
+    store(mean[k % 3], means[k % 3]);
     store(scale[k % 2], g.scale[k % 2]);
   }
-  const auto* r = view.rotation;
+  const float* r = view.rotation;
   const double focal[2] = {view.fx, view.fy}, center[2] = {view.cx, view.cy};
   for (int i = 0; i < W; ++i) {
     double q[4], p[3], t[3][2];
@@ -85,9 +85,12 @@ SB_INLINE void project_precisely(const GaussianLanes& g, const View& view, Preci
     const double axes[3][2] = {{1.0 - two * (y * y + z * z), two * (x * y - w * z)},
                                {two * (x * y + w * z), 1.0 - two * (x * x + z * z)},
                                {two * (x * z - w * y), two * (y * z + w * x)}};
+    const double centre[3] = {static_cast<double>(mean[0][i]) - view.origin[0],
+                              static_cast<double>(mean[1][i]) - view.origin[1],
+                              static_cast<double>(mean[2][i]) - view.origin[2]};
     for (int k = 0; k < 3; ++k) {
       const double r0 = r[3 * k], r1 = r[3 * k + 1], r2 = r[3 * k + 2];
-      p[k] = r0 * mean[0][i] + r1 * mean[1][i] + r2 * mean[2][i] + view.translation[k];
+      p[k] = r0 * centre[0] + r1 * centre[1] + r2 * centre[2] + view.translation[k];
       t[k][0] = r0 * axes[0][0] + r1 * axes[1][0] + r2 * axes[2][0];
       t[k][1] = r0 * axes[0][1] + r1 * axes[1][1] + r2 * axes[2][1];
     }

@@ -161,8 +161,12 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
                    std::uint32_t* visible, ProjectedBlock& out) {
   GaussianLanes g;
   F opacity[1];
-  load_lanes<3>(args.means, first, n, g.mean);
+  F means[3];
+  load_lanes<3>(args.means, first, n, means);
   load_lanes<1>(args.opacities, first, n, opacity);
+  for (int i = 0; i < 3; ++i) {
+    g.mean[i] = means[i] - cam.origin[i];
+  }
   Projected o;
   project_center(g, cam, o);
   M keep = (o.p[2] >= set1(args.options.near_plane)) & (o.p[2] <= set1(args.options.far_plane)) &
@@ -178,7 +182,7 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
     constexpr float kTwoLn2 = 1.3862944F;
     const F reach2 = set1(kTwoLn2) * max(lo - set1(kLog2AlphaMin), set1(0.0F));
     Lanes lanes;
-    project_precisely(g, args.view, lanes.precise);
+    project_precisely(means, g, args.view, lanes.precise);
     recall(lanes.precise, o, s);
     const Cover c = cover(o, s, cam, reach2);
     const F huge = set1(1e30F);
@@ -204,7 +208,9 @@ void surfel_project(const SurfelProjectArgs& args, std::size_t block, ProjectedB
   const std::size_t begin = block * kProjectBlock;
   const std::size_t end = begin + kProjectBlock < args.count ? begin + kProjectBlock : args.count;
   out = ProjectedBlock{};
-  if (find_fault(args, begin, end, out)) {
+  const float* const fields[] = {args.means, args.quats, args.scales, nullptr, args.opacities, args.colors};
+  const std::size_t widths[] = {3, 4, 3, 9, 1, static_cast<std::size_t>(args.channels)};
+  if (find_bad_row(fields, widths, begin, end, out)) {
     return;
   }
   const CameraLanes cam(args.view);

@@ -16,7 +16,7 @@ struct LaneSums {
 
 struct LaneGradients {
   F mean[3], quat[4], scale[3], point[2];
-  F rotation[9], translation[3];  // of the camera
+  F rotation[9], translation[3], intrinsics[4];  // of the camera
 };
 
 // Sum of a surfel's slots in the order of its tiles.
@@ -126,6 +126,13 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
       out.rotation[3 * i + j] = fma(gp[i], g.mean[j], turned);
     }
   }
+  // Of the focal lengths, b and h fall by the inverse.
+  const F fall_x = fma(s.b[0], sum(kSumU), fma(s.b[2], sum(kSumV), s.hx * sum(kSumD)));
+  const F fall_y = fma(s.b[1], sum(kSumU + 1), fma(s.b[3], sum(kSumV + 1), s.hy * sum(kSumD + 1)));
+  out.intrinsics[0] = fms(out.point[0], s.slope[0], fall_x / cam.fx);
+  out.intrinsics[1] = fms(out.point[1], s.slope[1], fall_y / cam.fy);
+  out.intrinsics[2] = out.point[0];
+  out.intrinsics[3] = out.point[1];
   F r[9];
   pull_back_axes(cam, ga, r);
   for (int i = 0; i < 3; ++i) {
@@ -199,6 +206,7 @@ void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t 
     collect(args, block, ids, n, sums);
     GaussianLanes g;
     gather_lanes<3>(args.forward.means, ids, n, g.mean);
+    from_origin(cam, g.mean);
     gather_lanes<4>(args.forward.quats, ids, n, g.quat);
     gather_lanes<3>(args.forward.scales, ids, n, g.scale);
     Projected o;
@@ -218,12 +226,12 @@ void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t 
       const F gradient[1] = {load(sums.of[kSumAlpha]) / opacity[0]};
       scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
     }
-    if (args.viewmat != nullptr) {
-      camera_sums.add(grads.rotation, grads.translation, n);
+    if (args.camera != nullptr) {
+      camera_sums.add(grads.rotation, grads.translation, grads.intrinsics, n);
     }
   }
-  if (args.viewmat != nullptr) {
-    camera_sums.write(args.viewmat + b * 12);
+  if (args.camera != nullptr) {
+    camera_sums.write(args.camera + b * kCameraSums);
   }
 }
 

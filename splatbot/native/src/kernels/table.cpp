@@ -8,7 +8,20 @@
 namespace splatbot::SPLATBOT_KERNELS {
 
 extern const Kernels kKernels;
-const Kernels kKernels = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), project, blend, blend_backward, project_backward,
-                          {surfel_project, surfel_blend, surfel_blend_backward, surfel_project_backward}};
+const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
+                          .project = project,
+                          .blend = blend,
+                          .blend_backward = blend_backward,
+                          .project_backward = project_backward,
+                          .linearize = linearize,
+                          .harmonics = harmonics,
+                          .harmonics_backward = harmonics_backward,
+                          .contributions = contributions,
+                          .medians = medians,
+                          .fronts = fronts,
+                          .surfels = {.project = surfel_project,
+                                      .blend = surfel_blend,
+                                      .blend_backward = surfel_blend_backward,
+                                      .project_backward = surfel_project_backward}};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

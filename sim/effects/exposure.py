@@ -1,0 +1,59 @@
+"""Brightness that jumps or drifts, as when automatic exposure reacts or a lamp is switched on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.frame import Frame
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Colours times a gain, plus an offset, clipped to 0..255; depth is untouched.
+
+    Applied to the 8-bit values as they are, without a camera's response curve: the affine model that photometric
+    trackers fit (Engel, Koltun, Cremers 2018, section 2.1).
+
+    Args:
+        step: gain from frame ``at`` on; 1 for none.
+        offset: added to the values (0..255) from frame ``at`` on.
+        at: first frame of the step.
+        until: first frame after it; 0 for never.
+        drift: doublings of the gain per second, from stamp 0 on; negative darkens.
+        why: who asked for it.
+
+    Raises:
+        InputError: an argument is out of range.
+    """
+
+    step: float = 2.0
+    offset: float = 0.0
+    at: int = 0
+    until: int = 0
+    drift: float = 0.0
+    why: str = "asked for"
+    name: str = "exposure"
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.step) and self.step >= 0):
+            raise InputError(f"is {self.step}.", field="step", hint="give a finite gain >= 0")
+        for name in ("offset", "drift"):
+            if not np.isfinite(getattr(self, name)):
+                raise InputError(f"is {getattr(self, name)}.", field=name, hint="give a finite number")
+        if self.at < 0:
+            raise InputError(f"is {self.at}.", field="at", hint="give a frame number >= 0")
+        if self.until and self.until <= self.at:
+            raise InputError(f"is {self.until}.", field="until", hint=f"give a frame after {self.at}, or 0 for never")
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        """The frame in its new brightness."""
+        stepped = frame.index >= self.at and not (self.until and frame.index >= self.until)
+        gain = float(2.0 ** np.clip(self.drift * frame.stamp, -64, 64)) * (self.step if stepped else 1.0)
+        offset = self.offset if stepped else 0.0
+        if gain == 1.0 and offset == 0.0:
+            return frame
+        table = np.clip(np.rint(gain * np.arange(256) + offset), 0, 255).astype(np.uint8)
+        return replace(frame, rgb=table[frame.rgb])

@@ -1,0 +1,76 @@
+"""Sensor effects by name. An effect's module is imported only when somebody asks for it."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import Any
+
+from splatbot.errors import InputError
+from splatbot.sim.effects.base import Effect, Effects, settings
+
+_CLASSES = {
+    "motion_blur": ("splatbot.sim.effects.motion_blur", "MotionBlur"),
+    "exposure": ("splatbot.sim.effects.exposure", "Exposure"),
+    "depth_noise": ("splatbot.sim.effects.depth_noise", "DepthNoise"),
+    "depth_holes": ("splatbot.sim.effects.depth_holes", "DepthHoles"),
+    "blackout": ("splatbot.sim.effects.blackout", "Blackout"),
+    "frame_drops": ("splatbot.sim.effects.frame_drops", "FrameDrops"),
+}
+
+EFFECTS = tuple(_CLASSES)
+"""The names, in the order in which a sensor would do them."""
+
+
+def effect_class(name: str) -> type[Any]:
+    """The class of an effect.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    if name not in _CLASSES:
+        raise InputError(f"there is no {name!r}.", field="effect", hint=f"effects: {', '.join(EFFECTS)}")
+    module, attribute = _CLASSES[name]
+    found: type[Any] = getattr(importlib.import_module(module), attribute)
+    return found
+
+
+def make_effect(spec: str, *, why: str = "") -> Effect:
+    """The effect that ``spec`` describes: `name`, or `name:option=value,option=value`; ``why`` is the spec if empty.
+
+    Raises:
+        InputError: the name or an option is unknown, or a value is no number or out of range.
+    """
+    name, _, text = spec.partition(":")
+    kind = effect_class(name.strip())
+    known = settings(kind)
+    values: dict[str, Any] = {}
+    for pair in filter(None, (pair.strip() for pair in text.split(","))):
+        key, equals, value = (part.strip() for part in pair.partition("="))
+        if key not in known or not equals:
+            raise InputError(
+                f"{pair!r} is no option of {name}.", field=f"effect {name}", hint=f"write {_written(name, known)}"
+            )
+        values[key] = _value(name, key, value, type(known[key]))
+    try:
+        made: Effect = kind(why=why or f"asked for as {spec}", **values)
+    except InputError as error:
+        raise InputError(error.message, field=f"effect {name}: {error.field}", hint=error.hint) from error
+    return made
+
+
+def make_effects(specs: Sequence[str], *, seed: int = 0, why: str = "") -> Effects:
+    """The effects of several specs, in their order; see :func:`make_effect`."""
+    return Effects([make_effect(spec, why=why) for spec in specs], seed=seed)
+
+
+def _value(name: str, key: str, text: str, kind: type) -> Any:
+    try:
+        return kind(text)
+    except ValueError as error:
+        what = "a whole number" if kind is int else "a number"
+        raise InputError(f"is {text!r}.", field=f"effect {name}: {key}", hint=f"give {what}") from error
+
+
+def _written(name: str, known: dict[str, Any]) -> str:
+    return f"{name}:" + ",".join(f"{key}={value}" for key, value in known.items())

@@ -1,0 +1,183 @@
+"""`splatbot simulate`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from splatbot.frame import Frame
+    from splatbot.logs.synthetic import Options, SyntheticLog
+
+_PLAIN_EVERY_S = 2.0
+
+
+def simulate(
+    scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = "",
+    /,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    trajectory: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+    frames: Annotated[int, tyro.conf.arg(metavar="N")] = 120,
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480",
+    fps: Annotated[float, tyro.conf.arg(metavar="HZ")] = 30.0,
+    arc: Annotated[float, tyro.conf.arg(metavar="DEG")] = 40.0,
+    event: Annotated[float, tyro.conf.arg(metavar="S")] = 2.0,
+    effects: Annotated[
+        tuple[str, ...], tyro.conf.arg(name="effect", metavar="NAME[:KEY=VALUE,...]"), tyro.conf.UseAppendAction
+    ] = (),
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    list_: Annotated[bool, tyro.conf.arg(name="list")] = False,
+    quiet: bool = False,
+) -> int:
+    """Record a synthetic log whose depth and poses are known exactly.
+
+    Writes a TUM-layout folder: rgb/, depth/, rgb.txt, depth.txt, groundtruth.txt, intrinsics.json, effects.json (what
+    the frames went through and why) and objects/NAME.tum (paths of what moves). `splatbot map` takes the folder, or,
+    without any file, the address that is printed at the end.
+
+    Examples:
+        splatbot simulate --list
+        splatbot simulate tabletop --out recordings/tabletop
+        splatbot simulate room --trajectory handheld --frames 300 --effect motion_blur --effect depth_noise --out r
+        splatbot simulate tabletop --effect exposure:step=2,at=40 --effect depth_holes:share=0.4 --out hard
+        splatbot simulate tabletop_crossing --event 1.5 --frames 150 --size 320x240 --out crossing
+
+    Args:
+        scene: what is filmed; --list names the scenes.
+        out: folder to write; must hold no recording.
+        trajectory: how the camera moves; by default the scene's own.
+        frames: how many the sensor takes (frame_drops loses some of them).
+        size: of the images [px].
+        fps: frames per second.
+        arc: angle over which the trajectory `orbit` swings [degrees].
+        event: when something moves or goes, in the scenes in which something does [s].
+        effects: what the frames go through, in this order; once for each effect. None unless asked for.
+        seed: of everything random; the same seed gives the same bits.
+        list_: print the scenes, trajectories and effects and leave.
+        quiet: no progress, no summary, only errors.
+    """
+    from splatbot.errors import InputError
+
+    if list_:
+        _print_lists()
+        return 0
+    if not scene:
+        raise InputError("is missing.", field="SCENE", hint="name one, as in: splatbot simulate tabletop --out DIR")
+    if out is None:
+        raise InputError("is missing.", field="--out", hint="name the folder to write: --out DIR")
+    width, height = _parse_size(size)
+
+    from splatbot.logs.synthetic import Options, SyntheticLog, synthetic_uri
+
+    wanted = Options(trajectory or "", frames, width, height, fps, arc, event, seed, ";".join(effects))
+    log = SyntheticLog(synthetic_uri(scene, wanted))
+    _record(log, out, quiet=quiet)
+    if not quiet:
+        _print_summary(log, out, wanted)
+    return 0
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    from splatbot.errors import InputError
+
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError(f"is {text!r}.", field="--size", hint="write WIDTHxHEIGHT, as in 640x480")
+    return int(width), int(height)
+
+
+def _record(log: SyntheticLog, out: Path, *, quiet: bool) -> None:
+    from splatbot.formats.trajectory import save_trajectory
+    from splatbot.logs.effects import write_account
+    from splatbot.logs.record import record
+
+    def frames() -> Iterator[Frame]:
+        def tell() -> None:
+            write_account(out, uri=log.uri, effects=log.effects, blanks_depth=log.blanks_depth)
+
+        tell()  # before the first frame: a recording that is interrupted must not pass for a real sensor's
+        try:
+            yield from log
+        finally:
+            tell()
+
+    with _progress(len(log), quiet=quiet) as show:
+        record(frames(), out, ground_truth=log.ground_truth, progress=show)
+    for name, path in log.objects().items():
+        save_trajectory(path, out / "objects" / f"{name}.tum", what="T_world_object")
+
+
+@contextmanager
+def _progress(total: int, *, quiet: bool) -> Iterator[Callable[[int], None]]:
+    """A callback with the number of frames done: a bar on a terminal, a line every two seconds elsewhere."""
+    if quiet:
+        yield lambda done: None
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import BarColumn as Bar
+        from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("[bold]recording"), Bar(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+            task = bars.add_task("", total=total)
+            yield lambda done: bars.update(task, completed=done)
+    else:
+        yield _plain_lines(total)
+
+
+def _plain_lines(total: int) -> Callable[[int], None]:
+    start = due = time.monotonic()
+
+    def show(done: int) -> None:
+        nonlocal due
+        now = time.monotonic()
+        if now >= due or done == total:
+            due = now + _PLAIN_EVERY_S
+            rate = done / (now - start) if now > start else 0.0
+            print(f"frame {done}/{total}  {rate:.1f} fps", file=sys.stderr, flush=True)
+
+    return show
+
+
+def _print_summary(log: SyntheticLog, out: Path, wanted: Options) -> None:
+    from splatbot.cli.tables import print_table
+    from splatbot.results.units import milliseconds
+
+    rows = [
+        ("frames", f"{len(log)} of {wanted.frames}" if len(log) < wanted.frames else str(len(log))),
+        *((f"effect {e['name']}", f"{e['why']}, {milliseconds(e['ms_per_frame'])} per frame") for e in log.effects),
+        ("log", str(out)),
+        ("without a file", f'splatbot map "{log.uri}"'),
+    ]
+    print_table(rows, title=f"{log.name}: recorded")
+
+
+def _print_lists() -> None:
+    from splatbot.cli.tables import print_table
+    from splatbot.logs.scenes import SCENES
+    from splatbot.logs.trajectories import TRAJECTORIES
+    from splatbot.sim.effects.base import settings
+    from splatbot.sim.effects.registry import EFFECTS, effect_class
+
+    print_table(
+        [(name, f"{kind.about}; by default {kind.trajectory}") for name, kind in SCENES.items()], title="scenes"
+    )
+    print_table([(name, _first_line(path)) for name, path in TRAJECTORIES.items()], title="trajectories")
+    kinds = [effect_class(name) for name in EFFECTS]
+    print_table(
+        [
+            (name, f"{_first_line(kind)} " + " ".join(f"{key}={value}" for key, value in settings(kind).items()))
+            for name, kind in zip(EFFECTS, kinds, strict=True)
+        ],
+        title="effects and their options",
+    )
+
+
+def _first_line(thing: object) -> str:
+    return (thing.__doc__ or "").strip().splitlines()[0]

@@ -1,0 +1,245 @@
+"""How a camera moves through a scene: poses as exact float64 functions of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.geometry import Array, so3_exp
+
+Path = Callable[[float], Array]
+"""T_world_camera (4, 4) at a time [s]."""
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where a camera may move in a scene; z is up.
+
+    Args:
+        eye, target: [m], the place to look from and what to look at.
+        ahead: [m], how far the way is free from ``eye`` towards ``target``.
+        circuit_center, circuit_radius: [m], the free circle on which a circuit leads, facing outwards; radius 0: there
+            is none, circuits lead around in front of ``target``, facing it.
+        paths: names of the trajectories that fit in; empty for all.
+    """
+
+    eye: Point
+    target: Point
+    ahead: float
+    circuit_center: Point = (0.0, 0.0, 0.0)
+    circuit_radius: float = 0.0
+    paths: tuple[str, ...] = ()
+
+    @property
+    def home(self) -> Array:
+        """T_world_camera (4, 4) at ``eye``, facing ``target``."""
+        return look_at(np.array(self.eye), np.array(self.target))
+
+
+@dataclass(frozen=True)
+class Shooting:
+    """What a trajectory may depend on beside the scene.
+
+    Args:
+        duration: from the first frame to the last [s].
+        rate: frames per second [Hz].
+        arc: angle [rad] over which an orbit swings.
+        seed: of what is random.
+    """
+
+    duration: float
+    rate: float = 30.0
+    arc: float = np.radians(40.0)
+    seed: int = 0
+
+
+def make_path(name: str, stage: Stage, shooting: Shooting) -> Path:
+    """The trajectory ``name`` on a stage.
+
+    Raises:
+        InputError: there is none of that name, or it would run into the scene.
+    """
+    if name not in TRAJECTORIES:
+        raise InputError(f"there is no {name!r}.", field="trajectory", hint=f"trajectories: {', '.join(TRAJECTORIES)}")
+    if stage.paths and name not in stage.paths:
+        raise InputError(
+            f"{name!r} does not fit into this scene.", field="trajectory", hint=f"take {', '.join(stage.paths)}"
+        )
+    return TRAJECTORIES[name](stage, shooting)
+
+
+def orbit(stage: Stage, shooting: Shooting) -> Path:
+    """Swings over an arc before the target and back in 8 s, bobbing: at most 0.5° and 8 mm per frame on a table top."""
+    target, offset = np.array(stage.target), np.array(stage.eye) - np.array(stage.target)
+    distance, middle = float(np.hypot(offset[0], offset[1])), np.arctan2(offset[1], offset[0])
+    scale = distance / 0.80
+
+    def pose(t: float) -> Array:
+        azimuth = middle + 0.5 * shooting.arc * np.sin(2 * np.pi * t / 8.0)
+        radius = distance + 0.06 * scale * np.sin(2 * np.pi * t / 5.3)
+        height = offset[2] + 0.05 * scale * np.sin(2 * np.pi * t / 6.7)
+        eye = target + np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
+        return look_at(eye, target + scale * np.array([-0.02, 0.03 * np.sin(2 * np.pi * t / 4.1), 0.04]))
+
+    return pose
+
+
+def arm(stage: Stage, _: Shooting) -> Path:
+    """A wrist camera that sweeps 50 x 20 cm without a stop, once in 9 s: at most 0.25 m/s."""
+
+    def pose(t: float) -> Array:
+        w = 2 * np.pi * t / 9.0
+        move = [0.25 * np.sin(w), 0.10 * np.sin(2 * w + 0.5), 0.06 * np.sin(w + 1.0)]
+        return _moved(stage.home, move, np.radians([5 * np.sin(2 * w), 8 * np.sin(w), 4 * np.sin(w + 2.0)]))
+
+    return pose
+
+
+_STOPS = np.array(  # x, y, z [m] and rotation vector [deg] from home, in the camera frame
+    [
+        [-0.22, -0.08, 0.00, 3, 6, 0],
+        [0.00, -0.10, 0.04, 5, 0, -3],
+        [0.22, -0.08, 0.00, 3, -6, 0],
+        [0.22, 0.08, 0.05, -4, -6, 4],
+        [0.00, 0.10, 0.08, -5, 0, 0],
+        [-0.22, 0.08, 0.05, -4, 6, -4],
+    ]
+)
+_MOVE_S, _REST_S = 1.2, 0.4
+
+
+def arm_stops(stage: Stage, _: Shooting) -> Path:
+    """A wrist camera that halts for 0.4 s at each of six views; minimum jerk between them (Flash, Hogan 1985)."""
+
+    def pose(t: float) -> Array:
+        leg, since = divmod(t, _MOVE_S + _REST_S)
+        s = min(since / _MOVE_S, 1.0)
+        share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        a, b = _STOPS[int(leg) % len(_STOPS)], _STOPS[(int(leg) + 1) % len(_STOPS)]
+        at = a + share * (b - a)
+        return _moved(stage.home, at[:3], np.radians(at[3:]))
+
+    return pose
+
+
+def handheld(stage: Stage, shooting: Shooting) -> Path:
+    """Held in a hand: sway (0.05 to 0.4 Hz, 5 cm and 4° RMS), jitter (0.5 to 6 Hz, 2 mm and 0.3° RMS), both seeded."""
+    rng = np.random.default_rng([shooting.seed, 1])
+    sway = _band(rng, 0.05, 0.4, np.r_[np.full(3, 0.05), np.full(3, np.radians(4.0))])
+    jitter = _band(rng, 0.5, 6.0, np.r_[np.full(3, 0.002), np.full(3, np.radians(0.3))])
+
+    def pose(t: float) -> Array:
+        at = sway(t) + jitter(t)
+        return _moved(stage.home, at[:3], at[3:])
+
+    return pose
+
+
+def rotation(stage: Stage, _: Shooting) -> Path:
+    """Turns where it stands: 35° to both sides in 8 s, nodding and rolling a little; the camera centre stays."""
+
+    def pose(t: float) -> Array:
+        yaw, nod = 35.0 * np.sin(2 * np.pi * t / 8.0), 8.0 * np.sin(2 * np.pi * t / 5.0)
+        roll = 4.0 * np.sin(2 * np.pi * t / 3.7)
+        T = stage.home
+        T[:3, :3] = so3_exp([0, 0, np.radians(-yaw)]) @ T[:3, :3] @ so3_exp(np.radians([nod, 0, roll]))
+        return T
+
+    return pose
+
+
+def forward(stage: Stage, _: Shooting) -> Path:
+    """Straight on towards the target as far as the way is free, at up to 0.5 m/s, and backwards to the start."""
+    half = np.pi * stage.ahead  # [s] one way; of (1 - cos)/2 the steepest slope is π/2 over it
+
+    def pose(t: float) -> Array:
+        return _moved(stage.home, [0, 0, 0.5 * stage.ahead * (1.0 - np.cos(np.pi * t / half))], np.zeros(3))
+
+    return pose
+
+
+_STEP_M, _STEP_DEG, _STEPS = 0.08, 5.0, 6
+
+
+def steps(stage: Stage, shooting: Shooting) -> Path:
+    """8 cm and 5° from every frame to the next, to and fro over six of them to both sides, about a point ahead."""
+    pivot = stage.home
+    lever = 0.5 * _STEP_M / np.sin(np.radians(0.5 * _STEP_DEG))
+    level = pivot[:3, 2] * [1, 1, 0]
+    center = pivot[:3, 3] + lever * level / np.linalg.norm(level)
+
+    def pose(t: float) -> Array:
+        k = _STEPS - abs((t * shooting.rate + _STEPS) % (4 * _STEPS) - 2 * _STEPS)  # 0, 1 .. 6, 5 .. -6, -5 ..
+        R = so3_exp([0, 0, np.radians(_STEP_DEG * k)])
+        T = stage.home
+        T[:3, 3] = center + R @ (T[:3, 3] - center)
+        T[:3, :3] = R @ T[:3, :3]
+        return T
+
+    return pose
+
+
+def loop(stage: Stage, shooting: Shooting) -> Path:
+    """One circuit in the length of the log; the last pose is the first."""
+    period = shooting.duration or 1.0
+    return lambda t: _circuit(stage, 2 * np.pi * t / period)
+
+
+def laps(stage: Stage, _: Shooting) -> Path:
+    """The same circuit again and again, 20 s each."""
+    return lambda t: _circuit(stage, 2 * np.pi * t / 20.0)
+
+
+def _circuit(stage: Stage, angle: float) -> Array:
+    if stage.circuit_radius > 0:
+        center = np.array(stage.circuit_center)
+        out = np.array([np.cos(angle), np.sin(angle), 0.0])
+        eye = center + stage.circuit_radius * out
+        return look_at(eye, eye + out - [0.0, 0.0, 0.2 + 0.1 * np.sin(angle)])
+    target, offset = np.array(stage.target), np.array(stage.eye) - np.array(stage.target)
+    distance = float(np.hypot(offset[0], offset[1]))
+    azimuth = np.arctan2(offset[1], offset[0]) + 0.7 * np.sin(angle)
+    height = offset[2] + 0.3 * distance * (1.0 - np.cos(angle))
+    eye = target + np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), height])
+    return look_at(eye, target)
+
+
+TRAJECTORIES: dict[str, Callable[[Stage, Shooting], Path]] = {
+    path.__name__: path for path in (orbit, arm, arm_stops, handheld, rotation, forward, steps, loop, laps)
+}
+
+
+def look_at(eye: Array, target: Array) -> Array:
+    """T_world_camera (4, 4) at ``eye`` (3,), facing ``target`` (3,) [m], upright: z is up in the world."""
+    forward_ = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward_, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward_, right), forward_])
+    T[:3, 3] = eye
+    return T
+
+
+def _moved(T: Array, move: Array | list[float], turn: Array) -> Array:
+    """``T`` after a move [m] and a rotation vector [rad], both in its own axes."""
+    out = T.copy()
+    out[:3, 3] += T[:3, :3] @ np.asarray(move)
+    out[:3, :3] = T[:3, :3] @ so3_exp(turn)
+    return out
+
+
+def _band(rng: np.random.Generator, low: float, high: float, rms: Array) -> Callable[[float], Array]:
+    """A random function of time, values (6,) of the given RMS (6,), without a frequency outside low..high [Hz].
+
+    Amplitudes fall with the frequency, as those of a hand do: every octave adds the same speed.
+    """
+    frequencies = np.exp(rng.uniform(np.log(low), np.log(high), (24, 6)))
+    phases = rng.uniform(0, 2 * np.pi, (24, 6))
+    weights = 1.0 / frequencies
+    weights *= rms / np.sqrt(0.5 * np.sum(weights**2, axis=0))
+    return lambda t: np.sum(weights * np.sin(2 * np.pi * frequencies * t + phases), axis=0)

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <vector>
+
+#include "bindings.hpp"
+#include "splatbot/depth.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using Image = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+using Pixels = nb::ndarray<const float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+
+splatbot::DepthImage view(const Image& depth) {
+  return {static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)), {depth.data(), depth.size()}};
+}
+
+template <class T>
+nb::object take(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
+  auto* data = new std::vector<T>(std::move(values));
+  nb::capsule owner(data, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+  return nb::cast(nb::ndarray<nb::numpy, T>(data->data(), shape, owner));
+}
+
+}  // namespace
+
+void define_depth(nb::module_& m) {
+  m.def(
+      "valid_depth",
+      [](Image depth, float near, float far, float step) {
+        std::vector<float> out(depth.size());
+        {
+          nb::gil_scoped_release release;
+          splatbot::valid_depth(view(depth), near, far, step, out);
+        }
+        return take(std::move(out), {depth.shape(0), depth.shape(1)});
+      },
+      "depth"_a.noconvert(), "near"_a, "far"_a, "step"_a, "Depth without implausible and flying pixels.");
+  m.def(
+      "halve_depth",
+      [](Image depth) {
+        const std::size_t height = depth.shape(0) / 2, width = depth.shape(1) / 2;
+        std::vector<float> out(height * width);
+        {
+          nb::gil_scoped_release release;
+          splatbot::halve_depth(view(depth), out);
+        }
+        return take(std::move(out), {height, width});
+      },
+      "depth"_a.noconvert(), "Half the size, the nearest surface of each 2x2 block.");
+  m.def(
+      "depth_around",
+      [](Image depth, Pixels pixels) {
+        std::vector<double> out(pixels.shape(0));
+        {
+          nb::gil_scoped_release release;
+          splatbot::depth_around(view(depth), {pixels.data(), pixels.size()}, out);
+        }
+        return take(std::move(out), {pixels.shape(0)});
+      },
+      "depth"_a.noconvert(), "pixels"_a.noconvert(), "Median depth of the 5x5 pixels around each; NaN where two surfaces meet.");
+}

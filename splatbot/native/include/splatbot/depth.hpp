@@ -1,0 +1,25 @@
+// SPDX-License-Identifier: Apache-2.0
+// Depth images [m], 0 where nothing was measured: what tracking takes from them.
+#pragma once
+
+#include <span>
+
+namespace splatbot {
+
+struct DepthImage {
+  int width = 0, height = 0;
+  std::span<const float> z;  // (H, W)
+};
+
+// out (H, W): z within [near, far] that is not flying between two surfaces, else 0. A pixel flies that is nearer than one
+// neighbour and farther than the opposite one by more than `step` of its own depth; a missing neighbour speaks for it.
+void valid_depth(const DepthImage& depth, float near, float far, float step, std::span<float> out);
+
+// out (H / 2, W / 2): the mean over each 2x2 block's pixels within 5 % of its nearest one; 0 where none is measured.
+void halve_depth(const DepthImage& depth, std::span<float> out);
+
+// out (N,): median over the measured ones of the 5x5 pixels around each of the pixels (N, 2); NaN where none is, or where
+// they span more than 5 % of it: two surfaces.
+void depth_around(const DepthImage& depth, std::span<const float> pixels, std::span<double> out);
+
+}  // namespace splatbot

@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdio>
+#include <cstdlib>
+#include <string>
+
+inline void promise(bool kept, const std::string& what) {
+  if (!kept) {
+    std::fprintf(stderr, "broken: %s\n", what.c_str());
+    std::exit(1);
+  }
+}
+
+void check_cameras(const std::string& isa);

@@ -1,0 +1,238 @@
+"""Cameras that are no plain pinhole: orthographic, fisheye, distorted, and read line by line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatbot.errors import InputError
+from splatbot.geometry import so3_exp, so3_log
+from splatbot.rasterize.native import native
+
+CameraModel = Literal["pinhole", "ortho", "fisheye"]
+CAMERA_MODELS: tuple[CameraModel, ...] = ("pinhole", "ortho", "fisheye")
+NO_LIMIT = 1e30
+_MAX_TURN = math.pi / 2  # [rad] between the first and the last line; more than any camera does
+
+
+class RollingShutterType(Enum):
+    """Order in which a camera reads its lines; gsplat's names."""
+
+    GLOBAL = 0
+    ROLLING_TOP_TO_BOTTOM = 1
+    ROLLING_LEFT_TO_RIGHT = 2
+    ROLLING_BOTTOM_TO_TOP = 3
+    ROLLING_RIGHT_TO_LEFT = 4
+
+
+@dataclass(frozen=True)
+class UnscentedTransformParameters:
+    """Spread of the sigma points (Julier and Uhlmann 2004; gsplat's names and defaults).
+
+    The points lie ``alpha * sqrt(3 + kappa)`` standard deviations from the centre; ``beta`` = 2 suits Gaussians.
+    """
+
+    alpha: float = 0.1
+    beta: float = 2.0
+    kappa: float = 0.0
+
+    def sigma(self) -> tuple[float, float, float]:
+        """Distance of the points in standard deviations, weight of each, and β - α², the centre's in the covariance.
+
+        Raises:
+            InputError: the points would coincide, or the covariance could be negative.
+        """
+        values = (self.alpha, self.beta, self.kappa)
+        fits = all(map(math.isfinite, values)) and self.alpha > 0 and self.kappa > -3 and self.beta >= self.alpha**2
+        if not fits:
+            raise InputError(f"is {self}.", field="ut_params", hint="alpha > 0, kappa > -3, beta >= alpha²")
+        square = self.alpha**2 * (3.0 + self.kappa)
+        return math.sqrt(square), 0.5 / square, self.beta - self.alpha**2
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """What a render is told of its cameras besides poses and intrinsics; see ``rasterization``."""
+
+    model: str = "pinhole"
+    with_ut: bool = False
+    radial_coeffs: Tensor | None = None
+    tangential_coeffs: Tensor | None = None
+    thin_prism_coeffs: Tensor | None = None
+    rolling_shutter: Any = None
+    viewmats_rs: Tensor | None = None
+    ut_params: Any = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether this is the pinhole that needs no lens."""
+        return self.model == "pinhole" and not self.with_ut
+
+    def check(self) -> None:
+        """Refuse options that do not go together.
+
+        Raises:
+            InputError: naming the option.
+        """
+        if self.model not in CAMERA_MODELS:
+            raise InputError(
+                f"{self.model!r} is not supported.", field="camera_model", hint=f"one of {', '.join(CAMERA_MODELS)}"
+            )
+        coefficients = {
+            name: getattr(self, name) for name in ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs")
+        }
+        needs_ut = {**coefficients, "viewmats_rs": self.viewmats_rs, "ut_params": self.ut_params}
+        for name, value in needs_ut.items():
+            if value is not None and not self.with_ut:
+                raise InputError("needs the unscented transform.", field=name, hint="pass with_ut=True")
+        for name, value in coefficients.items():
+            if value is not None and (self.model == "ortho" or (self.model == "fisheye" and name != "radial_coeffs")):
+                raise InputError(f"is given to a {self.model} camera.", field=name, hint="leave it out")
+            if value is not None and value.requires_grad:
+                raise InputError("receives no gradient.", field=name, hint=f"pass {name}.detach()")
+        rolling = shutter_of(self.rolling_shutter) is not RollingShutterType.GLOBAL
+        if rolling and self.viewmats_rs is None:
+            raise InputError("is missing.", field="viewmats_rs", hint="give the poses (C, 4, 4) at the last line")
+        if self.viewmats_rs is not None and not rolling:
+            raise InputError("is of no use to a global shutter.", field="viewmats_rs", hint="give rolling_shutter")
+
+
+def shutter_of(value: Any) -> RollingShutterType:
+    """The shutter of that name, global if None; accepts gsplat's own enumeration.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    name = "GLOBAL" if value is None else value if isinstance(value, str) else getattr(value, "name", None)
+    if not isinstance(name, str) or name not in RollingShutterType.__members__:
+        names = ", ".join(RollingShutterType.__members__)
+        raise InputError(f"is {value!r}.", field="rolling_shutter", hint=f"one of {names}")
+    return RollingShutterType[name]
+
+
+def lenses_of(
+    settings: CameraSettings, viewmats: Tensor, Ks: Tensor, near_plane: float
+) -> tuple[tuple[Any, ...] | None, Tensor]:
+    """The native lens of each view, None for plain pinholes, and the views' poses, of the shape of ``viewmats``.
+
+    With a rolling shutter the pose returned is that half-way between the first and the last line, float64.
+
+    Args:
+        settings: of all views; tensors have the leading dimensions of ``viewmats``.
+        viewmats: (..., C, 4, 4) world to camera.
+        Ks: (..., C, 3, 3) [px].
+        near_plane: [m].
+
+    Raises:
+        InputError: options do not go together, or a shape or value does not fit.
+    """
+    settings.check()
+    if settings.plain:
+        return None, viewmats
+    views = tuple(viewmats.shape[:-2])
+    if not settings.with_ut:
+        return (native().Lens.affine(settings.model),) * math.prod(views), viewmats
+    params = UnscentedTransformParameters() if settings.ut_params is None else settings.ut_params
+    sigma = UnscentedTransformParameters(params.alpha, params.beta, params.kappa).sigma()
+    radial = _coefficients("radial_coeffs", settings.radial_coeffs, views, 4 if settings.model == "fisheye" else 6)
+    tangential = _coefficients("tangential_coeffs", settings.tangential_coeffs, views, 2)
+    thin_prism = _coefficients("thin_prism_coeffs", settings.thin_prism_coeffs, views, 4)
+    limit = fisheye_limit if settings.model == "fisheye" else pinhole_limit
+    lenses = tuple(
+        native().Lens.unscented(
+            settings.model, [*k, *[0.0] * (6 - len(k))], p.tolist(), s.tolist(), limit(k), near_plane, list(sigma)
+        )
+        for k, p, s in zip(radial, tangential, thin_prism, strict=True)
+    )
+    if settings.viewmats_rs is None:
+        return lenses, viewmats
+    for name, tensor in (("viewmats", viewmats), ("viewmats_rs", settings.viewmats_rs), ("Ks", Ks)):
+        if tensor.requires_grad:
+            hint = f"pass {name}.detach(), or a global shutter"
+            raise InputError("receives no gradient under a rolling shutter.", field=name, hint=hint)
+    return _roll(lenses, settings, viewmats)
+
+
+def _roll(lenses: tuple[Any, ...], settings: CameraSettings, viewmats: Tensor) -> tuple[tuple[Any, ...], Tensor]:
+    last = settings.viewmats_rs
+    if last is None or tuple(last.shape) != tuple(viewmats.shape) or not last.isfinite().all():
+        raise InputError("does not fit viewmats.", field="viewmats_rs", hint="give finite poses of the same shape")
+    shutter = shutter_of(settings.rolling_shutter).value
+    firsts, lasts = (poses.reshape(-1, 4, 4).double().numpy() for poses in (viewmats, last))
+    motions = [middle_pose(a, b) for a, b in zip(firsts, lasts, strict=True)]
+    rolled = tuple(
+        lens.rolling(shutter, m.turn.tolist(), m.step.tolist(), m.middle[:3, 3].tolist())
+        for lens, m in zip(lenses, motions, strict=True)
+    )
+    middles = np.stack([m.middle for m in motions]) if motions else np.zeros((0, 4, 4))
+    return rolled, torch.from_numpy(middles).reshape(viewmats.shape)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """From one pose to another: half-way (4, 4), rotation vector (3,) [rad] and translation (3,) [m] in between."""
+
+    middle: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    step: NDArray[np.float64]
+
+
+def middle_pose(first: NDArray[np.float64], last: NDArray[np.float64]) -> Motion:
+    """World-to-camera poses in between: rotation by the shortest way at constant speed, translation linearly.
+
+    Raises:
+        InputError: they are more than 90 degrees apart.
+    """
+    turn = so3_log(last[:3, :3] @ first[:3, :3].T)
+    angle = float(np.linalg.norm(turn))
+    if angle > _MAX_TURN:
+        raise InputError(
+            f"is turned by {math.degrees(angle):.0f} degrees against viewmats.", field="viewmats_rs", hint="at most 90"
+        )
+    middle = np.eye(4)
+    middle[:3, :3] = so3_exp(0.5 * turn) @ first[:3, :3]
+    middle[:3, 3] = 0.5 * (first[:3, 3] + last[:3, 3])
+    return Motion(middle, turn, last[:3, 3] - first[:3, 3])
+
+
+def pinhole_limit(radial: Sequence[float] | NDArray[np.float64]) -> float:
+    """Tangent of the angle at which OpenCV's rational distortion (k1 .. k6) stops growing, 1e30 if it never does."""
+    k = np.asarray(radial, dtype=np.float64)
+    above, below = np.polynomial.Polynomial([1.0, *k[:3]]), np.polynomial.Polynomial([1.0, *k[3:6]])
+    s = np.polynomial.Polynomial([0.0, 1.0])  # squared tangent
+    slope = above * below + 2 * s * (above.deriv() * below - above * below.deriv())
+    return math.sqrt(min(_first_root(slope), _first_root(below)))
+
+
+def fisheye_limit(radial: Sequence[float] | NDArray[np.float64]) -> float:
+    """Angle [rad] at which OpenCV's fisheye polynomial (k1 .. k4) stops growing, at most π."""
+    k = np.asarray(radial, dtype=np.float64)
+    slope = np.polynomial.Polynomial([1.0, *(k * np.array([3.0, 5.0, 7.0, 9.0]))])
+    return min(math.sqrt(_first_root(slope)), math.pi)
+
+
+def _first_root(polynomial: np.polynomial.Polynomial) -> float:
+    """Least positive root, 1e60 if there is none."""
+    roots = polynomial.trim().roots() if polynomial.trim().degree() > 0 else np.array([])
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots.real))) & (roots.real > 0)]
+    return float(real.min()) if len(real) else NO_LIMIT**2
+
+
+def _coefficients(name: str, given: Tensor | None, views: tuple[int, ...], columns: int) -> NDArray[np.float64]:
+    """Rows (V, columns) of all views."""
+    if given is None:
+        return np.zeros((math.prod(views), columns))
+    if tuple(given.shape) != (*views, columns):
+        raise InputError(f"is {tuple(given.shape)}, expected {(*views, columns)}.", field=name)
+    values = given.detach().double().reshape(-1, columns).numpy()
+    if not np.isfinite(values).all():
+        raise InputError("is not finite.", field=name)
+    return values

@@ -1,0 +1,276 @@
+"""Fusion: new Gaussians lie on what was measured and only where the map lacked it; evidence against brute force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse, se3_exp, transform_points
+from splatbot.mapping.fusion import (
+    View,
+    guess_depth,
+    guessed_gaussians,
+    model_depth,
+    new_gaussians,
+    unexplained,
+    view_of,
+    weigh,
+)
+from splatbot.mapping.keyframes import Keyframe
+from tests.rgbd import CAMERA, small_config, wall_depth
+from tests.unit.mapping.conftest import MakeKeyframe
+
+CONFIG = small_config().mapping
+POSE = se3_exp([0.4, -0.2, 0.3, 0.1, 0.2, -0.3])
+SLANTED = np.array([0.5, -0.3, 0.9]) / np.linalg.norm([0.5, -0.3, 0.9])
+EVERYWHERE = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
+
+
+def fused(keyframe: Keyframe) -> GaussianModel:
+    """A map of one keyframe alone."""
+    return new_gaussians(keyframe, keyframe.depth > 0, CONFIG)
+
+
+def axes(model: GaussianModel) -> NDArray[np.float64]:
+    """Orientations (N, 3, 3): columns are the axes in the world."""
+    return np.asarray(Rotation.from_quat(model.quats.double().numpy(), scalar_first=True).as_matrix())
+
+
+def test_new_gaussians_lie_on_the_measured_surface_at_the_pixels_of_the_grid(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe(POSE, normal=SLANTED, distance=1.5)
+    model = fused(keyframe)
+    s = CONFIG.stride
+    assert len(model) == len(range(s // 2, 120, s)) * len(range(s // 2, 160, s))
+    means = model.means.double().numpy()
+    np.testing.assert_allclose(means @ SLANTED, 1.5, atol=2e-6)
+    pixels = CAMERA.project(transform_points(inverse(POSE), means))
+    offset = (pixels - s // 2) / s
+    np.testing.assert_allclose(offset, np.rint(offset), atol=1e-3)
+
+
+def test_their_shortest_axis_is_the_surface_normal(make_keyframe: MakeKeyframe) -> None:
+    model = fused(make_keyframe(POSE, normal=SLANTED, distance=1.5))
+    assert (model.log_scales.argmin(1) == 2).all()
+    known = np.abs(axes(model)[:, :, 2] @ SLANTED)
+    assert np.quantile(known, 0.05) > 1 - 1e-5  # but those on the image's border, which have no normal
+
+
+def test_their_disc_is_the_footprint_of_the_grid_stretched_by_the_slant(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe(POSE, normal=SLANTED, distance=1.5)
+    model = fused(keyframe)
+    points = transform_points(inverse(POSE), model.means.double().numpy())
+    inner = (np.abs(CAMERA.project(points) - [80, 60]) < [75, 55]).all(1)  # with a normal
+    normal = SLANTED @ POSE[:3, :3]
+    cosine = np.abs(points @ normal) / np.linalg.norm(points, axis=1)
+    across = 0.5 * CONFIG.stride * points[:, 2] / CAMERA.fx
+    expected = np.stack([across / cosine, across, 0.2 * across], 1)
+    np.testing.assert_allclose(model.scales.double().numpy()[inner], expected[inner], rtol=2e-3)
+    # The long axis lies in the plane that the line of sight and the normal span.
+    toward = (points / np.linalg.norm(points, axis=1, keepdims=True)) @ POSE[:3, :3].T
+    sideways = np.cross(toward, SLANTED)
+    sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+    assert np.abs((axes(model)[:, :, 0] * sideways).sum(1))[inner].max() < 0.02
+
+
+def test_neighbouring_discs_touch_at_one_sigma_whatever_the_slant(make_keyframe: MakeKeyframe) -> None:
+    model = fused(make_keyframe(normal=(0, 0, 1), distance=2.0))
+    distances, _ = cKDTree(model.means.numpy()).query(model.means.numpy(), k=2)
+    np.testing.assert_allclose(distances[:, 1], 2 * model.scales[:, 1].numpy(), rtol=0.02)
+
+
+def test_a_grazing_surface_stretches_at_most_three_times(make_keyframe: MakeKeyframe) -> None:
+    grazing = np.array([0.0, 1.0, 0.05]) / np.linalg.norm([0.0, 1.0, 0.05])
+    keyframe = make_keyframe()
+    depth = wall_depth(CAMERA, np.eye(4), grazing, 0.3)
+    keyframe.depth = torch.from_numpy(np.where((depth > 0.2) & (depth < 6), depth, 0).astype(np.float32))
+    model = fused(keyframe)
+    assert len(model) > 100
+    ratio = model.scales[:, 0] / model.scales[:, 1]
+    assert float(ratio.max()) <= 3.0 + 1e-4
+    assert float(ratio.max()) > 2.5
+
+
+def test_a_pixel_without_a_normal_faces_the_camera(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe(POSE)
+    lonely = torch.zeros_like(keyframe.depth)
+    lonely[61, 70] = 1.3
+    assert (61 - 1) % 3 == 0
+    assert (70 - 1) % 3 == 0
+    keyframe.depth = lonely
+    model = fused(keyframe)
+    assert len(model) == 1
+    ray = model.means[0].double().numpy() - POSE[:3, 3]
+    assert abs(axes(model)[0, :, 2] @ ray) == pytest.approx(np.linalg.norm(ray), rel=1e-5)
+
+
+def test_they_carry_the_colour_the_opacity_and_the_number_of_their_keyframe(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe(number=7)
+    model = fused(keyframe)
+    s = CONFIG.stride
+    colors = keyframe.rgb[s // 2 :: s, s // 2 :: s].reshape(-1, 3).float() / 255
+    torch.testing.assert_close(model.colors, colors, atol=1e-6, rtol=0)
+    torch.testing.assert_close(model.opacities, torch.full((len(model),), CONFIG.new_opacity))
+    assert (model.anchors == 7).all()
+    assert (model.observations == 1).all()
+
+
+def test_no_pixel_chosen_makes_no_gaussian(make_keyframe: MakeKeyframe) -> None:
+    assert len(new_gaussians(make_keyframe(), torch.zeros_like(EVERYWHERE), CONFIG)) == 0
+
+
+def test_a_view_of_an_empty_map_is_blank_and_everything_measured_is_unexplained(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe()
+    keyframe.depth[:30] = 0
+    view = view_of(GaussianModel.empty(), CAMERA, POSE)
+    assert view.rgb.shape == (120, 160, 3)
+    assert not view.rgb.any()
+    assert not view.depth.any()
+    assert not view.alpha.any()
+    assert torch.equal(unexplained(view, keyframe.depth, CONFIG), keyframe.depth > 0)
+
+
+def test_the_view_that_made_the_map_is_explained_by_it_to_a_millimetre(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe(POSE, normal=SLANTED, distance=1.5)
+    view = view_of(fused(keyframe), CAMERA, POSE)
+    inner = (slice(4, -4), slice(4, -4))
+    assert not unexplained(view, keyframe.depth, CONFIG)[inner].any()
+    assert float((view.depth - keyframe.depth).abs()[inner].max()) < 1e-3
+    assert len(new_gaussians(keyframe, unexplained(view, keyframe.depth, CONFIG), CONFIG)) < 0.02 * len(fused(keyframe))
+
+
+def test_something_in_front_of_the_map_is_unexplained_and_something_behind_it_is_not(
+    make_keyframe: MakeKeyframe,
+) -> None:
+    keyframe = make_keyframe()
+    view = view_of(fused(keyframe), CAMERA, np.eye(4))
+    depth = keyframe.depth.clone()
+    depth[40:60, 50:80] = 0.9
+    depth[70:90, 50:80] = 1.2
+    lacking = unexplained(view, depth, CONFIG)[4:-4, 4:-4]
+    box = torch.zeros_like(EVERYWHERE)
+    box[40:60, 50:80] = True
+    assert torch.equal(lacking, box[4:-4, 4:-4])
+
+
+def test_a_difference_within_the_tolerance_is_the_same_surface(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe()
+    view = View(torch.zeros(120, 160, 3), torch.full((120, 160), 1.0), torch.ones(120, 160))
+    for nearer, new in ((0.97, False), (0.95, True)):
+        lacking = unexplained(view, torch.full_like(keyframe.depth, nearer), CONFIG)
+        assert bool(lacking.all()) is new
+        assert bool(lacking.any()) is new
+
+
+def test_model_depth_is_the_maps_where_solid_and_agreeing_and_the_measured_elsewhere() -> None:
+    depth = torch.tensor([[1.01, 1.01, 1.2, 1.0, 0.0]])
+    alpha = torch.tensor([[0.95, 0.5, 0.95, 0.95, 0.0]])
+    measured = np.array([[1.0, 1.0, 1.0, 0.0, 1.0]], np.float32)
+    merged = model_depth(View(torch.zeros(1, 5, 3), depth, alpha), measured, CONFIG)
+    np.testing.assert_allclose(merged, [[1.01, 1.0, 1.0, 0.0, 1.0]])
+    assert merged.dtype == np.float32
+
+
+def test_a_guess_is_the_depth_of_the_nearest_measured_pixel() -> None:
+    rng = np.random.default_rng(5)
+    depth = np.where(rng.random((40, 50)) < 0.02, rng.uniform(0.5, 3, (40, 50)), 0).astype(np.float32)
+    guess = guess_depth(torch.from_numpy(depth)).numpy()
+    known, missing = np.argwhere(depth > 0), np.argwhere(depth == 0)
+    assert not guess[depth > 0].any()
+    assert (guess[depth == 0] > 0).all()
+    nearest, _ = cKDTree(known).query(missing)
+    values = depth[depth > 0]
+    for (v, u), least in zip(missing, nearest, strict=True):
+        distance = np.linalg.norm(known[values == guess[v, u]] - (v, u), axis=1).min()
+        assert distance <= 1.05 * least  # the transform's 5x5 mask is exact to 2 % or so
+
+
+def test_nothing_is_guessed_where_everything_or_nothing_was_measured() -> None:
+    for depth in (torch.ones(6, 8), torch.zeros(6, 8)):
+        assert not guess_depth(depth).any()
+
+
+def test_guessed_gaussians_have_no_observation_and_lie_only_where_neither_depth_nor_map_is(
+    make_keyframe: MakeKeyframe,
+) -> None:
+    keyframe = make_keyframe()
+    keyframe.depth[40:80, 60:100] = 0
+    seen = make_keyframe()
+    seen.depth[:, 80:] = 0
+    view = view_of(fused(seen), CAMERA, np.eye(4))  # the map knows the left half
+    guessed = guessed_gaussians(view, keyframe, CONFIG)
+    assert len(guessed) > 50
+    assert (guessed.observations == 0).all()
+    u, v = CAMERA.project(guessed.means.double().numpy()).T
+    assert u.min() > 78
+    assert u.max() < 100
+    assert v.min() > 39
+    assert v.max() < 80
+    np.testing.assert_allclose(guessed.means[:, 2], 1.0, atol=1e-6)
+
+
+def brute_force(model: GaussianModel, keyframe: Keyframe) -> tuple[list[bool], list[bool]]:
+    """Evidence one Gaussian at a time in float64."""
+    supported, through = [], []
+    depth = keyframe.depth.numpy()
+    for mean in model.means.double().numpy():
+        x, y, z = transform_points(inverse(keyframe.T_world_camera), mean)
+        yes = no = False
+        if z > 0.05:
+            u = int(np.rint(CAMERA.fx * x / z + CAMERA.cx))
+            v = int(np.rint(CAMERA.fy * y / z + CAMERA.cy))
+            if 0 <= u < CAMERA.width and 0 <= v < CAMERA.height and depth[v, u] > 0:
+                d = float(depth[v, u])
+                yes = abs(z - d) < CONFIG.new_depth * d
+                no = z < d - 2 * CONFIG.new_depth * d
+        supported.append(yes)
+        through.append(no)
+    return supported, through
+
+
+def test_evidence_equals_a_brute_force_count(make_keyframe: MakeKeyframe) -> None:
+    rng = np.random.default_rng(9)
+    keyframe = make_keyframe(POSE, normal=SLANTED, distance=1.5)
+    keyframe.depth[rng.random((120, 160)) < 0.3] = 0
+    points = rng.uniform([-0.8, -0.6, -1.0], [0.8, 0.6, 2.5], (6000, 3))
+    on_surface = fused(keyframe).means.double().numpy()
+    means = np.concatenate([transform_points(POSE, points), on_surface, POSE[None, :3, 3]])
+    n = len(means)
+    model = GaussianModel.from_activated(
+        means=means,
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        scales=np.full((n, 3), 0.01),
+        opacities=np.full(n, 0.8),
+        colors=np.full((n, 3), 0.5),
+    )
+    evidence = weigh(model, keyframe, CONFIG)
+    supported, through = brute_force(model, keyframe)
+    assert sum(supported) > 500
+    assert sum(through) > 100
+    # A centre within rounding of a pixel's edge may be read from either pixel.
+    assert np.mean(evidence.supported.numpy() != supported) < 1e-3
+    assert np.mean(evidence.seen_through.numpy() != through) < 1e-3
+    assert not (evidence.supported & evidence.seen_through).any()
+
+
+def test_an_empty_map_has_no_evidence(make_keyframe: MakeKeyframe) -> None:
+    evidence = weigh(GaussianModel.empty(), make_keyframe(), CONFIG)
+    assert evidence.supported.shape == evidence.seen_through.shape == (0,)
+
+
+def test_a_keyframe_without_depth_says_nothing_for_or_against(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe()
+    model = fused(keyframe)
+    blind = replace(keyframe, depth=torch.zeros_like(keyframe.depth))
+    evidence = weigh(model, blind, CONFIG)
+    assert not evidence.supported.any()
+    assert not evidence.seen_through.any()
+    view = view_of(model, CAMERA, np.eye(4))
+    assert not unexplained(view, blind.depth, CONFIG).any()
+    assert len(guessed_gaussians(view, blind, CONFIG)) == 0

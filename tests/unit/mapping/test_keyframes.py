@@ -1,0 +1,85 @@
+"""Keyframes: which views are new, and images that stay registered when they are made smaller."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.camera import Camera
+from splatbot.frame import Frame
+from splatbot.geometry import inverse, se3_exp
+from splatbot.mapping.keyframes import is_keyframe, mapping_images
+from tests.rgbd import CAMERA, small_config, wall_frame
+from tests.unit.mapping.conftest import MakeKeyframe
+
+CONFIG = small_config()
+
+
+@pytest.mark.parametrize(
+    ("twist", "new"),
+    [
+        ([0.0] * 6, False),
+        ([0.039, 0, 0, 0, 0, 0], False),
+        ([0.041, 0, 0, 0, 0, 0], True),
+        ([0, 0, 0, 0, 0.069, 0], False),
+        ([0, 0, 0, 0, 0.071, 0], True),
+    ],
+)
+def test_a_view_is_new_when_it_is_far_or_turned_from_the_keyframe(
+    twist: list[float], new: bool, make_keyframe: MakeKeyframe
+) -> None:
+    mapping = small_config(mapping__keyframe_translation=0.04, mapping__keyframe_rotation=0.07).mapping
+    T = se3_exp([1.0, -0.5, 0.2, 0.3, 0.8, -0.1])
+    assert is_keyframe(T @ se3_exp(twist), [make_keyframe(T)], mapping) is new
+
+
+def test_a_view_near_any_keyframe_is_not_new_and_the_first_view_is(make_keyframe: MakeKeyframe) -> None:
+    keyframes = [make_keyframe(se3_exp([x, 0, 0, 0, 0, 0])) for x in (0.0, 1.0, 2.0)]
+    assert not is_keyframe(se3_exp([0.01, 0, 0, 0, 0, 0]), keyframes, CONFIG.mapping)
+    assert is_keyframe(se3_exp([0.5, 0, 0, 0, 0, 0]), keyframes, CONFIG.mapping)
+    assert is_keyframe(np.eye(4), [], CONFIG.mapping)
+
+
+def test_matrices_are_those_the_rasterizer_takes(make_keyframe: MakeKeyframe) -> None:
+    T = se3_exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    keyframe = make_keyframe(T)
+    np.testing.assert_array_equal(keyframe.viewmat[0].numpy(), inverse(T))
+    np.testing.assert_array_equal(keyframe.K[0].numpy(), CAMERA.K_corner)
+
+
+def test_images_of_the_width_asked_for_are_kept_as_they_are() -> None:
+    frame = wall_frame(np.eye(4))
+    camera, rgb, depth = mapping_images(frame, CONFIG.mapping, CONFIG.tracking)
+    assert camera is CAMERA
+    assert np.array_equal(rgb, frame.rgb)
+    assert np.array_equal(depth, frame.depth)
+
+
+@pytest.mark.parametrize("size", [(256, 192), (255, 191), (129, 97)])
+def test_colour_depth_and_camera_stay_registered_when_halved(size: tuple[int, int]) -> None:
+    """Colour tells, four levels a pixel, where a pixel of the last 60 columns and rows was: the middle of its block."""
+    width, height = size
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    ramps = 4 * np.stack([u - width + 60, v - height + 60], -1)
+    rgb = np.concatenate([ramps.clip(0, 255), 0 * u[..., None]], -1).astype(np.uint8)
+    frame = Frame(0.0, rgb, np.ones((height, width), np.float32), Camera(200.0, 200.0, 100.0, 90.0, width, height))
+    camera, small, depth = mapping_images(frame, small_config(mapping__max_width=128).mapping, CONFIG.tracking)
+    assert small.shape[:2] == depth.shape == (camera.height, camera.width)
+    assert camera.width == width // 2
+    x, y, _ = np.moveaxis(camera.backproject(depth).astype(np.float64), -1, 0)
+    pixels = np.stack([200.0 * x + 100.0, 200.0 * y + 90.0], -1)  # where the full camera sees the same points
+    expected = 4 * (pixels - [width - 60, height - 60])
+    inside = expected > 4
+    assert inside.mean() > 0.1
+    np.testing.assert_allclose(small[..., :2][inside], expected[inside], atol=0.51)  # 8 bits
+
+
+def test_depth_that_tracking_would_not_believe_is_not_fused() -> None:
+    frame = wall_frame(np.eye(4))
+    depth = frame.depth.copy()
+    depth[10, 10], depth[20, 20] = 0.1, 9.0
+    _, _, kept = mapping_images(replace(frame, depth=depth), CONFIG.mapping, CONFIG.tracking)
+    assert kept[10, 10] == kept[20, 20] == 0.0
+    assert (kept > 0).sum() == kept.size - 2

@@ -1,0 +1,230 @@
+"""The mapper: one writer, whose map stays within its bounds and whose snapshots stay as they were."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse, se3_exp, transform_points
+from splatbot.mapping.fusion import view_of
+from splatbot.mapping.mapper import Mapper
+from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import PreparedFrame, prepare
+from tests.rgbd import CAMERA, Array, small_config, tabletop, wall_frame
+
+NO_FEATURES = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
+SIDE = se3_exp([0.1, 0, 0, 0, 0, 0])
+
+
+def insert(mapper: Mapper, frame: Frame, T_world_camera: Array | None = None) -> None:
+    T = np.eye(4) if T_world_camera is None else T_world_camera
+    mapper.insert(prepare(frame, mapper.config.tracking), T, NO_FEATURES)
+
+
+def prepared(frame: Frame) -> PreparedFrame:
+    return prepare(frame, small_config().tracking)
+
+
+def equal(a: GaussianModel, b: GaussianModel) -> bool:
+    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+
+
+def with_ball(frame: Frame, depth: float) -> Frame:
+    """A disc of another depth in the middle of the image."""
+    v, u = np.mgrid[:120, :160]
+    disc = (u - 80) ** 2 + (v - 60) ** 2 < 20**2
+    return replace(frame, depth=np.where(disc, np.float32(depth), frame.depth))
+
+
+def near_disc(model: GaussianModel, depth: float) -> torch.Tensor:
+    """Rows at this depth on the rays of the disc's middle."""
+    x, y, z = model.means.T
+    return ((x / z).abs() < 0.1) & ((y / z).abs() < 0.1) & ((z - depth).abs() < 0.03)
+
+
+def test_nothing_mapped_is_an_empty_snapshot_and_finishing_it_does_not_raise() -> None:
+    mapper = Mapper(small_config())
+    assert len(mapper.snapshot().model) == 0
+    assert mapper.snapshot().map_version == 0
+    mapper.finish()
+    assert len(mapper.snapshot().model) == 0
+
+
+def test_every_insertion_and_the_finish_are_a_new_version_with_the_stamp_of_the_last_frame() -> None:
+    mapper = Mapper(small_config())
+    versions = []
+    for stamp, T in ((1.0, np.eye(4)), (2.5, SIDE)):
+        insert(mapper, wall_frame(T, stamp=stamp), T)
+        versions.append(mapper.snapshot().map_version)
+        assert mapper.snapshot().stamp == stamp
+    mapper.finish()
+    assert [*versions, mapper.snapshot().map_version] == [1, 2, 3]
+    assert mapper.snapshot().stamp == 2.5
+
+
+def test_a_snapshot_is_not_changed_by_what_comes_after() -> None:
+    mapper = Mapper(small_config())
+    insert(mapper, wall_frame(np.eye(4)))
+    held = mapper.snapshot()
+    kept = held.model.clone()
+    insert(mapper, wall_frame(SIDE), SIDE)
+    mapper.finish()
+    assert equal(held.model, kept)
+
+
+def test_a_second_look_at_the_same_place_adds_next_to_nothing_and_confirms_what_is_there() -> None:
+    mapper = Mapper(small_config())
+    insert(mapper, wall_frame(np.eye(4)))
+    first = len(mapper.model)
+    insert(mapper, wall_frame(np.eye(4)))
+    assert len(mapper.model) < 1.02 * first
+    assert float((mapper.model.observations[:first] == 2).float().mean()) > 0.98
+
+
+def test_a_new_view_adds_gaussians_only_beside_the_old_one() -> None:
+    mapper = Mapper(small_config(mapping__refine_iterations=0))
+    insert(mapper, wall_frame(np.eye(4)))
+    T = se3_exp([0.4, 0, 0, 0, 0, 0])
+    insert(mapper, wall_frame(T), T)
+    added = mapper.model.means[mapper.model.anchors == 1].double().numpy()
+    assert len(added) > 300
+    u = CAMERA.project(transform_points(inverse(np.eye(4)), added))[:, 0]
+    assert u.min() > 155  # the old image ends at 159, its last Gaussian a little before
+
+
+def test_gaussians_are_anchored_in_the_keyframe_that_made_them() -> None:
+    mapper = Mapper(small_config())
+    for x in (0.0, 0.4, 0.8):
+        T = se3_exp([x, 0, 0, 0, 0, 0])
+        insert(mapper, wall_frame(T), T)
+    assert [k.number for k in mapper.keyframes] == [0, 1, 2]
+    assert set(mapper.model.anchors.tolist()) == {0, 1, 2}
+
+
+def test_what_is_seen_through_loses_its_odds_each_time_until_it_is_gone() -> None:
+    mapper = Mapper(small_config(mapping__refine_iterations=0))
+    insert(mapper, with_ball(wall_frame(np.eye(4)), 0.7))
+    ghosts = []
+    odds = 0.8 / 0.2
+    for _ in range(8):
+        rows = near_disc(mapper.model, 0.7)
+        ghosts.append(int(rows.sum()))
+        if not ghosts[-1]:
+            break
+        alive = mapper.model.opacities[rows]
+        assert float((alive / (1 - alive) / odds - 1).abs().max()) < 1e-4
+        odds /= np.e
+        insert(mapper, wall_frame(np.eye(4)))
+    assert ghosts[0] > 50
+    assert ghosts[-1] == 0
+    assert int(near_disc(mapper.model, 1.0).sum()) > 50  # what was behind has been mapped
+
+
+def test_a_guess_that_is_seen_through_goes_at_once() -> None:
+    mapper = Mapper(small_config(mapping__refine_iterations=0))
+    near = replace(wall_frame(np.eye(4)), depth=np.full((120, 160), 0.6, np.float32))
+    insert(mapper, with_ball(near, 0.0))
+    guesses = mapper.model.observations == 0
+    assert int(guesses.sum()) > 30
+    insert(mapper, with_ball(near, 1.0))
+    assert not (mapper.model.observations == 0).any()
+    assert int(near_disc(mapper.model, 0.6).sum()) == 0
+
+
+def test_a_guess_that_a_later_keyframe_measures_is_observed() -> None:
+    mapper = Mapper(small_config(mapping__refine_iterations=0))
+    insert(mapper, with_ball(wall_frame(np.eye(4)), 0.0))
+    assert int((mapper.model.observations == 0).sum()) > 30
+    insert(mapper, wall_frame(np.eye(4)))
+    assert not (mapper.model.observations == 0).any()
+
+
+@pytest.mark.parametrize("cap", [100, 1500])
+def test_the_cap_is_never_exceeded(cap: int) -> None:
+    mapper = Mapper(small_config(mapping__max_gaussians=cap))
+    for x in (0.0, 0.4, 0.8):
+        T = se3_exp([x, 0, 0, 0, 0, 0])
+        insert(mapper, wall_frame(T), T)
+        assert len(mapper.model) == cap
+    mapper.finish()
+    assert len(mapper.model) <= cap
+
+
+def test_gaussians_that_went_bad_are_pruned_before_anyone_renders_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = Mapper(small_config())
+    refine = mapper._refiner.refine
+
+    def damaging(model: GaussianModel, *rest: object) -> None:
+        refine(model, *rest)  # type: ignore[arg-type]
+        model.means[3] = torch.nan
+        model.sh[5] = torch.inf
+
+    monkeypatch.setattr(mapper._refiner, "refine", damaging)
+    for x in (0.0, 0.4):
+        T = se3_exp([x, 0, 0, 0, 0, 0])
+        insert(mapper, wall_frame(T), T)
+        for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+            assert torch.isfinite(getattr(mapper.model, name)).all()
+
+
+def test_the_optimiser_drops_the_rows_that_the_model_drops_in_the_same_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = Mapper(small_config(mapping__max_gaussians=1500))
+    of_model: list[torch.Tensor] = []
+    of_adam: list[torch.Tensor] = []
+    select, adam_select = GaussianModel.select, mapper._refiner.adam.select
+
+    def recording(model: GaussianModel, index: torch.Tensor) -> GaussianModel:
+        of_model.append(index)
+        return select(model, index)
+
+    def recording_adam(index: torch.Tensor) -> None:
+        of_adam.append(index)
+        adam_select(index)
+
+    monkeypatch.setattr(GaussianModel, "select", recording)
+    monkeypatch.setattr(mapper._refiner.adam, "select", recording_adam)
+    for x in (0.0, 0.4):
+        T = se3_exp([x, 0, 0, 0, 0, 0])
+        insert(mapper, wall_frame(T), T)
+    assert len(of_model) == len(of_adam) >= 2
+    assert all(torch.equal(a, b) for a, b in zip(of_model, of_adam, strict=True))
+
+
+def test_the_reference_of_a_keyframe_lies_on_the_map() -> None:
+    mapper = Mapper(small_config())
+    insert(mapper, wall_frame(SIDE, normal=(0.2, 0.1, 0.97), distance=1.1), SIDE)
+    reference = mapper.keyframes[0].reference
+    assert np.array_equal(reference.T_world_camera, SIDE)
+    assert len(reference.levels) == 3
+    for level in reference.levels:
+        world = transform_points(SIDE, level.points)
+        assert np.abs(world @ [0.2, 0.1, 0.97] - 1.1).max() < 5e-3
+
+
+def test_only_a_new_view_with_enough_depth_is_wanted() -> None:
+    mapper = Mapper(small_config())
+    frame = wall_frame(np.eye(4))
+    blind = replace(frame, depth=np.zeros_like(frame.depth))
+    assert mapper.wants(prepared(frame), np.eye(4))
+    assert not mapper.wants(prepared(blind), np.eye(4))
+    insert(mapper, frame)
+    assert not mapper.wants(prepared(frame), np.eye(4))
+    assert mapper.wants(prepared(frame), SIDE)
+
+
+def test_the_map_of_the_tabletop_shows_views_it_was_not_made_of() -> None:
+    frames, poses = tabletop()
+    mapper = Mapper(small_config(mapping__refine_iterations=8))
+    for i in (0, 10):
+        insert(mapper, frames[i], poses[i])
+    mapper.finish()
+    view = view_of(mapper.model, frames[5].camera, poses[5])
+    error = (view.rgb.double() - torch.from_numpy(frames[5].rgb).double() / 255).square().mean()
+    assert -10 * np.log10(float(error)) > 21.0  # [dB]
+    depth_error = (view.depth - torch.from_numpy(frames[5].depth)).abs()
+    assert float(depth_error.median()) < 4e-3

@@ -1,0 +1,190 @@
+"""The whole loop: the same bits for the same frames, held-out frames that leave no trace, a map within its bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
+from splatbot.logs import open_log
+from splatbot.rasterize.native import native
+from splatbot.slam import FrameResult, Slam
+from splatbot.tracking.tracker import pose_distance
+from tests.rgbd import small_config, tabletop
+
+
+@pytest.fixture(autouse=True)
+def _restore_threads() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    yield
+    native().set_num_threads(0)
+    torch.set_num_threads(threads)
+
+
+def run(frames: Sequence[Frame], *, hold_out: Sequence[int] = (), **overrides: object) -> Slam:
+    slam = Slam(small_config(**overrides))
+    for frame in frames:
+        slam.process(frame, hold_out=frame.index in hold_out)
+    return slam
+
+
+def assert_same(a: GaussianModel, b: GaussianModel) -> None:
+    for field in fields(a):
+        assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
+
+
+def assert_same_results(a: Sequence[FrameResult], b: Sequence[FrameResult]) -> None:
+    for one, two in zip(a, b, strict=True):
+        for name in ("index", "verdict", "reasons", "stage", "keyframe", "gaussians"):
+            assert getattr(one, name) == getattr(two, name), name
+        assert one.T_world_camera is not None
+        assert two.T_world_camera is not None
+        assert np.array_equal(one.T_world_camera, two.T_world_camera)
+
+
+def black(frame: Frame) -> Frame:
+    return replace(frame, rgb=np.zeros_like(frame.rgb))
+
+
+def test_a_run_tracks_and_maps_the_tabletop() -> None:
+    frames, poses = tabletop()
+    slam = run(frames)
+    assert [r.index for r in slam.results] == list(range(len(frames)))
+    assert [r.verdict for r in slam.results] == ["ok"] * len(frames)
+    assert 2 <= sum(r.keyframe for r in slam.results) < len(frames)
+    for result, truth in zip(slam.results, poses, strict=True):
+        assert result.T_world_camera is not None
+        moved, turned = pose_distance(truth, result.T_world_camera)
+        assert moved < 2e-3
+        assert turned < np.radians(0.15)
+    assert slam.results[-1].gaussians == len(slam.snapshot().model) > 1500
+
+
+def test_a_result_tells_the_milliseconds_of_each_stage() -> None:
+    frames, _ = tabletop()
+    slam = run(frames[:2])
+    assert set(slam.results[0].stage_ms) == {"prepare", "mapping"}
+    assert set(slam.results[1].stage_ms) == {"prepare", "geometric", "features", "direct", "health", "mapping"}
+    assert all(ms >= 0 for result in slam.results for ms in result.stage_ms.values())
+
+
+def test_the_same_frames_give_the_same_trajectory_and_map_bit_for_bit() -> None:
+    frames, _ = tabletop()
+    first, second = run(frames), run(frames)
+    for slam in (first, second):
+        slam.finish()
+    assert_same_results(first.results, second.results)
+    assert_same(first.snapshot().model, second.snapshot().model)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_the_number_of_threads_changes_no_bit(threads: int) -> None:
+    frames, _ = tabletop()
+    native().set_num_threads(1)
+    torch.set_num_threads(1)
+    want = run(frames)
+    native().set_num_threads(threads)
+    torch.set_num_threads(threads)
+    got = run(frames)
+    assert_same_results(got.results, want.results)
+    assert_same(got.snapshot().model, want.snapshot().model)
+
+
+def test_another_seed_draws_other_keyframes_for_refinement() -> None:
+    frames, _ = tabletop()
+    one, two = (run(frames, seed=seed, mapping__refine_iterations=4).snapshot().model for seed in (0, 1))
+    assert not torch.equal(one.means, two.means)
+
+
+def test_held_out_frames_are_tracked_and_never_enter_the_map() -> None:
+    frames, poses = tabletop()
+    held = [i for i in range(len(frames)) if i >= 4]
+    slam = run(frames, hold_out=held)
+    assert not any(slam.results[i].keyframe for i in held)
+    for i in held:
+        T = slam.results[i].T_world_camera
+        assert T is not None
+        assert pose_distance(poses[i], T)[0] < 4e-3
+    assert_same(slam.snapshot().model, run(frames[:4]).snapshot().model)
+
+
+def test_a_frame_held_out_before_the_map_has_begun_is_lost_and_does_not_define_the_world() -> None:
+    frames, poses = tabletop()
+    slam = run(frames[:3], hold_out=[0])
+    assert slam.results[0].verdict == "lost"
+    assert "before the map has begun" in slam.results[0].reasons[0]
+    assert slam.results[1].keyframe
+    T = slam.results[2].T_world_camera
+    assert T is not None
+    assert pose_distance(np.linalg.inv(poses[1]) @ poses[2], T)[0] < 2e-3
+
+
+@pytest.mark.parametrize("cap", [100, 1000])
+def test_the_cap_on_gaussians_is_never_exceeded(cap: int) -> None:
+    frames, _ = tabletop()
+    slam = run(frames, mapping__max_gaussians=cap)
+    slam.finish()
+    assert max(r.gaussians for r in slam.results) == cap
+    assert len(slam.snapshot().model) <= cap
+
+
+def test_a_black_frame_freezes_the_map_and_the_next_good_one_goes_on() -> None:
+    frames, poses = tabletop()
+    slam = run(frames[:6])
+    before = slam.snapshot()
+    for frame in frames[6:8]:
+        result = slam.process(black(frame))
+        assert result.verdict == "lost"
+        assert result.T_world_camera is None
+        assert not result.keyframe
+        assert any("blank" in reason for reason in result.reasons)
+    after = slam.snapshot()
+    assert after.map_version == before.map_version
+    assert_same(after.model, before.model)
+    found = slam.process(frames[8])
+    assert found.verdict == "ok"
+    assert found.T_world_camera is not None
+    assert pose_distance(poses[8], found.T_world_camera)[0] < 2e-3
+
+
+def test_black_frames_at_the_start_are_waited_out() -> None:
+    """Cameras deliver some while they settle."""
+    frames, poses = tabletop()
+    slam = run([black(frames[0]), replace(frames[1], depth=np.zeros_like(frames[1].depth)), *frames[2:4]])
+    assert [r.verdict for r in slam.results] == ["lost", "lost", "ok", "ok"]
+    T = slam.results[3].T_world_camera
+    assert T is not None
+    assert pose_distance(np.linalg.inv(poses[2]) @ poses[3], T)[0] < 2e-3
+
+
+def test_a_frame_without_depth_is_tracked_but_never_a_keyframe() -> None:
+    frames, poses = tabletop()
+    blind = [replace(f, depth=np.zeros_like(f.depth)) if f.index >= 4 else f for f in frames]
+    slam = run(blind)
+    assert not any(r.keyframe for r in slam.results[4:])
+    for result in slam.results[4:]:
+        assert result.T_world_camera is not None
+        assert pose_distance(poses[result.index], result.T_world_camera)[0] < 6e-3
+
+
+@pytest.mark.parametrize("size", ["width=16&height=16", "width=33&height=17"])
+@pytest.mark.parametrize("levels", [1, 6])
+def test_images_too_small_to_track_well_do_not_raise(size: str, levels: int) -> None:
+    log = open_log(f"synthetic:tabletop?{size}&frames=3")
+    slam = run(list(log), tracking__n_levels=levels)
+    slam.finish()
+    assert len(slam.results) == 3
+    assert slam.results[0].verdict == "ok"
+    assert len(slam.snapshot().model) > 10
+
+
+def test_nothing_processed_has_an_empty_map() -> None:
+    slam = Slam()
+    slam.finish()
+    assert slam.results == []
+    assert len(slam.snapshot().model) == 0
