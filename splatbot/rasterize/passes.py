@@ -137,24 +137,28 @@ def run_backward(
                 None if absolute2d is None else absolute2d[at],
                 c > 0,
             )
-    camera_grads = _camera_gradients(inputs, camera, shape[6] is not None, shape[7] is not None)
+    camera_grads = camera_gradients(camera, shape[6], shape[7])
     if backgrounds is not None and inputs.backgrounds is not None:
         backgrounds = backgrounds.to(torch.float32).reshape(inputs.backgrounds.shape)
     return Gradients([*geometry_grads, colors, *camera_grads, backgrounds], means2d, absolute2d)
 
 
-def _camera_gradients(
-    inputs: Inputs, camera: Tensor | None, wants_viewmats: bool, wants_Ks: bool
+def camera_gradients(
+    camera: Tensor | None, viewmats: Tensor | None, Ks: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Gradients to viewmats and Ks from (views, 16): rotation, translation, fx, fy, cx, cy."""
-    viewmats = Ks = None
-    if camera is not None and wants_viewmats:
-        viewmats = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
-        viewmats[:, :3, :3] = camera[:, :9].view(-1, 3, 3)
-        viewmats[:, :3, 3] = camera[:, 9:12]
-        viewmats = viewmats.to(inputs.viewmats.dtype).reshape(inputs.viewmats.shape)
-    if camera is not None and wants_Ks:
-        Ks = torch.zeros(len(camera), 3, 3, dtype=torch.float64)
-        Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2] = camera[:, 12:].unbind(-1)
-        Ks = Ks.to(inputs.Ks.dtype).reshape(inputs.Ks.shape)
-    return viewmats, Ks
+    """Gradients to viewmats and Ks, each None where None is given, of their shapes and types.
+
+    Args:
+        camera: (views, 16), as the kernels sum it: rotation, translation, fx, fy, cx, cy.
+    """
+    grad_viewmats = grad_Ks = None
+    if camera is not None and viewmats is not None:
+        grad_viewmats = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
+        grad_viewmats[:, :3, :3] = camera[:, :9].view(-1, 3, 3)
+        grad_viewmats[:, :3, 3] = camera[:, 9:12]
+        grad_viewmats = grad_viewmats.to(viewmats.dtype).reshape(viewmats.shape)
+    if camera is not None and Ks is not None:
+        grad_Ks = torch.zeros(len(camera), 3, 3, dtype=torch.float64)
+        grad_Ks[:, 0, 0], grad_Ks[:, 1, 1], grad_Ks[:, 0, 2], grad_Ks[:, 1, 2] = camera[:, 12:].unbind(-1)
+        grad_Ks = grad_Ks.to(Ks.dtype).reshape(Ks.shape)
+    return grad_viewmats, grad_Ks

@@ -18,6 +18,7 @@ from splatbot.rasterize.reference import (
     TRANSMITTANCE_MIN,
     _margins,
     _pixel_centers,
+    _shade,
     reference_rotations,
 )
 
@@ -64,6 +65,7 @@ def rasterization_2dgs_reference(
     height: int,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
+    sh_degree: int | None = None,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     distloss: bool = False,
@@ -89,7 +91,11 @@ def rasterization_2dgs_reference(
         hits = _hit(centers[order], axes[order], scales[order], opacities[order], Ks[i], pixels, near)
         facing = torch.where((axes[..., 2] * centers).sum(-1, keepdim=True) < 0, 1.0, -1.0).detach()
         normals = reference_rotations(quats)[..., 2] * facing
-        shown = None if colors is None or "RGB" not in render_mode else colors[i] if colors.ndim == 3 else colors
+        shown = None
+        if colors is not None and "RGB" in render_mode:
+            shown = colors[i] if colors.ndim == (3 if sh_degree is None else 4) else colors
+        if shown is not None and sh_degree is not None:
+            shown = _shade(shown, sh_degree, means, viewmats[i])
         background = None if backgrounds is None or shown is None else backgrounds[i]
         images = _composite(
             hits, None if shown is None else shown[order], normals[order], background, render_mode, distloss

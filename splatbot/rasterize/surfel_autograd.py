@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.rasterize.native import native
+from splatbot.rasterize.passes import camera_gradients
 
 
 @dataclass(frozen=True)
@@ -21,12 +22,18 @@ class SurfelOptions:
     near_plane: float
     far_plane: float
     radius_clip: float
+    sh_degree: int  # -1: colours are colours
+    view_colors: bool  # colours differ from view to view
     depth: str
     distortion: bool
 
     def colors_only(self) -> SurfelOptions:
         """The same render without depth and distortion."""
         return replace(self, depth="none", distortion=False)
+
+    def colors_of(self, colors: Tensor, i: int) -> Tensor:
+        """Colours, or their gradients, of view i."""
+        return (colors[i] if self.view_colors else colors).detach()
 
 
 class RasterizeSurfels(torch.autograd.Function):
@@ -53,7 +60,8 @@ class RasterizeSurfels(torch.autograd.Function):
         for i in range(len(viewmats)):
             state = native().surfels_forward(
                 *geometry,
-                _of_view(colors, i),
+                options.colors_of(colors, i),
+                options.sh_degree,
                 viewmats64[i],
                 Ks64[i],
                 options.width,
@@ -73,7 +81,7 @@ class RasterizeSurfels(torch.autograd.Function):
                 field, row = state
                 raise InputError(f"row {row} is not finite.", field=field, hint="find where the NaN or Inf comes from")
             states.append(state)
-        ctx.states = tuple(states)
+        ctx.states, ctx.options = tuple(states), options
         ctx.save_for_backward(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
         ctx.set_materialize_grads(False)
         return images
@@ -81,42 +89,35 @@ class RasterizeSurfels(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = ctx.saved_tensors
-        need = ctx.needs_input_grad
+        need, options = ctx.needs_input_grad, ctx.options
         if all(g is None for g in grads):
             return (None,) * 11
         geometry = [t.detach() for t in (means, quats, scales, opacities)]
         out = [torch.empty_like(t) if n else None for t, n in zip(geometry, need[:4], strict=True)]
         # Zeros only where the second view adds to rows that the first did not write.
-        new_colors = torch.empty if colors.ndim == 2 or len(ctx.states) == 1 else torch.zeros
+        new_colors = torch.zeros if options.view_colors and len(ctx.states) > 1 else torch.empty
         grad_colors = new_colors(colors.shape, dtype=torch.float32) if need[4] else None
-        grad_viewmats = torch.zeros(viewmats.shape, dtype=torch.float64) if need[5] else None
-        grad_Ks = torch.zeros(Ks.shape, dtype=torch.float64) if need[6] else None
+        camera = torch.zeros(len(ctx.states), 16, dtype=torch.float64) if need[5] or need[6] else None
         grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[7] else None
         grad_shift = torch.empty(len(ctx.states), len(means), 2) if need[8] else None
         for i, state in enumerate(ctx.states):
-            camera = torch.zeros(16, dtype=torch.float64) if need[5] or need[6] else None
             native().surfels_backward(
                 state,
                 *geometry,
-                _of_view(colors, i),
+                options.colors_of(colors, i),
+                options.sh_degree,
                 None if backgrounds is None else backgrounds[i].detach(),
                 *_image_gradients(grads, i),
                 *out,
-                None if grad_colors is None else _of_view(grad_colors, i),
-                camera,
+                None if grad_colors is None else options.colors_of(grad_colors, i),
+                None if camera is None else camera[i],
                 None if grad_backgrounds is None else grad_backgrounds[i],
                 None if grad_shift is None else grad_shift[i],
                 i > 0,
             )
-            if grad_viewmats is not None and camera is not None:
-                grad_viewmats[i, :3, :3] = camera[:9].view(3, 3)
-                grad_viewmats[i, :3, 3] = camera[9:12]
-            if grad_Ks is not None and camera is not None:
-                grad_Ks[i, (0, 1, 0, 1), (0, 1, 2, 2)] = camera[12:]
-        grad_viewmats = None if grad_viewmats is None else grad_viewmats.to(viewmats.dtype)
-        grad_Ks = None if grad_Ks is None else grad_Ks.to(Ks.dtype)
+        camera_grads = camera_gradients(camera, viewmats if need[5] else None, Ks if need[6] else None)
         grad_backgrounds = None if grad_backgrounds is None else grad_backgrounds.to(torch.float32)
-        return (*out, grad_colors, grad_viewmats, grad_Ks, grad_backgrounds, grad_shift, None, None)
+        return (*out, grad_colors, *camera_grads, grad_backgrounds, grad_shift, None, None)
 
 
 def _empty_images(views: int, channels: int, options: SurfelOptions) -> tuple[Tensor, ...]:
@@ -132,7 +133,3 @@ def _image_gradients(grads: tuple[Tensor | None, ...], i: int) -> list[Tensor | 
         grad = grads[k] if k < len(grads) else None
         found.append(None if grad is None else (grad[i] if k in (0, 2) else grad[i, ..., 0]).contiguous())
     return found
-
-
-def _of_view(colors: Tensor, i: int) -> Tensor:
-    return (colors if colors.ndim == 2 else colors[i]).detach()

@@ -54,7 +54,7 @@ class SurfelMeta(Mapping[str, Any]):
         return len(_PLAIN) + len(_PROJECTED) + len(_TILES)
 
     def _describe(self) -> None:
-        views = [state.describe(self._opacities) for state in self._states]
+        views = [state.describe() for state in self._states]
         for key in _PROJECTED:
             self._known[key] = torch.stack([torch.from_numpy(view[key]) for view in views])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -10,19 +9,13 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.rasterize.depth_normals import depth_to_normal
-from splatbot.rasterize.harmonics import harmonics_basis
 from splatbot.rasterize.inputs import Inputs, check_inputs
 from splatbot.rasterize.native import native
+from splatbot.rasterize.options import DEFAULT_TILE_SIZE, check_choice, parse_mode
 from splatbot.rasterize.surfel_autograd import RasterizeSurfels, SurfelOptions
 from splatbot.rasterize.surfel_meta import SurfelMeta
 
-_MODES = {
-    "RGB": (True, "none"),
-    "D": (False, "accumulated"),
-    "ED": (False, "expected"),
-    "RGB+D": (True, "accumulated"),
-    "RGB+ED": (True, "expected"),
-}
+_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
 def rasterization_2dgs(
@@ -73,7 +66,8 @@ def rasterization_2dgs(
         far_plane: surfels farther than this are left out [m].
         radius_clip: surfels whose extent is at most this are left out [px].
         eps2d: has no effect on the result (the low-pass filter is fixed); accepted for gsplat's sake.
-        sh_degree: None, or 0 to 4: colours are max(harmonics + 1/2, 0), seen from the camera's centre.
+        sh_degree: None, or the degree 0..4 of the spherical harmonics in use, K >= (degree + 1)²; the colour is
+            max(0, 1/2 + their sum), as in :func:`splatbot.rasterize.rasterization`.
         packed: has no effect on the result; accepted for gsplat's sake.
         tile_size: has no effect on the result; accepted for gsplat's sake.
         backgrounds: (C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
@@ -100,11 +94,10 @@ def rasterization_2dgs(
         NativeError: the C++ core is missing or cannot run here.
     """
     _reject_unsupported(sparse_grad, absgrad, depth_mode)
-    if render_mode not in _MODES:
-        raise InputError(f"is {render_mode!r}.", field="render_mode", hint=f"one of {', '.join(_MODES)}")
-    wants_color, depth = _MODES[render_mode]
+    check_choice("render_mode", render_mode, _MODES)
+    wants_color, depth = parse_mode(render_mode)
     if not wants_color:
-        colors, backgrounds = None, None
+        colors, backgrounds, sh_degree = None, None, None
     elif colors is None:
         raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
     inputs = check_inputs(
@@ -114,24 +107,24 @@ def rasterization_2dgs(
         None,
         opacities,
         colors,
-        sh_degree if wants_color else None,
+        sh_degree,
         viewmats,
         Ks,
         backgrounds,
         None,
         (width, height),
-        1,
+        DEFAULT_TILE_SIZE,
     )
     if inputs.layout.batch:
         raise InputError("has batch dimensions.", field="means", hint="render surfels of one scene at a time")
-    if wants_color and sh_degree is not None:
-        inputs = replace(inputs, colors=_shade(inputs, sh_degree))
     options = SurfelOptions(
         width=width,
         height=height,
         near_plane=float(near_plane),
         far_plane=float(far_plane),
         radius_clip=float(radius_clip),
+        sh_degree=-1 if sh_degree is None else sh_degree,
+        view_colors=inputs.layout.view_colors,
         depth=depth,
         distortion=distloss,
     )
@@ -175,22 +168,9 @@ def _expected(depth: Tensor, alphas: Tensor, kind: str) -> Tensor:
     return depth if kind == "expected" else depth / alphas.clamp_min(1e-10)
 
 
-def _shade(inputs: Inputs, degree: int) -> Tensor:
-    """Colours (C, N, 3) of coefficients (N, K, 3) or (C, N, K, 3), each view's from its camera's centre."""
-    colors = []
-    for c, pose in enumerate(inputs.viewmats):
-        coefficients = inputs.colors[c] if inputs.layout.view_colors else inputs.colors
-        center = -torch.linalg.solve(pose[:3, :3], pose[:3, 3]).to(inputs.means.dtype)
-        basis = harmonics_basis(torch.nn.functional.normalize(inputs.means - center, dim=-1), degree)
-        shaded = torch.einsum("nk,nkc->nc", basis, coefficients[:, : basis.shape[-1]])
-        colors.append((0.5 + shaded).clamp_min(0.0))
-    return torch.stack(colors)
-
-
 def _reject_unsupported(sparse_grad: bool, absgrad: bool, depth_mode: str) -> None:
     """An option that would change the result is refused, never ignored."""
     for name, value in (("sparse_grad", sparse_grad), ("absgrad", absgrad)):
         if value:
             raise InputError("is not supported for surfels.", field=name, hint="leave it out")
-    if depth_mode not in ("expected", "median"):
-        raise InputError(f"is {depth_mode!r}.", field="depth_mode", hint="use 'expected' or 'median'")
+    check_choice("depth_mode", depth_mode, ("expected", "median"))

@@ -204,6 +204,18 @@ def test_ten_kilometres_from_the_origin() -> None:
     assert_within_bounds(scene, "RGB")
 
 
+def test_harmonics_ten_kilometres_from_the_origin() -> None:
+    scene = hard_surfels(12)
+    scene.colors = torch.randn(150, 16, 3, generator=torch.Generator().manual_seed(0)) * 0.3
+    away = torch.tensor([1e4, -3e3, 2e3])
+    scene.means = scene.means + away
+    scene.viewmats[0, :3, 3] -= scene.viewmats[0, :3, :3] @ away
+    result = compare_surfels(scene, "RGB", sh_degree=3)
+    assert result.near_jumps <= 0.02 * result.pixels
+    assert max(result.forward[n] for n in ("colors", "alphas")) <= FORWARD_BOUND, result.forward
+    assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
+
+
 def test_a_principal_point_outside_the_image() -> None:
     scene = hard_surfels(13)
     scene.Ks[0, 0, 2], scene.Ks[0, 1, 2] = -30.0, 90.0

@@ -25,9 +25,9 @@ using InAny = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using OutAny = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using InMask = Array<const std::uint8_t, nb::shape<-1, -1>>;
 using In1 = Array<const float, nb::shape<-1>>;
-using InN33 = Array<const float, nb::shape<-1, 3, 3>>;
 using In2 = Array<const float, nb::shape<-1, -1>>;
 using In3 = Array<const float, nb::shape<-1, -1, -1>>;
+using InN33 = Array<const float, nb::shape<-1, 3, 3>>;
 using InN3 = Array<const float, nb::shape<-1, 3>>;
 using InN4 = Array<const float, nb::shape<-1, 4>>;
 using Out2 = Array<float, nb::shape<-1, -1>>;
@@ -43,6 +43,29 @@ auto span_of(const A& array) {
 template <class T, class A>
 std::span<T> span_of(const std::optional<A>& array) {
   return array ? std::span<T>(array->data(), array->size()) : std::span<T>();
+}
+
+// Flat arrays and how to read them, as Python hands them over for both passes.
+inline splatbot::Gaussians gaussians_of(const InN3& means, const std::optional<InN4>& quats,
+                                        const std::optional<InN3>& scales, const std::optional<InN33>& covars,
+                                        const In1& opacities, const InAny& colors, int sh_degree) {
+  splatbot::Gaussians g = {.count = means.shape(0),
+                           .channels = 3,
+                           .means = span_of(means),
+                           .quats = span_of<const float>(quats),
+                           .scales = span_of<const float>(scales),
+                           .covars = span_of<const float>(covars),
+                           .opacities = span_of(opacities),
+                           .colors = span_of(colors),
+                           .sh_degree = sh_degree};
+  if (sh_degree < 0 && colors.ndim() == 2) {
+    g.channels = static_cast<int>(colors.shape(1));
+  } else if (sh_degree >= 0 && colors.ndim() == 3 && colors.shape(2) == 3) {
+    g.coefficients = static_cast<int>(colors.shape(1));
+  } else {
+    throw std::invalid_argument("colors is neither (N, D) nor, with a degree, (N, K, 3)");
+  }
+  return g;
 }
 
 // The camera's centre is -R^-1 t; x -> R (x - origin) + translation, all in float64 before rounding.
@@ -102,4 +125,18 @@ nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<s
     const std::unique_ptr<std::vector<T>> released(static_cast<std::vector<T>*>(p));
   });
   return nb::ndarray<nb::numpy, T>(data, shape, owner);
+}
+
+inline nb::ndarray<nb::numpy, std::int64_t> indices_of(std::span<const std::uint32_t> ids) {
+  return owned(std::vector<std::int64_t>(ids.begin(), ids.end()), {ids.size()});
+}
+
+inline nb::dict dict_of(const splatbot::TileInfo& info) {
+  nb::dict d;
+  d["tile_size"] = nb::make_tuple(info.tile_width, info.tile_height);
+  d["tile_width"] = info.columns;
+  d["tile_height"] = info.rows;
+  d["n_isects"] = info.pairs;
+  d["state_bytes"] = info.state_bytes;
+  return d;
 }

@@ -21,29 +21,6 @@ using namespace nb::literals;
 
 namespace {
 
-// Flat arrays and how to read them, as Python hands them over for both passes.
-splatbot::Gaussians gaussians_of(const InN3& means, const std::optional<InN4>& quats,
-                                 const std::optional<InN3>& scales, const std::optional<InN33>& covars,
-                                 const In1& opacities, const InAny& colors, int sh_degree) {
-  splatbot::Gaussians g = {.count = means.shape(0),
-                           .channels = 3,
-                           .means = span_of(means),
-                           .quats = span_of<const float>(quats),
-                           .scales = span_of<const float>(scales),
-                           .covars = span_of<const float>(covars),
-                           .opacities = span_of(opacities),
-                           .colors = span_of(colors),
-                           .sh_degree = sh_degree};
-  if (sh_degree < 0 && colors.ndim() == 2) {
-    g.channels = static_cast<int>(colors.shape(1));
-  } else if (sh_degree >= 0 && colors.ndim() == 3 && colors.shape(2) == 3) {
-    g.coefficients = static_cast<int>(colors.shape(1));
-  } else {
-    throw std::invalid_argument("colors is neither (N, D) nor, with a degree, (N, K, 3)");
-  }
-  return g;
-}
-
 // A render's leftovers for its backward pass and its meta.
 struct State {
   splatbot::RasterStatePtr state;
@@ -136,22 +113,6 @@ nb::ndarray<nb::numpy, std::int32_t> contributions(const State& state) {
   return owned(std::move(counts), {n});
 }
 
-nb::ndarray<nb::numpy, std::int64_t> visible(const State& state) {
-  const auto ids = splatbot::visible_ids(*state.state);
-  return owned(std::vector<std::int64_t>(ids.begin(), ids.end()), {ids.size()});
-}
-
-nb::dict tiles(const State& state) {
-  const splatbot::TileInfo info = splatbot::tile_info(*state.state);
-  nb::dict d;
-  d["tile_size"] = nb::make_tuple(info.tile_width, info.tile_height);
-  d["tile_width"] = info.columns;
-  d["tile_height"] = info.rows;
-  d["n_isects"] = info.pairs;
-  d["state_bytes"] = info.state_bytes;
-  return d;
-}
-
 nb::object find_visible(const InN3& means, const std::optional<InN4>& quats, const std::optional<InN3>& scales,
                         const std::optional<InN33>& covars, const In1& opacities, const Matrix4& viewmat,
                         const Matrix3& K, int width, int height, float near_plane, float far_plane, float radius_clip,
@@ -181,7 +142,7 @@ nb::object find_visible(const InN3& means, const std::optional<InN4>& quats, con
   if (fault) {
     return nb::make_tuple(nb::str(fault->field.data(), fault->field.size()), fault->row);
   }
-  return nb::cast(owned(std::vector<std::int64_t>(ids.begin(), ids.end()), {ids.size()}));
+  return nb::cast(indices_of(ids));
 }
 
 void medians(const State& state, const Array<std::int32_t, nb::shape<-1, -1>>& out) {
@@ -202,8 +163,10 @@ void define_rasterize(nb::module_& m) {
       .def("describe", &describe, "Projections as a dict of arrays.")
       .def("contributions", &contributions, "In how many pixels (N,) each Gaussian counts.")
       .def_prop_ro("n_visible", [](const State& state) { return splatbot::visible_ids(*state.state).size(); })
-      .def("visible", &visible, "Indices (V,) of the Gaussians in view.")
-      .def("tiles", &tiles, "Tile grid, pairs and bytes held.")
+      .def("visible", [](const State& state) { return indices_of(splatbot::visible_ids(*state.state)); },
+           "Indices (V,) of the Gaussians in view.")
+      .def("tiles", [](const State& state) { return dict_of(splatbot::tile_info(*state.state)); },
+           "Tile grid, pairs and bytes held.")
       .def("medians", &medians, "out"_a.noconvert(),
            "Write to out (H, W) the Gaussian at which transmittance falls to 1/2, -1 where it does not.")
       .def("fronts", &fronts, "pixels"_a.noconvert(), "ids"_a.noconvert(), "weights"_a.noconvert(),

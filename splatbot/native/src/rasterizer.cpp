@@ -8,6 +8,7 @@
 #include <string>
 
 #include "checks.hpp"
+#include "pull_back.hpp"
 #include "splatbot/kernels.hpp"
 #include "splatbot/threads.hpp"
 #include "state_store.hpp"
@@ -15,24 +16,6 @@
 namespace splatbot {
 
 namespace {
-
-std::size_t color_columns(const Gaussians& g) {
-  return static_cast<std::size_t>(g.sh_degree < 0 ? g.channels : 3 * g.coefficients);
-}
-
-void check_gaussians(const Gaussians& g) {
-  require(g.count < (std::size_t{1} << 32) - 1 && g.channels >= 0, "too many Gaussians");
-  require(g.means.size() == 3 * g.count, "means is not (N, 3)");
-  const bool axes = g.covars.empty();
-  require(axes ? g.quats.size() == 4 * g.count : g.quats.empty(), "quats is not (N, 4), or given beside covars");
-  require(axes ? g.scales.size() == 3 * g.count : g.scales.empty(), "scales is not (N, 3), or given beside covars");
-  require(empty_or(g.covars, 9 * g.count), "covars is not (N, 3, 3)");
-  require(g.opacities.size() == g.count, "opacities is not (N,)");
-  require(g.sh_degree >= -1 && g.sh_degree <= kMaxHarmonicsDegree, "the degree of the harmonics is not in 0..4");
-  require(g.sh_degree < 0 || (g.channels == 3 && g.coefficients >= (g.sh_degree + 1) * (g.sh_degree + 1)),
-          "too few coefficients for this degree");
-  require(g.colors.size() == g.count * color_columns(g), "colors has a wrong size");
-}
 
 // Up to eight channels are blended at a time, depth with the first; plane depth needs room for its two slopes.
 std::vector<ChannelPass> plan_passes(int channels, const RasterOptions& options) {
@@ -142,28 +125,18 @@ void keep_mask(RasterState& state, const TileMask& mask) {
   }
 }
 
-HarmonicsArgs harmonics_args(const RasterState& state, const ProjectArgs& project) {
-  return {.forward = project,
+HarmonicsArgs harmonics_args(RasterState& state, const Gaussians& g) {
+  const int depth = state.options.depth != DepthMode::none ? 1 : 0;
+  return {.count = state.count,
+          .means = g.means.data(),
+          .coefficients = g.colors.data(),
+          .degree = g.sh_degree,
+          .held = g.coefficients,
+          .view = state.view,
+          .visible = state.visible.data(),
           .blocks = state.blocks.data(),
-          .first_channel = state.options.depth != DepthMode::none ? 1 : 0};
-}
-
-// d render / d background is the transmittance left.
-void add_background_gradient(const RasterState& state, std::span<const float> grad_colors, std::span<double> out) {
-  const auto width = static_cast<std::size_t>(state.view.width);
-  const auto stride = static_cast<std::size_t>(state.out_channels);
-  for (std::size_t y = 0; y < static_cast<std::size_t>(state.view.height); ++y) {
-    for (std::size_t x = 0; x < width; ++x) {
-      const std::size_t tile = y / kTileHeight * static_cast<std::size_t>(state.columns) + x / kTileWidth;
-      const std::size_t in_y = y % kTileHeight, in_x = x % kTileWidth;
-      const std::size_t i = ((in_y / kBlock) * kBlockColumns + in_x / kBlock) * kBlockPixels + in_y % kBlock * kBlock +
-                            in_x % kBlock;
-      const double t = static_cast<double>(state.final_state[tile * kFinalPlanes * kTilePixels + i]);
-      for (std::size_t c = 0; c < out.size(); ++c) {
-        out[c] += t * static_cast<double>(grad_colors[(y * width + x) * stride + c]);
-      }
-    }
-  }
+          .colors = state.count == 0 ? nullptr : state.records[0].channels + depth,
+          .color_stride = sizeof(Record) / sizeof(float)};
 }
 
 // How many of a pass's channels need their gradients summed.
@@ -179,37 +152,6 @@ struct BackwardScratch {
   Buffer<float> slots, carried, colors;
   Buffer<double> camera, center;
 };
-
-// What the passes sum of a camera's gradient: about the view's origin, and to the camera's centre.
-struct CameraGradient {
-  std::array<double, kCameraSums> sums{};
-  std::array<double, 3> center{};
-};
-
-// The camera sees R (x - origin) + translation = R x + t, and its centre is -R^-1 t.
-void add_camera_gradient(const View& view, const CameraGradient& from, std::span<double> out) {
-  const auto r = [&](std::size_t i, std::size_t j) { return static_cast<double>(view.rotation[3 * (i % 3) + j % 3]); };
-  double determinant = 0.0;
-  std::array<double, 3> pulled{};  // R^-T times the gradient to the centre, times det R
-  for (std::size_t i = 0; i < 3; ++i) {
-    for (std::size_t j = 0; j < 3; ++j) {
-      const double cofactor = r(i + 1, j + 1) * r(i + 2, j + 2) - r(i + 1, j + 2) * r(i + 2, j + 1);
-      pulled[i] += cofactor * from.center[j];
-      determinant += i == 0 ? cofactor * r(0, j) : 0.0;
-    }
-  }
-  for (std::size_t i = 0; i < kCameraSums; ++i) {
-    out[i] += from.sums[i];
-  }
-  for (std::size_t i = 0; i < 3; ++i) {
-    const double shift = -pulled[i] / determinant;
-    for (std::size_t j = 0; j < 3; ++j) {
-      const double origin = static_cast<double>(view.origin[j]);
-      out[3 * i + j] += from.sums[9 + i] * origin + shift * (origin + static_cast<double>(view.center_low[j]));
-    }
-    out[9 + i] += shift;
-  }
-}
 
 void describe_one(const RasterState& state, std::size_t i, const Projections& out) {
   constexpr double kRootHalfLog2e = 0.84932180028801904;  // d of Record in standard deviations
@@ -270,7 +212,7 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
     return fault;
   }
   if (g.sh_degree >= 0) {
-    const HarmonicsArgs colors = harmonics_args(state, project);
+    const HarmonicsArgs colors = harmonics_args(state, g);
     pool->run(state.blocks.size(), [&](std::size_t b) { k.harmonics(colors, b); });
   }
   order_by_depth(state, *pool);
@@ -334,7 +276,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
     std::fill(out.background.begin(), out.background.end(), 0.0);
   }
   if (!out.background.empty() && !grad_colors.empty()) {
-    add_background_gradient(state, grad_colors, out.background);
+    add_background_gradient(state, state.view, state.final_state.data(), kFinalPlanes, grad_colors, out.background);
   }
   const bool geometry = !(out.means.empty() && out.quats.empty() && out.scales.empty() && out.covars.empty() &&
                           out.opacities.empty() && out.camera.empty() && out.means2d.empty() &&
@@ -342,10 +284,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
   if (!geometry && out.colors.empty()) {
     return;
   }
-  // Harmonics of degree 1 and up depend on where the Gaussian and the camera are.
-  const bool harmonics = g.sh_degree >= 0;
-  const bool harmonics_move = g.sh_degree > 0 && !(out.means.empty() && out.camera.empty());
-  const bool harmonics_wanted = harmonics && (harmonics_move || !out.colors.empty());
+  const bool harmonics_wanted = wants_harmonics(g, out);
 
   BackwardScratch& s = scratch();
   const std::size_t passes = state.passes.size();
@@ -364,7 +303,6 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                      .absolute = !out.absolute2d.empty(),
                                      .slots = s.slots.data()};
     pool->run(state.tiles(), [&](std::size_t tile) { k.blend_backward(blend, tile); });
-    const auto pointer = [](std::span<float> span) { return span.empty() ? nullptr : span.data(); };
     const ProjectBackwardArgs project = {.forward = project_args(state, g),
                                          .blocks = state.blocks.data(),
                                          .slots = s.slots.data(),
@@ -375,7 +313,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                          .first = p == 0,
                                          .last = p + 1 == passes,
                                          .accumulate = out.accumulate,
-                                         .accumulate_colors = out.accumulate && !harmonics,
+                                         .accumulate_colors = out.accumulate && g.sh_degree < 0,
                                          .geometry = geometry,
                                          .means = pointer(out.means),
                                          .quats = pointer(out.quats),
@@ -389,23 +327,9 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
     pool->run(state.blocks.size(), [&](std::size_t b) { k.project_backward(project, b); });
   }
   CameraGradient camera;
-  for (std::size_t b = 0; b < state.blocks.size() && !out.camera.empty(); ++b) {
-    for (std::size_t i = 0; i < kCameraSums; ++i) {
-      camera.sums[i] += s.camera[b * kCameraSums + i];
-    }
-  }
+  camera.add_sums(s.camera.span());
   if (harmonics_wanted) {
-    s.center.resize(out.camera.empty() ? 0 : 3 * state.blocks.size());
-    const HarmonicsBackwardArgs args = {.forward = harmonics_args(state, project_args(state, g)),
-                                        .colors = s.colors.data(),
-                                        .accumulate = out.accumulate,
-                                        .coefficients = out.colors.empty() ? nullptr : out.colors.data(),
-                                        .means = out.means.empty() ? nullptr : out.means.data(),
-                                        .center = out.camera.empty() ? nullptr : s.center.data()};
-    pool->run(state.blocks.size(), [&](std::size_t b) { k.harmonics_backward(args, b); });
-    for (std::size_t i = 0; i < s.center.size(); ++i) {
-      camera.center[i % 3] += s.center[i];
-    }
+    pull_back_harmonics(harmonics_args(state, g), state.blocks.size(), s.colors.data(), out, s.center, camera);
   }
   if (!out.camera.empty()) {
     add_camera_gradient(state.view, camera, out.camera);

@@ -2,10 +2,10 @@
 #include "splatbot/surfels.hpp"
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 
 #include "checks.hpp"
+#include "pull_back.hpp"
 #include "splatbot/kernels.hpp"
 #include "splatbot/threads.hpp"
 #include "state_store.hpp"
@@ -24,14 +24,9 @@ struct SurfelState : TileLists {
 namespace {
 
 void check_surfels(const Gaussians& g) {
-  require(g.count < (std::size_t{1} << 32) - 1, "too many surfels");
-  require(g.channels >= 0 && g.channels <= kMaxSurfelChannels, "a surfel has at most 8 channels");
-  require(g.means.size() == 3 * g.count, "means is not (N, 3)");
-  require(g.quats.size() == 4 * g.count, "quats is not (N, 4)");
-  require(g.scales.size() == 3 * g.count, "scales is not (N, 3)");
-  require(g.covars.empty() && g.sh_degree < 0, "surfels have quaternions, scales and plain colours");
-  require(g.opacities.size() == g.count, "opacities is not (N,)");
-  require(g.colors.size() == g.count * static_cast<std::size_t>(g.channels), "colors is not (N, channels)");
+  check_gaussians(g);
+  require(g.channels <= kMaxSurfelChannels, "a surfel has at most 8 channels");
+  require(g.covars.empty(), "a surfel has no covariance");
 }
 
 std::size_t pixels_of(const View& view) {
@@ -51,7 +46,8 @@ void check_images(const SurfelState& state, const SurfelImages& out) {
   require(out.distortion.size() == (state.options.distortion ? pixels : 0), "distortion has a wrong size");
 }
 
-void check_gradients(const SurfelState& state, const SurfelImageGradients& grads, const Gradients& out) {
+void check_gradients(const SurfelState& state, const Gaussians& g, const SurfelImageGradients& grads,
+                     const Gradients& out) {
   const std::size_t pixels = pixels_of(state.view), n = state.count;
   const auto channels = static_cast<std::size_t>(state.channels);
   require(empty_or(grads.colors, pixels * columns_of(state)) && empty_or(grads.alphas, pixels) &&
@@ -59,9 +55,10 @@ void check_gradients(const SurfelState& state, const SurfelImageGradients& grads
               empty_or(grads.distortion, state.options.distortion ? pixels : 0),
           "a gradient of an image has a wrong size");
   require(empty_or(out.means, 3 * n) && empty_or(out.quats, 4 * n) && empty_or(out.scales, 3 * n) &&
-              empty_or(out.opacities, n) && empty_or(out.colors, channels * n) && empty_or(out.means2d, 2 * n) &&
+              empty_or(out.opacities, n) && empty_or(out.colors, g.colors.size()) && empty_or(out.means2d, 2 * n) &&
               empty_or(out.camera, std::size_t{kCameraSums}) && empty_or(out.background, channels),
           "a gradient has a wrong size");
+  require(out.covars.empty() && out.absolute2d.empty(), "surfels have no such gradient");
 }
 
 SurfelProjectArgs project_args(SurfelState& state, const Gaussians& g) {
@@ -69,9 +66,12 @@ SurfelProjectArgs project_args(SurfelState& state, const Gaussians& g) {
           .means = g.means.data(),
           .quats = g.quats.data(),
           .scales = g.scales.data(),
+          .covars = nullptr,
           .opacities = g.opacities.data(),
           .colors = g.colors.data(),
           .channels = state.channels,
+          .sh_degree = g.sh_degree,
+          .coefficients = g.coefficients,
           .view = state.view,
           .options = state.options,
           .columns = state.columns,
@@ -100,50 +100,28 @@ SurfelBlendArgs blend_args(SurfelState& state, std::span<const float> background
           .distortion = nullptr};
 }
 
-// d render / d background is the transmittance left.
-void add_background_gradient(const SurfelState& state, std::span<const float> grad_colors, std::span<double> out) {
-  const auto width = static_cast<std::size_t>(state.view.width);
-  for (std::size_t y = 0; y < static_cast<std::size_t>(state.view.height); ++y) {
-    for (std::size_t x = 0; x < width; ++x) {
-      const std::size_t tile = y / kTileHeight * static_cast<std::size_t>(state.columns) + x / kTileWidth;
-      const std::size_t in_y = y % kTileHeight, in_x = x % kTileWidth;
-      const std::size_t i = ((in_y / kBlock) * kBlockColumns + in_x / kBlock) * kBlockPixels + in_y % kBlock * kBlock +
-                            in_x % kBlock;
-      const auto t = static_cast<double>(
-          state.final_state[(tile * kSurfelPlanes + kPlaneTransmittance) * kTilePixels + i]);
-      for (std::size_t c = 0; c < out.size(); ++c) {
-        out[c] += t * static_cast<double>(grad_colors[(y * width + x) * columns_of(state) + c]);
-      }
-    }
-  }
-}
-
-template <class T>
-T* pointer(std::span<T> span) {
-  return span.empty() ? nullptr : span.data();
-}
-
-// The passes turn about the view's origin: R (x - origin) + translation = R x + t.
-void add_camera_gradient(const SurfelState& state, std::span<const double> blocks, std::span<double> out) {
-  std::array<double, kCameraSums> sums{};
-  for (std::size_t i = 0; i < blocks.size(); ++i) {
-    sums[i % kCameraSums] += blocks[i];
-  }
-  for (std::size_t i = 0; i < kCameraSums; ++i) {
-    out[i] += sums[i];
-  }
-  for (std::size_t i = 0; i < 9; ++i) {
-    out[i] += sums[9 + i / 3] * static_cast<double>(state.view.origin[i % 3]);
-  }
+HarmonicsArgs harmonics_args(SurfelState& state, const Gaussians& g) {
+  return {.count = state.count,
+          .means = g.means.data(),
+          .coefficients = g.colors.data(),
+          .degree = g.sh_degree,
+          .held = g.coefficients,
+          .view = state.view,
+          .visible = state.visible.data(),
+          .blocks = state.blocks.data(),
+          .colors = state.count == 0 ? nullptr : state.records[0].channels,
+          .color_stride = sizeof(SurfelRecord) / sizeof(float)};
 }
 
 struct BackwardScratch {
-  Buffer<float> slots;     // (pairs, kSurfelSlot)
+  Buffer<float> slots;    // (pairs, kSurfelSlot)
+  Buffer<float> colors;   // (N, 3), with harmonics
   Buffer<double> camera;  // (blocks, kCameraSums)
+  Buffer<double> center;  // (blocks, 3), with harmonics
 };
 
 BackwardScratch& scratch() {
-  thread_local BackwardScratch instance;
+  static thread_local BackwardScratch instance;
   return instance;
 }
 
@@ -173,6 +151,10 @@ std::optional<Fault> surfels_forward(const Gaussians& g, const View& view, const
   if (const std::optional<Fault> fault = find_fault(state.blocks)) {
     return fault;
   }
+  if (g.sh_degree >= 0) {
+    const HarmonicsArgs colors = harmonics_args(state, g);
+    pool->run(state.blocks.size(), [&](std::size_t b) { k.harmonics(colors, b); });
+  }
   order_by_depth(state, *pool);
   list_tiles(state, *pool);
   SurfelBlendArgs blend = blend_args(state, background);
@@ -192,13 +174,13 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
   // Kernel arguments hold plain pointers for both passes; this one writes to none of the state's arrays.
   auto& state = const_cast<SurfelState&>(const_state);
   require(g.count == state.count && g.channels == state.channels, "the surfels are not those of the forward pass");
-  check_gradients(state, grads, out);
+  check_gradients(state, g, grads, out);
   if (!out.accumulate) {
     std::fill(out.camera.begin(), out.camera.end(), 0.0);
     std::fill(out.background.begin(), out.background.end(), 0.0);
   }
   if (!out.background.empty() && !grads.colors.empty()) {
-    add_background_gradient(state, grads.colors, out.background);
+    add_background_gradient(state, state.view, state.final_state.data(), kSurfelPlanes, grads.colors, out.background);
   }
   if (out.means.empty() && out.quats.empty() && out.scales.empty() && out.opacities.empty() && out.camera.empty() &&
       out.colors.empty() && out.means2d.empty()) {
@@ -210,7 +192,9 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
   BackwardScratch& s = scratch();
   s.slots.resize(state.pairs.size() * kSurfelSlot);
   s.camera.resize(out.camera.empty() ? 0 : state.blocks.size() * kCameraSums);
-  const bool sum_channels = !out.colors.empty() || !out.quats.empty();
+  const bool harmonics = wants_harmonics(g, out);
+  s.colors.resize(harmonics ? 3 * g.count : 0);
+  const bool sum_channels = !out.colors.empty() || !out.quats.empty() || harmonics;
   const SurfelBlendBackwardArgs blend = {.forward = blend_args(state, background),
                                          .colors = pointer(grads.colors),
                                          .alphas = pointer(grads.alphas),
@@ -225,16 +209,22 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
                                              .slots = s.slots.data(),
                                              .sum_channels = sum_channels,
                                              .accumulate = out.accumulate,
+                                             .accumulate_colors = out.accumulate && g.sh_degree < 0,
                                              .means = pointer(out.means),
                                              .quats = pointer(out.quats),
                                              .scales = pointer(out.scales),
                                              .opacities = pointer(out.opacities),
-                                             .colors = pointer(out.colors),
+                                             .colors = harmonics ? s.colors.data() : pointer(out.colors),
                                              .means2d = pointer(out.means2d),
                                              .camera = out.camera.empty() ? nullptr : s.camera.data()};
   pool->run(state.blocks.size(), [&](std::size_t b) { k.surfels.project_backward(project, b); });
+  CameraGradient camera;
+  camera.add_sums(s.camera.span());
+  if (harmonics) {
+    pull_back_harmonics(harmonics_args(state, g), state.blocks.size(), s.colors.data(), out, s.center, camera);
+  }
   if (!out.camera.empty()) {
-    add_camera_gradient(state, s.camera.span(), out.camera);
+    add_camera_gradient(state.view, camera, out.camera);
   }
 }
 
@@ -262,6 +252,8 @@ void describe_surfels(const SurfelState& state, const SurfelProjections& out) {
     out.tiles_touched[i] = std::int32_t{place.nx} * std::int32_t{place.ny};
   }
 }
+
+std::size_t surfel_count(const SurfelState& state) { return state.count; }
 
 std::span<const std::uint32_t> visible_ids(const SurfelState& state) { return state.ids.span(); }
 

@@ -268,15 +268,16 @@ std::vector<float> render_surfels(const Scene& scene, const View& view, const Su
   std::vector<float> means(g.means.size()), quats(g.quats.size()), scales(g.scales.size()), opacities(g.count);
   std::vector<float> channels(g.colors.size()), means2d(2 * g.count);
   std::vector<double> camera(16), behind(background.size());
-  Gradients out;
-  out.means = means;
-  out.quats = quats;
-  out.scales = scales;
-  out.opacities = opacities;
-  out.colors = channels;
-  out.camera = camera;
-  out.background = behind;
-  out.means2d = means2d;
+  const Gradients out = {.means = means,
+                         .quats = quats,
+                         .scales = scales,
+                         .covars = {},
+                         .opacities = opacities,
+                         .colors = channels,
+                         .camera = camera,
+                         .background = behind,
+                         .means2d = means2d,
+                         .absolute2d = {}};
   surfels_backward(*state, g, background, {grad_colors, some, ones, some, distorted}, out);
   std::vector<float> depths(g.count), facing(3 * g.count);
   std::vector<std::int32_t> radii(2 * g.count), tiles(g.count);
@@ -298,7 +299,10 @@ void run_surfels(const std::string& isa) {
   for (const auto& [width, height] : {std::pair{1, 1}, {3, 70}, {97, 41}}) {
     for (const std::size_t n : {std::size_t{0}, std::size_t{1}, std::size_t{2500}}) {
       for (const int channels : {0, 3, 8}) {
-        const Scene scene = make_scene(n, channels, 7);
+        Scene scene = make_scene(n, channels, 7);
+        if (channels == 3 && width == 97) {
+          use_harmonics(scene, 4, 3);
+        }
         const SurfelOptions options = {.depth = channels == 3 ? DepthMode::accumulated : DepthMode::expected,
                                        .distortion = channels != 8};
         set_num_threads(1);

@@ -14,7 +14,6 @@ import splatbot
 from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.rasterize import rasterization_2dgs
-from splatbot.rasterize.harmonics import harmonics_basis
 from splatbot.rasterize.native import native
 from tests.scenes import Scene, one_gaussian, relative_l2
 from tests.surfels import NAMES, RENDERED, arguments, compare_surfels, hard_surfels, loss, reference, render, wall
@@ -245,22 +244,26 @@ def test_sh_degree_zero_is_the_colour_of_its_coefficients() -> None:
     assert float((got["colors"] - want["colors"]).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize("degree", [1, 4])
-def test_harmonics_are_shaded_from_each_camera(degree: int) -> None:
+@pytest.mark.parametrize("degree", range(5))
+def test_harmonics_of_every_degree_equal_the_reference(degree: int) -> None:
     scene = hard_surfels(19, views=2)
     scene.colors = torch.randn(150, 25, 3, generator=torch.Generator().manual_seed(0)) * 0.3
-    got, _ = render(scene, sh_degree=degree)
-    for i in range(2):
-        basis = harmonics_basis(
-            torch.nn.functional.normalize(scene.means + scene.viewmats[i, :3, :3].T @ scene.viewmats[i, :3, 3], dim=-1),
-            degree,
-        )
-        alone = Scene(**vars(scene))
-        alone.viewmats, alone.Ks = scene.viewmats[i : i + 1], scene.Ks[i : i + 1]
-        assert scene.backgrounds is not None
-        alone.backgrounds = scene.backgrounds[i : i + 1]
-        alone.colors = (0.5 + torch.einsum("nk,nkc->nc", basis, scene.colors[:, : (degree + 1) ** 2])).clamp_min(0.0)
-        assert float((render(alone)[0]["colors"][0] - got["colors"][i]).abs().max()) < 1e-5
+    assert_equal(scene, "RGB+ED", sh_degree=degree)
+
+
+def test_harmonics_of_each_view_equal_the_reference() -> None:
+    scene = hard_surfels(21, n=60, views=3)
+    scene.colors = torch.randn(3, 60, 16, 3, generator=torch.Generator().manual_seed(0)) * 0.3
+    assert_equal(scene, "RGB", sh_degree=3)
+
+
+def test_coefficients_beyond_the_degree_in_use_receive_no_gradient() -> None:
+    scene = hard_surfels(22)
+    scene.colors = torch.randn(150, 16, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    render(scene, sh_degree=1)[0]["colors"].sum().backward()
+    assert scene.colors.grad is not None
+    assert float(scene.colors.grad[:, :4].abs().max()) > 0.0
+    assert float(scene.colors.grad[:, 4:].abs().max()) == 0.0
 
 
 def test_batch_dimensions_are_refused() -> None:

@@ -86,13 +86,16 @@ struct ProjectBackwardArgs {
   double* camera;  // (blocks, kCameraSums) partial sums
 };
 
-// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy.
-inline constexpr int kCameraSums = 16;
-
+// Harmonics of what is in view; the colours go to (and, backwards, come from) the records of either kind of splat.
 struct HarmonicsArgs {
-  ProjectArgs forward;
+  std::size_t count;
+  const float *means, *coefficients;  // (N, 3), (N, held, 3)
+  int degree, held;
+  View view;
+  const std::uint32_t* visible;
   const ProjectedBlock* blocks;
-  int first_channel;  // of the colours in a record
+  float* colors;  // of Gaussian 0; rows `color_stride` apart
+  std::size_t color_stride;
 };
 
 struct HarmonicsBackwardArgs {

@@ -35,6 +35,9 @@ inline constexpr int kSlot = 16;
 inline constexpr int kAbsolute = 14;
 static_assert(kMoments + kRecordChannels <= kAbsolute && kAbsolute + 2 <= kSlot);
 
+// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy.
+inline constexpr int kCameraSums = 16;
+
 // What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
 inline constexpr int kFinalPlanes = 2 + kRecordChannels;
 inline constexpr int kWeightPlane = 1 + kRecordChannels;  // for expected depth only
@@ -84,9 +87,9 @@ struct ChannelPass {
 struct TileLists {
   int columns = 0, rows = 0;  // tiles
 
-  Buffer<Placement> placements;   // (N,)
-  Buffer<std::uint32_t> visible;  // ids in view; block b's begin at b * kProjectBlock until compacted
-  Buffer<std::uint32_t> ids;      // ids in view, ascending
+  Buffer<Placement> placements;    // (N,)
+  Buffer<std::uint32_t> visible;   // ids in view; block b's begin at b * kProjectBlock until compacted
+  Buffer<std::uint32_t> ids;       // ids in view, ascending
   std::vector<ProjectedBlock> blocks;
 
   Buffer<KeyedId> order, order_scratch;

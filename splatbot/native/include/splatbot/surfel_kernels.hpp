@@ -64,8 +64,9 @@ enum SurfelPlane : int {
 
 struct SurfelProjectArgs {
   std::size_t count;
-  const float *means, *quats, *scales, *opacities, *colors;
+  const float *means, *quats, *scales, *covars, *opacities, *colors;  // covars: null
   int channels;
+  int sh_degree, coefficients;  // degree -1: colours are colours
   View view;
   SurfelOptions options;
   int columns, rows;
@@ -102,6 +103,7 @@ struct SurfelProjectBackwardArgs {
   const float* slots;
   bool sum_channels;
   bool accumulate;  // add to the outputs
+  bool accumulate_colors;
   float *means, *quats, *scales, *opacities, *colors, *means2d;  // outputs; null: not asked for
   double* camera;                                                // (blocks, kCameraSums) partial sums, or null
 };

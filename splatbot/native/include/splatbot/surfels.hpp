@@ -46,7 +46,7 @@ struct SurfelImageGradients {
   std::span<const float> colors, alphas, normals, median, distortion;
 };
 
-// As rasterize_backward(); gradients of covariances and absolute values are none.
+// As rasterize_backward(); absolute2d is not computed.
 void surfels_backward(const SurfelState& state, const Gaussians& surfels, std::span<const float> background,
                       const SurfelImageGradients& grads, const Gradients& out);
 
@@ -59,6 +59,8 @@ struct SurfelProjections {
   std::span<std::int32_t> tiles_touched;  // (N,)
 };
 void describe_surfels(const SurfelState& state, const SurfelProjections& out);
+
+std::size_t surfel_count(const SurfelState& state);
 
 std::span<const std::uint32_t> visible_ids(const SurfelState& state);
 TileInfo tile_info(const SurfelState& state);

@@ -32,9 +32,9 @@ struct Basis {
 SB_INLINE Direction direction_of(const HarmonicsArgs& args, const std::uint32_t* ids, int n) {
   alignas(64) float lanes[3][W];
   for (int i = 0; i < W; ++i) {
-    const float* mean = args.forward.means + std::size_t{ids[i < n ? i : n - 1]} * 3;
+    const float* mean = args.means + std::size_t{ids[i < n ? i : n - 1]} * 3;
     for (int c = 0; c < 3; ++c) {
-      lanes[c][i] = (mean[c] - args.forward.view.origin[c]) - args.forward.view.center_low[c];
+      lanes[c][i] = (mean[c] - args.view.origin[c]) - args.view.center_low[c];
     }
   }
   Direction d;
@@ -140,21 +140,21 @@ SB_INLINE void differentiate(const Direction& d, const Basis& weights, F (&g)[3]
 
 template <int Degree>
 void color_block(const HarmonicsArgs& args, const std::uint32_t* visible, std::uint32_t count) {
-  const auto stride = static_cast<std::size_t>(args.forward.coefficients) * 3;
+  const auto stride = static_cast<std::size_t>(args.held) * 3;
   Basis basis;
   for (std::uint32_t at = 0; at < count; at += W) {
     const int n = count - at < W ? static_cast<int>(count - at) : W;
     evaluate<Degree>(direction_of(args, visible + at, n), basis);
     for (int i = 0; i < n; ++i) {
       const std::size_t id = visible[at + static_cast<std::uint32_t>(i)];
-      const float* from = args.forward.colors + id * stride;
+      const float* from = args.coefficients + id * stride;
       float sum[3] = {0.5F, 0.5F, 0.5F};
       for (int k = 0; k < count_of(Degree); ++k) {
         for (int c = 0; c < 3; ++c) {
           sum[c] += basis.rows[k][i] * from[3 * k + c];
         }
       }
-      float* to = args.forward.records[id].channels + args.first_channel;
+      float* to = args.colors + id * args.color_stride;
       for (int c = 0; c < 3; ++c) {
         to[c] = sum[c] > 0.0F ? sum[c] : 0.0F;
       }
@@ -186,7 +186,7 @@ SB_INLINE void move(const HarmonicsBackwardArgs& args, const Direction& d, const
 
 void zero_coefficients(const HarmonicsBackwardArgs& args, std::size_t from, std::size_t to) {
   if (args.coefficients != nullptr && !args.accumulate && from < to) {
-    const auto stride = static_cast<std::size_t>(args.forward.forward.coefficients) * 3;
+    const auto stride = static_cast<std::size_t>(args.forward.held) * 3;
     std::memset(args.coefficients + from * stride, 0, (to - from) * stride * sizeof(float));
   }
 }
@@ -195,7 +195,7 @@ template <int Degree>
 void backward_block(const HarmonicsBackwardArgs& args, const std::uint32_t* visible, std::uint32_t count,
                     std::size_t next_row, CenterSums& center) {
   const HarmonicsArgs& f = args.forward;
-  const auto held = static_cast<std::size_t>(f.forward.coefficients);
+  const auto held = static_cast<std::size_t>(f.held);
   constexpr int kCount = count_of(Degree);
   const bool moves = Degree > 0 && (args.means != nullptr || args.center != nullptr);
   Basis basis, weights;
@@ -209,7 +209,7 @@ void backward_block(const HarmonicsBackwardArgs& args, const std::uint32_t* visi
     }
     for (int i = 0; i < n; ++i) {
       const std::size_t id = ids[i];
-      const float* color = f.forward.records[id].channels + f.first_channel;
+      const float* color = f.colors + id * f.color_stride;
       float g[3];
       for (int c = 0; c < 3; ++c) {  // none where the colour is held at 0
         g[c] = color[c] > 0.0F ? args.colors[id * 3 + static_cast<std::size_t>(c)] : 0.0F;
@@ -228,7 +228,7 @@ void backward_block(const HarmonicsBackwardArgs& args, const std::uint32_t* visi
           std::memset(to + 3 * kCount, 0, (held - kCount) * 3 * sizeof(float));
         }
       }
-      const float* from = f.forward.colors + id * held * 3;
+      const float* from = f.coefficients + id * held * 3;
       for (int k = 1; moves && k < kCount; ++k) {
         weights.rows[k][i] = from[3 * k] * g[0] + from[3 * k + 1] * g[1] + from[3 * k + 2] * g[2];
       }
@@ -246,9 +246,9 @@ void backward_block(const HarmonicsBackwardArgs& args, const std::uint32_t* visi
 }  // namespace
 
 void harmonics(const HarmonicsArgs& args, std::size_t block) {
-  const std::uint32_t* visible = args.forward.visible + block * kProjectBlock;
+  const std::uint32_t* visible = args.visible + block * kProjectBlock;
   const std::uint32_t count = args.blocks[block].visible;
-  switch (args.forward.sh_degree) {
+  switch (args.degree) {
     case 0:
       return color_block<0>(args, visible, count);
     case 1:
@@ -263,13 +263,13 @@ void harmonics(const HarmonicsArgs& args, std::size_t block) {
 }
 
 void harmonics_backward(const HarmonicsBackwardArgs& args, std::size_t block) {
-  const std::uint32_t* visible = args.forward.forward.visible + block * kProjectBlock;
+  const std::uint32_t* visible = args.forward.visible + block * kProjectBlock;
   const std::uint32_t count = args.forward.blocks[block].visible;
   const std::size_t begin = block * kProjectBlock;
   const std::size_t end =
-      begin + kProjectBlock < args.forward.forward.count ? begin + kProjectBlock : args.forward.forward.count;
+      begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
   CenterSums center{};
-  switch (args.forward.forward.sh_degree) {
+  switch (args.forward.degree) {
     case 0:
       backward_block<0>(args, visible, count, begin, center);
       break;

@@ -27,11 +27,14 @@ inline std::size_t first_not_finite(const float* values, std::size_t n) {
   return n;
 }
 
-// Finds the first value of rows [begin, end) of several arrays that is not finite; null arrays are passed over.
-template <int N>
-bool find_bad_row(const float* const (&fields)[N], const std::size_t (&widths)[N], std::size_t begin, std::size_t end,
-                ProjectedBlock& out) {
-  for (int f = 0; f < N; ++f) {
+// The first input of Gaussians [begin, end) that is not finite, if there is one.
+template <class Args>
+bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
+  const bool harmonics = args.sh_degree >= 0;
+  const float* fields[] = {args.means, args.quats, args.scales, args.covars, args.opacities, args.colors};
+  const auto columns = static_cast<std::size_t>(harmonics ? 3 * args.coefficients : args.channels);
+  const std::size_t widths[] = {3, 4, 3, 9, 1, columns};
+  for (int f = 0; f < 6; ++f) {
     if (fields[f] == nullptr) {
       continue;
     }
@@ -95,7 +98,7 @@ SB_INLINE void scatter_lanes(float* rows, const std::uint32_t* ids, int n, const
   }
 }
 
-// Gradients of a camera, lane by lane until the end.
+// Gradients of the camera's rotation, translation and intrinsics, lane by lane until the end.
 class CameraSums {
  public:
   SB_INLINE void add(const F (&rotation)[9], const F (&translation)[3], const F (&intrinsics)[4], int n) {

@@ -8,14 +8,6 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
-bool find_fault(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
-  const bool harmonics = args.sh_degree >= 0;
-  const float* fields[] = {args.means, args.quats, args.scales, args.covars, args.opacities, args.colors};
-  const auto columns = static_cast<std::size_t>(harmonics ? 3 * args.coefficients : args.channels);
-  const std::size_t widths[] = {3, 4, 3, 9, 1, columns};
-  return find_bad_row(fields, widths, begin, end, out);
-}
-
 // Change of depth per pixel over a Gaussian's footprint if its matter lies in the plane through its centre whose
 // normal n is its flattest axis: the ray of pixel (u, v) meets that plane at z(u, v), and d z/d u is
 // -z^2 n_x / (fx n.p). A Gaussian with no flattest axis has no plane, so the slope fades with (least scale / middle scale)^2; it is bounded

@@ -143,8 +143,9 @@ SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const L
     r.normal[i] = -r.flip * lanes.rotated[i][lane];
   }
   const float* colors = args.colors + id * static_cast<std::size_t>(args.channels);
+  const int given = args.sh_degree < 0 ? args.channels : 0;  // else harmonics() writes them
   for (int c = 0; c < kMaxSurfelChannels; ++c) {
-    r.channels[c] = c < args.channels ? colors[c] : 0.0F;
+    r.channels[c] = c < given ? colors[c] : 0.0F;
   }
   Placement& place = args.placements[id];
   const std::uint32_t corner = lanes.corner[lane], size = lanes.size[lane];
@@ -164,9 +165,8 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
   F means[3];
   load_lanes<3>(args.means, first, n, means);
   load_lanes<1>(args.opacities, first, n, opacity);
-  for (int i = 0; i < 3; ++i) {
-    g.mean[i] = means[i] - cam.origin[i];
-  }
+  std::memcpy(g.mean, means, sizeof(means));
+  from_origin(cam, g.mean);
   Projected o;
   project_center(g, cam, o);
   M keep = (o.p[2] >= set1(args.options.near_plane)) & (o.p[2] <= set1(args.options.far_plane)) &
@@ -208,9 +208,7 @@ void surfel_project(const SurfelProjectArgs& args, std::size_t block, ProjectedB
   const std::size_t begin = block * kProjectBlock;
   const std::size_t end = begin + kProjectBlock < args.count ? begin + kProjectBlock : args.count;
   out = ProjectedBlock{};
-  const float* const fields[] = {args.means, args.quats, args.scales, nullptr, args.opacities, args.colors};
-  const std::size_t widths[] = {3, 4, 3, 9, 1, static_cast<std::size_t>(args.channels)};
-  if (find_bad_row(fields, widths, begin, end, out)) {
+  if (find_fault(args, begin, end, out)) {
     return;
   }
   const CameraLanes cam(args.view);

@@ -48,7 +48,7 @@ void collect(const SurfelProjectBackwardArgs& args, const ProjectedBlock& block,
       sum_slots(args, block, id, sums);
       float* to = args.colors == nullptr ? nullptr : args.colors + id * static_cast<std::size_t>(args.forward.channels);
       for (int c = 0; to != nullptr && c < args.forward.channels; ++c) {
-        put(to + c, sums[kSumColor + c], args.accumulate);
+        put(to + c, sums[kSumColor + c], args.accumulate_colors);
       }
     }
     for (int k = 0; k < kLaneSums; ++k) {
@@ -177,7 +177,13 @@ void zero_rows(const SurfelProjectBackwardArgs& args, std::size_t begin, std::si
       std::memset(rows + begin * width, 0, (end - begin) * width * sizeof(float));
     }
   };
-  clear(args.colors, static_cast<std::size_t>(args.forward.channels));
+  if (!args.accumulate_colors) {
+    clear(args.colors, static_cast<std::size_t>(args.forward.channels));
+  }
+  clear(args.means2d, 2);
+  if (args.accumulate) {
+    return;
+  }
   clear(args.means, 3);
   clear(args.quats, 4);
   clear(args.scales, 3);
@@ -191,11 +197,8 @@ void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t 
   const std::size_t end = begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
   const ProjectedBlock& block = args.blocks[b];
   const std::uint32_t* visible = args.forward.visible + begin;
-  if (!args.accumulate && block.visible < end - begin) {
+  if (block.visible < end - begin) {
     zero_rows(args, begin, end);
-  }
-  if (args.means2d != nullptr) {  // of one view: never added to
-    std::memset(args.means2d + 2 * begin, 0, 2 * (end - begin) * sizeof(float));
   }
   CameraSums camera_sums;
   const CameraLanes cam(args.forward.view);
