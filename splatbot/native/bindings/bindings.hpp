@@ -6,4 +6,5 @@
 
 void define_align(nanobind::module_& m);
 void define_mahalanobis(nanobind::module_& m);
+void define_optimize(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);

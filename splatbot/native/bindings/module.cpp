@@ -6,5 +6,6 @@ NB_MODULE(_native, m) {
   nanobind::set_leak_warnings(false);  // a render kept until the interpreter exits is no leak
   define_align(m);
   define_mahalanobis(m);
+  define_optimize(m);
   define_rasterize(m);
 }

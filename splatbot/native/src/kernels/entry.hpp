@@ -10,5 +10,8 @@ void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out);
 void blend(const BlendArgs& args, std::size_t tile);
 void blend_backward(const BlendBackwardArgs& args, std::size_t tile);
 void project_backward(const ProjectBackwardArgs& args, std::size_t block);
+void loss(const LossArgs& args, std::size_t tile, float* scratch, LossSums& sums);
+void adam(const AdamGroup& group, const AdamBlock& block);
+float multiply_add(std::size_t rounds);
 
 }  // namespace splatbot::SPLATBOT_KERNELS

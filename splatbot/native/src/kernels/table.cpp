@@ -7,6 +7,7 @@
 namespace splatbot::SPLATBOT_KERNELS {
 
 extern const Kernels kKernels;
-const Kernels kKernels = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), project, blend, blend_backward, project_backward};
+const Kernels kKernels = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), project, blend, blend_backward, project_backward,
+                          loss, adam, multiply_add, SPLATBOT_SIMD / 32};
 
 }  // namespace splatbot::SPLATBOT_KERNELS
