@@ -5,6 +5,7 @@
 #include <nanobind/nanobind.h>
 
 void define_align(nanobind::module_& m);
+void define_baseline(nanobind::module_& m);
 void define_mahalanobis(nanobind::module_& m);
 void define_optimize(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);

@@ -13,6 +13,7 @@
 #include <tuple>
 
 #include "splatbot/isa.hpp"
+#include "splatbot/raster_work.hpp"
 #include "splatbot/rasterizer.hpp"
 #include "splatbot/threads.hpp"
 
@@ -179,13 +180,27 @@ nb::dict tiles(const State& state) {
   return d;
 }
 
+nb::dict work(const State& state) {
+  const splatbot::StageTimes& times = splatbot::stage_times(*state.state);
+  nb::dict d;
+  d["project_ms"] = times.project;
+  d["order_ms"] = times.order;
+  d["list_tiles_ms"] = times.list_tiles;
+  d["blend_ms"] = times.blend;
+  d["blend_backward_ms"] = times.blend_backward;
+  d["project_backward_ms"] = times.project_backward;
+  d["evaluated_pairs"] = splatbot::evaluated_pairs(*state.state);
+  return d;
+}
+
 }  // namespace
 
 void define_rasterize(nb::module_& m) {
   nb::class_<State>(m, "RasterState", "What a render leaves for its backward pass.")
       .def("describe", &describe, "opacities"_a.noconvert(), "Projections as a dict of arrays.")
       .def("visible", &visible, "Indices (V,) of the Gaussians in view.")
-      .def("tiles", &tiles, "Tile grid, pairs and bytes held.");
+      .def("tiles", &tiles, "Tile grid, pairs and bytes held.")
+      .def("work", &work, "Milliseconds by stage of the last passes, and the (Gaussian, pixel) pairs of a blend pass.");
 
   m.def("rasterize_forward", &forward, "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(),
         "opacities"_a.noconvert(), "colors"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a,

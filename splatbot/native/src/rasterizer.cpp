@@ -9,6 +9,7 @@
 #include <string>
 
 #include "splatbot/kernels.hpp"
+#include "splatbot/stopwatch.hpp"
 #include "splatbot/threads.hpp"
 
 namespace splatbot {
@@ -247,13 +248,17 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
 
   const Kernels& k = kernels();
   const std::shared_ptr<ThreadPool> pool = thread_pool();
+  Stopwatch watch;
   const ProjectArgs project = project_args(state, g);
   pool->run(state.blocks.size(), [&](std::size_t b) { k.project(project, b, state.blocks[b]); });
+  state.times = {.project = watch.lap()};
   if (const std::optional<Fault> fault = find_fault(state)) {
     return fault;
   }
   order_by_depth(state, *pool);
+  state.times.order = watch.lap();
   list_tiles(state, *pool);
+  state.times.list_tiles = watch.lap();
   for (std::size_t p = 0; p < state.passes.size(); ++p) {
     const auto behind = background_of(state.passes[p], background);
     BlendArgs blend = blend_args(state, p, background.empty() ? nullptr : behind.data());
@@ -261,6 +266,7 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
     blend.out_alphas = out_alphas.data();
     pool->run(state.tiles(), [&](std::size_t tile) { k.blend(blend, tile); });
   }
+  state.times.blend = watch.lap();
   result = shared;
   return std::nullopt;
 }
@@ -310,7 +316,9 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                      .grad_alphas = grad_alphas.empty() || p > 0 ? nullptr : grad_alphas.data(),
                                      .channel_sums = sums,
                                      .slots = s.slots.data()};
+    Stopwatch watch;
     pool->run(state.tiles(), [&](std::size_t tile) { k.blend_backward(blend, tile); });
+    state.times.blend_backward = (p == 0 ? 0.0 : state.times.blend_backward) + watch.lap();
     const auto pointer = [](std::span<float> span) { return span.empty() ? nullptr : span.data(); };
     const ProjectBackwardArgs project = {.forward = project_args(state, g),
                                          .blocks = state.blocks.data(),
@@ -329,6 +337,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                          .colors = pointer(out.colors),
                                          .viewmat = out.viewmat.empty() ? nullptr : s.viewmat.data()};
     pool->run(state.blocks.size(), [&](std::size_t b) { k.project_backward(project, b); });
+    state.times.project_backward = (p == 0 ? 0.0 : state.times.project_backward) + watch.lap();
   }
   for (std::size_t b = 0; b < state.blocks.size() && !out.viewmat.empty(); ++b) {
     for (std::size_t i = 0; i < 12; ++i) {

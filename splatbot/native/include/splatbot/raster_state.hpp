@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "splatbot/buffer.hpp"
+#include "splatbot/raster_work.hpp"
 #include "splatbot/rasterizer.hpp"
 
 namespace splatbot {
@@ -87,6 +88,7 @@ struct RasterState {
   RasterOptions options;
   int columns = 0, rows = 0;  // tiles
   std::vector<ChannelPass> passes;
+  StageTimes times;
 
   Buffer<Record> records;          // (N,), in the order of the map
   Buffer<Placement> placements;    // (N,)
