@@ -42,16 +42,21 @@ class Results:
     rows: list[Row] = field(default_factory=list)
 
     def add(
-        self, case: str, metric: str, value: float | None, unit: str, *, peer: str | None = None, note: str | None = None
+        self,
+        case: str,
+        metric: str,
+        value: float | None,
+        unit: str,
+        *,
+        peer: str | None = None,
+        note: str | None = None,
     ) -> None:
         """Append one figure."""
         self.rows.append(Row(case, metric, value, unit, peer=peer, note=note))
 
     def add_time(self, case: str, metric: str, timing: Timing, *, peer: str | None = None) -> None:
         """Append the least time [ms], with the median's distance as its spread."""
-        self.rows.append(
-            Row(case, metric, timing.least_ms, "ms", spread=timing.median_ms - timing.least_ms, peer=peer)
-        )
+        self.rows.append(Row(case, metric, timing.least_ms, "ms", spread=timing.median_ms - timing.least_ms, peer=peer))
 
     def find(self, case: str, metric: str, peer: str | None = None) -> float | None:
         """The figure of that name, None if there is none."""

@@ -16,6 +16,7 @@ from splatbot.geometry import inverse
 from splatbot.rasterize.views import default_view
 
 MAP_WIDTH, MAP_HEIGHT = 320, 240  # [px] grid that the surface map is back-projected from
+NAMES = ("means", "quats", "scales", "opacities", "colors")
 BOX_DISTANCE = 2.5  # [m] from the camera to the centre of the random scenes
 
 
@@ -45,6 +46,10 @@ class SplatScene:
         """Means, quats, scales, opacities, colours."""
         return self.means, self.quats, self.scales, self.opacities, self.colors
 
+    def named(self) -> dict[str, Tensor]:
+        """The same, by the names of ``rasterization``'s arguments."""
+        return dict(zip(NAMES, self.tensors(), strict=True))
+
     def intrinsics(self, width: int, height: int) -> Tensor:
         """(1, 3, 3) [px], principal point at the centre."""
         focal = 0.5 * width / math.tan(0.5 * self.fov)
@@ -56,8 +61,7 @@ class SplatScene:
 
     def select(self, index: Tensor, name: str) -> SplatScene:
         """Some of the Gaussians."""
-        chosen = {k: getattr(self, k)[index] for k in ("means", "quats", "scales", "opacities", "colors")}
-        return replace(self, name=name, **chosen)
+        return replace(self, name=name, **{k: t[index] for k, t in self.named().items()})
 
 
 def surface_map(width: int = MAP_WIDTH, height: int = MAP_HEIGHT, *, sigma_px: float = 1.0) -> SplatScene:

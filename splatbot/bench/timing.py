@@ -24,7 +24,7 @@ class Timing:
 
 
 def measure(function: Callable[[], object], *, runs: int, budget_s: float = 2.0) -> Timing:
-    """Time ``function`` after one run that does not count: ``runs`` times, fewer (but one) if they exceed the budget."""
+    """Time ``function`` after one run that does not count: ``runs`` times, or fewer if the budget is spent."""
     function()
     samples: list[float] = []
     end = time.perf_counter() + budget_s
@@ -59,15 +59,13 @@ def isa(name: str) -> Iterator[None]:
 
 
 def peak_memory(function: Callable[[], object]) -> int | None:
-    """Bytes by which the process's memory rises above what it held, at most, during one run; None if not known here."""
-    before = _memory("VmRSS")
+    """The most bytes that the process holds in memory during one run; None if that is not known here."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # forget the earlier peak
     except OSError:
         return None
     function()
-    peak = _memory("VmHWM")
-    return None if before is None or peak is None else max(0, peak - before)
+    return _memory("VmHWM")
 
 
 def _memory(field: str) -> int | None:
