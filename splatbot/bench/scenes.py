@@ -61,7 +61,8 @@ class SplatScene:
 
     def select(self, index: Tensor, name: str) -> SplatScene:
         """Some of the Gaussians."""
-        return replace(self, name=name, **{k: t[index] for k, t in self.named().items()})
+        means, quats, scales, opacities, colors = (t[index] for t in self.tensors())
+        return replace(self, name=name, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
 
 
 def surface_map(width: int = MAP_WIDTH, height: int = MAP_HEIGHT, *, sigma_px: float = 1.0) -> SplatScene:

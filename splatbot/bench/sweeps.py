@@ -57,7 +57,7 @@ def run_sweeps(
 
 def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
     """The most exact setting of each knob first."""
-    plain = {k: v.detach() if isinstance(v, Tensor) else v for k, v in plain_arguments(scene, size).items()}
+    plain = _detached(scene, size)
     for value in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1):
         yield Setting(
             "transmittance_min", value, plain | {"transmittance_min": value}, exact=value == 1e-6, default=value == 1e-4
@@ -69,9 +69,9 @@ def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
     for percent in (100, 80, 60, 40, 20):
         index = order[: max(1, len(order) * percent // 100)].sort().values
         fewer = scene.select(index, scene.name)
-        arguments = plain_arguments(fewer, size)
-        detached = {k: v.detach() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-        yield Setting("percent_of_gaussians", percent, detached, exact=percent == 100, default=percent == 100)
+        yield Setting(
+            "percent_of_gaussians", percent, _detached(fewer, size), exact=percent == 100, default=percent == 100
+        )
     top = with_harmonics(plain, 4)
     for degree in (4, 3, 2, 1, 0):
         cut = top | {"colors": top["colors"].detach()[:, : (degree + 1) ** 2].contiguous(), "sh_degree": degree}
@@ -85,17 +85,21 @@ def _sweep_instruction_sets(results: Results, *, runs: int, budget_s: float, qui
     """Each has its own exponential (a table and degree 2 in AVX-512, degree 5 elsewhere) and its own rounding."""
     size = (24, 16) if quick else (96, 64)
     scene = random_box(200 if quick else 2000, shrink=3.0)
-    arguments = {k: v.detach() if isinstance(v, Tensor) else v for k, v in plain_arguments(scene, size).items()}
-    doubled = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    arguments = _detached(scene, size)
+    doubled: dict[str, Any] = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
     exact, _, meta = rasterization_reference(**doubled)
     safe = (meta.margins > 1e-4)[..., None].reshape(*exact.shape[:-1], 1)  # pixels that no rounding can flip
-    large = {k: v.detach() if isinstance(v, Tensor) else v for k, v in plain_arguments(*_speed_case(quick)).items()}
+    large = _detached(*_speed_case(quick))
     for name in native().available_isas():
         with isa(name):
             case = f"{SWEEP} instruction set: {name}"
             image = _render(arguments)
             results.add_time(case, "forward", measure(partial(_render, large), runs=runs, budget_s=budget_s))
             _add_errors(results, case, torch.where(safe, image.double(), exact), exact)
+
+
+def _detached(scene: SplatScene, size: tuple[int, int]) -> dict[str, Any]:
+    return {k: v.detach() if isinstance(v, Tensor) else v for k, v in plain_arguments(scene, size).items()}
 
 
 def _speed_case(quick: bool) -> tuple[SplatScene, tuple[int, int]]:

@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "optimize_tests.hpp"
 #include "splatbot/isa.hpp"
 #include "splatbot/rasterizer.hpp"
 #include "splatbot/threads.hpp"
@@ -207,6 +208,7 @@ int main() {
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);
+    run_optimize();
   }
   std::puts("all promises kept");
   return 0;
