@@ -11,12 +11,12 @@ from torch import Tensor
 
 from splatbot.rasterize import rasterization, rasterization_reference
 
-NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+NAMES = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks", "backgrounds")
 
 
 @dataclass
 class Scene:
-    """Float32 inputs of a render of C views; ``backgrounds`` may be None."""
+    """Float32 inputs of a render of C views; ``backgrounds`` may be None, and so may quats and scales or covars."""
 
     means: Tensor
     quats: Tensor
@@ -28,6 +28,7 @@ class Scene:
     width: int
     height: int
     backgrounds: Tensor | None = None
+    covars: Tensor | None = None
 
     def render(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
         """Through the native kernels."""
@@ -48,7 +49,7 @@ class Scene:
             for name in NAMES
             for value in [getattr(self, name)]
         }
-        return Scene(**tensors, Ks=self.Ks.to(dtype), width=self.width, height=self.height)  # type: ignore[arg-type]
+        return Scene(**tensors, width=self.width, height=self.height)  # type: ignore[arg-type]
 
     def _arguments(self) -> dict[str, Any]:
         return dict(vars(self))

@@ -54,7 +54,7 @@ class RasterPlan:
     @classmethod
     def quick_plan(cls, *, peers: bool = False, splat: Path | None = None, say: Say = lambda text: None) -> RasterPlan:
         """A run of seconds."""
-        return cls(((48, 32),), (1, 2), 2, 0.2, peers, splat, True, say)
+        return cls(((32, 24),), (1, 2), 2, 0.1, peers, splat, True, say)
 
     def scenes(self) -> list[SplatScene]:
         """The surface map, random boxes, and the given file."""
@@ -209,7 +209,8 @@ def run_peers(plan: RasterPlan, results: Results) -> None:
                 results.add(case + ", RGB", "forward", None, "ms", peer=peer.name, note="absent")
                 continue
             plan.say(f"{case}: {peer.name}")
-            torch.set_num_threads(max(plan.thread_counts))  # a peer has torch's threads; splatbot has its own
+            # A peer has torch's threads, splatbot its own; on tiny scenes torch's would only spin.
+            torch.set_num_threads(1 if plan.quick else max(plan.thread_counts))
             forward = measure(partial(peer.render, scene, *size, None), runs=3, budget_s=plan.budget_s)
             both = measure(partial(peer.render, scene, *size, grad), runs=3, budget_s=plan.budget_s)
             theirs = peer.render(scene, *size, grad)

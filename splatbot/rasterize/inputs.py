@@ -10,82 +10,174 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 
+MAX_SH_DEGREE = 4
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the tensors of B scenes of N Gaussians, seen by C views each, are arranged.
+
+    Without leading batch dimensions (``batch`` is ()), tensors have the shapes of :func:`rasterization`; with them,
+    the batch dimensions are flattened to one, B.
+    """
+
+    batch: tuple[int, ...]
+    n_cameras: int
+    n_gaussians: int
+    view_colors: bool  # colours differ from view to view
+
+    @property
+    def n_batches(self) -> int:
+        return math.prod(self.batch)
+
+    @property
+    def n_views(self) -> int:
+        return self.n_batches * self.n_cameras
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """Leading dimensions of what there is one of per view."""
+        return (*self.batch, self.n_cameras)
+
+    def scene(self, tensor: Tensor, b: int) -> Tensor:
+        """The part of a tensor that belongs to scene b."""
+        return tensor[b] if self.batch else tensor
+
+    def view(self, tensor: Tensor, b: int, c: int) -> Tensor:
+        """The part of a tensor that belongs to view c of scene b."""
+        return tensor[b, c] if self.batch else tensor[c]
+
+    def colors_of(self, colors: Tensor, b: int, c: int) -> Tensor:
+        """Colours, or their gradients, of view c of scene b."""
+        return self.view(colors, b, c) if self.view_colors else self.scene(colors, b)
+
 
 @dataclass(frozen=True)
 class Inputs:
-    """Checked tensors: float32, CPU, contiguous; ``viewmats`` may be float64, ``Ks`` is."""
+    """Checked tensors: float32 (cameras may be float64), CPU, contiguous."""
 
+    layout: Layout
     means: Tensor
-    quats: Tensor
-    scales: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    covars: Tensor | None
     opacities: Tensor
-    colors: Tensor
+    colors: Tensor  # of D channels, or coefficients
     viewmats: Tensor
     Ks: Tensor
     backgrounds: Tensor | None
+    masks: Tensor | None = None  # uint8
 
     def tensors(self) -> tuple[Tensor | None, ...]:
-        """The differentiable ones, in the order of ``rasterization``; backgrounds last."""
+        """The differentiable ones, in the order of the fields."""
         return (
             self.means,
             self.quats,
             self.scales,
+            self.covars,
             self.opacities,
             self.colors,
             self.viewmats,
+            self.Ks,
             self.backgrounds,
         )
+
+    def detached(self) -> Inputs:
+        """The same values outside the graph."""
+        tensors = (t if t is None else t.detach() for t in (*self.tensors(), self.masks))
+        return Inputs(self.layout, *tensors)  # type: ignore[arg-type]
 
 
 def check_inputs(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
     opacities: Tensor,
     colors: Tensor | None,
+    sh_degree: int | None,
     viewmats: Tensor,
     Ks: Tensor,
     backgrounds: Tensor | None,
-    width: int,
-    height: int,
+    masks: Tensor | None,
+    size: tuple[int, int],
+    tile_size: int,
 ) -> Inputs:
-    """Check and make contiguous; ``colors`` None becomes (N, 0).
+    """Check, make contiguous and flatten the batch dimensions; ``colors`` None becomes (N, 0).
+
+    Args:
+        size: width and height of the image [px].
+        tile_size: of the tiles of ``masks`` [px].
 
     Raises:
         InputError: naming the argument.
     """
-    for name, size in (("width", width), ("height", height)):
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-            raise InputError(f"is {size!r}.", field=name, hint="give a positive integer [px]")
-    n = len(_floats("means", means, (None, 3)))
-    poses = _floats("viewmats", viewmats, (None, 4, 4), double=True)
-    c = len(poses)
-    intrinsics = _floats("Ks", Ks, (c, 3, 3), double=True).detach().to(torch.float64)
-    _check_camera(poses, intrinsics)
-    given = colors is not None
-    if colors is None:
-        colors = means.new_zeros(n, 0)
-    shape = (n, None) if colors.ndim == 2 else (c, n, None)
-    checked = _floats("colors", colors, shape)
-    if given and checked.shape[-1] == 0:
-        raise InputError("has no channels.", field="colors", hint="give colours (N, D), D >= 1")
+    for name, pixels in (("width", size[0]), ("height", size[1]), ("tile_size", tile_size)):
+        if isinstance(pixels, bool) or not isinstance(pixels, int) or pixels < 1:
+            raise InputError(f"is {pixels!r}.", field=name, hint="give a positive integer [px]")
+    _require_tensor("means", means)
+    batch = tuple(means.shape[:-2])
+    means = _floats("means", means, (*batch, None, 3))
+    n = means.shape[-2]
+    viewmats = _floats("viewmats", viewmats, (*batch, None, 4, 4), double=True)
+    c = viewmats.shape[-3]
+    Ks = _floats("Ks", Ks, (*batch, c, 3, 3), double=True)
+    _check_cameras(viewmats, Ks)
+    if covars is not None:
+        covars, quats, scales = _floats("covars", covars, (*batch, n, 3, 3)), None, None
+    else:
+        quats = _floats("quats", quats, (*batch, n, 4))
+        scales = _floats("scales", scales, (*batch, n, 3))
+    colors, view_colors = _check_colors(colors, sh_degree, means, (*batch, c))
+    channels = colors.shape[-1]
     if backgrounds is not None:
-        backgrounds = _floats("backgrounds", backgrounds, (c, checked.shape[-1]))
+        backgrounds = _floats("backgrounds", backgrounds, (*batch, c, channels))
         if not torch.isfinite(backgrounds).all():
             raise InputError("is not finite.", field="backgrounds")
-    return Inputs(
-        means=_floats("means", means, (n, 3)),
-        quats=_floats("quats", quats, (n, 4)),
-        scales=_floats("scales", scales, (n, 3)),
-        opacities=_floats("opacities", opacities, (n,)),
-        colors=checked,
-        viewmats=poses,
-        Ks=intrinsics.contiguous(),
-        backgrounds=backgrounds,
-    )
+    if masks is not None:
+        masks = _check_masks(masks, (*batch, c, -(-size[1] // tile_size), -(-size[0] // tile_size)))
+
+    opacities = _floats("opacities", opacities, (*batch, n))
+    tensors = (means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds, masks)
+    flat = [t if t is None or not batch else t.reshape(-1, *t.shape[len(batch) :]) for t in tensors]
+    return Inputs(Layout(batch, c, n, view_colors), *flat)  # type: ignore[arg-type]
 
 
-def _floats(name: str, tensor: Tensor, shape: tuple[int | None, ...], *, double: bool = False) -> Tensor:
+def _check_colors(
+    colors: Tensor | None, sh_degree: int | None, means: Tensor, views: tuple[int, ...]
+) -> tuple[Tensor, bool]:
+    """Colours, and whether each view has its own; ``views`` are the batch dimensions and C."""
+    batch, n = tuple(means.shape[:-2]), means.shape[-2]
+    if colors is None:
+        return means.new_zeros(*batch, n, 0), False
+    _require_tensor("colors", colors)
+    tail: tuple[int | None, ...] = (n, None) if sh_degree is None else (n, None, 3)
+    own = colors.ndim == len(views) + len(tail)
+    checked = _floats("colors", colors, (*(views if own else batch), *tail))
+    if sh_degree is None and checked.shape[-1] == 0:
+        raise InputError("has no channels.", field="colors", hint="give colours (N, D), D >= 1")
+    if sh_degree is not None:
+        if isinstance(sh_degree, bool) or not isinstance(sh_degree, int) or not 0 <= sh_degree <= MAX_SH_DEGREE:
+            raise InputError(f"is {sh_degree!r}.", field="sh_degree", hint=f"give 0 to {MAX_SH_DEGREE}, or None")
+        if checked.shape[-2] < (sh_degree + 1) ** 2:
+            needed = f"{(sh_degree + 1) ** 2} coefficients a channel for degree {sh_degree}"
+            raise InputError(f"holds {checked.shape[-2]}.", field="colors", hint=f"give at least {needed}")
+    return checked, own
+
+
+def _check_masks(masks: Tensor, shape: tuple[int, ...]) -> Tensor:
+    _require_tensor("masks", masks)
+    if tuple(masks.shape) != shape or masks.dtype != torch.bool:
+        raise InputError(f"is {masks.dtype} {tuple(masks.shape)}, expected torch.bool {shape}.", field="masks")
+    return masks.cpu().contiguous().view(torch.uint8)
+
+
+def _require_tensor(name: str, tensor: object) -> None:
+    if not isinstance(tensor, Tensor):
+        raise InputError(f"is a {type(tensor).__name__}.", field=name, hint="give a torch tensor")
+
+
+def _floats(name: str, tensor: Tensor | None, shape: tuple[int | None, ...], *, double: bool = False) -> Tensor:
     if not isinstance(tensor, Tensor):
         raise InputError(f"is a {type(tensor).__name__}.", field=name, hint="give a torch tensor")
     fits = tensor.ndim == len(shape) and all(
@@ -101,12 +193,18 @@ def _floats(name: str, tensor: Tensor, shape: tuple[int | None, ...], *, double:
     return tensor.contiguous()
 
 
-def _check_camera(viewmats: Tensor, Ks: Tensor) -> None:
+def _check_cameras(viewmats: Tensor, Ks: Tensor) -> None:
     for name, tensor in (("viewmats", viewmats), ("Ks", Ks)):
-        for i, row in enumerate(tensor.detach().flatten(1).tolist()):
+        width = tensor.shape[-1] * tensor.shape[-2]
+        for i, row in enumerate(tensor.detach().reshape(-1, width).tolist()):
             if not all(map(math.isfinite, row)):
                 raise InputError(f"row {i} is not finite.", field=name)
-            if name == "Ks" and not (row[0] > 0.0 and row[4] > 0.0):
-                raise InputError(f"row {i} has focal lengths {row[0]:g}, {row[4]:g}.", field=name, hint="positive [px]")
-            if name == "Ks" and (row[1] != 0.0 or row[3] != 0.0):
-                raise InputError(f"row {i} has skew.", field=name, hint="undistort to a camera without skew")
+            if name == "Ks":
+                _check_intrinsics(i, row)
+
+
+def _check_intrinsics(i: int, row: list[float]) -> None:
+    if not (row[0] > 0.0 and row[4] > 0.0):
+        raise InputError(f"row {i} has focal lengths {row[0]:g}, {row[4]:g}.", field="Ks", hint="positive [px]")
+    if row[1] != 0.0 or row[3] != 0.0:
+        raise InputError(f"row {i} has skew.", field="Ks", hint="undistort to a camera without skew")

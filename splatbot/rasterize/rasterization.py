@@ -2,40 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
-from splatbot.gaussians.harmonics import sh_to_rgb
-from splatbot.rasterize.inputs import check_inputs
+from splatbot.rasterize.autograd import attach
+from splatbot.rasterize.centers import Centers
+from splatbot.rasterize.gsplat_backend import rasterization_gsplat
+from splatbot.rasterize.inputs import Inputs, check_inputs
 from splatbot.rasterize.meta import RenderMeta
-from splatbot.rasterize.native import native
+from splatbot.rasterize.options import DEFAULT_TILE_SIZE, Options, check_choice, parse_mode, refuse_absent
+from splatbot.rasterize.passes import run_forward
 
 DepthMode = Literal["center", "plane"]
 
 
-@dataclass(frozen=True)
-class _Options:
-    """What a render is told besides tensors."""
-
-    width: int
-    height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
-    depth: str
-    plane_depth: bool
-
-
 def rasterization(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
     opacities: Tensor,
     colors: Tensor | None,
     viewmats: Tensor,
@@ -47,7 +33,7 @@ def rasterization(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
-    packed: bool = False,
+    packed: bool = True,
     tile_size: int | None = None,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
@@ -55,11 +41,15 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     channel_chunk: int = 32,
+    distributed: bool = False,
     camera_model: Literal["pinhole"] = "pinhole",
+    segmented: bool = False,
     covars: Tensor | None = None,
     *,
+    masks: Tensor | None = None,
     depth_mode: DepthMode = "center",
-    **unsupported: Any,
+    backend: Literal["native", "gsplat"] = "native",
+    **absent: Any,
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render N Gaussians into C views; differentiable.
 
@@ -70,204 +60,136 @@ def rasterization(
     order of depth, equal depths in order of index. The result is the same, bit for bit, in every run and for any
     number of threads.
 
+    Dimensions "..." are leading batch dimensions, the same for all arguments: scenes rendered one after the other.
+
     Args:
-        means: (N, 3) [m], world frame.
-        quats: (N, 4) wxyz, any norm; a zero quaternion counts as no rotation and receives no gradient.
-        scales: (N, 3) standard deviations [m].
-        opacities: (N,) in 0..1.
-        colors: (N, D) or (C, N, D), any number of channels; with ``sh_degree=0`` (N, 1, 3) DC coefficients; None in
-            the modes D and ED.
-        viewmats: (C, 4, 4) world to camera; float32 or float64.
-        Ks: (C, 3, 3) [px]; float32 or float64. Receives no gradient.
+        means: (..., N, 3) [m], world frame.
+        quats: (..., N, 4) wxyz, any norm; a zero quaternion counts as no rotation and receives no gradient.
+        scales: (..., N, 3) standard deviations [m].
+        opacities: (..., N) in 0..1.
+        colors: (..., N, D) or (..., C, N, D), any number of channels; with ``sh_degree`` coefficients (..., N, K, 3)
+            or (..., C, N, K, 3); None in the modes D and ED.
+        viewmats: (..., C, 4, 4) world to camera; float32 or float64.
+        Ks: (..., C, 3, 3) [px]; float32 or float64. fx, fy, cx and cy receive gradients.
         width: of the image [px].
         height: of the image [px].
         near_plane: Gaussians nearer than this are left out [m].
         far_plane: Gaussians farther than this are left out [m].
         radius_clip: Gaussians whose extent is at most this are left out [px].
         eps2d: added to the diagonal of each projected covariance [px²].
-        sh_degree: None, or 0.
-        packed: has no effect on the result; accepted for gsplat's sake.
-        tile_size: has no effect on the result; accepted for gsplat's sake.
-        backgrounds: (C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
+        sh_degree: None, or the degree 0..4 of the spherical harmonics in use, K >= (degree + 1)²; the colour is
+            max(0, 1/2 + their sum), with 3DGS's signs, found for the Gaussians in view alone.
+        packed: the layout of meta: rows of what is in view, or one row for every Gaussian and view. The images are
+            the same.
+        tile_size: side of the square tiles of ``masks`` and meta [px], 16 by default; no effect on the images.
+        backgrounds: (..., C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
         render_mode: RGB; D: depth summed with the blend weights [m]; ED: that, divided by the sum of weights; RGB+D
             and RGB+ED append it as the last channel.
-        rasterize_mode: "classic".
-        camera_model: "pinhole".
+        sparse_grad: gradients to means, quats, scales and covars as sparse COO tensors of the rows in view; packed
+            and without batch dimensions only.
+        absgrad: ``meta["means2d"].absgrad`` after backward: the sums over pixels of the absolute values of the
+            centres' gradients through alpha (Ye et al. 2024); beyond 8 channels, of each 8 channels apart.
+        rasterize_mode: "classic"; "antialiased" multiplies opacities by √max(det Σ / det(Σ + eps2d I), 0.005²) of the
+            projected covariance Σ (Yu et al. 2024).
         channel_chunk: has no effect on the result; accepted for gsplat's sake.
+        distributed: False.
+        camera_model: "pinhole".
+        segmented: has no effect on the result; accepted for gsplat's sake.
+        covars: (..., N, 3, 3) [m²] in place of quats and scales; the upper triangle counts, and receives the gradient.
+        masks: (..., C, tile_height, tile_width) bool; tiles that are False show the background alone and give no
+            gradient to Gaussians.
         depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat); "plane" lets it vary over the
             footprint as that of the plane through the centre and normal to the Gaussian's shortest axis, faded out as
             the shortest axis nears the middle one and bounded where the plane is seen edge-on. Its gradient takes
             the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them.
+        backend: "gsplat" hands the call to gsplat.rasterization, for tensors on a CUDA device.
+        absent: gsplat's other options, as long as they ask for nothing.
 
     Returns:
-        render_colors (C, H, W, X), render_alphas (C, H, W, 1), meta: means2d, depths, conics, radii, opacities,
-        tiles_per_gauss, visible_ids and the tile grid, computed when asked for.
+        render_colors (..., C, H, W, X), render_alphas (..., C, H, W, 1), meta (see :class:`RenderMeta`), computed
+        when asked for.
 
     Raises:
         InputError: a shape, type, device or option does not fit, or a value is not finite.
         NativeError: the C++ core is missing or cannot run here.
     """
-    _reject_unsupported(rasterize_mode, camera_model, covars, sparse_grad, absgrad, depth_mode, unsupported)
-    if sh_degree is not None:
-        colors = _from_harmonics(colors, sh_degree)
-    wants_color, depth = _parse_mode(render_mode)
+    arguments = dict(locals())
+    if backend == "gsplat":
+        return _to_gsplat(arguments)
+    check_choice("backend", backend, ("native", "gsplat"))
+    options = _check_options(arguments)
+    wants_color, _ = parse_mode(render_mode)
     if not wants_color:
-        colors, backgrounds = None, None
+        colors, backgrounds, sh_degree = None, None, None
     elif colors is None:
         raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
-    inputs = check_inputs(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width, height)
-    options = _Options(
-        width=width,
-        height=height,
-        near_plane=float(near_plane),
-        far_plane=float(far_plane),
-        radius_clip=float(radius_clip),
-        eps2d=float(eps2d),
-        depth=depth,
-        plane_depth=depth_mode == "plane" and depth != "none",
+    inputs = check_inputs(
+        means,
+        quats,
+        scales,
+        covars,
+        opacities,
+        colors,
+        sh_degree,
+        viewmats,
+        Ks,
+        backgrounds,
+        masks,
+        (width, height),
+        options.tile_size,
     )
-    states: list[Any] = []
-    renders, alphas = _Rasterize.apply(*inputs.tensors(), inputs.Ks, options, states)
-    return renders, alphas, RenderMeta(states, inputs.opacities.detach(), width, height)
+    if options.sparse_grad and inputs.layout.batch:
+        raise InputError("is set beside batch dimensions.", field="sparse_grad", hint="render one scene at a time")
+    return _render(inputs, options)
 
 
-class _Rasterize(torch.autograd.Function):
-    """The native passes, one view after the other."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        viewmats: Tensor,
-        backgrounds: Tensor | None,
-        Ks: Tensor,
-        options: _Options,
-        states: list[Any],
-    ) -> tuple[Tensor, Tensor]:
-        n_views, depth_channels = len(viewmats), int(options.depth != "none")
-        size = (n_views, options.height, options.width)
-        renders = torch.empty((*size, colors.shape[-1] + depth_channels), dtype=torch.float32)
-        alphas = torch.empty((*size, 1), dtype=torch.float32)
-        geometry = [t.detach() for t in (means, quats, scales, opacities)]
-        viewmats64 = viewmats.detach().to(torch.float64).contiguous()
-        for i in range(n_views):
-            state = native().rasterize_forward(
-                *geometry,
-                _of_view(colors, i),
-                viewmats64[i],
-                Ks[i],
-                options.width,
-                options.height,
-                options.near_plane,
-                options.far_plane,
-                options.radius_clip,
-                options.eps2d,
-                options.depth,
-                options.plane_depth,
-                None if backgrounds is None else backgrounds[i].detach(),
-                renders[i],
-                alphas[i, ..., 0],
-            )
-            if isinstance(state, tuple):
-                field, row = state
-                raise InputError(f"row {row} is not finite.", field=field, hint="find where the NaN or Inf comes from")
-            states.append(state)
-        ctx.states = tuple(states)
-        ctx.save_for_backward(means, quats, scales, opacities, colors, viewmats, backgrounds)
-        ctx.set_materialize_grads(False)
-        return renders, alphas
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        grad_renders, grad_alphas = grads
-        means, quats, scales, opacities, colors, viewmats, backgrounds = ctx.saved_tensors
-        need = ctx.needs_input_grad
-        geometry = [t.detach() for t in (means, quats, scales, opacities)]
-        out = [torch.empty_like(t) if n else None for t, n in zip(geometry, need[:4], strict=True)]
-        # Zeros only where the second view adds to rows that the first did not write.
-        new_colors = torch.empty if colors.ndim == 2 or len(ctx.states) == 1 else torch.zeros
-        grad_colors = new_colors(colors.shape, dtype=torch.float32) if need[4] else None
-        grad_viewmats = torch.zeros(viewmats.shape, dtype=torch.float64) if need[5] else None
-        grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[6] else None
-        if grad_renders is None and grad_alphas is None:
-            return (None,) * 10
-        for i, state in enumerate(ctx.states):
-            pose = torch.zeros(12, dtype=torch.float64) if grad_viewmats is not None else None
-            native().rasterize_backward(
-                state,
-                *geometry,
-                _of_view(colors, i),
-                None if backgrounds is None else backgrounds[i].detach(),
-                None if grad_renders is None else grad_renders[i].contiguous(),
-                None if grad_alphas is None else grad_alphas[i, ..., 0].contiguous(),
-                *out,
-                None if grad_colors is None else _of_view(grad_colors, i),
-                pose,
-                None if grad_backgrounds is None else grad_backgrounds[i],
-                i > 0,
-            )
-            if grad_viewmats is not None and pose is not None:
-                grad_viewmats[i, :3, :3] = pose[:9].view(3, 3)
-                grad_viewmats[i, :3, 3] = pose[9:]
-        grad_viewmats = None if grad_viewmats is None else grad_viewmats.to(viewmats.dtype)
-        grad_backgrounds = None if grad_backgrounds is None else grad_backgrounds.to(torch.float32)
-        return (*out, grad_colors, grad_viewmats, grad_backgrounds, None, None, None)
+def _render(inputs: Inputs, options: Options) -> tuple[Tensor, Tensor, RenderMeta]:
+    layout = inputs.layout
+    rendered = run_forward(inputs, options)
+    centers = Centers(layout, rendered.states if options.packed else None, absgrad=options.absgrad)
+    means2d = centers.new_tensor(inputs)
+    renders, alphas = attach(inputs, options, rendered, centers, means2d)
+    if layout.batch:
+        renders, alphas = (t.reshape(*layout.batch, *t.shape[1:]) for t in (renders, alphas))
+    meta = RenderMeta(rendered.states, layout, options, inputs.opacities.detach(), centers, means2d)
+    return renders, alphas, meta
 
 
-def _of_view(colors: Tensor, i: int) -> Tensor:
-    return (colors if colors.ndim == 2 else colors[i]).detach()
-
-
-def _from_harmonics(colors: Tensor | None, sh_degree: int) -> Tensor:
-    if sh_degree != 0:
-        raise InputError(f"is {sh_degree}.", field="sh_degree", hint="pass colours, or coefficients with sh_degree=0")
-    if colors is None or colors.ndim != 3 or colors.shape[1] < 1 or colors.shape[2] != 3:
-        shape = None if colors is None else tuple(colors.shape)
-        raise InputError(f"is {shape}.", field="colors", hint="with sh_degree give coefficients (N, K, 3)")
-    return sh_to_rgb(colors[:, 0]).clamp_min(0.0)
-
-
-def _parse_mode(render_mode: str) -> tuple[bool, str]:
-    """Whether colours are rendered, and what of depth."""
-    modes = {
-        "RGB": (True, "none"),
-        "D": (False, "accumulated"),
-        "ED": (False, "expected"),
-        "RGB+D": (True, "accumulated"),
-        "RGB+ED": (True, "expected"),
-    }
-    if render_mode not in modes:
-        raise InputError(f"is {render_mode!r}.", field="render_mode", hint=f"one of {', '.join(modes)}")
-    return modes[render_mode]
-
-
-def _reject_unsupported(
-    rasterize_mode: str,
-    camera_model: str,
-    covars: Tensor | None,
-    sparse_grad: bool,
-    absgrad: bool,
-    depth_mode: str,
-    unsupported: dict[str, Any],
-) -> None:
+def _check_options(given: dict[str, Any]) -> Options:
     """An option that would change the result is refused, never ignored."""
-    choices: Sequence[tuple[str, Any, tuple[Any, ...]]] = (
-        ("rasterize_mode", rasterize_mode, ("classic",)),
-        ("camera_model", camera_model, ("pinhole",)),
-        ("sparse_grad", sparse_grad, (False,)),
-        ("absgrad", absgrad, (False,)),
-        ("depth_mode", depth_mode, ("center", "plane")),
+    refuse_absent({**given["absent"], "distributed": given["distributed"]})
+    check_choice("rasterize_mode", given["rasterize_mode"], ("classic", "antialiased"))
+    check_choice("camera_model", given["camera_model"], ("pinhole",))
+    check_choice("depth_mode", given["depth_mode"], ("center", "plane"))
+    if given["sparse_grad"] and not given["packed"]:
+        raise InputError("needs packed=True.", field="sparse_grad", hint="set packed, or leave sparse_grad out")
+    if given["covars"] is not None and given["depth_mode"] == "plane":
+        raise InputError("is set beside depth_mode='plane'.", field="covars", hint="give quats and scales")
+    wants_color, depth = parse_mode(given["render_mode"])
+    sh_degree = given["sh_degree"] if wants_color else None
+    return Options(
+        width=given["width"],
+        height=given["height"],
+        near_plane=float(given["near_plane"]),
+        far_plane=float(given["far_plane"]),
+        radius_clip=float(given["radius_clip"]),
+        eps2d=float(given["eps2d"]),
+        sh_degree=-1 if sh_degree is None else sh_degree,
+        depth=depth,
+        plane_depth=given["depth_mode"] == "plane" and depth != "none",
+        antialiased=given["rasterize_mode"] == "antialiased",
+        packed=bool(given["packed"]),
+        tile_size=DEFAULT_TILE_SIZE if given["tile_size"] is None else given["tile_size"],
+        sparse_grad=bool(given["sparse_grad"]),
+        absgrad=bool(given["absgrad"]),
     )
-    for name, value, known in choices:
-        if value not in known:
-            names = ", ".join(repr(k) for k in known)
-            raise InputError(f"{value!r} is not supported.", field=name, hint=f"use {names}")
-    if covars is not None:
-        raise InputError("is not supported.", field="covars", hint="give quats and scales")
-    for name, value in unsupported.items():
-        if value is not None and value is not False:
-            raise InputError("is not supported.", field=name, hint="leave it out")
+
+
+def _to_gsplat(given: dict[str, Any]) -> tuple[Tensor, Tensor, Any]:
+    """What gsplat has no name for is refused; the rest goes through as it is."""
+    check_choice("depth_mode", given.pop("depth_mode"), ("center",))
+    if given.pop("masks") is not None:
+        raise InputError("is not known to gsplat.", field="masks", hint="use backend='native'")
+    del given["backend"]
+    absent = given.pop("absent")
+    return rasterization_gsplat(**given, **absent)

@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
+from splatbot.rasterize.harmonics import harmonics_basis
 
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
+ANTIALIAS_MIN = 0.005
 FOV_MARGIN = 0.3  # of half the field of view, where the slope of the projection is clamped
 
 
@@ -39,8 +41,8 @@ class ReferenceMeta:
 
 def rasterization_reference(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
     opacities: Tensor,
     colors: Tensor | None,
     viewmats: Tensor,
@@ -50,14 +52,18 @@ def rasterization_reference(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     eps2d: float = 0.3,
+    sh_degree: int | None = None,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    covars: Tensor | None = None,
     *,
     depth_mode: Literal["center", "plane"] = "center",
 ) -> tuple[Tensor, Tensor, ReferenceMeta]:
     """As :func:`splatbot.rasterize.rasterization`, computed in the type of ``means`` by torch alone.
 
-    Args and returns: see there; ``colors`` (N, D), (C, N, D) or None.
+    Args and returns: see there, but without batch dimensions; ``colors`` (N, D), (C, N, D) or None, with ``sh_degree``
+    (N, K, 3) or (C, N, K, 3).
 
     Raises:
         InputError: an unknown render mode.
@@ -66,16 +72,21 @@ def rasterization_reference(
         raise InputError(f"is {render_mode!r}.", field="render_mode", hint="one of RGB, D, ED, RGB+D, RGB+ED")
     renders, alphas, metas = [], [], []
     for i in range(len(viewmats)):
-        view_colors = None if colors is None or "RGB" not in render_mode else colors[i] if colors.ndim == 3 else colors
+        view_colors = None
+        if colors is not None and "RGB" in render_mode:
+            view_colors = colors[i] if colors.ndim == (3 if sh_degree is None else 4) else colors
+        if view_colors is not None and sh_degree is not None:
+            view_colors = _shade(view_colors, sh_degree, means, viewmats[i])
         background = None if backgrounds is None or view_colors is None else backgrounds[i]
-        projected = _project(means, quats, scales, viewmats[i], Ks[i], width, height, eps2d, depth_mode)
+        projected = _project(means, quats, scales, covars, viewmats[i], Ks[i], width, height, eps2d, depth_mode)
+        blended = opacities * _antialias(projected) if rasterize_mode == "antialiased" else opacities
         # The kernels hold the planes in float32: a float32 Gaussian on the plane must be kept here as well.
         near, far = (float(torch.tensor(plane, dtype=torch.float32)) for plane in (near_plane, far_plane))
         keep = (projected.depth >= near) & (projected.depth <= far)
         order = torch.argsort(projected.depth.detach().float(), stable=True)
         order = order[keep[order]]
         pixels = _pixel_centers(width, height, means)
-        weights, left, margin = _blend(projected, opacities, order, pixels)
+        weights, left, margin = _blend(projected, blended, order, pixels)
         channels = _channels(projected, view_colors, order, pixels, render_mode)
         image = _composite(weights, channels, left, background, render_mode)
         renders.append(image.reshape(height, width, -1))
@@ -88,9 +99,23 @@ def rasterization_reference(
 @dataclass(frozen=True)
 class _Projected:
     mean2d: Tensor  # (N, 2)
+    sharp2d: Tensor  # (N, 2, 2) covariance before the blur
     covar2d: Tensor  # (N, 2, 2)
     depth: Tensor  # (N,)
     slope: Tensor  # (N, 2) change of depth per pixel
+
+
+def _shade(coefficients: Tensor, degree: int, means: Tensor, viewmat: Tensor) -> Tensor:
+    """Colours (N, 3) of harmonics (N, K, 3) as the camera sees them."""
+    center = -torch.linalg.solve(viewmat[:3, :3], viewmat[:3, 3]).to(means.dtype)
+    basis = harmonics_basis(torch.nn.functional.normalize(means - center, dim=-1), degree)
+    return (0.5 + torch.einsum("nk,nkc->nc", basis, coefficients[:, : basis.shape[-1]])).clamp_min(0.0)
+
+
+def _antialias(projected: _Projected) -> Tensor:
+    """Factor (N,) on opacity for the area that the blur adds (Yu et al. 2024, eq. 9)."""
+    squared = torch.linalg.det(projected.sharp2d) / torch.linalg.det(projected.covar2d)
+    return squared.clamp_min(ANTIALIAS_MIN**2).sqrt()
 
 
 def _rotations(quats: Tensor) -> Tensor:
@@ -109,8 +134,9 @@ def _rotations(quats: Tensor) -> Tensor:
 
 def _project(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
     viewmat: Tensor,
     K: Tensor,
     width: int,
@@ -120,23 +146,35 @@ def _project(
 ) -> _Projected:
     """EWA splatting (Zwicker et al. 2001, eq. 24 and 29)."""
     W, t = viewmat[:3, :3].to(means.dtype), viewmat[:3, 3].to(means.dtype)
-    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    fx, fy, cx, cy = (v.to(means.dtype) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     p = means @ W.T + t
     depth = p[:, 2]
     z = torch.where(depth > 0, depth, torch.ones_like(depth))  # behind the camera nothing counts
     margins = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
-    slope_x = (p[:, 0] / z).clamp(-(cx / fx + margins[0]), (width - cx) / fx + margins[0])
-    slope_y = (p[:, 1] / z).clamp(-(cy / fy + margins[1]), (height - cy) / fy + margins[1])
+    slope_x = _clamp(p[:, 0] / z, -(cx / fx + margins[0]), (width - cx) / fx + margins[0])
+    slope_y = _clamp(p[:, 1] / z, -(cy / fy + margins[1]), (height - cy) / fy + margins[1])
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).reshape(-1, 2, 3)
-    axes = W @ _rotations(quats)  # columns: the Gaussian's axes in the camera frame
-    M = J @ axes * scales[:, None, :]
-    covar2d = M @ M.mT + eps2d * torch.eye(2, dtype=means.dtype)
+    slopes = torch.zeros(len(means), 2, dtype=means.dtype)
+    if covars is not None:
+        upper = covars.triu()
+        sharp2d = J @ W @ (upper + upper.triu(1).mT) @ W.mT @ J.mT
+    elif quats is not None and scales is not None:
+        axes = W @ _rotations(quats)  # columns: the Gaussian's axes in the camera frame
+        M = J @ axes * scales[:, None, :]
+        sharp2d = M @ M.mT
+    else:
+        raise InputError("are missing.", field="quats, scales", hint="give them, or covars")
+    covar2d = sharp2d + eps2d * torch.eye(2, dtype=means.dtype)
+    if depth_mode == "plane" and scales is not None:
+        slopes = _plane_slopes(p, axes, scales, covar2d, fx.item(), fy.item()).detach()
     mean2d = torch.stack([fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy], -1)
-    slope = torch.zeros_like(mean2d)
-    if depth_mode == "plane":
-        slope = _plane_slopes(p, axes, scales, covar2d, fx, fy).detach()
-    return _Projected(mean2d, covar2d, depth, slope)
+    return _Projected(mean2d, sharp2d, covar2d, depth, slopes)
+
+
+def _clamp(values: Tensor, least: Tensor, most: Tensor) -> Tensor:
+    """Clamp whose bounds receive gradients."""
+    return torch.where(values < least, least, torch.where(values > most, most, values))
 
 
 def _plane_slopes(p: Tensor, axes: Tensor, scales: Tensor, covar2d: Tensor, fx: float, fy: float) -> Tensor:

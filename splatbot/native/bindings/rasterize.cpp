@@ -24,12 +24,15 @@ namespace {
 
 template <class T, class Shape>
 using Array = nb::ndarray<T, Shape, nb::c_contig, nb::device::cpu>;
+using InAny = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using OutAny = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using InMask = Array<const std::uint8_t, nb::shape<-1, -1>>;
 using In1 = Array<const float, nb::shape<-1>>;
+using InN33 = Array<const float, nb::shape<-1, 3, 3>>;
 using In2 = Array<const float, nb::shape<-1, -1>>;
 using In3 = Array<const float, nb::shape<-1, -1, -1>>;
 using InN3 = Array<const float, nb::shape<-1, 3>>;
 using InN4 = Array<const float, nb::shape<-1, 4>>;
-using Out1 = Array<float, nb::shape<-1>>;
 using Out2 = Array<float, nb::shape<-1, -1>>;
 using Out3 = Array<float, nb::shape<-1, -1, -1>>;
 using Matrix3 = Array<const double, nb::shape<3, 3>>;
@@ -45,24 +48,55 @@ std::span<T> span_of(const std::optional<A>& array) {
   return array ? std::span<T>(array->data(), array->size()) : std::span<T>();
 }
 
-splatbot::Gaussians gaussians_of(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
-                                 const In2& colors) {
-  return {.count = means.shape(0),
-          .channels = static_cast<int>(colors.shape(1)),
-          .means = span_of(means),
-          .quats = span_of(quats),
-          .scales = span_of(scales),
-          .opacities = span_of(opacities),
-          .colors = span_of(colors)};
+// Flat arrays and how to read them, as Python hands them over for both passes.
+splatbot::Gaussians gaussians_of(const InN3& means, const std::optional<InN4>& quats,
+                                 const std::optional<InN3>& scales, const std::optional<InN33>& covars,
+                                 const In1& opacities, const InAny& colors, int sh_degree) {
+  splatbot::Gaussians g = {.count = means.shape(0),
+                           .channels = 3,
+                           .means = span_of(means),
+                           .quats = span_of<const float>(quats),
+                           .scales = span_of<const float>(scales),
+                           .covars = span_of<const float>(covars),
+                           .opacities = span_of(opacities),
+                           .colors = span_of(colors),
+                           .sh_degree = sh_degree};
+  if (sh_degree < 0 && colors.ndim() == 2) {
+    g.channels = static_cast<int>(colors.shape(1));
+  } else if (sh_degree >= 0 && colors.ndim() == 3 && colors.shape(2) == 3) {
+    g.coefficients = static_cast<int>(colors.shape(1));
+  } else {
+    throw std::invalid_argument("colors is neither (N, D) nor, with a degree, (N, K, 3)");
+  }
+  return g;
 }
 
+// The camera's centre is -R^-1 t; x -> R (x - origin) + translation, all in float64 before rounding.
 splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int width, int height) {
   splatbot::View view{};
+  const auto r = [&](int i, int j) { return viewmat(i % 3, j % 3); };
+  double determinant = 0.0, center[3] = {};
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) {
+      const double cofactor = r(i + 1, j + 1) * r(i + 2, j + 2) - r(i + 1, j + 2) * r(i + 2, j + 1);
+      center[j] -= cofactor * viewmat(i, 3);
+      determinant += i == 0 ? cofactor * viewmat(0, j) : 0.0;
       view.rotation[3 * i + j] = static_cast<float>(viewmat(i, j));
     }
-    view.translation[i] = static_cast<float>(viewmat(i, 3));
+  }
+  if (determinant == 0.0) {
+    throw std::invalid_argument("the rotation of viewmat has no inverse");
+  }
+  for (int j = 0; j < 3; ++j) {
+    view.origin[j] = static_cast<float>(center[j] / determinant);
+    view.center_low[j] = static_cast<float>(center[j] / determinant - static_cast<double>(view.origin[j]));
+  }
+  for (int i = 0; i < 3; ++i) {
+    double shift = viewmat(i, 3);
+    for (int j = 0; j < 3; ++j) {
+      shift += viewmat(i, j) * static_cast<double>(view.origin[j]);
+    }
+    view.translation[i] = static_cast<float>(shift);
   }
   view.fx = static_cast<float>(K(0, 0));
   view.fy = static_cast<float>(K(1, 1));
@@ -91,23 +125,27 @@ struct State {
   splatbot::RasterStatePtr state;
 };
 
-nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities, const In2& colors,
+nb::object forward(const InN3& means, const std::optional<InN4>& quats, const std::optional<InN3>& scales,
+                   const std::optional<InN33>& covars, const In1& opacities, const InAny& colors, int sh_degree,
                    const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane, float far_plane,
-                   float radius_clip, float eps2d, const std::string& depth, bool plane_depth,
-                   const std::optional<In1>& background, const Out3& out_colors, const Out2& out_alphas) {
-  const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, opacities, colors);
+                   float radius_clip, float eps2d, const std::string& depth, bool plane_depth, bool antialiased,
+                   const std::optional<In1>& background, const std::optional<InMask>& mask, int mask_size,
+                   const Out3& out_colors, const Out2& out_alphas) {
+  const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
   const splatbot::View view = view_of(viewmat, K, width, height);
   const splatbot::RasterOptions options = {.near_plane = near_plane,
                                            .far_plane = far_plane,
                                            .radius_clip = radius_clip,
                                            .eps2d = eps2d,
                                            .depth = depth_mode(depth),
-                                           .plane_depth = plane_depth};
+                                           .plane_depth = plane_depth,
+                                           .antialiased = antialiased};
+  const splatbot::TileMask tiles = {.keep = span_of<const std::uint8_t>(mask), .size = mask_size};
   State state;
   std::optional<splatbot::Fault> fault;
   {
     const nb::gil_scoped_release release;
-    fault = splatbot::rasterize_forward(gaussians, view, options, span_of<const float>(background),
+    fault = splatbot::rasterize_forward(gaussians, view, options, span_of<const float>(background), tiles,
                                         span_of(out_colors), span_of(out_alphas), state.state);
   }
   if (fault) {
@@ -116,21 +154,28 @@ nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, con
   return nb::cast(std::move(state));
 }
 
-void backward(const State& state, const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
-              const In2& colors, const std::optional<In1>& background, const std::optional<In3>& grad_render,
-              const std::optional<In2>& grad_alphas, const std::optional<Out2>& grad_means,
-              const std::optional<Out2>& grad_quats, const std::optional<Out2>& grad_scales,
-              const std::optional<Out1>& grad_opacities, const std::optional<Out2>& grad_colors,
-              const std::optional<Array<double, nb::shape<12>>>& grad_viewmat,
-              const std::optional<Array<double, nb::shape<-1>>>& grad_background, bool accumulate) {
-  const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, opacities, colors);
+void backward(const State& state, const InN3& means, const std::optional<InN4>& quats,
+              const std::optional<InN3>& scales, const std::optional<InN33>& covars, const In1& opacities,
+              const InAny& colors, int sh_degree, const std::optional<In1>& background,
+              const std::optional<In3>& grad_render, const std::optional<In2>& grad_alphas,
+              const std::optional<OutAny>& grad_means, const std::optional<OutAny>& grad_quats,
+              const std::optional<OutAny>& grad_scales, const std::optional<OutAny>& grad_covars,
+              const std::optional<OutAny>& grad_opacities, const std::optional<OutAny>& grad_colors,
+              const std::optional<Array<double, nb::shape<16>>>& grad_camera,
+              const std::optional<Array<double, nb::shape<-1>>>& grad_background,
+              const std::optional<OutAny>& grad_means2d, const std::optional<OutAny>& absolute_means2d,
+              bool accumulate) {
+  const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
   const splatbot::Gradients out = {.means = span_of<float>(grad_means),
                                    .quats = span_of<float>(grad_quats),
                                    .scales = span_of<float>(grad_scales),
+                                   .covars = span_of<float>(grad_covars),
                                    .opacities = span_of<float>(grad_opacities),
                                    .colors = span_of<float>(grad_colors),
-                                   .viewmat = span_of<double>(grad_viewmat),
+                                   .camera = span_of<double>(grad_camera),
                                    .background = span_of<double>(grad_background),
+                                   .means2d = span_of<float>(grad_means2d),
+                                   .absolute2d = span_of<float>(absolute_means2d),
                                    .accumulate = accumulate};
   const nb::gil_scoped_release release;
   splatbot::rasterize_backward(*state.state, gaussians, span_of<const float>(background),
@@ -147,21 +192,31 @@ nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<s
   return nb::ndarray<nb::numpy, T>(data, shape, owner);
 }
 
-nb::dict describe(const State& state, const In1& opacities) {
-  const std::size_t n = opacities.size();
-  std::vector<float> means2d(2 * n), depths(n), conics(3 * n);
-  std::vector<std::int32_t> radii(2 * n), tiles(n);
+nb::dict describe(const State& state) {
+  const std::size_t n = splatbot::gaussian_count(*state.state);
+  std::vector<float> means2d(2 * n), depths(n), conics(3 * n), opacities(n);
+  std::vector<std::int32_t> radii(2 * n);
   {
     const nb::gil_scoped_release release;
-    splatbot::describe_projections(*state.state, span_of(opacities), {means2d, depths, conics, radii, tiles});
+    splatbot::describe_projections(*state.state, {means2d, depths, conics, radii, opacities});
   }
   nb::dict d;
   d["means2d"] = owned(std::move(means2d), {n, 2});
   d["depths"] = owned(std::move(depths), {n});
   d["conics"] = owned(std::move(conics), {n, 3});
   d["radii"] = owned(std::move(radii), {n, 2});
-  d["tiles_per_gauss"] = owned(std::move(tiles), {n});
+  d["opacities"] = owned(std::move(opacities), {n});
   return d;
+}
+
+nb::ndarray<nb::numpy, std::int32_t> contributions(const State& state) {
+  std::vector<std::int32_t> counts(splatbot::gaussian_count(*state.state));
+  {
+    const nb::gil_scoped_release release;
+    splatbot::count_contributions(*state.state, counts);
+  }
+  const std::size_t n = counts.size();
+  return owned(std::move(counts), {n});
 }
 
 nb::ndarray<nb::numpy, std::int64_t> visible(const State& state) {
@@ -197,25 +252,31 @@ nb::dict work(const State& state) {
 
 void define_rasterize(nb::module_& m) {
   nb::class_<State>(m, "RasterState", "What a render leaves for its backward pass.")
-      .def("describe", &describe, "opacities"_a.noconvert(), "Projections as a dict of arrays.")
+      .def("describe", &describe, "Projections as a dict of arrays.")
+      .def("contributions", &contributions, "In how many pixels (N,) each Gaussian counts.")
+      .def_prop_ro("n_visible", [](const State& state) { return splatbot::visible_ids(*state.state).size(); })
       .def("visible", &visible, "Indices (V,) of the Gaussians in view.")
       .def("tiles", &tiles, "Tile grid, pairs and bytes held.")
       .def("work", &work, "Milliseconds by stage of the last passes, and the (Gaussian, pixel) pairs of a blend pass.");
 
-  m.def("rasterize_forward", &forward, "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(),
-        "opacities"_a.noconvert(), "colors"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a,
-        "height"_a, "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a,
-        nb::arg("background").noconvert().none(), "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(),
+  m.def("rasterize_forward", &forward, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
+        nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
+        "colors"_a.noconvert(), "sh_degree"_a, "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a,
+        "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a, "antialiased"_a,
+        nb::arg("background").noconvert().none(), nb::arg("mask").noconvert().none(), "mask_size"_a,
+        "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(),
         "Render one view into out_colors (H, W, X) and out_alphas (H, W). Returns a RasterState, or (field, row) of an "
         "input that is not finite.");
 
-  m.def("rasterize_backward", &backward, "state"_a, "means"_a.noconvert(), "quats"_a.noconvert(),
-        "scales"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(),
-        nb::arg("background").noconvert().none(), nb::arg("grad_render").noconvert().none(),
-        nb::arg("grad_alphas").noconvert().none(), nb::arg("grad_means").noconvert().none(),
-        nb::arg("grad_quats").noconvert().none(), nb::arg("grad_scales").noconvert().none(),
+  m.def("rasterize_backward", &backward, "state"_a, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
+        nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
+        "colors"_a.noconvert(), "sh_degree"_a, nb::arg("background").noconvert().none(),
+        nb::arg("grad_render").noconvert().none(), nb::arg("grad_alphas").noconvert().none(),
+        nb::arg("grad_means").noconvert().none(), nb::arg("grad_quats").noconvert().none(),
+        nb::arg("grad_scales").noconvert().none(), nb::arg("grad_covars").noconvert().none(),
         nb::arg("grad_opacities").noconvert().none(), nb::arg("grad_colors").noconvert().none(),
-        nb::arg("grad_viewmat").noconvert().none(), nb::arg("grad_background").noconvert().none(), "accumulate"_a,
+        nb::arg("grad_camera").noconvert().none(), nb::arg("grad_background").noconvert().none(),
+        nb::arg("grad_means2d").noconvert().none(), nb::arg("absolute_means2d").noconvert().none(), "accumulate"_a,
         "Write (or add) the gradients whose arrays are given.");
 
   m.def("isa", [] { return std::string(splatbot::isa()); }, "The kernels in use: v2, v3, v4 or baseline.");

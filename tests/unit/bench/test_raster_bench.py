@@ -32,7 +32,7 @@ def test_every_scene_size_and_number_of_threads_is_measured(run: tuple[Results, 
     plan = RasterPlan.quick_plan()
     for scene in plan.scenes():
         for threads in ("1 thread", "2 threads"):
-            found = figures(results, f"{scene.name} 48x32, {threads}")
+            found = figures(results, f"{scene.name} 32x24, {threads}")
             for metric in ("forward", "forward+backward", "forward+pose backward", "evaluated pairs", "state memory"):
                 assert found[metric] > 0.0
 
@@ -68,7 +68,7 @@ def test_ratios_are_those_of_the_measured_times(run: tuple[Results, Path]) -> No
 def test_the_share_of_the_peak_follows_from_pairs_time_and_peak(run: tuple[Results, Path]) -> None:
     results, _ = run
     isa = results.machine["isa"]
-    found = figures(results, "surface 48x32, 2 threads")
+    found = figures(results, "surface 32x24, 2 threads")
     peak = results.machine["fma_peak_gflops"][isa]["2"]
     for name, flop, stage in (("forward", FORWARD_FLOP, "blend"), ("backward", BACKWARD_FLOP, "blend_backward")):
         gflops = 1e-6 * flop * found["evaluated pairs"] / found[f"stage {stage}"]
@@ -78,7 +78,7 @@ def test_the_share_of_the_peak_follows_from_pairs_time_and_peak(run: tuple[Resul
 
 def test_peers_show_the_same_image_and_gradients(run: tuple[Results, Path]) -> None:
     results, _ = run
-    for case in ("surface 48x32, 2 threads, RGB", "random 500 48x32, 2 threads, RGB"):
+    for case in ("surface 32x24, 2 threads, RGB", "random 500 32x24, 2 threads, RGB"):
         for peer in ("torch", "scalar C++"):
             found = figures(results, case, peer)
             assert found["image, error of 99.9 % of the pixels"] < 1e-4
@@ -95,7 +95,7 @@ def test_an_absent_peer_is_said_to_be_absent(run: tuple[Results, Path]) -> None:
 def test_every_effect_has_a_line_with_figures_or_a_reason(run: tuple[Results, Path]) -> None:
     results, _ = run
     for effect in all_effects():
-        rows = results.select(f"effect on surface 48x32: {effect.name}")
+        rows = results.select(f"effect on surface 32x24: {effect.name}")
         assert rows
         assert all(row.value is not None or row.note for row in rows)
 

@@ -35,7 +35,7 @@ def test_gradients_equal_central_differences(mode: str) -> None:
     checked = 0
     for name in NAMES:
         leaf = getattr(scene, name)
-        if leaf.grad is None:
+        if leaf is None or leaf.grad is None:
             continue
         flat = leaf.grad.abs().flatten()
         for k in flat.topk(min(4, len(flat))).indices.tolist():

@@ -16,12 +16,14 @@ inline constexpr float kAlphaMax = 0.99F;
 inline constexpr float kTransmittanceMin = 1e-4F;
 inline constexpr float kMaxSigmas = 3.33F;
 inline constexpr float kExpectedDepthMin = 1e-10F;  // least sum of weights that expected depth is divided by
+inline constexpr float kMinAntialias = 0.005F;      // least factor on opacity
 inline constexpr float kFovMargin = 0.3F;           // of half the field of view, where slopes are clamped
 
 struct ProjectArgs {
   std::size_t count;
-  const float *means, *quats, *scales, *opacities, *colors;
+  const float *means, *quats, *scales, *covars, *opacities, *colors;
   int channels;
+  int sh_degree, coefficients;  // degree -1: colours are colours
   View view;
   RasterOptions options;
   int columns, rows;
@@ -49,6 +51,8 @@ struct BlendArgs {
   std::uint32_t* tile_done;
   float* final_state;  // of this pass
   const float* background;  // per channel of the pass, or null
+  const std::uint8_t* mask;  // of square tiles of mask_size pixels, or null
+  int mask_size, mask_columns;
   float* out_colors;
   int out_channels;
   float* out_alphas;
@@ -59,6 +63,7 @@ struct BlendBackwardArgs {
   const float* grad_colors;  // (H, W, out_channels) or null
   const float* grad_alphas;  // (H, W) or null; null for all but the first pass
   int channel_sums;          // how many channels' gradients are summed: 0, 1 (depth) or all
+  bool absolute;             // sum absolute gradients of the centre as well
   float* slots;              // (pairs, kSlot)
 };
 
@@ -72,8 +77,33 @@ struct ProjectBackwardArgs {
   float* carried;   // (N, kSlot) sums of earlier passes, or null if there is one pass only
   bool first, last;
   bool accumulate;  // add to the outputs
-  float *means, *quats, *scales, *opacities, *colors;  // outputs; null: not asked for
-  double* viewmat;                                     // (blocks, 12) partial sums, or null
+  bool accumulate_colors;
+  // Outputs; null: not asked for.
+  float *means, *quats, *scales, *covars, *opacities, *colors, *means2d, *absolute2d;
+  double* camera;  // (blocks, kCameraSums) partial sums
+};
+
+// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy.
+inline constexpr int kCameraSums = 16;
+
+struct HarmonicsArgs {
+  ProjectArgs forward;
+  const ProjectedBlock* blocks;
+  int first_channel;  // of the colours in a record
+};
+
+struct HarmonicsBackwardArgs {
+  HarmonicsArgs forward;
+  const float* colors;  // (N, 3): gradient to the colours of what is in view
+  bool accumulate;      // add to the coefficients' gradient
+  float* coefficients;  // output, or null
+  float* means;         // output, always added to, or null
+  double* center;       // (blocks, 3): gradient to the camera's centre, or null
+};
+
+struct ContributionArgs {
+  BlendArgs forward;
+  std::uint32_t* counts;  // (pairs,), by slot
 };
 
 // The fused loss; see loss.hpp.
@@ -124,6 +154,9 @@ struct Kernels {
   void (*blend)(const BlendArgs&, std::size_t tile);
   void (*blend_backward)(const BlendBackwardArgs&, std::size_t tile);
   void (*project_backward)(const ProjectBackwardArgs&, std::size_t block);
+  void (*harmonics)(const HarmonicsArgs&, std::size_t block);
+  void (*harmonics_backward)(const HarmonicsBackwardArgs&, std::size_t block);
+  void (*contributions)(const ContributionArgs&, std::size_t tile);
   void (*loss)(const LossArgs&, std::size_t tile, float* scratch, LossSums& sums);
   void (*adam)(const AdamGroup&, const AdamBlock&);
   float (*multiply_add)(std::size_t rounds);  // kMultiplyAddFlops x lanes x rounds floating-point operations

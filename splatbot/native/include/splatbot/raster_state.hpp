@@ -30,10 +30,11 @@ inline constexpr int kChunk = 64;
 
 inline constexpr int kRecordChannels = 8;
 
-// Gradient sums of one pair: six moments of the blend exponent, then the channels.
+// Gradient sums of one pair: six moments of the blend exponent, then the channels, then absolute gradients.
 inline constexpr int kMoments = 6;
 inline constexpr int kSlot = 16;
-static_assert(kMoments + kRecordChannels <= kSlot);
+inline constexpr int kAbsolute = 14;
+static_assert(kMoments + kRecordChannels <= kAbsolute && kAbsolute + 2 <= kSlot);
 
 // What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
 inline constexpr int kFinalPlanes = 2 + kRecordChannels;
@@ -60,7 +61,7 @@ struct alignas(64) ProjectedBlock {
   std::uint64_t pairs = 0;
   std::uint64_t first_pair = 0;
   std::uint32_t first_visible = 0;
-  int fault_field = -1;  // means, quats, scales, opacities, colors
+  int fault_field = -1;  // means, quats, scales, covars, opacities, colors
   std::size_t fault_row = 0;
 };
 
@@ -104,6 +105,8 @@ struct RasterState {
   Buffer<std::uint32_t> masks;       // (pairs,), live blocks reached
   Buffer<std::uint32_t> tile_done;   // (tiles,): pairs looked at before the tile closed
   Buffer<float> final_state;         // (passes, tiles, kFinalPlanes, kTilePixels)
+  Buffer<std::uint8_t> mask;         // of square tiles of mask_size pixels; empty: none
+  int mask_size = 0, mask_columns = 0;
 
   std::size_t tiles() const noexcept { return static_cast<std::size_t>(columns) * static_cast<std::size_t>(rows); }
   std::size_t bytes() const noexcept;

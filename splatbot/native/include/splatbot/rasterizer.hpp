@@ -10,21 +10,29 @@
 
 namespace splatbot {
 
-// N Gaussians in the world frame. Contiguous rows; colours have `channels` columns.
+inline constexpr int kMaxHarmonicsDegree = 4;
+
+// N Gaussians in the world frame. Contiguous rows; colours have `channels` columns, or are harmonics.
 struct Gaussians {
   std::size_t count = 0;
   int channels = 0;
   std::span<const float> means;      // (N, 3)
   std::span<const float> quats;      // (N, 4) wxyz, any norm; a zero quaternion counts as no rotation
   std::span<const float> scales;     // (N, 3)
+  std::span<const float> covars;     // (N, 3, 3), or empty: in place of quats and scales; the upper triangle counts
   std::span<const float> opacities;  // (N,)
-  std::span<const float> colors;     // (N, channels)
+  std::span<const float> colors;     // (N, channels), or (N, coefficients, 3) with harmonics
+  int sh_degree = -1;                // of the harmonics in use, -1 for plain colours; with it, channels is 3
+  int coefficients = 0;              // harmonics held: at least (sh_degree + 1)^2
 };
 
-// A pinhole camera; pixel (i, j) covers [i, i+1) x [j, j+1), its centre is at +0.5.
+// A pinhole camera; pixel (i, j) covers [i, i+1) x [j, j+1), its centre is at +0.5. A world point x is at
+// rotation (x - origin) + translation: with the origin at the camera, nothing is lost far from the world's origin.
 struct View {
   float rotation[9];  // world to camera, row-major
   float translation[3];
+  float origin[3];
+  float center_low[3];   // the camera's centre less origin: what rounding the origin took from it
   float fx, fy, cx, cy;  // [px]
   int width, height;     // [px]
 };
@@ -42,6 +50,13 @@ struct RasterOptions {
   float eps2d = 0.3F;        // [px^2]; added to the diagonal of the projected covariance
   DepthMode depth = DepthMode::none;
   bool plane_depth = false;  // depth varies over a footprint as that of the Gaussian's own plane
+  bool antialiased = false;  // opacity falls by what the blur adds to a footprint's area
+};
+
+// Pixels to leave out, by square tiles of `size` pixels, row by row; nonzero counts. Empty: none.
+struct TileMask {
+  std::span<const std::uint8_t> keep;
+  int size = 16;
 };
 
 // An input value that is not finite.
@@ -63,14 +78,17 @@ using RasterStatePtr = std::shared_ptr<RasterState>;
 //
 // Returns the fault instead of rendering if an input is not finite.
 std::optional<Fault> rasterize_forward(const Gaussians& gaussians, const View& view, const RasterOptions& options,
-                                       std::span<const float> background, std::span<float> out_colors,
-                                       std::span<float> out_alphas, RasterStatePtr& state);
+                                       std::span<const float> background, const TileMask& mask,
+                                       std::span<float> out_colors, std::span<float> out_alphas,
+                                       RasterStatePtr& state);
 
 // Where gradients go; an empty span is not computed. With `accumulate`, they are added to what is there.
 struct Gradients {
-  std::span<float> means, quats, scales, opacities, colors;
-  std::span<double> viewmat;     // (12,): dL/d(rotation row-major, translation)
+  std::span<float> means, quats, scales, covars, opacities, colors;
+  std::span<double> camera;      // (16,): dL/d(world-to-camera rotation row-major, translation, fx, fy, cx, cy)
   std::span<double> background;  // (channels,)
+  std::span<float> means2d;      // (N, 2): to the projected centres; never accumulated
+  std::span<float> absolute2d;   // (N, 2): the same, of absolute values pixel by pixel (AbsGS, Ye et al. 2024)
   bool accumulate = false;
 };
 
@@ -85,9 +103,14 @@ struct Projections {
   std::span<float> depths;                // (N,)
   std::span<float> conics;                // (N, 3): the inverse of the 2D covariance, upper triangle [px^-2]
   std::span<std::int32_t> radii;          // (N, 2) [px]
-  std::span<std::int32_t> tiles_touched;  // (N,)
+  std::span<float> opacities;             // (N,), as blended: after antialiasing
 };
-void describe_projections(const RasterState& state, std::span<const float> opacities, const Projections& out);
+void describe_projections(const RasterState& state, const Projections& out);
+
+// In how many pixels each Gaussian counts. out: (N,).
+void count_contributions(const RasterState& state, std::span<std::int32_t> out);
+
+std::size_t gaussian_count(const RasterState& state);
 
 // Indices of the Gaussians in view, ascending.
 std::span<const std::uint32_t> visible_ids(const RasterState& state);

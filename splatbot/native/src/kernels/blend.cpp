@@ -33,12 +33,17 @@ struct Extras {
   bool weigh;  // sum the weights
 };
 
-void start(const TileFrame& frame, int channels, TileState& state) {
+void start(const BlendArgs& args, const TileFrame& frame, int channels, TileState& state) {
   for (int i = 0; i < kTilePixels; ++i) {
     const bool inside =
         kCenters.x[i] < static_cast<float>(frame.width) && kCenters.y[i] < static_cast<float>(frame.height);
     state.through[i] = inside ? 1.0F : 0.0F;
     state.transmittance[i] = 1.0F;
+  }
+  for (int y = 0; args.mask != nullptr && y < frame.height; ++y) {
+    for (int x = 0; x < frame.width; ++x) {
+      state.through[pixel_index(x, y)] = kept(args, frame.x0 + x, frame.y0 + y) ? 1.0F : 0.0F;
+    }
   }
   for (int c = 0; c < channels; ++c) {
     std::memset(state.channels[c], 0, sizeof(state.channels[c]));
@@ -196,7 +201,7 @@ void write_tile(const BlendArgs& args, const TileFrame& frame, const TileState& 
 
 template <int C>
 void blend_channels(const BlendArgs& args, const TileFrame& frame, std::size_t tile, TileState& state) {
-  start(frame, C, state);
+  start(args, frame, C, state);
   const bool depth = args.pass->depth_first;
   const bool expected = depth && args.depth == DepthMode::expected;
   if (depth && args.plane_depth) {

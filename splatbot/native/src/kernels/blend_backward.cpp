@@ -63,12 +63,18 @@ void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const floa
         static_cast<std::size_t>(frame.x0);
     for (int x = 0; x < frame.width; ++x) {
       load_pixel(args, line + static_cast<std::size_t>(x), pixel_index(x, y), saved, state);
+      if (!kept(args.forward, frame.x0 + x, frame.y0 + y)) {
+        state.through[pixel_index(x, y)] = 0.0F;
+      }
     }
   }
 }
 
-// Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha); then weight times gradient for the first S channels.
-template <int C, int S, bool Plane>
+SB_INLINE F abs(F a) { return max(a, -a); }
+
+// Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha); then weight times gradient for the first S channels; then,
+// if Absolute, the absolute gradients of the centre in x (less a factor) and y.
+template <int C, int S, bool Plane, bool Absolute>
 SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDepth& plane, std::uint32_t mask,
                         TileGradient& state, float* slot) {
   F acc[16];
@@ -115,12 +121,16 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
       acc[3] = fma(vu, a.u, acc[3]);
       acc[4] = fma(vu, a.w, acc[4]);
       acc[5] = fma(vw, a.w, acc[5]);
+      if (Absolute) {
+        acc[kAbsolute] = acc[kAbsolute] + abs(vu);
+        acc[kAbsolute + 1] = acc[kAbsolute + 1] + abs(fma(set1(local.l21), vu, set1(local.l22) * vw));
+      }
     }
   } while (mask != 0);
-  store_sums<kMoments + S>(slot, acc);
+  store_sums<Absolute ? kSlot : kMoments + S>(slot, acc);
 }
 
-template <int C, int S, bool Plane>
+template <int C, int S, bool Plane, bool Absolute>
 void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
   const BlendArgs& f = args.forward;
   const std::uint32_t begin = f.tile_begin[tile];
@@ -142,18 +152,20 @@ void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::
     const Local local = localize(f.records[id], frame);
     const float* channels = f.channels + id * f.channel_stride;
     const PlaneDepth plane = Plane ? plane_depth(f.records[id], channels, frame) : PlaneDepth{};
-    sum_pair<C, S, Plane>(local, channels, plane, mask, state, slot);
+    sum_pair<C, S, Plane, Absolute>(local, channels, plane, mask, state, slot);
   }
 }
 
 template <int C, bool Plane>
 void backward_sums(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
-  if (args.channel_sums == 0) {
-    backward_lists<C, 0, Plane>(args, frame, tile, state);
+  if (args.absolute) {  // for densification, which wants all gradients anyway
+    backward_lists<C, C, Plane, true>(args, frame, tile, state);
+  } else if (args.channel_sums == 0) {
+    backward_lists<C, 0, Plane, false>(args, frame, tile, state);
   } else if (args.channel_sums == 1) {
-    backward_lists<C, 1, Plane>(args, frame, tile, state);
+    backward_lists<C, 1, Plane, false>(args, frame, tile, state);
   } else {
-    backward_lists<C, C, Plane>(args, frame, tile, state);
+    backward_lists<C, C, Plane, false>(args, frame, tile, state);
   }
 }
 

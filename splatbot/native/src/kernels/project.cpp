@@ -28,9 +28,14 @@ std::size_t first_not_finite(const float* values, std::size_t n) {
 }
 
 bool find_fault(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
-  const float* fields[] = {args.means, args.quats, args.scales, args.opacities, args.colors};
-  const std::size_t widths[] = {3, 4, 3, 1, static_cast<std::size_t>(args.channels)};
-  for (int f = 0; f < 5; ++f) {
+  const bool harmonics = args.sh_degree >= 0;
+  const float* fields[] = {args.means, args.quats, args.scales, args.covars, args.opacities, args.colors};
+  const auto columns = static_cast<std::size_t>(harmonics ? 3 * args.coefficients : args.channels);
+  const std::size_t widths[] = {3, 4, 3, 9, 1, columns};
+  for (int f = 0; f < 6; ++f) {
+    if (fields[f] == nullptr) {
+      continue;
+    }
     const std::size_t n = (end - begin) * widths[f];
     const std::size_t bad = first_not_finite(fields[f] + begin * widths[f], n);
     if (bad < n) {
@@ -123,7 +128,9 @@ SB_INLINE void write_channels(const ProjectArgs& args, std::size_t id, const Lan
     const float* from = args.colors + id * static_cast<std::size_t>(args.channels) + pass.first_color;
     std::memset(to, 0, kRecordChannels * sizeof(float));
     to[0] = lanes.z[lane];
-    copy_few(to + depth, from, pass.count - depth);
+    if (args.sh_degree < 0) {  // else harmonics() writes them
+      copy_few(to + depth, from, pass.count - depth);
+    }
     if (pass.depth_first && args.options.plane_depth) {
       to[kRecordChannels - 2] = lanes.slope_x[lane];
       to[kRecordChannels - 1] = lanes.slope_y[lane];
@@ -153,10 +160,8 @@ SB_INLINE void write_lane(const ProjectArgs& args, std::size_t id, const Lanes& 
   out.pairs += std::uint64_t{size & 0xffffU} * (size >> 16);
 }
 
-// Extent of the ellipse in tiles, clamped to the image; a mask of lanes that reach it.
-SB_INLINE M cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Lanes& lanes) {
-  const F width = set1(static_cast<float>(args.view.width));
-  const F height = set1(static_cast<float>(args.view.height));
+// Extent of the ellipse in tiles, clamped to the image.
+SB_INLINE void cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Lanes& lanes) {
   const F zero = set1(0.0F);
   const F left = mx - rx, right = mx + rx, top = my - ry, bottom = my + ry;
   const F last_x = set1(static_cast<float>(args.columns - 1));
@@ -167,7 +172,22 @@ SB_INLINE M cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Lanes& 
   const I y1 = to_int(clamp(floor(bottom * set1(1.0F / kTileHeight)), zero, last_y));
   store(lanes.corner, x0 | shift_left<16>(y0));
   store(lanes.size, (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1)));
-  return (right > zero) & (left < width) & (bottom > zero) & (top < height);
+}
+
+// Where the box about the ellipse, in whole pixels from its centre, meets the image: gsplat's test of visibility.
+SB_INLINE M meets_image(const View& view, F mx, F my, F radius_x, F radius_y) {
+  const F zero = set1(0.0F);
+  return (mx + radius_x > zero) & (mx - radius_x < set1(static_cast<float>(view.width))) & (my + radius_y > zero) &
+         (my - radius_y < set1(static_cast<float>(view.height)));
+}
+
+SB_INLINE void load_covars(const float* rows, std::size_t first, int n, F (&out)[6]) {
+  F all[9];
+  load_lanes<9>(rows, first, n, all);
+  const int upper[6] = {0, 1, 2, 4, 5, 8};
+  for (int i = 0; i < 6; ++i) {
+    out[i] = all[upper[i]];
+  }
 }
 
 void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t first, int n, std::uint32_t* visible,
@@ -175,6 +195,7 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
   GaussianLanes g;
   F opacity[1];
   load_lanes<3>(args.means, first, n, g.mean);
+  from_origin(cam, g.mean);
   load_lanes<1>(args.opacities, first, n, opacity);
   Projected o;
   project_center(g, cam, o);
@@ -183,9 +204,18 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
   const std::uint32_t wanted = (1U << n) - 1U;
   std::uint32_t kept = bits(keep) & wanted;
   if (kept != 0) {
-    load_lanes<4>(args.quats, first, n, g.quat);
-    load_lanes<3>(args.scales, first, n, g.scale);
-    project_rest(g, cam, set1(args.options.eps2d), o);
+    const bool of_covar = args.covars != nullptr;
+    if (of_covar) {
+      load_covars(args.covars, first, n, g.covar);
+    } else {
+      load_lanes<4>(args.quats, first, n, g.quat);
+      load_lanes<3>(args.scales, first, n, g.scale);
+    }
+    project_rest(g, cam, set1(args.options.eps2d), of_covar, o);
+    if (args.options.antialiased) {
+      opacity[0] = opacity[0] * sqrt(antialias_squared(o));
+      keep = keep & (opacity[0] >= set1(kAlphaMin));
+    }
     Lanes lanes;
     const F lo = log2(max(opacity[0], set1(kAlphaMin)));
     const F reach = sqrt(max(lo - set1(kLog2AlphaMin), set1(0.0F)));
@@ -200,7 +230,8 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
     const F radius_y = ceil(min(sigmas, set1(kMaxSigmas)) * root.sy);
     const F clip = set1(args.options.radius_clip);
     const F huge = set1(3e38F);
-    keep = keep & cover_tiles(args, o.mx, o.my, rx, ry, lanes) & (o.det > set1(0.0F)) & (o.det < huge) &
+    cover_tiles(args, o.mx, o.my, rx, ry, lanes);
+    keep = keep & meets_image(args.view, o.mx, o.my, radius_x, radius_y) & (o.det > set1(0.0F)) & (o.det < huge) &
            (o.c00 < huge) & (o.c11 < huge) & (max(radius_x, radius_y) > clip);
     keep = keep & (root.l11 > set1(0.0F)) & (root.l11 < huge) & (root.l22 > set1(0.0F));
     kept = bits(keep) & wanted;

@@ -12,11 +12,13 @@ inline constexpr float kRootHalfLog2e = 0.84932180028801904F;
 inline constexpr float kZeroQuat = 1e-30F;  // a quaternion whose largest entry is below has no direction
 
 struct GaussianLanes {
-  F mean[3], quat[4], scale[3];
+  F mean[3];  // less the view's origin
+  F quat[4], scale[3];
+  F covar[6];  // upper triangle, row by row; given in place of the two above, or not
 };
 
 struct CameraLanes {
-  F r[9], t[3], fx, fy, cx, cy, slope_min[2], slope_max[2];
+  F r[9], t[3], origin[3], fx, fy, cx, cy, slope_min[2], slope_max[2];
 
   SB_INLINE explicit CameraLanes(const View& view) {
     for (int i = 0; i < 9; ++i) {
@@ -24,6 +26,7 @@ struct CameraLanes {
     }
     for (int i = 0; i < 3; ++i) {
       t[i] = set1(view.translation[i]);
+      origin[i] = set1(view.origin[i]);
     }
     fx = set1(view.fx);
     fy = set1(view.fy);
@@ -50,8 +53,10 @@ struct Projected {
   F unit[4];                // unit quaternion
   F rotation[9];            // of the Gaussian
   F a[9];                   // camera rotation x Gaussian rotation
+  // Of a covariance, a is the camera rotation alone.
   F rows[2][3];             // a[0] - slope x a[2] and a[1] - slope y a[2]
-  F m[2][3];                // root of the 2D covariance: j x rows x scale
+  F m[2][3];                // root of the 2D covariance: j x rows x scale; of a covariance: (covariance j rows)^T
+  F s00, s11, det_sharp;    // 2D covariance before the blur
   F c00, c01, c11, det;     // 2D covariance, blurred
   F mx, my;                 // [px]
 };
@@ -96,6 +101,12 @@ SB_INLINE void rotate_gaussian(const GaussianLanes& g, const CameraLanes& cam, P
   }
 }
 
+SB_INLINE void from_origin(const CameraLanes& cam, F (&mean)[3]) {
+  for (int i = 0; i < 3; ++i) {
+    mean[i] = mean[i] - cam.origin[i];
+  }
+}
+
 SB_INLINE void project_center(const GaussianLanes& g, const CameraLanes& cam, Projected& o) {
   for (int i = 0; i < 3; ++i) {
     o.p[i] = fma(cam.r[3 * i], g.mean[0], fma(cam.r[3 * i + 1], g.mean[1], fma(cam.r[3 * i + 2], g.mean[2], cam.t[i])));
@@ -118,9 +129,8 @@ SB_INLINE Root root_of_inverse(const Projected& o) {
   return r;
 }
 
-// Everything after project_center(); lanes at z <= 0 hold no meaning.
-SB_INLINE void project_rest(const GaussianLanes& g, const CameraLanes& cam, F eps2d, Projected& o) {
-  rotate_gaussian(g, cam, o);
+// The camera's linearisation about the centre; lanes at z <= 0 hold no meaning.
+SB_INLINE void linearize(const CameraLanes& cam, Projected& o) {
   const F inverse_z = set1(1.0F) / o.p[2];
   o.jx = cam.fx * inverse_z;
   o.jy = cam.fy * inverse_z;
@@ -131,25 +141,93 @@ SB_INLINE void project_rest(const GaussianLanes& g, const CameraLanes& cam, F ep
     o.slope[i] = clamp(free, cam.slope_min[i], cam.slope_max[i]);
     o.slope_free[i] = (free >= cam.slope_min[i]) & (free <= cam.slope_max[i]);
   }
-  F normal[3];  // a^T (slope x, slope y, 1): the cross product of the two rows
+}
+
+// Two rows of the linearisation, in the frame of the columns of a, and their cross product (a is orthonormal).
+SB_INLINE void rows_of(Projected& o, F (&normal)[3]) {
   for (int k = 0; k < 3; ++k) {
     o.rows[0][k] = fnma(o.slope[0], o.a[6 + k], o.a[k]);
     o.rows[1][k] = fnma(o.slope[1], o.a[6 + k], o.a[3 + k]);
-    o.m[0][k] = o.jx * o.rows[0][k] * g.scale[k];
-    o.m[1][k] = o.jy * o.rows[1][k] * g.scale[k];
     normal[k] = fma(o.slope[0], o.a[k], fma(o.slope[1], o.a[3 + k], o.a[6 + k]));
   }
-  const F s00 = dot3(o.m[0], o.m[0]);
-  const F s11 = dot3(o.m[1], o.m[1]);
+}
+
+SB_INLINE void spread_of_axes(const GaussianLanes& g, const CameraLanes& cam, Projected& o) {
+  rotate_gaussian(g, cam, o);
+  F normal[3];
+  rows_of(o, normal);
+  for (int k = 0; k < 3; ++k) {
+    o.m[0][k] = o.jx * o.rows[0][k] * g.scale[k];
+    o.m[1][k] = o.jy * o.rows[1][k] * g.scale[k];
+  }
+  o.s00 = dot3(o.m[0], o.m[0]);
+  o.s11 = dot3(o.m[1], o.m[1]);
   o.c01 = dot3(o.m[0], o.m[1]);
-  o.c00 = s00 + eps2d;
-  o.c11 = s11 + eps2d;
-  // det(m m^T) as the sum of squared minors (Cauchy-Binet): c00 c11 - c01^2 loses all digits of a needle.
+  // det(m m^T) as the sum of squared minors (Cauchy-Binet): s00 s11 - c01^2 loses all digits of a needle.
   const F area = o.jx * o.jy;
   const F n0 = area * normal[0] * g.scale[1] * g.scale[2];
   const F n1 = area * normal[1] * g.scale[0] * g.scale[2];
   const F n2 = area * normal[2] * g.scale[0] * g.scale[1];
-  o.det = fma(n0, n0, fma(n1, n1, fma(n2, n2, eps2d * (s00 + s11 + eps2d))));
+  o.det_sharp = fma(n0, n0, fma(n1, n1, n2 * n2));
+}
+
+// a b - c d without cancellation where fma() rounds once (Kahan).
+SB_INLINE F minor(F a, F b, F c, F d) {
+  const F cd = c * d;
+  return fms(a, b, cd) + fnma(c, d, cd);
+}
+
+SB_INLINE void spread_of_covar(const GaussianLanes& g, const CameraLanes& cam, Projected& o) {
+  for (int i = 0; i < 9; ++i) {
+    o.a[i] = cam.r[i];
+  }
+  F normal[3];
+  rows_of(o, normal);
+  const F* v = g.covar;
+  F b[2][3];
+  for (int k = 0; k < 3; ++k) {
+    b[0][k] = o.jx * o.rows[0][k];
+    b[1][k] = o.jy * o.rows[1][k];
+  }
+  for (int i = 0; i < 2; ++i) {
+    o.m[i][0] = fma(v[0], b[i][0], fma(v[1], b[i][1], v[2] * b[i][2]));
+    o.m[i][1] = fma(v[1], b[i][0], fma(v[3], b[i][1], v[4] * b[i][2]));
+    o.m[i][2] = fma(v[2], b[i][0], fma(v[4], b[i][1], v[5] * b[i][2]));
+  }
+  o.s00 = dot3(b[0], o.m[0]);
+  o.s11 = dot3(b[1], o.m[1]);
+  o.c01 = dot3(b[0], o.m[1]);
+  // det(B V B^T) = n^T adj(V) n with n the cross product of B's rows: the same sum of minors as above.
+  const F n[3] = {normal[0], normal[1], normal[2]};
+  const F adj[6] = {minor(v[3], v[5], v[4], v[4]), minor(v[2], v[4], v[1], v[5]), minor(v[1], v[4], v[2], v[3]),
+                    minor(v[0], v[5], v[2], v[2]), minor(v[1], v[2], v[0], v[4]), minor(v[0], v[3], v[1], v[1])};
+  const F t[3] = {fma(adj[0], n[0], fma(adj[1], n[1], adj[2] * n[2])),
+                  fma(adj[1], n[0], fma(adj[3], n[1], adj[4] * n[2])),
+                  fma(adj[2], n[0], fma(adj[4], n[1], adj[5] * n[2]))};
+  const F area = o.jx * o.jy;
+  o.det_sharp = max(area * area * dot3(n, t), set1(0.0F));
+}
+
+SB_INLINE void blur(F eps2d, Projected& o) {
+  o.c00 = o.s00 + eps2d;
+  o.c11 = o.s11 + eps2d;
+  o.det = fma(eps2d, o.s00 + o.s11 + eps2d, o.det_sharp);
+}
+
+// Everything after project_center(); lanes at z <= 0 hold no meaning.
+SB_INLINE void project_rest(const GaussianLanes& g, const CameraLanes& cam, F eps2d, bool of_covar, Projected& o) {
+  linearize(cam, o);
+  if (of_covar) {
+    spread_of_covar(g, cam, o);
+  } else {
+    spread_of_axes(g, cam, o);
+  }
+  blur(eps2d, o);
+}
+
+// Squared factor on the opacity that makes up for the area the blur adds (Mip-Splatting, Yu et al. 2024, eq. 9).
+SB_INLINE F antialias_squared(const Projected& o) {
+  return max(o.det_sharp / o.det, set1(kMinAntialias * kMinAntialias));
 }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -7,7 +7,17 @@
 namespace splatbot::SPLATBOT_KERNELS {
 
 extern const Kernels kKernels;
-const Kernels kKernels = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), project, blend, blend_backward, project_backward,
-                          loss, adam, multiply_add, SPLATBOT_SIMD / 32};
+const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
+                          .project = project,
+                          .blend = blend,
+                          .blend_backward = blend_backward,
+                          .project_backward = project_backward,
+                          .harmonics = harmonics,
+                          .harmonics_backward = harmonics_backward,
+                          .contributions = contributions,
+                          .loss = loss,
+                          .adam = adam,
+                          .multiply_add = multiply_add,
+                          .lanes = SPLATBOT_SIMD / 32};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -24,6 +24,11 @@ SB_INLINE TileFrame tile_frame(const View& view, int columns, std::size_t tile) 
   return {x0, y0, width, height};
 }
 
+// Whether a pixel of the image is asked for.
+SB_INLINE bool kept(const BlendArgs& args, int x, int y) {
+  return args.mask == nullptr || args.mask[(y / args.mask_size) * args.mask_columns + x / args.mask_size] != 0;
+}
+
 // Pixels of a tile are kept block by block, 16 to a block, row by row within it.
 SB_INLINE int pixel_index(int x, int y) {
   return ((y / kBlock) * kBlockColumns + x / kBlock) * kBlockPixels + (y % kBlock) * kBlock + x % kBlock;

@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: Apache-2.0
+// In how many pixels each Gaussian of a tile counts: the forward pass over again, with counts in place of colours.
+#include "entry.hpp"
+#include "tile.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
+
+struct Through {
+  alignas(64) float values[kTilePixels];  // see advance()
+};
+
+void open_pixels(const BlendArgs& args, const TileFrame& frame, Through& through) {
+  std::memset(through.values, 0, sizeof(through.values));
+  for (int y = 0; y < frame.height; ++y) {
+    for (int x = 0; x < frame.width; ++x) {
+      through.values[pixel_index(x, y)] = kept(args, frame.x0 + x, frame.y0 + y) ? 1.0F : 0.0F;
+    }
+  }
+}
+
+std::uint32_t count_pair(const Local& local, std::uint32_t mask, Through& through) {
+  std::uint32_t count = 0;
+  for (; mask != 0; mask &= mask - 1) {
+    const int block = __builtin_ctz(mask);
+    for (int part = 0; part < kParts; ++part) {
+      const auto first = static_cast<std::size_t>(block * kBlockPixels + part * W);
+      const Alpha a = alpha_at(load(kCenters.x + first), load(kCenters.y + first), &local.l11, &local.l21, &local.l22,
+                               &local.u0, &local.w0, &local.lo);
+      F left = load(through.values + first);
+      const Step step = advance(a, left);
+      store(through.values + first, left);
+      count += static_cast<std::uint32_t>(__builtin_popcount(bits(step.weight > set1(0.0F))));
+    }
+  }
+  return count;
+}
+
+}  // namespace
+
+void contributions(const ContributionArgs& args, std::size_t tile) {
+  const BlendArgs& f = args.forward;
+  const TileFrame frame = tile_frame(f.view, f.columns, tile);
+  Through through;
+  open_pixels(f, frame, through);
+  const std::uint32_t begin = f.tile_begin[tile], done = begin + f.tile_done[tile];
+  for (std::uint32_t at = begin; at < f.tile_begin[tile + 1]; ++at) {
+    const Pair& pair = f.pairs[at];
+    args.counts[pair.slot] =
+        at < done ? count_pair(localize(f.records[pair.id], frame), f.masks[at], through) : 0U;
+  }
+}
+
+}  // namespace splatbot::SPLATBOT_KERNELS

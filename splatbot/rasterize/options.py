@@ -1,0 +1,94 @@
+"""What a render is told besides tensors, and which of gsplat's options it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from splatbot.errors import InputError
+
+DEFAULT_TILE_SIZE = 16
+
+# Render mode: whether colours are rendered, and what of depth.
+_MODES = {
+    "RGB": (True, "none"),
+    "D": (False, "accumulated"),
+    "ED": (False, "expected"),
+    "RGB+D": (True, "accumulated"),
+    "RGB+ED": (True, "expected"),
+}
+
+# gsplat's options that this rasterizer does not have, with the value that asks for nothing.
+_ABSENT: dict[str, Any] = {
+    "distributed": False,
+    "segmented": False,
+    "with_ut": False,
+    "with_eval3d": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+    "ut_params": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Checked options; lengths in the units of :func:`splatbot.rasterize.rasterization`."""
+
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_degree: int  # -1: colours are colours
+    depth: str  # none, accumulated, expected
+    plane_depth: bool
+    antialiased: bool
+    packed: bool
+    tile_size: int
+    sparse_grad: bool
+    absgrad: bool
+
+
+def parse_mode(render_mode: str) -> tuple[bool, str]:
+    """Whether colours are rendered, and what of depth: "none", "accumulated" or "expected".
+
+    Raises:
+        InputError: an unknown mode.
+    """
+    if render_mode not in _MODES:
+        raise InputError(f"is {render_mode!r}.", field="render_mode", hint=f"one of {', '.join(_MODES)}")
+    return _MODES[render_mode]
+
+
+def check_choice(name: str, value: object, known: tuple[str, ...]) -> None:
+    """Raise InputError unless the value is one of those known."""
+    if value not in known:
+        raise InputError(f"{value!r} is not supported.", field=name, hint=f"use {', '.join(map(repr, known))}")
+
+
+def refuse_absent(absent: dict[str, Any]) -> None:
+    """An option that would change the result is refused, never ignored.
+
+    Raises:
+        InputError: naming the option.
+    """
+    for name, value in absent.items():
+        if name not in _ABSENT:
+            raise InputError("is no option of rasterization().", field=name, hint="see its signature")
+        nothing = _ABSENT[name]
+        is_global_shutter = name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL"
+        if value is not None and value != nothing and not is_global_shutter:
+            raise InputError("is not supported.", field=name, hint="leave it out")
