@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from splatbot.bench.results import Results
 from splatbot.bench.sweeps import GROWTH, SWEEP
 
-_KNOBS = ("transmittance_min", "radius_clip", "percent_of_gaussians", "sh_degree", "unscented_transform")
+_KNOBS = ("radius_clip", "percent_of_gaussians", "sh_degree", "unscented_transform")
 
 
 def plot_sweeps(results: Results, out: Path) -> None:

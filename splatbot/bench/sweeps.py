@@ -58,10 +58,6 @@ def run_sweeps(
 def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
     """The most exact setting of each knob first."""
     plain = _detached(scene, size)
-    for value in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1):
-        yield Setting(
-            "transmittance_min", value, plain | {"transmittance_min": value}, exact=value == 1e-6, default=value == 1e-4
-        )
     for clip in (0.0, 0.5, 1.0, 2.0, 4.0):
         yield Setting("radius_clip", clip, plain | {"radius_clip": clip}, exact=clip == 0.0, default=clip == 0.0)
     weight = scene.opacities * scene.scales.amax(-1) ** 2
