@@ -38,7 +38,11 @@ class Peer:
 def all_peers() -> list[Peer]:
     """The peers there are, those that cannot run here included."""
     return [
-        Peer("torch", "plain torch, float32: a tile of 16x16 px at a time, dense over its Gaussians", torch_render),
+        Peer(
+            "torch",
+            "plain torch, float32, one thread: a tile of 16x16 px at a time, dense over its Gaussians",
+            torch_render,
+        ),
         Peer(
             "scalar C++",
             "textbook C++, -O2, no vectors, one thread; its backward ends at the projected Gaussians",

@@ -67,30 +67,37 @@ def _full_scenes() -> list[SplatScene]:
 
 
 def run_raster(plan: RasterPlan, out: Path) -> Results:
-    """Run the plan; write raster.json, raster.csv and the plots (PNG and SVG) into ``out``."""
+    """Run the plan; write raster.json (after each part), raster.csv and the plots (PNG, SVG) into ``out``."""
     plan.say("measuring the machine")
     results = Results(describe_machine(plan.thread_counts, peak_ms=20.0 if plan.quick else 200.0))
+    out.mkdir(parents=True, exist_ok=True)
+    scenes, size = plan.scenes(), plan.sizes[0]
+    runs, budget_s = plan.runs, plan.budget_s
     for count in plan.thread_counts:
-        for scene in plan.scenes():
-            for size in plan.sizes:
-                case = case_name(scene, size, count)
+        for scene in scenes:
+            for each in plan.sizes:
+                case = case_name(scene, each, count)
                 plan.say(case)
                 with threads(count):
-                    run_case(plan, results, scene, size, case, count)
-    most = max(plan.thread_counts)
-    with threads(most):
-        plan.say("loss")
-        run_loss(plan, results)
-        if plan.peers:
+                    run_case(plan, results, scene, each, case, count)
+        results.write_json(out / "raster.json")
+    parts: list[tuple[str, Callable[[], None]]] = [
+        ("loss", partial(run_loss, plan, results)),
+        ("what options cost", partial(run_effects, results, scenes[0], size, runs=runs, budget_s=budget_s)),
+        (
+            "accuracy against time",
+            partial(run_sweeps, results, scenes[1], size, runs=runs, budget_s=budget_s, quick=plan.quick),
+        ),
+        ("growth", partial(run_growth, results, runs=max(2, runs // 5), budget_s=budget_s, quick=plan.quick)),
+    ]
+    for name, part in parts:
+        plan.say(name)
+        with threads(max(plan.thread_counts)):
+            part()
+        results.write_json(out / "raster.json")
+    if plan.peers:
+        with threads(1):  # as the peers
             run_peers(plan, results)
-        plan.say("effects")
-        run_effects(results, plan.scenes()[0], plan.sizes[0], runs=plan.runs, budget_s=plan.budget_s)
-        plan.say("accuracy against time")
-        run_sweeps(results, plan.scenes()[1], plan.sizes[0], runs=plan.runs, budget_s=plan.budget_s, quick=plan.quick)
-        plan.say("growth")
-        run_growth(results, runs=max(2, plan.runs // 5), budget_s=plan.budget_s, quick=plan.quick)
-    out.mkdir(parents=True, exist_ok=True)
-    results.write_json(out / "raster.json")
     results.write_csv(out / "raster.csv")
     plot_sweeps(results, out)
     plot_growth(results, out)
@@ -196,7 +203,7 @@ def run_peers(plan: RasterPlan, results: Results) -> None:
     """Every peer on the first two scenes: its times, how many times splatbot's, and whether they agree."""
     size = plan.sizes[0]
     for scene in plan.scenes()[:2]:
-        case = case_name(scene, size, max(plan.thread_counts))
+        case = case_name(scene, size, 1)
         passes = Passes(scene, size, "RGB")
         own_forward = measure(passes.forward, runs=plan.runs, budget_s=plan.budget_s)
         own_both = measure(passes.forward_backward, runs=plan.runs, budget_s=plan.budget_s)
@@ -209,12 +216,9 @@ def run_peers(plan: RasterPlan, results: Results) -> None:
                 results.add(case + ", RGB", "forward", None, "ms", peer=peer.name, note="absent")
                 continue
             plan.say(f"{case}: {peer.name}")
-            # A peer has torch's threads, splatbot its own; on tiny scenes torch's would only spin.
-            torch.set_num_threads(1 if plan.quick else max(plan.thread_counts))
             forward = measure(partial(peer.render, scene, *size, None), runs=3, budget_s=plan.budget_s)
             both = measure(partial(peer.render, scene, *size, grad), runs=3, budget_s=plan.budget_s)
             theirs = peer.render(scene, *size, grad)
-            torch.set_num_threads(1)
             _add_peer(results, case + ", RGB", peer.name, (forward, both), (own_forward, own_both))
             _compare(results, case + ", RGB", peer.name, passes, theirs.image, theirs.gradients)
 

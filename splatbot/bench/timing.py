@@ -24,15 +24,22 @@ class Timing:
 
 
 def measure(function: Callable[[], object], *, runs: int, budget_s: float = 2.0) -> Timing:
-    """Time ``function`` after one run that does not count: ``runs`` times, or fewer if the budget is spent."""
-    function()
-    samples: list[float] = []
+    """Time ``function`` ``runs`` times, or fewer if the budget is spent.
+
+    A first run warms up and does not count, unless it alone spends the budget.
+    """
+    first = _milliseconds(function)
+    samples = [first] if first > 1e3 * budget_s else []
     end = time.perf_counter() + budget_s
-    while len(samples) < runs and (not samples or time.perf_counter() < end):
-        start = time.perf_counter()
-        function()
-        samples.append(1e3 * (time.perf_counter() - start))
+    while len(samples) < runs and (not samples or (time.perf_counter() < end and first <= 1e3 * budget_s)):
+        samples.append(_milliseconds(function))
     return Timing(min(samples), statistics.median(samples), len(samples))
+
+
+def _milliseconds(function: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    function()
+    return 1e3 * (time.perf_counter() - start)
 
 
 @contextmanager
