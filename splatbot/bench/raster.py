@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from splatbot.bench.effects import run_effects
-from splatbot.bench.machine import describe_machine
+from splatbot.bench.machine import describe_machine, raise_peaks
 from splatbot.bench.peers import all_peers
 from splatbot.bench.plots import plot_growth, plot_sweeps
 from splatbot.bench.results import Results
@@ -79,7 +79,9 @@ def run_raster(plan: RasterPlan, out: Path) -> Results:
                 case = case_name(scene, each, count)
                 plan.say(case)
                 with threads(count):
-                    run_case(plan, results, scene, each, case, count)
+                    run_case(plan, results, scene, each, case)
+                raise_peaks(results.machine, count, peak_ms=5.0 if plan.quick else 50.0)
+        add_shares(results, count)
         results.write_json(out / "raster.json")
     parts: list[tuple[str, Callable[[], None]]] = [
         ("loss", partial(run_loss, plan, results)),
@@ -98,6 +100,7 @@ def run_raster(plan: RasterPlan, out: Path) -> Results:
     if plan.peers:
         with threads(1):  # as the peers
             run_peers(plan, results)
+    results.write_json(out / "raster.json")
     results.write_csv(out / "raster.csv")
     plot_sweeps(results, out)
     plot_growth(results, out)
@@ -109,10 +112,8 @@ def case_name(scene: SplatScene, size: tuple[int, int], count: int) -> str:
     return f"{scene.name} {size[0]}x{size[1]}, {count} thread{'s' if count > 1 else ''}"
 
 
-def run_case(
-    plan: RasterPlan, results: Results, scene: SplatScene, size: tuple[int, int], case: str, count: int
-) -> None:
-    """Forward, forward and backward, pose only, memory, and the blend stage's share of the peak."""
+def run_case(plan: RasterPlan, results: Results, scene: SplatScene, size: tuple[int, int], case: str) -> None:
+    """Forward, forward and backward, pose only, memory, pairs and the stages' times."""
     passes = Passes(scene, size)
     for metric, function in (
         ("forward", passes.forward),
@@ -127,13 +128,21 @@ def run_case(
     results.add(case, "evaluated pairs", float(work.evaluated_pairs), "pairs")
     for stage in ("project", "order", "list_tiles", "blend", "blend_backward", "project_backward"):
         results.add(case, f"stage {stage}", getattr(work, f"{stage}_ms"), "ms")
+
+
+def add_shares(results: Results, count: int) -> None:
+    """The blend stages' shares of the peak, of the cases on ``count`` threads, once their peak is known."""
     peak = results.machine["fma_peak_gflops"][results.machine["isa"]][str(count)]
-    for name, flop, ms in (
-        ("forward", FORWARD_FLOP, work.blend_ms),
-        ("backward", BACKWARD_FLOP, work.blend_backward_ms),
-    ):
-        share = 1e-6 * flop * work.evaluated_pairs / ms / peak if ms > 0 else None
-        results.add(case, f"blend {name}, share of FMA peak", None if share is None else 100.0 * share, "%")
+    ending = f", {count} thread{'s' if count > 1 else ''}"
+    pairs = {r.case: r.value for r in results.rows if r.metric == "evaluated pairs" and r.case.endswith(ending)}
+    for case, evaluated in pairs.items():
+        for name, flop, stage in (
+            ("forward", FORWARD_FLOP, "stage blend"),
+            ("backward", BACKWARD_FLOP, "stage blend_backward"),
+        ):
+            ms = results.find(case, stage)
+            share = 1e-6 * flop * evaluated / ms / peak if ms and evaluated else None
+            results.add(case, f"blend {name}, share of FMA peak", None if share is None else 100.0 * share, "%")
 
 
 class Passes:

@@ -82,13 +82,22 @@ def _print(results: Results, folder: Path) -> None:
         f"{gflops:.0f} GFLOP/s on {n}" for n, gflops in machine["fma_peak_gflops"][machine["isa"]].items()
     )
     console.print(f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}, peak {peaks} threads")
+    if machine["load_1min"] is not None and machine["load_1min"] > 0.5:
+        console.print(f"[yellow]the machine was busy (load {machine['load_1min']}): times are upper bounds[/yellow]")
     prefixes = ("effect", "sweep", "growth")
     own = [r for r in results.rows if r.peer is None and not r.case.startswith(prefixes)]
     console.print(_table("Milliseconds, least (median)", own, (*_TIMES, "state memory", "peak memory", *_SHARES)))
     off, on = ("forward, off", "forward+backward, off"), ("forward, on minus off", "forward+backward, on minus off")
     console.print(_table("What an option costs", results.select("effect"), (*off, *on)))
     console.print(_table("Accuracy against time", results.select("sweep"), ("forward", "largest error", "PSNR")))
-    growth = ("forward+backward", "stages over Gaussians", "stages over pixels", "pairs per pixel")
+    growth = (
+        "forward+backward",
+        "stages over Gaussians",
+        "stages over pixels",
+        "pairs per pixel",
+        "one Gaussian",
+        "one evaluated pair",
+    )
     console.print(_table("Growth", results.select("growth"), growth))
     for row in results.select("growth"):
         if row.unit == "x":
