@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.errors import SplatbotError
-from splatbot.frame import Frame
 from splatbot.geometry import transform_points
 from splatbot.logs import Log, open_log
 from splatbot.logs.record import record
 from splatbot.run import Progress, map_log
+from splatbot.sim.effects.base import Effects
 from splatbot.sim.effects.depth_noise import DepthNoise
 
 _START_S = 120.0  # the service imports torch first
@@ -49,9 +49,10 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
     scene = open_log(f"synthetic:tabletop?frames={frames}")
     shutil.rmtree(out / "log", ignore_errors=True)
     _say(f"1/4 recording {frames} frames of a synthetic table top, with a depth camera's noise → {out / 'log'}")
-    record(_noisy(scene), out / "log", ground_truth=scene.ground_truth)
+    effects = Effects([DepthNoise(why="a depth camera measures no table top exactly")])
+    record(effects.over(scene), out / "log", ground_truth=scene.ground_truth)
     _say("2/4 mapping the recording")
-    run = map_log(open_log(out / "log"), out=out, on_progress=_tell)
+    run = map_log(open_log(out / "log"), out=out, on_progress=_tell, effects=effects.report())
     if run.exit_code:
         _say(f"mapping ended early: {run.error or 'interrupted'}")
         return run.exit_code
@@ -121,12 +122,6 @@ def _judge(question: _Question, answer: dict[str, Any]) -> int:
         wrong += bool(inside) != occupied
     _say(f"    answered on map_version {answer['map_version']}")
     return wrong
-
-
-def _noisy(scene: Log) -> Iterator[Frame]:
-    effect = DepthNoise()
-    for frame in scene:
-        yield effect.apply(frame, np.random.default_rng([0, frame.index]))
 
 
 @contextmanager

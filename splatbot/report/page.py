@@ -52,6 +52,7 @@ def report_html(
         _section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
         _section("Time per frame", _image(stages_plot(rows), "milliseconds per stage"), _stages(metrics)),
         _section("Map", _image(gaussians_plot(rows), "Gaussians over frames")),
+        _section("Simulated sensor effects", _effects(metrics["effects"])),
         _details("Configuration", f"<pre>{html.escape(config.to_yaml())}</pre>"),
         _details("Versions", _table(("", ""), _versions())),
     ]
@@ -133,6 +134,11 @@ def _stages(metrics: Mapping[str, Any]) -> str:
     rows += [(name, values, values["frames"]) for name, values in metrics["stages"].items()]
     cells = [(name, *(milliseconds(v[p]) for p in ("p50", "p95", "p99")), str(n)) for name, v, n in rows]
     return _table(("stage", "p50", "p95", "p99", "frames"), cells)
+
+
+def _effects(effects: Sequence[Mapping[str, Any]]) -> str:
+    cells = [(e["name"], e["why"], milliseconds(e["ms_per_frame"]), str(e["frames"])) for e in effects]
+    return _table(("effect", "why", "per frame", "frames"), cells)
 
 
 def _versions() -> list[tuple[str, str]]:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from splatbot.errors import InputError
 from tests.scenes import NAMES, Scene, compare, hard_scene, one_gaussian, pinhole
 
 FORWARD_BOUND = 1e-5
@@ -220,3 +221,60 @@ def test_plane_depth_of_a_disc_seen_edge_on_stays_within_the_disc() -> None:
         assert float((depth[..., 0][seen] - 2.0).abs().max()) <= 2 * 0.1 * 3.34
         want = scene.reference("ED", depth_mode="plane")[0]
         assert float((depth.double() - want)[seen].abs().max()) <= 2e-4
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-3, 1.0, 1e3])
+def test_standard_deviations_from_a_micrometre_to_a_kilometre(sigma: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    scene = hard_scene(14)
+    scene.scales = sigma * (0.5 + 0.5 * torch.rand(400, 3, generator=generator))
+    scene.opacities = 0.02 + 0.3 * torch.rand(400, generator=generator)  # a huge one is its opacity at every pixel
+    assert_within_bounds(scene, forward=2e-5)
+
+
+@pytest.mark.parametrize("ratio", [1e2, 1e3])
+def test_needles_given_as_covariances(ratio: float) -> None:
+    scene = hard_scene(15)
+    axes = torch.linalg.qr(torch.randn(400, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    M = axes * torch.tensor([0.3, 0.3 / ratio, 0.3 / ratio], dtype=torch.float64)
+    scene.covars, scene.quats, scene.scales = (M @ M.mT).float(), None, None  # type: ignore[assignment]
+    assert_within_bounds(scene, forward=1e-4, gradient=1e-3)
+
+
+@pytest.mark.parametrize("sigma_px", [1e-3, 0.1, 10.0])
+def test_antialiasing_where_the_blur_is_all_there_is_and_where_it_is_nothing(sigma_px: float) -> None:
+    scene = hard_scene(16)
+    scene.opacities = 0.9 + 0.1 * scene.opacities
+    scene.scales = torch.full_like(scene.scales, sigma_px * 2.5 / 60.0)
+    scene.scales[:, 1] *= 0.1
+    result = compare(scene, "RGB", rasterize_mode="antialiased")
+    assert result.forward <= FORWARD_BOUND
+    assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
+
+
+def test_forward_and_backward_count_a_gaussian_in_the_same_pixels() -> None:
+    """With colours of 1, the gradients to the colours of the sum of the image sum to the sum of alpha, jumps or not."""
+    generator = torch.Generator().manual_seed(0)
+    scene = hard_scene(17, n=3000)
+    scene.opacities = 0.0039 + 4e-5 * torch.rand(3000, generator=generator)  # every alpha is within 2 % of 1/255
+    scene.opacities[:1000] = 0.99 + 0.01 * torch.rand(1000, generator=generator)
+    scene.scales = 0.05 + 0.3 * torch.rand(3000, 3, generator=generator)
+    scene.colors, scene.backgrounds = torch.ones(3000, 1, requires_grad=True), None
+    image, alpha, meta = scene.render("RGB")
+    image.sum().backward()
+    assert scene.colors.grad is not None
+    total = float(alpha.double().sum())
+    assert float(scene.colors.grad.double().sum()) == pytest.approx(total, rel=2e-6)
+    counted = meta["contributions"][0] > 0
+    assert torch.equal(counted, scene.colors.grad[:, 0] > 0)
+
+
+@pytest.mark.parametrize("name", ["covars", "colors"])
+def test_covariances_and_harmonics_that_are_not_finite_are_named(name: str) -> None:
+    scene = hard_scene(18, n=1500)
+    scene.covars, scene.quats, scene.scales = torch.eye(3).repeat(1500, 1, 1), None, None  # type: ignore[assignment]
+    scene.colors = torch.zeros(1500, 25, 3)
+    getattr(scene, name)[1234, 2, 2] = float("inf")
+    with pytest.raises(InputError, match="row 1234 ") as caught:
+        scene.render("RGB", sh_degree=4)
+    assert caught.value.field == name

@@ -283,6 +283,30 @@ void add_camera_gradient(const View& view, const CameraGradient& from, std::span
   }
 }
 
+void describe_one(const RasterState& state, std::size_t i, const Projections& out) {
+  constexpr double kRootHalfLog2e = 0.84932180028801904;  // d of Record in standard deviations
+  const Placement& place = state.placements[i];
+  const bool visible = place.nx != 0;
+  const Record& r = state.records[i];
+  const double l11 = visible ? r.l11 / kRootHalfLog2e : 0.0;
+  const double l21 = visible ? r.l21 / kRootHalfLog2e : 0.0;
+  const double l22 = visible ? r.l22 / kRootHalfLog2e : 0.0;
+  const double lo = visible ? r.lo : kLog2AlphaMin;
+  out.means2d[2 * i] = visible ? r.mx : 0.0F;
+  out.means2d[2 * i + 1] = visible ? r.my : 0.0F;
+  out.depths[i] = std::bit_cast<float>(visible ? place.depth_bits : 0U);
+  out.conics[3 * i] = static_cast<float>(l11 * l11);
+  out.conics[3 * i + 1] = static_cast<float>(l11 * l21);
+  out.conics[3 * i + 2] = static_cast<float>(l21 * l21 + l22 * l22);
+  out.opacities[i] = visible ? static_cast<float>(std::exp2(lo)) : 0.0F;
+  const double sigmas =
+      std::min(static_cast<double>(kMaxSigmas), std::sqrt(2.0 * std::log(2.0) * std::max(lo - kLog2AlphaMin, 0.0)));
+  const double sx = visible ? std::sqrt(l21 * l21 + l22 * l22) / (l11 * l22) : 0.0;
+  const double sy = visible ? 1.0 / l22 : 0.0;
+  out.radii[2 * i] = static_cast<std::int32_t>(std::min(1e9, std::ceil(sigmas * sx)));
+  out.radii[2 * i + 1] = static_cast<std::int32_t>(std::min(1e9, std::ceil(sigmas * sy)));
+}
+
 BackwardScratch& scratch() {
   static thread_local BackwardScratch instance;
   return instance;
@@ -393,6 +417,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                      .grad_colors = grad_colors.empty() ? nullptr : grad_colors.data(),
                                      .grad_alphas = grad_alphas.empty() || p > 0 ? nullptr : grad_alphas.data(),
                                      .channel_sums = sums,
+                                     .geometry = geometry,
                                      .absolute = !out.absolute2d.empty(),
                                      .slots = s.slots.data()};
     Stopwatch watch;
@@ -410,6 +435,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                          .last = p + 1 == passes,
                                          .accumulate = out.accumulate,
                                          .accumulate_colors = out.accumulate && !harmonics,
+                                         .geometry = geometry,
                                          .means = pointer(out.means),
                                          .quats = pointer(out.quats),
                                          .scales = pointer(out.scales),
@@ -451,29 +477,12 @@ void describe_projections(const RasterState& state, const Projections& out) {
               out.conics.size() == 3 * state.count && out.radii.size() == 2 * state.count &&
               out.opacities.size() == state.count,
           "an output has a wrong size");
-  constexpr double kRootHalfLog2e = 0.84932180028801904;  // d of Record in standard deviations
-  for (std::size_t i = 0; i < state.count; ++i) {
-    const Placement& place = state.placements[i];
-    const bool visible = place.nx != 0;
-    const Record& r = state.records[i];
-    const double l11 = visible ? r.l11 / kRootHalfLog2e : 0.0;
-    const double l21 = visible ? r.l21 / kRootHalfLog2e : 0.0;
-    const double l22 = visible ? r.l22 / kRootHalfLog2e : 0.0;
-    out.means2d[2 * i] = visible ? r.mx : 0.0F;
-    out.means2d[2 * i + 1] = visible ? r.my : 0.0F;
-    out.depths[i] = std::bit_cast<float>(visible ? place.depth_bits : 0U);
-    out.conics[3 * i] = static_cast<float>(l11 * l11);
-    out.conics[3 * i + 1] = static_cast<float>(l11 * l21);
-    out.conics[3 * i + 2] = static_cast<float>(l21 * l21 + l22 * l22);
-    const double lo = visible ? r.lo : kLog2AlphaMin;
-    out.opacities[i] = visible ? static_cast<float>(std::exp2(lo)) : 0.0F;
-    const double sigmas = std::min(static_cast<double>(kMaxSigmas),
-                                   std::sqrt(2.0 * std::log(2.0) * std::max(lo - kLog2AlphaMin, 0.0)));
-    const double sx = visible ? std::hypot(l21, l22) / (l11 * l22) : 0.0;
-    const double sy = visible ? 1.0 / l22 : 0.0;
-    out.radii[2 * i] = static_cast<std::int32_t>(std::min(1e9, std::ceil(sigmas * sx)));
-    out.radii[2 * i + 1] = static_cast<std::int32_t>(std::min(1e9, std::ceil(sigmas * sy)));
-  }
+  thread_pool()->run(state.blocks.size(), [&](std::size_t b) {
+    const std::size_t end = std::min(state.count, (b + 1) * kProjectBlock);
+    for (std::size_t i = b * kProjectBlock; i < end; ++i) {
+      describe_one(state, i, out);
+    }
+  });
 }
 
 void count_contributions(const RasterState& const_state, std::span<std::int32_t> out) {

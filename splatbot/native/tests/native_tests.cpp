@@ -29,6 +29,8 @@ void check(bool ok, const std::string& promise) {
 struct Scene {
   int channels;
   std::vector<float> means, quats, scales, opacities, colors;
+  std::vector<float> covars = {};  // in place of quats and scales, or empty
+  int sh_degree = -1, coefficients = 0;
 
   Gaussians gaussians() const {
     return {.count = opacities.size(),
@@ -36,8 +38,11 @@ struct Scene {
             .means = means,
             .quats = quats,
             .scales = scales,
+            .covars = covars,
             .opacities = opacities,
-            .colors = colors};
+            .colors = colors,
+            .sh_degree = sh_degree,
+            .coefficients = coefficients};
   }
 };
 
@@ -65,6 +70,32 @@ Scene make_scene(std::size_t n, int channels, unsigned seed) {
   return s;
 }
 
+// The scene's scales along the world's axes, as covariances.
+void use_covars(Scene& s) {
+  for (std::size_t i = 0; i < s.opacities.size(); ++i) {
+    for (std::size_t k = 0; k < 9; ++k) {
+      const float scale = s.scales[3 * i + k / 3];
+      s.covars.push_back(k % 4 == 0 ? scale * scale : 0.0F);
+    }
+  }
+  if (!s.covars.empty()) {
+    s.quats.clear();
+    s.scales.clear();
+  }
+}
+
+void use_harmonics(Scene& s, int degree, unsigned seed) {
+  std::mt19937 random(seed);
+  std::normal_distribution<float> normal;
+  s.sh_degree = degree;
+  s.coefficients = 25;
+  s.channels = 3;
+  s.colors.resize(s.opacities.size() * 75);
+  for (float& value : s.colors) {
+    value = normal(random);
+  }
+}
+
 View make_view(int width, int height) {
   View view{};
   view.rotation[0] = view.rotation[4] = view.rotation[8] = 1.0F;
@@ -77,8 +108,9 @@ View make_view(int width, int height) {
 }
 
 struct Result {
-  std::vector<float> image, alphas, means, quats, scales, opacities, colors;
-  std::vector<double> viewmat, background;
+  std::vector<float> image, alphas, means, quats, scales, covars, opacities, colors, means2d, absolute2d;
+  std::vector<double> camera, background;
+  std::vector<std::int32_t> contributions;
 
   bool operator==(const Result& other) const {
     const auto same = [](const auto& a, const auto& b) {
@@ -86,11 +118,13 @@ struct Result {
     };
     return same(image, other.image) && same(alphas, other.alphas) && same(means, other.means) &&
            same(quats, other.quats) && same(scales, other.scales) && same(opacities, other.opacities) &&
-           same(colors, other.colors) && same(viewmat, other.viewmat) && same(background, other.background);
+           same(colors, other.colors) && same(covars, other.covars) && same(means2d, other.means2d) &&
+           same(absolute2d, other.absolute2d) && same(camera, other.camera) && same(background, other.background) &&
+           same(contributions, other.contributions);
   }
 };
 
-Result render(const Scene& scene, const View& view, const RasterOptions& options) {
+Result render(const Scene& scene, const View& view, const RasterOptions& options, bool masked = false) {
   const Gaussians g = scene.gaussians();
   const std::size_t pixels = static_cast<std::size_t>(view.width) * static_cast<std::size_t>(view.height);
   const std::size_t columns =
@@ -100,7 +134,18 @@ Result render(const Scene& scene, const View& view, const RasterOptions& options
   r.alphas.resize(pixels);
   const std::vector<float> background(static_cast<std::size_t>(scene.channels), 0.25F);
   RasterStatePtr state;
-  check(!rasterize_forward(g, view, options, background, r.image, r.alphas, state), "finite inputs are no fault");
+  constexpr int kMaskSize = 5;
+  std::vector<std::uint8_t> keep;
+  if (masked) {
+    keep.resize(static_cast<std::size_t>((view.width + kMaskSize - 1) / kMaskSize) *
+                static_cast<std::size_t>((view.height + kMaskSize - 1) / kMaskSize));
+    for (std::size_t i = 0; i < keep.size(); ++i) {
+      keep[i] = i % 3 != 0 ? 1 : 0;
+    }
+  }
+  const TileMask mask = {.keep = keep, .size = kMaskSize};
+  check(!rasterize_forward(g, view, options, background, mask, r.image, r.alphas, state),
+        "finite inputs are no fault");
   for (const float alpha : r.alphas) {
     check(alpha >= 0.0F && alpha <= 1.0F, "alpha lies in 0..1");
   }
@@ -117,24 +162,35 @@ Result render(const Scene& scene, const View& view, const RasterOptions& options
   r.scales.resize(g.scales.size());
   r.opacities.resize(g.count);
   r.colors.resize(g.colors.size());
-  r.viewmat.resize(12);
+  r.covars.resize(g.covars.size());
+  r.means2d.resize(2 * g.count);
+  r.absolute2d.resize(2 * g.count);
+  r.camera.resize(16);
+  r.contributions.resize(g.count);
   r.background.resize(background.size());
   const Gradients out = {.means = r.means,
                          .quats = r.quats,
                          .scales = r.scales,
+                         .covars = r.covars,
                          .opacities = r.opacities,
                          .colors = r.colors,
-                         .viewmat = r.viewmat,
-                         .background = r.background};
+                         .camera = r.camera,
+                         .background = r.background,
+                         .means2d = r.means2d,
+                         .absolute2d = r.absolute2d};
   rasterize_backward(*state, g, background, grad_image, grad_alphas, out);
-  for (const auto* gradient : {&r.means, &r.quats, &r.scales, &r.opacities, &r.colors}) {
+  for (const auto* gradient : {&r.means, &r.quats, &r.scales, &r.covars, &r.opacities, &r.colors, &r.means2d}) {
     for (const float value : *gradient) {
       check(std::isfinite(value), "gradients are finite");
     }
   }
-  std::vector<float> means2d(2 * g.count), depths(g.count), conics(3 * g.count);
-  std::vector<std::int32_t> radii(2 * g.count), tiles(g.count);
-  describe_projections(*state, g.opacities, {means2d, depths, conics, radii, tiles});
+  std::vector<float> means2d(2 * g.count), depths(g.count), conics(3 * g.count), opacities(g.count);
+  std::vector<std::int32_t> radii(2 * g.count);
+  describe_projections(*state, {means2d, depths, conics, radii, opacities});
+  count_contributions(*state, r.contributions);
+  for (const std::int32_t count : r.contributions) {
+    check(count >= 0 && static_cast<std::size_t>(count) <= pixels, "a Gaussian counts in no more pixels than there are");
+  }
   check(visible_ids(*state).size() <= g.count, "no more Gaussians are seen than there are");
   return r;
 }
@@ -164,16 +220,41 @@ void run_all(const std::string& isa) {
   std::printf("%s: %d renders, forward and backward, on 1, 2 and 8 threads\n", isa.c_str(), renders);
 }
 
+void run_variants(const std::string& isa) {
+  int renders = 0;
+  for (const std::size_t n : {std::size_t{0}, std::size_t{1}, std::size_t{40}, std::size_t{2500}}) {
+    for (int degree = -1; degree <= kMaxHarmonicsDegree; ++degree) {
+      for (const bool of_covars : {false, true}) {
+        Scene scene = make_scene(n, 3, 11);
+        if (of_covars) {
+          use_covars(scene);
+        }
+        if (degree >= 0) {
+          use_harmonics(scene, degree, 3);
+        }
+        const RasterOptions options = {.depth = degree % 2 == 0 ? DepthMode::expected : DepthMode::none,
+                                       .antialiased = degree % 3 == 0};
+        set_num_threads(1);
+        const Result want = render(scene, make_view(70, 45), options, true);
+        set_num_threads(3);
+        check(render(scene, make_view(70, 45), options, true) == want, "threads change no bit of any variant");
+        ++renders;
+      }
+    }
+  }
+  std::printf("%s: %d renders of harmonics, covariances, masks and antialiasing\n", isa.c_str(), renders);
+}
+
 void check_errors() {
   Scene scene = make_scene(5000, 3, 1);
   scene.scales[3 * 4321 + 1] = std::nanf("");
   std::vector<float> image(32 * 16 * 3), alphas(32 * 16);
   RasterStatePtr state;
-  const auto fault = rasterize_forward(scene.gaussians(), make_view(32, 16), {}, {}, image, alphas, state);
+  const auto fault = rasterize_forward(scene.gaussians(), make_view(32, 16), {}, {}, {}, image, alphas, state);
   check(fault && fault->field == "scales" && fault->row == 4321, "a NaN is found with its field and row");
   bool thrown = false;
   try {
-    rasterize_forward(make_scene(5, 3, 1).gaussians(), make_view(33, 16), {}, {}, image, alphas, state);
+    rasterize_forward(make_scene(5, 3, 1).gaussians(), make_view(33, 16), {}, {}, {}, image, alphas, state);
   } catch (const std::invalid_argument&) {
     thrown = true;
   }
@@ -208,6 +289,7 @@ int main() {
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);
+    run_variants(isa);
     run_optimize();
   }
   std::puts("all promises kept");

@@ -20,6 +20,8 @@ from splatbot.report.images import MAX_WIDTH, colour_png, depth_png, difference_
 from splatbot.results.folder import FrameRow, RunFolder
 from splatbot.results.units import decibels
 from splatbot.run import RunResult, map_log
+from splatbot.sim.effects.base import Effects
+from splatbot.sim.effects.depth_noise import DepthNoise
 from tests.unit.oracle import OracleSlam
 
 MakeLog = Callable[..., Path]
@@ -131,6 +133,18 @@ def test_a_run_without_held_out_frames_says_so(make_log: MakeLog, tmp_path: Path
 def test_a_run_of_one_frame_has_a_report(make_log: MakeLog, tmp_path: Path) -> None:
     _, page = report(open_log(make_log(1)), tmp_path / "run")
     assert "1/1" in page.all_text
+
+
+def test_simulated_effects_are_named_with_the_reason_and_a_real_sensor_has_none(log: Log, tmp_path: Path) -> None:
+    effects = Effects([DepthNoise(why="asked for by a test")])
+    effects(log.read(0))
+    assert log.ground_truth is not None
+    for name, account in (("simulated", effects.report()), ("real", [])):
+        map_log(log, out=tmp_path / name, slam=OracleSlam(log.ground_truth), effects=account)
+    simulated, real = (Page(RunFolder(tmp_path / name).report.read_text()).all_text for name in ("simulated", "real"))
+    assert "Simulated sensor effects" in simulated
+    assert "asked for by a test" in simulated
+    assert "Simulated sensor effects" not in real
 
 
 def test_bands_span_neighbouring_frames_that_are_not_ok() -> None:

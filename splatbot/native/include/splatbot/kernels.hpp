@@ -63,6 +63,7 @@ struct BlendBackwardArgs {
   const float* grad_colors;  // (H, W, out_channels) or null
   const float* grad_alphas;  // (H, W) or null; null for all but the first pass
   int channel_sums;          // how many channels' gradients are summed: 0, 1 (depth) or all
+  bool geometry;             // not the colours' gradients alone
   bool absolute;             // sum absolute gradients of the centre as well
   float* slots;              // (pairs, kSlot)
 };
@@ -78,6 +79,7 @@ struct ProjectBackwardArgs {
   bool first, last;
   bool accumulate;  // add to the outputs
   bool accumulate_colors;
+  bool geometry;  // not the colours' gradients alone
   // Outputs; null: not asked for.
   float *means, *quats, *scales, *covars, *opacities, *colors, *means2d, *absolute2d;
   double* camera;  // (blocks, kCameraSums) partial sums

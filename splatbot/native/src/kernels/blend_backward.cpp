@@ -72,9 +72,13 @@ void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const floa
 
 SB_INLINE F abs(F a) { return max(a, -a); }
 
+// What is summed of each pair besides the channels' gradients.
+enum class Sums { none, moments, absolute };
+
 // Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha); then weight times gradient for the first S channels; then,
-// if Absolute, the absolute gradients of the centre in x (less a factor) and y.
-template <int C, int S, bool Plane, bool Absolute>
+// if absolute, the absolute gradients of the centre in x (less a factor) and y. Without moments there is no need of
+// the gradient to alpha.
+template <int C, int S, bool Plane, Sums Kind>
 SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDepth& plane, std::uint32_t mask,
                         TileGradient& state, float* slot) {
   F acc[16];
@@ -101,13 +105,18 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
         if (Plane && c == 0) {
           value = fma(set1(plane.slope_x), x, fma(set1(plane.slope_y), y, set1(plane.corner)));
         }
-        along = fma(value, g, along);
+        if (Kind != Sums::none) {
+          along = fma(value, g, along);
+        }
         if (c < S) {
           acc[kMoments + c] = fma(step.weight, g, acc[kMoments + c]);
         }
       }
-      const F rest = fnma(step.weight, along, load(state.rest + first));
       store(state.through + first, through);
+      if (Kind == Sums::none) {
+        continue;
+      }
+      const F rest = fnma(step.weight, along, load(state.rest + first));
       store(state.rest + first, rest);
       // alpha x d loss / d alpha; none where the cap holds alpha, nor in closed pixels.
       const F other = a.alpha * reciprocal(a.left) * rest;
@@ -121,16 +130,16 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
       acc[3] = fma(vu, a.u, acc[3]);
       acc[4] = fma(vu, a.w, acc[4]);
       acc[5] = fma(vw, a.w, acc[5]);
-      if (Absolute) {
+      if (Kind == Sums::absolute) {
         acc[kAbsolute] = acc[kAbsolute] + abs(vu);
         acc[kAbsolute + 1] = acc[kAbsolute + 1] + abs(fma(set1(local.l21), vu, set1(local.l22) * vw));
       }
     }
   } while (mask != 0);
-  store_sums<Absolute ? kSlot : kMoments + S>(slot, acc);
+  store_sums<Kind == Sums::absolute ? kSlot : kMoments + S>(slot, acc);
 }
 
-template <int C, int S, bool Plane, bool Absolute>
+template <int C, int S, bool Plane, Sums Kind>
 void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
   const BlendArgs& f = args.forward;
   const std::uint32_t begin = f.tile_begin[tile];
@@ -152,20 +161,22 @@ void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::
     const Local local = localize(f.records[id], frame);
     const float* channels = f.channels + id * f.channel_stride;
     const PlaneDepth plane = Plane ? plane_depth(f.records[id], channels, frame) : PlaneDepth{};
-    sum_pair<C, S, Plane, Absolute>(local, channels, plane, mask, state, slot);
+    sum_pair<C, S, Plane, Kind>(local, channels, plane, mask, state, slot);
   }
 }
 
 template <int C, bool Plane>
 void backward_sums(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
   if (args.absolute) {  // for densification, which wants all gradients anyway
-    backward_lists<C, C, Plane, true>(args, frame, tile, state);
+    backward_lists<C, C, Plane, Sums::absolute>(args, frame, tile, state);
+  } else if (!args.geometry) {
+    backward_lists<C, C, Plane, Sums::none>(args, frame, tile, state);
   } else if (args.channel_sums == 0) {
-    backward_lists<C, 0, Plane, false>(args, frame, tile, state);
+    backward_lists<C, 0, Plane, Sums::moments>(args, frame, tile, state);
   } else if (args.channel_sums == 1) {
-    backward_lists<C, 1, Plane, false>(args, frame, tile, state);
+    backward_lists<C, 1, Plane, Sums::moments>(args, frame, tile, state);
   } else {
-    backward_lists<C, C, Plane, false>(args, frame, tile, state);
+    backward_lists<C, C, Plane, Sums::moments>(args, frame, tile, state);
   }
 }
 

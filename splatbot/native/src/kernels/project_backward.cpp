@@ -391,7 +391,7 @@ void project_backward(const ProjectBackwardArgs& args, std::size_t b) {
     const int n = block.visible - at < W ? static_cast<int>(block.visible - at) : W;
     LaneSums sums;
     collect(args, block, ids, n, sums);
-    if (!args.last) {
+    if (!args.last || !args.geometry) {
       continue;
     }
     GaussianLanes g;
