@@ -82,6 +82,12 @@ class MappingConfig(_Section):
     final_iterations: int = Field(default=200, ge=0, description="optimiser steps once the log has ended")
     window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")
     depth_weight: float = Field(default=0.5, ge=0, description="weight of relative depth against colour")
+    dssim_weight: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="share of structure (1 - SSIM) in the colour loss; 0: colour alone, cheaper",
+    )
     rate_means: float = Field(default=2e-4, ge=0, description="learning rate of positions [m]")
     rate_quats: float = Field(default=1e-3, ge=0, description="learning rate of orientations")
     rate_scales: float = Field(default=5e-3, ge=0, description="learning rate of log-scales")

@@ -26,6 +26,7 @@ COMMANDS = {
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
+    "bench": _Command("splatbot.cli.bench", "bench", "Measure speed, and what accuracy costs in time."),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 

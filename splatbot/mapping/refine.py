@@ -13,7 +13,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.harmonics import sh_to_rgb
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
-from splatbot.optimize.losses import l1
+from splatbot.optimize.losses import l1, l1_dssim
 from splatbot.rasterize import rasterization
 
 
@@ -86,8 +86,13 @@ class Refiner:
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         observed = keyframe.rgb.float() / 255.0
         covered = alpha[..., 0].detach() > 0.5
-        color = l1(render[..., :3], observed, covered[..., None])
+        color = self._color_loss(render[..., :3], observed, covered)
         depth = keyframe.depth[..., None]
         ranged = (depth > 0) & covered[..., None]
         relative = l1(render[..., 3:] / depth.clamp_min(0.1), depth / depth.clamp_min(0.1), ranged)
         return color + self.config.depth_weight * relative
+
+    def _color_loss(self, rendered: Tensor, observed: Tensor, covered: Tensor) -> Tensor:
+        if self.config.dssim_weight > 0:
+            return l1_dssim(rendered, observed, self.config.dssim_weight, covered)
+        return l1(rendered, observed, covered[..., None])

@@ -7,7 +7,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
+from splatbot.rasterize.native import native
 
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -46,18 +48,83 @@ class GaussianAdam:
 
     @torch.no_grad()
     def step(self, model: GaussianModel, grads: Mapping[str, Tensor], visible: Tensor) -> None:
-        """One step in place, of the rows that ``visible`` (N,) marks."""
-        rows = visible.nonzero()[:, 0]
-        self.steps[rows] += 1
-        b1, b2 = self.betas
-        count = self.steps[rows]
-        c1, c2 = 1 - b1**count, 1 - b2**count
-        for name, grad in grads.items():
-            g = grad[rows]
-            m = self.first[name][rows].mul_(b1).add_(g, alpha=1 - b1)
-            v = self.second[name][rows].mul_(b2).addcmul_(g, g, value=1 - b2)
-            self.first[name][rows] = m
-            self.second[name][rows] = v
-            shape = (-1,) + (1,) * (g.ndim - 1)
-            update = m / c1.view(shape) / ((v / c2.view(shape)).sqrt_() + self.eps)
-            getattr(model, name)[rows] -= self.rates[name] * update
+        """One step in place, of the rows that ``visible`` (N,) marks; the others keep their bits.
+
+        Raises:
+            InputError: ``visible`` or a gradient does not fit the model, or rows came without :meth:`extend`.
+        """
+        if len(self.steps) != len(model):
+            raise InputError(
+                f"knows {len(self.steps)} rows of {len(model)}.", field="adam", hint="call extend() or select() first"
+            )
+        adam_step(
+            {name: getattr(model, name) for name in grads},
+            grads,
+            self.first,
+            self.second,
+            self.steps,
+            visible,
+            self.rates,
+            betas=self.betas,
+            eps=self.eps,
+        )
+
+
+def adam_step(
+    parameters: Mapping[str, Tensor],
+    grads: Mapping[str, Tensor],
+    first: Mapping[str, Tensor],
+    second: Mapping[str, Tensor],
+    steps: Tensor,
+    visible: Tensor,
+    rates: Mapping[str, float],
+    *,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """One step of Adam in place, natively, on the rows that ``visible`` marks.
+
+    Args:
+        parameters: (N, ...) each, float32, contiguous; changed in place, as are the moments.
+        grads: of each parameter; ``first`` and ``second``: its moments, all of its shape.
+        steps: (N,) float32, the number of steps each row has taken; counted up for the visible ones.
+        visible: (N,) bool.
+        rates: learning rate of each parameter.
+        betas: decay of the two moments.
+        eps: added to the root of the second moment, > 0.
+
+    Raises:
+        InputError: a shape, type or layout does not fit.
+    """
+    n = len(steps)
+    if visible.dtype != torch.bool or visible.shape != (n,):
+        raise InputError(f"is {tuple(visible.shape)}, {visible.dtype}.", field="visible", hint=f"give bool ({n},)")
+    if not eps > 0.0:
+        raise InputError(f"is {eps}.", field="eps", hint="give a positive number; 0 divides by 0 at a zero gradient")
+    names = list(parameters)
+    for name in names:
+        _check(name, parameters[name], n)
+        for what, tensors in (("gradient", grads), ("first moment", first), ("second moment", second)):
+            if tensors[name].shape != parameters[name].shape or tensors[name].dtype != torch.float32:
+                got = f"{tuple(tensors[name].shape)}, {tensors[name].dtype}"
+                raise InputError(f"has a {what} of {got}.", field=name, hint="give the parameter's shape, float32")
+        for moments in (first, second):
+            _check(name, moments[name], n)
+    native().adam_step(
+        [parameters[name].detach() for name in names],
+        [grads[name].detach().contiguous() for name in names],
+        [first[name] for name in names],
+        [second[name] for name in names],
+        [rates[name] for name in names],
+        visible.contiguous().view(torch.uint8),
+        steps,
+        *betas,
+        eps,
+    )
+
+
+def _check(name: str, tensor: Tensor, rows: int) -> None:
+    if tensor.ndim == 0 or len(tensor) != rows:
+        raise InputError(f"is {tuple(tensor.shape)}.", field=name, hint=f"give {rows} rows")
+    if tensor.dtype != torch.float32 or tensor.device.type != "cpu" or not tensor.is_contiguous():
+        raise InputError("is changed in place.", field=name, hint="give contiguous float32 on the CPU")

@@ -5,9 +5,11 @@ NB_MODULE(_native, m) {
   m.doc() = "splatbot's C++ core";
   nanobind::set_leak_warnings(false);  // a render kept until the interpreter exits is no leak
   define_align(m);
+  define_baseline(m);
   define_depth(m);
   define_mahalanobis(m);
   define_matching(m);
+  define_optimize(m);
   define_rasterize(m);
   define_lens(m);
   define_surfels(m);

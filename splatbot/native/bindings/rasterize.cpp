@@ -13,6 +13,7 @@
 
 #include "splatbot/fronts.hpp"
 #include "splatbot/isa.hpp"
+#include "splatbot/raster_work.hpp"
 #include "splatbot/rasterizer.hpp"
 #include "splatbot/threads.hpp"
 
@@ -156,6 +157,19 @@ void fronts(const State& state, const Array<const std::int64_t, nb::shape<-1>>& 
   splatbot::front_gaussians(*state.state, span_of(pixels), ids.shape(1), span_of(ids), span_of(weights));
 }
 
+nb::dict work(const State& state) {
+  const splatbot::StageTimes& times = splatbot::stage_times(*state.state);
+  nb::dict d;
+  d["project_ms"] = times.project;
+  d["order_ms"] = times.order;
+  d["list_tiles_ms"] = times.list_tiles;
+  d["blend_ms"] = times.blend;
+  d["blend_backward_ms"] = times.blend_backward;
+  d["project_backward_ms"] = times.project_backward;
+  d["evaluated_pairs"] = splatbot::evaluated_pairs(*state.state);
+  return d;
+}
+
 }  // namespace
 
 void define_rasterize(nb::module_& m) {
@@ -170,7 +184,8 @@ void define_rasterize(nb::module_& m) {
       .def("medians", &medians, "out"_a.noconvert(),
            "Write to out (H, W) the Gaussian at which transmittance falls to 1/2, -1 where it does not.")
       .def("fronts", &fronts, "pixels"_a.noconvert(), "ids"_a.noconvert(), "weights"_a.noconvert(),
-           "Write the front K Gaussians of pixels (P,), y W + x, to ids and weights (P, K).");
+           "Write the front K Gaussians of pixels (P,), y W + x, to ids and weights (P, K).")
+      .def("work", &work, "Milliseconds by stage of the last passes, and the (Gaussian, pixel) pairs of a blend pass.");
 
   m.def("rasterize_forward", &forward, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
         nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),

@@ -10,6 +10,7 @@
 #include "checks.hpp"
 #include "pull_back.hpp"
 #include "splatbot/kernels.hpp"
+#include "splatbot/stopwatch.hpp"
 #include "splatbot/threads.hpp"
 #include "state_store.hpp"
 
@@ -206,8 +207,10 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
 
   const Kernels& k = kernels();
   const std::shared_ptr<ThreadPool> pool = thread_pool();
+  Stopwatch watch;
   const ProjectArgs project = project_args(state, g);
   pool->run(state.blocks.size(), [&](std::size_t b) { k.project(project, b, state.blocks[b]); });
+  state.times = {.project = watch.lap()};
   if (const std::optional<Fault> fault = find_fault(state.blocks)) {
     return fault;
   }
@@ -216,7 +219,9 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
     pool->run(state.blocks.size(), [&](std::size_t b) { k.harmonics(colors, b); });
   }
   order_by_depth(state, *pool);
+  state.times.order = watch.lap();
   list_tiles(state, *pool);
+  state.times.list_tiles = watch.lap();
   for (std::size_t p = 0; p < state.passes.size(); ++p) {
     const auto behind = background_of(state.passes[p], background);
     BlendArgs blend = blend_args(state, p, background.empty() ? nullptr : behind.data());
@@ -224,6 +229,7 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
     blend.out_alphas = out_alphas.data();
     pool->run(state.tiles(), [&](std::size_t tile) { k.blend(blend, tile); });
   }
+  state.times.blend = watch.lap();
   result = shared;
   return std::nullopt;
 }
@@ -302,7 +308,9 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                      .geometry = geometry,
                                      .absolute = !out.absolute2d.empty(),
                                      .slots = s.slots.data()};
+    Stopwatch watch;
     pool->run(state.tiles(), [&](std::size_t tile) { k.blend_backward(blend, tile); });
+    state.times.blend_backward = (p == 0 ? 0.0 : state.times.blend_backward) + watch.lap();
     const ProjectBackwardArgs project = {.forward = project_args(state, g),
                                          .blocks = state.blocks.data(),
                                          .slots = s.slots.data(),
@@ -325,6 +333,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                          .absolute2d = pointer(out.absolute2d),
                                          .camera = out.camera.empty() ? nullptr : s.camera.data()};
     pool->run(state.blocks.size(), [&](std::size_t b) { k.project_backward(project, b); });
+    state.times.project_backward = (p == 0 ? 0.0 : state.times.project_backward) + watch.lap();
   }
   CameraGradient camera;
   camera.add_sums(s.camera.span());

@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "optimize_tests.hpp"
 #include "promises.hpp"
 #include "splatbot/isa.hpp"
 #include "splatbot/rasterizer.hpp"
@@ -367,6 +368,7 @@ int main() {
     run_surfels(isa);
     check_cameras(isa);
     run_variants(isa);
+    run_optimize();
   }
   std::puts("all promises kept");
   return 0;

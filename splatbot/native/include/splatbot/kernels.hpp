@@ -150,6 +150,48 @@ struct FrontArgs {
   float* weights;
 };
 
+// The fused loss; see loss.hpp.
+inline constexpr int kWindow = 11;
+inline constexpr int kWindowReach = kWindow / 2;
+inline constexpr float kSsimC1 = 0.01F * 0.01F;
+inline constexpr float kSsimC2 = 0.03F * 0.03F;
+
+// A tile's scratch: this many lines of LossArgs::stride floats.
+inline constexpr int kLossLines = 12 + 7 * kWindow;
+
+struct LossArgs {
+  int width, height, channels;
+  const float *rendered, *target;  // (images, H, W, channels)
+  const std::uint8_t* mask;        // (images, H, W) or null
+  int margin;                      // pixels at the border that are no window's centre
+  int tile_width, tile_height, columns, rows;  // [px], [tiles]
+  int stride;                                  // of a line: a row with both blurs' reach, and a vector beyond
+  float window[kWindow];
+  float l1_scale, ssim_scale;  // of the two sums in the loss
+  float* gradient;             // as rendered, or null
+};
+
+struct alignas(64) LossSums {
+  double l1, ssim;
+};
+
+// One group of parameters of Adam: (rows, columns) each.
+struct AdamGroup {
+  float *values, *first, *second;
+  const float* gradient;
+  std::size_t columns;
+  float rate;
+};
+
+// Of one block of rows. step_scale is sqrt(1 - b2^t) / (1 - b1^t) of each row, 0 for a row that is left alone; eps is
+// scaled by sqrt(1 - b2^t) as well.
+struct AdamBlock {
+  std::size_t begin, count;
+  const float *step_scale, *eps;
+  float beta1, beta2;
+  float* scratch;  // 2 x count x columns of the widest group, padded
+};
+
 struct Kernels {
   const char* name;
   void (*project)(const ProjectArgs&, std::size_t block, ProjectedBlock& out);
@@ -163,7 +205,14 @@ struct Kernels {
   void (*medians)(const MedianArgs&, std::size_t tile);
   void (*fronts)(const FrontArgs&, std::size_t tile);
   SurfelKernels surfels;
+  void (*loss)(const LossArgs&, std::size_t tile, float* scratch, LossSums& sums);
+  void (*adam)(const AdamGroup&, const AdamBlock&);
+  float (*multiply_add)(std::size_t rounds);  // kMultiplyAddFlops x lanes x rounds floating-point operations
+  int lanes;
 };
+
+inline constexpr int kMultiplyAddChains = 12;  // enough to hide the latency of two units
+inline constexpr std::size_t kMultiplyAddFlops = 2 * kMultiplyAddChains;
 
 // The kernels in use (isa.cpp).
 const Kernels& kernels();

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "splatbot/buffer.hpp"
+#include "splatbot/raster_work.hpp"
 #include "splatbot/rasterizer.hpp"
 
 namespace splatbot {
@@ -111,6 +112,7 @@ struct RasterState : TileLists {
   View view{};
   RasterOptions options;
   std::vector<ChannelPass> passes;
+  StageTimes times;
 
   Buffer<Record> records;       // (N,), in the order of the map
   Buffer<float> more_channels;  // (passes - 1, N, kRecordChannels)

@@ -22,6 +22,10 @@ const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
                           .surfels = {.project = surfel_project,
                                       .blend = surfel_blend,
                                       .blend_backward = surfel_blend_backward,
-                                      .project_backward = surfel_project_backward}};
+                                      .project_backward = surfel_project_backward},
+                          .loss = loss,
+                          .adam = adam,
+                          .multiply_add = multiply_add,
+                          .lanes = SPLATBOT_SIMD / 32};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,139 @@
+"""The scenes that the rasterizer is measured on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse
+from splatbot.rasterize.views import default_view
+
+MAP_WIDTH, MAP_HEIGHT = 320, 240  # [px] grid that the surface map is back-projected from
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+BOX_DISTANCE = 2.5  # [m] from the camera to the centre of the random scenes
+
+
+@dataclass(frozen=True)
+class SplatScene:
+    """Gaussians in the camera frame, and the camera's field of view.
+
+    Args:
+        means: (N, 3) [m]; quats: (N, 4) wxyz; scales: (N, 3) [m]; opacities: (N,); colors: (N, 3).
+        viewmat: (4, 4) world to camera.
+        fov: horizontal field of view [rad].
+    """
+
+    name: str
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    viewmat: Tensor
+    fov: float
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Means, quats, scales, opacities, colours."""
+        return self.means, self.quats, self.scales, self.opacities, self.colors
+
+    def named(self) -> dict[str, Tensor]:
+        """The same, by the names of ``rasterization``'s arguments."""
+        return dict(zip(NAMES, self.tensors(), strict=True))
+
+    def intrinsics(self, width: int, height: int) -> Tensor:
+        """(1, 3, 3) [px], principal point at the centre."""
+        focal = 0.5 * width / math.tan(0.5 * self.fov)
+        return torch.tensor([[[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]])
+
+    def view(self, width: int, height: int) -> dict[str, Any]:
+        """What ``rasterization`` is told of the camera."""
+        return {"viewmats": self.viewmat[None], "Ks": self.intrinsics(width, height), "width": width, "height": height}
+
+    def select(self, index: Tensor, name: str) -> SplatScene:
+        """Some of the Gaussians."""
+        means, quats, scales, opacities, colors = (t[index] for t in self.tensors())
+        return replace(self, name=name, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+
+
+def surface_map(width: int = MAP_WIDTH, height: int = MAP_HEIGHT, *, sigma_px: float = 1.0) -> SplatScene:
+    """A table with two boxes, one round Gaussian of opacity 0.7 back-projected from each pixel (76,800 by default).
+
+    Args:
+        width, height: of the grid of pixels.
+        sigma_px: standard deviation of a Gaussian in pixels of that grid.
+    """
+    generator = torch.Generator().manual_seed(0)
+    focal = 0.9 * width
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    x, y = (u - 0.5 * width) / focal, (v - 0.5 * height) / focal
+    z = 1.6 / (1.0 + 1.2 * y)
+    for (cu, cv), (du, dv), share in (((0.4, 0.5), (0.12, 0.15), 0.85), ((0.7, 0.6), (0.08, 0.2), 0.8)):
+        box = ((u / width - cu).abs() < du) & ((v / height - cv).abs() < dv)
+        z = torch.where(box, share * z, z)
+    n = width * height
+    return SplatScene(
+        name="surface",
+        means=torch.stack([x * z, y * z, z], -1).reshape(n, 3).contiguous(),
+        quats=torch.randn(n, 4, generator=generator),
+        scales=(sigma_px * z / focal).reshape(n, 1).expand(n, 3).contiguous(),
+        opacities=torch.full((n,), 0.7),
+        colors=torch.rand(n, 3, generator=generator),
+        viewmat=torch.eye(4),
+        fov=2.0 * math.atan(0.5 * width / focal),
+    )
+
+
+def random_box(n: int, *, shrink: float = 1.0) -> SplatScene:
+    """Uniform in [-1, 1]³, scales 1e-4..0.02, opacity 0..1; camera at z = -2.5, 60° field of view.
+
+    Args:
+        n: how many.
+        shrink: factor of the scales; sqrt(1e5 / n) keeps the blends per pixel those of 1e5.
+    """
+    g = torch.Generator().manual_seed(n)
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = BOX_DISTANCE
+    return SplatScene(
+        name=f"random {_thousands(n)}",
+        means=2.0 * torch.rand(n, 3, generator=g) - 1.0,
+        quats=torch.randn(n, 4, generator=g),
+        scales=shrink * (1e-4 + (0.02 - 1e-4) * torch.rand(n, 3, generator=g)),
+        opacities=torch.rand(n, generator=g),
+        colors=torch.rand(n, 3, generator=g),
+        viewmat=viewmat,
+        fov=math.radians(60.0),
+    )
+
+
+def from_file(path: Path) -> SplatScene:
+    """A map or splat file as its default view shows it.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    model = GaussianModel.load(path)
+    camera, T_world_camera = default_view(model)
+    return SplatScene(
+        name=path.stem,
+        means=model.means,
+        quats=model.quats,
+        scales=model.log_scales.exp(),
+        opacities=model.opacities.contiguous(),
+        colors=model.colors.contiguous(),
+        viewmat=torch.from_numpy(inverse(T_world_camera).astype(np.float32)),
+        fov=2.0 * math.atan(0.5 * camera.width / camera.fx),
+    )
+
+
+def _thousands(n: int) -> str:
+    return f"{n // 1_000_000}M" if n % 1_000_000 == 0 else f"{n // 1000}k" if n % 1000 == 0 else str(n)
