@@ -68,6 +68,9 @@ def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
         yield Setting(
             "percent_of_gaussians", percent, _detached(fewer, size), exact=percent == 100, default=percent == 100
         )
+    for limit in (0.0, 1e-6, 1e-4, 1e-3, 1e-2):
+        arguments = plain | {"transmittance_min": limit}
+        yield Setting("transmittance_min", limit, arguments, exact=limit == 0.0, default=limit == 1e-4)
     top = with_harmonics(plain, 4)
     for degree in (4, 3, 2, 1, 0):
         cut = top | {"colors": top["colors"].detach()[:, : (degree + 1) ** 2].contiguous(), "sh_degree": degree}

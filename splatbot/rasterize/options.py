@@ -8,6 +8,7 @@ from typing import Any
 from splatbot.errors import InputError
 
 DEFAULT_TILE_SIZE = 16
+TRANSMITTANCE_MIN = 1e-4
 
 # Render mode: whether colours are rendered, and what of depth.
 _MODES = {
@@ -50,6 +51,7 @@ class Options:
     depth: str  # none, accumulated, expected
     plane_depth: bool
     antialiased: bool
+    transmittance_min: float
     packed: bool
     tile_size: int
     sparse_grad: bool

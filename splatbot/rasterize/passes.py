@@ -69,6 +69,7 @@ def run_forward(inputs: Inputs, options: Options) -> Rendered:
                 options.depth,
                 options.plane_depth,
                 options.antialiased,
+                options.transmittance_min,
                 None if inputs.backgrounds is None else layout.view(inputs.backgrounds, b, c),
                 None if inputs.masks is None else layout.view(inputs.masks, b, c),
                 options.tile_size,

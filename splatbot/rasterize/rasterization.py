@@ -23,7 +23,14 @@ from splatbot.rasterize.inputs import Inputs, check_inputs
 from splatbot.rasterize.median import median_depth, median_ids
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.normals import facing_axes
-from splatbot.rasterize.options import DEFAULT_TILE_SIZE, Options, check_choice, parse_mode, refuse_absent
+from splatbot.rasterize.options import (
+    DEFAULT_TILE_SIZE,
+    TRANSMITTANCE_MIN,
+    Options,
+    check_choice,
+    parse_mode,
+    refuse_absent,
+)
 from splatbot.rasterize.passes import run_forward
 
 DepthMode = Literal["center", "plane"]
@@ -59,6 +66,7 @@ def rasterization(
     *,
     masks: Tensor | None = None,
     depth_mode: DepthMode = "center",
+    transmittance_min: float = TRANSMITTANCE_MIN,
     with_ut: bool = False,
     radial_coeffs: Tensor | None = None,
     tangential_coeffs: Tensor | None = None,
@@ -127,6 +135,8 @@ def rasterization(
             the shortest axis nears the middle one and bounded where the plane is seen edge-on. Its gradient takes
             the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them. "plane" is for
             the linearized pinhole, and not for median depth.
+        transmittance_min: a pixel is closed before its transmittance falls to this, [0, 0.5): accuracy for time.
+            gsplat's is 1e-4.
         with_ut: project by the unscented transform (Wu et al. 2024, 3DGUT): exact at seven sigma points, so that
             distortion and rolling shutter are possible; slower. What is drawn is still an ellipse: ``with_eval3d`` is
             refused. Needs quats and scales. A Gaussian of which a sigma point is nearer to a pinhole than
@@ -272,6 +282,7 @@ def _check_options(given: dict[str, Any]) -> Options:
         depth=depth,
         plane_depth=given["depth_mode"] == "plane" and depth != "none",
         antialiased=given["rasterize_mode"] == "antialiased",
+        transmittance_min=_check_transmittance(given["transmittance_min"]),
         packed=bool(given["packed"]),
         tile_size=DEFAULT_TILE_SIZE if given["tile_size"] is None else given["tile_size"],
         sparse_grad=bool(given["sparse_grad"]),
@@ -279,9 +290,17 @@ def _check_options(given: dict[str, Any]) -> Options:
     )
 
 
+def _check_transmittance(value: float) -> float:
+    if not 0.0 <= value < 0.5:
+        raise InputError(f"is {value}.", field="transmittance_min", hint="give a share in [0, 0.5)")
+    return float(value)
+
+
 def _to_gsplat(given: dict[str, Any]) -> tuple[Tensor, Tensor, Any]:
     """What gsplat has no name for is refused; the rest goes through as it is."""
     check_choice("depth_mode", given.pop("depth_mode"), ("center",))
+    if given.pop("transmittance_min") != TRANSMITTANCE_MIN:
+        raise InputError("is fixed in gsplat.", field="transmittance_min", hint="use backend='native'")
     if given.pop("masks") is not None:
         raise InputError("is not known to gsplat.", field="masks", hint="use backend='native'")
     for name, nothing in {**_CAMERA, "return_normals": False}.items():

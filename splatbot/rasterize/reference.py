@@ -77,6 +77,7 @@ def rasterization_reference(
     covars: Tensor | None = None,
     *,
     depth_mode: Literal["center", "plane"] = "center",
+    transmittance_min: float = TRANSMITTANCE_MIN,
     project: Projector | None = None,
 ) -> tuple[Tensor, Tensor, ReferenceMeta]:
     """As :func:`splatbot.rasterize.rasterization`, computed in the type of ``means`` by torch alone.
@@ -106,7 +107,7 @@ def rasterization_reference(
         order = torch.argsort(projected.depth.detach().float(), stable=True)
         order = order[keep[order]]
         pixels = _pixel_centers(width, height, means)
-        weights, left, margin = _blend(projected, blended, order, pixels)
+        weights, left, margin = _blend(projected, blended, order, pixels, transmittance_min)
         channels = _channels(projected, view_colors, order, pixels, render_mode)
         image = _composite(weights, channels, left, background, render_mode)
         renders.append(image.reshape(height, width, -1))
@@ -210,7 +211,7 @@ def _pixel_centers(width: int, height: int, like: Tensor) -> Tensor:
 
 
 def _blend(
-    projected: ReferenceProjection, opacities: Tensor, order: Tensor, pixels: Tensor
+    projected: ReferenceProjection, opacities: Tensor, order: Tensor, pixels: Tensor, transmittance_min: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Weights (M, P) of the M Gaussians of ``order``, transmittance (P,) left, margins (P,)."""
     d = pixels[None] - projected.mean2d[order][:, None]
@@ -221,19 +222,19 @@ def _blend(
     alpha = torch.where(counts, power.clamp_max(ALPHA_MAX), torch.zeros_like(power))
     # Transmittance only falls, so whoever comes after a Gaussian that closes the pixel finds it closed as well.
     after = torch.cumprod(1.0 - alpha, 0)
-    opened = after.detach() > TRANSMITTANCE_MIN
+    opened = after.detach() > transmittance_min
     alpha = torch.where(opened, alpha, torch.zeros_like(alpha))
     after_open = torch.cumprod(1.0 - alpha, 0)
     before = torch.cat([torch.ones_like(after_open[:1]), after_open[:-1]])
     left = after_open[-1] if len(order) else torch.ones(len(pixels), dtype=pixels.dtype)
-    return alpha * before, left, _margins(power.detach(), after.detach(), counts)
+    return alpha * before, left, _margins(power.detach(), after.detach(), counts, transmittance_min)
 
 
-def _margins(power: Tensor, after: Tensor, counts: Tensor) -> Tensor:
+def _margins(power: Tensor, after: Tensor, counts: Tensor, transmittance_min: float) -> Tensor:
     if len(power) == 0:
         return power.new_full((power.shape[1],), torch.inf)
     jumps = torch.stack([(power / ALPHA_MIN - 1).abs(), (power / ALPHA_MAX - 1).abs()]).amin(0)
-    closing = torch.where(counts, (after / TRANSMITTANCE_MIN - 1).abs(), torch.inf)
+    closing = torch.where(counts, (after / max(transmittance_min, 1e-30) - 1).abs(), torch.inf)
     return torch.minimum(jumps, closing).amin(0)
 
 

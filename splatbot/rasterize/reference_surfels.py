@@ -159,7 +159,7 @@ def _composite(
     if len(alpha) == 0:
         through = torch.ones_like(hits.power.new_empty(1, hits.power.shape[1]))
     weights, left = alpha * through[:-1], through[-1]
-    margin = _margins(hits.power.detach(), after.detach(), counts)
+    margin = _margins(hits.power.detach(), after.detach(), counts, TRANSMITTANCE_MIN)
     counted = weights.detach() > 0
     half = torch.where(counted, (through[:-1].detach() / 0.5 - 1).abs(), torch.inf)
     jumps = torch.where(counted, hits.margin, torch.inf)

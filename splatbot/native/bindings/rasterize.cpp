@@ -31,6 +31,7 @@ nb::object forward(const InN3& means, const std::optional<InN4>& quats, const st
                    const std::optional<InN33>& covars, const In1& opacities, const InAny& colors, int sh_degree,
                    const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane, float far_plane,
                    float radius_clip, float eps2d, const std::string& depth, bool plane_depth, bool antialiased,
+                   float transmittance_min,
                    const std::optional<In1>& background, const std::optional<InMask>& mask, int mask_size,
                    const Out3& out_colors, const Out2& out_alphas, const splatbot::Lens* lens) {
   const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
@@ -44,7 +45,8 @@ nb::object forward(const InN3& means, const std::optional<InN4>& quats, const st
                                            .eps2d = eps2d,
                                            .depth = depth_mode(depth),
                                            .plane_depth = plane_depth,
-                                           .antialiased = antialiased};
+                                           .antialiased = antialiased,
+                                           .transmittance_min = transmittance_min};
   const splatbot::TileMask tiles = {.keep = span_of<const std::uint8_t>(mask), .size = mask_size};
   State state;
   std::optional<splatbot::Fault> fault;
@@ -191,6 +193,7 @@ void define_rasterize(nb::module_& m) {
         nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
         "colors"_a.noconvert(), "sh_degree"_a, "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a,
         "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a, "antialiased"_a,
+        "transmittance_min"_a,
         nb::arg("background").noconvert().none(), nb::arg("mask").noconvert().none(), "mask_size"_a,
         "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(), nb::arg("lens").none() = nb::none(),
         "Render one view into out_colors (H, W, X) and out_alphas (H, W). Returns a RasterState, or (field, row) of an "

@@ -72,6 +72,7 @@ BlendArgs blend_args(RasterState& state, std::size_t p, const float* background)
           .depth = state.options.depth,
           .plane_depth = state.options.plane_depth,
           .write_alphas = first,
+          .transmittance_min = state.options.transmittance_min,
           .records = state.records.data(),
           .channels = first ? (state.count == 0 ? nullptr : state.records[0].channels)
                             : state.more_channels.data() + (p - 1) * state.count * kRecordChannels,

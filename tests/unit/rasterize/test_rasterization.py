@@ -29,6 +29,20 @@ def test_equals_the_float64_reference(seed: int, mode: str) -> None:
     assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
 
 
+@pytest.mark.parametrize("limit", [0.0, 1e-6, 1e-2, 0.3])
+def test_pixels_are_closed_at_the_transmittance_that_is_asked_for(limit: float) -> None:
+    result = compare(hard_scene(3), "RGB+ED", transmittance_min=limit)
+    assert result.forward <= FORWARD_BOUND * 5
+    assert result.near_jumps <= 0.01 * result.pixels
+    assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
+
+
+@pytest.mark.parametrize("limit", [-1e-4, 0.5, float("nan")])
+def test_a_transmittance_that_closes_nothing_or_everything_is_refused(limit: float) -> None:
+    with pytest.raises(InputError, match="transmittance_min"):
+        compare(hard_scene(3), "RGB", transmittance_min=limit)
+
+
 @pytest.mark.parametrize("channels", [1, 2, 4, 5, 8, 9, 19])
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
 def test_any_number_of_channels_equals_the_reference(channels: int, mode: str) -> None:

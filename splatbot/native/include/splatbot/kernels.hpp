@@ -43,6 +43,7 @@ struct BlendArgs {
   DepthMode depth;
   bool plane_depth;
   bool write_alphas;
+  float transmittance_min;
   const Record* records;
   const float* channels;  // of Gaussian 0; rows `channel_stride` apart
   std::size_t channel_stride;

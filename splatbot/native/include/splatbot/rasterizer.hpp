@@ -55,6 +55,7 @@ struct RasterOptions {
   DepthMode depth = DepthMode::none;
   bool plane_depth = false;  // depth varies over a footprint as that of the Gaussian's own plane
   bool antialiased = false;  // opacity falls by what the blur adds to a footprint's area
+  float transmittance_min = 1e-4F;  // a pixel is closed before its transmittance falls to this
 };
 
 // Pixels to leave out, by square tiles of `size` pixels, row by row; nonzero counts. Empty: none.

@@ -85,7 +85,7 @@ SB_INLINE void load_chunk(const BlendArgs& args, const TileFrame& frame, const P
 }
 
 template <int C, Extras E>
-SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_t first, TileState& state) {
+SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_t first, F limit, TileState& state) {
   const F x = load(kCenters.x + first), y = load(kCenters.y + first);
   F through = load(state.through + first);
   F transmittance = load(state.transmittance + first);
@@ -99,7 +99,7 @@ SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_
     const float* row = chunk.rows[__builtin_ctzll(members)];
     members &= members - 1;
     const Alpha a = alpha_at(x, y, row, row + 1, row + 2, row + 3, row + 4, row + 5);
-    const Step step = advance(a, through);
+    const Step step = advance(a, through, limit);
     transmittance = select(step.open, through, transmittance);
 #pragma GCC unroll 8
     for (int c = 0; c < C; ++c) {
@@ -124,12 +124,12 @@ SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_
   }
 }
 
-std::uint32_t live_blocks(const TileState& state) {
+std::uint32_t live_blocks(const TileState& state, F limit) {
   std::uint32_t live = 0;
   for (int b = 0; b < kBlocks; ++b) {
     std::uint32_t open = 0;
     for (int part = 0; part < kParts; ++part) {
-      open |= bits(load(state.through + b * kBlockPixels + part * W) > set1(kTransmittanceMin));
+      open |= bits(load(state.through + b * kBlockPixels + part * W) > limit);
     }
     live |= static_cast<std::uint32_t>(open != 0) << b;
   }
@@ -142,7 +142,8 @@ void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile
   const std::uint32_t begin = args.tile_begin[tile];
   const std::uint32_t end = args.tile_begin[tile + 1];
   std::uint32_t at = begin;
-  std::uint32_t live = live_blocks(state);
+  const F limit = set1(args.transmittance_min);
+  std::uint32_t live = live_blocks(state, limit);
   while (at < end && live != 0) {
     const int n = end - at < kChunk ? static_cast<int>(end - at) : kChunk;
     load_chunk<C>(args, frame, args.pairs + at, n, E.plane, chunk);
@@ -163,11 +164,11 @@ void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile
       const std::uint64_t members = chunk.columns[block];
       if (members != 0) {
         for (int part = 0; part < kParts; ++part) {
-          blend_block<C, E>(chunk, members, static_cast<std::size_t>(block * kBlockPixels + part * W), state);
+          blend_block<C, E>(chunk, members, static_cast<std::size_t>(block * kBlockPixels + part * W), limit, state);
         }
       }
     }
-    live = live_blocks(state);
+    live = live_blocks(state, limit);
     at += static_cast<std::uint32_t>(n);
   }
   args.tile_done[tile] = at - begin;

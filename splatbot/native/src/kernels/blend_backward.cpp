@@ -80,7 +80,7 @@ enum class Sums { none, moments, absolute };
 // the gradient to alpha.
 template <int C, int S, bool Plane, Sums Kind>
 SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDepth& plane, std::uint32_t mask,
-                        TileGradient& state, float* slot) {
+                        F limit, TileGradient& state, float* slot) {
   F acc[16];
 #pragma GCC unroll 16
   for (int i = 0; i < 16; ++i) {
@@ -96,7 +96,7 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
       const Alpha a = alpha_at(x, y, &local.l11, &local.l21, &local.l22,
                                &local.u0, &local.w0, &local.lo);
       F through = load(state.through + first);
-      const Step step = advance(a, through);
+      const Step step = advance(a, through, limit);
       F along = set1(0.0F);
 #pragma GCC unroll 8
       for (int c = 0; c < C; ++c) {
@@ -142,6 +142,7 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
 template <int C, int S, bool Plane, Sums Kind>
 void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
   const BlendArgs& f = args.forward;
+  const F limit = set1(f.transmittance_min);
   const std::uint32_t begin = f.tile_begin[tile];
   const std::uint32_t end = f.tile_begin[tile + 1];
   const std::uint32_t done = begin + f.tile_done[tile];
@@ -161,7 +162,7 @@ void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::
     const Local local = localize(f.records[id], frame);
     const float* channels = f.channels + id * f.channel_stride;
     const PlaneDepth plane = Plane ? plane_depth(f.records[id], channels, frame) : PlaneDepth{};
-    sum_pair<C, S, Plane, Kind>(local, channels, plane, mask, state, slot);
+    sum_pair<C, S, Plane, Kind>(local, channels, plane, mask, limit, state, slot);
   }
 }
 

@@ -20,7 +20,7 @@ void open_pixels(const BlendArgs& args, const TileFrame& frame, Through& through
   }
 }
 
-std::uint32_t count_pair(const Local& local, std::uint32_t mask, Through& through) {
+std::uint32_t count_pair(const Local& local, std::uint32_t mask, F limit, Through& through) {
   std::uint32_t count = 0;
   for (; mask != 0; mask &= mask - 1) {
     const int block = __builtin_ctz(mask);
@@ -29,7 +29,7 @@ std::uint32_t count_pair(const Local& local, std::uint32_t mask, Through& throug
       const Alpha a = alpha_at(load(kCenters.x + first), load(kCenters.y + first), &local.l11, &local.l21, &local.l22,
                                &local.u0, &local.w0, &local.lo);
       F left = load(through.values + first);
-      const Step step = advance(a, left);
+      const Step step = advance(a, left, limit);
       store(through.values + first, left);
       count += static_cast<std::uint32_t>(__builtin_popcount(bits(step.weight > set1(0.0F))));
     }
@@ -42,13 +42,14 @@ std::uint32_t count_pair(const Local& local, std::uint32_t mask, Through& throug
 void contributions(const ContributionArgs& args, std::size_t tile) {
   const BlendArgs& f = args.forward;
   const TileFrame frame = tile_frame(f.view, f.columns, tile);
+  const F limit = set1(f.transmittance_min);
   Through through;
   open_pixels(f, frame, through);
   const std::uint32_t begin = f.tile_begin[tile], done = begin + f.tile_done[tile];
   for (std::uint32_t at = begin; at < f.tile_begin[tile + 1]; ++at) {
     const Pair& pair = f.pairs[at];
     args.counts[pair.slot] =
-        at < done ? count_pair(localize(f.records[pair.id], frame), f.masks[at], through) : 0U;
+        at < done ? count_pair(localize(f.records[pair.id], frame), f.masks[at], limit, through) : 0U;
   }
 }
 

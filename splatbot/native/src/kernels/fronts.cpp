@@ -27,14 +27,14 @@ SB_INLINE Alpha alpha_in(const Local& local, std::size_t first) {
 }
 
 // Names the Gaussian in the pixels of a block that it takes from above to half; true if some pixel is still above.
-bool halve_block(const Local& local, std::uint32_t id, int block, Through& through, std::int32_t* ids) {
+bool halve_block(const Local& local, std::uint32_t id, int block, F limit, Through& through, std::int32_t* ids) {
   const F half = set1(0.5F);
   std::uint32_t above = 0;
   for (int part = 0; part < kParts; ++part) {
     const auto first = static_cast<std::size_t>(block * kBlockPixels + part * W);
     const F before = load(through.values + first);
     F after = before;
-    advance(alpha_in(local, first), after);
+    advance(alpha_in(local, first), after, limit);
     store(through.values + first, after);
     for (std::uint32_t met = bits((before > half) & (after <= half)); met != 0; met &= met - 1) {
       ids[first + static_cast<std::size_t>(__builtin_ctz(met))] = static_cast<std::int32_t>(id);
@@ -64,12 +64,12 @@ struct Wanted {
 };
 
 void pick_block(const FrontArgs& args, const Local& local, std::uint32_t id, int block, std::uint32_t first_entry,
-                Through& through, Wanted& wanted) {
+                F limit, Through& through, Wanted& wanted) {
   alignas(64) float weights[W];
   for (int part = 0; part < kParts; ++part) {
     const auto first = static_cast<std::size_t>(block * kBlockPixels + part * W);
     F left = load(through.values + first);
-    const Step step = advance(alpha_in(local, first), left);
+    const Step step = advance(alpha_in(local, first), left, limit);
     store(through.values + first, left);
     store(weights, step.weight);
     std::uint32_t met = bits(step.weight > set1(0.0F)) & (wanted.lanes[block] >> (part * W));
@@ -94,6 +94,7 @@ void pick_block(const FrontArgs& args, const Local& local, std::uint32_t id, int
 
 void medians(const MedianArgs& args, std::size_t tile) {
   const BlendArgs& f = args.forward;
+  const F limit = set1(f.transmittance_min);
   const TileFrame frame = tile_frame(f.view, f.columns, tile);
   Through through;
   open_pixels(f, frame, through);
@@ -110,7 +111,7 @@ void medians(const MedianArgs& args, std::size_t tile) {
     const Local local = localize(f.records[id], frame);
     for (; mask != 0; mask &= mask - 1) {
       const int block = __builtin_ctz(mask);
-      if (!halve_block(local, id, block, through, ids)) {
+      if (!halve_block(local, id, block, limit, through, ids)) {
         waiting &= ~(1U << block);
       }
     }
@@ -125,6 +126,7 @@ void medians(const MedianArgs& args, std::size_t tile) {
 
 void fronts(const FrontArgs& args, std::size_t tile) {
   const BlendArgs& f = args.forward;
+  const F limit = set1(f.transmittance_min);
   const std::uint32_t first_entry = args.tile_pixels[tile], entries = args.tile_pixels[tile + 1] - first_entry;
   if (entries == 0) {
     return;
@@ -142,7 +144,7 @@ void fronts(const FrontArgs& args, std::size_t tile) {
     const std::uint32_t id = f.pairs[at].id;
     const Local local = localize(f.records[id], frame);
     for (; mask != 0; mask &= mask - 1) {
-      pick_block(args, local, id, __builtin_ctz(mask), first_entry, through, wanted);
+      pick_block(args, local, id, __builtin_ctz(mask), first_entry, limit, through, wanted);
     }
   }
 }

@@ -111,7 +111,7 @@ SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, int place,
     members &= members - 1;
     const SurfelHit hit = hit_at(x, y, row, near);
     const F before = through;
-    const Step step = advance(hit.alpha, through);
+    const Step step = advance(hit.alpha, through, set1(kTransmittanceMin));
     transmittance = select(step.open, through, transmittance);
     const M candidate = median_candidate(hit, step, before);
     median = select(candidate, hit.depth, median);

@@ -154,7 +154,7 @@ SB_INLINE void sum_pair(const float* row, F near, std::int32_t place, std::uint3
       const std::size_t first = static_cast<std::size_t>(block * kBlockPixels + part * W);
       const SurfelHit hit = hit_at(load(kCenters.x + first), load(kCenters.y + first), row, near);
       F through = load(state.through + first);
-      const Step step = advance(hit.alpha, through);
+      const Step step = advance(hit.alpha, through, set1(kTransmittanceMin));
       const M median = bit_cast_int(load(state.median_place + first)) == own;
       const Along along = along_at<C, Distort>(row, hit, step.weight, median, first, state);
       const F rest = fnma(step.weight, along.weight, load(state.rest + first));

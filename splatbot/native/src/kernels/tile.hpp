@@ -98,9 +98,9 @@ struct Step {
 // `through` is the product of (1 - alpha) over all Gaussians so far, those that came after the pixel was closed
 // included (0 outside the image): it only falls, so it is above the limit as long as the pixel is open, and the chain
 // of steps, of which each waits for the one before, is one multiplication long.
-SB_INLINE Step advance(const Alpha& a, F& through) {
+SB_INLINE Step advance(const Alpha& a, F& through, F limit) {
   const F next = through * a.left;
-  const M open = next > set1(kTransmittanceMin);
+  const M open = next > limit;
   const F weight = mul_zero_unless(open, a.alpha, through);
   through = next;
   return {weight, open};
