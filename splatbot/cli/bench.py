@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from splatbot.bench.results import Results, Row
 
 _TIMES = ("forward", "forward+backward", "forward+pose backward")
+_FILE_WIDTH = 160  # [characters] where there is no terminal to ask
 _SHARES = ("blend forward, share of FMA peak", "blend backward, share of FMA peak")
 
 
@@ -76,7 +78,7 @@ def bench(
 def _print(results: Results, folder: Path) -> None:
     from rich.console import Console
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
     machine = results.machine
     peaks = ", ".join(
         f"{gflops:.0f} GFLOP/s on {n}" for n, gflops in machine["fma_peak_gflops"][machine["isa"]].items()
