@@ -38,7 +38,7 @@ def render_view(
     """What a pinhole camera at a pose sees of the map.
 
     Args:
-        model: the map; view-independent colour (the DC term) is drawn.
+        model: the map; its harmonics, of any degree, colour it as seen from the pose.
         camera: intrinsics and size; without distortion.
         T_world_camera: (4, 4) rigid.
         mode: "rgb" (H, W, 3) in 0..1; "depth" (H, W) [m] along the optical axis; "normal" (H, W, 3) unit vectors in
@@ -55,11 +55,11 @@ def render_view(
             "is set, and views are pinhole.", field="distortion", hint="pass the camera with distortion=()"
         )
     if mode == "rgb":
-        rgb, alpha = _splat(model, model.colors, camera, T_camera_world, "RGB")
+        rgb, alpha = _splat(model, None, camera, T_camera_world, "RGB")
         rgb += (1.0 - alpha[..., None]) * np.asarray(background, dtype=np.float32)
         return rgb.clip(0.0, 1.0)
     if mode == "depth":
-        depth, alpha = _splat(model, model.colors, camera, T_camera_world, "ED")
+        depth, alpha = _splat(model, None, camera, T_camera_world, "ED")
         return np.where(alpha >= MIN_ALPHA, depth[..., 0], np.float32(0))
     if mode == "normal":
         blended, alpha = _splat(model, facing_normals(model, T_camera_world), camera, T_camera_world, "RGB")
@@ -67,7 +67,7 @@ def render_view(
         known = (alpha[..., None] >= MIN_ALPHA) & (length > 1e-6)
         return np.divide(blended, length, out=np.zeros_like(blended), where=known)
     if mode == "alpha":
-        return _splat(model, model.colors, camera, T_camera_world, "RGB")[1]
+        return _splat(model, None, camera, T_camera_world, "RGB")[1]
     raise InputError(f"is {mode!r}.", field="mode", hint=f"one of {', '.join(MODES)}")
 
 
@@ -152,21 +152,22 @@ def to_png(view: NDArray[np.float32], mode: Mode, *, depth_range: tuple[float, f
 
 def _splat(
     model: GaussianModel,
-    colors: Tensor,
+    features: Tensor | None,
     camera: Camera,
     T_camera_world: NDArray[np.float64],
     render_mode: Literal["RGB", "ED"],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Blended features (H, W, C) and opacity (H, W)."""
+    """Blended features (H, W, C), None: the model's colours; and opacity (H, W)."""
     with torch.no_grad():
         images, alphas, _ = rasterization(
             means=model.means,
             quats=model.quats,
             scales=model.scales,
             opacities=model.opacities,
-            colors=colors.contiguous(),
-            viewmats=torch.as_tensor(T_camera_world, dtype=torch.float32)[None],
-            Ks=torch.as_tensor(camera.K_corner, dtype=torch.float32)[None],
+            colors=model.sh if features is None else features.contiguous(),
+            sh_degree=model.sh_degree if features is None else None,
+            viewmats=torch.as_tensor(T_camera_world, dtype=torch.float64)[None],
+            Ks=torch.as_tensor(camera.K_corner, dtype=torch.float64)[None],
             width=camera.width,
             height=camera.height,
             render_mode=render_mode,

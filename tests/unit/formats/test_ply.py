@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from splatbot.errors import FormatError, InputError
 from splatbot.formats import load_gaussians, save_gaussians
 from splatbot.formats.ply import load_ply, save_ply
 from splatbot.gaussians import GaussianModel
+from splatbot.rasterize.views import default_view, render_view
 
 STORED = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -70,6 +72,29 @@ def test_plyfile_finds_every_value_under_its_standard_name(tmp_path: Path) -> No
     for channel in range(3):  # channel-major: 15 of red, 15 of green, 15 of blue
         names = [f"f_rest_{15 * channel + k}" for k in range(15)]
         assert np.array_equal(columns(vertex, *names), model.sh[:, 1:, channel].numpy())
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_what_plyfile_reads_renders_to_the_identical_image(tmp_path: Path, degree: int) -> None:
+    model = random_model(degree=degree)
+    save_gaussians(model, tmp_path / "map.ply")
+    vertex = plyfile.PlyData.read(str(tmp_path / "map.ply"))["vertex"]
+    k = model.sh.shape[1] - 1  # coefficients beyond DC, channel by channel
+    rest = [vertex[f"f_rest_{i}"] for i in range(3 * k)]
+    dc = columns(vertex, "f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    sh = np.concatenate([dc, np.reshape(rest, (3, k, len(model))).transpose(2, 1, 0)], axis=1)
+    read = replace(
+        model,
+        means=torch.from_numpy(columns(vertex, "x", "y", "z")),
+        quats=torch.from_numpy(columns(vertex, "rot_0", "rot_1", "rot_2", "rot_3")),
+        log_scales=torch.from_numpy(columns(vertex, "scale_0", "scale_1", "scale_2")),
+        opacity_logits=torch.from_numpy(np.array(vertex["opacity"])),
+        sh=torch.from_numpy(sh.astype(np.float32)),
+    )
+    camera, pose = default_view(model, width=160, height=120)
+    image = render_view(model, camera, pose)
+    assert (image > 0.1).mean() > 0.05  # something is seen
+    assert np.array_equal(render_view(read, camera, pose), image)
 
 
 def test_an_empty_model_reads_back_empty(tmp_path: Path) -> None:

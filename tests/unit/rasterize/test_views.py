@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -210,3 +212,20 @@ def test_a_png_decodes_to_the_colours_of_the_view() -> None:
     grey = cv2.imdecode(np.frombuffer(to_png(view[..., 0], "alpha"), np.uint8), cv2.IMREAD_UNCHANGED)
     assert grey is not None
     assert grey.shape == (7, 9)
+
+
+def test_a_map_with_harmonics_changes_its_colour_with_the_direction() -> None:
+    model = GaussianModel.from_activated(
+        means=[[0.0, 0.0, 0.0]], quats=[[1, 0, 0, 0]], scales=[[0.2] * 3], opacities=[0.99], colors=[[0.5, 0.5, 0.5]]
+    )
+    sh = torch.zeros(1, 4, 3)
+    sh[0, 2, 0] = 0.5  # the term in z, of red
+    model = replace(model, sh=sh)
+    camera = Camera(100.0, 100.0, 31.5, 23.5, 64, 48)
+    front, back = np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])
+    front[2, 3], back[2, 3] = -1.0, 1.0  # looking along +z and along -z
+    expected = 0.48860251 * 0.5
+    for pose, sign in ((front, 1.0), (back, -1.0)):
+        red, green, _ = render_view(model, camera, pose)[24, 32] / render_view(model, camera, pose, "alpha")[24, 32]
+        assert green == pytest.approx(0.5, abs=1e-3)
+        assert red == pytest.approx(0.5 + sign * expected, abs=2e-3)
