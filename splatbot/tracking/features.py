@@ -21,6 +21,7 @@ Index = NDArray[np.intp]
 MIN_INLIERS = 20
 _MAX_REPROJECTION = 3.0  # [px]
 _MATCH_RATIO = 0.8  # Lowe's ratio test
+_MIN_SPREAD = 0.05  # standard deviation of matched pixels across their narrowest direction [image width]
 _MATCH_BITS = 64  # descriptors that differ in more of their 256 bits are strangers
 
 
@@ -84,8 +85,8 @@ def match_pose(
 
     A keyframe's points are looked for near to where they are expected, or everywhere. Then P3P in RANSAC (Gao et al.
     2003) and Levenberg-Marquardt on the inliers; OpenCV's RANSAC is seeded alike on every call, so the result is
-    repeatable. None when too few matches agree, or when those that do pile up at the edge of the search: then the true
-    matches lie outside, and what was found inside is a choice that agrees with the expectation.
+    repeatable. None when too few matches agree. Near to an expectation, also None when those that do pile up at the
+    edge of the search, or in one corner of the image: it was wrong, and what was found is a choice that agrees with it.
     """
     pixels, points = [], []
     for features, T_world_keyframe in keyframes:
@@ -106,8 +107,15 @@ def match_pose(
     found = _pose_from_matches(np.concatenate(pixels).astype(np.float64), np.concatenate(points), camera)
     if found is None or expected is None:
         return found
+    return found if _is_believable(found, camera, expected) else None
+
+
+def _is_believable(found: FeaturePose, camera: Camera, expected: Expectation) -> bool:
+    """Whether a pose from a search near to an expectation is more than a choice that agrees with it."""
     shift = camera.project(transform_points(inverse(expected.T_world_camera), found.points)) - found.pixels
-    return found if np.percentile(np.linalg.norm(shift, axis=1), 80) < 0.5 * expected.radius else None
+    inside = np.percentile(np.linalg.norm(shift, axis=1), 80) < 0.5 * expected.radius
+    narrowest = np.sqrt(max(np.linalg.eigvalsh(np.cov(found.pixels.T))[0], 0.0))
+    return bool(inside and narrowest > _MIN_SPREAD * camera.width)
 
 
 def _match(

@@ -180,3 +180,17 @@ def test_matches_at_the_edge_of_the_search_are_not_believed() -> None:
     assert pose_distance(right.T_world_camera, truth)[0] < 1.5e-2
     shifted = truth @ se3_exp([0, 0, 0, 0, 10.0 / camera.fx, 0])  # everything is expected 10 px to one side
     assert match_pose(current, views, camera, Expectation(shifted, 12.0)) is None
+
+
+def test_matches_in_one_corner_of_the_image_are_believed_only_when_searched_for_everywhere() -> None:
+    camera = tabletop(width=WIDTH)[0][0].camera
+    current, truth = view(2)
+    distance = np.abs(current.pixels[:, None] - current.pixels[None]).max(-1)
+    near = distance[(distance < 25).sum(1).argmax()] < 25  # the most crowded 50 pixels
+    corner = replace(
+        current, pixels=current.pixels[near], descriptors=current.descriptors[near], points=current.points[near]
+    )
+    views = [view(0), view(1)]
+    assert match_pose(corner, views, camera) is not None
+    assert match_pose(corner, views, camera, Expectation(truth, 12.0)) is None
+    assert match_pose(current, views, camera, Expectation(truth, 12.0)) is not None
