@@ -114,7 +114,7 @@ class TumLog(LogBase):
             "of rgb.txt).",
             file=self.folder / "depth.txt",
             field=f"after line {before[-1]}" if before else "first line",
-            hint='restore the missing line, remove that image from rgb.txt, or open the log with missing="skip"',
+            hint="restore the line, remove that image from rgb.txt, or leave such frames out: --on-bad-frame skip",
         )
 
     def _calibration(self, camera: str | Path | Calibration | None) -> Calibration:
