@@ -26,14 +26,10 @@ class Alignment:
     Args:
         T_world_camera: (4, 4).
         information: (6, 6) of the twist (t [m], ω [rad]) that left-multiplies T_camera_world, at the last step.
-        dense_chi2: cost of the dense residuals per residual, Student's t; about 1 where noise is as assumed.
-        pixel_iterations: points looked at, over all steps: the work that was done.
     """
 
     T_world_camera: Array
     information: Array
-    dense_chi2: float
-    pixel_iterations: int
 
 
 def settings_of(config: TrackingConfig, *, photometric: bool, gate: float) -> _native.AlignSettings:
@@ -91,7 +87,7 @@ def align(
     matches = None
     if features is not None and camera is not None:
         matches = (features.points, features.pixels, _intrinsics(camera))
-    T_camera_world, information, cost, count, work = _native.align(
+    T_camera_world, information = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
         matches,
@@ -100,9 +96,8 @@ def align(
         config.dense_weight,
         config.iterations,
         finest,
-        None,
     )
-    return Alignment(inverse(T_camera_world), information, 2.0 * cost / count if count else np.inf, work)
+    return Alignment(inverse(T_camera_world), information)
 
 
 def _level_arrays(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float, float, float]]:

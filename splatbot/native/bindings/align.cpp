@@ -14,10 +14,10 @@
 #include <utility>
 #include <vector>
 
+#include "arrays.hpp"
 #include "bindings.hpp"
 #include "splatbot/align.hpp"
 
-namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
@@ -28,13 +28,7 @@ using Vector = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device:
 using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
 using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Pixels = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-using Information = nb::ndarray<const double, nb::shape<6, 6>, nb::c_contig, nb::device::cpu>;
 using Intrinsics = std::array<double, 4>;
-
-template <typename A>
-auto view(const A& a) {
-  return std::span(a.data(), a.size());
-}
 
 template <std::size_t N, typename A>
 auto fixed(const A& a) {
@@ -42,27 +36,19 @@ auto fixed(const A& a) {
 }
 
 nb::object copy(std::span<const double> values, std::initializer_list<std::size_t> shape) {
-  auto* data = new std::vector<double>(values.begin(), values.end());
-  nb::capsule owner(data, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
-  return nb::cast(nb::ndarray<nb::numpy, double>(data->data(), shape, owner));
-}
-
-nb::object take(std::vector<float>&& values) {
-  auto* data = new std::vector<float>(std::move(values));
-  nb::capsule owner(data, [](void* p) noexcept { delete static_cast<std::vector<float>*>(p); });
-  return nb::cast(nb::ndarray<nb::numpy, float>(data->data(), {data->size()}, owner));
+  return nb::cast(owned(std::vector<double>(values.begin(), values.end()), shape));
 }
 
 splatbot::AlignImage image_of(const Image& gray, const Image& depth, const Intrinsics& k) {
   if (gray.shape(0) != depth.shape(0) || gray.shape(1) != depth.shape(1))
     throw nb::value_error("gray and depth differ in size");
-  return {static_cast<int>(gray.shape(1)), static_cast<int>(gray.shape(0)), k[0], k[1], k[2], k[3], view(gray), view(depth)};
+  return {static_cast<int>(gray.shape(1)), static_cast<int>(gray.shape(0)), k[0], k[1], k[2], k[3], span_of(gray), span_of(depth)};
 }
 
 splatbot::AlignPoints points_of(const Rows3& points, const Rows3& normals, const Vector& gray) {
   if (points.shape(0) != gray.size() || normals.shape(0) != gray.size())
     throw nb::value_error("points, normals, gray differ in length");
-  return {view(points), view(normals), view(gray)};
+  return {span_of(points), span_of(normals), span_of(gray)};
 }
 
 // What Python holds: the arrays stay alive through the call because the caller's tuples do.
@@ -70,7 +56,6 @@ using LevelArrays = std::tuple<Image, Image, Intrinsics>;
 using PointArrays = std::tuple<Rows3, Rows3, Vector>;
 using ReferenceArrays = std::pair<Pose, std::vector<PointArrays>>;
 using MatchArrays = std::tuple<Points, Pixels, Intrinsics>;
-using PriorArrays = std::pair<Pose, Information>;
 
 }  // namespace
 
@@ -102,7 +87,7 @@ void define_align(nb::module_& m) {
                                                residual_photometric, residual_geometric);
         }
         return nb::make_tuple(copy(sums.H, {8, 8}), copy(sums.g, {8}), sums.cost, sums.projected,
-                              take(std::move(residual_photometric)), take(std::move(residual_geometric)));
+                              owned(std::move(residual_photometric), {gray_reference.size()}), owned(std::move(residual_geometric), {gray_reference.size()}));
       },
       "gray"_a.noconvert(), "depth"_a.noconvert(), "intrinsics"_a, "points"_a.noconvert(), "normals"_a.noconvert(),
       "gray_reference"_a.noconvert(), "T_current_reference"_a.noconvert(), "gain"_a, "offset"_a, "settings"_a,
@@ -111,7 +96,7 @@ void define_align(nb::module_& m) {
       "align",
       [](const std::vector<LevelArrays>& levels, const std::vector<ReferenceArrays>& references,
          const std::optional<MatchArrays>& matches, Pose T_camera_world, const splatbot::AlignSettings& settings,
-         double dense_weight, int iterations, std::size_t finest, const std::optional<PriorArrays>& prior) {
+         double dense_weight, int iterations, std::size_t finest) {
         std::vector<splatbot::AlignImage> images;
         for (const auto& [gray, depth, intrinsics] : levels) images.push_back(image_of(gray, depth, intrinsics));
         std::vector<splatbot::AlignReference> known;
@@ -125,24 +110,20 @@ void define_align(nb::module_& m) {
         if (matches) {
           const auto& [points, pixels, k] = *matches;
           if (points.shape(0) != pixels.shape(0)) throw nb::value_error("points and pixels differ in length");
-          match = {.fx = k[0], .fy = k[1], .cx = k[2], .cy = k[3], .points = view(points), .pixels = view(pixels)};
+          match = {.fx = k[0], .fy = k[1], .cx = k[2], .cy = k[3], .points = span_of(points), .pixels = span_of(pixels)};
         }
-        splatbot::AlignPlan plan{.settings = settings, .dense_weight = dense_weight, .iterations = iterations, .finest = finest};
-        if (prior) {
-          std::copy_n(prior->first.data(), 16, plan.T_prior_camera_world.begin());
-          std::copy_n(prior->second.data(), 36, plan.prior_information.begin());
-        }
+        const splatbot::AlignPlan plan{
+            .settings = settings, .dense_weight = dense_weight, .iterations = iterations, .finest = finest};
         splatbot::AlignResult result;
         {
           nb::gil_scoped_release release;
           result = splatbot::align(images, known, match, fixed<16>(T_camera_world), plan);
         }
-        return nb::make_tuple(copy(result.T_camera_world, {4, 4}), copy(result.H, {6, 6}), result.dense_cost,
-                              result.dense_residuals, result.pixel_iterations);
+        return nb::make_tuple(copy(result.T_camera_world, {4, 4}), copy(result.H, {6, 6}));
       },
       "levels"_a, "references"_a, "matches"_a.none(), "T_camera_world"_a.noconvert(), "settings"_a, "dense_weight"_a,
-      "iterations"_a, "finest"_a, "prior"_a.none(),
+      "iterations"_a, "finest"_a,
       "Gauss-Newton over the levels (gray, depth, (fx, fy, cx, cy)), fine to coarse, against references (T_world_reference, "
-      "[(points, normals, gray)] per level) and matches (points, pixels, (fx, fy, cx, cy)); prior: (T_camera_world, "
-      "information (6, 6)). Returns (T_camera_world, H (6, 6), dense cost, dense residuals, pixel-iterations).");
+      "[(points, normals, gray)] per level) and matches (points, pixels, (fx, fy, cx, cy)). Returns "
+      "(T_camera_world, H (6, 6)).");
 }

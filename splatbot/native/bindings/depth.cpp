@@ -4,10 +4,10 @@
 
 #include <vector>
 
+#include "arrays.hpp"
 #include "bindings.hpp"
 #include "splatbot/depth.hpp"
 
-namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
@@ -16,14 +16,7 @@ using Image = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::devi
 using Pixels = nb::ndarray<const float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 
 splatbot::DepthImage view(const Image& depth) {
-  return {static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)), {depth.data(), depth.size()}};
-}
-
-template <class T>
-nb::object take(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
-  auto* data = new std::vector<T>(std::move(values));
-  nb::capsule owner(data, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
-  return nb::cast(nb::ndarray<nb::numpy, T>(data->data(), shape, owner));
+  return {static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)), span_of(depth)};
 }
 
 }  // namespace
@@ -37,7 +30,7 @@ void define_depth(nb::module_& m) {
           nb::gil_scoped_release release;
           splatbot::valid_depth(view(depth), near, far, step, out);
         }
-        return take(std::move(out), {depth.shape(0), depth.shape(1)});
+        return owned(std::move(out), {depth.shape(0), depth.shape(1)});
       },
       "depth"_a.noconvert(), "near"_a, "far"_a, "step"_a, "Depth without implausible and flying pixels.");
   m.def(
@@ -49,7 +42,7 @@ void define_depth(nb::module_& m) {
           nb::gil_scoped_release release;
           splatbot::halve_depth(view(depth), out);
         }
-        return take(std::move(out), {height, width});
+        return owned(std::move(out), {height, width});
       },
       "depth"_a.noconvert(), "Half the size, the nearest surface of each 2x2 block.");
   m.def(
@@ -58,9 +51,9 @@ void define_depth(nb::module_& m) {
         std::vector<double> out(pixels.shape(0));
         {
           nb::gil_scoped_release release;
-          splatbot::depth_around(view(depth), {pixels.data(), pixels.size()}, out);
+          splatbot::depth_around(view(depth), span_of(pixels), out);
         }
-        return take(std::move(out), {pixels.shape(0)});
+        return owned(std::move(out), {pixels.shape(0)});
       },
       "depth"_a.noconvert(), "pixels"_a.noconvert(), "Median depth of the 5x5 pixels around each; NaN where two surfaces meet.");
 }

@@ -4,10 +4,10 @@
 
 #include <vector>
 
+#include "arrays.hpp"
 #include "bindings.hpp"
 #include "splatbot/matching.hpp"
 
-namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
@@ -17,7 +17,7 @@ using Descriptors = nb::ndarray<const std::uint8_t, nb::shape<-1, 32>, nb::c_con
 
 splatbot::Keypoints view(const Pixels& pixels, const Descriptors& descriptors) {
   if (pixels.shape(0) != descriptors.shape(0)) throw nb::value_error("pixels and descriptors differ in length");
-  return {{pixels.data(), pixels.size()}, {descriptors.data(), descriptors.size()}};
+  return {span_of(pixels), span_of(descriptors)};
 }
 
 }  // namespace
@@ -28,13 +28,12 @@ void define_matching(nb::module_& m) {
       [](Pixels expected, Descriptors expected_descriptors, Pixels found, Descriptors found_descriptors, float radius,
          int max_distance, float ratio) {
         const splatbot::Keypoints wanted = view(expected, expected_descriptors), seen = view(found, found_descriptors);
-        auto* data = new std::vector<std::int32_t>(expected.shape(0));
-        nb::capsule owner(data, [](void* p) noexcept { delete static_cast<std::vector<std::int32_t>*>(p); });
+        std::vector<std::int32_t> matches(expected.shape(0));
         {
           nb::gil_scoped_release release;
-          splatbot::match_near(wanted, seen, radius, max_distance, ratio, *data);
+          splatbot::match_near(wanted, seen, radius, max_distance, ratio, matches);
         }
-        return nb::cast(nb::ndarray<nb::numpy, std::int32_t>(data->data(), {data->size()}, owner));
+        return owned(std::move(matches), {expected.shape(0)});
       },
       "expected"_a.noconvert(), "expected_descriptors"_a.noconvert(), "found"_a.noconvert(),
       "found_descriptors"_a.noconvert(), "radius"_a, "max_distance"_a, "ratio"_a,

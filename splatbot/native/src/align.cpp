@@ -52,27 +52,6 @@ Mat4 se3_exp(const Vec6& xi) {
   return T;
 }
 
-// Logarithm of the rotation and translation of a small motion: (t, ω) to first order in t, exact in the angle.
-Vec6 small_motion(const Mat4& T) {
-  const double x = 0.5 * (T[9] - T[6]), y = 0.5 * (T[2] - T[8]), z = 0.5 * (T[4] - T[1]);
-  const double sine = std::sqrt(x * x + y * y + z * z);
-  const double angle = std::atan2(sine, 0.5 * (T[0] + T[5] + T[10] - 1.0));
-  const double scale = sine > 1e-12 ? angle / sine : 1.0;
-  return {T[3], T[7], T[11], scale * x, scale * y, scale * z};
-}
-
-Mat4 inverse(std::span<const double, 16> T) {
-  Mat4 out{};
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) {
-      out[4 * i + j] = T[4 * j + i];
-      out[4 * i + 3] -= T[4 * j + i] * T[4 * j + 3];
-    }
-  }
-  out[15] = 1.0;
-  return out;
-}
-
 struct Normal {
   Mat6 H{};
   Vec6 g{};
@@ -110,7 +89,7 @@ class DenseTerm {
       : image_(image), points_(points), T_world_reference_(T_world_reference) {}
 
   // Add this term, exposure marginalised (Schur complement); remember how exposure would follow a step.
-  void add(std::span<const double, 16> T_camera_world, const AlignPlan& plan, Normal& total, AlignResult& result) {
+  void add(std::span<const double, 16> T_camera_world, const AlignPlan& plan, Normal& total) {
     const Mat4 T = multiply(T_camera_world, T_world_reference_);
     const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, plan.settings, {}, {});
     const double A00 = s.H[54] + kExposurePrior, A01 = s.H[55], A11 = s.H[63] + kExposurePrior;
@@ -128,9 +107,6 @@ class DenseTerm {
         total.H[6 * i + j] += plan.dense_weight * (s.H[8 * i + j] - k0 * coupling_[2 * j] - k1 * coupling_[2 * j + 1]);
       total.g[i] += plan.dense_weight * (s.g[i] - k0 * residual_[0] - k1 * residual_[1]);
     }
-    result.dense_cost += s.cost;
-    result.dense_residuals += s.photometric + s.geometric;
-    result.pixel_iterations += points_.gray.size();
   }
 
   // Back-substitute the exposure that belongs to a twist step.
@@ -171,20 +147,6 @@ void add_matches(const AlignMatches& m, std::span<const double, 16> T, Normal& t
     for (int a = 0; a < 6; ++a) {
       for (int b = 0; b < 6; ++b) total.H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
       total.g[a] += w * (Ju[a] * ru + Jv[a] * rv);
-    }
-  }
-}
-
-// ½ ξᵀ Λ ξ of the twist ξ between the prior's pose and this one.
-void add_prior(const AlignPlan& plan, std::span<const double, 16> T_camera_world, Normal& total) {
-  if (std::all_of(plan.prior_information.begin(), plan.prior_information.end(), [](double v) { return v == 0.0; })) {
-    return;
-  }
-  const Vec6 xi = small_motion(multiply(T_camera_world, inverse(plan.T_prior_camera_world)));
-  for (int i = 0; i < 6; ++i) {
-    for (int j = 0; j < 6; ++j) {
-      total.H[6 * i + j] += plan.prior_information[6 * i + j];
-      total.g[i] += plan.prior_information[6 * i + j] * xi[j];
     }
   }
 }
@@ -256,11 +218,8 @@ AlignResult align(std::span<const AlignImage> levels, std::span<const AlignRefer
     }
     for (int iteration = 0; iteration < plan.iterations; ++iteration) {
       Normal total;
-      result.dense_cost = 0.0;
-      result.dense_residuals = 0;
-      for (DenseTerm& term : terms) term.add(result.T_camera_world, plan, total, result);
+      for (DenseTerm& term : terms) term.add(result.T_camera_world, plan, total);
       add_matches(matches, result.T_camera_world, total);
-      add_prior(plan, result.T_camera_world, total);
       result.H = total.H;
       const Vec6 step = total.solve();
       result.T_camera_world = multiply(se3_exp(step), result.T_camera_world);

@@ -69,16 +69,11 @@ struct AlignPlan {
   double dense_weight = 1.0;  // of a dense residual against a match's, whose σ is 1 px: neighbours are correlated
   int iterations = 5;         // per level, at most
   std::size_t finest = 0;     // level to end on
-  std::array<double, 36> prior_information{};  // (6, 6) of the twist that takes T_prior to the pose; zero: none
-  std::array<double, 16> T_prior_camera_world{};
 };
 
 struct AlignResult {
   std::array<double, 16> T_camera_world;
-  std::array<double, 36> H{};  // (6, 6) information of the last linearisation, prior included
-  double dense_cost = 0.0;     // of the last linearisation
-  std::size_t dense_residuals = 0;
-  std::size_t pixel_iterations = 0;  // points looked at, over all iterations: the work done
+  std::array<double, 36> H{};  // (6, 6) information of the last linearisation
 };
 
 // Gauss-Newton over the levels, coarse to fine. Each reference has its own exposure, which is marginalised (Schur
