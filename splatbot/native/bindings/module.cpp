@@ -7,7 +7,7 @@ NB_MODULE(_native, m) {
   define_align(m);
   define_baseline(m);
   define_depth(m);
-  define_mahalanobis(m);
+  define_field(m);
   define_matching(m);
   define_optimize(m);
   define_rasterize(m);
