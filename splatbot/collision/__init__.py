@@ -2,5 +2,15 @@
 
 from splatbot.collision.answers import ClearanceResult, MahalanobisResult, NeighboursResult
 from splatbot.collision.field import GaussianCollisionField
+from splatbot.collision.robot import ArmClearanceResult, ConfigurationResult, EdgeResult, RobotSpheres
 
-__all__ = ["ClearanceResult", "GaussianCollisionField", "MahalanobisResult", "NeighboursResult"]
+__all__ = [
+    "ArmClearanceResult",
+    "ClearanceResult",
+    "ConfigurationResult",
+    "EdgeResult",
+    "GaussianCollisionField",
+    "MahalanobisResult",
+    "NeighboursResult",
+    "RobotSpheres",
+]

@@ -64,18 +64,18 @@ class GaussianCollisionField:
         check_model(model)
         self._rows = np.flatnonzero(self.gate.solid(model))  # by name; a name is a Gaussian's place among the solid
         s = solid_arrays(model, self._rows, np.arange(len(self._rows), dtype=np.int32))
-        self._native = CollisionField(
+        self.native = CollisionField(
             s.means, s.quats, s.scales, s.names, n_sigma=self.n_sigma, voxel=VOXEL, max_voxels=MAX_VOXELS
         )
 
     def __len__(self) -> int:
         """Number of Gaussians that count, after the gates on opacity and observation."""
-        return len(self._native)
+        return len(self.native)
 
     @property
     def nbytes(self) -> int:
         """Bytes of the ellipsoids, the tree, the grid and the table of rows."""
-        return int(self._native.bytes) + self._rows.nbytes
+        return int(self.native.bytes) + self._rows.nbytes
 
     def mahalanobis(self, points: ArrayLike | Tensor) -> MahalanobisResult:
         """The nearest Gaussian of each of ``points`` (P, 3) [m, world frame], numpy or torch.
@@ -83,8 +83,8 @@ class GaussianCollisionField:
         Raises:
             InputError: the shape is not (P, 3) or a value is not finite (the message names the row).
         """
-        distance, names = self._native.mahalanobis(rows(points, "points", 3, "world coordinates in metres"))
-        return MahalanobisResult(distance.astype(np.float32), self._rows_of(names), self.map_version)
+        distance, names = self.native.mahalanobis(rows(points, "points", 3, "world coordinates in metres"))
+        return MahalanobisResult(distance.astype(np.float32), self.rows_of(names), self.map_version)
 
     def in_collision(self, points: ArrayLike | Tensor) -> NDArray[np.bool_]:
         """Whether each of ``points`` (P, 3) or spheres (P, 4) = (x, y, z, radius) [m, world] may touch a Gaussian (P,).
@@ -95,7 +95,7 @@ class GaussianCollisionField:
         Raises:
             InputError: another shape, a value that is not finite, a radius below 0.
         """
-        hits: NDArray[np.uint8] = self._native.hits(*spheres(points))
+        hits: NDArray[np.uint8] = self.native.hits(*spheres(points))
         return hits.astype(np.bool_)
 
     def clearance(self, points: ArrayLike | Tensor, *, cut: float = np.inf) -> ClearanceResult:
@@ -108,9 +108,9 @@ class GaussianCollisionField:
         Raises:
             InputError: as :meth:`in_collision`; the cut is negative or NaN.
         """
-        distance, gradient, witness, names = self._native.nearest(*spheres(points), _checked_cut(cut))
+        distance, gradient, witness, names = self.native.nearest(*spheres(points), _checked_cut(cut))
         witness[names < 0] = np.nan
-        return ClearanceResult(distance, gradient, witness, self._rows_of(names), self.map_version)
+        return ClearanceResult(distance, gradient, witness, self.rows_of(names), self.map_version)
 
     def nearest(self, points: ArrayLike | Tensor, k: int, *, cut: float = np.inf) -> NeighboursResult:
         """The ``k`` (1..64) nearest Gaussians of each of ``points`` (P, 3) or spheres (P, 4), by signed distance.
@@ -120,10 +120,11 @@ class GaussianCollisionField:
         """
         if not 1 <= k <= 64:
             raise InputError(f"is {k}.", field="k", hint="give 1..64")
-        distance, names = self._native.k_nearest(*spheres(points), k, _checked_cut(cut))
-        return NeighboursResult(distance, self._rows_of(names), self.map_version)
+        distance, names = self.native.k_nearest(*spheres(points), k, _checked_cut(cut))
+        return NeighboursResult(distance, self.rows_of(names), self.map_version)
 
-    def _rows_of(self, names: NDArray[np.int32]) -> NDArray[np.int64]:
+    def rows_of(self, names: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Rows of the model of the native field's names; -1 stays -1."""
         if not len(self._rows):
             return np.full(names.shape, -1, dtype=np.int64)
         return np.where(names >= 0, self._rows[names], -1)

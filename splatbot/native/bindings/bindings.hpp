@@ -5,6 +5,7 @@
 #include <nanobind/nanobind.h>
 
 void define_align(nanobind::module_& m);
+void define_arm(nanobind::module_& m);
 void define_baseline(nanobind::module_& m);
 void define_depth(nanobind::module_& m);
 void define_field(nanobind::module_& m);

@@ -5,6 +5,7 @@ NB_MODULE(_native, m) {
   m.doc() = "splatbot's C++ core";
   nanobind::set_leak_warnings(false);  // a render kept until the interpreter exits is no leak
   define_align(m);
+  define_arm(m);
   define_baseline(m);
   define_depth(m);
   define_field(m);

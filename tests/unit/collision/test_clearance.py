@@ -178,7 +178,7 @@ def test_the_grids_bound_never_exceeds_the_distance() -> None:
     model = random_gaussians(400, rng, most=0.02)
     field = GaussianCollisionField(model)
     points = rng.uniform(-1.4, 1.4, (100_000, 3))
-    bound = field._native.grid_bounds(points)
+    bound = field.native.grid_bounds(points)
     distance = np.maximum(field.clearance(points, cut=0.4).distance, 0)
     assert (bound <= distance).all()
     assert (bound > 0.02).mean() > 0.05

@@ -12,7 +12,7 @@ namespace splatbot::SPLATBOT_KERNELS {
 namespace {
 const FieldKernels kField = {field_hits, field_nearest, field_k_nearest, field_mahalanobis,
                              field_grid_bounds, bound_columns, bound_slice};
-const ArmKernels kArm = {};
+const ArmKernels kArm = {arm_configurations, arm_certify, arm_sample, arm_centers};
 }  // namespace
 
 extern const Kernels kKernels;
