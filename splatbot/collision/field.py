@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from splatbot.collision.answers import ClearanceResult, MahalanobisResult, NeighboursResult
+from splatbot.collision.evidence import Evidence
 from splatbot.collision.inputs import rows, spheres
-from splatbot.collision.solids import MIN_OPACITY, SCALE_FLOOR, SolidGate, check_model, solid_arrays
+from splatbot.collision.solids import MIN_OPACITY, SCALE_FLOOR, SolidGate, check_opacities, solid_arrays
 from splatbot.errors import InputError, NativeError
 from splatbot.gaussians import GaussianModel, Snapshot
 
@@ -41,6 +45,7 @@ class GaussianCollisionField:
         n_sigma: where the surface of a Gaussian is taken to be.
         min_opacity: Gaussians fainter than this are air.
         min_observations: so are those that fewer keyframes' depth supports.
+        evidence: so are those that were seen through more often than hit; None: whether is not asked.
 
     Raises:
         InputError: a mean, scale, opacity or quaternion is not finite, or a quaternion is zero (the message names the
@@ -54,6 +59,7 @@ class GaussianCollisionField:
         *,
         min_opacity: float = MIN_OPACITY,
         min_observations: int = 1,
+        evidence: Evidence | None = None,
     ) -> None:
         if not 1e-3 <= n_sigma <= 1e3:
             raise InputError(f"is {n_sigma}.", field="n_sigma", hint="give standard deviations in 0.001..1000")
@@ -61,12 +67,77 @@ class GaussianCollisionField:
         self.map_version = source.map_version if isinstance(source, Snapshot) else 0
         self.n_sigma = float(n_sigma)
         self.gate = SolidGate(min_opacity, min_observations)
-        check_model(model)
-        self._rows = np.flatnonzero(self.gate.solid(model))  # by name; a name is a Gaussian's place among the solid
-        s = solid_arrays(model, self._rows, np.arange(len(self._rows), dtype=np.int32))
+        check_opacities(model)
+        # A solid Gaussian has a name, which it keeps from field to field while its row in the model may change.
+        self._rows = np.flatnonzero(self.gate.solid(model, evidence))  # by name
+        self._names = np.full(len(model), -1, np.int32)  # by row
+        self._names[self._rows] = np.arange(len(self._rows), dtype=np.int32)
+        s = solid_arrays(model, self._rows, self._names[self._rows])
         self.native = CollisionField(
             s.means, s.quats, s.scales, s.names, n_sigma=self.n_sigma, voxel=VOXEL, max_voxels=MAX_VOXELS
         )
+
+    def updated(
+        self,
+        source: GaussianModel | Snapshot,
+        changed: ArrayLike | Tensor,
+        *,
+        previous: ArrayLike | Tensor | None = None,
+        evidence: Evidence | None = None,
+    ) -> GaussianCollisionField:
+        """The field of a later state of the map, which shares what did not change; this one stays as it is.
+
+        The answers are those of a field built anew with the same n_sigma and gates.
+
+        Args:
+            source: the later map.
+            changed: (N,) bool, Gaussians that moved, changed their shape, opacity or observations, or are new.
+            previous: (N,) the row that each Gaussian had in this field's model, -1 for a new one; None: rows stay
+                what they were, and further ones are new. Rows of this field's model that nobody had are removed.
+            evidence: as at first; None: changed Gaussians are not asked for it.
+
+        Raises:
+            InputError: as the constructor, for what changed; changed or previous do not fit the models.
+        """
+        model = source.model if isinstance(source, Snapshot) else source
+        before, dirty = _delta(model, changed, previous, len(self._names))
+        names = np.where(before >= 0, self._names[before] if len(self._names) else -1, -1).astype(np.int32)
+        rows = np.flatnonzero(dirty)
+        part = model.select(torch.from_numpy(rows))
+        check_opacities(part)
+        solid = rows[self.gate.solid(part, None if evidence is None else evidence.select(rows))]
+        alive = np.zeros(len(self._rows), np.bool_)  # by name
+        alive[names[names >= 0]] = True
+        names[np.setdiff1d(rows, solid, assume_unique=True)] = -1
+        fresh = solid[names[solid] < 0]
+        names[fresh] = len(self._rows) + np.arange(len(fresh), dtype=np.int32)
+        kept = np.zeros(len(self._rows) + len(fresh), np.bool_)
+        kept[names[names >= 0]] = True
+        gone = np.flatnonzero((self._rows >= 0) & ~(alive & kept[: len(alive)])).astype(np.int32)
+        s = solid_arrays(model, solid, names[solid])
+        field = copy.copy(self)
+        field.map_version = source.map_version if isinstance(source, Snapshot) else self.map_version + 1
+        field._names = names
+        field._rows = np.full(len(kept), -1, np.int64)
+        field._rows[names[names >= 0]] = np.flatnonzero(names >= 0)
+        field.native = self.native.updated(gone, s.means, s.quats, s.scales, s.names)
+        return field
+
+    def added_since(self, earlier: GaussianCollisionField) -> GaussianCollisionField:
+        """A field of what ``earlier`` has not: only that can be in the way of a path that was free of ``earlier``.
+
+        Compared by geometry, block by block; blocks that both share cost nothing.
+
+        Raises:
+            InputError: the two differ in n_sigma.
+        """
+        if earlier.n_sigma != self.n_sigma:
+            raise InputError(
+                f"is {earlier.n_sigma}, not {self.n_sigma}.", field="n_sigma", hint="ask fields of one kind"
+            )
+        field = copy.copy(self)
+        field.native = self.native.added_since(earlier.native)
+        return field
 
     def __len__(self) -> int:
         """Number of Gaussians that count, after the gates on opacity and observation."""
@@ -75,7 +146,7 @@ class GaussianCollisionField:
     @property
     def nbytes(self) -> int:
         """Bytes of the ellipsoids, the tree, the grid and the table of rows."""
-        return int(self.native.bytes) + self._rows.nbytes
+        return int(self.native.bytes) + self._rows.nbytes + self._names.nbytes
 
     def mahalanobis(self, points: ArrayLike | Tensor) -> MahalanobisResult:
         """The nearest Gaussian of each of ``points`` (P, 3) [m, world frame], numpy or torch.
@@ -134,3 +205,23 @@ def _checked_cut(cut: float) -> float:
     if not cut >= 0.0:
         raise InputError(f"is {cut}.", field="cut", hint="give metres, 0 or more")
     return cut
+
+
+def _delta(
+    model: GaussianModel, changed: ArrayLike | Tensor, previous: ArrayLike | Tensor | None, known: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Each row's row before (-1: none) and whether it must be looked at."""
+    n = len(model)
+    dirty = np.asarray(changed)
+    if dirty.shape != (n,) or dirty.dtype != np.bool_:
+        raise InputError(f"is {dirty.dtype} {dirty.shape}.", field="changed", hint=f"give ({n},) booleans")
+    rows = np.arange(n, dtype=np.int64)
+    before = np.where(rows < known, rows, -1) if previous is None else np.asarray(previous).astype(np.int64)
+    if before.shape != (n,) or (n and (before.min() < -1 or before.max() >= known)):
+        raise InputError(
+            "names a row that was not there.", field="previous", hint=f"give ({n},) rows in -1..{known - 1}"
+        )
+    held = before[before >= 0]
+    if len(np.unique(held)) != len(held) if previous is not None else False:
+        raise InputError("names a row twice.", field="previous", hint="give each row of the earlier map at most once")
+    return before, dirty | (before < 0)

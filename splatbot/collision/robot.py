@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,6 +95,7 @@ class RobotSpheres:
         if not 0.0 <= margin < np.inf:
             raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
         self.robot = robot
+        self.base_in_map = base_in_map
         self.T_world_base = _rigid(np.eye(4) if T_world_base is None else T_world_base)
         self.spheres = _with(robot.spheres(opening), len(robot.chain), attached, margin)
         self.pairs = np.ascontiguousarray(robot.self_collision_pairs, dtype=np.int32).reshape(-1, 2)
@@ -173,6 +175,27 @@ class RobotSpheres:
             raise InputError(f"is {eps}.", field="eps", hint="give metres, at least 0.00001")
         return self._edges(field, self.native.certify(_native(field), *self._ends(start, end), eps))
 
+    def still_free(
+        self,
+        before: GaussianCollisionField,
+        now: GaussianCollisionField,
+        start: ArrayLike,
+        end: ArrayLike,
+        *,
+        eps: float = EPS,
+    ) -> EdgeResult:
+        """Whether edges that were certified on the map ``before`` are free on the map ``now``: only what is new is asked.
+
+        Raises:
+            InputError: as :meth:`certify`, or the fields differ in n_sigma.
+        """
+        return self._without_pairs.certify(now.added_since(before), start, end, eps=eps)
+
+    @cached_property
+    def _without_pairs(self) -> RobotSpheres:
+        """The same arm, which may touch itself."""
+        return RobotSpheres(_Unpaired(self), T_world_base=self.T_world_base, base_in_map=self.base_in_map)
+
     def sample(
         self, field: GaussianCollisionField | None, start: ArrayLike, end: ArrayLike, *, samples: int = 32
     ) -> EdgeResult:
@@ -217,6 +240,18 @@ class RobotSpheres:
         sliding = np.einsum("cji,ci->cj", z, normal)
         gradient = np.where(self.robot.chain.prismatic, sliding, turning)
         return np.where(np.arange(q.shape[1]) < link[:, None], gradient, 0.0)
+
+
+class _Unpaired:
+    """A robot with another's spheres and no pairs."""
+
+    def __init__(self, arm: RobotSpheres) -> None:
+        self.name, self.chain = arm.robot.name, arm.robot.chain
+        self.self_collision_pairs = np.zeros((0, 2), np.int32)
+        self._spheres = arm.spheres
+
+    def spheres(self, opening: float | None = None) -> LinkSpheres:
+        return self._spheres
 
 
 def _with(spheres: LinkSpheres, last: int, attached: ArrayLike | None, margin: float) -> LinkSpheres:

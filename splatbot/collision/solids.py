@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatbot.collision.evidence import Evidence
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 
@@ -41,9 +43,17 @@ class SolidGate:
         if self.min_observations < 0:
             raise InputError(f"is {self.min_observations}.", field="min_observations", hint="give 0 or more keyframes")
 
-    def solid(self, model: GaussianModel) -> NDArray[np.bool_]:
-        """Whether each Gaussian (N,) is solid."""
-        return ((model.opacities >= self.min_opacity) & (model.observations >= self.min_observations)).numpy()
+    def solid(self, model: GaussianModel, evidence: Evidence | None = None) -> NDArray[np.bool_]:
+        """Whether each Gaussian (N,) is solid; one that was seen through more often than hit is not.
+
+        Raises:
+            InputError: the evidence is of another number of Gaussians.
+        """
+        if evidence is not None and len(evidence.hits) != len(model):
+            raise InputError(f"has {len(evidence.hits)} rows.", field="evidence", hint=f"gather it for {len(model)}")
+        solid = (model.opacities.detach() >= self.min_opacity) & (model.observations >= self.min_observations)
+        found = np.asarray(solid.numpy(), dtype=np.bool_)
+        return found if evidence is None else found & ~evidence.seen_through
 
 
 @dataclass(frozen=True)
@@ -64,37 +74,45 @@ class SolidArrays:
 
 
 def solid_arrays(model: GaussianModel, rows: NDArray[np.int64], names: NDArray[np.int32]) -> SolidArrays:
-    """The Gaussians ``rows`` (N,) of a model, under ``names`` (N,)."""
-    chosen = torch.from_numpy(rows)
-    scales = model.log_scales.detach()[chosen].exp().clamp_min(SCALE_FLOOR)
-    if len(rows) and (float(scales.max()) > LARGEST or float(model.means.abs().max()) > LARGEST):
-        raise InputError(f"has values above {LARGEST:g} m.", field="means, scales", hint="give metres")
-    return SolidArrays(
-        _array(model.means.detach()[chosen]),
-        _array(model.quats.detach()[chosen]),
-        _array(scales),
-        np.ascontiguousarray(names, dtype=np.int32),
-    )
-
-
-def check_model(model: GaussianModel) -> None:
-    """Refuse a damaged map: a Gaussian of NaN is never hit, which would read as free.
+    """The Gaussians ``rows`` (N,) of a model, each once and in order, under ``names`` (N,).
 
     Raises:
-        InputError: a mean, scale, opacity or quaternion is not finite, or a quaternion is zero (with the row).
+        InputError: a mean, scale, opacity or quaternion is not finite, or a quaternion is zero: a damaged Gaussian
+            would never be hit, which reads as free (with the row); or a value is above 1e6 m.
     """
-    for name in ("means", "quats", "log_scales", "opacity_logits"):
-        values: Tensor = getattr(model, name).detach()
-        if not bool(torch.isfinite(values).all()):
-            bad = ~torch.isfinite(values).reshape(len(values), -1).all(dim=1)
-            raise InputError(
-                f"row {int(bad.nonzero()[0, 0])} is not finite.", field=name, hint="remove it with GaussianModel.select"
-            )
-    zero = (model.quats.detach() == 0.0).all(dim=1)
-    if bool(zero.any()):
-        raise InputError(
-            f"row {int(zero.nonzero()[0, 0])} is zero.", field="quats", hint="use (1, 0, 0, 0) for no rotation"
-        )
+    columns = [model.means, model.quats, model.log_scales]
+    if len(rows) != len(model):
+        chosen = torch.from_numpy(rows)
+        columns = [values[chosen] for values in columns]
+    for name, values in zip(("means", "quats", "log_scales"), columns, strict=True):
+        _check_finite(name, values, rows)
+    means, quats, log_scales = (values.detach() for values in columns)
+    zero = quats[:, 0] == 0.0
+    if bool(zero.any()) and bool((zero := (quats == 0.0).all(dim=1)).any()):
+        row = rows[int(zero.nonzero()[0, 0])]
+        raise InputError(f"row {row} is zero.", field="quats", hint="use (1, 0, 0, 0) for no rotation")
+    scales = log_scales.exp().clamp_min_(SCALE_FLOOR)
+    if len(rows) and max(float(scales.amax()), float(means.amax()), -float(means.amin())) > LARGEST:
+        raise InputError(f"has values above {LARGEST:g} m.", field="means, scales", hint="give metres")
+    return SolidArrays(_array(means), _array(quats), _array(scales), np.ascontiguousarray(names, dtype=np.int32))
+
+
+def check_opacities(model: GaussianModel) -> None:
+    """Refuse opacities that are not finite: they would read as air.
+
+    Raises:
+        InputError: the message names the row.
+    """
+    _check_finite("opacity_logits", model.opacity_logits, np.arange(len(model)))
+
+
+def _check_finite(name: str, values: Tensor, rows: NDArray[np.int64]) -> None:
+    if math.isfinite(float(values.detach().sum(dtype=torch.float64))):  # no sum of float32 overflows float64
+        return
+    bad = ~torch.isfinite(values).reshape(len(values), -1).all(dim=1)
+    raise InputError(
+        f"row {rows[int(bad.nonzero()[0, 0])]} is not finite.", field=name, hint="remove it with GaussianModel.select"
+    )
 
 
 def _array(values: Tensor) -> NDArray[np.float32]:

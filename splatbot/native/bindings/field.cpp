@@ -154,15 +154,13 @@ void define_field(nb::module_& m) {
                         : owned(std::vector<std::uint8_t>(), {0, 0, 0});
            },
            "Squared bounds in voxels (nz, ny, nx), a copy")
-      .def("changed_box",
-           [](const CollisionField& self, const CollisionField& other) -> std::optional<nb::tuple> {
-             float box[6];
-             if (!self.changed_box(other, box)) {
-               return std::nullopt;
-             }
-             return nb::make_tuple(nb::make_tuple(box[0], box[1], box[2]), nb::make_tuple(box[3], box[4], box[5]));
-           },
-           "other"_a)
+      .def(
+          "added_since",
+          [](const CollisionField& self, const CollisionField& earlier) {
+            nb::gil_scoped_release release;
+            return std::const_pointer_cast<CollisionField>(self.added_since(earlier));
+          },
+          "earlier"_a, "A field of the ellipsoids that an earlier field has not")
       .def("shared_bytes", &CollisionField::shared_bytes, "other"_a)
       .def_prop_ro("bytes", &CollisionField::bytes)
       .def_prop_ro("voxel", [](const CollisionField& self) { return self.grid() != nullptr ? self.grid()->voxel : 0.0F; })

@@ -2,6 +2,7 @@
 #include "splatbot/field.hpp"
 
 #include <algorithm>
+#include <array>
 #include <unordered_map>
 
 #include "solid_blocks.hpp"
@@ -21,17 +22,6 @@ void in_parts(std::size_t count, Ask&& ask) {
   const auto pool = thread_pool();
   const std::size_t part = std::max(kFewest, count / (8 * pool->size()) + 1);
   pool->run((count + part - 1) / part, [&](std::size_t i) { ask(i * part, std::min(count, (i + 1) * part)); });
-}
-
-// Runs of one block in sorted items.
-std::vector<std::span<const SolidItem>> runs_of(std::span<const SolidItem> items) {
-  std::vector<std::span<const SolidItem>> runs;
-  for (std::size_t begin = 0, end = 0; begin < items.size(); begin = end) {
-    for (end = begin + 1; end < items.size() && block_key(items[end].key) == block_key(items[begin].key); ++end) {
-    }
-    runs.push_back(items.subspan(begin, end - begin));
-  }
-  return runs;
 }
 
 void widen(float box[6], const SolidBox& other) {
@@ -57,24 +47,85 @@ SolidBox box_of(const SolidBlock& block) {
 }  // namespace
 
 CollisionField::CollisionField(const Solids& solids, const FieldOptions& options) : options_(options) {
-  std::vector<SolidItem> items = make_items(solids, options.n_sigma);
-  sort_items(items);
-  const auto runs = runs_of(items);
+  const float n_sigma = options.n_sigma;
+  std::vector<SolidPlace> order;
+  const auto runs = sort_into_blocks(
+      solids.ids.size(), [&](std::size_t i) { return key_of(solids, i, n_sigma); },
+      [&](std::size_t i) { return solids.ids[i]; }, order);
   blocks_.resize(runs.size());
-  thread_pool()->run(runs.size(), [&](std::size_t b) { blocks_[b] = make_block(runs[b]); });
+  thread_pool()->run(runs.size(), [&](std::size_t b) {
+    blocks_[b] = make_block(runs[b].key, std::span(order).subspan(runs[b].begin, runs[b].end - runs[b].begin),
+                            [&](std::size_t i) { return make_item(solids, i, n_sigma); });
+  });
   std::int32_t most = -1;
-  for (const SolidItem& item : items) {
-    most = std::max(most, item.id);
+  for (const std::int32_t id : solids.ids) {
+    most = std::max(most, id);
   }
   block_of_.assign(static_cast<std::size_t>(most + 1), -1);
   for (std::size_t b = 0; b < runs.size(); ++b) {
-    for (const SolidItem& item : runs[b]) {
-      block_of_[static_cast<std::size_t>(item.id)] = static_cast<std::int32_t>(b);
+    for (std::size_t i = runs[b].begin; i < runs[b].end; ++i) {
+      block_of_[static_cast<std::size_t>(solids.ids[order[i].index])] = static_cast<std::int32_t>(b);
     }
   }
-  size_ = items.size();
+  size_ = solids.ids.size();
   grid_ = make_grid(blocks_, options_);
   finish();
+}
+
+std::shared_ptr<const CollisionField> CollisionField::added_since(const CollisionField& earlier) const {
+  using Content = std::array<float, 10>;
+  const auto content = [](const SolidItem& item) {
+    Content c;
+    std::copy_n(item.mean, 3, c.begin());
+    std::copy_n(item.quat, 4, c.begin() + 3);
+    std::copy_n(item.axes, 3, c.begin() + 7);
+    return c;
+  };
+  std::unordered_map<std::uint64_t, const SolidBlock*> theirs;
+  for (const auto& block : earlier.blocks_) {
+    if (block) {
+      theirs.emplace(block->key, block.get());
+    }
+  }
+  std::vector<SolidItem> added, mine, before;
+  for (const auto& block : blocks_) {
+    if (!block) {
+      continue;
+    }
+    const auto found = theirs.find(block->key);
+    if (found != theirs.end() && found->second == block.get()) {
+      continue;
+    }
+    std::vector<Content> known;
+    before.clear();
+    if (found != theirs.end()) {
+      append_items(*found->second, before);
+    }
+    for (const SolidItem& item : before) {
+      known.push_back(content(item));
+    }
+    std::sort(known.begin(), known.end());
+    mine.clear();
+    append_items(*block, mine);
+    for (const SolidItem& item : mine) {
+      if (!std::binary_search(known.begin(), known.end(), content(item))) {
+        added.push_back(item);
+      }
+    }
+  }
+  const std::shared_ptr<CollisionField> field(new CollisionField());
+  field->options_ = options_;
+  field->options_.voxel = 0.0F;
+  std::vector<SolidPlace> order;
+  const auto runs = sort_into_blocks(
+      added.size(), [&](std::size_t i) { return added[i].key; }, [&](std::size_t i) { return added[i].id; }, order);
+  for (const BlockRun& run : runs) {
+    field->blocks_.push_back(make_block(run.key, std::span(order).subspan(run.begin, run.end - run.begin),
+                                        [&](std::size_t i) { return added[i]; }));
+  }
+  field->size_ = added.size();
+  field->finish();
+  return field;
 }
 
 void CollisionField::finish() {
@@ -172,22 +223,25 @@ std::shared_ptr<const CollisionField> CollisionField::updated(std::span<const st
   for (const std::int32_t id : inserted.ids) {
     fresh[static_cast<std::size_t>(id)] = 1;
   }
-  sort_items(items);
-  const auto runs = runs_of(items);
+  std::vector<SolidPlace> order;
+  const auto runs = sort_into_blocks(
+      items.size(), [&](std::size_t i) { return items[i].key; }, [&](std::size_t i) { return items[i].id; }, order);
   std::vector<std::int32_t> places(runs.size());
   for (std::size_t r = 0; r < runs.size(); ++r) {
-    const auto [slot, added] = slots.emplace(block_key(runs[r].front().key), static_cast<std::int32_t>(next->blocks_.size()));
+    const auto [slot, added] = slots.emplace(runs[r].key, static_cast<std::int32_t>(next->blocks_.size()));
     if (added) {
       next->blocks_.emplace_back();
     }
     places[r] = slot->second;
   }
   thread_pool()->run(runs.size(), [&](std::size_t r) {
-    next->blocks_[static_cast<std::size_t>(places[r])] = make_block(runs[r]);
+    next->blocks_[static_cast<std::size_t>(places[r])] =
+        make_block(runs[r].key, std::span(order).subspan(runs[r].begin, runs[r].end - runs[r].begin),
+                   [&](std::size_t i) { return items[i]; });
   });
   for (std::size_t r = 0; r < runs.size(); ++r) {
-    for (const SolidItem& item : runs[r]) {
-      next->block_of_[static_cast<std::size_t>(item.id)] = places[r];
+    for (std::size_t i = runs[r].begin; i < runs[r].end; ++i) {
+      next->block_of_[static_cast<std::size_t>(items[order[i].index].id)] = places[r];
     }
     const SolidBlock& block = *next->blocks_[static_cast<std::size_t>(places[r])];
     for (const SolidLeaf& leaf : block.leaves) {
@@ -232,31 +286,6 @@ std::size_t CollisionField::shared_bytes(const CollisionField& other) const {
     }
   }
   return sum;
-}
-
-bool CollisionField::changed_box(const CollisionField& other, float box[6]) const {
-  clear_box(box);
-  std::unordered_map<std::uint64_t, const SolidBlock*> theirs;
-  for (const auto& block : other.blocks_) {
-    if (block) {
-      theirs.emplace(block->key, block.get());
-    }
-  }
-  for (const auto& block : blocks_) {
-    if (!block) {
-      continue;
-    }
-    const auto found = theirs.find(block->key);
-    if (found != theirs.end() && found->second == block.get()) {
-      theirs.erase(found);
-    } else {
-      widen(box, box_of(*block));
-    }
-  }
-  for (const auto& [key, block] : theirs) {
-    widen(box, box_of(*block));
-  }
-  return box[0] <= box[3];
 }
 
 void CollisionField::hits(const SphereQueries& queries, std::size_t count, std::span<std::uint8_t> out) const {

@@ -6,7 +6,7 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
-#include <utility>
+#include <unordered_map>
 
 #include "splatbot/threads.hpp"
 
@@ -43,31 +43,9 @@ std::uint64_t key_of(const float* mean, float longest) {
   return (longest > kBlockEdge ? kLargeBlock : block) << kPlaceBits | place;
 }
 
-SolidItem make_item(const Solids& s, std::size_t i, float n_sigma) {
-  SolidItem item;
-  std::memcpy(item.mean, &s.means[3 * i], sizeof(item.mean));
-  double q[4], largest = 0.0, norm = 0.0;
-  for (int k = 0; k < 4; ++k) {
-    q[k] = static_cast<double>(s.quats[4 * i + static_cast<std::size_t>(k)]);
-    largest = std::max(largest, std::abs(q[k]));
-  }
-  for (double& x : q) {
-    x /= largest;
-    norm += x * x;
-  }
-  norm = std::sqrt(norm);
-  float longest = 0.0F;
-  for (int k = 0; k < 4; ++k) {
-    item.quat[k] = static_cast<float>(q[k] / norm);
-  }
-  for (int k = 0; k < 3; ++k) {
-    const float a = n_sigma * s.scales[3 * i + static_cast<std::size_t>(k)];
-    item.axes[k] = std::max(a, kSmallestAxis) * (1.0F + 4.0F * std::numeric_limits<float>::epsilon());  // scales are rounded
-    longest = std::max(longest, item.axes[k]);
-  }
-  item.key = key_of(item.mean, longest);
-  item.id = s.ids[i];
-  return item;
+// Rounded up by more than the scale and the product were rounded.
+float axis_of(float scale, float n_sigma) {
+  return std::max(n_sigma * scale, kSmallestAxis) * (1.0F + 4.0F * std::numeric_limits<float>::epsilon());
 }
 
 void put_lane(SolidLeaf& leaf, int lane, const SolidItem& item, std::int32_t id) {
@@ -101,13 +79,37 @@ SolidBox nothing() {
 
 }  // namespace
 
+SolidItem make_item(const Solids& s, std::size_t i, float n_sigma) {
+  SolidItem item;
+  std::memcpy(item.mean, &s.means[3 * i], sizeof(item.mean));
+  double q[4], largest = 0.0, norm = 0.0;
+  for (int k = 0; k < 4; ++k) {
+    q[k] = static_cast<double>(s.quats[4 * i + static_cast<std::size_t>(k)]);
+    largest = std::max(largest, std::abs(q[k]));
+  }
+  for (double& x : q) {
+    x /= largest;
+    norm += x * x;
+  }
+  norm = std::sqrt(norm);
+  float longest = 0.0F;
+  for (int k = 0; k < 4; ++k) {
+    item.quat[k] = static_cast<float>(q[k] / norm);
+  }
+  for (int k = 0; k < 3; ++k) {
+    item.axes[k] = axis_of(s.scales[3 * i + static_cast<std::size_t>(k)], n_sigma);
+    longest = std::max(longest, item.axes[k]);
+  }
+  item.key = key_of(item.mean, longest);
+  item.id = s.ids[i];
+  return item;
+}
+
 std::vector<SolidItem> make_items(const Solids& solids, float n_sigma) {
   std::vector<SolidItem> items(solids.ids.size());
-  thread_pool()->run((items.size() + kChunk - 1) / kChunk, [&](std::size_t c) {
-    for (std::size_t i = c * kChunk; i < std::min(items.size(), (c + 1) * kChunk); ++i) {
-      items[i] = make_item(solids, i, n_sigma);
-    }
-  });
+  for (std::size_t i = 0; i < items.size(); ++i) {
+    items[i] = make_item(solids, i, n_sigma);
+  }
   return items;
 }
 
@@ -134,47 +136,58 @@ void append_items(const SolidBlock& block, std::vector<SolidItem>& items) {
   }
 }
 
-void sort_items(std::vector<SolidItem>& items) {
-  struct Entry {
-    std::uint64_t key;
-    std::uint32_t id, index;
-  };
-  std::vector<Entry> from(items.size()), to(items.size());
-  bool by_id = true;
-  std::uint64_t any = 0, all = ~std::uint64_t{0};
-  for (std::size_t i = 0; i < items.size(); ++i) {
-    from[i] = {items[i].key, static_cast<std::uint32_t>(items[i].id), static_cast<std::uint32_t>(i)};
-    by_id &= i == 0 || from[i - 1].id < from[i].id;
-    any |= items[i].key;
-    all &= items[i].key;
-  }
-  if (!by_id || items.size() < 2048) {
-    std::sort(from.begin(), from.end(),
-              [](const Entry& a, const Entry& b) { return a.key < b.key || (a.key == b.key && a.id < b.id); });
-  } else {
-    for (int shift = 0; shift < 64; shift += 11) {  // stable, so that ids stay in order
-      if ((((any ^ all) >> shift) & 0x7ff) == 0) {
-        continue;
-      }
-      std::array<std::uint32_t, 2048> count{};
-      for (const Entry& e : from) {
-        ++count[(e.key >> shift) & 0x7ff];
-      }
-      std::uint32_t sum = 0;
-      for (std::uint32_t& c : count) {
-        sum += std::exchange(c, sum);
-      }
-      for (const Entry& e : from) {
-        to[count[(e.key >> shift) & 0x7ff]++] = e;
-      }
-      from.swap(to);
+std::vector<BlockRun> sort_into_blocks(std::size_t count, const std::function<std::uint64_t(std::size_t)>& key_of_item,
+                                       const std::function<std::int32_t(std::size_t)>& id_of_item,
+                                       std::vector<SolidPlace>& order) {
+  std::vector<std::uint64_t> keys(count);
+  const auto pool = thread_pool();
+  pool->run((count + kChunk - 1) / kChunk, [&](std::size_t c) {
+    for (std::size_t i = c * kChunk; i < std::min(count, (c + 1) * kChunk); ++i) {
+      keys[i] = key_of_item(i);
     }
+  });
+  std::unordered_map<std::uint64_t, std::uint32_t> slots;
+  std::vector<BlockRun> runs;
+  std::vector<std::uint32_t> slot_of(count);
+  std::uint64_t last_key = ~std::uint64_t{0};
+  std::uint32_t last = 0;
+  for (std::size_t i = 0; i < count; ++i) {
+    const std::uint64_t block = block_key(keys[i]);
+    if (block != last_key) {  // neighbours in the map are neighbours in space more often than not
+      const auto [found, added] = slots.emplace(block, static_cast<std::uint32_t>(runs.size()));
+      if (added) {
+        runs.push_back({block, 0, 0});
+      }
+      last_key = block;
+      last = found->second;
+    }
+    slot_of[i] = last;
+    ++runs[last].end;
   }
-  std::vector<SolidItem> sorted(items.size());
-  for (std::size_t i = 0; i < items.size(); ++i) {
-    sorted[i] = items[from[i].index];
+  std::size_t sum = 0;
+  std::vector<std::size_t> next(runs.size());
+  for (std::size_t r = 0; r < runs.size(); ++r) {
+    next[r] = runs[r].begin = sum;
+    sum += runs[r].end;
+    runs[r].end = sum;
   }
-  items.swap(sorted);
+  order.resize(count);
+  for (std::size_t i = 0; i < count; ++i) {
+    order[next[slot_of[i]]++] = {static_cast<std::uint32_t>(keys[i] & ((std::uint64_t{1} << kPlaceBits) - 1)),
+                                 static_cast<std::uint32_t>(i)};
+  }
+  pool->run(runs.size(), [&](std::size_t r) {
+    const auto at = [&](std::size_t i) { return order.begin() + static_cast<std::ptrdiff_t>(i); };
+    std::sort(at(runs[r].begin), at(runs[r].end), [&](const SolidPlace& a, const SolidPlace& b) {
+      return a.place < b.place || (a.place == b.place && id_of_item(a.index) < id_of_item(b.index));
+    });
+  });
+  return runs;
+}
+
+std::uint64_t key_of(const Solids& s, std::size_t i, float n_sigma) {
+  const float longest = std::max({s.scales[3 * i], s.scales[3 * i + 1], s.scales[3 * i + 2]});
+  return key_of(&s.means[3 * i], axis_of(longest, n_sigma));
 }
 
 void axes_of(const SolidLeaf& leaf, int lane, float R[9]) {
@@ -254,20 +267,23 @@ std::vector<SolidNode> make_tree(std::span<const SolidBox> boxes) {
   return nodes;
 }
 
-std::shared_ptr<const SolidBlock> make_block(std::span<const SolidItem> items) {
+std::shared_ptr<const SolidBlock> make_block(std::uint64_t key, std::span<const SolidPlace> order,
+                                             const std::function<SolidItem(std::size_t)>& item_at) {
   auto block = std::make_shared<SolidBlock>();
-  block->key = block_key(items.front().key);
-  block->count = items.size();
-  block->leaves.resize((items.size() + kFan - 1) / kFan);
+  block->key = key;
+  block->count = order.size();
+  block->leaves.resize((order.size() + kFan - 1) / kFan);
   std::vector<SolidBox> boxes(block->leaves.size());
   for (std::size_t l = 0; l < boxes.size(); ++l) {
     std::array<SolidBox, kFan> own;
-    const std::size_t used = std::min<std::size_t>(kFan, items.size() - l * kFan);
+    const std::size_t used = std::min<std::size_t>(kFan, order.size() - l * kFan);
+    SolidItem first;
     for (int lane = 0; lane < kFan; ++lane) {
       const bool real = static_cast<std::size_t>(lane) < used;
-      const SolidItem& item = items[l * kFan + (real ? static_cast<std::size_t>(lane) : 0)];
+      const SolidItem item = real ? item_at(order[l * kFan + static_cast<std::size_t>(lane)].index) : first;
+      first = lane == 0 ? item : first;
       put_lane(block->leaves[l], lane, item, real ? item.id : -1);
-      own[static_cast<std::size_t>(lane)] = box_of(block->leaves[l], lane);
+      own[static_cast<std::size_t>(lane)] = real ? box_of(block->leaves[l], lane) : own[0];
     }
     boxes[l] = hull({own.data(), used});
   }

@@ -2,6 +2,7 @@
 // Blocks of the collision field: sorting into them, their leaves and their trees.
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <span>
 #include <vector>
@@ -20,13 +21,29 @@ struct SolidItem {
 inline constexpr int kPlaceBits = 21;
 inline std::uint64_t block_key(std::uint64_t key) { return key >> kPlaceBits; }
 
+SolidItem make_item(const Solids& solids, std::size_t i, float n_sigma);
 std::vector<SolidItem> make_items(const Solids& solids, float n_sigma);
+std::uint64_t key_of(const Solids& solids, std::size_t i, float n_sigma);  // as the item has it
 void append_items(const SolidBlock& block, std::vector<SolidItem>& items);
 
-// By key, then by id.
-void sort_items(std::vector<SolidItem>& items);
+// An item's place along the curve in its block, and which item it is.
+struct SolidPlace {
+  std::uint32_t place, index;
+};
 
-std::shared_ptr<const SolidBlock> make_block(std::span<const SolidItem> items);
+// One block's part of an order.
+struct BlockRun {
+  std::uint64_t key;
+  std::size_t begin, end;
+};
+
+// The order of items by block, then by place, then by id.
+std::vector<BlockRun> sort_into_blocks(std::size_t count, const std::function<std::uint64_t(std::size_t)>& key_of_item,
+                                       const std::function<std::int32_t(std::size_t)>& id_of_item,
+                                       std::vector<SolidPlace>& order);
+
+std::shared_ptr<const SolidBlock> make_block(std::uint64_t key, std::span<const SolidPlace> order,
+                                             const std::function<SolidItem(std::size_t)>& item_at);
 
 // A tree over boxes: nodes with the root first; leaf i is child ~i.
 struct SolidBox {

@@ -58,6 +58,29 @@ Range intersection(const Range& a, const Range& b) {
   return r;
 }
 
+std::uint8_t& mark_of(BoundGrid& g, std::int32_t x, std::int32_t y, std::int32_t z) {
+  return g.marks[(static_cast<std::size_t>(z) * static_cast<std::size_t>(g.size[1]) + static_cast<std::size_t>(y)) *
+                     static_cast<std::size_t>(g.size[0]) +
+                 static_cast<std::size_t>(x)];
+}
+
+// Whether all of a few voxels are marked already, as is common where ellipsoids are smaller than voxels.
+bool all_marked(BoundGrid& grid, const Range& r) {
+  if (r.count() > 8) {
+    return false;
+  }
+  for (std::int32_t z = r.low[2]; z < r.high[2]; ++z) {
+    for (std::int32_t y = r.low[1]; y < r.high[1]; ++y) {
+      for (std::int32_t x = r.low[0]; x < r.high[0]; ++x) {
+        if (std::atomic_ref(mark_of(grid, x, y, z)).load(std::memory_order_relaxed) == 0) {
+          return false;
+        }
+      }
+    }
+  }
+  return true;
+}
+
 // Marks the voxels that an ellipsoid may touch: those not parted from it by a plane across one of its axes.
 class Marker {
  public:
@@ -80,10 +103,10 @@ class Marker {
   }
 
   void mark(const Range& r) {
-    if (r.count() > 1 && parted(r)) {
+    if (r.count() > kFew && parted(r)) {
       return;
     }
-    if (r.count() > 1) {
+    if (r.count() > kFew) {
       int longest = 0;
       for (int k = 1; k < 3; ++k) {
         longest = r.high[k] - r.low[k] > r.high[longest] - r.low[longest] ? k : longest;
@@ -94,12 +117,21 @@ class Marker {
       mark(far);
       return;
     }
-    if (!parted(r)) {
-      set(r.low[0], r.low[1], r.low[2]);
+    for (std::int32_t z = r.low[2]; z < r.high[2]; ++z) {
+      for (std::int32_t y = r.low[1]; y < r.high[1]; ++y) {
+        for (std::int32_t x = r.low[0]; x < r.high[0]; ++x) {
+          const std::atomic_ref mark(mark_of(grid_, x, y, z));  // blocks may mark the same voxel at once
+          if (mark.load(std::memory_order_relaxed) == 0 && !parted({{x, y, z}, {x + 1, y + 1, z + 1}})) {
+            mark.store(1, std::memory_order_relaxed);
+          }
+        }
+      }
     }
   }
 
  private:
+  static constexpr std::size_t kFew = 27;
+
   bool parted(const Range& r) const {
     float from[3];
     for (int k = 0; k < 3; ++k) {
@@ -118,13 +150,6 @@ class Marker {
     return false;
   }
 
-  void set(std::int32_t x, std::int32_t y, std::int32_t z) {
-    std::uint8_t& mark = grid_.marks[(static_cast<std::size_t>(z) * static_cast<std::size_t>(grid_.size[1]) +
-                                      static_cast<std::size_t>(y)) * static_cast<std::size_t>(grid_.size[0]) +
-                                     static_cast<std::size_t>(x)];
-    std::atomic_ref(mark).store(1, std::memory_order_relaxed);  // blocks may mark the same voxel at once
-  }
-
   BoundGrid& grid_;
   float across_[3][3], size_[3][3], axes_[3], mean_[3], slack_;
 };
@@ -137,7 +162,7 @@ void mark_block(BoundGrid& grid, const SolidBlock& block, const Range& range) {
     for (int lane = 0; lane < kFan && leaf.id[lane] >= 0; ++lane) {
       const SolidBox box = box_of(leaf, lane);
       const Range touched = intersection(voxels_of(grid, box.low, box.high), range);
-      if (!touched.empty()) {
+      if (!touched.empty() && !all_marked(grid, touched)) {
         Marker(grid, leaf, lane).mark(touched);
       }
     }
@@ -164,6 +189,7 @@ void fill_bounds(BoundGrid& grid, const Range& marked) {
     around.low[k] = std::max(args.low[k] - kBoundReach, 0);
     around.high[k] = std::min(args.high[k] + kBoundReach, grid.size[k]);
   }
+  args.open = grid.open;
   args.marks = grid.marks.data();
   args.bound = grid.bound.data();
   args.x0 = around.low[0];
@@ -187,53 +213,81 @@ void fill_bounds(BoundGrid& grid, const Range& marked) {
   });
 }
 
-}  // namespace
+void mark(BoundGrid& grid, BlockList blocks, const Range& range) {
+  thread_pool()->run(blocks.size(), [&](std::size_t b) {
+    if (blocks[b]) {
+      mark_block(grid, *blocks[b], range);
+    }
+  });
+}
 
-std::shared_ptr<BoundGrid> make_grid(BlockList blocks, const FieldOptions& options) {
-  std::vector<float> along[3];
-  float low[3], high[3];
+bool reaches_out(const BoundGrid& grid, BlockList blocks) {
   for (const auto& block : blocks) {
-    for (std::size_t l = 0; block && l < block->leaves.size(); l += 2) {
-      for (int k = 0; k < 3; ++k) {
-        along[k].push_back(block->leaves[l].mean[k][0]);
+    for (int k = 0; block && k < 3; ++k) {
+      if (block->low[k] < grid.origin[k] ||
+          block->high[k] > grid.origin[k] + static_cast<float>(grid.size[k]) * grid.voxel) {
+        return true;
       }
     }
   }
-  if (along[0].empty() || !(options.voxel > 0.0F)) {
+  return false;
+}
+
+// Where the Gaussians' means are, but for a share at either end of each axis, with a margin; false if there is none.
+bool extent(BlockList blocks, double aside, float* low, float* high) {
+  std::vector<float> along[3];
+  for (const auto& block : blocks) {
+    for (std::size_t l = 0; block && l < block->leaves.size(); ++l) {
+      for (int k = 0; k < 3; ++k) {
+        const float* means = block->leaves[l].mean[k];
+        const auto [least, most] = std::minmax_element(means, means + kFan);
+        along[k].insert(along[k].end(), {*least, *most});
+      }
+    }
+  }
+  for (int k = 0; k < 3 && !along[0].empty(); ++k) {
+    auto& values = along[k];
+    const auto skip = static_cast<std::ptrdiff_t>(aside * static_cast<double>(values.size()));
+    std::nth_element(values.begin(), values.begin() + skip, values.end());
+    low[k] = values[static_cast<std::size_t>(skip)] - kMargin;
+    std::nth_element(values.begin(), values.end() - 1 - skip, values.end());
+    high[k] = *(values.end() - 1 - skip) + kMargin;
+  }
+  return !along[0].empty();
+}
+
+bool fit(BoundGrid& grid, const float* low, const float* high, std::size_t most) {
+  double voxels = 1.0;
+  for (int k = 0; k < 3; ++k) {
+    const double cells = std::ceil(static_cast<double>(high[k] - low[k]) / static_cast<double>(grid.voxel));
+    grid.size[k] = static_cast<std::int32_t>(std::min(cells, 1e6));
+    voxels *= cells;
+  }
+  return voxels <= static_cast<double>(most);
+}
+
+}  // namespace
+
+std::shared_ptr<BoundGrid> make_grid(BlockList blocks, const FieldOptions& options) {
+  auto grid = std::make_shared<BoundGrid>();
+  float low[3], high[3];
+  grid->voxel = options.voxel;
+  if (!(options.voxel > 0.0F) || !extent(blocks, 0.0, low, high)) {
     return nullptr;
   }
-  auto grid = std::make_shared<BoundGrid>();
-  grid->voxel = options.voxel;
-  for (int k = 0; k < 3; ++k) {
-    auto& values = along[k];
-    const auto aside = static_cast<std::ptrdiff_t>(kOutside * static_cast<double>(values.size()));
-    std::nth_element(values.begin(), values.begin() + aside, values.end());
-    low[k] = values[static_cast<std::size_t>(aside)] - kMargin;
-    std::nth_element(values.begin(), values.end() - 1 - aside, values.end());
-    high[k] = *(values.end() - 1 - aside) + kMargin;
-  }
-  for (;;) {
-    double voxels = 1.0;
-    for (int k = 0; k < 3; ++k) {
-      const double cells = std::ceil(static_cast<double>(high[k] - low[k]) / static_cast<double>(grid->voxel));
-      grid->size[k] = static_cast<std::int32_t>(std::min(cells, 1e6));
-      voxels *= cells;
+  if (!fit(*grid, low, high, options.max_voxels)) {  // without what lies far off
+    extent(blocks, kOutside, low, high);
+    while (!fit(*grid, low, high, options.max_voxels)) {
+      grid->voxel *= 1.03F;
     }
-    if (voxels <= static_cast<double>(options.max_voxels)) {
-      break;
-    }
-    grid->voxel *= std::max(1.02F, static_cast<float>(std::cbrt(voxels / static_cast<double>(options.max_voxels))));
   }
   std::copy(std::begin(low), std::end(low), grid->origin);
   const std::size_t total = whole(*grid).count();
   grid->marks.assign(total, 0);
   grid->bound.assign(total, 0);
-  float box[6];
-  for (int k = 0; k < 3; ++k) {
-    box[k] = -1e30F;
-    box[3 + k] = 1e30F;
-  }
-  refresh(*grid, blocks, box);
+  grid->open = reaches_out(*grid, blocks);
+  mark(*grid, blocks, whole(*grid));
+  fill_bounds(*grid, whole(*grid));
   return grid;
 }
 
@@ -257,16 +311,17 @@ bool outgrown(const BoundGrid& grid, BlockList blocks) {
 
 void refresh(BoundGrid& grid, BlockList blocks, const float box[6]) {
   const Range range = intersection(voxels_of(grid, box, box + 3), whole(grid));
-  if (range.empty()) {
-    return;
+  if (!range.empty()) {
+    clear_marks(grid, range);
+    mark(grid, blocks, range);
   }
-  clear_marks(grid, range);
-  thread_pool()->run(blocks.size(), [&](std::size_t b) {
-    if (blocks[b]) {
-      mark_block(grid, *blocks[b], range);
-    }
-  });
-  fill_bounds(grid, range);
+  const bool open = reaches_out(grid, blocks);
+  if (open != grid.open) {
+    grid.open = open;
+    fill_bounds(grid, whole(grid));
+  } else if (!range.empty()) {
+    fill_bounds(grid, range);
+  }
 }
 
 }  // namespace splatbot

@@ -186,6 +186,19 @@ def test_the_grids_bound_never_exceeds_the_distance() -> None:
     assert (distance - bound)[tight].max() < 0.02 * 2 * np.sqrt(3) + 0.02
 
 
+def test_the_grids_bound_holds_where_some_gaussians_lie_beyond_the_grid() -> None:
+    rng = np.random.default_rng(8)
+    model = random_gaussians(2000, rng, most=0.02)
+    model.means[0] = torch.tensor([300.0, 0, 0])  # too far for a grid of fine voxels
+    model.means[1:5] = torch.tensor([[1.45, 0, 0], [-1.5, 0.5, 0], [0, 1.6, 0.2], [0, 0, -1.7]])
+    field = GaussianCollisionField(model)
+    points = rng.uniform(-2, 2, (100_000, 3))
+    bound = field.native.grid_bounds(points)
+    assert (bound <= np.maximum(field.clearance(points, cut=0.4).distance, 0)).all()
+    assert (bound > 0.05).any()
+    assert 0 < field.native.voxel < 0.04
+
+
 @pytest.mark.parametrize("radius", [-0.1, np.nan, 1e9])
 def test_a_radius_that_makes_no_sense_is_named(radius: float) -> None:
     with pytest.raises(InputError, match=r"row 1|radius"):

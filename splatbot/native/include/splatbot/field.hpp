@@ -43,6 +43,7 @@ struct BoundGrid {
   std::int32_t size[3];
   float origin[3];
   float voxel;
+  bool open;  // some ellipsoid reaches outside: no bound goes beyond the rim
   std::vector<std::uint8_t> marks, bound;
 };
 
@@ -54,14 +55,15 @@ class CollisionField {
   // change concerns are shared. The answers are those of a field built anew.
   std::shared_ptr<const CollisionField> updated(std::span<const std::int32_t> removed, const Solids& inserted) const;
 
+  // A field of what `earlier` has not, by geometry and not by id: what may be in the way only now. Without a grid.
+  std::shared_ptr<const CollisionField> added_since(const CollisionField& earlier) const;
+
   std::size_t size() const noexcept { return size_; }
   std::size_t bytes() const;         // of leaves, trees, grid and the place of each id
   std::size_t shared_bytes(const CollisionField& other) const;  // of blocks that both hold
   const FieldOptions& options() const noexcept { return options_; }
   const SolidsView& view() const noexcept { return view_; }
   const BoundGrid* grid() const noexcept { return grid_.get(); }
-  // The box (low 3, high 3) around everything that differs from `other`; false if nothing does.
-  bool changed_box(const CollisionField& other, float box[6]) const;
 
   void hits(const SphereQueries& queries, std::size_t count, std::span<std::uint8_t> out) const;
   void nearest(const SphereQueries& queries, std::size_t count, float cut, std::span<NearestSolid> out) const;

@@ -29,6 +29,7 @@ inline constexpr int kBoundReach = 15;  // [voxels] as far as bounds go; its squ
 struct BoundArgs {
   const std::uint8_t* marks;  // (nz, ny, nx): 1 where an ellipsoid may be
   std::int32_t size[3];       // nx, ny, nz
+  bool open;                  // something may be anywhere outside of the grid
   std::int32_t low[3], high[3];
   std::int32_t x0, x1, y0, y1;  // low and high with what lies around them
   std::uint8_t* along_z;        // scratch (high z - low z, y1 - y0, x1 - x0): squared distances along z

@@ -35,10 +35,13 @@ void bound_columns(const BoundArgs& a, int y, std::uint8_t* steps) {
       steps[x] = m[x] != 0 ? std::uint8_t{0} : next;
     }
   };
+  const int first = a.low[2] - kReach < 0 ? 0 : a.low[2] - kReach;
+  const int last = a.high[2] + kReach < a.size[2] ? a.high[2] + kReach : a.size[2];
+  const auto outside = [&](bool rim) { return static_cast<std::uint8_t>(a.open && rim ? 0 : kReach + 1); };
   for (int x = 0; x < width; ++x) {
-    steps[x] = kReach + 1;
+    steps[x] = outside(first == 0);
   }
-  for (int z = a.low[2] - kReach < 0 ? 0 : a.low[2] - kReach; z < a.high[2]; ++z) {
+  for (int z = first; z < a.high[2]; ++z) {
     sweep(z);
     if (z >= a.low[2]) {
       std::uint8_t* o = out(z);
@@ -48,9 +51,9 @@ void bound_columns(const BoundArgs& a, int y, std::uint8_t* steps) {
     }
   }
   for (int x = 0; x < width; ++x) {
-    steps[x] = kReach + 1;
+    steps[x] = outside(last == a.size[2]);
   }
-  for (int z = (a.high[2] + kReach < a.size[2] ? a.high[2] + kReach : a.size[2]) - 1; z >= a.low[2]; --z) {
+  for (int z = last - 1; z >= a.low[2]; --z) {
     sweep(z);
     if (z < a.high[2]) {
       std::uint8_t* o = out(z);
@@ -68,8 +71,8 @@ void bound_slice(const BoundArgs& a, int z, std::uint16_t* line) {
   std::uint16_t* const row = line + kReach;  // with room on both sides
   std::uint16_t* const best = row + width + kReach;
   for (int x = -kReach; x < 0; ++x) {
-    row[x] = kMost;
-    row[width - 1 - x] = kMost;
+    row[x] = a.open && a.x0 == 0 ? 0 : kMost;
+    row[width - 1 - x] = a.open && a.x1 == a.size[0] ? 0 : kMost;
   }
   for (int y = a.low[1]; y < a.high[1]; ++y) {
     for (int x = 0; x < width; ++x) {
@@ -77,6 +80,12 @@ void bound_slice(const BoundArgs& a, int z, std::uint16_t* line) {
     }
     for (int j = -kReach; j <= kReach; ++j) {
       if (y + j < a.y0 || y + j >= a.y1) {
+        if (a.open && (y + j < 0 || y + j >= a.size[1])) {
+          const auto f = static_cast<std::uint16_t>(square_gap(j));
+          for (int x = 0; x < width; ++x) {
+            row[x] = f < row[x] ? f : row[x];
+          }
+        }
         continue;
       }
       const std::uint8_t* d = a.along_z + (static_cast<std::size_t>(z - a.low[2]) * static_cast<std::size_t>(a.y1 - a.y0) +
