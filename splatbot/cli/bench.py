@@ -20,7 +20,7 @@ _SHARES = ("blend forward, share of FMA peak", "blend backward, share of FMA pea
 
 
 def bench(
-    name: Annotated[Literal["raster"], tyro.conf.Positional, tyro.conf.arg(metavar="NAME")],
+    name: Annotated[Literal["raster", "collision"], tyro.conf.Positional, tyro.conf.arg(metavar="NAME")],
     /,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -35,18 +35,22 @@ def bench(
     machine's peak of multiply-adds; the fused loss; what each option costs; error against milliseconds; growth.
     Times are the least of several runs (with the median beside), in milliseconds, through Python and autograd.
 
+    collision: the collision field and an arm of spheres: build, update, memory, questions a second; false free and
+    false hit against exact truth, over n_sigma and over how edges are checked; what floaters block.
+
     Examples:
         splatbot bench raster
         splatbot bench raster --peers
         splatbot bench raster --splat runs/latest/map.ply --threads 1 2 4
         splatbot bench raster --quick --json figures.json
+        splatbot bench collision --peers
 
     Args:
         name: what to measure.
-        out: folder for raster.json, raster.csv and the plots; by default runs/bench-NAME.
+        out: folder for NAME.json, NAME.csv and the plots; by default runs/bench-NAME.
         json: another place for the JSON file.
         peers: measure other implementations of the same model beside it (minutes).
-        splat: a map or splat file to render as well.
+        splat: a map or splat file to render as well (raster).
         threads: how many threads to measure with.
         quick: tiny scenes, to see whether it runs.
     """
@@ -59,13 +63,24 @@ def bench(
 
     from rich.console import Console
 
-    from splatbot.bench.raster import RasterPlan, run_raster
-
     folder = out if out is not None else Path("runs") / f"bench-{name}"
     progress = Console(stderr=True)
 
     def say(text: str) -> None:
         progress.print(f"[dim]{text} ...[/dim]", highlight=False)
+
+    if name == "collision":
+        from splatbot.bench.collision import CollisionPlan, run_collision
+        from splatbot.cli.bench_collision import print_collision
+
+        field_plan = CollisionPlan.quick_plan(say=say) if quick else CollisionPlan(say=say)
+        found = run_collision(replace(field_plan, thread_counts=tuple(threads), peers=peers), folder)
+        if json is not None:
+            found.write_json(json)
+        print_collision(found, folder)
+        return 0
+
+    from splatbot.bench.raster import RasterPlan, run_raster
 
     plan = RasterPlan.quick_plan(say=say) if quick else RasterPlan(say=say)
     results = run_raster(replace(plan, thread_counts=tuple(threads), peers=peers, splat=splat), folder)

@@ -14,8 +14,8 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 
-# A depth within this much of a Gaussian's own hits it; a depth farther behind sees through it. Both grow with the square
-# of the depth, as a structured-light camera's noise does (Khoshelham & Elberink 2012: sigma = 1.4e-3 z^2).
+# A depth within this much of a Gaussian's own hits it; one farther behind sees through it. It grows with the square of
+# the depth, as a structured-light camera's noise does (Khoshelham & Elberink 2012: sigma = 1.4e-3 z^2).
 TOLERANCE, TOLERANCE_PER_Z2 = 0.01, 0.006  # [m], [1/m]
 
 

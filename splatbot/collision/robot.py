@@ -184,7 +184,7 @@ class RobotSpheres:
         *,
         eps: float = EPS,
     ) -> EdgeResult:
-        """Whether edges that were certified on the map ``before`` are free on the map ``now``: only what is new is asked.
+        """Whether edges that were certified on the map ``before`` are free on ``now``: only what is new is asked.
 
         Raises:
             InputError: as :meth:`certify`, or the fields differ in n_sigma.
