@@ -22,6 +22,7 @@ from splatbot.bench.timing import Timing, measure, threads
 from splatbot.bench.truth import Audit, Truth, apart_from_itself, audit, score
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres, gather_evidence
+from splatbot.collision.robot import EPS
 from splatbot.gaussians import GaussianModel
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
@@ -129,8 +130,8 @@ def run_speed(
     _rate(plan, results, case, "configurations with clearance", len(some), lambda: arm.clearance(field, some, cut=0.2))
     start, end = free_edges(arm, field, q[:20_000], rng, 50 if plan.quick else 2000)
     for metric, ask in (
-        ("1 rad edge, certified", lambda a, b: arm.certify(field, a, b)),
-        ("1 rad edge, 32 samples", lambda a, b: arm.sample(field, a, b)),
+        ("1 rad edge, certified", lambda a, b: arm.native.certify(field.native, a, b, EPS)),
+        ("1 rad edge, 32 samples", lambda a, b: arm.native.sample(field.native, a, b, 32)),
     ):
         spent = np.array([_seconds(ask, start[i : i + 1], end[i : i + 1]) for i in range(len(start))])
         results.add(case, f"{metric}, median of single calls", 1e6 * float(np.median(spent)), "us")

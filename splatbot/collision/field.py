@@ -100,26 +100,27 @@ class GaussianCollisionField:
             InputError: as the constructor, for what changed; changed or previous do not fit the models.
         """
         model = source.model if isinstance(source, Snapshot) else source
-        before, dirty = _delta(model, changed, previous, len(self._names))
-        names = np.where(before >= 0, self._names[before] if len(self._names) else -1, -1).astype(np.int32)
-        rows = np.flatnonzero(dirty)
+        names, rows = self._carried(model, changed, previous)
         part = model.select(torch.from_numpy(rows))
         check_opacities(part)
-        solid = rows[self.gate.solid(part, None if evidence is None else evidence.select(rows))]
-        alive = np.zeros(len(self._rows), np.bool_)  # by name
-        alive[names[names >= 0]] = True
-        names[np.setdiff1d(rows, solid, assume_unique=True)] = -1
-        fresh = solid[names[solid] < 0]
+        here = self.gate.solid(part, None if evidence is None else evidence.select(rows))
+        solid, was = rows[here], names[rows]
+        names[rows[~here]] = -1
+        fresh = solid[was[here] < 0]
         names[fresh] = len(self._rows) + np.arange(len(fresh), dtype=np.int32)
-        kept = np.zeros(len(self._rows) + len(fresh), np.bool_)
-        kept[names[names >= 0]] = True
-        gone = np.flatnonzero((self._rows >= 0) & ~(alive & kept[: len(alive)])).astype(np.int32)
+        table = np.concatenate([self._rows, fresh])
+        if previous is None and len(model) >= len(self._names):
+            gone = was[~here & (was >= 0)]
+            table[gone] = -1
+        else:
+            table[:] = -1
+            table[names[names >= 0]] = np.flatnonzero(names >= 0)
+            gone = np.flatnonzero((table[: len(self._rows)] < 0) & (self._rows >= 0)).astype(np.int32)
         s = solid_arrays(model, solid, names[solid])
         field = copy.copy(self)
         field.map_version = source.map_version if isinstance(source, Snapshot) else self.map_version + 1
         field._names = names
-        field._rows = np.full(len(kept), -1, np.int64)
-        field._rows[names[names >= 0]] = np.flatnonzero(names >= 0)
+        field._rows = table
         field.native = self.native.updated(gone, s.means, s.quats, s.scales, s.names)
         return field
 
@@ -194,6 +195,32 @@ class GaussianCollisionField:
         distance, names = self.native.k_nearest(*spheres(points), k, _checked_cut(cut))
         return NeighboursResult(distance, self.rows_of(names), self.map_version)
 
+    def _carried(
+        self, model: GaussianModel, changed: ArrayLike | Tensor, previous: ArrayLike | Tensor | None
+    ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """The names (N,) that Gaussians bring from this field, -1 for none, and the rows that must be looked at."""
+        n, known = len(model), len(self._names)
+        dirty = np.asarray(changed)
+        if dirty.shape != (n,) or dirty.dtype != np.bool_:
+            raise InputError(f"is {dirty.dtype} {dirty.shape}.", field="changed", hint=f"give ({n},) booleans")
+        if previous is None:
+            names = np.full(n, -1, np.int32)
+            names[: min(n, known)] = self._names[:n]
+            new = np.arange(min(n, known), n)
+            return names, np.concatenate([np.flatnonzero(dirty[: min(n, known)]), new])
+        before = np.asarray(previous).astype(np.int64)
+        if before.shape != (n,) or (n and (before.min() < -1 or before.max() >= known)):
+            hint = f"give ({n},) rows in -1..{known - 1}"
+            raise InputError("names a row that was not there.", field="previous", hint=hint)
+        count = np.bincount(before[before >= 0], minlength=1)
+        if count.max() > 1:
+            raise InputError(
+                "names a row twice.", field="previous", hint="give each row of the earlier map at most once"
+            )
+        names = np.full(n, -1, np.int32)
+        names[before >= 0] = self._names[before[before >= 0]]
+        return names, np.flatnonzero(dirty | (before < 0))
+
     def rows_of(self, names: NDArray[np.int32]) -> NDArray[np.int64]:
         """Rows of the model of the native field's names; -1 stays -1."""
         if not len(self._rows):
@@ -205,23 +232,3 @@ def _checked_cut(cut: float) -> float:
     if not cut >= 0.0:
         raise InputError(f"is {cut}.", field="cut", hint="give metres, 0 or more")
     return cut
-
-
-def _delta(
-    model: GaussianModel, changed: ArrayLike | Tensor, previous: ArrayLike | Tensor | None, known: int
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Each row's row before (-1: none) and whether it must be looked at."""
-    n = len(model)
-    dirty = np.asarray(changed)
-    if dirty.shape != (n,) or dirty.dtype != np.bool_:
-        raise InputError(f"is {dirty.dtype} {dirty.shape}.", field="changed", hint=f"give ({n},) booleans")
-    rows = np.arange(n, dtype=np.int64)
-    before = np.where(rows < known, rows, -1) if previous is None else np.asarray(previous).astype(np.int64)
-    if before.shape != (n,) or (n and (before.min() < -1 or before.max() >= known)):
-        raise InputError(
-            "names a row that was not there.", field="previous", hint=f"give ({n},) rows in -1..{known - 1}"
-        )
-    held = before[before >= 0]
-    if len(np.unique(held)) != len(held) if previous is not None else False:
-        raise InputError("names a row twice.", field="previous", hint="give each row of the earlier map at most once")
-    return before, dirty | (before < 0)

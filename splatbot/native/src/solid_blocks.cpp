@@ -14,7 +14,7 @@ namespace splatbot {
 
 namespace {
 
-constexpr int kBlockBits = 14;  // an axis: 2 km either way, beyond which blocks at the rim hold the rest
+constexpr int kBlockBits = 14;  // an axis: 1 km either way, beyond which blocks at the rim hold the rest
 constexpr int kInBlockBits = kPlaceBits / 3;
 constexpr std::uint64_t kLargeBlock = (std::uint64_t{1} << (3 * kBlockBits)) - 1;
 constexpr float kSmallestAxis = 1e-9F;  // [m]; squares must not vanish

@@ -28,7 +28,7 @@ struct Solids {
   std::span<const std::int32_t> ids;  // (N,), each once
 };
 
-inline constexpr float kBlockEdge = 0.25F;  // [m]; where a mean lies says which block it belongs to
+inline constexpr float kBlockEdge = 0.125F;  // [m]; where a mean lies says which block it belongs to
 
 // The Gaussians whose means lie in one cube of space (those too large for a cube: in one block of their own).
 struct SolidBlock {
