@@ -27,6 +27,7 @@ COMMANDS = {
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "bench": _Command("splatbot.cli.bench", "bench", "Measure speed, and what accuracy costs in time."),
+    "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 
