@@ -27,6 +27,7 @@ def bench(
     peers: bool = False,
     splat: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     threads: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (1, 2),
+    run: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     quick: bool = False,
 ) -> int:
     """Measure speed, and what accuracy costs in time.
@@ -52,6 +53,7 @@ def bench(
         peers: measure other implementations of the same model beside it (minutes).
         splat: a map or splat file to render as well (raster).
         threads: how many threads to measure with.
+        run: a run folder of splatbot map, whose field is compared with its log's raw depth (collision).
         quick: tiny scenes, to see whether it runs.
     """
     from splatbot.errors import InputError
@@ -74,7 +76,7 @@ def bench(
         from splatbot.cli.bench_collision import print_collision
 
         field_plan = CollisionPlan.quick_plan(say=say) if quick else CollisionPlan(say=say)
-        found = run_collision(replace(field_plan, thread_counts=tuple(threads), peers=peers), folder)
+        found = run_collision(replace(field_plan, thread_counts=tuple(threads), peers=peers, run=run), folder)
         if json is not None:
             found.write_json(json)
         print_collision(found, folder)

@@ -31,6 +31,8 @@ def print_collision(results: Results, folder: Path) -> None:
         ("Floaters", "gate"),
     ):
         console.print(_by_case(title, results.select(prefix)))
+    maps = [row for row in own if row.case.startswith("mapped") or row.case.endswith("points in free space")]
+    console.print(_by_metric("Maps made from images", maps))
     rest = [row for row in results.rows if row.case.startswith(("points against", "configurations, "))]
     if rest:
         table = Table("case", "metric", "whose", "figure", title="Beside peers")
