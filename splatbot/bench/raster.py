@@ -21,6 +21,7 @@ from splatbot.bench.sweeps import run_growth, run_sweeps
 from splatbot.bench.timing import Timing, measure, peak_memory, threads
 from splatbot.optimize.losses import l1_dssim
 from splatbot.rasterize import rasterization
+from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.work import RasterWork, raster_work
 
 # Floating-point operations of a (Gaussian, pixel) pair with RGB and depth, counted in the algorithm.
@@ -163,11 +164,11 @@ class Passes:
         with torch.no_grad():
             return rasterization(**self._plain)[0]
 
-    def forward_backward(self) -> RasterWork:
+    def forward_backward(self) -> RenderMeta:
         """Gradients to all five tensors."""
         image, _, meta = rasterization(**(self._plain | self._leaves))
         torch.autograd.grad(image, tuple(self._leaves.values()), self.upstream)
-        return raster_work(meta)[0]
+        return meta
 
     def pose_backward(self) -> Tensor:
         """The gradient to the view matrix alone."""
@@ -186,7 +187,7 @@ class Passes:
 
     def best_work(self, runs: int) -> RasterWork:
         """Each stage's least time over a few runs."""
-        works = [self.forward_backward() for _ in range(runs)]
+        works = [raster_work(self.forward_backward())[0] for _ in range(runs)]
         stages = [name for name in RasterWork.__dataclass_fields__ if name.endswith("_ms")]
         return RasterWork(
             **{name: min(getattr(work, name) for work in works) for name in stages},

@@ -22,6 +22,12 @@ inline constexpr int kBlockPixels = kBlock * kBlock;
 inline constexpr int kTilePixels = kTileWidth * kTileHeight;
 static_assert(kBlocks == 32 && kBlockColumns == 8);
 
+// Where a tile keeps its pixel (x, y): block by block, 16 to a block, column by column within it, so that what depends
+// on a pixel's line alone is four numbers over and over. Always inlined: the kernels are compiled for several CPUs.
+__attribute__((always_inline)) inline constexpr int pixel_index(int x, int y) {
+  return ((y / kBlock) * kBlockColumns + x / kBlock) * kBlockPixels + (x % kBlock) * kBlock + y % kBlock;
+}
+
 // Gaussians are projected in blocks of this many, whatever the number of threads: sums over them are in fixed order.
 inline constexpr std::size_t kProjectBlock = 1024;
 
