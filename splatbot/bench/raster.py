@@ -19,6 +19,7 @@ from splatbot.bench.results import Results
 from splatbot.bench.scenes import SplatScene, from_file, random_box, surface_map
 from splatbot.bench.sweeps import run_growth, run_sweeps
 from splatbot.bench.timing import Timing, measure, peak_memory, threads
+from splatbot.bench.variants import run_variants
 from splatbot.optimize.losses import l1_dssim
 from splatbot.rasterize import rasterization
 from splatbot.rasterize.meta import RenderMeta
@@ -41,6 +42,7 @@ class RasterPlan:
         peers: measure other implementations too, at the first size.
         splat: a map or splat file to render besides the built-in scenes.
         quick: tiny scenes: whether it runs, not how fast.
+        variants: compile the core with other constants and measure that too (minutes).
     """
 
     sizes: tuple[tuple[int, int], ...] = ((320, 240), (640, 480), (1280, 720))
@@ -50,12 +52,13 @@ class RasterPlan:
     peers: bool = False
     splat: Path | None = None
     quick: bool = False
+    variants: bool = False
     say: Say = field(default=lambda text: None)
 
     @classmethod
     def quick_plan(cls, *, peers: bool = False, splat: Path | None = None, say: Say = lambda text: None) -> RasterPlan:
         """A run of seconds."""
-        return cls(((32, 24),), (1, 2), 2, 0.1, peers, splat, True, say)
+        return cls(((32, 24),), (1, 2), 2, 0.1, peers, splat, quick=True, say=say)
 
     def scenes(self) -> list[SplatScene]:
         """The surface map, random boxes, and the given file."""
@@ -101,6 +104,8 @@ def run_raster(plan: RasterPlan, out: Path) -> Results:
     if plan.peers:
         with threads(1):  # as the peers
             run_peers(plan, results)
+    if plan.variants:
+        run_variants(results, threads=max(plan.thread_counts), say=plan.say)
     results.write_json(out / "raster.json")
     results.write_csv(out / "raster.csv")
     plot_sweeps(results, out)

@@ -12,15 +12,19 @@
 namespace splatbot {
 
 // Tiles are large because each (Gaussian, tile) pair carries an exact mask of the 4x4-pixel blocks it reaches.
-inline constexpr int kTileWidth = 32;
-inline constexpr int kTileHeight = 16;
+#if !defined(SPLATBOT_TILE_WIDTH)
+#define SPLATBOT_TILE_WIDTH 32
+#define SPLATBOT_TILE_HEIGHT 16
+#endif
+inline constexpr int kTileWidth = SPLATBOT_TILE_WIDTH;
+inline constexpr int kTileHeight = SPLATBOT_TILE_HEIGHT;
 inline constexpr int kBlock = 4;
 inline constexpr int kBlockColumns = kTileWidth / kBlock;
 inline constexpr int kBlockRows = kTileHeight / kBlock;
 inline constexpr int kBlocks = kBlockColumns * kBlockRows;  // one bit each in a std::uint32_t
 inline constexpr int kBlockPixels = kBlock * kBlock;
 inline constexpr int kTilePixels = kTileWidth * kTileHeight;
-static_assert(kBlocks == 32 && kBlockColumns == 8);
+static_assert(kBlocks <= 32 && kTileHeight % 16 == 0);
 
 // Where a tile keeps its pixel (x, y): block by block, 16 to a block, column by column within it, so that what depends
 // on a pixel's line alone is four numbers over and over. Always inlined: the kernels are compiled for several CPUs.

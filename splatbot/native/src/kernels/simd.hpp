@@ -361,7 +361,13 @@ SB_INLINE F exp2(F q) {
   const __m512i k = _mm512_castps_si512(t.v);
   const __m512i root = _mm512_permutex2var_epi32(_mm512_load_si512(kRoots), k, _mm512_load_si512(kRoots + 16));
   const F scale = {_mm512_castsi512_ps(_mm512_add_epi32(root, _mm512_slli_epi32(k, 18)))};
+#if SPLATBOT_EXP_DEGREE == 1  // 2.9e-5
+  return fma(set1(0.693160721F), x, set1(1.00002933F)) * scale;
+#elif SPLATBOT_EXP_DEGREE == 3  // 6e-8, all of it rounding
+  return fma(fma(fma(set1(0.0555041F), x, set1(0.2402265F)), x, set1(0.6931472F)), x, set1(1.0F)) * scale;
+#else
   return fma(fma(set1(0.240224746F), x, set1(0.693157344F)), x, set1(1.0F)) * scale;
+#endif
 }
 #else
 // 2^q to 7.5e-8 relative (a minimax polynomial of degree 5 on [-1/2, 1/2]).
