@@ -91,7 +91,7 @@ def map_log(
             rows=loop.rows(),
             costs=cost_metrics(loop.rows()),
             trajectory=loop.trajectory(),
-            track=score_trajectory(loop.trajectory(), truth),
+            track=score_trajectory(loop.trajectory(), truth, loop.covariances()),
         )
         outcome.save(folder)
     if loop.crash is not None:

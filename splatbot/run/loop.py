@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.config import Config
 from splatbot.errors import InputError
@@ -133,11 +134,19 @@ class FrameLoop:
                 keyframe=bool(r.keyframe),
                 held_out=r.index in self.held_out,
                 gaussians=int(r.gaussians),
+                covariance=None if r.covariance is None else tuple(r.covariance[np.triu_indices(6)].tolist()),
             )
             for r in self.slam.results
         ]
         rows += [FrameRow(index=i, stamp=None, verdict="skipped", reasons=(why,)) for i, why in self.skipped.items()]
         return sorted(rows, key=lambda row: row.index)
+
+    def covariances(self) -> NDArray[np.float64] | None:
+        """Covariances (N, 6, 6) of the tracked poses; None where one is not known."""
+        tracked = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
+        if any(covariance is None for covariance in tracked):
+            return None
+        return np.array(tracked, dtype=np.float64).reshape(-1, 6, 6)
 
     def trajectory(self) -> Trajectory:
         """The tracked poses."""

@@ -25,7 +25,7 @@ _MIN_SPREAD = 0.05  # standard deviation of matched pixels across their narrowes
 _MATCH_BITS = 64  # descriptors that differ in more of their 256 bits are strangers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Features:
     """Keypoints of one image.
 

@@ -69,6 +69,13 @@ def valid_share(prepared: PreparedFrame) -> float:
     return float((prepared.levels[0].depth > 0).mean())
 
 
+def typical_depth(prepared: PreparedFrame) -> float:
+    """Median depth [m] of what is seen; 1 where nothing has a depth."""
+    coarse = prepared.levels[-1].depth
+    measured = coarse[coarse > 0]
+    return float(np.median(measured)) if len(measured) else 1.0
+
+
 def halve(level: Level) -> Level:
     """The next coarser level: grey averaged, depth as :func:`halve_depth` has it."""
     height, width = level.gray.shape[0] // 2, level.gray.shape[1] // 2
