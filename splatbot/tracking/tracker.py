@@ -45,7 +45,7 @@ class Tracker:
         share = valid_share(prepared)
         if share < self.config.min_valid:
             return PoseEstimate(np.eye(4), "lost", (f"only {share:.1%} of the pixels have a usable depth",), "start")
-        if float(prepared.levels[0].gray.std()) < _BLANK:
+        if not float(np.nanstd(prepared.levels[0].gray)) >= _BLANK:
             return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")
         self.motion.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
@@ -80,7 +80,7 @@ class Tracker:
 
     def detect(self, prepared: PreparedFrame) -> Features:
         """Keypoints of a frame, with depth."""
-        return detect(prepared.frame.rgb, prepared.depth, prepared.frame.camera, self.config.n_features)
+        return detect_in(prepared, self.config.n_features)
 
     def _with_prior(
         self, attempt: _Attempt, pose: Judged, told: Prediction, own: Prediction
@@ -202,7 +202,7 @@ class _Attempt:
         """
         frame, keyframes = self._prepared.frame, self._keyframes
         if self.features is None:
-            self.features = detect(frame.rgb, self._prepared.depth, frame.camera, self.config.n_features)
+            self.features = detect_in(self._prepared, self.config.n_features)
         n = self.config.match_keyframes * (4 if self._lost else 1)
         chosen = [*order_by_distance(keyframes, T_expected)[:n], 0, len(keyframes) - 1]
         views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in sorted(set(chosen))]
@@ -215,6 +215,12 @@ class _Attempt:
 
     def _nearest(self, T_world_camera: Array) -> list[TrackedKeyframe]:
         return nearest(self._keyframes, T_world_camera, self.config.reference_keyframes)
+
+
+def detect_in(prepared: PreparedFrame, n_features: int) -> Features:
+    """Keypoints of a frame, with depth, off its mask."""
+    frame = prepared.frame
+    return detect(frame.rgb, prepared.depth, frame.camera, n_features, frame.mask)
 
 
 class Clock:

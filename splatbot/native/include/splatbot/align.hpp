@@ -13,7 +13,7 @@ namespace splatbot {
 struct AlignImage {
   int width = 0, height = 0;
   double fx = 0, fy = 0, cx = 0, cy = 0;
-  std::span<const float> gray;   // (H, W) intensity
+  std::span<const float> gray;   // (H, W) intensity, NaN where it may not be used
   std::span<const float> depth;  // (H, W) [m], 0 = missing
 };
 
