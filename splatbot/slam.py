@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from splatbot.config import Config
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
+from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
 from splatbot.tracking.health import Verdict
 from splatbot.tracking.prepare import PreparedFrame, prepare
@@ -86,6 +88,11 @@ class Slam:
     def finish(self) -> None:
         """Spend the last refinement on the map once the stream has ended."""
         self._mapper.finish()
+
+    @property
+    def keyframes(self) -> Sequence[Keyframe]:
+        """What frames are tracked against."""
+        return self._mapper.keyframes
 
     def snapshot(self) -> Snapshot:
         """The map as it is now, immutable."""

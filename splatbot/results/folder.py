@@ -161,8 +161,12 @@ class RunFolder:
         Raises:
             FormatError: ``frames.jsonl`` and ``trajectory.tum`` do not belong together.
         """
-        indices = [row.index for row in self.load_frames() if row.tracked]
-        poses = list(self.load_trajectory().T_world_camera) if indices else []
+        rows = [row for row in self.load_frames() if row.tracked]
+        indices = [row.index for row in rows]
+        trajectory = self.load_trajectory() if rows else None
+        poses = list(trajectory.T_world_camera) if trajectory is not None else []
+        if trajectory is not None and len(rows) < len(poses) and self._was_killed():
+            poses = poses[: len(rows)]  # between writing the one file and the other
         if len(indices) != len(poses):
             raise FormatError(
                 f"has {len(poses)} poses, {self.frames.name} has {len(indices)} tracked frames.",
@@ -170,6 +174,10 @@ class RunFolder:
                 hint="restore the file, or run `splatbot map` again",
             )
         return dict(zip(indices, poses, strict=True))
+
+    def _was_killed(self) -> bool:
+        """Whether the run neither ended nor was interrupted."""
+        return self.metrics.is_file() and not self.load_metrics().get("finished", True)
 
     def _save_trajectory(self, trajectory: Trajectory) -> None:
         if len(trajectory):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -17,6 +18,14 @@ from splatbot.run.interrupts import Interrupts
 from splatbot.run.progress import Phase, Progress
 from splatbot.slam import FrameResult, Slam
 from splatbot.trajectory import Trajectory
+
+
+class FrameSaver(Protocol):
+    """What the loop asks of the one who saves it."""
+
+    def processed(self, loop: FrameLoop, frame: Frame, index: int) -> None: ...
+
+    def save(self, loop: FrameLoop) -> None: ...
 
 
 @dataclass
@@ -36,6 +45,8 @@ class FrameLoop:
         crash: what broke unexpectedly.
         first_bad: the first unreadable frame.
         started: clock at the start [s].
+        first: the frame to begin with; those before were processed by the run that is resumed.
+        saver: saves the run while it goes on.
     """
 
     log: Log
@@ -53,19 +64,30 @@ class FrameLoop:
     crash: Exception | None = None
     first_bad: InputError | None = None
     started: float = field(default_factory=time.perf_counter)
+    first: int = 0
+    saver: FrameSaver | None = None
 
     def run(self, interrupts: Interrupts) -> None:
         """Process the frames until they end, ``error``, ``crash`` or a signal; raises nothing."""
         try:
-            for index in range(self.total):
-                if interrupts.requested is not None or not self._step(index):
-                    return
-            self.progress("refining")
-            self.slam.finish()
+            through = self._all_frames(interrupts)
+            if self.saver is not None:
+                self.progress("saving")
+                self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
+            if through:
+                self.progress("refining")
+                self.slam.finish()
         except KeyboardInterrupt:  # the second signal, or one raised by a callback
             interrupts.requested = interrupts.requested or 2
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash
+
+    def _all_frames(self, interrupts: Interrupts) -> bool:
+        """Whether the log ended, rather than a signal or an unreadable frame ending the run."""
+        for index in range(self.first, self.total):
+            if interrupts.requested is not None or not self._step(index):
+                return False
+        return True
 
     def _step(self, index: int) -> bool:
         """Read and process one frame; False when the log ends here."""
@@ -83,6 +105,8 @@ class FrameLoop:
         self.keyframes += result.keyframe
         self.lost += result.verdict == "lost"
         self.progress("mapping", done=index + 1, result=result)
+        if self.saver is not None:
+            self.saver.processed(self, frame, index)
         return True
 
     def _process(self, frame: Frame, index: int) -> FrameResult:

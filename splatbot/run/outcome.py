@@ -31,23 +31,28 @@ class Outcome:
     trajectory: Trajectory
     track: TrajectoryScore | None
     views: ViewScores = field(default_factory=ViewScores)
+    finished: bool = False
 
     def save(self, folder: RunFolder) -> None:
         """Save first; then score and report, which a signal may cut short without loss."""
         self.loop.progress("saving")
         with self.interrupts.held():
-            folder.save(
-                config=self.loop.config,
-                rows=self.rows,
-                trajectory=self.trajectory,
-                model=self.model,
-                metrics=self.metrics(),
-            )
+            self.save_files(folder)
         self.interrupts.release()
         try:
             self._score_and_report(folder)
         except KeyboardInterrupt:
             folder.save_metrics(self.metrics())
+
+    def save_files(self, folder: RunFolder) -> None:
+        """Write all that takes no scoring."""
+        folder.save(
+            config=self.loop.config,
+            rows=self.rows,
+            trajectory=self.trajectory,
+            model=self.model,
+            metrics=self.metrics(),
+        )
 
     def _score_and_report(self, folder: RunFolder) -> None:
         self.loop.progress("scoring")
@@ -77,6 +82,7 @@ class Outcome:
             "gaussians": len(self.model),
             "map_bytes": self.model.nbytes,
             "effects": self.effects,
+            "finished": self.finished,
             "interrupted": self.interrupts.requested is not None,
             "error": str(error) if error else None,
             "log": {"name": log.name, "frames": len(log), "uri": _lasting(log.uri), **self.source},
