@@ -25,6 +25,8 @@ def map_log_command(
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    realtime: bool = False,
+    rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None,
     dump_config: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -37,6 +39,7 @@ def map_log_command(
         splatbot map recordings/desk
         splatbot map recordings/desk --out runs/desk --set mapping.max_gaussians=50000
         splatbot map rgbd_dataset_freiburg1_desk --camera tum_fr1
+        splatbot map recordings/desk --realtime --rate 30
         splatbot map "synthetic:tabletop?frames=40" --out runs/tabletop
         splatbot map --dump-config > mine.yaml
 
@@ -48,6 +51,8 @@ def map_log_command(
         camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         on_bad_frame: what to do about a frame that cannot be read: save and stop, or leave it out.
         max_frames: read only the first N frames.
+        realtime: give frames at the times of their stamps, map beside tracking, drop frames there is no time for.
+        rate: the same at so many frames per second.
         dump_config: print the configuration in force and leave.
         quiet: no progress and no summary, only errors.
     """
@@ -77,6 +82,8 @@ def map_log_command(
             on_progress=on_progress,
             on_bad_frame=on_bad_frame,
             max_frames=max_frames,
+            realtime=realtime,
+            rate=rate,
             source={"camera": _lasting(camera) if camera else None},
         )
     if out is None:
@@ -123,6 +130,13 @@ def _link_latest(folder: Path) -> None:
     fresh.replace(link)
 
 
+def _pace(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    paced = metrics["paced"]
+    if paced is None:
+        return []
+    return [("paced", f"{metrics['late']} frames late, {metrics['dropped']} dropped")]
+
+
 def _print_summary(result: RunResult) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, decibels, megabytes, metres, milliseconds
@@ -131,6 +145,7 @@ def _print_summary(result: RunResult) -> None:
     ms = m["ms_per_frame"]
     rows = [
         ("frames tracked", f"{m['tracked']} of {m['frames']}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
+        *_pace(m),
         ("ATE RMSE", metres(m["ate_rmse_m"])),
         ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
         ("depth error, median", metres(m["depth_median_m"])),

@@ -28,7 +28,8 @@ class FrameRow:
     Args:
         index: position in the log.
         stamp: time [s]; None for a frame that could not be read.
-        verdict: as in :class:`splatbot.slam.FrameResult`, or "skipped" when the frame could not be read.
+        verdict: as in :class:`splatbot.slam.FrameResult`, "skipped" when the frame could not be read, or
+            "dropped" when a paced run had no time for it.
         reasons: why it is not "ok".
         stage: the tracking stage whose pose was taken.
         ms: wall-clock milliseconds for tracking and mapping, without reading the file.
@@ -36,11 +37,12 @@ class FrameRow:
         keyframe: whether the frame entered the map.
         held_out: whether the frame was kept out of the map, to be scored against it.
         gaussians: size of the map afterwards.
+        late: whether, in a paced run, the next frame arrived before this one was done.
     """
 
     index: int
     stamp: float | None
-    verdict: Literal["ok", "degraded", "lost", "skipped"]
+    verdict: Literal["ok", "degraded", "lost", "skipped", "dropped"]
     reasons: tuple[str, ...] = ()
     stage: str = ""
     ms: float = 0.0
@@ -48,6 +50,12 @@ class FrameRow:
     keyframe: bool = False
     held_out: bool = False
     gaussians: int = 0
+    late: bool = False
+
+    @property
+    def processed(self) -> bool:
+        """Whether the frame was looked at."""
+        return self.verdict not in ("skipped", "dropped")
 
     @property
     def tracked(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,8 +16,9 @@ from splatbot.results.scoring import score_trajectory
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.loop import FrameLoop
 from splatbot.run.outcome import Outcome
+from splatbot.run.pacing import FrameSource, PacedSource
 from splatbot.run.progress import Progress
-from splatbot.run.saving import Saver
+from splatbot.run.saving import Saver, resume_loop
 from splatbot.run.state import Checkpoint, SavedRun
 from splatbot.slam import Slam
 
@@ -48,6 +49,8 @@ def map_log(
     on_progress: Callable[[Progress], None] | None = None,
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: int | None = None,
+    realtime: bool = False,
+    rate: float | None = None,
     save_every: float | None = None,
     resume: SavedRun | None = None,
     source: dict[str, Any] | None = None,
@@ -67,6 +70,9 @@ def map_log(
         on_progress: called after every frame and at every phase.
         on_bad_frame: what to do about a frame that cannot be read.
         max_frames: read no more frames than this.
+        realtime: give frames at the times of their stamps, as a camera would, map in a thread beside tracking, and drop
+            frames that there is no time for; they and those done late are counted.
+        rate: give frames at this rate [Hz] instead of their stamps'; implies ``realtime``.
         save_every: save the whole state into ``out/state`` whenever so many seconds have passed, and at the end; a run
             that is killed loses what came after the last save. None: never.
         resume: go on where this run was saved; ``log`` must be its log, and ``config`` and ``slam`` are the run's.
@@ -82,14 +88,20 @@ def map_log(
         resume.place.check(log)
         config, slam = resume.config, resume.slam
     config = config or (slam.config if slam else Config())
+    realtime = realtime or rate is not None
+    if rate is not None and not 0 < rate < 1e4:
+        raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")
+    if realtime and slam is None:
+        config = config.model_copy(update={"mapping": config.mapping.model_copy(update={"threaded": True})})
     folder = RunFolder.create(out)
     total = len(log) if max_frames is None else min(len(log), max_frames)
     if total == 0:
         raise LogError("has no frames.", file=log.name, hint="record the log again, or name another one")
     truth = log.ground_truth  # now: a damaged file must not cost the user a whole run
-    loop = FrameLoop(log, slam or Slam(config), config, total, on_bad_frame, on_progress or (lambda _: None))
+    frames = PacedSource(log, total, rate) if realtime else FrameSource(log, total)
+    loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, on_progress or (lambda _: None))
     if resume is not None:
-        loop = replace(loop, first=resume.place.next_index, **resume.loop)
+        resume_loop(loop, resume)
     with Interrupts() as interrupts:
 
         def outcome() -> Outcome:

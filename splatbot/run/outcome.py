@@ -58,7 +58,7 @@ class Outcome:
         self.loop.progress("scoring")
         poses = {r.index: r.T_world_camera for r in self.loop.slam.results if r.T_world_camera is not None}
         held_out = {i: poses[i] for i in sorted(self.loop.held_out) if i in poses}
-        self.views = score_views(self.loop.log, self.model, held_out)
+        self.views = score_views(self.loop.source.log, self.model, held_out)
         folder.save_metrics(self.metrics())
         self.loop.progress("reporting")
         folder.save_report(
@@ -74,13 +74,14 @@ class Outcome:
 
     def metrics(self) -> dict[str, Any]:
         """The contents of ``metrics.json``."""
-        log, error = self.loop.log, self.loop.error or self.loop.crash
+        log, error = self.loop.source.log, self.loop.error or self.loop.crash
         values = {
             **self.costs,
             **trajectory_metrics(self.track),
             **self.views.metrics(),
             "gaussians": len(self.model),
             "map_bytes": self.model.nbytes,
+            "paced": self.loop.source.pace,
             "effects": self.effects,
             "finished": self.finished,
             "interrupted": self.interrupts.requested is not None,

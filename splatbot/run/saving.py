@@ -9,11 +9,10 @@ from typing import Any
 from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.run.loop import FrameLoop
-from splatbot.run.state.checkpoint import Checkpoint, LogPlace, checksum
+from splatbot.run.state.checkpoint import Checkpoint, LogPlace, SavedRun, checksum
 
 # What belongs to one process, or is given anew by the one who resumes.
-_NOT_SAVED = {"log", "slam", "config", "total", "first", "on_bad_frame", "tell", "saver", "error", "crash"}
-_NOT_SAVED |= {"first_bad", "started"}
+_NOT_SAVED = {"source", "slam", "config", "on_bad_frame", "tell", "saver", "error", "crash", "first_bad", "started"}
 
 
 class Saver:
@@ -65,5 +64,14 @@ class Saver:
 
 
 def loop_state(loop: FrameLoop) -> dict[str, Any]:
-    """The loop's counters by name, to make another loop of that goes on."""
-    return {f.name: getattr(loop, f.name) for f in fields(loop) if f.name not in _NOT_SAVED}
+    """The loop's counters by name, and which frames its source has dropped or given late."""
+    counters = {f.name: getattr(loop, f.name) for f in fields(loop) if f.name not in _NOT_SAVED}
+    return {"loop": counters, "source": {"dropped": loop.source.dropped, "late": loop.source.late}}
+
+
+def resume_loop(loop: FrameLoop, saved: SavedRun) -> None:
+    """Let a fresh loop go on where a saved one was."""
+    for name, value in saved.loop["loop"].items():
+        setattr(loop, name, value)
+    loop.source.first = saved.place.next_index
+    loop.source.dropped, loop.source.late = saved.loop["source"]["dropped"], saved.loop["source"]["late"]

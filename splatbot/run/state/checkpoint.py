@@ -107,6 +107,13 @@ class Checkpoint:
     def save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
         """Save a run between two frames."""
         start = time.perf_counter()
+        with slam.paused():
+            self._save(slam, loop, place, config)
+        self._saved_at = time.perf_counter()
+        self.saves += 1
+        self.seconds += self._saved_at - start
+
+    def _save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._journal.begin()
         lasting = {id(owner) for owner in _lasting_arrays(slam)}
@@ -125,9 +132,6 @@ class Checkpoint:
         self._journal.sync()
         write_container(self.folder / FILE, header, encoder.arrays)
         self._journal.finish()
-        self._saved_at = time.perf_counter()
-        self.saves += 1
-        self.seconds += self._saved_at - start
 
 
 @dataclass(frozen=True)
