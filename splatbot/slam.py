@@ -19,8 +19,11 @@ from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.motion import JointMotion
 from splatbot.mapping.worker import MappingWorker
 from splatbot.tracking.health import Verdict
+from splatbot.tracking.places import likeliest
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from splatbot.tracking.tracker import PoseEstimate, Tracker
+
+_LIKELY = 12  # keyframes that a lost frame is compared with
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,7 @@ class Slam:
         mapper = Mapper(self.config)
         self._mapper = MappingWorker(mapper) if self.config.mapping.threaded else mapper
         self._size: tuple[int, int] | None = None
+        self._growing = True
         self._motion = JointMotion(self.config.mapping.still)
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
@@ -77,9 +81,10 @@ class Slam:
         prepared_at = time.perf_counter()
         estimate = self._track(prepared, hold_out)
         tracked_at = time.perf_counter()
-        self._mapper.hold(self._motion.update(frame.stamp, frame.joints))
+        if self._growing:
+            self._mapper.hold(self._motion.update(frame.stamp, frame.joints))
         placed = estimate.verdict != "lost"
-        keyframe = placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
+        keyframe = self._growing and placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
         if keyframe:
             self._map(prepared, estimate)
         stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
@@ -100,7 +105,25 @@ class Slam:
 
     def finish(self) -> None:
         """Spend the last refinement on the map once the stream has ended."""
-        self._mapper.finish()
+        if self._growing:
+            self._mapper.finish()
+        else:
+            self._mapper.close()
+
+    def localise_only(self) -> None:
+        """From here on frames are placed in the map as it is, which nothing changes; the next may be anywhere in it.
+
+        ``results`` begins anew, and the world stays the map's.
+
+        Raises:
+            InputError: there is no map yet.
+        """
+        if not self._mapper.keyframes:
+            raise InputError("the map has no keyframes.", field="map", hint="map a log first")
+        self._growing = False
+        self._size = None
+        self.results = []
+        self._tracker.forget()
 
     def close(self) -> None:
         """End the mapping thread, if there is one, once what has been handed to it is in the map."""
@@ -133,10 +156,17 @@ class Slam:
     def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
         keyframes = self._mapper.keyframes
         if keyframes:
-            return self._tracker.track(prepared, keyframes)
+            return self._tracker.track(prepared, self._likely(prepared, keyframes))
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
+
+    def _likely(self, prepared: PreparedFrame, keyframes: Sequence[Keyframe]) -> Sequence[Keyframe]:
+        """The keyframes that a frame is tracked against: when lost, those that look like it, wherever they are."""
+        if not self._tracker.is_lost or len(keyframes) <= _LIKELY:
+            return keyframes
+        features = self._tracker.detect(prepared)
+        return [keyframes[k] for k in sorted(likeliest(features, keyframes, _LIKELY))]
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)

@@ -53,6 +53,7 @@ def map_log(
     rate: float | None = None,
     save_every: float | None = None,
     resume: SavedRun | None = None,
+    localise: SavedRun | None = None,
     source: dict[str, Any] | None = None,
     effects: Sequence[Mapping[str, Any]] | None = None,
 ) -> RunResult:
@@ -70,6 +71,8 @@ def map_log(
         on_progress: called after every frame and at every phase.
         on_bad_frame: what to do about a frame that cannot be read.
         max_frames: read no more frames than this.
+        localise: place the frames in this run's map, which stays as it is; the trajectory is in its world. The run's
+            configuration is taken.
         realtime: give frames at the times of their stamps, as a camera would, map in a thread beside tracking, and drop
             frames that there is no time for; they and those done late are counted.
         rate: give frames at this rate [Hz] instead of their stamps'; implies ``realtime``.
@@ -87,6 +90,9 @@ def map_log(
     if resume is not None:
         resume.place.check(log)
         config, slam = resume.config, resume.slam
+    if localise is not None:
+        config, slam = localise.config, localise.slam
+        slam.localise_only()
     config = config or (slam.config if slam else Config())
     realtime = realtime or rate is not None
     if rate is not None and not 0 < rate < 1e4:
@@ -108,6 +114,7 @@ def map_log(
             return Outcome(
                 loop=loop,
                 source=source or {},
+                localised_in=str(localise.folder.resolve()) if localise is not None else None,
                 effects=list(log.effects if effects is None else effects),
                 interrupts=interrupts,
                 model=loop.slam.snapshot().model,
@@ -117,7 +124,7 @@ def map_log(
                 track=score_trajectory(loop.trajectory(), truth),
             )
 
-        if save_every is not None:
+        if save_every is not None and localise is None:
             checkpoint = Checkpoint(folder.path, save_every)
             loop.saver = Saver(checkpoint, log, (source or {}).get("camera"), lambda: outcome().save_files(folder))
         loop.run(interrupts)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,7 +24,10 @@ _DROPPED = "a newer frame had arrived"
 
 
 class FrameSaver(Protocol):
-    """What the loop asks of the one who saves it."""
+    """What the loop asks of the one who saves it; ``cost`` says how often that was and how long it took."""
+
+    @property
+    def cost(self) -> dict[str, Any]: ...
 
     def processed(self, loop: FrameLoop, frame: Frame, index: int) -> None: ...
 

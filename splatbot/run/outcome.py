@@ -32,6 +32,7 @@ class Outcome:
     track: TrajectoryScore | None
     views: ViewScores = field(default_factory=ViewScores)
     finished: bool = False
+    localised_in: str | None = None
 
     def save(self, folder: RunFolder) -> None:
         """Save first; then score and report, which a signal may cut short without loss."""
@@ -84,6 +85,8 @@ class Outcome:
             "paced": self.loop.source.pace,
             "effects": self.effects,
             "finished": self.finished,
+            "localised_in": self.localised_in,
+            "saves": self.loop.saver.cost if self.loop.saver is not None else None,
             "interrupted": self.interrupts.requested is not None,
             "error": str(error) if error else None,
             "log": {"name": log.name, "frames": len(log), "uri": _lasting(log.uri), **self.source},

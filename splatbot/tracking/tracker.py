@@ -75,6 +75,16 @@ class Tracker:
         self.motion.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the last frame could not be placed."""
+        return self._lost
+
+    def forget(self) -> None:
+        """The next frame may be anywhere: nothing is known of the motion."""
+        self.motion = ConstantVelocity()
+        self._lost = True
+
     def track(self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe]) -> PoseEstimate:
         """The pose of a frame; "lost" when no candidate explains it."""
         clock = _Clock()

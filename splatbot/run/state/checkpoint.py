@@ -77,7 +77,7 @@ class LogPlace:
 
 def checksum(frame: Frame) -> int:
     """CRC-32 of a frame's colour and depth."""
-    return zlib.crc32(np.ascontiguousarray(frame.depth), zlib.crc32(np.ascontiguousarray(frame.rgb)))
+    return zlib.crc32(np.ascontiguousarray(frame.depth).data, zlib.crc32(np.ascontiguousarray(frame.rgb).data))
 
 
 class Checkpoint:

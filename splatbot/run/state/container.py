@@ -26,7 +26,7 @@ _HINT = "restore the folder from a copy, or map the log again"
 def write_container(path: Path, header: dict[str, Any], arrays: Sequence[Array]) -> None:
     """Replace ``path`` by a whole new file, on the disk before it takes the old one's place."""
     plain = [np.ascontiguousarray(array) for array in arrays]
-    table = [[array.dtype.str, list(array.shape), zlib.crc32(array)] for array in plain]
+    table = [[a.dtype.str, list(a.shape), zlib.crc32(p.data)] for a, p in zip(arrays, plain, strict=True)]
     text = json.dumps(header | {"arrays": table}, allow_nan=False).encode()
     with atomic_write(path) as file:
         file.write(MAGIC + _LENGTHS.pack(len(text), zlib.crc32(text)) + text)

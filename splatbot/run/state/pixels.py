@@ -28,8 +28,8 @@ def pack(array: Array, *, compress: bool) -> Packed:
     A float's four bytes are the four channels of a picture: neighbours differ in the low ones only, and PNG codes
     differences. No bit is lost, NaN included.
     """
-    array = np.ascontiguousarray(array)
     dtype, shape = array.dtype.str, list(array.shape)
+    array = np.ascontiguousarray(array)  # which has one dimension at least
     if compress and array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3 and array.size:
         return Packed(_png(array), "png", dtype, shape)
     if compress and array.dtype == np.float32 and array.ndim == 2 and array.size:

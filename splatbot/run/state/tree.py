@@ -21,8 +21,15 @@ Array = NDArray[Any]
 Tree = Any
 
 # Only classes of these modules are made when a state is read, and none of their code runs but __setstate__.
-_MODULES = ("splatbot.camera", "splatbot.gaussians.", "splatbot.mapping.", "splatbot.optimize.", "splatbot.run.loop")
-_MODULES += ("splatbot.slam", "splatbot.tracking.", "splatbot.frame")
+_MODULES = (
+    "splatbot.camera",
+    "splatbot.frame",
+    "splatbot.gaussians.",
+    "splatbot.mapping.",
+    "splatbot.optimize.",
+    "splatbot.slam",
+    "splatbot.tracking.",
+)
 
 
 class Encoder:
@@ -161,7 +168,7 @@ class Decoder:
 
     def _object(self, name: str, inner: dict[str, Tree], place: int) -> Any:
         kind = _class_of(name)
-        value = kind.__new__(kind)
+        value: Any = object.__new__(kind)
         self._known[place] = value
         state = {key: self.decode(item) for key, item in inner.items()}
         if "__setstate__" in kind.__dict__:
