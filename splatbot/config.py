@@ -58,7 +58,10 @@ class TrackingConfig(_Section):
     min_overlap: float = Field(default=0.15, ge=0, le=1, description="a smaller share of the reference in view: lost")
     min_inliers: float = Field(default=0.3, ge=0, le=1, description="a smaller share of residuals within 3 σ: lost")
     min_eigen_ratio: float = Field(
-        default=1e-3, ge=0, description="a smaller ratio of the translation's information: degraded"
+        default=0.02,
+        ge=0,
+        le=1,
+        description="a smaller ratio of the translation's information: degraded, the prediction stands in",
     )
 
 

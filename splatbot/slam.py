@@ -37,6 +37,7 @@ class FrameResult:
         stage_ms: milliseconds by stage.
         keyframe: whether the frame entered the map.
         gaussians: size of the map afterwards.
+        covariance: (6, 6) of the pose, see :attr:`splatbot.tracking.estimate.PoseEstimate.covariance`; None when lost.
     """
 
     index: int
@@ -48,6 +49,7 @@ class FrameResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
     keyframe: bool = False
     gaussians: int = 0
+    covariance: NDArray[np.float64] | None = None
 
 
 class Slam:
@@ -99,6 +101,7 @@ class Slam:
             stage_ms=stage_ms,
             keyframe=keyframe,
             gaussians=self._mapper.size,
+            covariance=estimate.covariance if placed else None,
         )
         self.results.append(result)
         return result
@@ -170,4 +173,5 @@ class Slam:
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)
+        self._tracker.remember(features, estimate)
         self._mapper.insert(prepared, estimate.T_world_camera, features)

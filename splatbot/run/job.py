@@ -121,7 +121,7 @@ def map_log(
                 rows=loop.rows(),
                 costs=cost_metrics(loop.rows()),
                 trajectory=loop.trajectory(),
-                track=score_trajectory(loop.trajectory(), truth),
+                track=score_trajectory(loop.trajectory(), truth, loop.covariances()),
             )
 
         if save_every is not None and localise is None:

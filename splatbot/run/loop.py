@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.config import Config
 from splatbot.errors import InputError
@@ -169,12 +170,20 @@ class FrameLoop:
                 held_out=r.index in self.held_out,
                 gaussians=int(r.gaussians),
                 late=r.index in self.source.late,
+                covariance=None if r.covariance is None else tuple(r.covariance[np.triu_indices(6)].tolist()),
             )
             for r in self.slam.results
         ]
         rows += [FrameRow(index=i, stamp=None, verdict="skipped", reasons=(why,)) for i, why in self.skipped.items()]
         rows += [FrameRow(index=i, stamp=None, verdict="dropped", reasons=(_DROPPED,)) for i in self.source.dropped]
         return sorted(rows, key=lambda row: row.index)
+
+    def covariances(self) -> NDArray[np.float64] | None:
+        """Covariances (N, 6, 6) of the tracked poses; None where one is not known."""
+        tracked = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
+        if any(covariance is None for covariance in tracked):
+            return None
+        return np.array(tracked, dtype=np.float64).reshape(-1, 6, 6)
 
     def trajectory(self) -> Trajectory:
         """The tracked poses."""

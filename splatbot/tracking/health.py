@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from splatbot.config import TrackingConfig
 from splatbot.geometry import inverse
 from splatbot.tracking.align import residuals
+from splatbot.tracking.degeneracy import WeakDirections
 from splatbot.tracking.prepare import Level
 from splatbot.tracking.reference import Reference
 
@@ -80,8 +81,10 @@ def _contrast(gray: Array, reference_gray: Array) -> float:
     return float(gray.std()) / spread if spread > 1e-6 else 1.0
 
 
-def verdict_of(health: Health, information: Array, config: TrackingConfig) -> tuple[Verdict, tuple[str, ...]]:
-    """The verdict and what speaks against the pose."""
+def verdict_of(
+    health: Health, information: Array, weak: WeakDirections | None, config: TrackingConfig
+) -> tuple[Verdict, tuple[str, ...]]:
+    """The verdict and what speaks against a pose that was found with an information matrix (6, 6)."""
     lost, doubts = [], []
     # Comparisons are written so that NaN speaks against the pose.
     if not health.overlap >= config.min_overlap:
@@ -93,14 +96,8 @@ def verdict_of(health: Health, information: Array, config: TrackingConfig) -> tu
         lost.append(f"the image is blank: {health.contrast:.0%} of the reference's contrast")
     if not np.isfinite(information).all():
         lost.append("the alignment is not finite")
-    elif not _is_constrained(information, config.min_eigen_ratio):
-        doubts.append("translation is hardly constrained in one direction")
+    elif weak is not None:
+        doubts.append(weak.reason)
     if lost:
         return "lost", tuple(lost + doubts)
     return ("degraded", tuple(doubts)) if doubts else ("ok", ())
-
-
-def _is_constrained(information: Array, min_ratio: float) -> bool:
-    """Whether the translation is known in its weakest direction, against its strongest."""
-    eigenvalues = np.linalg.eigvalsh(information[:3, :3])
-    return bool(eigenvalues[0] > min_ratio * eigenvalues[2])

@@ -22,7 +22,10 @@ _LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of 
 
 @dataclass(frozen=True)
 class Level:
-    """One pyramid level: grey (H, W) in 0..1, depth (H, W) [m] with 0 missing, and the camera of that size."""
+    """One pyramid level: grey (H, W) in 0..1, depth (H, W) [m] with 0 missing, and the camera of that size.
+
+    Grey is NaN where it may not be used.
+    """
 
     gray: Image
     depth: Image
@@ -31,7 +34,10 @@ class Level:
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame, its plausible depth (H, W) [m] at full size, and its pyramid, finest level first."""
+    """A frame, its plausible depth (H, W) [m] at full size, and its pyramid, finest level first.
+
+    What the frame's mask leaves out has no depth, and NaN as its grey.
+    """
 
     frame: Frame
     depth: Image
@@ -44,7 +50,11 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
     """
     depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
+    if frame.mask is not None:
+        depth = np.where(frame.mask, depth, np.float32(0))
     gray = np.multiply(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.float32(1 / 255), dtype=np.float32)
+    if frame.mask is not None:
+        gray[~frame.mask] = np.nan  # and so is all that is smoothed or interpolated from it
     level = Level(gray, depth, frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
@@ -67,6 +77,13 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
 def valid_share(prepared: PreparedFrame) -> float:
     """Share of the pixels that have a usable depth."""
     return float((prepared.levels[0].depth > 0).mean())
+
+
+def typical_depth(prepared: PreparedFrame) -> float:
+    """Median depth [m] of what is seen; 1 where nothing has a depth."""
+    coarse = prepared.levels[-1].depth
+    measured = coarse[coarse > 0]
+    return float(np.median(measured)) if len(measured) else 1.0
 
 
 def halve(level: Level) -> Level:
