@@ -140,6 +140,14 @@ class MappingConfig(_Section):
     rate_sh: float = Field(default=2e-2, ge=0, description="learning rate of colour coefficients")
     min_opacity: float = Field(default=0.05, ge=0, le=1, description="fainter Gaussians are pruned")
     max_scale: float = Field(default=0.5, gt=0, description="larger Gaussians are pruned [m]")
+    threaded: bool = Field(
+        default=False, description="map in a thread beside tracking: quicker frames, but no two runs are the same"
+    )
+    still: float = Field(
+        default=0.05,
+        ge=0,
+        description="refinement waits while a joint moves faster than this, if joints are told [rad/s]",
+    )
     holdout_every: int = Field(
         default=8, ge=0, description="every n-th frame is tracked, not mapped, and scored; 0: none"
     )

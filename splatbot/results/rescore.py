@@ -46,7 +46,7 @@ def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) ->
     model = GaussianModel.load(folder.map)
     views = score_views(log, model, held_out)
     counts = {
-        "frames": sum(row.verdict != "skipped" for row in rows),
+        "frames": sum(row.processed for row in rows),
         "tracked": len(poses),
         "lost": sum(row.verdict == "lost" for row in rows),
         "held_out": len(views.scores),

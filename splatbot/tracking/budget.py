@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -37,11 +36,13 @@ class Costs:
     """What stages have cost lately, against the table; kept from frame to frame."""
 
     def __init__(self) -> None:
-        self._ratios: dict[str, deque[float]] = {}
+        self._ratios: dict[str, list[float]] = {}
 
     def record(self, stage: str, units: float, ms: float) -> None:
         """That a stage took so long."""
-        self._ratios.setdefault(stage, deque(maxlen=_RECENT)).append(ms / table_ms(stage, units))
+        recent = self._ratios.setdefault(stage, [])
+        recent.append(ms / table_ms(stage, units))
+        del recent[:-_RECENT]
 
     def p95_ms(self, stage: str, units: float) -> float:
         """What 95 % of recent runs would have cost at most for this work [ms]."""

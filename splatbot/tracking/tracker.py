@@ -55,6 +55,16 @@ class Tracker:
         self.motion.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the last frame could not be placed."""
+        return self._lost
+
+    def forget(self) -> None:
+        """The next frame may be anywhere: nothing is known of the motion."""
+        self.motion = ConstantVelocity()
+        self._lost = True
+
     def remember(self, features: Features, estimate: PoseEstimate) -> None:
         """That the frame with these features becomes a keyframe: poses found with it inherit its uncertainty."""
         self._known[features] = estimate.uncertainty

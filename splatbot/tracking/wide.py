@@ -31,6 +31,10 @@ class WideStage:
         self.config = config
         self._clouds: WeakKeyDictionary[Features, Cloud] = WeakKeyDictionary()
 
+    def __getstate__(self) -> dict[str, object]:
+        """Without the clouds, which are made again from the keyframes."""
+        return {"config": self.config, "_clouds": WeakKeyDictionary()}
+
     def register(self, prepared: PreparedFrame, view: TrackedKeyframe, T_world_camera: Array) -> Array | None:
         """T_world_camera (4, 4) from a start; None where too few points find a partner.
 

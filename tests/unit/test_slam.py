@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.logs import open_log
@@ -188,3 +189,13 @@ def test_nothing_processed_has_an_empty_map() -> None:
     slam.finish()
     assert slam.results == []
     assert len(slam.snapshot().model) == 0
+
+
+def test_a_frame_of_another_size_is_refused_and_the_map_stays() -> None:
+    frames, _ = tabletop()
+    slam = run(frames[:2])
+    before = slam.snapshot().model
+    with pytest.raises(InputError, match=r"80 x 60.*160 x 120"):
+        slam.process(tabletop(width=80)[0][2])
+    assert_same(slam.snapshot().model, before)
+    assert slam.process(frames[2]).verdict == "ok"
