@@ -22,6 +22,7 @@ _TABLE: dict[str, tuple[float, float]] = {
     "detect": (3.5, 1.8e-3),  # keypoints
     "match near": (1.2, 1.3e-6),  # keypoints, times keypoints of a keyframe
     "match all": (0.8, 2.3e-6),  # keypoints, times keypoints of a keyframe
+    "vote": (0.0, 0.5),  # keyframes
     "wide": (3.0, 6.0e-3),  # points
 }
 

@@ -120,13 +120,6 @@ def match_pose(
     return found if _is_believable(found, camera, expected) else None
 
 
-def match_count(current: Features, known: Features) -> int:
-    """How many keypoints of an image match anchored ones of another, wherever they are."""
-    anchored = np.flatnonzero(np.isfinite(known.points[:, 2]))
-    nowhere = np.zeros((len(anchored), 2), np.float32)
-    return len(_match(current, known.descriptors[anchored], nowhere, np.inf)[0])
-
-
 def _is_believable(found: FeaturePose, camera: Camera, expected: Expectation) -> bool:
     """Whether a pose from a search near to an expectation is more than a choice that agrees with it."""
     shift = camera.project(transform_points(inverse(expected.T_world_camera), found.points)) - found.pixels

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.tracking.budget import Budget
 from splatbot.tracking.candidate import Judged
-from splatbot.tracking.features import FeaturePose, Features, match_count, match_pose
+from splatbot.tracking.features import FeaturePose, Features, match_pose
+from splatbot.tracking.places import votes
 from splatbot.tracking.views import TrackedKeyframe, pose_distance
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ def is_sure(pose: Judged) -> bool:
 
 
 class KeyframeSearch:
-    """Matches a frame with all keyframes, over several frames where there is no time for all of them in one."""
+    """Compares a frame with all keyframes, over several frames where there is no time for all of them in one."""
 
     def __init__(self) -> None:
         self._next = 0
@@ -56,23 +57,21 @@ class KeyframeSearch:
     def find(
         self, features: Features, keyframes: Sequence[TrackedKeyframe], camera: Camera, budget: Budget
     ) -> FeaturePose | None:
-        """The pose from the keyframes that share the most features with the frame; None where none share enough.
+        """The pose from the keyframes that look most like the frame; None where none shares enough features.
 
         Begins with the latest keyframe at first, and where it stopped on the frame before; at least one is tried.
         """
-        newest_first = keyframes[::-1]
-        counts: list[tuple[int, TrackedKeyframe]] = []
+        newest_first, found = keyframes[::-1], list[tuple[int, TrackedKeyframe]]()
+        search = ("match all", float(_BEST * len(features) * max(len(view.features) for view in keyframes)))
         for tried in range(len(newest_first)):
-            units = len(features) * len(newest_first[self._next % len(newest_first)].features)
-            # A keyframe is matched again in search of the pose, with those that are as good.
-            if tried and not budget.fits(*[("match all", units)] * (_BEST + 1)):
+            if tried and not budget.fits(("vote", 1), search):
                 budget.skip("keyframes")
                 break
             view = newest_first[self._next % len(newest_first)]
             self._next += 1
-            with budget.run("match all", units, under="recover"):
-                counts.append((match_count(features, view.features), view))
-        counts.sort(key=lambda pair: -pair[0])
-        best = [view for _, view in counts[:_BEST]]
-        with budget.run("match all", len(features) * sum(len(v.features) for v in best), under="recover"):
-            return match_pose(features, [(v.features, v.reference.T_world_camera) for v in best], camera)
+            with budget.run("vote", 1, under="recover"):
+                found.append((int(votes(features, [view])[0]), view))
+        found.sort(key=lambda pair: -pair[0])
+        best = [view for _, view in found[:_BEST]]
+        with budget.run("match all", len(features) * sum(len(view.features) for view in best), under="recover"):
+            return match_pose(features, [(view.features, view.reference.T_world_camera) for view in best], camera)
