@@ -72,6 +72,15 @@ def inverse(T: ArrayLike) -> Array:
     return out
 
 
+def adjoint(T_a_b: ArrayLike) -> Array:
+    """Matrix (6, 6) that takes a twist (translation, rotation) of frame b to frame a: T exp(ξ) T⁻¹ = exp(Ad ξ)."""
+    M = np.asarray(T_a_b, dtype=np.float64)
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = M[:3, :3]
+    A[:3, 3:] = skew(M[:3, 3]) @ M[:3, :3]
+    return A
+
+
 def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
     """Points (..., 3) [m] of frame b in frame a."""
     M = np.asarray(T_a_b, dtype=np.float64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -19,6 +20,13 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import Level, halve, valid_depth
 from splatbot.tracking.reference import Reference
 from splatbot.tracking.tracker import pose_distance
+
+
+class Placed(Protocol):
+    """What has a pose."""
+
+    @property
+    def T_world_camera(self) -> NDArray[np.float64]: ...
 
 
 @dataclass
@@ -72,7 +80,7 @@ def mapping_images(
     return level.camera, rgb, level.depth
 
 
-def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Keyframe], config: MappingConfig) -> bool:
+def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Placed], config: MappingConfig) -> bool:
     """Whether a view is new: farther or turned further from every keyframe than the configuration says."""
     for keyframe in reversed(keyframes):
         moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)

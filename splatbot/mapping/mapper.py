@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,7 +13,7 @@ from numpy.typing import NDArray
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.fusion import guessed_gaussians, model_depth, new_gaussians, unexplained, view_of, weigh
-from splatbot.mapping.keyframes import Keyframe, is_keyframe, mapping_images
+from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images
 from splatbot.mapping.prune import fittest, worth_keeping
 from splatbot.mapping.refine import Refiner
 from splatbot.tracking.features import Features
@@ -17,47 +21,131 @@ from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
 from splatbot.tracking.reference import Reference, make_reference
 
 
+@dataclass(frozen=True)
+class Observation:
+    """A frame that is to become a keyframe: its images, T_world_camera (4, 4) and features."""
+
+    prepared: PreparedFrame
+    T_world_camera: NDArray[np.float64]
+    features: Features
+
+
 class Mapper:
-    """Holds the keyframes and the model."""
+    """Holds the keyframes and the model; all work is done in the thread that calls."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.keyframes: list[Keyframe] = []
         self.model = GaussianModel.empty()
+        self.owed = 0
+        """Refinement steps that keyframes have called for and that were not spent yet."""
         self._refiner = Refiner(config.mapping, config.seed)
         self._refiner.adam.extend(self.model)
+        self._held = False
         self._version = 0
         self._stamp = 0.0
 
-    def wants(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether a frame at this pose would be a keyframe: a new view, with depth for later frames to align to."""
+    @property
+    def size(self) -> int:
+        """Number of Gaussians."""
+        return len(self.model)
+
+    def wants(
+        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], waiting: Sequence[Placed] = ()
+    ) -> bool:
+        """Whether a frame at this pose would be a keyframe: a new view, with depth for later frames to align to.
+
+        ``waiting`` are views that will be keyframes, but are not yet.
+        """
         if valid_share(prepared) < self.config.tracking.min_valid:
             return False
-        return is_keyframe(T_world_camera, self.keyframes, self.config.mapping)
+        return is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
 
-    def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> Keyframe:
-        """Fuse a frame into the map, refine, and make it a reference for tracking."""
-        keyframe = self._make_keyframe(prepared, T_world_camera, features)
-        self.keyframes.append(keyframe)
-        self._weigh(keyframe)
-        self._add(keyframe)
-        self._prune()
-        self._refiner.refine(self.model, self.keyframes, self.config.mapping.refine_iterations)
-        self._prune()  # or what refinement made faint, huge or not finite would be rendered
-        keyframe.reference = self._model_reference(prepared, keyframe)
-        self._version += 1
-        self._stamp = prepared.frame.stamp
-        return keyframe
+    def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
+        """Fuse a frame into the map, refine, and make it a reference for tracking.
+
+        An exception leaves keyframes and map as they were.
+        """
+        observation = Observation(prepared, T_world_camera, features)
+        with self._undone_on_error():
+            keyframe = self.add_keyframe(observation)
+            self.fuse(keyframe)
+            self.refine(0 if self._held else self.owed)
+            self.make_reference(observation, keyframe)
+
+    def hold(self, moving: bool) -> None:
+        """Whether refinement is to wait, because the robot moves; steps owed are spent once it stands."""
+        self._held = moving
+        if not moving and self.owed:
+            self.refine(min(self.owed, self.config.mapping.refine_iterations))
+            self._version += 1
 
     def finish(self) -> None:
         """Refine over all keyframes once no more will come."""
+        self.refine(self.owed)
         self._refiner.refine_all(self.model, self.keyframes, self.config.mapping.final_iterations)
         self._prune()
         self._version += 1
 
+    def close(self) -> None:
+        """Nothing goes on in the background that would have to be ended."""
+
+    def paused(self) -> AbstractContextManager[None]:
+        """Nothing goes on in the background that would have to wait."""
+        return nullcontext()
+
     def snapshot(self) -> Snapshot:
         """The map as it is, copied."""
         return Snapshot(self.model.clone(), self._version, self._stamp)
+
+    def add_keyframe(self, observation: Observation, *, provisional: bool = False) -> Keyframe:
+        """A keyframe of an observation, which the map does not know yet.
+
+        ``provisional`` gives it a reference of the measured depth, for tracking until :meth:`make_reference`.
+        """
+        keyframe = self._make_keyframe(observation.prepared, observation.T_world_camera, observation.features)
+        if provisional:
+            levels, n_pixels = observation.prepared.levels, self.config.tracking.n_pixels
+            keyframe.reference = make_reference(levels, observation.T_world_camera, n_pixels)
+        self.keyframes = [*self.keyframes, keyframe]  # a new list: the tracker may be reading the old one
+        self._stamp = observation.prepared.frame.stamp
+        return keyframe
+
+    def fuse(self, keyframe: Keyframe) -> None:
+        """Bring a keyframe's evidence and its new surfaces into the map; it calls for refinement."""
+        self._weigh(keyframe)
+        self._add(keyframe)
+        self._prune()
+        self.owed += self.config.mapping.refine_iterations
+        self._version += 1
+
+    def refine(self, steps: int) -> None:
+        """Spend at most so many of the steps owed, first on the latest keyframe if it has had none."""
+        if steps <= 0:
+            return
+        steps = min(steps, self.owed)
+        self.owed -= steps
+        self._refiner.refine(self.model, self.keyframes, steps)
+        self._prune()  # or what refinement made faint, huge or not finite would be rendered
+
+    def make_reference(self, observation: Observation, keyframe: Keyframe) -> None:
+        """What later frames are aligned to: the frame's own grey, the map's depth where the map is solid."""
+        levels = observation.prepared.levels
+        view = view_of(self.model, levels[0].camera, keyframe.T_world_camera)
+        depth = model_depth(view, levels[0].depth, self.config.mapping)
+        n_pixels = self.config.tracking.n_pixels
+        keyframe.reference = make_reference(with_depth(levels, depth), keyframe.T_world_camera, n_pixels)
+
+    @contextmanager
+    def _undone_on_error(self) -> Iterator[None]:
+        """Puts everything back when the block raises. Cheap: up to :meth:`refine` the block writes to copies only."""
+        before = self.keyframes, self.model, self.owed, self._version, self._stamp, self._refiner.state()
+        try:
+            yield
+        except BaseException:
+            self.keyframes, self.model, self.owed, self._version, self._stamp, state = before
+            self._refiner.restore(state)
+            raise
 
     def _make_keyframe(
         self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features
@@ -75,11 +163,12 @@ class Mapper:
 
     def _weigh(self, keyframe: Keyframe) -> None:
         evidence = weigh(self.model, keyframe, self.config.mapping)
-        self.model.observations += evidence.supported.int()
+        observations = self.model.observations + evidence.supported.int()
         # Seen through once may be a wrong depth; its opacity halves, roughly, each time, until it is pruned. A guess
         # that is seen through was wrong.
-        self.model.opacity_logits -= evidence.seen_through.float()
-        self.model.opacity_logits[evidence.seen_through & (self.model.observations == 0)] = -10.0
+        logits = self.model.opacity_logits - evidence.seen_through.float()
+        logits[evidence.seen_through & (observations == 0)] = -10.0
+        self.model = replace(self.model, observations=observations, opacity_logits=logits)
 
     def _add(self, keyframe: Keyframe) -> None:
         view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
@@ -98,11 +187,3 @@ class Mapper:
     def _select(self, index: torch.Tensor) -> None:
         self.model = self.model.select(index)
         self._refiner.adam.select(index)
-
-    def _model_reference(self, prepared: PreparedFrame, keyframe: Keyframe) -> Reference:
-        """What later frames are aligned to: the frame's own grey, the map's depth where the map is solid."""
-        finest = prepared.levels[0]
-        view = view_of(self.model, finest.camera, keyframe.T_world_camera)
-        depth = model_depth(view, finest.depth, self.config.mapping)
-        levels = with_depth(prepared.levels, depth)
-        return make_reference(levels, keyframe.T_world_camera, self.config.tracking.n_pixels)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,14 +33,26 @@ class Refiner:
             }
         )
         self._random = np.random.default_rng(seed)
+        self._latest = -1  # number of the latest keyframe that a step was spent on as such
+
+    def state(self) -> Any:
+        """All that steps change besides the model, for :meth:`restore`."""
+        return self.adam.state(), self._random.bit_generator.state, self._latest
+
+    def restore(self, state: Any) -> None:
+        """Go back to a :meth:`state`."""
+        adam, self._random.bit_generator.state, self._latest = state
+        self.adam.restore(adam)
 
     def refine(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
-        """Spend ``iterations`` steps on the model, in place: the latest keyframe first, then at random.
+        """Spend ``iterations`` steps on the model, in place: on the latest keyframe if it has had none, then at random.
 
         Half of the random draws come from the latest ``config.window`` keyframes, half from all, against forgetting.
         """
-        for i in range(iterations if len(model) else 0):
-            self.step(model, keyframes[-1] if i == 0 else self._draw(keyframes))
+        for _ in range(iterations if len(model) else 0):
+            fresh = keyframes[-1].number > self._latest
+            self._latest = keyframes[-1].number
+            self.step(model, keyframes[-1] if fresh else self._draw(keyframes))
 
     def refine_all(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
         """Spend ``iterations`` steps on all keyframes alike."""

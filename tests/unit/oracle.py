@@ -71,6 +71,9 @@ class OracleSlam(Slam):
         """Nothing to refine."""
         self.finished = True
 
+    def close(self) -> None:
+        """No thread to end."""
+
     def snapshot(self) -> Snapshot:
         """A small sphere for every pixel that was added."""
         if not self._points:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -228,3 +230,31 @@ def test_the_map_of_the_tabletop_shows_views_it_was_not_made_of() -> None:
     assert -10 * np.log10(float(error)) > 21.0  # [dB]
     depth_error = (view.depth - torch.from_numpy(frames[5].depth)).abs()
     assert float(depth_error.median()) < 4e-3
+
+
+@pytest.mark.parametrize("broken", ["_add", "refine", "make_reference"])
+def test_an_exception_in_an_insertion_leaves_the_map_and_what_follows_as_if_it_had_not_been_tried(
+    broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper, other = Mapper(small_config()), Mapper(small_config())
+    for m in (mapper, other):
+        insert(m, wall_frame(np.eye(4)))
+    before, keyframes = mapper.snapshot(), mapper.keyframes
+
+    def fail_after(work: Callable[..., None]) -> Callable[..., None]:
+        def run(*arguments: Any) -> None:
+            work(*arguments)
+            raise MemoryError("on purpose")
+
+        return run
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mapper, broken, fail_after(getattr(mapper, broken)))
+        with pytest.raises(MemoryError):
+            insert(mapper, wall_frame(SIDE), SIDE)
+    assert equal(mapper.model, before.model)
+    assert mapper.keyframes == keyframes
+    assert mapper.snapshot().map_version == before.map_version
+    for m in (mapper, other):
+        insert(m, wall_frame(SIDE), SIDE)
+    assert equal(mapper.model, other.model)  # the optimiser and the draws are back, too
