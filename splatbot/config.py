@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_serializer, model_validator
+from pydantic_core.core_schema import FieldSerializationInfo
 
 from splatbot.errors import ConfigError
 
@@ -19,9 +20,28 @@ class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class TrackingConfig(_Section):
-    """Camera tracking."""
+# What a budget buys: the row of the largest budget that is not larger [ms]. Everything that a budget changes is here.
+_EFFORT: dict[float, dict[str, Any]] = {
+    0: {"n_pixels": 2400, "iterations": 4, "features": "always", "n_features": 500},
+    100: {"n_pixels": 4800, "iterations": 5, "features": "always", "n_features": 2000},
+    300: {"n_pixels": 9600, "iterations": 8, "features": "always", "n_features": 3000},
+    1000: {"n_pixels": 19200, "iterations": 10, "features": "always", "n_features": 4000},
+}
 
+
+class TrackingConfig(_Section):
+    """Camera tracking.
+
+    ``budget_ms`` decides ``n_pixels``, ``iterations``, ``features`` and ``n_features`` unless they are given; null
+    leaves them to it, and so they are written in YAML.
+    """
+
+    budget_ms: float = Field(
+        default=100.0, gt=0, description="time for one frame, without decoding it: accuracy for time [ms]"
+    )
+    deterministic: bool = Field(
+        default=True, description="count work instead of milliseconds: the same frames, the same result, bit for bit"
+    )
     min_depth: float = Field(default=0.2, gt=0, description="nearer is ignored: a gripper, or too near to measure [m]")
     max_depth: float = Field(default=6.0, gt=0, description="farther depth is ignored [m]")
     max_width: int = Field(default=640, ge=64, description="finest width used for alignment [px]")
@@ -52,6 +72,10 @@ class TrackingConfig(_Section):
     )
     features_motion: float = Field(default=0.03, ge=0, description="predicted motion that calls for features [m]")
     features_rotation: float = Field(default=0.05, ge=0, description="predicted rotation that calls for features [rad]")
+    wide: Literal["needed", "never"] = Field(
+        default="needed", description="register point clouds where motion is large and features do not help"
+    )
+    wide_points: int = Field(default=4000, ge=100, description="points of a registered cloud: accuracy for time")
     min_valid: float = Field(
         default=0.02, ge=0, le=1, description="a frame with less valid depth begins no map and is no keyframe"
     )
@@ -63,6 +87,24 @@ class TrackingConfig(_Section):
         le=1,
         description="a smaller ratio of the translation's information: degraded, the prediction stands in",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_nulls(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        return {key: value for key, value in values.items() if value is not None or key not in _EFFORT[0]}
+
+    @model_validator(mode="after")
+    def _by_budget(self) -> TrackingConfig:
+        row = _EFFORT[max(limit for limit in _EFFORT if limit <= self.budget_ms)]
+        for key in row.keys() - self.model_fields_set:
+            self.__dict__[key] = row[key]
+        return self
+
+    @field_serializer(*_EFFORT[0], when_used="json")
+    def _null_if_by_budget(self, value: Any, info: FieldSerializationInfo) -> Any:
+        return value if info.field_name in self.model_fields_set else None
 
 
 class MappingConfig(_Section):

@@ -19,11 +19,8 @@ from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.motion import JointMotion
 from splatbot.mapping.worker import MappingWorker
 from splatbot.tracking.health import Verdict
-from splatbot.tracking.places import likeliest
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from splatbot.tracking.tracker import PoseEstimate, Tracker
-
-_LIKELY = 12  # keyframes that a lost frame is compared with
 
 
 @dataclass(frozen=True)
@@ -37,6 +34,7 @@ class FrameResult:
         stage_ms: milliseconds by stage.
         keyframe: whether the frame entered the map.
         gaussians: size of the map afterwards.
+        skipped: tracking stages that there was no time for.
         covariance: (6, 6) of the pose, see :attr:`splatbot.tracking.estimate.PoseEstimate.covariance`; None when lost.
     """
 
@@ -49,6 +47,7 @@ class FrameResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
     keyframe: bool = False
     gaussians: int = 0
+    skipped: tuple[str, ...] = ()
     covariance: NDArray[np.float64] | None = None
 
 
@@ -103,6 +102,7 @@ class Slam:
             stage_ms=stage_ms,
             keyframe=keyframe,
             gaussians=self._mapper.size,
+            skipped=estimate.skipped,
             covariance=estimate.covariance if placed else None,
         )
         self.results.append(result)
@@ -166,7 +166,7 @@ class Slam:
     def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
         keyframes = self._mapper.keyframes
         if keyframes:
-            return self._tracker.track(prepared, self._likely(prepared, keyframes))
+            return self._tracker.track(prepared, keyframes)
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
@@ -183,13 +183,6 @@ class Slam:
         self.results = moved
         if number in correction:
             self._tracker.move(correction[number])
-
-    def _likely(self, prepared: PreparedFrame, keyframes: Sequence[Keyframe]) -> Sequence[Keyframe]:
-        """The keyframes that a frame is tracked against: when lost, those that look like it, wherever they are."""
-        if not self._tracker.is_lost or len(keyframes) <= _LIKELY:
-            return keyframes
-        features = self._tracker.detect(prepared)
-        return [keyframes[k] for k in sorted(likeliest(features, keyframes, _LIKELY))]
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)

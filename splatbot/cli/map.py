@@ -23,6 +23,7 @@ def map_log_command(
     overrides: Annotated[
         tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction
     ] = (),
+    budget_ms: Annotated[float | None, tyro.conf.arg(metavar="MS")] = None,
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
@@ -44,7 +45,7 @@ def map_log_command(
         splatbot map recordings/desk
         splatbot map recordings/desk --out runs/desk --set mapping.max_gaussians=50000
         splatbot map rgbd_dataset_freiburg1_desk --camera tum_fr1
-        splatbot map recordings/desk --realtime --rate 30
+        splatbot map recordings/desk --budget-ms 30 --realtime --rate 30
         splatbot map "synthetic:tabletop?frames=40" --out runs/tabletop
         splatbot map --resume runs/desk
         splatbot map recordings/desk_again --localise runs/desk
@@ -55,6 +56,8 @@ def map_log_command(
         out: folder to write; by default runs/NAME-TIME, with a link runs/latest.
         config: YAML file; environment variables (SPLATBOT_MAPPING__MAX_GAUSSIANS=...) and then --set override it.
         overrides: one key of the configuration, as in mapping.max_gaussians=50000.
+        budget_ms: time for tracking one frame, 100 by default; 30, 300 and 1000 have other settings. As --set
+            tracking.budget_ms=MS; counted in work, so that runs repeat, unless --realtime.
         camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         on_bad_frame: what to do about a frame that cannot be read: save and stop, or leave it out.
         max_frames: read only the first N frames.
@@ -63,22 +66,24 @@ def map_log_command(
         save_every: seconds between two saves of the state; 0: never, not even at the end.
         resume: go on with a run that was killed, interrupted or cut short, into its own folder unless --out is given;
             LOG only if the log has moved.
-        localise: place the frames in the map of this run instead of building one; the first may be anywhere in it.
+        localise: place the frames in the map of this run instead of building one; the first may be anywhere in it, and
+            is not believed before the second agrees.
         dump_config: print the configuration in force and leave.
         quiet: no progress and no summary, only errors.
     """
     from splatbot.config import load_config
     from splatbot.errors import InputError
 
-    settings = load_config(config, overrides=_parse_overrides(overrides))
+    given = _parse_overrides(overrides) | ({} if budget_ms is None else {"tracking.budget_ms": budget_ms})
+    settings = load_config(config, overrides=given)
     if dump_config:
         print(settings.to_yaml(), end="")
         return 0
     if resume is not None and localise is not None:
         raise InputError("excludes --resume.", field="--localise", hint="give the one or the other")
-    if (resume or localise) and (config or overrides):
-        hint = "leave --config and --set out, or map the log anew"
-        raise InputError("a saved run keeps its configuration.", field="--config, --set", hint=hint)
+    if (resume or localise) and (config or given):
+        hint = "leave --config, --set and --budget-ms out, or map the log anew"
+        raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
     if not log and resume is None:
         raise InputError("is missing.", field="LOG", hint="name a recording: splatbot map LOG")
     if max_frames is not None and max_frames < 1:

@@ -19,8 +19,8 @@ from splatbot.tracking.features import Features, match_pose
 from splatbot.tracking.health import measure
 from splatbot.tracking.places import votes
 from splatbot.tracking.prepare import PreparedFrame
-from splatbot.tracking.tracker import order_by_distance, pose_distance
 from splatbot.tracking.uncertainty import alignment_covariance
+from splatbot.tracking.views import order_by_distance, pose_distance
 
 Array = NDArray[np.float64]
 

@@ -98,7 +98,9 @@ def map_log(
     if rate is not None and not 0 < rate < 1e4:
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")
     if realtime and slam is None:
-        config = config.model_copy(update={"mapping": config.mapping.model_copy(update={"threaded": True})})
+        threaded = config.mapping.model_copy(update={"threaded": True})
+        by_the_clock = config.tracking.model_copy(update={"deterministic": False})
+        config = config.model_copy(update={"mapping": threaded, "tracking": by_the_clock})
     folder = RunFolder.create(out)
     total = len(log) if max_frames is None else min(len(log), max_frames)
     if total == 0:

@@ -43,6 +43,9 @@ class Alignment:
         return replace(self, T_world_camera=T_world_camera)
 
 
+_FULL_PIXELS = 4800  # of a reference that ``dense_weight`` is meant for
+
+
 @dataclass(frozen=True)
 class SoftPrior:
     """What is known of T_world_camera (4, 4) before a frame is looked at.
@@ -107,7 +110,8 @@ def align(
 
     Dense residuals are correlated between neighbouring pixels (blur, rolling shutter, depth registered a moment
     earlier), so they count ``config.dense_weight`` each, against reprojected features (``features`` with the
-    ``camera`` of their pixels), which count one.
+    ``camera`` of their pixels), which count one. More pixels measure the same better; they bring no more that is
+    independent, so together they weigh as 4800 do.
     """
     matches = None
     if features is not None and camera is not None:
@@ -119,7 +123,7 @@ def align(
         None if prior is None else (inverse(prior.T_world_camera), prior.information),
         inverse(T_world_camera),
         settings_of(config, photometric=photometric, gate=gate),
-        config.dense_weight,
+        config.dense_weight * _FULL_PIXELS / config.n_pixels,
         config.iterations,
         finest,
     )

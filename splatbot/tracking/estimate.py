@@ -27,6 +27,7 @@ class PoseEstimate:
         health: how well it explains the frame.
         features: keypoints of the frame, where they were looked for.
         stage_ms: milliseconds by stage.
+        skipped: stages that there was no time for.
     """
 
     T_world_camera: Array
@@ -37,6 +38,7 @@ class PoseEstimate:
     health: Health | None = None
     features: Features | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
+    skipped: tuple[str, ...] = ()
 
     @property
     def covariance(self) -> Array:

@@ -24,6 +24,8 @@ _INLIER = 3.0  # [σ]
 # A frame of less contrast than this share of the reference's shows nothing: a covered lens, the dark, a lost image. The
 # exposure fit would explain it by a gain near 0, at any pose.
 _MIN_CONTRAST = 0.1
+# On a table, or before a wall, depth agrees wherever the camera slides along it; colour does not.
+_FEW_PHOTOMETRIC = 0.55
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,12 @@ def verdict_of(
         lost.append(f"only {inliers:.0%} of the residuals are inliers")
     if not health.contrast >= _MIN_CONTRAST:
         lost.append(f"the image is blank: {health.contrast:.0%} of the reference's contrast")
+    if not health.photometric_inliers >= _FEW_PHOTOMETRIC:
+        doubts.append(f"only {health.photometric_inliers:.0%} of the colours agree")
     if not np.isfinite(information).all():
         lost.append("the alignment is not finite")
     elif weak is not None:
         doubts.append(weak.reason)
     if lost:
-        return "lost", tuple(lost + doubts)
+        return "lost", tuple(lost)
     return ("degraded", tuple(doubts)) if doubts else ("ok", ())

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -36,12 +37,14 @@ class Level:
 class PreparedFrame:
     """A frame, its plausible depth (H, W) [m] at full size, and its pyramid, finest level first.
 
-    What the frame's mask leaves out has no depth, and NaN as its grey.
+    What the frame's mask leaves out has no depth, and NaN as its grey. ``started`` is :func:`time.perf_counter` when
+    work on the frame began.
     """
 
     frame: Frame
     depth: Image
     levels: tuple[Level, ...]
+    started: float = field(default_factory=time.perf_counter, compare=False)
 
 
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
@@ -49,6 +52,7 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
 
     It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
     """
+    started = time.perf_counter()
     depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
     if frame.mask is not None:
         depth = np.where(frame.mask, depth, np.float32(0))
@@ -62,7 +66,7 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     levels = [Level(smooth, level.depth, level.camera)]
     while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
         levels.append(halve(levels[-1]))
-    return PreparedFrame(frame, depth, tuple(levels))
+    return PreparedFrame(frame, depth, tuple(levels), started)
 
 
 def valid_depth(depth: Image, near: float, far: float) -> Image:

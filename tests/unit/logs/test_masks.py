@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from splatbot.logs import open_log
 MakeLog = Callable[..., Path]
 
 
-def write_mask(path: Path, blacked: slice, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
+def write_mask(path: Path, blacked: Any, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
     mask = np.full(shape, 255, np.uint8)
     mask[blacked] = 0
     path.parent.mkdir(exist_ok=True)
