@@ -123,6 +123,9 @@ class MappingConfig(_Section):
     keyframe_rotation: float = Field(
         default=0.07, gt=0, description="a view turned so far from all others is new [rad]"
     )
+    max_keyframes: int = Field(
+        default=300, ge=10, description="hard cap on the images kept, some 3 MB each; the most redundant go: memory"
+    )
     refine_iterations: int = Field(default=15, ge=0, description="optimiser steps per keyframe: accuracy for time")
     final_iterations: int = Field(default=200, ge=0, description="optimiser steps once the log has ended")
     window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")

@@ -139,6 +139,13 @@ class Slam:
         return self._mapper.paused()
 
     @property
+    def memory(self) -> dict[str, int]:
+        """Bytes held: "gaussians_bytes" (bookkeeping included), "optimiser_bytes", "keyframe_images_bytes" and
+        "keyframe_tracking_bytes" (features, sampled pixels).
+        """
+        return self._mapper.memory
+
+    @property
     def loop_counts(self) -> dict[str, int]:
         """How many places were recognised ("closed"), and how many only looked like it ("rejected")."""
         return self._mapper.loop_counts

@@ -161,7 +161,7 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome)
 
 
 def _with_budget(config: Config | None, budget_ms: float) -> Config:
-    values = (config or Config()).model_dump()
+    values = (config or Config()).model_dump(mode="json")  # where null stands for what a budget decides
     values["tracking"]["budget_ms"] = budget_ms
     return Config.model_validate(values)
 

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.fusion import guessed_gaussians, model_depth, new_gaussians, unexplained, view_of, weigh
 from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images
 from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
 from splatbot.mapping.loop import View as LoopView
+from splatbot.mapping.memory import memory_of
 from splatbot.mapping.prune import fittest, worth_keeping
 from splatbot.mapping.refine import Refiner
 from splatbot.tracking.features import Features
@@ -108,6 +110,11 @@ class Mapper:
         return correction
 
     @property
+    def memory(self) -> dict[str, int]:
+        """Bytes held, by what for."""
+        return memory_of(self.model, self._refiner.adam, self.keyframes)
+
+    @property
     def loop_counts(self) -> dict[str, int]:
         """Loops that were "closed", and "rejected" ones."""
         return {"closed": self.loops.closed, "rejected": self.loops.rejected}
@@ -151,7 +158,8 @@ class Mapper:
         if provisional:
             levels, n_pixels = observation.prepared.levels, self.config.tracking.n_pixels
             keyframe.reference = make_reference(levels, observation.T_world_camera, n_pixels)
-        self.keyframes = [*self.keyframes, keyframe]  # a new list: the tracker may be reading the old one
+        # A new list: the tracker may be reading the old one.
+        self.keyframes = without_redundant([*self.keyframes, keyframe], self.config.mapping.max_keyframes)
         self._stamp = observation.prepared.frame.stamp
         return keyframe
 
@@ -196,7 +204,7 @@ class Mapper:
     ) -> Keyframe:
         camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
         return Keyframe(
-            number=len(self.keyframes),
+            number=self.keyframes[-1].number + 1 if self.keyframes else 0,
             camera=camera,
             rgb=torch.from_numpy(np.ascontiguousarray(rgb)),
             depth=torch.from_numpy(depth),

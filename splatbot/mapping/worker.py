@@ -86,6 +86,11 @@ class MappingWorker:
             self._start(first)
 
     @property
+    def memory(self) -> dict[str, int]:
+        """As :meth:`Mapper.memory`; while the thread works, of about now."""
+        return self._mapper.memory
+
+    @property
     def loop_counts(self) -> dict[str, int]:
         """As :meth:`Mapper.loop_counts`."""
         return self._mapper.loop_counts

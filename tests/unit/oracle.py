@@ -40,6 +40,11 @@ class OracleSlam(Slam):
         self._colors: list[NDArray[np.float64]] = []
 
     @property
+    def memory(self) -> dict[str, int]:
+        """Not counted."""
+        return {}
+
+    @property
     def loop_counts(self) -> dict[str, int]:
         """It has none."""
         return {"closed": 0, "rejected": 0}
