@@ -33,12 +33,14 @@ def pose_distance(T_world_a: Array, T_world_b: Array) -> tuple[float, float]:
 
 def order_by_distance(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[int]:
     """Indices of keyframes, nearest first; one radian counts as half a metre."""
-
-    def distance(k: int) -> float:
-        moved, turned = pose_distance(keyframes[k].reference.T_world_camera, T_world_camera)
-        return moved + 0.5 * turned
-
-    return sorted(range(len(keyframes)), key=distance)
+    if not keyframes:
+        return []
+    poses = np.stack([keyframe.reference.T_world_camera for keyframe in keyframes])
+    moved = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+    R = poses[:, :3, :3].transpose(0, 2, 1) @ T_world_camera[:3, :3]
+    sine = np.linalg.norm(R - R.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8)
+    turned = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1))
+    return [int(k) for k in np.argsort(moved + 0.5 * turned, kind="stable")]
 
 
 def nearest(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array, n: int) -> list[TrackedKeyframe]:
