@@ -141,9 +141,7 @@ def _grad(tensor: Tensor) -> Tensor:
     return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
 
 
-def _project(
-    scene: SplatScene, means: Tensor, quats: Tensor, scales: Tensor, width: int, height: int
-) -> Projection:
+def _project(scene: SplatScene, means: Tensor, quats: Tensor, scales: Tensor, width: int, height: int) -> Projection:
     """EWA projection (Zwicker et al. 2001)."""
     K = scene.intrinsics(width, height)[0]
     fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
