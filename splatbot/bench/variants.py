@@ -1,4 +1,4 @@
-"""What is fixed when the C++ core is compiled, swept by compiling it again: degree of the exponential, shape of the tiles.
+"""Sweeps of what is fixed when the C++ core is compiled: degree of the exponential, shape of the tiles.
 
 Run as a module, it measures one such build and prints JSON.
 """
@@ -44,8 +44,11 @@ VARIANTS = (
 
 @dataclass(frozen=True)
 class Measured:
-    """Of one build: milliseconds of the surface map at 320x240, RGB and expected depth, and the largest error of its colour
-    against the float64 reference, in pixels that no rounding can flip."""
+    """Of one build: milliseconds of the surface map at 320x240, RGB and expected depth.
+
+    Args:
+        largest_error: of a small image's colours and depths against the float64 reference, where no rounding can flip.
+    """
 
     forward_ms: float
     forward_backward_ms: float
