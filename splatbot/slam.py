@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -57,6 +58,7 @@ class Slam:
         self._tracker = Tracker(self.config.tracking)
         mapper = Mapper(self.config)
         self._mapper = MappingWorker(mapper) if self.config.mapping.threaded else mapper
+        self._looked = -math.inf
         self._size: tuple[int, int] | None = None
         self._motion = JointMotion(self.config.mapping.still)
 
@@ -79,6 +81,8 @@ class Slam:
         keyframe = placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
         if keyframe:
             self._map(prepared, estimate)
+        elif estimate.verdict == "ok" and not hold_out and self._looks(frame.stamp):
+            self._mapper.look(prepared, estimate.T_world_camera)
         stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
         stage_ms["mapping"] = 1e3 * (time.perf_counter() - tracked_at)
         result = FrameResult(
@@ -125,6 +129,13 @@ class Slam:
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
+
+    def _looks(self, stamp: float) -> bool:
+        """Whether it is time to look at a frame that is no keyframe."""
+        if 0 <= stamp - self._looked < self.config.mapping.look_every:
+            return False
+        self._looked = stamp
+        return True
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)

@@ -8,6 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -42,6 +43,7 @@ class MappingWorker:
         self._backlog = backlog
         self._waiting: deque[Observation] = deque()
         self._news = threading.Condition()
+        self._to_look: tuple[PreparedFrame, NDArray[np.float64]] | None = None
         self._held = False
         self._ending = False
         self._error: BaseException | None = None
@@ -75,6 +77,12 @@ class MappingWorker:
         if first is not None:
             self._start(first)
 
+    def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
+        """As :meth:`Mapper.look`, when there is time; the latest frame only."""
+        with self._news:
+            self._to_look = (prepared, T_world_camera)
+            self._news.notify()
+
     def hold(self, moving: bool) -> None:
         """As :meth:`Mapper.hold`."""
         with self._news:
@@ -86,7 +94,7 @@ class MappingWorker:
         self._end()
         self._raise_error()
         self._mapper.finish()
-        self._published = self._mapper.snapshot()
+        self._publish()
 
     def close(self) -> None:
         """End the thread once all observations are in the map; what went wrong in it has been or is not raised."""
@@ -95,6 +103,9 @@ class MappingWorker:
     def snapshot(self) -> Snapshot:
         """The map as it was published last: after each keyframe's fusion, and when refinement has caught up."""
         return self._published
+
+    def _publish(self) -> None:
+        self._published = replace(self._mapper.snapshot(), map_version=self._published.map_version + 1)
 
     def _start(self, first: Keyframe) -> None:
         sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_S))
@@ -129,6 +140,8 @@ class MappingWorker:
                     return self._take
                 if self._ending:
                     return None
+                if self._to_look is not None:
+                    return self._look
                 if self._mapper.owed and not self._held:
                     return self._refine
                 self._news.wait()
@@ -143,12 +156,18 @@ class MappingWorker:
         self._mapper.fuse(keyframe)
         self._mapper.make_reference(observation, keyframe)
         self._waiting.popleft()
-        self._published = self._mapper.snapshot()
+        self._publish()
+
+    def _look(self) -> None:
+        with self._news:
+            frame, self._to_look = self._to_look, None
+        if frame is not None:
+            self._mapper.look(*frame)
 
     def _refine(self) -> None:
         self._mapper.refine(_CHUNK)
         if not self._mapper.owed:
-            self._published = self._mapper.snapshot()
+            self._publish()
 
 
 def _stand_back() -> None:

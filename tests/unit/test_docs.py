@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/stability.md", "docs/simulate.md", "docs/bench.md", "docs/mapping.md"]
+DOCUMENTS = [
+    "README.md",
+    "ARCHITECTURE.md",
+    "CHANGELOG.md",
+    "docs/stability.md",
+    "docs/simulate.md",
+    "docs/bench.md",
+    "docs/mapping.md",
+]
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)

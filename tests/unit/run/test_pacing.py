@@ -93,7 +93,7 @@ def test_a_bug_of_a_reader_is_raised_where_the_frames_are_taken() -> None:
 def test_a_source_that_is_left_early_ends_its_thread() -> None:
     arrivals = iter(source(Stream(100)))
     next(arrivals)
-    arrivals.close()  # type: ignore[attr-defined]
+    arrivals.close()
     for _ in range(200):
         if not any(t.name == "reading" for t in threading.enumerate()):
             return
