@@ -127,22 +127,26 @@ class MappingConfig(_Section):
         default=300, ge=10, description="hard cap on the images kept, some 3 MB each; the most redundant go: memory"
     )
     refine_iterations: int = Field(default=15, ge=0, description="optimiser steps per keyframe: accuracy for time")
-    final_iterations: int = Field(default=200, ge=0, description="optimiser steps once the log has ended")
+    final_iterations: int = Field(default=300, ge=0, description="optimiser steps once the log has ended")
     window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")
-    depth_weight: float = Field(default=0.5, ge=0, description="weight of relative depth against colour")
+    depth_weight: float = Field(default=8.0, ge=0, description="weight of relative depth against colour")
     dssim_weight: float = Field(
         default=0.0,
         ge=0,
         le=1,
         description="share of structure (1 - SSIM) in the colour loss; 0: colour alone, cheaper",
     )
-    rate_means: float = Field(default=2e-4, ge=0, description="learning rate of positions [m]")
+    rate_means: float = Field(default=5e-4, ge=0, description="learning rate of positions [m]")
     rate_quats: float = Field(default=1e-3, ge=0, description="learning rate of orientations")
-    rate_scales: float = Field(default=5e-3, ge=0, description="learning rate of log-scales")
+    rate_scales: float = Field(default=5e-2, ge=0, description="learning rate of log-scales")
     rate_opacities: float = Field(default=2e-2, ge=0, description="learning rate of opacity logits")
     rate_sh: float = Field(default=2e-2, ge=0, description="learning rate of colour coefficients")
     min_opacity: float = Field(default=0.05, ge=0, le=1, description="fainter Gaussians are pruned")
     max_scale: float = Field(default=0.5, gt=0, description="larger Gaussians are pruned [m]")
+    look_every: float = Field(
+        default=0.2, ge=0, description="between keyframes, a frame as old as this tells what has gone or moves [s]"
+    )
+    settle: float = Field(default=1.0, ge=0, description="what appeared and has stayed for so long is mapped [s]")
     threaded: bool = Field(
         default=False, description="map in a thread beside tracking: quicker frames, but no two runs are the same"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -64,6 +65,7 @@ class Slam:
         self._tracker = Tracker(self.config.tracking)
         mapper = Mapper(self.config)
         self._mapper = MappingWorker(mapper) if self.config.mapping.threaded else mapper
+        self._looked = -math.inf
         self._size: tuple[int, int] | None = None
         self._growing = True
         self._motion = JointMotion(self.config.mapping.still)
@@ -90,6 +92,8 @@ class Slam:
         keyframe = self._growing and placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
         if keyframe:
             self._map(prepared, estimate)
+        elif self._growing and estimate.verdict == "ok" and not hold_out and self._looks(frame.stamp):
+            self._mapper.look(prepared, estimate.T_world_camera)
         stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
         stage_ms["mapping"] = 1e3 * (time.perf_counter() - tracked_at)
         result = FrameResult(
@@ -190,6 +194,13 @@ class Slam:
         self.results = moved
         if number in correction:
             self._tracker.move(correction[number])
+
+    def _looks(self, stamp: float) -> bool:
+        """Whether it is time to look at a frame that is no keyframe."""
+        if 0 <= stamp - self._looked < self.config.mapping.look_every:
+            return False
+        self._looked = stamp
+        return True
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)

@@ -40,6 +40,7 @@ class Keyframe:
         depth: (H, W) float32 [m], 0 missing.
         T_world_camera: (4, 4).
         features: for matching later frames.
+        still: (H, W) bool, pixels that show nothing that moves, depth being 0 elsewhere; None: all.
         reference: for aligning later frames; its depth is the model's once the keyframe has been fused.
     """
 
@@ -50,6 +51,7 @@ class Keyframe:
     T_world_camera: NDArray[np.float64]
     features: Features
     reference: Reference
+    still: Tensor | None = None
 
     @property
     def viewmat(self) -> Tensor:

@@ -4,25 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
-from splatbot.mapping.fusion import guessed_gaussians, model_depth, new_gaussians, unexplained, view_of, weigh
+from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, weigh
+from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
 from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images
 from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
 from splatbot.mapping.loop import View as LoopView
 from splatbot.mapping.memory import memory_of
+from splatbot.mapping.merge import merge_alike
+from splatbot.mapping.moving import Movers
 from splatbot.mapping.prune import fittest, worth_keeping
 from splatbot.mapping.refine import Refiner
 from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
 from splatbot.tracking.reference import Reference, make_reference
+
+_REVEALED = 0.03  # share of a frame that the map has nothing of, from which on the frame is wanted
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,9 @@ class Mapper:
         self.loops = LoopCloser(config)
         self._refiner = Refiner(config.mapping, config.seed)
         self._refiner.adam.extend(self.model)
+        self._movers = Movers(config.mapping.settle)
+        self._revealed = False
+        self._noise = DepthNoise.of(config.tracking)
         self._held = False
         self._version = 0
         self._stamp = 0.0
@@ -72,8 +83,10 @@ class Mapper:
         """
         if valid_share(prepared) < self.config.tracking.min_valid:
             return False
-        new = is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
-        return self.loops.is_bridge(T_world_camera, self.keyframes) or new
+        bridge = self.loops.is_bridge(T_world_camera, self.keyframes)
+        if bridge or (self._revealed and not waiting):
+            return True
+        return is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
 
     def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
         """Fuse a frame into the map, refine, and make it a reference for tracking.
@@ -163,11 +176,30 @@ class Mapper:
         self._stamp = observation.prepared.frame.stamp
         return keyframe
 
+    def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
+        """Weigh the map against a frame that is no keyframe: what has gone goes, what moves is followed.
+
+        Where it shows what the map has nothing of, the next frame is wanted as a keyframe, from wherever it is.
+        """
+        camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
+        depths = torch.from_numpy(depth)
+        self._weigh(depths, camera, T_world_camera)
+        self._prune()
+        view = view_of(self.model, camera, T_world_camera)
+        colors, stamp = torch.from_numpy(np.ascontiguousarray(rgb)), prepared.frame.stamp
+        self._movers.find(view, colors, depths, camera, T_world_camera, self.keyframes, stamp)
+        bare = (depths > 0) & (view.alpha < self.config.mapping.new_alpha)
+        self._revealed = float(bare.float().mean()) > _REVEALED
+        self._version += 1
+
     def fuse(self, keyframe: Keyframe) -> None:
         """Bring a keyframe's evidence and its new surfaces into the map; it calls for refinement."""
-        self._weigh(keyframe)
-        self._add(keyframe)
+        self._weigh(keyframe.depth, keyframe.camera, keyframe.T_world_camera)
+        view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
+        self._leave_out_what_moves(keyframe, view)
+        self._add(keyframe, view)
         self._prune()
+        self._revealed = False
         self.owed += self.config.mapping.refine_iterations
         self._version += 1
 
@@ -185,6 +217,8 @@ class Mapper:
         levels = observation.prepared.levels
         view = view_of(self.model, levels[0].camera, keyframe.T_world_camera)
         depth = model_depth(view, levels[0].depth, self.config.mapping)
+        if keyframe.still is not None:
+            depth = np.where(_resized(keyframe.still.numpy(), depth.shape), depth, np.float32(0))
         n_pixels = self.config.tracking.n_pixels
         keyframe.reference = make_reference(with_depth(levels, depth), keyframe.T_world_camera, n_pixels)
 
@@ -192,11 +226,13 @@ class Mapper:
     def _undone_on_error(self) -> Iterator[None]:
         """Puts everything back when the block raises. Cheap: up to :meth:`refine` the block writes to copies only."""
         before = self.keyframes, self.model, self.owed, self._version, self._stamp, self._refiner.state()
+        movers = copy(self._movers)
         try:
             yield
         except BaseException:
             self.keyframes, self.model, self.owed, self._version, self._stamp, state = before
             self._refiner.restore(state)
+            self._movers = movers
             raise
 
     def _make_keyframe(
@@ -213,19 +249,29 @@ class Mapper:
             reference=Reference(T_world_camera, ()),
         )
 
-    def _weigh(self, keyframe: Keyframe) -> None:
-        evidence = weigh(self.model, keyframe, self.config.mapping)
-        observations = self.model.observations + evidence.supported.int()
-        # Seen through once may be a wrong depth; its opacity halves, roughly, each time, until it is pruned. A guess
-        # that is seen through was wrong.
-        logits = self.model.opacity_logits - evidence.seen_through.float()
-        logits[evidence.seen_through & (observations == 0)] = -10.0
-        self.model = replace(self.model, observations=observations, opacity_logits=logits)
+    def _weigh(self, depth: torch.Tensor, camera: Camera, T_world_camera: NDArray[np.float64]) -> None:
+        evidence = weigh(self.model, depth, camera, T_world_camera, self._noise)
+        self.model = count(fuse_depth(self.model, evidence), evidence)
 
-    def _add(self, keyframe: Keyframe) -> None:
-        view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
+    def _leave_out_what_moves(self, keyframe: Keyframe, view: View) -> None:
+        moving = self._movers.find(
+            view,
+            keyframe.rgb,
+            keyframe.depth,
+            keyframe.camera,
+            keyframe.T_world_camera,
+            self.keyframes[:-1],
+            self._stamp,
+        )
+        if moving.any():
+            keyframe.still = ~moving
+            keyframe.depth = torch.where(moving, 0.0, keyframe.depth)
+
+    def _add(self, keyframe: Keyframe, view: View) -> None:
         measured = new_gaussians(keyframe, unexplained(view, keyframe.depth, self.config.mapping), self.config.mapping)
         guessed = guessed_gaussians(view, keyframe, self.config.mapping)
+        for new in (measured, guessed):
+            new.uncertainty = first_uncertainty(new, keyframe.T_world_camera, self._noise)
         self.model = GaussianModel.concatenate([self.model, measured, guessed])
         self._refiner.adam.extend(self.model)
 
@@ -233,9 +279,20 @@ class Mapper:
         keep = worth_keeping(self.model, self.config.mapping)
         if not keep.all():
             self._select(keep.nonzero()[:, 0])
+        excess = len(self.model) - self.config.mapping.max_gaussians
+        if excess > 0:
+            self.model, rows = merge_alike(self.model, excess)
+            self._refiner.adam.select(rows)
         if len(self.model) > self.config.mapping.max_gaussians:
             self._select(fittest(self.model, self.config.mapping.max_gaussians))
 
     def _select(self, index: torch.Tensor) -> None:
         self.model = self.model.select(index)
         self._refiner.adam.select(index)
+
+
+def _resized(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The mask at another size, by the nearest pixel."""
+    if mask.shape == shape:
+        return mask
+    return cv2.resize(mask.astype(np.uint8), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST) > 0

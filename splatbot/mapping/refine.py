@@ -17,6 +17,8 @@ from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
 from splatbot.rasterize import rasterization
 
+_GONE = 0.1  # where a keyframe is nearer than the map by more, it shows something that has gone [share of depth]
+
 
 class Refiner:
     """Owns the optimiser; the mapper tells it when rows come and go."""
@@ -88,6 +90,7 @@ class Refiner:
             keyframe.camera.width,
             keyframe.camera.height,
             render_mode="RGB+ED",
+            depth_mode="plane",  # what tracking is aligned to
         )
         loss = self._loss(renders[0], alphas[0], keyframe)
         grads = torch.autograd.grad(loss, list(parameters.values()))
@@ -99,6 +102,10 @@ class Refiner:
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         observed = keyframe.rgb.float() / 255.0
         covered = alpha[..., 0].detach() > 0.5
+        if keyframe.still is not None:
+            covered &= keyframe.still
+        # What was before the map's surface and is there no more has nothing to say of what is behind.
+        covered &= ~((keyframe.depth > 0) & (render[..., 3].detach() * (1 - _GONE) > keyframe.depth))
         color = self._color_loss(render[..., :3], observed, covered)
         depth = keyframe.depth[..., None]
         ranged = (depth > 0) & covered[..., None]

@@ -8,6 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,7 @@ class MappingWorker:
         self._backlog = backlog
         self._waiting: deque[Observation] = deque()
         self._news = threading.Condition()
+        self._to_look: tuple[PreparedFrame, NDArray[np.float64]] | None = None
         self._held = False
         self._ending = False
         self._error: BaseException | None = None
@@ -102,9 +104,16 @@ class MappingWorker:
 
     def close_loops(self) -> dict[int, NDArray[np.float64]]:
         """As :meth:`Mapper.close_loops`, while paused."""
+        self._to_look = None  # its pose is of the world as it was
         moved = self._mapper.close_loops()
-        self._published = self._mapper.snapshot()
+        self._publish()
         return moved
+
+    def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
+        """As :meth:`Mapper.look`, when there is time; the latest frame only."""
+        with self._news:
+            self._to_look = (prepared, T_world_camera)
+            self._news.notify()
 
     def hold(self, moving: bool) -> None:
         """As :meth:`Mapper.hold`."""
@@ -117,7 +126,7 @@ class MappingWorker:
         self._end()
         self._raise_error()
         self._mapper.finish()
-        self._published = self._mapper.snapshot()
+        self._publish()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -135,6 +144,9 @@ class MappingWorker:
     def snapshot(self) -> Snapshot:
         """The map as it was published last: after each keyframe's fusion, and when refinement has caught up."""
         return self._published
+
+    def _publish(self) -> None:
+        self._published = replace(self._mapper.snapshot(), map_version=self._published.map_version + 1)
 
     def _start(self, first: Keyframe) -> None:
         sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_S))
@@ -172,6 +184,8 @@ class MappingWorker:
                     return self._take
                 if self._ending:
                     return None
+                if self._to_look is not None:
+                    return self._look
                 if self._mapper.owed and not self._held:
                     return self._refine
                 self._news.wait()
@@ -186,15 +200,21 @@ class MappingWorker:
         self._mapper.fuse(keyframe)
         self._mapper.make_reference(observation, keyframe)
         self._mapper.look_for_loops(observation, keyframe)
-        self._published = self._mapper.snapshot()
+        self._publish()
         with self._news:
             self._waiting.popleft()
             self._news.notify_all()
 
+    def _look(self) -> None:
+        with self._news:
+            frame, self._to_look = self._to_look, None
+        if frame is not None:
+            self._mapper.look(*frame)
+
     def _refine(self) -> None:
         self._mapper.refine(_CHUNK)
         if not self._mapper.owed:
-            self._published = self._mapper.snapshot()
+            self._publish()
 
 
 def _stand_back() -> None:
