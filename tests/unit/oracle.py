@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,10 +48,6 @@ class OracleSlam(Slam):
     def loop_counts(self) -> dict[str, int]:
         """It has none."""
         return {"closed": 0, "rejected": 0}
-
-    def paused(self) -> AbstractContextManager[None]:
-        """Nothing runs beside it."""
-        return nullcontext()
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """The reference's pose; the frame's pixels enter the map unless it is held out or lost."""
