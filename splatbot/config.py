@@ -130,6 +130,9 @@ class MappingConfig(_Section):
     keyframe_rotation: float = Field(
         default=0.07, gt=0, description="a view turned so far from all others is new [rad]"
     )
+    max_keyframes: int = Field(
+        default=300, ge=10, description="hard cap on the images kept, some 3 MB each; the most redundant go: memory"
+    )
     refine_iterations: int = Field(default=15, ge=0, description="optimiser steps per keyframe: accuracy for time")
     final_iterations: int = Field(default=200, ge=0, description="optimiser steps once the log has ended")
     window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")
@@ -160,11 +163,28 @@ class MappingConfig(_Section):
     )
 
 
+class LoopsConfig(_Section):
+    """Places seen again."""
+
+    enabled: bool = Field(default=True, description="look for places seen again and correct the map for drift")
+    min_votes: int = Field(default=25, ge=1, description="of 400 descriptors, partners that make a candidate by looks")
+    min_matches: int = Field(default=30, ge=20, description="features that agree in one pose, or it is no loop")
+    min_overlap: float = Field(default=0.3, ge=0, le=1, description="share of a keyframe that is seen, or it is none")
+    min_inliers: float = Field(default=0.5, ge=0, le=1, description="share of residuals within 3 σ, or it is none")
+    max_drift: float = Field(
+        default=0.05, gt=0, description="a loop that asks for more drift per way is a look-alike [m/m, rad/rad]"
+    )
+    min_shift: float = Field(default=0.01, gt=0, description="smaller gaps are left as they are [m]")
+    min_turn: float = Field(default=0.01, gt=0, description="smaller gaps are left as they are [rad]")
+    max_strain: float = Field(default=6.0, gt=0, description="a loop that stretches a measured motion more is none [σ]")
+
+
 class Config(_Section):
     """Everything a run can be told."""
 
     tracking: TrackingConfig = Field(default_factory=lambda: TrackingConfig())
     mapping: MappingConfig = Field(default_factory=lambda: MappingConfig())
+    loops: LoopsConfig = Field(default_factory=lambda: LoopsConfig())
     seed: int = Field(default=0, description="seed of every random choice")
 
     def to_yaml(self) -> str:

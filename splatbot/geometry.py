@@ -132,6 +132,14 @@ def rotation_to_quat(R: ArrayLike) -> Array:
     return np.where(q[..., :1] < 0, -q, q)
 
 
+def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
+    """Hamilton products (..., 4) wxyz: the rotation ``b``, then ``a``."""
+    p, q = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
+    w = pw * qw - np.sum(pv * qv, axis=-1, keepdims=True)
+    return np.concatenate([w, pw * qv + qw * pv + np.cross(pv, qv)], axis=-1)
+
+
 def pose_from_quat(translation: ArrayLike, quat: ArrayLike) -> Array:
     """Poses (..., 4, 4) of translations (..., 3) [m] and quaternions (..., 4) wxyz."""
     t = np.asarray(translation, dtype=np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,8 @@ class Slam:
         """
         self._check_size(frame)
         start = time.perf_counter()
+        if self._growing and self._mapper.has_loop:
+            self._close_loops()
         prepared = prepare(frame, self.config.tracking)
         prepared_at = time.perf_counter()
         estimate = self._track(prepared, hold_out)
@@ -137,6 +139,18 @@ class Slam:
         return self._mapper.paused()
 
     @property
+    def memory(self) -> dict[str, int]:
+        """Bytes held: "gaussians_bytes" (bookkeeping included), "optimiser_bytes", "keyframe_images_bytes" and
+        "keyframe_tracking_bytes" (features, sampled pixels).
+        """
+        return self._mapper.memory
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """How many places were recognised ("closed"), and how many only looked like it ("rejected")."""
+        return self._mapper.loop_counts
+
+    @property
     def keyframes(self) -> Sequence[Keyframe]:
         """What frames are tracked against."""
         return self._mapper.keyframes
@@ -163,6 +177,19 @@ class Slam:
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
+
+    def _close_loops(self) -> None:
+        """Move the map's pieces where the loops want them, and with them the poses found so far and the tracker."""
+        with self._mapper.paused():
+            correction = self._mapper.close_loops()
+        number, moved = -1, []
+        for result in self.results:
+            number += result.keyframe
+            T, known = result.T_world_camera, correction.get(number)
+            moved.append(result if T is None or known is None else replace(result, T_world_camera=known @ T))
+        self.results = moved
+        if number in correction:
+            self._tracker.move(correction[number])
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)

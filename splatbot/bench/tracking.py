@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.odometry import Odometry, tracking_peers
 from splatbot.bench.results import Results
+from splatbot.bench.stress import run_stress
 from splatbot.bench.timing import memory_peak
 from splatbot.bench.tracking_plot import plot_tracking
 from splatbot.config import Config, TrackingConfig
@@ -39,6 +40,7 @@ class TrackingPlan:
         peers: whether to run the other trackers too.
         max_frames: read no more frames of a log; None reads all.
         config: what the runs share; the budget is set on top.
+        stress: whether to run the hard synthetic logs, with ``stress_frames`` frames of ``stress_width`` pixels each.
         say: told what is being done.
     """
 
@@ -46,6 +48,9 @@ class TrackingPlan:
     peers: bool = True
     max_frames: int | None = None
     config: Config | None = None
+    stress: bool = False
+    stress_frames: int = 90
+    stress_width: int = 640
     say: Callable[[str], None] = lambda _: None
 
 
@@ -99,9 +104,13 @@ def run_tracking(logs: Sequence[Log], plan: TrackingPlan, folder: Path) -> Resul
         for contender in contenders(plan):
             plan.say(f"{log.name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
             add_rows(results, log, contender, run_log(log, contender.make(), plan.max_frames))
+    if plan.stress:
+        config = plan.config or Config()
+        run_stress(results, config, frames=plan.stress_frames, width=plan.stress_width, say=plan.say)
     results.write_json(folder / "tracking.json")
     results.write_csv(folder / "tracking.csv")
-    plot_tracking(results, folder)
+    if logs:
+        plot_tracking(results, folder)
     return results
 
 
@@ -161,7 +170,7 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome)
 
 
 def _with_budget(config: Config | None, budget_ms: float) -> Config:
-    values = (config or Config()).model_dump()
+    values = (config or Config()).model_dump(mode="json")  # where null stands for what a budget decides
     values["tracking"]["budget_ms"] = budget_ms
     return Config.model_validate(values)
 

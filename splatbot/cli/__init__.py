@@ -34,6 +34,11 @@ COMMANDS = {
         "bench_tracking",
         "Measure tracking: error against milliseconds, beside other trackers.",
     ),
+    "bench collision": _Command(
+        "splatbot.cli.bench_collision",
+        "bench_collision",
+        "Measure the collision field: questions a second, and errors against exact truth.",
+    ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 

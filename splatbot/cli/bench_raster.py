@@ -21,6 +21,7 @@ def bench_raster(
     splat: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     threads: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (1, 2),
     quick: bool = False,
+    variants: bool = False,
 ) -> int:
     """Measure the rasterizer's speed, and what accuracy costs it in time.
 
@@ -32,6 +33,7 @@ def bench_raster(
         splatbot bench raster
         splatbot bench raster --peers
         splatbot bench raster --splat runs/latest/map.ply --threads 1 2 4
+        splatbot bench raster --variants
         splatbot bench raster --quick --json figures.json
 
     Args:
@@ -41,6 +43,7 @@ def bench_raster(
         splat: a map or splat file to render as well.
         threads: how many threads to measure with.
         quick: tiny scenes, to see whether it runs.
+        variants: compile the C++ core with other constants (exponential, tiles) and measure that too (ten minutes).
     """
     from splatbot.errors import InputError
 
@@ -60,7 +63,9 @@ def bench_raster(
         progress.print(f"[dim]{text} ...[/dim]", highlight=False)
 
     plan = RasterPlan.quick_plan(say=say) if quick else RasterPlan(say=say)
-    results = run_raster(replace(plan, thread_counts=tuple(threads), peers=peers, splat=splat), folder)
+    results = run_raster(
+        replace(plan, thread_counts=tuple(threads), peers=peers, splat=splat, variants=variants), folder
+    )
     if json is not None:
         results.write_json(json)
     _print(results, folder)

@@ -20,6 +20,7 @@ def bench_tracking(
     budgets: Annotated[tuple[float, ...], tyro.conf.arg(metavar="MS ...")] = (30.0, 100.0, 300.0, 1000.0),
     no_peers: bool = False,
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    stress: bool = False,
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
 ) -> int:
@@ -29,9 +30,13 @@ def bench_tracking(
     odometry, small_gicp, and ORB with PnP against keyframes. Errors are ATE (RMSE over all tracked frames, aligned by a
     rigid motion) and RPE; milliseconds are those until the pose is known, without decoding and without mapping.
 
+    --stress runs hard synthetic logs with exact truth: flat walls, a corridor, pure rotation, jumps, depth holes, black
+    frames, exposure, a hand. Each frame is within a bound or reported degraded or lost, and the map stays true.
+
     Examples:
         splatbot bench tracking recordings/desk
         splatbot bench tracking recordings/desk recordings/shelf --no-peers
+        splatbot bench tracking --stress
         splatbot bench tracking "synthetic:room?trajectory=loop&frames=90" --budgets 30 100 --json figures.json
 
     Args:
@@ -42,12 +47,13 @@ def bench_tracking(
         budgets: time budgets per frame [ms].
         no_peers: leave the other trackers out.
         max_frames: read only the first N frames of each log.
+        stress: run the hard synthetic logs; LOG and --budgets are not needed.
         config: YAML file with what all runs share.
         camera: intrinsics instead of the logs' own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
     """
     from splatbot.errors import InputError
 
-    if not logs:
+    if not logs and not stress:
         raise InputError("is missing.", field="LOG", hint="name recordings: splatbot bench tracking LOG ...")
     if max_frames is not None and max_frames < 3:
         raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 3")
@@ -67,6 +73,7 @@ def bench_tracking(
         peers=not no_peers,
         max_frames=max_frames,
         config=load_config(config),
+        stress=stress,
         say=lambda text: progress.print(f"[dim]{text} ...[/dim]", highlight=False),
     )
     results = run_tracking([open_log(log, camera=camera) for log in logs], plan, folder)
@@ -79,6 +86,8 @@ def bench_tracking(
 
 
 def _print(results: Results, folder: Path) -> None:
+    from splatbot.bench.stress import AFTER, DEGRADED, RECOVERY, SILENT, STRESS, VIEWS, WORST
+    from splatbot.bench.stress import LOST as STRESS_LOST
     from splatbot.bench.tracking import ATE, FRAME_MS, LOST, PERCENTILES, RESIDENT, RPE, RPE_ROT, TRACKED
     from splatbot.cli.bench_tables import figure_table, wide_console
 
@@ -88,5 +97,10 @@ def _print(results: Results, folder: Path) -> None:
     if machine["load_1min"] is not None and machine["load_1min"] > 0.5:
         console.print(f"[yellow]the machine was busy (load {machine['load_1min']}): times are upper bounds[/yellow]")
     metrics = (ATE, RPE, RPE_ROT, TRACKED, LOST, *(f"p{p}" for p in PERCENTILES), FRAME_MS, RESIDENT)
-    console.print(figure_table("Tracking", results.rows, metrics))
+    hard = results.select(STRESS)
+    if not hard or len(results.rows) > len(hard):
+        console.print(figure_table("Tracking", [row for row in results.rows if row not in hard], metrics))
+    if hard:
+        columns = ("bound", SILENT, WORST, DEGRADED, STRESS_LOST, RECOVERY, AFTER, VIEWS)
+        console.print(figure_table("Hard logs", hard, columns))
     console.print(f"written to {folder}")

@@ -34,7 +34,7 @@ class Keyframe:
     """One observation as the map keeps it.
 
     Args:
-        number: position among the keyframes.
+        number: counts all keyframes there have been.
         camera: of the images kept here.
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 [m], 0 missing.

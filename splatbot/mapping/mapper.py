@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.fusion import guessed_gaussians, model_depth, new_gaussians, unexplained, view_of, weigh
 from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images
+from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
+from splatbot.mapping.loop import View as LoopView
+from splatbot.mapping.memory import memory_of
 from splatbot.mapping.prune import fittest, worth_keeping
 from splatbot.mapping.refine import Refiner
 from splatbot.tracking.features import Features
@@ -23,11 +27,19 @@ from splatbot.tracking.reference import Reference, make_reference
 
 @dataclass(frozen=True)
 class Observation:
-    """A frame that is to become a keyframe: its images, T_world_camera (4, 4) and features."""
+    """A frame that is to become a keyframe.
+
+    Args:
+        prepared: its images.
+        T_world_camera: (4, 4).
+        features: of it.
+        anchor: number of the keyframe that frames were near to before.
+    """
 
     prepared: PreparedFrame
     T_world_camera: NDArray[np.float64]
     features: Features
+    anchor: int | None = None
 
 
 class Mapper:
@@ -39,6 +51,7 @@ class Mapper:
         self.model = GaussianModel.empty()
         self.owed = 0
         """Refinement steps that keyframes have called for and that were not spent yet."""
+        self.loops = LoopCloser(config)
         self._refiner = Refiner(config.mapping, config.seed)
         self._refiner.adam.extend(self.model)
         self._held = False
@@ -59,19 +72,57 @@ class Mapper:
         """
         if valid_share(prepared) < self.config.tracking.min_valid:
             return False
-        return is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
+        new = is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
+        return self.loops.is_bridge(T_world_camera, self.keyframes) or new
 
     def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
         """Fuse a frame into the map, refine, and make it a reference for tracking.
 
         An exception leaves keyframes and map as they were.
         """
-        observation = Observation(prepared, T_world_camera, features)
+        observation = Observation(prepared, T_world_camera, features, self.loops.anchor)
         with self._undone_on_error():
             keyframe = self.add_keyframe(observation)
             self.fuse(keyframe)
             self.refine(0 if self._held else self.owed)
             self.make_reference(observation, keyframe)
+        self.look_for_loops(observation, keyframe)
+
+    def look_for_loops(self, observation: Observation, keyframe: Keyframe) -> None:
+        """Whether a keyframe shows a place seen before; :meth:`close_loops` acts on it."""
+        view = LoopView(observation.prepared, observation.T_world_camera, observation.features, observation.anchor)
+        self.loops.add(keyframe, view, self.keyframes)
+
+    def close_loops(self) -> dict[int, NDArray[np.float64]]:
+        """Move keyframes and their Gaussians where the pose graph has them; T_new_old (4, 4) by keyframe number.
+
+        Nobody may track or map meanwhile. Empty when no loop waits.
+        """
+        correction = self.loops.correction
+        if correction is None:
+            return {}
+        self.keyframes = [move_keyframe(keyframe, correction) for keyframe in self.keyframes]
+        self.model = move_gaussians(self.model, correction)
+        self.loops.moved(correction)
+        self.owed += self.config.mapping.refine_iterations
+        self.refine(0 if self._held else self.owed)
+        self._version += 1
+        return correction
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """Bytes held, by what for."""
+        return memory_of(self.model, self._refiner.adam, self.keyframes)
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """Loops that were "closed", and "rejected" ones."""
+        return {"closed": self.loops.closed, "rejected": self.loops.rejected}
+
+    @property
+    def has_loop(self) -> bool:
+        """Whether :meth:`close_loops` has something to do."""
+        return self.loops.correction is not None
 
     def hold(self, moving: bool) -> None:
         """Whether refinement is to wait, because the robot moves; steps owed are spent once it stands."""
@@ -107,7 +158,8 @@ class Mapper:
         if provisional:
             levels, n_pixels = observation.prepared.levels, self.config.tracking.n_pixels
             keyframe.reference = make_reference(levels, observation.T_world_camera, n_pixels)
-        self.keyframes = [*self.keyframes, keyframe]  # a new list: the tracker may be reading the old one
+        # A new list: the tracker may be reading the old one.
+        self.keyframes = without_redundant([*self.keyframes, keyframe], self.config.mapping.max_keyframes)
         self._stamp = observation.prepared.frame.stamp
         return keyframe
 
@@ -152,7 +204,7 @@ class Mapper:
     ) -> Keyframe:
         camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
         return Keyframe(
-            number=len(self.keyframes),
+            number=self.keyframes[-1].number + 1 if self.keyframes else 0,
             camera=camera,
             rgb=torch.from_numpy(np.ascontiguousarray(rgb)),
             depth=torch.from_numpy(depth),

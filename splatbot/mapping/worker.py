@@ -77,13 +77,34 @@ class MappingWorker:
     def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
         """Hand over a frame and return at once; only the first is made a keyframe here: nothing is tracked before."""
         self._raise_error()
-        observation = Observation(prepared, T_world_camera, features)
+        observation = Observation(prepared, T_world_camera, features, self._mapper.loops.anchor)
         first = self._mapper.add_keyframe(observation, provisional=True) if self._thread is None else None
         with self._news:
             self._waiting.append(observation)
             self._news.notify()
         if first is not None:
             self._start(first)
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """As :meth:`Mapper.memory`; while the thread works, of about now."""
+        return self._mapper.memory
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """As :meth:`Mapper.loop_counts`."""
+        return self._mapper.loop_counts
+
+    @property
+    def has_loop(self) -> bool:
+        """As :meth:`Mapper.has_loop`."""
+        return self._mapper.has_loop
+
+    def close_loops(self) -> dict[int, NDArray[np.float64]]:
+        """As :meth:`Mapper.close_loops`, while paused."""
+        moved = self._mapper.close_loops()
+        self._published = self._mapper.snapshot()
+        return moved
 
     def hold(self, moving: bool) -> None:
         """As :meth:`Mapper.hold`."""
@@ -164,6 +185,7 @@ class MappingWorker:
         observation = self._waiting[0]
         self._mapper.fuse(keyframe)
         self._mapper.make_reference(observation, keyframe)
+        self._mapper.look_for_loops(observation, keyframe)
         self._published = self._mapper.snapshot()
         with self._news:
             self._waiting.popleft()

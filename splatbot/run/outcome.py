@@ -84,6 +84,8 @@ class Outcome:
             "map_bytes": self.model.nbytes,
             "paced": self.loop.source.pace,
             "effects": self.effects,
+            "memory": self.loop.slam.memory,
+            "loops": self.loop.slam.loop_counts,
             "finished": self.finished,
             "localised_in": self.localised_in,
             "saves": self.loop.saver.cost if self.loop.saver is not None else None,

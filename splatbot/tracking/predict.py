@@ -79,6 +79,13 @@ class ConstantVelocity:
         self._last = (stamp, T_world_camera)
         self._reckoned = None
 
+    def move(self, T_new_old: Array) -> None:
+        """The world was moved: the last pose is another, the motion is the same."""
+        if self._last is not None:
+            self._last = (self._last[0], T_new_old @ self._last[1])
+        if self._reckoned is not None:
+            self._reckoned = (T_new_old @ self._reckoned[0], self._reckoned[1])
+
     def forget_velocity(self, told: Prediction | None = None) -> None:
         """After a lost frame: start again from rest at the last known pose, or from where a robot says it is."""
         self._interval = 0.0

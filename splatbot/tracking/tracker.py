@@ -65,6 +65,10 @@ class Tracker:
         self.motion = ConstantVelocity()
         self._lost = True
 
+    def move(self, T_new_old: Array) -> None:
+        """The map was moved where the camera is; the motion goes on from there."""
+        self.motion.move(T_new_old)
+
     def remember(self, features: Features, estimate: PoseEstimate) -> None:
         """That the frame with these features becomes a keyframe: poses found with it inherit its uncertainty."""
         self._known[features] = estimate.uncertainty

@@ -5,9 +5,10 @@
 #include <nanobind/nanobind.h>
 
 void define_align(nanobind::module_& m);
+void define_arm(nanobind::module_& m);
 void define_baseline(nanobind::module_& m);
 void define_depth(nanobind::module_& m);
-void define_mahalanobis(nanobind::module_& m);
+void define_field(nanobind::module_& m);
 void define_matching(nanobind::module_& m);
 void define_optimize(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);

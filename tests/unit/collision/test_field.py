@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from splatbot._native import MahalanobisField
+from splatbot._native import CollisionField
 from splatbot.collision import GaussianCollisionField
 from splatbot.collision.field import SCALE_FLOOR
 from splatbot.errors import InputError
@@ -238,12 +238,19 @@ def test_a_shell_without_extent_is_refused(n_sigma: float) -> None:
 
 
 def test_the_native_border_converts_nothing_silently() -> None:
-    means, whitening = np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[None]
-    field = MahalanobisField(means, whitening)
-    distance, index = np.zeros(1, np.float32), np.zeros(1, np.int32)
+    means, quats = np.zeros((1, 3), np.float32), np.array([[1, 0, 0, 0]], np.float32)
+    names = np.zeros(1, np.int32)
+    options = {"n_sigma": 2.0, "voxel": 0.0, "max_voxels": 1}
+    field = CollisionField(means, quats, means + 1, names, **options)
     with pytest.raises(TypeError):
-        field.nearest(np.zeros((1, 3)), distance, index)  # float64
+        field.mahalanobis(np.zeros((1, 3), np.float32))
     with pytest.raises(TypeError):
-        field.nearest(np.zeros((1, 6), np.float32)[:, ::2], distance, index)  # not contiguous
+        field.mahalanobis(np.zeros((1, 6))[:, ::2])  # not contiguous
+    with pytest.raises(TypeError):
+        CollisionField(means.astype(np.float64), quats, means + 1, names, **options)
     with pytest.raises(ValueError, match="length"):
-        field.nearest(np.zeros((2, 3), np.float32), distance, index)
+        field.hits(np.zeros((2, 3)), np.zeros(1, np.float32))
+    with pytest.raises(ValueError, match="length"):
+        CollisionField(np.zeros((2, 3), np.float32), quats, means + 1, names, **options)
+    with pytest.raises(ValueError, match="negative"):
+        CollisionField(means, quats, means + 1, names - 1, **options)

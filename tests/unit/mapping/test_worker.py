@@ -133,7 +133,8 @@ def test_what_goes_wrong_in_the_thread_is_told_and_the_last_published_map_stays(
     worker = MappingWorker(mapper)
     insert(worker, at(0.0))
     wait_until(lambda: len(worker.snapshot().model) > 0 and mapper.owed == 0)
-    kept = worker.snapshot()
+    with worker.paused():  # or the last step of refinement might be done and not be published yet
+        kept = worker.snapshot()
 
     def broken(keyframe: Keyframe) -> None:
         raise ValueError("broken on purpose")

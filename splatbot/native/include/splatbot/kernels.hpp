@@ -193,6 +193,9 @@ struct AdamBlock {
   float* scratch;  // 2 x count x columns of the widest group, padded
 };
 
+struct FieldKernels;  // field_kernels.hpp
+struct ArmKernels;    // arm_kernels.hpp
+
 struct Kernels {
   const char* name;
   void (*project)(const ProjectArgs&, std::size_t block, ProjectedBlock& out);
@@ -209,6 +212,8 @@ struct Kernels {
   void (*loss)(const LossArgs&, std::size_t tile, float* scratch, LossSums& sums);
   void (*adam)(const AdamGroup&, const AdamBlock&);
   float (*multiply_add)(std::size_t rounds);  // kMultiplyAddFlops x lanes x rounds floating-point operations
+  const FieldKernels* field;
+  const ArmKernels* arm;
   int lanes;
 };
 

@@ -1,11 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "arm_entry.hpp"
 #include "entry.hpp"
+#include "field_entry.hpp"
 #include "surfel_entry.hpp"
 
 #define SB_TEXT(name) #name
 #define SB_EXPANDED_TEXT(name) SB_TEXT(name)
 
 namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
+const FieldKernels kField = {field_hits, field_nearest, field_k_nearest, field_mahalanobis,
+                             field_grid_bounds, bound_columns, bound_slice};
+const ArmKernels kArm = {arm_configurations, arm_certify, arm_sample, arm_centers};
+}  // namespace
 
 extern const Kernels kKernels;
 const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
@@ -26,6 +34,8 @@ const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
                           .loss = loss,
                           .adam = adam,
                           .multiply_add = multiply_add,
+                          .field = &kField,
+                          .arm = &kArm,
                           .lanes = SPLATBOT_SIMD / 32};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,100 @@
+"""Spheres that cover a link's collision geometry, and the check that they do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.protocols import Array, LinkSpheres
+from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
+
+
+def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
+    """Spheres around every shape, which reach at most ``slack`` [m] beyond it.
+
+    Capsules: spheres of radius R + slack along the segment, half of each other's chord apart, so that their union
+    holds the capsule exactly. Boxes and meshes: see :func:`cover_solid`.
+    """
+    found = [(shape.link, *cover_shape(shape, slack)) for shape in shapes]
+    link = np.concatenate([np.full(len(radii), link, np.int32) for link, _, radii in found])
+    order = np.argsort(link, kind="stable")
+    centers = np.concatenate([c for _, c, _ in found])
+    radii = np.concatenate([r for _, _, r in found])
+    return LinkSpheres(link[order], np.ascontiguousarray(centers[order]), radii[order])
+
+
+def cover_shape(shape: Shape, slack: float) -> tuple[Array, Array]:
+    """Centres (S, 3) [m, link frame] and radii (S,) [m]."""
+    if not slack > 0:
+        raise InputError(f"is {slack}.", field="slack", hint="give metres above 0, as 0.01")
+    if isinstance(shape, Capsule):
+        return _cover_capsule(shape, slack)
+    if isinstance(shape, (Box, Mesh)):
+        return cover_solid(shape, slack)
+    raise InputError(
+        f"cannot be covered: {type(shape).__name__}.", field="shape", hint="give capsules, boxes or meshes"
+    )
+
+
+def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
+    """The ends inset by the slack (a cap's tip is then just inside), and between them at most a chord apart."""
+    radius = shape.radius + slack
+    half_chord = np.sqrt(radius**2 - shape.radius**2)
+    middle = (np.asarray(shape.start) + np.asarray(shape.end)) / 2
+    inner = shape.length - 2 * slack
+    if inner <= 0:
+        return middle[None], np.array([shape.radius + shape.length / 2])
+    count = int(np.ceil(inner / (2 * half_chord))) + 1
+    at = np.linspace(-inner / 2, inner / 2, count)
+    return middle + at[:, None] * shape.along(), np.full(count, radius)
+
+
+def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
+    """Greedy: of the candidates on a grid inside, each as large as fits plus the slack, that which covers most is next.
+
+    What no candidate covers is covered by balls of radius ``slack`` on the surface itself. Points of the surface stand
+    for a neighbourhood of a quarter of the slack, by which every ball is taken to be smaller.
+    """
+    spacing = slack / 4
+    left = shape.surface(spacing)
+    grid = _grid(left.min(axis=0), left.max(axis=0), slack)
+    depth = shape.depth(grid)
+    centers, radii = grid[depth > 0], depth[depth > 0] + slack
+    found: list[tuple[Array, float]] = []
+    while len(left) and len(centers):
+        few = left[:: max(1, len(left) // 2000)]
+        gains = (np.linalg.norm(few[None] - centers[:, None], axis=2) <= (radii - spacing)[:, None]).sum(axis=1)
+        best = int(gains.argmax())
+        if gains[best] == 0:
+            break
+        found.append((centers[best], float(radii[best])))
+        left = left[np.linalg.norm(left - centers[best], axis=1) > radii[best] - spacing]
+    while len(left):
+        found.append((left[0], slack))
+        left = left[np.linalg.norm(left - left[0], axis=1) > slack - spacing]
+    return np.array([center for center, _ in found]), np.array([radius for _, radius in found])
+
+
+def _grid(low: Array, high: Array, slack: float) -> Array:
+    """Points (P, 3) at most the slack apart, or a sixteenth of the longest side."""
+    step = max(slack, float((high - low).max()) / 16)
+    lines = [np.linspace(low[k], high[k], int((high[k] - low[k]) / step) + 3)[1:-1] for k in range(3)]
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def uncovered(shapes: Sequence[Shape], spheres: LinkSpheres, spacing: float) -> float:
+    """How far the worst point of the shapes' surfaces lies outside of the spheres [m], at most ``spacing`` too little.
+
+    Negative: every point is that deep inside.
+    """
+    worst = -np.inf
+    for shape in shapes:
+        own = spheres.link == shape.link
+        points = shape.surface(spacing)
+        beyond = np.full(len(points), np.inf)
+        for center, radius in zip(spheres.centers[own], spheres.radii[own], strict=True):
+            beyond = np.minimum(beyond, np.linalg.norm(points - center, axis=1) - radius)
+        worst = max(worst, float(beyond.max()))
+    return worst

@@ -1,0 +1,44 @@
+"""Joints of an arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.protocols import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint that turns about, or moves along, the z axis of its own frame.
+
+    Args:
+        name: as the robot's maker calls it.
+        T_before_joint: (4, 4), its frame at 0 in the frame of the link before [m].
+        lower, upper: limits [rad or m].
+        velocity, acceleration, jerk: largest magnitudes [1/s, 1/s², 1/s³ of those units].
+        effort: largest torque [Nm] or force [N].
+        prismatic: moves along z instead of turning.
+
+    Raises:
+        InputError: a limit is not finite or upper is below lower.
+    """
+
+    name: str
+    T_before_joint: Array = field(repr=False)
+    lower: float
+    upper: float
+    velocity: float
+    acceleration: float
+    jerk: float
+    effort: float
+    prismatic: bool = False
+
+    def __post_init__(self) -> None:
+        limits = (self.lower, self.upper, self.velocity, self.acceleration, self.jerk, self.effort)
+        if not np.isfinite(limits).all() or self.upper < self.lower or min(limits[2:]) < 0:
+            raise InputError(
+                f"has limits {limits}.", field=self.name, hint="give finite limits with lower <= upper and rates >= 0"
+            )

@@ -1,0 +1,116 @@
+"""Franka Emika Panda with its hand: published kinematics and limits, estimated inertias, coarse collision shapes.
+
+Sources: DH parameters and limits from Franka's documentation (robot and interface specifications); inertias as
+identified by Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019); capsules as in Franka's
+own coarse self-collision model.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from splatbot.protocols import Array
+from splatbot.robots.joints import Joint
+from splatbot.robots.robot import Gripper, Inertial, RobotModel
+from splatbot.robots.shapes import Capsule
+
+# Modified DH (Craig): a [m], d [m], alpha [rad] of the frame of each joint in that before it.
+_DH = (
+    (0.0, 0.333, 0.0),
+    (0.0, 0.0, -np.pi / 2),
+    (0.0, 0.316, np.pi / 2),
+    (0.0825, 0.0, np.pi / 2),
+    (-0.0825, 0.384, -np.pi / 2),
+    (0.0, 0.0, np.pi / 2),
+    (0.088, 0.0, np.pi / 2),
+)
+_LOWER = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
+_UPPER = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
+_VELOCITY = (2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.6100)
+_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+_JERK = (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)
+_EFFORT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+_FLANGE, _HAND_YAW, _FINGERS, _TCP = 0.107, -np.pi / 4, 0.0584, 0.1034  # [m], [rad], [m] and [m] above the hand
+_HOME = (0.0, -0.3, 0.0, -2.2, 0.0, 2.0, np.pi / 4)
+
+# Mass, centre, and inertia (xx, yy, zz, xy, xz, yz) of the links 0..7, the hand with link 7.
+_INERTIALS = (
+    (2.92, (-0.025566, -2.88e-05, 0.057332), (0.00782, 0.0109, 0.0102, -1.56e-05, -0.00126, 1.08e-06)),
+    (4.970684, (0.003875, 0.002081, -0.1750), (0.70337, 0.70661, 0.009117, -0.000139, 0.006772, 0.019169)),
+    (0.646926, (-0.003141, -0.02872, 0.003495), (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704)),
+    (3.228604, (0.027518, 0.039252, -0.066502), (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805)),
+    (3.587895, (-0.05317, 0.104419, 0.027454), (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641)),
+    (1.225946, (-0.011953, 0.041065, -0.038437), (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229)),
+    (1.666555, (0.060149, -0.014117, -0.010517), (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341)),
+    (1.495522, (0.0102, -0.0021, 0.0972), (0.0192, 0.0184, 0.0068, -0.0004, -0.0012, -0.0007)),
+)
+
+
+@cache
+def panda() -> RobotModel:
+    """The arm with its hand; the tool's frame lies between the finger tips."""
+    joints = tuple(
+        Joint(
+            f"panda_joint{k + 1}",
+            _dh(*_DH[k]),
+            _LOWER[k],
+            _UPPER[k],
+            _VELOCITY[k],
+            _ACCELERATION[k],
+            _JERK[k],
+            _EFFORT[k],
+        )
+        for k in range(7)
+    )
+    T_link_hand = _turned(_HAND_YAW, _FLANGE)
+    return RobotModel(
+        name="panda",
+        joints=joints,
+        shapes=(*_arm_shapes(), *_hand_shapes(T_link_hand)),
+        T_link_tcp=T_link_hand @ _turned(0.0, _TCP),
+        home=np.array(_HOME),
+        inertials=tuple(Inertial(m, c, _symmetric(i)) for m, c, i in _INERTIALS),
+        gripper=Gripper(
+            np.stack([T_link_hand @ _turned(yaw, _FINGERS) for yaw in (0.0, np.pi)]),
+            0.04,
+            (Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.0413), 0.0125),),
+        ),
+    )
+
+
+def _arm_shapes() -> list[Capsule]:
+    return [
+        Capsule(0, (-0.09, 0.0, 0.06), (-0.06, 0.0, 0.06), 0.06),
+        Capsule(1, (0.0, 0.0, -0.333), (0.0, 0.0, -0.05), 0.06),
+        Capsule(2, (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
+        Capsule(3, (0.0, 0.0, -0.22), (0.0, 0.0, -0.07), 0.06),
+        Capsule(4, (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
+        Capsule(5, (0.0, 0.0, -0.31), (0.0, 0.0, -0.21), 0.06),
+        Capsule(5, (0.0, 0.08, -0.20), (0.0, 0.08, -0.06), 0.025),
+        Capsule(6, (0.0, 0.0, -0.07), (0.0, 0.0, 0.01), 0.05),
+        Capsule(7, (0.0, 0.0, -0.06), (0.0, 0.0, 0.08), 0.04),
+        Capsule(7, (0.0424, 0.0424, 0.077), (0.0424, 0.0424, 0.087), 0.03),
+    ]
+
+
+def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
+    start, end = (T_link_hand @ np.array([0.0, y, 0.04, 1.0]) for y in (-0.06, 0.06))
+    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.04)]
+
+
+def _dh(a: float, d: float, alpha: float) -> Array:
+    """Rot_x(alpha) Trans_x(a) Trans_z(d) (Craig 1986)."""
+    c, s = np.cos(alpha), np.sin(alpha)
+    return np.array([[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1.0]])
+
+
+def _turned(yaw: float, z: float) -> Array:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, z], [0, 0, 0, 1.0]])
+
+
+def _symmetric(i: tuple[float, ...]) -> Array:
+    xx, yy, zz, xy, xz, yz = i
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

@@ -1,0 +1,222 @@
+"""A robot arm: kinematics, limits, collision geometry and the spheres that stand for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.errors import InputError
+from splatbot.protocols import Array, KinematicChain, LinkSpheres
+from splatbot.robots.cover import cover
+from splatbot.robots.joints import Joint
+from splatbot.robots.shapes import Shape
+
+SLACK = 0.008  # [m] that generated spheres may reach beyond the collision geometry
+
+
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """Mass [kg], its centre (3,) [m, link frame] and inertia about it (3, 3) [kg m²] along the link's axes."""
+
+    mass: float
+    center: tuple[float, float, float]
+    inertia: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Gripper:
+    """Two fingers on the last link that open symmetrically.
+
+    Args:
+        T_link_finger: (2, 4, 4), each finger's frame when closed; its y axis points the way it opens.
+        stroke: how far each finger moves [m].
+        shapes: of one finger, in its own frame; their ``link`` is ignored.
+        speed: of each finger [m/s].
+        force: between the fingers [N].
+    """
+
+    T_link_finger: Array
+    stroke: float
+    shapes: tuple[Shape, ...]
+    speed: float = 0.2
+    force: float = 70.0
+
+
+@dataclass(frozen=True, eq=False)
+class RobotModel:
+    """A serial arm.
+
+    Args:
+        name: as the user calls it.
+        joints: from the base outwards.
+        shapes: collision geometry of the links; 0 is the base, link k moves with joint k - 1.
+        T_link_tcp: (4, 4), the tool's frame on the last link.
+        home: (J,) a posture to rest in.
+        inertials: of the links 0..J, for the twin; empty where they are not known.
+        gripper: fingers, or None.
+        slack: how far the spheres may reach beyond the shapes [m].
+        allowed: pairs of links that may touch, beside neighbours and those that always do.
+
+    Raises:
+        InputError: joints, home or shapes do not fit together.
+    """
+
+    name: str
+    joints: tuple[Joint, ...]
+    shapes: tuple[Shape, ...] = field(repr=False)
+    T_link_tcp: Array = field(repr=False)
+    home: Array
+    inertials: tuple[Inertial, ...] = field(default=(), repr=False)
+    gripper: Gripper | None = field(default=None, repr=False)
+    slack: float = SLACK
+    allowed: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.home) != len(self.joints):
+            raise InputError(f"has {len(self.home)} values for {len(self.joints)} joints.", field="home")
+        if any(not 0 <= shape.link <= len(self.joints) for shape in self.shapes):
+            raise InputError("names a link that is not there.", field="shapes", hint=f"links are 0..{len(self.joints)}")
+
+    def __len__(self) -> int:
+        """Number of joints."""
+        return len(self.joints)
+
+    @cached_property
+    def chain(self) -> KinematicChain:
+        """Joints and their limits."""
+
+        def column(name: str) -> Array:
+            return np.array([getattr(joint, name) for joint in self.joints], dtype=np.float64)
+
+        return KinematicChain(
+            tuple(joint.name for joint in self.joints),
+            np.array([joint.T_before_joint for joint in self.joints]),
+            np.array([joint.prismatic for joint in self.joints]),
+            *(column(name) for name in ("lower", "upper", "velocity", "acceleration", "jerk", "effort")),
+        )
+
+    def fk(self, q: ArrayLike) -> Array:
+        """Poses T_base_link (..., J + 1, 4, 4) of all links at configurations (..., J) [rad or m]."""
+        values = self.configurations(q)
+        T = np.empty((*values.shape[:-1], len(self) + 1, 4, 4))
+        T[..., 0, :, :] = np.eye(4)
+        for k, joint in enumerate(self.joints):
+            T[..., k + 1, :, :] = T[..., k, :, :] @ joint.T_before_joint @ _moved(values[..., k], joint.prismatic)
+        return T
+
+    def tcp(self, q: ArrayLike) -> Array:
+        """Poses T_base_tcp (..., 4, 4) of the tool."""
+        return np.asarray(self.fk(q)[..., -1, :, :] @ self.T_link_tcp)
+
+    def jacobian(self, q: ArrayLike, link: int | None = None, point: ArrayLike | None = None) -> Array:
+        """Geometric Jacobian (..., 6, J): velocity [m] and angular velocity [rad] of a point per unit of each joint.
+
+        Args:
+            q: configurations (..., J).
+            link: on which the point is; the last by default.
+            point: (3,) or (..., 3) in the base's frame [m]; the tool's origin by default.
+        """
+        T = self.fk(q)
+        last = len(self) if link is None else link
+        p = (T[..., -1, :, :] @ self.T_link_tcp)[..., :3, 3] if point is None else np.asarray(point, dtype=np.float64)
+        J = np.zeros((*T.shape[:-3], 6, len(self)))
+        for k in range(last):
+            z, at = T[..., k + 1, :3, 2], T[..., k + 1, :3, 3]
+            if self.joints[k].prismatic:
+                J[..., :3, k] = z
+            else:
+                J[..., :3, k] = np.cross(z, p - at)
+                J[..., 3:, k] = z
+        return J
+
+    def spheres(self, opening: float | None = None) -> LinkSpheres:
+        """Spheres that cover the shapes, the gripper opened by ``opening`` [m] between its fingers (None: all the way).
+
+        Raises:
+            InputError: the opening is out of range.
+        """
+        if self.gripper is None:
+            return self._link_spheres
+        most = 2 * self.gripper.stroke
+        width = most if opening is None else opening
+        if not 0 <= width <= most:
+            raise InputError(f"is {width}.", field="opening", hint=f"give 0..{most:g} m")
+        centers, radii = [self._link_spheres.centers], [self._link_spheres.radii]
+        for T in self.gripper.T_link_finger:
+            moved = self._finger_spheres.centers + np.array([0.0, width / 2, 0.0])
+            centers.append(moved @ T[:3, :3].T + T[:3, 3])
+            radii.append(self._finger_spheres.radii)
+        fingers = np.full(2 * len(self._finger_spheres), len(self), np.int32)
+        return LinkSpheres(
+            np.concatenate([self._link_spheres.link, fingers]), np.concatenate(centers), np.concatenate(radii)
+        )
+
+    @cached_property
+    def self_collision_pairs(self) -> NDArray[np.int32]:
+        """(M, 2) links that may not touch: all but neighbours, those allowed, and those whose spheres meet at home."""
+        s = self.spheres()
+        T = self.fk(self.home)[s.link]
+        at = np.einsum("sij,sj->si", T[:, :3, :3], s.centers) + T[:, :3, 3]
+        touch = np.linalg.norm(at[:, None] - at[None], axis=-1) <= s.radii[:, None] + s.radii[None]
+        links = sorted(set(s.link.tolist()))
+        pairs = [
+            (a, b)
+            for a in links
+            for b in links
+            if b > a + 1 and (a, b) not in self.allowed and not touch[np.ix_(s.link == a, s.link == b)].any()
+        ]
+        return np.array(pairs, dtype=np.int32).reshape(-1, 2)
+
+    def random(self, count: int, rng: np.random.Generator) -> Array:
+        """Configurations (count, J), uniform within the limits."""
+        return rng.uniform(self.chain.lower, self.chain.upper, (count, len(self)))
+
+    def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> NDArray[np.bool_]:
+        """Whether configurations (..., J) respect the limits of position."""
+        values = self.configurations(q)
+        low, high = self.chain.lower - tolerance, self.chain.upper + tolerance
+        return np.asarray(((values >= low) & (values <= high)).all(axis=-1))
+
+    def configurations(self, q: ArrayLike) -> Array:
+        """``q`` as float64 (..., J).
+
+        Raises:
+            InputError: another number of joints, or a value that is not finite.
+        """
+        values = np.asarray(q, dtype=np.float64)
+        if values.ndim < 1 or values.shape[-1] != len(self):
+            raise InputError(f"is {values.shape}.", field="q", hint=f"{self.name} has {len(self)} joints")
+        if not np.isfinite(values).all():
+            raise InputError("has values that are not finite.", field="q", hint="give radians and metres")
+        return values
+
+    @cached_property
+    def _link_spheres(self) -> LinkSpheres:
+        return _covered(self.shapes, self.slack)
+
+    @cached_property
+    def _finger_spheres(self) -> LinkSpheres:
+        return _covered(self.gripper.shapes if self.gripper else (), self.slack / 2)
+
+
+def _covered(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
+    if not shapes:
+        return LinkSpheres(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros(0))
+    return cover(shapes, slack)
+
+
+def _moved(q: Array, prismatic: bool) -> Array:
+    """What a joint about or along z does (..., 4, 4)."""
+    T = np.zeros((*q.shape, 4, 4))
+    T[..., range(4), range(4)] = 1.0
+    if prismatic:
+        T[..., 2, 3] = q
+    else:
+        T[..., 0, 0] = T[..., 1, 1] = np.cos(q)
+        T[..., 1, 0] = np.sin(q)
+        T[..., 0, 1] = -np.sin(q)
+    return T

@@ -1,0 +1,126 @@
+"""Collision geometry of links: capsules, boxes and meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from splatbot.geometry import inverse, transform_points
+from splatbot.protocols import Array
+
+
+class Shape(Protocol):
+    """A solid that is fixed to a link."""
+
+    @property
+    def link(self) -> int:
+        """Which; 0 is the base."""
+        ...
+
+    def surface(self, spacing: float) -> Array:
+        """Points (P, 3) of its surface in the link's frame, at most about ``spacing`` [m] apart."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """All points within ``radius`` [m] of the segment from ``start`` to ``end`` (3,) [m, link frame]."""
+
+    link: int
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+    @property
+    def length(self) -> float:
+        """Of the segment [m]."""
+        return float(np.linalg.norm(np.subtract(self.end, self.start)))
+
+    def along(self) -> Array:
+        """Unit vector (3,) of the segment; x for a ball."""
+        d = np.subtract(self.end, self.start)
+        return np.asarray(d / self.length) if self.length > 0 else np.array([1.0, 0.0, 0.0])
+
+    def surface(self, spacing: float) -> Array:
+        """Rings along the segment, and rings of latitude on both caps."""
+        axis = self.along()
+        side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        side /= np.linalg.norm(side)
+        around = np.arange(max(8, int(np.ceil(2 * np.pi * self.radius / spacing)))) / max(
+            8, int(np.ceil(2 * np.pi * self.radius / spacing))
+        )
+        turn = 2 * np.pi * around
+        ring = np.outer(np.cos(turn), side) + np.outer(np.sin(turn), np.cross(axis, side))
+        steps = np.linspace(0.0, 1.0, max(2, int(np.ceil(self.length / spacing)) + 1))
+        start, end = np.asarray(self.start), np.asarray(self.end)
+        rings = [start + t * (end - start) + self.radius * ring for t in steps]
+        for angle in np.linspace(0, np.pi / 2, max(3, int(np.ceil(np.pi / 2 * self.radius / spacing)) + 1)):
+            out = self.radius * np.sin(angle) * axis
+            rings += [end + self.radius * np.cos(angle) * ring + out, start + self.radius * np.cos(angle) * ring - out]
+        return np.concatenate(rings)
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box of ``size`` (3,) [m] whose centre has the pose ``T_link_box`` (4, 4)."""
+
+    link: int
+    T_link_box: Array
+    size: tuple[float, float, float]
+
+    def surface(self, spacing: float) -> Array:
+        """A grid on each face."""
+        half = np.asarray(self.size) / 2
+        faces = []
+        for k in range(3):
+            u, v = (k + 1) % 3, (k + 2) % 3
+            lines = [np.linspace(-half[i], half[i], max(2, int(np.ceil(self.size[i] / spacing)) + 1)) for i in (u, v)]
+            grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
+            for sign in (-1.0, 1.0):
+                face = np.empty((len(grid), 3))
+                face[:, k], face[:, [u, v]] = sign * half[k], grid
+                faces.append(face)
+        return transform_points(self.T_link_box, np.concatenate(faces))
+
+    def depth(self, points: Array) -> Array:
+        """How deep points (P, 3) [m, link frame] lie inside (P,) [m]; below 0 outside."""
+        local = transform_points(inverse(self.T_link_box), points)
+        return np.asarray((np.asarray(self.size) / 2 - np.abs(local)).min(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A closed triangle mesh: vertices (V, 3) [m, link frame] and triangles (T, 3)."""
+
+    link: int
+    vertices: Array = field(repr=False)
+    triangles: NDArray[np.int64] = field(repr=False)
+
+    def depth(self, points: Array) -> Array:
+        """How deep points (P, 3) [m, link frame] lie inside (P,) [m]; below 0 outside."""
+        scene = o3d.t.geometry.RaycastingScene()
+        vertices, triangles = self.vertices.astype(np.float32), self.triangles.astype(np.uint32)
+        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
+        queries = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
+        return np.asarray(-scene.compute_signed_distance(queries, nsamples=5).numpy(), dtype=np.float64)
+
+    def surface(self, spacing: float) -> Array:
+        """Barycentric grids on the triangles."""
+        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
+        edge = np.max(
+            [np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)], axis=0
+        )
+        points = [self.vertices]
+        for parts in np.unique(steps := np.ceil(edge / spacing).astype(int)):
+            chosen = steps == parts
+            i, j = np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), indexing="ij")
+            inside = (i + j <= parts).ravel()
+            u, v = i.ravel()[inside] / max(parts, 1), j.ravel()[inside] / max(parts, 1)
+            corners = a[chosen, None], b[chosen, None], c[chosen, None]
+            grid = corners[0] + u[:, None] * (corners[1] - corners[0]) + v[:, None] * (corners[2] - corners[0])
+            points.append(grid.reshape(-1, 3))
+        return np.concatenate(points)

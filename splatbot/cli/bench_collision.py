@@ -1,0 +1,133 @@
+"""`splatbot bench collision`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from splatbot.bench.results import Results, Row
+
+
+def bench_collision(
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    peers: bool = False,
+    threads: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (1, 2),
+    quick: bool = False,
+) -> int:
+    """Measure the collision field and an arm of spheres in it.
+
+    Build, update, memory, questions a second; false free and false hit against exact truth, over n_sigma and over how
+    edges are checked; what floaters block.
+
+    Examples:
+        splatbot bench collision
+        splatbot bench collision --peers
+        splatbot bench collision --quick --json figures.json
+
+    Args:
+        out: folder for collision.json, collision.csv and the plots; by default runs/bench-collision.
+        json: another place for the JSON file.
+        peers: measure other ways to ask for collisions beside it (minutes).
+        threads: how many threads to measure with.
+        quick: tiny scenes, to see whether it runs.
+    """
+    from splatbot.errors import InputError
+
+    if not threads or min(threads) < 1:
+        raise InputError(f"is {threads}.", field="--threads", hint="give one or more positive numbers, as in 1 2")
+
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from splatbot.bench.collision import CollisionPlan, run_collision
+
+    folder = out if out is not None else Path("runs") / "bench-collision"
+    progress = Console(stderr=True)
+
+    def say(text: str) -> None:
+        progress.print(f"[dim]{text} ...[/dim]", highlight=False)
+
+    plan = CollisionPlan.quick_plan(say=say) if quick else CollisionPlan(say=say)
+    results = run_collision(replace(plan, thread_counts=tuple(threads), peers=peers), folder)
+    if json is not None:
+        results.write_json(json)
+    _print(results, folder)
+    return 0
+
+
+def _print(results: Results, folder: Path) -> None:
+    """A table of speed with a column per case, one of errors with a line per case, and the peers."""
+    from rich.table import Table
+
+    from splatbot.cli.bench_tables import wide_console
+
+    console = wide_console()
+    machine = results.machine
+    console.print(f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}")
+    if machine["load_1min"] is not None and machine["load_1min"] > 0.5:
+        console.print(f"[yellow]the machine was busy (load {machine['load_1min']}): times are upper bounds[/yellow]")
+    own = [row for row in results.rows if row.peer is None]
+    console.print(_by_metric("Speed and memory", [row for row in own if " Gaussians, " in row.case]))
+    for title, prefix in (
+        ("Configurations against exact truth", "sweep n_sigma"),
+        ("Edges against exact truth", "sweep edges"),
+        ("Floaters", "gate"),
+    ):
+        console.print(_by_case(title, results.select(prefix)))
+    rest = [row for row in results.rows if row.case.startswith(("points against", "configurations, "))]
+    if rest:
+        table = Table("case", "metric", "whose", "figure", title="Beside peers")
+        for row in rest:
+            table.add_row(row.case, row.metric, row.peer or "splatbot", _figure(row))
+        console.print(table)
+    console.print(f"written to {folder}")
+
+
+def _by_metric(title: str, rows: Iterable[Row]) -> Table:
+    from rich.table import Table
+
+    cells: dict[str, dict[str, str]] = {}
+    cases: dict[str, None] = {}
+    for row in rows:
+        cells.setdefault(f"{row.metric} [{row.unit}]", {})[row.case] = _value(row)
+        cases[row.case] = None
+    table = Table(title=title)
+    table.add_column("")
+    for case in cases:
+        table.add_column(case, justify="right")
+    for metric, values in cells.items():
+        table.add_row(metric, *(values.get(case, "") for case in cases))
+    return table
+
+
+def _by_case(title: str, rows: Iterable[Row]) -> Table:
+    from rich.table import Table
+
+    cells: dict[str, dict[str, str]] = {}
+    metrics: dict[str, None] = {}
+    for row in rows:
+        cells.setdefault(row.case, {})[row.metric] = _figure(row)
+        metrics[row.metric] = None
+    table = Table(title=title)
+    table.add_column("case")
+    for metric in metrics:
+        table.add_column(metric, justify="right")
+    for case, values in cells.items():
+        table.add_row(case, *(values.get(metric, "") for metric in metrics))
+    return table
+
+
+def _value(row: Row) -> str:
+    return "-" if row.value is None else f"{row.value:.3g}"
+
+
+def _figure(row: Row) -> str:
+    return row.note or "-" if row.value is None else f"{row.value:.6g} {row.unit}".rstrip()

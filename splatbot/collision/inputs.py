@@ -1,0 +1,66 @@
+"""Checks of what a collision field is asked, with errors that name the row."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from splatbot.errors import InputError
+
+LARGEST_RADIUS = 1e4  # [m]
+
+
+def as_float64(values: ArrayLike | Tensor) -> NDArray[np.float64]:
+    """A numpy copy or view in float64 of what numpy or torch holds."""
+    return np.asarray(values.detach() if isinstance(values, Tensor) else values, dtype=np.float64)
+
+
+def rows(values: ArrayLike | Tensor, name: str, width: int, meaning: str) -> NDArray[np.float64]:
+    """``values`` as (P, width) finite float64, C-contiguous.
+
+    Raises:
+        InputError: another shape, or a value that is not finite (the message names the row).
+    """
+    array = as_float64(values)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise InputError(f"is {array.shape}.", field=name, hint=f"give (P, {width}) {meaning}")
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        raise InputError(f"row {int(np.argmax(bad))} is not finite.", field=name, hint=f"give finite {meaning}")
+    return np.ascontiguousarray(array)
+
+
+def spheres(values: ArrayLike | Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    """Centres (P, 3) and radii (P,), None for points, of points (P, 3) or spheres (P, 4) = (x, y, z, radius) [m].
+
+    Radii are rounded up to float32.
+
+    Raises:
+        InputError: another shape, a value that is not finite, a radius below 0 or above 10 km.
+    """
+    array = as_float64(values)
+    if array.ndim != 2 or array.shape[1] not in (3, 4):
+        raise InputError(
+            f"is {array.shape}.",
+            field="points",
+            hint="give (P, 3) world coordinates in metres, or (P, 4) with a radius each",
+        )
+    array = rows(array, "points", array.shape[1], "world coordinates in metres")
+    if array.shape[1] == 3:
+        return array, None
+    return np.ascontiguousarray(array[:, :3]), radii(array[:, 3])
+
+
+def radii(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Radii (P,) [m] rounded up to float32.
+
+    Raises:
+        InputError: a radius is below 0 or above 10 km.
+    """
+    bad = ~((values >= 0.0) & (values <= LARGEST_RADIUS))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(f"row {row} is {values[row]}.", field="radius", hint=f"give 0..{LARGEST_RADIUS:g} m")
+    rounded = values.astype(np.float32)
+    return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)

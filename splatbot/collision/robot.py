@@ -1,0 +1,285 @@
+"""A robot of spheres against the map and against itself: configurations and straight edges in joint space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot._native import ARM_SELF, Arm
+from splatbot.collision.field import GaussianCollisionField
+from splatbot.collision.inputs import rows
+from splatbot.errors import InputError
+from splatbot.protocols import Array, LinkSpheres, RobotKinematics
+
+EPS = 1e-3  # [m]; an edge with less room than this for a sphere is not certified
+
+
+@dataclass(frozen=True)
+class ConfigurationResult:
+    """Verdicts on C configurations.
+
+    Args:
+        in_collision: (C,), false is certain for the ellipsoids of the map.
+        link: (C,) the link that may touch something, -1 for none.
+        other: (C,) the link that it may touch; -1 for the map, or for none.
+        map_version: the state of the map that was asked; -1 for self-collision alone.
+    """
+
+    in_collision: NDArray[np.bool_]
+    link: NDArray[np.int32]
+    other: NDArray[np.int32]
+    map_version: int
+
+
+@dataclass(frozen=True)
+class EdgeResult(ConfigurationResult):
+    """Verdicts on E edges.
+
+    Args:
+        at: (E,) where on the edge (0..1) it was rejected; 1 for a free one.
+        checked: (E,) how many configurations were looked at.
+    """
+
+    at: NDArray[np.float32]
+    checked: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class ArmClearanceResult:
+    """Clearance of C configurations from the map.
+
+    Args:
+        distance: (C,) [m], of the sphere that has least; never above the true one. Infinity: more than the cut.
+        gradient: (C, J), of the distance with respect to the joints [m per rad or m]; 0 beyond the cut.
+        link: (C,) of that sphere, -1 beyond the cut.
+        index: (C,) int64, row of the Gaussian in the model, -1 beyond the cut.
+        map_version: the state of the map that was asked.
+    """
+
+    distance: Array
+    gradient: Array
+    link: NDArray[np.int32]
+    index: NDArray[np.int64]
+    map_version: int
+
+
+class RobotSpheres:
+    """The spheres of a robot, ready to be asked.
+
+    Args:
+        robot: its chain, spheres and pairs of links that may not touch.
+        T_world_base: (4, 4) pose of its base.
+        opening: of the gripper [m]; None: as wide as it goes.
+        attached: (A, 4) spheres (x, y, z, radius) [m] of a held object, in the frame of the last link.
+        base_in_map: test the base's own spheres against the map too; where it stands, the map usually holds its stand.
+        margin: added to every radius [m].
+
+    Raises:
+        InputError: T_world_base is no rigid pose, attached or margin make no sense, or the arm is too large for the
+            kernels (16 joints, 256 spheres, 256 pairs).
+    """
+
+    def __init__(
+        self,
+        robot: RobotKinematics,
+        *,
+        T_world_base: ArrayLike | None = None,
+        opening: float | None = None,
+        attached: ArrayLike | None = None,
+        base_in_map: bool = False,
+        margin: float = 0.0,
+    ) -> None:
+        if not 0.0 <= margin < np.inf:
+            raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
+        self.robot = robot
+        self.base_in_map = base_in_map
+        self.T_world_base = _rigid(np.eye(4) if T_world_base is None else T_world_base)
+        self.spheres = _with(robot.spheres(opening), len(robot.chain), attached, margin)
+        self.pairs = np.ascontiguousarray(robot.self_collision_pairs, dtype=np.int32).reshape(-1, 2)
+        chain = robot.chain
+        try:
+            self.native = Arm(
+                joints=np.ascontiguousarray(chain.T_before_joint[:, :3, :]),
+                prismatic=chain.prismatic.astype(np.uint8),
+                travel=np.maximum(np.abs(chain.lower), np.abs(chain.upper)),
+                link=np.ascontiguousarray(self.spheres.link, dtype=np.int32),
+                centers=np.ascontiguousarray(self.spheres.centers),
+                radii=np.ascontiguousarray(self.spheres.radii),
+                pairs=self.pairs,
+                base=np.ascontiguousarray(self.T_world_base[:3]),
+                base_in_map=base_in_map,
+            )
+        except ValueError as error:
+            raise InputError(f"{error}.", field=robot.name, hint="give an arm of fewer parts") from error
+
+    def centers(self, q: ArrayLike) -> Array:
+        """Centres (C, S, 3) [m, world] of the spheres at configurations (C, J)."""
+        centers: Array = self.native.centers(self._joints(q, "q"))
+        return centers
+
+    def forward(self, q: ArrayLike) -> Array:
+        """Poses T_world_link (C, J + 1, 4, 4) at configurations (C, J)."""
+        poses: Array = self.native.forward(self._joints(q, "q"))
+        return poses
+
+    def check(self, field: GaussianCollisionField | None, q: ArrayLike) -> ConfigurationResult:
+        """Whether configurations (C, J) may touch the map or themselves; without a field, themselves alone.
+
+        Raises:
+            InputError: ``q`` is of another shape or not finite.
+        """
+        verdict = self.native.configurations(_native(field), self._joints(q, "q"))
+        return ConfigurationResult(verdict >= 0, *self._links(verdict), _version(field))
+
+    def clearance(self, field: GaussianCollisionField, q: ArrayLike, *, cut: float = np.inf) -> ArmClearanceResult:
+        """The room (C,) that configurations (C, J) have to the map, with its gradient in joint space.
+
+        Args:
+            field: the map.
+            q: configurations (C, J).
+            cut: how far to look [m].
+
+        Raises:
+            InputError: ``q`` is of another shape or not finite, or the cut is negative.
+        """
+        if not cut >= 0.0:
+            raise InputError(f"is {cut}.", field="cut", hint="give metres, 0 or more")
+        joints = self._joints(q, "q")
+        distance, normal, center, sphere, names = self.native.clearance(field.native, joints, cut)
+        link = np.where(sphere >= 0, self.spheres.link[sphere], -1).astype(np.int32)
+        gradient = self._gradient(joints, normal, center, link)
+        return ArmClearanceResult(distance, gradient, link, field.rows_of(names), field.map_version)
+
+    def certify(
+        self, field: GaussianCollisionField | None, start: ArrayLike, end: ArrayLike, *, eps: float = EPS
+    ) -> EdgeResult:
+        """Whether every configuration on straight edges in joint space is free of the map and of itself.
+
+        Conservative: an edge is cut into stretches, on each of which a sphere moves less than the room that it has
+        (speed at the middle, and a bound of the acceleration); stretches with too little room are halved. An edge is
+        rejected where a configuration may collide, or where a sphere has less room than ``eps``.
+
+        Args:
+            field: the map; None for self-collision alone.
+            start: (E, J) configurations.
+            end: (E, J) configurations.
+            eps: [m]
+
+        Raises:
+            InputError: the ends do not fit, or eps is not above 1e-5 m.
+        """
+        if not 1e-5 <= eps < np.inf:
+            raise InputError(f"is {eps}.", field="eps", hint="give metres, at least 0.00001")
+        return self._edges(field, self.native.certify(_native(field), *self._ends(start, end), eps))
+
+    def still_free(
+        self,
+        before: GaussianCollisionField,
+        now: GaussianCollisionField,
+        start: ArrayLike,
+        end: ArrayLike,
+        *,
+        eps: float = EPS,
+    ) -> EdgeResult:
+        """Whether edges that were certified on the map ``before`` are free on ``now``: only what is new is asked.
+
+        Raises:
+            InputError: as :meth:`certify`, or the fields differ in n_sigma.
+        """
+        return self._without_pairs.certify(now.added_since(before), start, end, eps=eps)
+
+    @cached_property
+    def _without_pairs(self) -> RobotSpheres:
+        """The same arm, which may touch itself."""
+        return RobotSpheres(_Unpaired(self), T_world_base=self.T_world_base, base_in_map=self.base_in_map)
+
+    def sample(
+        self, field: GaussianCollisionField | None, start: ArrayLike, end: ArrayLike, *, samples: int = 32
+    ) -> EdgeResult:
+        """The fast knob: ``samples`` configurations of each edge, both ends included; what lies between is not seen.
+
+        Raises:
+            InputError: the ends do not fit, or samples is out of range.
+        """
+        if not 1 <= samples <= 1 << 20:
+            raise InputError(f"is {samples}.", field="samples", hint="give 1..1048576")
+        return self._edges(field, self.native.sample(_native(field), *self._ends(start, end), samples))
+
+    def _edges(self, field: GaussianCollisionField | None, answer: tuple[NDArray[np.int32], ...]) -> EdgeResult:
+        verdict, at, checked = answer
+        link, other = self._links(verdict)
+        return EdgeResult(verdict >= 0, link, other, _version(field), at.astype(np.float32), checked)
+
+    def _ends(self, start: ArrayLike, end: ArrayLike) -> tuple[Array, Array]:
+        a, b = self._joints(start, "start"), self._joints(end, "end")
+        if len(a) != len(b):
+            raise InputError(f"has {len(b)} rows for {len(a)} of start.", field="end", hint="give one end for each")
+        return a, b
+
+    def _joints(self, q: ArrayLike, name: str) -> Array:
+        values = np.asarray(q, dtype=np.float64)
+        return rows(values[None] if values.ndim == 1 else values, name, len(self.robot.chain), "joint values")
+
+    def _links(self, verdict: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The link and what it may touch, of native verdicts."""
+        link, other = np.full(len(verdict), -1, np.int32), np.full(len(verdict), -1, np.int32)
+        pair = verdict - ARM_SELF
+        own, touched = pair >= 0, (verdict >= 0) & (pair < 0)
+        link[touched] = self.spheres.link[verdict[touched]]
+        other[own], link[own] = self.pairs[pair[own]].T
+        return link, other
+
+    def _gradient(self, q: Array, normal: Array, center: Array, link: NDArray[np.int32]) -> Array:
+        """d distance / d q = n · (z × (c - o)), or n · z for a joint that slides."""
+        T = self.native.forward(q)[:, 1:]
+        z, at = T[..., :3, 2], T[..., :3, 3]
+        turning = np.einsum("cji,ci->cj", np.cross(z, center[:, None] - at), normal)
+        sliding = np.einsum("cji,ci->cj", z, normal)
+        gradient = np.where(self.robot.chain.prismatic, sliding, turning)
+        return np.where(np.arange(q.shape[1]) < link[:, None], gradient, 0.0)
+
+
+class _Unpaired:
+    """A robot with another's spheres and no pairs."""
+
+    def __init__(self, arm: RobotSpheres) -> None:
+        self.name, self.chain = arm.robot.name, arm.robot.chain
+        self.self_collision_pairs = np.zeros((0, 2), np.int32)
+        self._spheres = arm.spheres
+
+    def spheres(self, opening: float | None = None) -> LinkSpheres:
+        return self._spheres
+
+
+def _with(spheres: LinkSpheres, last: int, attached: ArrayLike | None, margin: float) -> LinkSpheres:
+    """The spheres with those of a held object, each larger by the margin."""
+    held = (
+        np.zeros((0, 4)) if attached is None else rows(np.asarray(attached), "attached", 4, "metres (x, y, z, radius)")
+    )
+    if (held[:, 3] < 0).any():
+        raise InputError("has a radius below 0.", field="attached", hint="give (x, y, z, radius) in metres")
+    return LinkSpheres(
+        np.concatenate([spheres.link, np.full(len(held), last, np.int32)]),
+        np.concatenate([spheres.centers, held[:, :3]]),
+        np.concatenate([spheres.radii, held[:, 3]]) + margin,
+    )
+
+
+def _rigid(T: ArrayLike) -> Array:
+    pose = np.asarray(T, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError(f"is {pose.shape} or not finite.", field="T_world_base", hint="give a (4, 4) pose")
+    if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 1e-6 or np.linalg.det(pose[:3, :3]) < 0:
+        raise InputError("is no rotation.", field="T_world_base", hint="give an orthonormal, right-handed rotation")
+    return pose
+
+
+def _native(field: GaussianCollisionField | None) -> object:
+    return None if field is None else field.native
+
+
+def _version(field: GaussianCollisionField | None) -> int:
+    return -1 if field is None else field.map_version

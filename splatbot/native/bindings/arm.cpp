@@ -1,0 +1,171 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "splatbot/arm.hpp"
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+
+using namespace nb::literals;
+
+namespace {
+
+using splatbot::Arm;
+using splatbot::ArmClearance;
+using splatbot::ArmEdge;
+using splatbot::CollisionField;
+using Joints = Array<const double, nb::shape<-1, 3, 4>>;
+using Kinds = Array<const std::uint8_t, nb::shape<-1>>;
+using Numbers = Array<const double, nb::shape<-1>>;
+using Links = Array<const std::int32_t, nb::shape<-1>>;
+using Pairs = Array<const std::int32_t, nb::shape<-1, 2>>;
+using Points = Array<const double, nb::shape<-1, 3>>;
+using Base = Array<const double, nb::shape<3, 4>>;
+using Configurations = Array<const double, nb::shape<-1, -1>>;
+
+void check(const Arm& arm, const Configurations& q) {
+  if (q.shape(1) != static_cast<std::size_t>(arm.joints())) {
+    throw nb::value_error("configurations have another number of joints");
+  }
+}
+
+template <class Ask>
+nb::tuple edges(const Arm& arm, const Configurations& from, const Configurations& to, Ask&& ask) {
+  check(arm, from);
+  check(arm, to);
+  if (from.shape(0) != to.shape(0)) {
+    throw nb::value_error("the edges' ends differ in number");
+  }
+  const std::size_t n = from.shape(0);
+  std::vector<std::int32_t> verdict(n), checked(n);
+  std::vector<float> at(n);
+  {
+    nb::gil_scoped_release release;
+    std::vector<ArmEdge> out(n);
+    ask(std::span<ArmEdge>(out));
+    for (std::size_t i = 0; i < n; ++i) {
+      verdict[i] = out[i].verdict;
+      at[i] = out[i].at;
+      checked[i] = out[i].checked;
+    }
+  }
+  return nb::make_tuple(owned(std::move(verdict), {n}), owned(std::move(at), {n}), owned(std::move(checked), {n}));
+}
+
+}  // namespace
+
+void define_arm(nb::module_& m) {
+  m.attr("ARM_SELF") = static_cast<int>(splatbot::kArmSelf);
+  m.attr("ARM_ROUNDING") = splatbot::kArmRounding;
+  nb::class_<Arm>(m, "Arm", "A serial arm of spheres; immutable")
+      .def(
+          "__init__",
+          [](Arm* self, Joints joints, Kinds prismatic, Numbers travel, Links link, Points centers, Numbers radii,
+             Pairs pairs, Base base, bool base_in_map) {
+            new (self) Arm({span_of(joints), span_of(prismatic), span_of(travel), span_of(link), span_of(centers),
+                            span_of(radii), span_of(pairs), span_of(base), base_in_map});
+          },
+          nb::kw_only(), "joints"_a.noconvert(), "prismatic"_a.noconvert(), "travel"_a.noconvert(),
+          "link"_a.noconvert(), "centers"_a.noconvert(), "radii"_a.noconvert(), "pairs"_a.noconvert(),
+          "base"_a.noconvert(), "base_in_map"_a)
+      .def(
+          "forward",
+          [](const Arm& self, Configurations q) {
+            check(self, q);
+            const std::size_t n = q.shape(0), links = static_cast<std::size_t>(self.joints()) + 1;
+            std::vector<double> poses(16 * n * links);
+            {
+              nb::gil_scoped_release release;
+              self.forward(span_of(q), poses);
+            }
+            return owned(std::move(poses), {n, links, 4, 4});
+          },
+          "q"_a.noconvert(), "T_world_link (C, J + 1, 4, 4)")
+      .def(
+          "centers",
+          [](const Arm& self, Configurations q) {
+            check(self, q);
+            const std::size_t n = q.shape(0), spheres = static_cast<std::size_t>(self.spheres());
+            std::vector<double> out(3 * n * spheres);
+            {
+              nb::gil_scoped_release release;
+              self.centers(span_of(q), out);
+            }
+            return owned(std::move(out), {n, spheres, 3});
+          },
+          "q"_a.noconvert(), "Centres of the spheres (C, S, 3) in float64")
+      .def(
+          "centers_float",
+          [](const Arm& self, Configurations q) {
+            check(self, q);
+            const std::size_t n = q.shape(0), spheres = static_cast<std::size_t>(self.spheres());
+            std::vector<float> out(3 * n * spheres);
+            {
+              nb::gil_scoped_release release;
+              self.centers_float(span_of(q), out);
+            }
+            return owned(std::move(out), {n, spheres, 3});
+          },
+          "q"_a.noconvert(), "The same as the kernels see them, in float32")
+      .def(
+          "configurations",
+          [](const Arm& self, const CollisionField* field, Configurations q) {
+            check(self, q);
+            std::vector<std::int32_t> verdict(q.shape(0));
+            {
+              nb::gil_scoped_release release;
+              self.configurations(field, span_of(q), verdict);
+            }
+            const std::size_t n = verdict.size();
+            return owned(std::move(verdict), {n});
+          },
+          "field"_a.none(), "q"_a.noconvert(), "Verdicts (C): -1 free, a sphere, or ARM_SELF + a pair")
+      .def(
+          "certify",
+          [](const Arm& self, const CollisionField* field, Configurations from, Configurations to, float eps) {
+            return edges(self, from, to, [&](std::span<ArmEdge> out) {
+              self.certify(field, span_of(from), span_of(to), eps, out);
+            });
+          },
+          "field"_a.none(), "from_"_a.noconvert(), "to"_a.noconvert(), "eps"_a,
+          "Verdict, place and number of configurations (E) of edges checked all along")
+      .def(
+          "sample",
+          [](const Arm& self, const CollisionField* field, Configurations from, Configurations to, int samples) {
+            if (samples < 1 || samples > (1 << 20)) {
+              throw nb::value_error("samples is not in 1..2^20");
+            }
+            return edges(self, from, to, [&](std::span<ArmEdge> out) {
+              self.sample(field, span_of(from), span_of(to), samples, out);
+            });
+          },
+          "field"_a.none(), "from_"_a.noconvert(), "to"_a.noconvert(), "samples"_a)
+      .def(
+          "clearance",
+          [](const Arm& self, const CollisionField& field, Configurations q, double cut) {
+            check(self, q);
+            const std::size_t n = q.shape(0);
+            std::vector<double> distance(n), normal(3 * n), center(3 * n);
+            std::vector<std::int32_t> sphere(n), id(n);
+            {
+              nb::gil_scoped_release release;
+              std::vector<ArmClearance> out(n);
+              self.clearance(field, span_of(q), cut, out);
+              for (std::size_t i = 0; i < n; ++i) {
+                distance[i] = out[i].distance;
+                sphere[i] = out[i].sphere;
+                id[i] = out[i].id;
+                for (std::size_t k = 0; k < 3; ++k) {
+                  normal[3 * i + k] = out[i].normal[k];
+                  center[3 * i + k] = out[i].center[k];
+                }
+              }
+            }
+            return nb::make_tuple(owned(std::move(distance), {n}), owned(std::move(normal), {n, 3}),
+                                  owned(std::move(center), {n, 3}), owned(std::move(sphere), {n}),
+                                  owned(std::move(id), {n}));
+          },
+          "field"_a, "q"_a.noconvert(), "cut"_a,
+          "Clearance (C), its gradient at the sphere (C, 3), the sphere's centre (C, 3), sphere and id");
+}

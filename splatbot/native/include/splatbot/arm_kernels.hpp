@@ -1,0 +1,64 @@
+// SPDX-License-Identifier: Apache-2.0
+// The arm's kernels, compiled once for each instruction set; see kernels.hpp. A lane is a configuration.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "splatbot/solids.hpp"
+
+namespace splatbot {
+
+inline constexpr int kMostJoints = 16, kMostSpheres = 256, kMostPairs = 256;
+
+// From the frame of the link before to that of the joint at 0; the joint then turns about z, or moves along it.
+struct ArmJoint {
+  float R[9], t[3];
+  std::int32_t prismatic;
+};
+
+// An arm as the kernels see it. Spheres are sorted by link; link 0 is the base, link k moves with joint k - 1.
+struct ArmView {
+  int joints, spheres, first_sphere;  // spheres before the first are not tested against the map
+  const ArmJoint* joint;
+  float base_R[9];
+  double base_t[3];  // of T_world_base
+  const float* center[3];
+  const float* radius;              // with the error of float32 in it
+  const std::int32_t* link_begin;   // (joints + 2,)
+  const float* enclosing;           // (joints + 1, 4): a ball around each link's spheres; radius < 0: none
+  int pairs;
+  const std::int32_t* pair;  // (pairs, 2): links a < b that may not touch
+  const float* reach;        // (spheres, joints): farthest from each joint's axis; 1 for prismatic joints
+  const float* link_reach;   // (joints + 1, joints): the farthest of each link's spheres
+};
+
+// What became of a configuration or an edge.
+enum ArmVerdict : std::int32_t {
+  kArmFree = -1,
+  // 0 to spheres - 1: that sphere may touch the map. From kArmSelf on: that pair of links may touch.
+  kArmSelf = 1 << 16,
+};
+
+struct ArmEdge {
+  std::int32_t verdict;
+  float at;              // where on the edge, 0..1; of a free edge 1
+  std::int32_t checked;  // configurations looked at
+};
+
+struct ArmKernels {
+  // Verdicts of configurations (C, joints). A field of null: self-collision alone.
+  void (*configurations)(const ArmView&, const SolidsView* field, const double* q, std::size_t begin, std::size_t end,
+                         std::int32_t* verdict);
+  // Edges from `from` to `to` (E, joints), straight in joint space: every configuration on them, or else rejected;
+  // where a sphere has less than `eps` [m] of room, so that halving ends.
+  void (*certify)(const ArmView&, const SolidsView* field, const double* from, const double* to, float eps,
+                  std::size_t begin, std::size_t end, ArmEdge* out);
+  // Edges by `samples` configurations each, evenly spaced with both ends.
+  void (*sample)(const ArmView&, const SolidsView* field, const double* from, const double* to, int samples,
+                 std::size_t begin, std::size_t end, ArmEdge* out);
+  // Centres (C, spheres, 3) of the spheres in float32.
+  void (*centers)(const ArmView&, const double* q, std::size_t begin, std::size_t end, float* out);
+};
+
+}  // namespace splatbot

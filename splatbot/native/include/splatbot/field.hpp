@@ -1,0 +1,89 @@
+// SPDX-License-Identifier: Apache-2.0
+// The collision field: n-sigma ellipsoids under a tree of boxes, in blocks of space that successive fields share, and a
+// grid of proven lower bounds of the distance. Immutable, so any number of threads may ask at once.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <span>
+#include <vector>
+
+#include "splatbot/field_kernels.hpp"
+#include "splatbot/solids.hpp"
+
+namespace splatbot {
+
+struct FieldOptions {
+  float n_sigma = 2.0F;      // where an ellipsoid's surface is
+  float voxel = 0.02F;       // [m] of the grid; 0: no grid. Made larger where max_voxels asks for it
+  std::size_t max_voxels = 2'000'000;
+};
+
+// Gaussians as the field takes them. Values must be finite, quaternions not zero, ids not negative.
+struct Solids {
+  std::span<const float> means;   // (N, 3) [m]
+  std::span<const float> quats;   // (N, 4) wxyz, any norm
+  std::span<const float> scales;  // (N, 3) standard deviations [m], above 0
+  std::span<const std::int32_t> ids;  // (N,), each once
+};
+
+inline constexpr float kBlockEdge = 0.125F;  // [m]; where a mean lies says which block it belongs to
+
+// The Gaussians whose means lie in one cube of space (those too large for a cube: in one block of their own).
+struct SolidBlock {
+  std::uint64_t key;
+  std::size_t count;
+  std::vector<SolidLeaf> leaves;
+  std::vector<SolidNode> nodes;
+  float low[3], high[3], reach[3];
+};
+
+struct BoundGrid {
+  std::int32_t size[3];
+  float origin[3];
+  float voxel;
+  bool open;  // some ellipsoid reaches outside: no bound goes beyond the rim
+  std::vector<std::uint8_t> marks, bound;
+};
+
+class CollisionField {
+ public:
+  CollisionField(const Solids& solids, const FieldOptions& options);
+
+  // A field of the same options without the ids `removed`, and with `inserted`. An id in both is moved. Blocks that no
+  // change concerns are shared. The answers are those of a field built anew.
+  std::shared_ptr<const CollisionField> updated(std::span<const std::int32_t> removed, const Solids& inserted) const;
+
+  // A field of what `earlier` has not, by geometry and not by id: what may be in the way only now. Without a grid.
+  std::shared_ptr<const CollisionField> added_since(const CollisionField& earlier) const;
+
+  std::size_t size() const noexcept { return size_; }
+  std::size_t bytes() const;         // of leaves, trees, grid and the place of each id
+  std::size_t shared_bytes(const CollisionField& other) const;  // of blocks that both hold
+  const FieldOptions& options() const noexcept { return options_; }
+  const SolidsView& view() const noexcept { return view_; }
+  const BoundGrid* grid() const noexcept { return grid_.get(); }
+
+  void hits(const SphereQueries& queries, std::size_t count, std::span<std::uint8_t> out) const;
+  void nearest(const SphereQueries& queries, std::size_t count, float cut, std::span<NearestSolid> out) const;
+  void k_nearest(const SphereQueries& queries, std::size_t count, int k, float cut, std::span<double> distance,
+                 std::span<std::int32_t> id) const;
+  void mahalanobis(std::span<const double> points, std::span<double> distance, std::span<std::int32_t> id) const;
+  void grid_bounds(std::span<const double> points, std::span<float> out) const;
+
+ private:
+  CollisionField() = default;
+  void finish();
+
+  FieldOptions options_;
+  std::size_t size_ = 0;
+  std::vector<std::shared_ptr<const SolidBlock>> blocks_;  // a slot stays empty when its last Gaussian goes
+  std::vector<std::int32_t> block_of_;                     // by id; -1: none
+  std::vector<SolidNode> top_;
+  std::vector<SolidBlockView> views_;
+  std::shared_ptr<const BoundGrid> grid_;
+  SolidsView view_{};
+};
+
+}  // namespace splatbot

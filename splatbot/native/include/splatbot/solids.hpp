@@ -1,0 +1,50 @@
+// SPDX-License-Identifier: Apache-2.0
+// How the collision field keeps its Gaussians: n-sigma ellipsoids in leaves of 16, under a tree of boxes, 16 to a node.
+#pragma once
+
+#include <cstdint>
+
+namespace splatbot {
+
+inline constexpr int kFan = 16;  // ellipsoids to a leaf, children to a node
+
+// Sixteen ellipsoids, each quantity contiguous over them. Rotation and semi-axes are kept apart: a packed inverse
+// covariance in float32 loses flat ones. Unused lanes repeat lane 0 with an id of -1.
+struct alignas(64) SolidLeaf {
+  float mean[3][kFan];  // world [m], bit for bit as the model holds them
+  float quat[4][kFan];  // unit, wxyz
+  float axes[3][kFan];  // semi-axes of the n-sigma ellipsoid [m], rounded up
+  std::int32_t id[kFan];
+};
+
+// Boxes around the ellipsoids below each child, rounded outwards. The semi-extents of one ellipsoid's box are at most
+// `reach`. A child is a node, or ~(a leaf) in a block's tree, or ~(a block) in the top tree.
+struct alignas(64) SolidNode {
+  float low[3][kFan];
+  float high[3][kFan];
+  float reach[3][kFan];
+  std::int32_t child[kFan];
+};
+
+struct SolidBlockView {
+  const SolidNode* nodes;  // the first is the root
+  const SolidLeaf* leaves;
+};
+
+// Proven lower bounds of the distance from any point of a voxel to any ellipsoid, as squares of voxels.
+struct BoundGridView {
+  const std::uint8_t* bound;  // (nz, ny, nx), null if there is no grid
+  std::int32_t size[3];       // nx, ny, nz
+  float origin[3];
+  float voxel, per_voxel;  // [m], [1/m]
+};
+
+// What the kernels see of a field.
+struct SolidsView {
+  const SolidNode* top;  // the first is the root; null if there is no Gaussian
+  const SolidBlockView* blocks;
+  BoundGridView grid;
+  float n_sigma;
+};
+
+}  // namespace splatbot

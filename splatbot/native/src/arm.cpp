@@ -1,0 +1,294 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "splatbot/arm.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <stdexcept>
+
+#include "splatbot/kernels.hpp"
+#include "splatbot/threads.hpp"
+
+namespace splatbot {
+
+namespace {
+
+constexpr std::size_t kFewest = 16;
+
+template <class Ask>
+void in_parts(std::size_t count, std::size_t fewest, Ask&& ask) {
+  const auto pool = thread_pool();
+  const std::size_t part = (std::max(fewest, count / (8 * pool->size()) + 1) + 15) / 16 * 16;
+  pool->run((count + part - 1) / part, [&](std::size_t i) { ask(i * part, std::min(count, (i + 1) * part)); });
+}
+
+void require(bool ok, const char* what) {
+  if (!ok) {
+    throw std::invalid_argument(what);
+  }
+}
+
+float rounded_up(double x) {
+  const auto f = static_cast<float>(x);
+  return static_cast<double>(f) < x ? std::nextafter(f, std::numeric_limits<float>::infinity()) : f;
+}
+
+double norm(const double* v) { return std::hypot(v[0], v[1], v[2]); }
+
+}  // namespace
+
+Arm::Arm(const ArmSpec& spec) {
+  const std::size_t joints = spec.prismatic.size(), spheres = spec.link.size(), pairs = spec.pairs.size() / 2;
+  require(joints >= 1 && joints <= kMostJoints, "an arm has 1 to 16 joints");
+  require(spheres <= kMostSpheres, "an arm has at most 256 spheres");
+  require(pairs <= kMostPairs, "an arm has at most 256 pairs of links that may not touch");
+  require(spec.joints.size() == 12 * joints && spec.travel.size() == joints, "joints, kinds and travel differ in number");
+  require(spec.centers.size() == 3 * spheres && spec.radii.size() == spheres, "links, centres and radii differ in number");
+  require(spec.base.size() == 12, "the base is not a pose");
+  exact_.resize(joints);
+  joint_.resize(joints);
+  for (std::size_t j = 0; j < joints; ++j) {
+    const double* T = spec.joints.data() + 12 * j;
+    for (std::size_t i = 0; i < 3; ++i) {
+      for (std::size_t k = 0; k < 3; ++k) {
+        exact_[j].R[3 * i + k] = T[4 * i + k];
+        joint_[j].R[3 * i + k] = static_cast<float>(T[4 * i + k]);
+      }
+      exact_[j].t[i] = T[4 * i + 3];
+      joint_[j].t[i] = static_cast<float>(T[4 * i + 3]);
+    }
+    exact_[j].prismatic = spec.prismatic[j] != 0;
+    joint_[j].prismatic = spec.prismatic[j] != 0 ? 1 : 0;
+  }
+  std::copy(spec.base.begin(), spec.base.end(), base_);
+  link_.assign(spec.link.begin(), spec.link.end());
+  exact_centers_.assign(spec.centers.begin(), spec.centers.end());
+  exact_radii_.assign(spec.radii.begin(), spec.radii.end());
+  begin_.assign(joints + 2, 0);
+  for (std::size_t s = 0; s < spheres; ++s) {
+    require(link_[s] >= 0 && link_[s] <= static_cast<std::int32_t>(joints), "a sphere is on a link that is not there");
+    require(s == 0 || link_[s - 1] <= link_[s], "spheres are not sorted by link");
+    require(spec.radii[s] >= 0.0, "a radius is negative");
+    ++begin_[static_cast<std::size_t>(link_[s]) + 1];
+  }
+  std::partial_sum(begin_.begin(), begin_.end(), begin_.begin());
+  radius_.resize(spheres);
+  for (auto& axis : center_) {
+    axis.resize(spheres);
+  }
+  reach_.assign(spheres * joints, 0.0F);
+  link_reach_.assign((joints + 1) * joints, 0.0F);
+  for (std::size_t s = 0; s < spheres; ++s) {
+    radius_[s] = rounded_up(spec.radii[s] + kArmRounding);
+    for (std::size_t k = 0; k < 3; ++k) {
+      center_[k][s] = static_cast<float>(spec.centers[3 * s + k]);
+    }
+    // Farthest from each axis: the offsets' lengths from there on, of the first one only what is across the axis.
+    const auto link = static_cast<std::size_t>(link_[s]);
+    double beyond = norm(&spec.centers[3 * s]);
+    double across = std::hypot(spec.centers[3 * s], spec.centers[3 * s + 1]);
+    for (std::size_t j = link; j-- > 0;) {
+      const double reach = exact_[j].prismatic ? 1.0 : across;
+      reach_[s * joints + j] = rounded_up(reach * (1.0 + 1e-6));
+      float& most = link_reach_[link * joints + j];
+      most = std::max(most, reach_[s * joints + j]);
+      const double travel = exact_[j].prismatic ? spec.travel[j] : 0.0;
+      across = std::hypot(exact_[j].t[0], exact_[j].t[1]) + beyond + travel;
+      beyond += norm(exact_[j].t) + travel;
+    }
+  }
+  enclosing_.assign(4 * (joints + 1), -1.0F);
+  for (std::size_t l = 0; l <= joints; ++l) {
+    const auto first = static_cast<std::size_t>(begin_[l]), last = static_cast<std::size_t>(begin_[l + 1]);
+    if (first == last) {
+      continue;
+    }
+    double middle[3];
+    for (std::size_t k = 0; k < 3; ++k) {
+      double low = 1e30, high = -1e30;
+      for (std::size_t s = first; s < last; ++s) {
+        low = std::min(low, spec.centers[3 * s + k] - spec.radii[s]);
+        high = std::max(high, spec.centers[3 * s + k] + spec.radii[s]);
+      }
+      middle[k] = 0.5 * (low + high);
+    }
+    double radius = 0.0;
+    for (std::size_t s = first; s < last; ++s) {
+      const double d[3] = {spec.centers[3 * s] - middle[0], spec.centers[3 * s + 1] - middle[1],
+                           spec.centers[3 * s + 2] - middle[2]};
+      radius = std::max(radius, norm(d) + static_cast<double>(radius_[s]));
+    }
+    for (std::size_t k = 0; k < 3; ++k) {
+      enclosing_[4 * l + k] = static_cast<float>(middle[k]);
+    }
+    enclosing_[4 * l + 3] = rounded_up(radius + 2.0 * kArmRounding);
+  }
+  for (std::size_t p = 0; p < pairs; ++p) {
+    const std::int32_t a = std::min(spec.pairs[2 * p], spec.pairs[2 * p + 1]);
+    const std::int32_t b = std::max(spec.pairs[2 * p], spec.pairs[2 * p + 1]);
+    require(a >= 0 && a < b && b <= static_cast<std::int32_t>(joints), "a pair names a link that is not there, or one twice");
+    if (begin_[static_cast<std::size_t>(a)] < begin_[static_cast<std::size_t>(a) + 1] &&
+        begin_[static_cast<std::size_t>(b)] < begin_[static_cast<std::size_t>(b) + 1]) {
+      pairs_.insert(pairs_.end(), {a, b});
+    } else {
+      throw std::invalid_argument("a pair names a link without spheres");
+    }
+  }
+  view_.joints = static_cast<int>(joints);
+  view_.spheres = static_cast<int>(spheres);
+  view_.first_sphere = spec.base_in_map ? 0 : begin_[1];
+  view_.joint = joint_.data();
+  for (int i = 0; i < 3; ++i) {
+    for (int k = 0; k < 3; ++k) {
+      view_.base_R[3 * i + k] = static_cast<float>(base_[4 * i + k]);
+    }
+    view_.base_t[i] = base_[4 * i + 3];
+    view_.center[i] = center_[i].data();
+  }
+  view_.radius = radius_.data();
+  view_.link_begin = begin_.data();
+  view_.enclosing = enclosing_.data();
+  view_.pairs = static_cast<int>(pairs);
+  view_.pair = pairs_.data();
+  view_.reach = reach_.data();
+  view_.link_reach = link_reach_.data();
+}
+
+void Arm::forward_one(const double* q, double* poses) const {
+  std::copy(base_, base_ + 12, poses);
+  std::fill(poses + 12, poses + 15, 0.0);
+  poses[15] = 1.0;
+  for (std::size_t j = 0; j < exact_.size(); ++j) {
+    const double* from = poses + 16 * j;
+    double* to = poses + 16 * (j + 1);
+    const Joint& joint = exact_[j];
+    const double c = joint.prismatic ? 1.0 : std::cos(q[j]), s = joint.prismatic ? 0.0 : std::sin(q[j]);
+    const double along = joint.prismatic ? q[j] : 0.0;
+    for (int i = 0; i < 3; ++i) {
+      double row[3];
+      for (int k = 0; k < 3; ++k) {
+        row[k] = from[4 * i] * joint.R[k] + from[4 * i + 1] * joint.R[3 + k] + from[4 * i + 2] * joint.R[6 + k];
+      }
+      to[4 * i] = c * row[0] + s * row[1];
+      to[4 * i + 1] = c * row[1] - s * row[0];
+      to[4 * i + 2] = row[2];
+      to[4 * i + 3] = from[4 * i] * joint.t[0] + from[4 * i + 1] * joint.t[1] + from[4 * i + 2] * joint.t[2] +
+                      from[4 * i + 3] + row[2] * along;
+    }
+    std::fill(to + 12, to + 15, 0.0);
+    to[15] = 1.0;
+  }
+}
+
+void Arm::forward(std::span<const double> q, std::span<double> poses) const {
+  const std::size_t n = exact_.size(), stride = 16 * (n + 1);
+  in_parts(q.size() / n, 256, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t i = begin; i < end; ++i) {
+      forward_one(q.data() + i * n, poses.data() + i * stride);
+    }
+  });
+}
+
+void Arm::centers(std::span<const double> q, std::span<double> out) const {
+  const std::size_t n = exact_.size(), spheres = link_.size();
+  in_parts(q.size() / n, 64, [&](std::size_t begin, std::size_t end) {
+    double poses[16 * (kMostJoints + 1)];
+    for (std::size_t i = begin; i < end; ++i) {
+      forward_one(q.data() + i * n, poses);
+      for (std::size_t s = 0; s < spheres; ++s) {
+        const double* T = poses + 16 * static_cast<std::size_t>(link_[s]);
+        const double* c = &exact_centers_[3 * s];
+        for (std::size_t k = 0; k < 3; ++k) {
+          out[3 * (i * spheres + s) + k] = T[4 * k] * c[0] + T[4 * k + 1] * c[1] + T[4 * k + 2] * c[2] + T[4 * k + 3];
+        }
+      }
+    }
+  });
+}
+
+void Arm::centers_float(std::span<const double> q, std::span<float> out) const {
+  const ArmKernels& k = *kernels().arm;
+  in_parts(q.size() / exact_.size(), 64, [&](std::size_t begin, std::size_t end) {
+    k.centers(view_, q.data(), begin, end, out.data());
+  });
+}
+
+void Arm::configurations(const CollisionField* field, std::span<const double> q, std::span<std::int32_t> verdict) const {
+  const ArmKernels& k = *kernels().arm;
+  const SolidsView* solids = field != nullptr ? &field->view() : nullptr;
+  in_parts(verdict.size(), 64, [&](std::size_t begin, std::size_t end) {
+    k.configurations(view_, solids, q.data(), begin, end, verdict.data());
+  });
+}
+
+void Arm::certify(const CollisionField* field, std::span<const double> from, std::span<const double> to, float eps,
+                  std::span<ArmEdge> out) const {
+  const ArmKernels& k = *kernels().arm;
+  const SolidsView* solids = field != nullptr ? &field->view() : nullptr;
+  in_parts(out.size(), kFewest, [&](std::size_t begin, std::size_t end) {
+    k.certify(view_, solids, from.data(), to.data(), eps, begin, end, out.data());
+  });
+}
+
+void Arm::sample(const CollisionField* field, std::span<const double> from, std::span<const double> to, int samples,
+                 std::span<ArmEdge> out) const {
+  const ArmKernels& k = *kernels().arm;
+  const SolidsView* solids = field != nullptr ? &field->view() : nullptr;
+  in_parts(out.size(), kFewest, [&](std::size_t begin, std::size_t end) {
+    k.sample(view_, solids, from.data(), to.data(), samples, begin, end, out.data());
+  });
+}
+
+void Arm::clearance(const CollisionField& field, std::span<const double> q, double cut,
+                    std::span<ArmClearance> out) const {
+  const FieldKernels& k = *kernels().field;
+  const std::size_t n = exact_.size(), spheres = link_.size();
+  in_parts(out.size(), kFewest, [&](std::size_t begin, std::size_t end) {
+    std::vector<double> at(3 * spheres);
+    std::vector<float> bound(spheres);
+    std::vector<std::size_t> order(spheres);
+    double poses[16 * (kMostJoints + 1)];
+    for (std::size_t i = begin; i < end; ++i) {
+      forward_one(q.data() + i * n, poses);
+      for (std::size_t s = 0; s < spheres; ++s) {
+        const double* T = poses + 16 * static_cast<std::size_t>(link_[s]);
+        const double* c = &exact_centers_[3 * s];
+        for (std::size_t a = 0; a < 3; ++a) {
+          at[3 * s + a] = T[4 * a] * c[0] + T[4 * a + 1] * c[1] + T[4 * a + 2] * c[2] + T[4 * a + 3];
+        }
+      }
+      k.grid_bounds(field.view(), at.data(), 0, spheres, bound.data());
+      std::iota(order.begin(), order.end(), std::size_t{0});
+      std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
+        return static_cast<double>(bound[a]) - exact_radii_[a] < static_cast<double>(bound[b]) - exact_radii_[b];
+      });
+      ArmClearance& best = out[i];
+      best = {std::numeric_limits<double>::infinity(), {0, 0, 0}, {0, 0, 0}, -1, -1};
+      for (const std::size_t s : order) {  // nearest first, as the grid sees it: later ones need look less far
+        if (s < static_cast<std::size_t>(view_.first_sphere)) {
+          continue;
+        }
+        const double limit = std::min(cut, best.distance);
+        const double reach = limit + exact_radii_[s];
+        if (reach < 0.0 || static_cast<double>(bound[s]) > reach) {
+          if (reach >= 0.0) {
+            continue;
+          }
+        }
+        NearestSolid found;
+        k.nearest(field.view(), {at.data() + 3 * s, nullptr}, rounded_up(std::max(reach, 0.0)), 0, 1, &found);
+        if (found.id >= 0 && found.distance - exact_radii_[s] < best.distance &&
+            found.distance - exact_radii_[s] <= cut) {
+          best.distance = found.distance - exact_radii_[s];
+          std::copy(std::begin(found.normal), std::end(found.normal), best.normal);
+          std::copy_n(at.data() + 3 * s, 3, best.center);
+          best.sphere = static_cast<std::int32_t>(s);
+          best.id = found.id;
+        }
+      }
+    }
+  });
+}
+
+}  // namespace splatbot

@@ -1,0 +1,377 @@
+// SPDX-License-Identifier: Apache-2.0
+// Questions to the collision field: hits, the nearest, the k nearest, the Mahalanobis distance.
+#include "field_entry.hpp"
+#include "solid_tree.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
+
+constexpr float kInfinity = __builtin_inff();
+
+struct Seen {
+  float bound;
+  const SolidLeaf* leaf;
+  int lane;
+  std::int32_t id;
+};
+
+// Unused children lie infinitely far off.
+template <class Search>
+SB_INLINE float limit_of(const Search& search) {
+  const float limit = search.limit();
+  return limit < 3e38F ? limit : 3e38F;
+}
+
+// What a walk looks for: `nearer` says how far it need look, `leaf` takes what it finds.
+//
+// Boxes in order of their bounds; a bound is compared with `limit()` and a box is left out only if it is greater, so
+// that equals are all seen and the lowest id wins.
+template <class Search>
+SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
+  if (s.top == nullptr) {
+    return;
+  }
+  Place stack[kStack];
+  int n = 0;
+  stack[n++] = {-1, 0, 0.0F};
+  alignas(64) float bounds[kFan];
+  while (n > 0) {
+    const Place place = stack[--n];
+    if (place.bound > limit_of(search)) {
+      continue;
+    }
+    if (place.node < 0) {
+      search.leaf(s.blocks[place.block].leaves[~place.node], p);
+      continue;
+    }
+    const SolidNode& node = node_at(s, place);
+    std::uint32_t met = 0;
+    const F limit = set1(limit_of(search));
+    for (int at = 0; at < kFan; at += W) {
+      const F b = search.bound(node, p, at);
+      store(bounds + at, b);
+      met |= bits(b <= limit) << at;
+    }
+    const int first = n;
+    for (; met != 0; met &= met - 1) {
+      const int i = __builtin_ctz(met);
+      const std::int32_t child = node.child[i];
+      Place next{place.block, child, bounds[i]};
+      if (place.block < 0) {
+        next = child >= 0 ? Place{-1, child, bounds[i]} : Place{~child, 0, bounds[i]};
+      }
+      int at = n++;
+      for (; at > first && stack[at - 1].bound < next.bound; --at) {
+        stack[at] = stack[at - 1];
+      }
+      stack[at] = next;
+    }
+  }
+}
+
+// Bounds are squared distances to boxes.
+struct NearestSearch {
+  float best;  // certified lower bound of the signed distance so far, or the cut
+  float slack;
+  const SolidLeaf* found = nullptr;
+  int lane = 0;
+
+  SB_INLINE float limit() const {
+    const float reach = best + slack;
+    return reach > 0.0F ? reach * reach * (1.0F + 1e-5F) : 0.0F;
+  }
+  SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
+
+  SB_INLINE void leaf(const SolidLeaf& leaf, const Split& p) {
+    alignas(64) float d[W];
+    for (int at = 0; at < kFan; at += W) {
+      const Local l = local_of(leaf, p, at);
+      const F margin = set1(best > 0.0F ? best + slack : slack) + rounding(l, least_axis(l));
+      const std::uint32_t near = bits(box_squared(l) <= margin * margin * set1(1.0F + 1e-5F));
+      if (near == 0) {
+        continue;
+      }
+      store(d, distance_bound<8>(l));
+      for (std::uint32_t m = near; m != 0; m &= m - 1) {
+        const int i = __builtin_ctz(m);
+        const bool equal = d[i] == best && found != nullptr &&
+                           static_cast<std::uint32_t>(leaf.id[at + i]) < static_cast<std::uint32_t>(found->id[lane]);
+        if (d[i] < best || equal) {
+          best = d[i];
+          found = &leaf;
+          lane = at + i;
+        }
+      }
+    }
+  }
+};
+
+struct KSearch {
+  int k;
+  float cut, slack;
+  int count = 0;
+  Seen seen[kMostNearest];
+
+  SB_INLINE float worst() const { return count < k ? cut : seen[count - 1].bound; }
+  SB_INLINE float limit() const {
+    const float reach = worst() + slack;
+    return reach > 0.0F ? reach * reach * (1.0F + 1e-5F) : 0.0F;
+  }
+  SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
+
+  SB_INLINE void leaf(const SolidLeaf& leaf, const Split& p) {
+    alignas(64) float d[W];
+    for (int at = 0; at < kFan; at += W) {
+      const Local l = local_of(leaf, p, at);
+      store(d, distance_bound<8>(l));
+      for (int i = 0; i < W; ++i) {
+        if (leaf.id[at + i] >= 0 && d[i] <= worst()) {
+          insert({d[i], &leaf, at + i, leaf.id[at + i]});
+        }
+      }
+    }
+  }
+
+  void insert(const Seen& next) {
+    if (count == k && !before(next, seen[count - 1])) {
+      return;
+    }
+    int at = count < k ? count++ : count - 1;
+    for (; at > 0 && before(next, seen[at - 1]); --at) {
+      seen[at] = seen[at - 1];
+    }
+    seen[at] = next;
+  }
+
+  static bool before(const Seen& a, const Seen& b) { return a.bound < b.bound || (a.bound == b.bound && a.id < b.id); }
+};
+
+// Bounds are squared distances in units of the n-sigma ellipsoids.
+struct MahalanobisSearch {
+  float best = kInfinity;  // squared
+  float slack;
+  float n_sigma;
+  const SolidLeaf* found = nullptr;
+  int lane = 0;
+
+  SB_INLINE float limit() const { return best * (1.0F + 1e-5F); }
+
+  // Where p is delta beyond a box that reaches at least to the ellipsoid's own box, it is at least 1 + delta / extent
+  // of that ellipsoid's size away.
+  SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const {
+    F most = set1(0.0F);
+    for (int k = 0; k < 3; ++k) {
+      const F beyond = gap(node.low[k], node.high[k], at, set1(p.hi[k])) - set1(slack);
+      most = max(most, beyond / load(node.reach[k] + at));
+    }
+    const F size = most * set1(1.0F - 1e-5F) + set1(1.0F);
+    return select(most > set1(0.0F), size * size, set1(0.0F));
+  }
+
+  SB_INLINE void leaf(const SolidLeaf& leaf, const Split& p) {
+    alignas(64) float d[W];
+    for (int at = 0; at < kFan; at += W) {
+      const Local l = local_of(leaf, p, at);
+      const F x = l.v[0] / l.a[0], y = l.v[1] / l.a[1], z = l.v[2] / l.a[2];
+      const F squared = fma(x, x, fma(y, y, z * z));
+      std::uint32_t near = bits(squared <= set1(best));
+      if (near == 0) {
+        continue;
+      }
+      store(d, squared);
+      for (; near != 0; near &= near - 1) {
+        const int i = __builtin_ctz(near);
+        const bool equal = d[i] == best && found != nullptr &&
+                           static_cast<std::uint32_t>(leaf.id[at + i]) < static_cast<std::uint32_t>(found->id[lane]);
+        if (d[i] < best || equal) {
+          best = d[i];
+          found = &leaf;
+          lane = at + i;
+        }
+      }
+    }
+  }
+};
+
+// One ellipsoid in float64.
+struct Exact {
+  double v[3], a[3], R[9], mean[3];
+};
+
+Exact exact_of(const SolidLeaf& leaf, int lane, const double* p) {
+  Exact e;
+  double q[4], norm = 0.0;
+  for (int k = 0; k < 4; ++k) {
+    q[k] = static_cast<double>(leaf.quat[k][lane]);
+    norm += q[k] * q[k];
+  }
+  const double w = q[0], x = q[1], y = q[2], z = q[3], t = 2.0 / norm;
+  const double R[9] = {1 - t * (y * y + z * z), t * (x * y - w * z),     t * (x * z + w * y),
+                       t * (x * y + w * z),     1 - t * (x * x + z * z), t * (y * z - w * x),
+                       t * (x * z - w * y),     t * (y * z + w * x),     1 - t * (x * x + y * y)};
+  double d[3];
+  for (int k = 0; k < 3; ++k) {
+    e.mean[k] = static_cast<double>(leaf.mean[k][lane]);
+    e.a[k] = static_cast<double>(leaf.axes[k][lane]);
+    d[k] = p[k] - e.mean[k];
+  }
+  for (int i = 0; i < 9; ++i) {
+    e.R[i] = R[i];
+  }
+  for (int k = 0; k < 3; ++k) {
+    e.v[k] = R[k] * d[0] + R[3 + k] * d[1] + R[6 + k] * d[2];
+  }
+  return e;
+}
+
+// The signed distance in float64, its normal and the nearest point: distance_bound() to the end.
+void solve(const Exact& e, NearestSolid& out) {
+  double least = e.a[0], D[3], v[3], b[3], s = 0.0;
+  for (int k = 1; k < 3; ++k) {
+    least = e.a[k] < least ? e.a[k] : least;
+  }
+  for (int k = 0; k < 3; ++k) {
+    const double size = e.v[k] < 0.0 ? -e.v[k] : e.v[k];
+    v[k] = e.a[k] <= least && size < 1e-7 * least ? 1e-7 * least : size;
+    D[k] = (e.a[k] - least) * (e.a[k] + least);
+    b[k] = e.a[k] * v[k];
+    s = b[k] - D[k] > s ? b[k] - D[k] : s;
+  }
+  for (int i = 0; i < 60; ++i) {
+    double norm2 = 0.0, slope = 0.0;
+    for (int k = 0; k < 3; ++k) {
+      const double inverse = 1.0 / (D[k] + s), q = b[k] * inverse;
+      norm2 += q * q;
+      slope += q * q * inverse;
+    }
+    const double step = (__builtin_sqrt(norm2) - 1.0) * norm2 / slope;
+    if (!(step > 1e-15 * s)) {
+      break;
+    }
+    s += step;
+  }
+  double n[3], length = 0.0, along = 0.0, support = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    n[k] = v[k] * (s / (D[k] + s));
+    length += n[k] * n[k];
+  }
+  length = __builtin_sqrt(length);
+  double at[3];
+  for (int k = 0; k < 3; ++k) {
+    n[k] /= length;
+    along += n[k] * (e.v[k] < 0.0 ? -e.v[k] : e.v[k]);
+    support += e.a[k] * n[k] * (e.a[k] * n[k]);
+  }
+  support = __builtin_sqrt(support);
+  for (int k = 0; k < 3; ++k) {
+    const double sign = e.v[k] < 0.0 ? -1.0 : 1.0;
+    n[k] *= sign;
+    at[k] = e.a[k] * e.a[k] * n[k] / support;
+  }
+  out.distance = along - support;
+  for (int k = 0; k < 3; ++k) {
+    out.normal[k] = e.R[3 * k] * n[0] + e.R[3 * k + 1] * n[1] + e.R[3 * k + 2] * n[2];
+    out.point[k] = e.mean[k] + e.R[3 * k] * at[0] + e.R[3 * k + 1] * at[1] + e.R[3 * k + 2] * at[2];
+  }
+}
+
+// Certified and smooth: the float64 distance of the winner less what float32 may have hidden of its rivals, or, should
+// the bound not have come that close, the bound itself.
+double certified(const Exact& e, double exact, double bound) {
+  double size = e.a[0];
+  for (int k = 0; k < 3; ++k) {
+    size = e.a[k] < size ? e.a[k] : size;
+  }
+  for (int k = 0; k < 3; ++k) {
+    size += e.v[k] < 0.0 ? -e.v[k] : e.v[k];
+  }
+  const double lower = exact - 3.0 * static_cast<double>(kRounding) * size;
+  return lower <= bound ? lower : bound;
+}
+
+SB_INLINE float radius_of(const SphereQueries& q, std::size_t i) { return q.radii == nullptr ? 0.0F : q.radii[i]; }
+
+}  // namespace
+
+void field_hits(const SolidsView& s, const SphereQueries& q, std::size_t begin, std::size_t end, std::uint8_t* out) {
+  for (std::size_t i = begin; i < end; ++i) {
+    out[i] = sphere_hit(s, split(q.centers + 3 * i), radius_of(q, i)) ? 1 : 0;
+  }
+}
+
+void field_nearest(const SolidsView& s, const SphereQueries& q, float cut, std::size_t begin, std::size_t end,
+                   NearestSolid* out) {
+  for (std::size_t i = begin; i < end; ++i) {
+    const double* center = q.centers + 3 * i;
+    const Split p = split(center);
+    const float r = radius_of(q, i);
+    NearestSearch search{cut + r, p.slack};
+    NearestSolid& answer = out[i];
+    answer = {static_cast<double>(kInfinity), {0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, -1};
+    if (grid_bound(s.grid, p) > cut + r) {
+      continue;
+    }
+    walk(s, p, search);
+    if (search.found != nullptr) {
+      const Exact e = exact_of(*search.found, search.lane, center);
+      solve(e, answer);
+      answer.distance = certified(e, answer.distance, static_cast<double>(search.best)) - static_cast<double>(r);
+      answer.id = search.found->id[search.lane];
+    }
+  }
+}
+
+void field_k_nearest(const SolidsView& s, const SphereQueries& q, int k, float cut, std::size_t begin, std::size_t end,
+                     double* distance, std::int32_t* id) {
+  for (std::size_t i = begin; i < end; ++i) {
+    const double* center = q.centers + 3 * i;
+    const Split p = split(center);
+    const float r = radius_of(q, i);
+    KSearch search{k, cut + r, p.slack, 0, {}};
+    walk(s, p, search);
+    const auto row = i * static_cast<std::size_t>(k);
+    for (int j = 0; j < k; ++j) {
+      const auto at = row + static_cast<std::size_t>(j);
+      distance[at] = static_cast<double>(kInfinity);
+      id[at] = -1;
+      if (j < search.count) {
+        const Seen& seen = search.seen[j];
+        const Exact e = exact_of(*seen.leaf, seen.lane, center);
+        NearestSolid solved;
+        solve(e, solved);
+        distance[at] = certified(e, solved.distance, static_cast<double>(seen.bound)) - static_cast<double>(r);
+        id[at] = seen.id;
+      }
+    }
+  }
+}
+
+void field_mahalanobis(const SolidsView& s, const double* points, std::size_t begin, std::size_t end, double* distance,
+                       std::int32_t* id) {
+  for (std::size_t i = begin; i < end; ++i) {
+    const Split p = split(points + 3 * i);
+    MahalanobisSearch search{.slack = 2.0F * p.slack, .n_sigma = s.n_sigma};
+    walk(s, p, search);
+    distance[i] = static_cast<double>(kInfinity);
+    id[i] = -1;
+    if (search.found != nullptr) {
+      const Exact e = exact_of(*search.found, search.lane, points + 3 * i);
+      double squared = 0.0;
+      for (int k = 0; k < 3; ++k) {
+        squared += (e.v[k] / e.a[k]) * (e.v[k] / e.a[k]);
+      }
+      distance[i] = static_cast<double>(s.n_sigma) * __builtin_sqrt(squared);
+      id[i] = search.found->id[search.lane];
+    }
+  }
+}
+
+void field_grid_bounds(const SolidsView& s, const double* points, std::size_t begin, std::size_t end, float* out) {
+  for (std::size_t i = begin; i < end; ++i) {
+    const float bound = grid_bound(s.grid, split(points + 3 * i));
+    out[i] = bound < 0.0F ? 0.0F : bound;
+  }
+}
+
+}  // namespace splatbot::SPLATBOT_KERNELS
