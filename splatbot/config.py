@@ -23,9 +23,9 @@ class _Section(BaseModel):
 # What a budget buys: the row of the largest budget that is not larger [ms]. Everything that a budget changes is here.
 _EFFORT: dict[float, dict[str, Any]] = {
     0: {"n_pixels": 2400, "iterations": 4, "features": "always", "n_features": 500},
-    100: {"n_pixels": 4800, "iterations": 5, "features": "always", "n_features": 2000},
-    300: {"n_pixels": 9600, "iterations": 8, "features": "always", "n_features": 3000},
-    1000: {"n_pixels": 19200, "iterations": 10, "features": "always", "n_features": 4000},
+    100: {"n_pixels": 4800, "iterations": 8, "features": "always", "n_features": 2000},
+    300: {"n_pixels": 9600, "iterations": 10, "features": "always", "n_features": 3000},
+    1000: {"n_pixels": 19200, "iterations": 12, "features": "always", "n_features": 4000},
 }
 
 
@@ -47,7 +47,7 @@ class TrackingConfig(_Section):
     max_width: int = Field(default=640, ge=64, description="finest width used for alignment [px]")
     n_levels: int = Field(default=3, ge=1, le=6, description="levels of the pyramid")
     n_pixels: int = Field(default=4800, ge=100, description="pixels per level in alignment: accuracy for time")
-    iterations: int = Field(default=5, ge=1, description="Gauss-Newton steps per level: accuracy for time")
+    iterations: int = Field(default=8, ge=1, description="Gauss-Newton steps per level: accuracy for time")
     reference_keyframes: int = Field(default=2, ge=1, description="keyframes that a frame is aligned to at once")
     sigma_gray: float = Field(default=0.02, gt=0, description="noise of a grey value in 0..1")
     sigma_depth_floor: float = Field(default=1e-3, gt=0, description="σ_z = floor + quad z² [m]")
@@ -58,6 +58,13 @@ class TrackingConfig(_Section):
         gt=0,
         le=1,
         description="weight of a dense residual against a feature's: neighbours are correlated",
+    )
+    dense_share: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="dense residuals and features are weighed by the spread that they show in each frame, the dense "
+        "with this share: they err together across the image too; 0: by dense_weight alone",
     )
     features: Literal["always", "needed"] = Field(
         default="always", description="match ORB features on every frame, or only when motion or residual is large"

@@ -116,7 +116,7 @@ def align(
     matches = None
     if features is not None and camera is not None:
         matches = (features.points, features.pixels, _intrinsics(camera))
-    T_camera_world, information, curvature, spread, cells = _native.align(
+    T_camera_world, information, curvature, spread, cells, *_ = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
         matches,
@@ -126,6 +126,7 @@ def align(
         config.dense_weight * _FULL_PIXELS / config.n_pixels,
         config.iterations,
         finest,
+        config.dense_share if photometric else 0.0,
     )
     return Alignment(inverse(T_camera_world), information, curvature, spread, cells)
 

@@ -105,10 +105,15 @@ class Cells {
            static_cast<int>(u * kAlignCellColumns / width);
   }
 
-  void add(int cell, const Vec6& g) {
+  void add(int cell, const Vec6& g, const Mat6& H) {
     for (int i = 0; i < 6; ++i) sums_[cell][i] += g[i];
+    for (int i = 0; i < 36; ++i) H_[cell][i] += H[i];
     used_[cell] = true;
   }
+
+  // How much larger the spread of the gradients is than the noise model says, which is 1 for independent residuals of
+  // the noise that it states. About the minimum of these residuals, wherever the pose is; 0 where there are too few.
+  double excess() const;
 
   void report(AlignResult& result) const {
     for (int c = 0; c < kCount; ++c) {
@@ -121,6 +126,7 @@ class Cells {
 
  private:
   std::array<Vec6, kCount> sums_{};
+  std::array<Mat6, kCount> H_{};
   std::array<bool, kCount> used_{};
 };
 
@@ -154,6 +160,34 @@ struct Normal {
   }
 };
 
+double Cells::excess() const {
+  Normal total;
+  int n = 0;
+  for (int c = 0; c < kCount; ++c) {
+    n += used_[c] ? 1 : 0;
+    for (int i = 0; i < 6; ++i) total.g[i] += sums_[c][i];
+    for (int i = 0; i < 36; ++i) total.H[i] += H_[c][i];
+  }
+  if (n < 2 * 6) return 0.0;
+  const Vec6 x = total.solve();
+  double excess = 0.0;
+  for (int i = 0; i < 6; ++i) {
+    double squares = 0.0;
+    for (int c = 0; c < kCount; ++c) {
+      double g = sums_[c][i];
+      for (int j = 0; j < 6; ++j) g += H_[c][6 * i + j] * x[j];
+      squares += g * g;
+    }
+    if (total.H[7 * i] > 0.0) excess += squares / total.H[7 * i] / 6.0;
+  }
+  return excess * n / (n - 6);
+}
+
+// What one residual of each kind weighs.
+struct Weights {
+  double dense, matches;
+};
+
 // One reference on one level, with that pair's own exposure (a, b).
 class DenseTerm {
  public:
@@ -161,7 +195,7 @@ class DenseTerm {
       : image_(image), points_(points), T_world_reference_(T_world_reference) {}
 
   // Add this term, exposure marginalised (Schur complement); remember how exposure would follow a step.
-  void add(std::span<const double, 16> T_camera_world, const AlignPlan& plan, Normal& total) {
+  void add(std::span<const double, 16> T_camera_world, const AlignPlan& plan, double weight, Normal& total) {
     const Mat4 T = multiply(T_camera_world, T_world_reference_);
     const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, plan.settings, {}, {});
     const double A00 = s.H[54] + kExposurePrior, A01 = s.H[55], A11 = s.H[63] + kExposurePrior;
@@ -176,14 +210,15 @@ class DenseTerm {
       const double c0 = coupling_[2 * i], c1 = coupling_[2 * i + 1];
       const double k0 = c0 * inverse_[0] + c1 * inverse_[1], k1 = c0 * inverse_[1] + c1 * inverse_[2];
       for (int j = 0; j < 6; ++j)
-        H_[6 * i + j] = plan.dense_weight * (s.H[8 * i + j] - k0 * coupling_[2 * j] - k1 * coupling_[2 * j + 1]);
-      total.g[i] += plan.dense_weight * (s.g[i] - k0 * residual_[0] - k1 * residual_[1]);
+        H_[6 * i + j] = weight * (s.H[8 * i + j] - k0 * coupling_[2 * j] - k1 * coupling_[2 * j + 1]);
+      total.g[i] += weight * (s.g[i] - k0 * residual_[0] - k1 * residual_[1]);
     }
     for (int i = 0; i < 36; ++i) total.H[i] += H_[i];
   }
 
   // Gradients of this term by cell, and its curvature, exposure marginalised as in `add`, which came before.
-  void scatter(std::span<const double, 16> T_camera_world, const AlignPlan& plan, Cells& cells, Mat6& curvature) const {
+  void scatter(std::span<const double, 16> T_camera_world, const AlignPlan& plan, double weight, Cells& cells,
+               Mat6& curvature) const {
     Mat6 H_geometric{};
     Curving of_photometric, of_geometric;
     const Mat4 T = multiply(T_camera_world, T_world_reference_);
@@ -207,18 +242,21 @@ class DenseTerm {
       of_photometric.add(r_photometric, plan.settings.nu);
       of_geometric.add(r_geometric, plan.settings.nu);
       Vec6 g{};
+      Mat6 H{};
       for (int i = 0; i < 6; ++i) {
         const double k0 = coupling_[2 * i] * inverse_[0] + coupling_[2 * i + 1] * inverse_[1];
         const double k1 = coupling_[2 * i] * inverse_[1] + coupling_[2 * i + 1] * inverse_[2];
-        g[i] = plan.dense_weight * (s.g[i] - k0 * s.g[6] - k1 * s.g[7]);
+        g[i] = weight * (s.g[i] - k0 * s.g[6] - k1 * s.g[7]);
+        for (int j = 0; j < 6; ++j)
+          H[6 * i + j] = weight * (s.H[8 * i + j] - k0 * s.H[8 * j + 6] - k1 * s.H[8 * j + 7]);
       }
-      cells.add(c, g);
+      cells.add(c, g, H);
     }
     AlignSettings geometric = plan.settings;
     geometric.use_photometric = false;
     const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, geometric, {}, {});
     for (int i = 0; i < 6; ++i)
-      for (int j = 0; j < 6; ++j) H_geometric[6 * i + j] = plan.dense_weight * s.H[8 * i + j];
+      for (int j = 0; j < 6; ++j) H_geometric[6 * i + j] = weight * s.H[8 * i + j];
     for (int i = 0; i < 36; ++i)
       curvature[i] += of_photometric.share() * (H_[i] - H_geometric[i]) + of_geometric.share() * H_geometric[i];
   }
@@ -279,8 +317,9 @@ void for_matches(const AlignMatches& m, std::span<const double, 16> T, Take take
   }
 }
 
-void add_matches(const AlignMatches& m, std::span<const double, 16> T, Normal& total) {
-  for_matches(m, T, [&](std::size_t, double w, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
+void add_matches(const AlignMatches& m, std::span<const double, 16> T, double weight, Normal& total) {
+  for_matches(m, T, [&](std::size_t, double robust, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
+    const double w = weight * robust;
     for (int a = 0; a < 6; ++a) {
       for (int b = 0; b < 6; ++b) total.H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
       total.g[a] += w * (Ju[a] * ru + Jv[a] * rv);
@@ -289,18 +328,22 @@ void add_matches(const AlignMatches& m, std::span<const double, 16> T, Normal& t
 }
 
 // The matches' pixels are of the full image, which is as wide as the finest level's, or a multiple of it.
-void scatter_matches(const AlignMatches& m, std::span<const double, 16> T, const AlignImage& finest, Cells& cells,
-                     Mat6& curvature) {
+void scatter_matches(const AlignMatches& m, std::span<const double, 16> T, const AlignImage& finest, double weight,
+                     Cells& cells, Mat6& curvature) {
   const double scale = m.fx / finest.fx;
   Mat6 H{};
   Curving curving;
-  for_matches(m, T, [&](std::size_t i, double w, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
+  for_matches(m, T, [&](std::size_t i, double robust, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
+    const double w = weight * robust;
     const int cell = Cells::of(m.pixels[2 * i], m.pixels[2 * i + 1], scale * finest.width, scale * finest.height);
     Vec6 g{};
-    for (int a = 0; a < 6; ++a) g[a] = w * (Ju[a] * ru + Jv[a] * rv);
-    if (cell >= 0) cells.add(cell, g);
-    for (int a = 0; a < 6; ++a)
-      for (int b = 0; b < 6; ++b) H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
+    Mat6 own{};
+    for (int a = 0; a < 6; ++a) {
+      g[a] = w * (Ju[a] * ru + Jv[a] * rv);
+      for (int b = 0; b < 6; ++b) own[6 * a + b] = w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
+    }
+    if (cell >= 0) cells.add(cell, g, own);
+    for (int a = 0; a < 36; ++a) H[a] += own[a];
     curving.add(std::hypot(ru, rv), 4.0);
   });
   for (int i = 0; i < 36; ++i) curvature[i] += curving.share() * H[i];
@@ -315,6 +358,37 @@ void add_prior(const AlignPrior& prior, std::span<const double, 16> T_camera_wor
       total.g[i] += prior.information[6 * i + j] * off[j];
     }
   }
+}
+
+// Gauss-Newton on one level.
+void descend(std::vector<DenseTerm>& terms, const AlignMatches& matches, const AlignPrior* prior, const AlignPlan& plan,
+             const Weights& weights, AlignResult& result) {
+  for (int iteration = 0; iteration < plan.iterations; ++iteration) {
+    Normal total;
+    for (DenseTerm& term : terms) term.add(result.T_camera_world, plan, weights.dense, total);
+    add_matches(matches, result.T_camera_world, weights.matches, total);
+    result.H = total.H;
+    if (prior != nullptr) add_prior(*prior, result.T_camera_world, total);
+    const Vec6 step = total.solve();
+    result.T_camera_world = multiply(se3_exp(step), result.T_camera_world);
+    for (DenseTerm& term : terms) term.follow(step);
+    if (std::all_of(step.begin(), step.end(), [](double s) { return std::abs(s) < kStepDone; })) break;
+  }
+}
+
+// However well residuals agree (a camera at rest before a still scene): the noise is no less than this share.
+constexpr double kLeastExcess = 0.05;
+
+// Weights by what the residuals of this frame show: the inverse of each kind's excess over its noise model.
+Weights adapted(const std::vector<DenseTerm>& terms, const AlignMatches& matches, const AlignImage& finest,
+                const AlignPlan& plan, const Weights& before, const AlignResult& result) {
+  Cells dense, sparse;
+  Mat6 unused{};
+  for (const DenseTerm& term : terms) term.scatter(result.T_camera_world, plan, 1.0, dense, unused);
+  scatter_matches(matches, result.T_camera_world, finest, 1.0, sparse, unused);
+  const double of_dense = dense.excess(), of_sparse = sparse.excess();
+  return {.dense = of_dense > 0.0 ? plan.dense_share / std::max(of_dense, kLeastExcess) : before.dense,
+          .matches = of_sparse > 0.0 ? 1.0 / std::max(of_sparse, kLeastExcess) : before.matches};
 }
 
 }  // namespace
@@ -378,29 +452,25 @@ AlignResult align(std::span<const AlignImage> levels, std::span<const AlignRefer
                   const AlignPlan& plan) {
   AlignResult result;
   std::copy(T_start.begin(), T_start.end(), result.T_camera_world.begin());
+  Weights weights{.dense = plan.dense_weight, .matches = 1.0};
   for (std::size_t level = levels.size(); level-- > plan.finest;) {
     std::vector<DenseTerm> terms;
     for (const AlignReference& reference : references) {
       terms.emplace_back(levels[level], reference.levels[level], reference.T_world_reference);
     }
-    for (int iteration = 0; iteration < plan.iterations; ++iteration) {
-      Normal total;
-      for (DenseTerm& term : terms) term.add(result.T_camera_world, plan, total);
-      add_matches(matches, result.T_camera_world, total);
-      result.H = total.H;
-      if (prior != nullptr) add_prior(*prior, result.T_camera_world, total);
-      const Vec6 step = total.solve();
-      result.T_camera_world = multiply(se3_exp(step), result.T_camera_world);
-      for (DenseTerm& term : terms) term.follow(step);
-      if (std::all_of(step.begin(), step.end(), [](double s) { return std::abs(s) < kStepDone; })) break;
+    descend(terms, matches, prior, plan, weights, result);
+    if (level > plan.finest) continue;
+    if (plan.dense_share > 0.0) {
+      weights = adapted(terms, matches, levels[level], plan, weights, result);
+      descend(terms, matches, prior, plan, weights, result);
     }
-    if (level == plan.finest) {
-      Cells cells;
-      for (const DenseTerm& term : terms) term.scatter(result.T_camera_world, plan, cells, result.curvature);
-      scatter_matches(matches, result.T_camera_world, levels[level], cells, result.curvature);
-      cells.report(result);
-    }
+    Cells cells;
+    for (const DenseTerm& term : terms) term.scatter(result.T_camera_world, plan, weights.dense, cells, result.curvature);
+    scatter_matches(matches, result.T_camera_world, levels[level], weights.matches, cells, result.curvature);
+    cells.report(result);
   }
+  result.dense_weight = weights.dense;
+  result.match_weight = weights.matches;
   return result;
 }
 

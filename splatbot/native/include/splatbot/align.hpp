@@ -75,6 +75,9 @@ struct AlignPlan {
   double dense_weight = 1.0;  // of a dense residual against a match's, whose σ is 1 px: neighbours are correlated
   int iterations = 5;         // per level, at most
   std::size_t finest = 0;     // level to end on
+  // On the last level both kinds are weighed by the spread that they show; the dense ones with this share of it, since
+  // they err together across cells too (a rolling shutter, depth registered late). 0: keep the weights.
+  double dense_share = 0.0;
 };
 
 struct AlignResult {
@@ -82,6 +85,7 @@ struct AlignResult {
   std::array<double, 36> H{};       // (6, 6) information of the last linearisation, the prior's left out
   std::array<double, 36> curvature{};  // (6, 6) of the robust cost: less than H by what outlying residuals do not curve
   std::array<double, 36> spread{};  // (6, 6) Σ g gᵀ over the cells of the image, g the gradient of a cell's residuals
+  double dense_weight = 0, match_weight = 0;  // of one residual, at the end
   std::size_t cells = 0;            // cells that have residuals
 };
 
