@@ -55,26 +55,38 @@ def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
     """Greedy: of the candidates on a grid inside, each as large as fits plus the slack, that which covers most is next.
 
     What no candidate covers is covered by balls of radius ``slack`` on the surface itself. Points of the surface stand
-    for a neighbourhood of a quarter of the slack, by which every ball is taken to be smaller.
+    for a neighbourhood of a quarter of the slack (their spacing and that of the cells they are thinned by), by which every ball
+    is taken to be smaller.
     """
-    spacing = slack / 4
-    left = shape.surface(spacing)
+    spacing = slack / 8
+    left = _thinned(shape.surface(spacing), spacing / 2)
     grid = _grid(left.min(axis=0), left.max(axis=0), slack)
     depth = shape.depth(grid)
     centers, radii = grid[depth > 0], depth[depth > 0] + slack
     found: list[tuple[Array, float]] = []
-    while len(left) and len(centers):
-        few = left[:: max(1, len(left) // 2000)]
-        gains = (np.linalg.norm(few[None] - centers[:, None], axis=2) <= (radii - spacing)[:, None]).sum(axis=1)
+    few = left[:: max(1, len(left) // 3000)]
+    covers = np.stack(
+        [np.linalg.norm(few - c, axis=1) <= r - 2 * spacing for c, r in zip(centers, radii, strict=True)]
+        or [np.zeros(len(few), bool)]
+    )
+    while (gains := covers.sum(axis=1)).max() > 0:
         best = int(gains.argmax())
-        if gains[best] == 0:
-            break
         found.append((centers[best], float(radii[best])))
-        left = left[np.linalg.norm(left - centers[best], axis=1) > radii[best] - spacing]
+        covers &= ~covers[best]
+    for center, radius in found:
+        left = left[np.linalg.norm(left - center, axis=1) > radius - 2 * spacing]
     while len(left):
         found.append((left[0], slack))
-        left = left[np.linalg.norm(left - left[0], axis=1) > slack - spacing]
+        left = left[np.linalg.norm(left - left[0], axis=1) > slack - 2 * spacing]
     return np.array([center for center, _ in found]), np.array([radius for _, radius in found])
+
+
+def _thinned(points: Array, cell: float) -> Array:
+    """One point (the first) of each cell [m] of a grid."""
+    at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    size = at.max(axis=0) + 1
+    _, first = np.unique((at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2], return_index=True)
+    return points[np.sort(first)]
 
 
 def _grid(low: Array, high: Array, slack: float) -> Array:

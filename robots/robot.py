@@ -59,7 +59,9 @@ class RobotModel:
         inertials: of the links 0..J, for the twin; empty where they are not known.
         gripper: fingers, or None.
         slack: how far the spheres may reach beyond the shapes [m].
-        allowed: pairs of links that may touch, beside neighbours and those that always do.
+        allowed: pairs of links that may touch, beside neighbours and those whose spheres meet at home.
+        covering: spheres of the links; None: generated from the shapes.
+        pairs: (M, 2) links that may not touch; None: found from the spheres.
 
     Raises:
         InputError: joints, home or shapes do not fit together.
@@ -74,6 +76,8 @@ class RobotModel:
     gripper: Gripper | None = field(default=None, repr=False)
     slack: float = SLACK
     allowed: tuple[tuple[int, int], ...] = ()
+    covering: LinkSpheres | None = field(default=None, repr=False)
+    pairs: NDArray[np.int32] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.home) != len(self.joints):
@@ -158,6 +162,8 @@ class RobotModel:
     @cached_property
     def self_collision_pairs(self) -> NDArray[np.int32]:
         """(M, 2) links that may not touch: all but neighbours, those allowed, and those whose spheres meet at home."""
+        if self.pairs is not None:
+            return self.pairs
         s = self.spheres()
         T = self.fk(self.home)[s.link]
         at = np.einsum("sij,sj->si", T[:, :3, :3], s.centers) + T[:, :3, 3]
@@ -196,7 +202,7 @@ class RobotModel:
 
     @cached_property
     def _link_spheres(self) -> LinkSpheres:
-        return _covered(self.shapes, self.slack)
+        return _covered(self.shapes, self.slack) if self.covering is None else self.covering
 
     @cached_property
     def _finger_spheres(self) -> LinkSpheres:

@@ -215,7 +215,7 @@ def run_floaters(plan: CollisionPlan, results: Results, scene: Tabletop, arm: Ro
     rng = np.random.default_rng(4)
     model = scene.gaussians(plan.reference if plan.quick else 50_000)
     count = len(model) // 100
-    air = rng.uniform([-0.7, -0.8, 0.0], [0.9, 0.9, 1.1], (20 * count, 3))
+    air = rng.uniform([0.25, -0.7, 0.0], [0.9, 0.8, 0.9], (20 * count, 3))
     air = air[scene.distance(air) > 0.03][:count]
     floaters = GaussianModel.from_activated(
         means=air,

@@ -26,6 +26,7 @@ COMMANDS = {
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
+    "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
     "bench raster": _Command(
         "splatbot.cli.bench_raster", "bench_raster", "Measure the rasterizer's speed, and what accuracy costs in time."
     ),

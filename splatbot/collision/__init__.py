@@ -1,19 +1,31 @@
 """Where the robot may not go, asked of the Gaussians themselves."""
 
 from splatbot.collision.answers import ClearanceResult, MahalanobisResult, NeighboursResult
+from splatbot.collision.bodies import boxes_in_collision, capsules_in_collision
+from splatbot.collision.esdf import Esdf, esdf
 from splatbot.collision.evidence import Evidence, gather_evidence
 from splatbot.collision.field import GaussianCollisionField
+from splatbot.collision.probability import ProbabilityResult, collision_probability
 from splatbot.collision.robot import ArmClearanceResult, ConfigurationResult, EdgeResult, RobotSpheres
+from splatbot.collision.unknown import UnknownSpace, find_unknown
 
 __all__ = [
     "ArmClearanceResult",
     "ClearanceResult",
     "ConfigurationResult",
     "EdgeResult",
+    "Esdf",
     "Evidence",
     "GaussianCollisionField",
     "MahalanobisResult",
     "NeighboursResult",
+    "ProbabilityResult",
     "RobotSpheres",
+    "UnknownSpace",
+    "boxes_in_collision",
+    "capsules_in_collision",
+    "collision_probability",
+    "esdf",
+    "find_unknown",
     "gather_evidence",
 ]

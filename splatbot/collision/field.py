@@ -145,6 +145,11 @@ class GaussianCollisionField:
         return len(self.native)
 
     @property
+    def rows(self) -> int:
+        """Number of Gaussians of the model, air included."""
+        return len(self._names)
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the ellipsoids, the tree, the grid and the table of rows."""
         return int(self.native.bytes) + self._rows.nbytes + self._names.nbytes

@@ -54,7 +54,7 @@ SB_INLINE bool touches(const SolidLeaf& leaf, const Split& p, float r) {
       return true;
     }
     const M close = near & (distance_bound<2>(l) <= set1(r));
-    if (bits(close) != 0 && bits(close & (distance_bound<7>(l) <= set1(r))) != 0) {
+    if (bits(close) != 0 && bits(close & (distance_bound<12>(l) <= set1(r))) != 0) {
       return true;
     }
   }

@@ -1,0 +1,111 @@
+"""Robots by name: the Panda, and those that were added from URDF files."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatbot.atomic import atomic_write
+from splatbot.errors import FormatError, InputError
+from splatbot.protocols import LinkSpheres
+from splatbot.robots.joints import Joint
+from splatbot.robots.panda import panda
+from splatbot.robots.robot import Inertial, RobotModel
+
+_FORMAT = "splatbot robot 1"
+
+
+def robots_folder() -> Path:
+    """Where added robots are kept: SPLATBOT_ROBOTS, else splatbot/robots in the user's data folder."""
+    chosen = os.environ.get("SPLATBOT_ROBOTS")
+    data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    return Path(chosen) if chosen else data / "splatbot" / "robots"
+
+
+def robot_names() -> list[str]:
+    """All robots there are."""
+    folder = robots_folder()
+    added = sorted(path.stem for path in folder.glob("*.json")) if folder.is_dir() else []
+    return ["panda", *(name for name in added if name != "panda")]
+
+
+def load_robot(name: str | Path) -> RobotModel:
+    """A robot by name, or from a file that :func:`save_robot` wrote.
+
+    Raises:
+        InputError: there is none of that name.
+        FormatError: its file is damaged.
+    """
+    if str(name) == "panda":
+        return panda()
+    path = Path(name) if str(name).endswith(".json") else robots_folder() / f"{name}.json"
+    if not path.is_file():
+        raise InputError(
+            f"there is no robot {str(name)!r}.",
+            field="robot",
+            hint=f"robots: {', '.join(robot_names())}; add one with `splatbot robot add FILE.urdf`",
+        )
+    return read_robot(path)
+
+
+def save_robot(robot: RobotModel, path: Path) -> None:
+    """Write joints, spheres and what else collision checks and planning need; not the shapes."""
+    spheres = robot.spheres()
+    document = {
+        "format": _FORMAT,
+        "name": robot.name,
+        "joints": [
+            {
+                "name": j.name,
+                "T_before_joint": j.T_before_joint.tolist(),
+                "limits": [j.lower, j.upper, j.velocity, j.acceleration, j.jerk, j.effort],
+                "prismatic": j.prismatic,
+            }
+            for j in robot.joints
+        ],
+        "T_link_tcp": robot.T_link_tcp.tolist(),
+        "home": robot.home.tolist(),
+        "slack": robot.slack,
+        "inertials": [[i.mass, list(i.center), i.inertia.tolist()] for i in robot.inertials],
+        "pairs": robot.self_collision_pairs.tolist(),
+        "spheres": np.c_[spheres.link, spheres.centers, spheres.radii].tolist(),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as file:
+        file.write(json.dumps(document, indent=1).encode())
+
+
+def read_robot(path: Path) -> RobotModel:
+    """A robot that :func:`save_robot` wrote.
+
+    Raises:
+        FormatError: the file is missing or damaged.
+    """
+    try:
+        d: dict[str, Any] = json.loads(path.read_text())
+        if d["format"] != _FORMAT:
+            raise ValueError(f"format {d['format']!r}")
+        spheres = np.array(d["spheres"], dtype=np.float64).reshape(-1, 5)
+        return RobotModel(
+            name=str(d["name"]),
+            joints=tuple(_joint(j) for j in d["joints"]),
+            shapes=(),
+            T_link_tcp=np.array(d["T_link_tcp"], dtype=np.float64),
+            home=np.array(d["home"], dtype=np.float64),
+            inertials=tuple(Inertial(float(m), tuple(c), np.array(i)) for m, c, i in d["inertials"]),
+            slack=float(d["slack"]),
+            covering=LinkSpheres(spheres[:, 0].astype(np.int32), np.ascontiguousarray(spheres[:, 1:4]), spheres[:, 4]),
+            pairs=np.array(d["pairs"], dtype=np.int32).reshape(-1, 2),
+        )
+    except (OSError, ValueError, KeyError, TypeError, InputError) as error:
+        raise FormatError(f"is no robot ({error}).", file=path, hint="add it again: splatbot robot add") from error
+
+
+def _joint(j: dict[str, Any]) -> Joint:
+    lower, upper, velocity, acceleration, jerk, effort = (float(x) for x in j["limits"])
+    T = np.array(j["T_before_joint"], dtype=np.float64).reshape(4, 4)
+    return Joint(str(j["name"]), T, lower, upper, velocity, acceleration, jerk, effort, bool(j["prismatic"]))

@@ -1,0 +1,306 @@
+"""An arm from a URDF file."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from splatbot.errors import FormatError, InputError
+from splatbot.geometry import so3_exp, transform_points
+from splatbot.protocols import Array
+from splatbot.robots.joints import Joint
+from splatbot.robots.robot import SLACK, Inertial, RobotModel
+from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
+
+_MOVING = ("revolute", "continuous", "prismatic")
+# A URDF has no limits of acceleration and jerk, and often none of velocity.
+VELOCITY, ACCELERATION_PER_VELOCITY, JERK_PER_VELOCITY = 1.0, 5.0, 50.0  # [rad/s or m/s], [1/s], [1/s²]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What came of a file: the robot, and what was assumed for want of it."""
+
+    robot: RobotModel
+    notes: tuple[str, ...]
+
+
+def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = SLACK) -> Reading:
+    """The serial arm from the root to ``tip`` (by default the link with most moving joints before it).
+
+    Fixed links belong to the arm's link that carries them; moving joints off the arm (fingers) are held at 0, or at the
+    limit nearest to it. Collision geometry is taken where a link has any, else what is visible.
+
+    Raises:
+        FormatError: the file is no URDF, has no moving joint, or an element cannot be used (it is named).
+    """
+    file = Path(path)
+    try:
+        root = ElementTree.parse(file).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise FormatError(
+            f"cannot be read ({error}).", file=file, hint="give a URDF file; expand a xacro first"
+        ) from error
+    if root.tag != "robot":
+        raise FormatError(f"its root is <{root.tag}>.", file=file, hint="give a URDF file, whose root is <robot>")
+    return _Reader(file, root, slack).read(tip)
+
+
+class _Reader:
+    def __init__(self, file: Path, root: ElementTree.Element, slack: float) -> None:
+        self.file, self.root, self.slack = file, root, slack
+        self.links = {self._name(e): e for e in root.findall("link")}
+        self.joint_to = {self._link(e, "child"): e for e in root.findall("joint")}
+        self.notes: list[str] = []
+
+    def read(self, tip: str | None) -> Reading:
+        if tip is not None and tip not in self.links:
+            raise FormatError(f"there is no link {tip!r}.", file=self.file, hint=f"links: {', '.join(self.links)}")
+        end = tip or max(self.links, key=lambda link: (self._moving_before(link), -len(self._path(link))))
+        arm = [e for e in self._path(end) if e.get("type") in _MOVING]
+        if not arm:
+            raise FormatError("has no moving joint.", file=self.file, field=end, hint="name another link with tip")
+        joints: list[Joint] = []
+        placed: dict[str, tuple[int, Array]] = {
+            link: (0, np.eye(4)) for link in self.links if link not in self.joint_to
+        }
+        if len(placed) != 1:
+            raise FormatError(f"has {len(placed)} root links.", file=self.file, hint="a URDF has one")
+        left = dict(self.joint_to)
+        while ready := [child for child, joint in left.items() if self._link(joint, "parent") in placed]:
+            for child in ready:
+                joint = left.pop(child)
+                k, T = placed[self._link(joint, "parent")]
+                T = T @ _origin(joint)
+                if joint not in arm:
+                    placed[child] = (k, T @ self._held(joint))
+                    continue
+                turn = np.eye(4)
+                turn[:3, :3] = _z_to(self._axis(joint))
+                joints.append(self._joint(joint, T @ turn))
+                placed[child] = (k + 1, turn.T)
+        if left:
+            raise FormatError("has links in a circle.", file=self.file, field=next(iter(left)), hint="a URDF is a tree")
+        shapes = [shape for link, (k, T) in placed.items() for shape in self._shapes(link, k, T)]
+        lower, upper = np.array([j.lower for j in joints]), np.array([j.upper for j in joints])
+        robot = RobotModel(
+            name=self.root.get("name") or self.file.stem,
+            joints=tuple(joints),
+            shapes=tuple(shapes),
+            T_link_tcp=placed[end][1],
+            home=np.clip(np.zeros(len(joints)), lower, upper),
+            inertials=self._inertials(len(joints), placed),
+            slack=self.slack,
+        )
+        return Reading(robot, tuple(self.notes))
+
+    def _path(self, link: str) -> list[ElementTree.Element]:
+        found: list[ElementTree.Element] = []
+        while link in self.joint_to and len(found) <= len(self.joint_to):
+            found.append(self.joint_to[link])
+            link = self._link(found[-1], "parent")
+        return found[::-1]
+
+    def _moving_before(self, link: str) -> int:
+        return sum(e.get("type") in _MOVING for e in self._path(link))
+
+    def _joint(self, e: ElementTree.Element, T: Array) -> Joint:
+        name, limit = self._name(e), e.find("limit")
+        values = {key: _number(limit.get(key)) if limit is not None else None for key in ("velocity", "effort")}
+        low, high = (_number(limit.get(key)) if limit is not None else None for key in ("lower", "upper"))
+        if e.get("type") == "continuous":
+            low, high = -2 * np.pi, 2 * np.pi
+            self.notes.append(f"{name} turns without end: limited to two turns")
+        if low is None or high is None:
+            raise FormatError("has no limits of position.", file=self.file, field=name, hint="add lower and upper")
+        velocity = values["velocity"] or 0.0
+        if velocity <= 0:
+            velocity = VELOCITY
+            self.notes.append(f"{name} has no limit of velocity: {VELOCITY:g} per second is assumed")
+        try:
+            return Joint(
+                name=name,
+                T_before_joint=T,
+                lower=low,
+                upper=high,
+                velocity=velocity,
+                acceleration=ACCELERATION_PER_VELOCITY * velocity,
+                jerk=JERK_PER_VELOCITY * velocity,
+                effort=values["effort"] or 0.0,
+                prismatic=e.get("type") == "prismatic",
+            )
+        except InputError as error:
+            raise FormatError(error.message, file=self.file, field=name, hint=error.hint) from error
+
+    def _held(self, e: ElementTree.Element) -> Array:
+        """Where a joint off the arm is held."""
+        T = np.eye(4)
+        if e.get("type") not in _MOVING:
+            return T
+        limit = e.find("limit")
+        low, high = (_number(limit.get(key)) if limit is not None else None for key in ("lower", "upper"))
+        at = float(np.clip(0.0, low if low is not None else -np.inf, high if high is not None else np.inf))
+        self.notes.append(f"{self._name(e)} is not on the arm: held at {at:g}")
+        if e.get("type") == "prismatic":
+            T[:3, 3] = at * self._axis(e)
+        else:
+            T[:3, :3] = so3_exp(at * self._axis(e))
+        return T
+
+    def _axis(self, e: ElementTree.Element) -> Array:
+        found = e.find("axis")
+        axis = _vector(found.get("xyz") if found is not None else None, (1.0, 0.0, 0.0))
+        if not np.linalg.norm(axis) > 0:
+            raise FormatError("has an axis of no length.", file=self.file, field=self._name(e), hint="give a direction")
+        return np.asarray(axis / np.linalg.norm(axis))
+
+    def _shapes(self, link: str, k: int, T: Array) -> list[Shape]:
+        elements = self.links[link].findall("collision") or self.links[link].findall("visual")
+        return [self._shape(e, link, k, T @ _origin(e)) for e in elements]
+
+    def _shape(self, e: ElementTree.Element, link: str, k: int, T: Array) -> Shape:
+        kind = next(iter(e.find("geometry") or []), None)
+        if kind is None:
+            raise FormatError("has no geometry.", file=self.file, field=link, hint="remove the element, or fill it")
+        if kind.tag == "sphere":
+            at = (float(T[0, 3]), float(T[1, 3]), float(T[2, 3]))
+            return Capsule(k, at, at, self._size(kind, "radius", link))
+        if kind.tag == "cylinder":
+            return _cylinder(k, T, self._size(kind, "radius", link), self._size(kind, "length", link))
+        if kind.tag == "box":
+            x, y, z = _vector(kind.get("size"), (0.0, 0.0, 0.0))
+            return Box(k, T, (float(x), float(y), float(z)))
+        if kind.tag == "mesh":
+            return self._mesh(kind, link, k, T)
+        raise FormatError(
+            f"has a <{kind.tag}>.", file=self.file, field=link, hint="use spheres, cylinders, boxes, meshes"
+        )
+
+    def _mesh(self, e: ElementTree.Element, link: str, k: int, T: Array) -> Mesh:
+        path = self._resolve(e.get("filename") or "", link)
+        mesh = o3d.io.read_triangle_mesh(path)
+        if not len(mesh.triangles):
+            raise FormatError("holds no triangles that can be read.", file=path, hint="give an STL or OBJ file")
+        mesh.merge_close_vertices(1e-9)
+        if not mesh.is_watertight():
+            mesh, _ = mesh.compute_convex_hull()
+            self.notes.append(f"{link}: {path.name} is not closed, its convex hull is taken")
+        scale = _vector(e.get("scale"), (1.0, 1.0, 1.0))
+        return Mesh(k, transform_points(T, np.asarray(mesh.vertices) * scale), np.asarray(mesh.triangles, np.int64))
+
+    def _resolve(self, name: str, link: str) -> Path:
+        """A mesh beside the URDF, or of a package:// whose folder is above it."""
+        if not name.startswith("package://"):
+            found = (self.file.parent / name.removeprefix("file://")).resolve()
+        else:
+            package, _, rest = name.removeprefix("package://").partition("/")
+            above = [folder for folder in self.file.resolve().parents if folder.name == package]
+            beside = [folder / package for folder in self.file.resolve().parents if (folder / package).is_dir()]
+            folders = (*above, *beside, *self.file.resolve().parents)  # some packages were renamed since
+            found = next((f / rest for f in folders if (f / rest).exists()), Path(name))
+        if not found.exists():
+            raise FormatError(
+                f"{name} is not there.", file=self.file, field=link, hint="keep the meshes beside the file"
+            )
+        return found
+
+    def _inertials(self, joints: int, placed: dict[str, tuple[int, Array]]) -> tuple[Inertial, ...]:
+        """Of the arm's links, each with what is fixed to it; empty if a moving one has none."""
+        mass, first, second = np.zeros(joints + 1), np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3, 3))
+        for link, (k, T_link) in placed.items():
+            e = self.links[link].find("inertial")
+            m = _number(e.find("mass").get("value")) if e is not None and e.find("mass") is not None else None  # type: ignore[union-attr]
+            if e is None or not m:
+                continue
+            T, values = T_link @ _origin(e), e.find("inertia")
+            ixx, iyy, izz, ixy, ixz, iyz = (
+                float(values.get(key, "0")) if values is not None else 0.0
+                for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+            )
+            own = T[:3, :3] @ np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ T[:3, :3].T
+            c = T[:3, 3]
+            mass[k] += m
+            first[k] += m * c
+            second[k] += own + m * (c @ c * np.eye(3) - np.outer(c, c))
+        if (mass[1:] <= 0).any():
+            self.notes.append("some moving links have no mass: the twin cannot be built from it")
+            return ()
+        found = []
+        for m, moment, inertia in zip(mass, first, second, strict=True):
+            c = moment / m if m > 0 else np.zeros(3)
+            about = inertia - m * (c @ c * np.eye(3) - np.outer(c, c))
+            found.append(Inertial(float(m), (float(c[0]), float(c[1]), float(c[2])), about))
+        return tuple(found)
+
+    def _size(self, e: ElementTree.Element, key: str, link: str) -> float:
+        value = _number(e.get(key))
+        if value is None or not value > 0:
+            raise FormatError(
+                f"<{e.tag}> has {key} {e.get(key)!r}.", file=self.file, field=link, hint="give metres above 0"
+            )
+        return value
+
+    def _name(self, e: ElementTree.Element) -> str:
+        name = e.get("name")
+        if not name:
+            raise FormatError(f"a <{e.tag}> has no name.", file=self.file, hint="name it")
+        return name
+
+    def _link(self, joint: ElementTree.Element, end: str) -> str:
+        e = joint.find(end)
+        name = e.get("link") if e is not None else None
+        if name is None or name not in self.links:
+            raise FormatError(f"its {end} is {name!r}.", file=self.file, field=self._name(joint), hint="name a link")
+        return name
+
+
+def _cylinder(k: int, T: Array, radius: float, length: float) -> Shape:
+    """A box where it is flatter than a capsule could be; else the capsule around it would be too long by its caps."""
+    ends = transform_points(T, np.array([[0, 0, -length / 2], [0, 0, length / 2]]))
+    start, end = ends
+    if length <= 2 * radius:
+        return Box(k, T, (2 * radius, 2 * radius, length))
+    return Capsule(k, (start[0], start[1], start[2]), (end[0], end[1], end[2]), radius)
+
+
+def _origin(e: ElementTree.Element) -> Array:
+    """The pose (4, 4) of an element: fixed-axis roll, pitch, yaw."""
+    found = e.find("origin")
+    T = np.eye(4)
+    if found is not None:
+        roll, pitch, yaw = _vector(found.get("rpy"), (0.0, 0.0, 0.0))
+        T[:3, :3] = so3_exp([0, 0, yaw]) @ so3_exp([0, pitch, 0]) @ so3_exp([roll, 0, 0])
+        T[:3, 3] = _vector(found.get("xyz"), (0.0, 0.0, 0.0))
+    return T
+
+
+def _z_to(axis: Array) -> Array:
+    """A rotation (3, 3) that takes z to a unit vector, the shortest way."""
+    c = float(axis[2])
+    if c < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    v = np.cross([0.0, 0.0, 1.0], axis)
+    s = float(np.linalg.norm(v))
+    return so3_exp(v / s * np.arctan2(s, c)) if s > 0 else np.eye(3)
+
+
+def _vector(text: str | None, default: Sequence[float]) -> Array:
+    if text is None:
+        return np.asarray(default, dtype=np.float64)
+    values = [_number(word) for word in text.split()]
+    if len(values) != 3 or any(v is None for v in values):
+        raise FormatError(f"is {text!r}.", field="xyz, rpy, size or scale", hint="give three numbers")
+    return np.array(values, dtype=np.float64)
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        value = float(text) if text is not None else None
+    except ValueError:
+        return None
+    return value if value is not None and np.isfinite(value) else None

@@ -1,0 +1,36 @@
+"""`splatbot robot`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.unit.cli.conftest import RunCommand
+from tests.unit.robots.test_urdf import ur5
+
+
+def test_a_robot_is_added_checked_listed_and_described(
+    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPLATBOT_ROBOTS", str(tmp_path / "robots"))
+    added = run("robot", "add", ur5(tmp_path))
+    assert added.code == 0
+    assert "ur5: 6 joints" in added.out
+    assert "all of it is inside" in added.out
+    assert run("robot", "list").out.split() == ["panda", "ur5"]
+    assert "shoulder_pan" in run("robot", "info", "ur5").out
+    refused = run("robot", "mjcf", "ur5")
+    assert refused.code == 2
+    assert "has no inertias" in refused.err
+
+
+def test_the_panda_is_written_for_mujoco(run: RunCommand, tmp_path: Path) -> None:
+    assert run("robot", "mjcf", "panda", "--out", tmp_path / "panda.xml").code == 0
+    assert "panda_joint7" in (tmp_path / "panda.xml").read_text()
+
+
+def test_a_robot_that_is_not_there_is_named(run: RunCommand) -> None:
+    answer = run("robot", "info", "nobody")
+    assert answer.code == 2
+    assert "there is no robot 'nobody'" in answer.err
