@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.config import Config
+from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
+from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.motion import JointMotion
+from splatbot.mapping.worker import MappingWorker
 from splatbot.tracking.health import Verdict
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from splatbot.tracking.tracker import PoseEstimate, Tracker
@@ -28,6 +35,8 @@ class FrameResult:
         stage_ms: milliseconds by stage.
         keyframe: whether the frame entered the map.
         gaussians: size of the map afterwards.
+        skipped: tracking stages that there was no time for.
+        covariance: (6, 6) of the pose, see :attr:`splatbot.tracking.estimate.PoseEstimate.covariance`; None when lost.
     """
 
     index: int
@@ -39,34 +48,52 @@ class FrameResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
     keyframe: bool = False
     gaussians: int = 0
+    skipped: tuple[str, ...] = ()
+    covariance: NDArray[np.float64] | None = None
 
 
 class Slam:
     """Tracks and maps a stream; ``results`` holds one entry per processed frame.
 
-    Everything runs in the calling thread in a fixed order, so the same frames give the same map, bit for bit.
+    Everything runs in the calling thread in a fixed order, so the same frames give the same map, bit for bit; unless
+    ``config.mapping.threaded``: then a thread maps while the caller's tracks; :meth:`close` or :meth:`finish` ends it.
     """
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
         self.results: list[FrameResult] = []
         self._tracker = Tracker(self.config.tracking)
-        self._mapper = Mapper(self.config)
+        mapper = Mapper(self.config)
+        self._mapper = MappingWorker(mapper) if self.config.mapping.threaded else mapper
+        self._looked = -math.inf
+        self._size: tuple[int, int] | None = None
+        self._growing = True
+        self._motion = JointMotion(self.config.mapping.still)
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """Track ``frame`` and, unless ``hold_out``, fuse it. Never raises for a frame that cannot be tracked.
 
         A frame held out before the map has begun is lost: there is no world yet to place it in.
+
+        Raises:
+            InputError: the frame is of another size than those before; the map is as it was.
         """
+        self._check_size(frame)
         start = time.perf_counter()
+        if self._growing and self._mapper.has_loop:
+            self._close_loops()
         prepared = prepare(frame, self.config.tracking)
         prepared_at = time.perf_counter()
         estimate = self._track(prepared, hold_out)
         tracked_at = time.perf_counter()
+        if self._growing:
+            self._mapper.hold(self._motion.update(frame.stamp, frame.joints))
         placed = estimate.verdict != "lost"
-        keyframe = placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
+        keyframe = self._growing and placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
         if keyframe:
             self._map(prepared, estimate)
+        elif self._growing and estimate.verdict == "ok" and not hold_out and self._looks(frame.stamp):
+            self._mapper.look(prepared, estimate.T_world_camera)
         stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
         stage_ms["mapping"] = 1e3 * (time.perf_counter() - tracked_at)
         result = FrameResult(
@@ -78,26 +105,104 @@ class Slam:
             stage=estimate.stage,
             stage_ms=stage_ms,
             keyframe=keyframe,
-            gaussians=len(self._mapper.model),
+            gaussians=self._mapper.size,
+            skipped=estimate.skipped,
+            covariance=estimate.covariance if placed else None,
         )
         self.results.append(result)
         return result
 
     def finish(self) -> None:
         """Spend the last refinement on the map once the stream has ended."""
-        self._mapper.finish()
+        if self._growing:
+            self._mapper.finish()
+        else:
+            self._mapper.close()
+
+    def localise_only(self) -> None:
+        """From here on frames are placed in the map as it is, which nothing changes; the next may be anywhere in it.
+
+        ``results`` begins anew, and the world stays the map's.
+
+        Raises:
+            InputError: there is no map yet.
+        """
+        if not self._mapper.keyframes:
+            raise InputError("the map has no keyframes.", field="map", hint="map a log first")
+        self._growing = False
+        self._size = None
+        self.results = []
+        self._tracker.forget()
+
+    def close(self) -> None:
+        """End the mapping thread, if there is one, once what has been handed to it is in the map."""
+        self._mapper.close()
+
+    def paused(self) -> AbstractContextManager[None]:
+        """A block in which nothing changes: what has been handed to a mapping thread is in the map, and it waits."""
+        return self._mapper.paused()
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """Bytes held: "gaussians_bytes" (bookkeeping included), "optimiser_bytes", "keyframe_images_bytes" and
+        "keyframe_tracking_bytes" (features, sampled pixels).
+        """
+        return self._mapper.memory
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """How many places were recognised ("closed"), and how many only looked like it ("rejected")."""
+        return self._mapper.loop_counts
+
+    @property
+    def keyframes(self) -> Sequence[Keyframe]:
+        """What frames are tracked against."""
+        return self._mapper.keyframes
 
     def snapshot(self) -> Snapshot:
         """The map as it is now, immutable."""
         return self._mapper.snapshot()
 
+    def _check_size(self, frame: Frame) -> None:
+        size = frame.camera.width, frame.camera.height
+        self._size = self._size or size
+        if size != self._size:
+            raise InputError(
+                f"is {size[0]} x {size[1]}, frames before are {self._size[0]} x {self._size[1]}.",
+                file=frame.source or f"frame {frame.index}",
+                field="image size",
+                hint="map recordings of different sizes by themselves",
+            )
+
     def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
-        if self._mapper.keyframes:
-            return self._tracker.track(prepared, self._mapper.keyframes)
+        keyframes = self._mapper.keyframes
+        if keyframes:
+            return self._tracker.track(prepared, keyframes)
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
 
+    def _close_loops(self) -> None:
+        """Move the map's pieces where the loops want them, and with them the poses found so far and the tracker."""
+        with self._mapper.paused():
+            correction = self._mapper.close_loops()
+        number, moved = -1, []
+        for result in self.results:
+            number += result.keyframe
+            T, known = result.T_world_camera, correction.get(number)
+            moved.append(result if T is None or known is None else replace(result, T_world_camera=known @ T))
+        self.results = moved
+        if number in correction:
+            self._tracker.move(correction[number])
+
+    def _looks(self, stamp: float) -> bool:
+        """Whether it is time to look at a frame that is no keyframe."""
+        if 0 <= stamp - self._looked < self.config.mapping.look_every:
+            return False
+        self._looked = stamp
+        return True
+
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)
+        self._tracker.remember(features, estimate)
         self._mapper.insert(prepared, estimate.T_world_camera, features)

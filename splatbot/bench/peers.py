@@ -56,7 +56,8 @@ def _gsplat() -> Peer:
     name = "gsplat torch reference"
     if importlib.util.find_spec("gsplat") is None:
         return Peer(name, "absent: gsplat is not installed (pip install gsplat)", None)
-    return Peer(name, "gsplat's own _torch_impl", gsplat_render)
+    note = "gsplat's own projection in torch; its blending needs its CUDA extension, so tiles are blended as by torch"
+    return Peer(name, note, gsplat_render)
 
 
 def scalar_render(scene: SplatScene, width: int, height: int, grad: Tensor | None) -> PeerRender:
@@ -75,17 +76,32 @@ def scalar_render(scene: SplatScene, width: int, height: int, grad: Tensor | Non
     return PeerRender(image, alpha, gradients if grad is not None else {})
 
 
-def torch_render(scene: SplatScene, width: int, height: int, grad: Tensor | None) -> PeerRender:
+@dataclass(frozen=True)
+class Projection:
+    """Centres (N, 2), inverse covariances (N, 2, 2), extents in x and y (N, 2) [px], depths (N,)."""
+
+    mean2d: Tensor
+    conic: Tensor
+    radius: Tensor
+    depth: Tensor
+
+
+def torch_render(
+    scene: SplatScene,
+    width: int,
+    height: int,
+    grad: Tensor | None,
+    project: Callable[..., Projection] | None = None,
+) -> PeerRender:
     """Through torch's float32 operations. A tile is differentiated as soon as it is rendered, which bounds memory."""
     leaves = [t.detach().clone().requires_grad_(grad is not None) for t in scene.tensors()]
     means, quats, scales, opacities, colors = leaves
     with torch.set_grad_enabled(grad is not None):
-        mean2d, covar2d, depth = _project(scene, means, quats, scales, width, height)
-        conic = torch.linalg.inv(covar2d)
+        found = (project or _project)(scene, means, quats, scales, width, height)
+    mean2d, conic, depth = found.mean2d, found.conic, found.depth
     cut = [t.detach().requires_grad_(grad is not None) for t in (mean2d, conic, opacities, colors)]
     image, alpha = torch.zeros(height, width, 3), torch.zeros(height, width)
-    radius = torch.ceil(MAX_SIGMAS * covar2d.detach().diagonal(dim1=-2, dim2=-1).sqrt())
-    low, high = (mean2d.detach() - radius).floor(), (mean2d.detach() + radius).ceil()
+    low, high = (mean2d.detach() - found.radius).floor(), (mean2d.detach() + found.radius).ceil()
     order = torch.argsort(depth.detach(), stable=True)
     order = order[(depth.detach() >= 0.01)[order]]
     for y in range(0, height, TILE):
@@ -98,40 +114,35 @@ def torch_render(scene: SplatScene, width: int, height: int, grad: Tensor | None
     if grad is None:
         return PeerRender(image, alpha, {})
     torch.autograd.backward([mean2d, conic], [_grad(cut[0]), _grad(cut[1])])
-    found = [_grad(t) for t in (means, quats, scales)] + [_grad(cut[2]), _grad(cut[3])]
-    return PeerRender(image, alpha, dict(zip(NAMES, found, strict=True)))
+    gradients = [_grad(t) for t in (means, quats, scales)] + [_grad(cut[2]), _grad(cut[3])]
+    return PeerRender(image, alpha, dict(zip(NAMES, gradients, strict=True)))
 
 
 def gsplat_render(scene: SplatScene, width: int, height: int, grad: Tensor | None) -> PeerRender:
-    """Through gsplat's torch reference (gsplat.cuda._torch_impl), as far as it runs without a GPU."""
+    """Projected by gsplat's torch reference and differentiated through it, blended as in :func:`torch_render`."""
+    return torch_render(scene, width, height, grad, _gsplat_project)
+
+
+def _gsplat_project(
+    scene: SplatScene, means: Tensor, quats: Tensor, scales: Tensor, width: int, height: int
+) -> Projection:
     impl = importlib.import_module("gsplat.cuda._torch_impl")
-    leaves = [t.detach().clone().requires_grad_(grad is not None) for t in scene.tensors()]
-    means, quats, scales, opacities, colors = leaves
     covars, _ = impl._quat_scale_to_covar_preci(quats, scales, True, False, False)
     K = scene.intrinsics(width, height)
     radii, means2d, depths, conics, _ = impl._fully_fused_projection(
         means, covars, scene.viewmat[None], K, width, height
     )
-    columns, rows = -(-width // TILE), -(-height // TILE)
-    _, isect_ids, flatten_ids = impl._isect_tiles(means2d, radii, depths, TILE, columns, rows)
-    offsets = impl._isect_offset_encode(isect_ids, 1, columns, rows)
-    image, alpha = impl._rasterize_to_pixels(
-        means2d, conics, colors[None], opacities[None], width, height, TILE, offsets, flatten_ids
-    )
-    if grad is not None:
-        image.backward(grad[None])
-    gradients = {} if grad is None else dict(zip(NAMES, map(_grad, leaves), strict=True))
-    return PeerRender(image[0].detach(), alpha[0, ..., 0].detach(), gradients)
+    xx, xy, yy = conics[0].unbind(-1)
+    conic = torch.stack([xx, xy, xy, yy], -1).reshape(-1, 2, 2)
+    return Projection(means2d[0], conic, radii[0].float(), depths[0])
 
 
 def _grad(tensor: Tensor) -> Tensor:
     return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
 
 
-def _project(
-    scene: SplatScene, means: Tensor, quats: Tensor, scales: Tensor, width: int, height: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """2D means (N, 2) and covariances (N, 2, 2), depths (N,) (Zwicker et al. 2001)."""
+def _project(scene: SplatScene, means: Tensor, quats: Tensor, scales: Tensor, width: int, height: int) -> Projection:
+    """EWA projection (Zwicker et al. 2001)."""
     K = scene.intrinsics(width, height)[0]
     fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     R, t = scene.viewmat[:3, :3], scene.viewmat[:3, 3]
@@ -148,7 +159,9 @@ def _project(
     rows += [2 * (x * v - w * y), 2 * (y * v + w * x), 1 - 2 * (x * x + y * y)]
     M = J @ R @ (torch.stack(rows, -1).reshape(-1, 3, 3) * scales[:, None])
     covar = M @ M.mT + EPS2D * torch.eye(2)
-    return torch.stack([fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy], -1), covar, p[:, 2]
+    mean2d = torch.stack([fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy], -1)
+    radius = torch.ceil(MAX_SIGMAS * covar.detach().diagonal(dim1=-2, dim2=-1).sqrt())
+    return Projection(mean2d, torch.linalg.inv(covar), radius, p[:, 2])
 
 
 def _tile(

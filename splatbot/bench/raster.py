@@ -19,8 +19,10 @@ from splatbot.bench.results import Results
 from splatbot.bench.scenes import SplatScene, from_file, random_box, surface_map
 from splatbot.bench.sweeps import run_growth, run_sweeps
 from splatbot.bench.timing import Timing, measure, peak_memory, threads
+from splatbot.bench.variants import run_variants
 from splatbot.optimize.losses import l1_dssim
 from splatbot.rasterize import rasterization
+from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.work import RasterWork, raster_work
 
 # Floating-point operations of a (Gaussian, pixel) pair with RGB and depth, counted in the algorithm.
@@ -40,6 +42,7 @@ class RasterPlan:
         peers: measure other implementations too, at the first size.
         splat: a map or splat file to render besides the built-in scenes.
         quick: tiny scenes: whether it runs, not how fast.
+        variants: compile the core with other constants and measure that too (minutes).
     """
 
     sizes: tuple[tuple[int, int], ...] = ((320, 240), (640, 480), (1280, 720))
@@ -49,12 +52,13 @@ class RasterPlan:
     peers: bool = False
     splat: Path | None = None
     quick: bool = False
+    variants: bool = False
     say: Say = field(default=lambda text: None)
 
     @classmethod
     def quick_plan(cls, *, peers: bool = False, splat: Path | None = None, say: Say = lambda text: None) -> RasterPlan:
         """A run of seconds."""
-        return cls(((32, 24),), (1, 2), 2, 0.1, peers, splat, True, say)
+        return cls(((32, 24),), (1, 2), 2, 0.1, peers, splat, quick=True, say=say)
 
     def scenes(self) -> list[SplatScene]:
         """The surface map, random boxes, and the given file."""
@@ -100,6 +104,8 @@ def run_raster(plan: RasterPlan, out: Path) -> Results:
     if plan.peers:
         with threads(1):  # as the peers
             run_peers(plan, results)
+    if plan.variants:
+        run_variants(results, threads=max(plan.thread_counts), say=plan.say)
     results.write_json(out / "raster.json")
     results.write_csv(out / "raster.csv")
     plot_sweeps(results, out)
@@ -163,11 +169,11 @@ class Passes:
         with torch.no_grad():
             return rasterization(**self._plain)[0]
 
-    def forward_backward(self) -> RasterWork:
+    def forward_backward(self) -> RenderMeta:
         """Gradients to all five tensors."""
         image, _, meta = rasterization(**(self._plain | self._leaves))
         torch.autograd.grad(image, tuple(self._leaves.values()), self.upstream)
-        return raster_work(meta)[0]
+        return meta
 
     def pose_backward(self) -> Tensor:
         """The gradient to the view matrix alone."""
@@ -186,7 +192,7 @@ class Passes:
 
     def best_work(self, runs: int) -> RasterWork:
         """Each stage's least time over a few runs."""
-        works = [self.forward_backward() for _ in range(runs)]
+        works = [raster_work(self.forward_backward())[0] for _ in range(runs)]
         stages = [name for name in RasterWork.__dataclass_fields__ if name.endswith("_ms")]
         return RasterWork(
             **{name: min(getattr(work, name) for work in works) for name in stages},

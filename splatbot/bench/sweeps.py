@@ -82,12 +82,7 @@ def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
 
 def _sweep_instruction_sets(results: Results, *, runs: int, budget_s: float, quick: bool) -> None:
     """Each has its own exponential (a table and degree 2 in AVX-512, degree 5 elsewhere) and its own rounding."""
-    size = (24, 16) if quick else (96, 64)
-    scene = random_box(200 if quick else 2000, shrink=3.0)
-    arguments = _detached(scene, size)
-    doubled: dict[str, Any] = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    exact, _, meta = rasterization_reference(**doubled)
-    safe = (meta.margins > 1e-4)[..., None].reshape(*exact.shape[:-1], 1)  # pixels that no rounding can flip
+    arguments, exact, safe = _reference_case(quick=quick)
     large = _detached(*_speed_case(quick))
     for name in native().available_isas():
         with isa(name):
@@ -95,6 +90,21 @@ def _sweep_instruction_sets(results: Results, *, runs: int, budget_s: float, qui
             image = _render(arguments)
             results.add_time(case, "forward", measure(partial(_render, large), runs=runs, budget_s=budget_s))
             _add_errors(results, case, torch.where(safe, image.double(), exact), exact)
+
+
+def error_against_reference() -> float:
+    """The largest error of a small image against float64, of the kernels in use."""
+    arguments, exact, safe = _reference_case(quick=False)
+    return float(torch.where(safe, (_render(arguments).double() - exact).abs(), 0.0).max())
+
+
+def _reference_case(*, quick: bool) -> tuple[dict[str, Any], Tensor, Tensor]:
+    """Arguments, their image in float64, and its pixels that no rounding can flip."""
+    scene = random_box(200 if quick else 2000, shrink=3.0)
+    arguments = _detached(scene, (24, 16) if quick else (96, 64))
+    doubled: dict[str, Any] = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    exact, _, meta = rasterization_reference(**doubled)
+    return arguments, exact, (meta.margins > 1e-4)[..., None].reshape(*exact.shape[:-1], 1)
 
 
 def _detached(scene: SplatScene, size: tuple[int, int]) -> dict[str, Any]:
@@ -128,6 +138,8 @@ def run_growth(results: Results, *, runs: int, budget_s: float, quick: bool) -> 
         _grow(results, f"{GROWTH} pixels", width * height, scene, (width, height), runs=runs, budget_s=budget_s)
     for kind, metric in (("gaussians", _ONE_GAUSSIAN), ("pixels", _ONE_PAIR)):
         costs = [row.value for row in results.select(f"{GROWTH} {kind}: ") if row.metric == metric and row.value]
+        worst = max(after / before for i, before in enumerate(costs) for after in costs[i:])
+        results.add(f"{GROWTH} {kind}", f"{metric}: growth against linear, at worst", worst, "x")
         results.add(f"{GROWTH} {kind}", f"{metric}: largest over smallest", max(costs) / min(costs), "x")
 
 

@@ -1,24 +1,78 @@
-"""What `splatbot bench collision` prints."""
+"""`splatbot bench collision`."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
-from rich.table import Table
+import tyro
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from splatbot.bench.results import Results, Row
 
-_FILE_WIDTH = 160  # [characters] where there is no terminal to ask
+
+def bench_collision(
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    peers: bool = False,
+    threads: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (1, 2),
+    run: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    quick: bool = False,
+) -> int:
+    """Measure the collision field and an arm of spheres in it.
+
+    Build, update, memory, questions a second; false free and false hit against exact truth, over n_sigma and over how
+    edges are checked; what floaters block; the map of a noisy log against its true shapes.
+
+    Examples:
+        splatbot bench collision
+        splatbot bench collision --peers
+        splatbot bench collision --run runs/latest
+        splatbot bench collision --quick --json figures.json
+
+    Args:
+        out: folder for collision.json, collision.csv and the plots; by default runs/bench-collision.
+        json: another place for the JSON file.
+        peers: measure other ways to ask for collisions beside it (minutes).
+        threads: how many threads to measure with.
+        run: a run folder of `splatbot map`, whose field is compared with its log's raw depth.
+        quick: tiny scenes, to see whether it runs.
+    """
+    from splatbot.errors import InputError
+
+    if not threads or min(threads) < 1:
+        raise InputError(f"is {threads}.", field="--threads", hint="give one or more positive numbers, as in 1 2")
+
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from splatbot.bench.collision import CollisionPlan, run_collision
+
+    folder = out if out is not None else Path("runs") / "bench-collision"
+    progress = Console(stderr=True)
+
+    def say(text: str) -> None:
+        progress.print(f"[dim]{text} ...[/dim]", highlight=False)
+
+    plan = CollisionPlan.quick_plan(say=say) if quick else CollisionPlan(say=say)
+    results = run_collision(replace(plan, thread_counts=tuple(threads), peers=peers, run=run), folder)
+    if json is not None:
+        results.write_json(json)
+    _print(results, folder)
+    return 0
 
 
-def print_collision(results: Results, folder: Path) -> None:
+def _print(results: Results, folder: Path) -> None:
     """A table of speed with a column per case, one of errors with a line per case, and the peers."""
-    console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
+    from rich.table import Table
+
+    from splatbot.cli.bench_tables import wide_console
+
+    console = wide_console()
     machine = results.machine
     console.print(f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}")
     if machine["load_1min"] is not None and machine["load_1min"] > 0.5:
@@ -43,6 +97,8 @@ def print_collision(results: Results, folder: Path) -> None:
 
 
 def _by_metric(title: str, rows: Iterable[Row]) -> Table:
+    from rich.table import Table
+
     cells: dict[str, dict[str, str]] = {}
     cases: dict[str, None] = {}
     for row in rows:
@@ -58,6 +114,8 @@ def _by_metric(title: str, rows: Iterable[Row]) -> Table:
 
 
 def _by_case(title: str, rows: Iterable[Row]) -> Table:
+    from rich.table import Table
+
     cells: dict[str, dict[str, str]] = {}
     metrics: dict[str, None] = {}
     for row in rows:

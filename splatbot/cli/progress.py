@@ -70,10 +70,17 @@ def describe(progress: Progress, rate: float) -> str:
     if progress.phase != "mapping":
         return f"{progress.phase} ..."
     verdict = progress.result.verdict if progress.result else "skipped"
+    counts = mishaps(progress)
     return (
         f"frame {progress.done}/{progress.total}  {rate:.1f} fps  {progress.gaussians:,} Gaussians  "
-        f"{progress.keyframes} keyframes  {verdict}" + (f"  ({progress.lost} lost)" if progress.lost else "")
+        f"{progress.keyframes} keyframes  {verdict}" + (f"  ({counts})" if counts else "")
     )
+
+
+def mishaps(progress: Progress) -> str:
+    """How many frames were lost, late and dropped, where any were."""
+    counts = {"lost": progress.lost, "late": progress.late, "dropped": progress.dropped}
+    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
 
 
 @contextmanager
@@ -107,7 +114,7 @@ def _live() -> Iterator[Callable[[Progress], None]]:
                 completed=progress.done,
                 phase=progress.phase,
                 numbers=f"{fps:.1f} fps  {progress.gaussians:,} Gaussians  {progress.keyframes} keyframes"
-                + (f"  {progress.lost} lost" if progress.lost else ""),
+                + (f"  {mishaps(progress)}" if mishaps(progress) else ""),
                 verdict=verdict,
                 colour=_COLOURS.get(verdict, "white"),
             )

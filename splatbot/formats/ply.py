@@ -26,7 +26,7 @@ _MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
 _DC = [f"f_dc_{i}" for i in range(3)]
 _SCALES, _QUATS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 _REST_COUNTS = (0, 9, 24, 45, 72)  # 3 ((degree + 1)² - 1)
-_BOOKKEEPING = ["observations", "anchors"]
+_BOOKKEEPING = {"observations": 1, "anchors": -1, "uncertainty": 0, "misses": 0}  # and what their absence means
 
 
 def load_ply(path: str | Path) -> GaussianModel:
@@ -62,8 +62,7 @@ def load_ply(path: str | Path) -> GaussianModel:
         log_scales=_tensor(log_scales),
         opacity_logits=_tensor(opacity[:, 0]),
         sh=_tensor(sh),
-        observations=_integers(vertex, present, "observations", default=1),
-        anchors=_integers(vertex, present, "anchors", default=-1),
+        **{name: _column(vertex, present, name, default) for name, default in _BOOKKEEPING.items()},
     )
 
 
@@ -72,8 +71,8 @@ def save_ply(model: GaussianModel, path: str | Path, *, normals: bool = True, bo
 
     Args:
         normals: write nx ny nz (zero), as the original does; readers of a fixed layout expect them.
-        bookkeeping: append int `observations` and `anchors`. Readers that go by the header skip them; those that
-            assume the original's layout would not, hence the default.
+        bookkeeping: append int `observations`, `anchors` and `misses` and float `uncertainty`. Readers that go by the
+            header skip them; those that assume the original's layout would not, hence the default.
     """
     n = len(model)
     sh = model.sh.detach().numpy()
@@ -90,9 +89,10 @@ def save_ply(model: GaussianModel, path: str | Path, *, normals: bool = True, bo
     dtype = [(name, "<f4") for names, _ in columns for name in names]
     rows = np.concatenate([values for _, values in columns], axis=1, dtype="<f4").view(np.uint8)
     if bookkeeping:
-        counts = np.stack([model.observations.numpy(), model.anchors.numpy()], axis=1).astype("<i4")
-        rows = np.concatenate([rows, counts.view(np.uint8)], axis=1)
-        dtype += [(name, "<i4") for name in _BOOKKEEPING]
+        for name in _BOOKKEEPING:
+            values = getattr(model, name).detach().numpy()[:, None]
+            dtype.append((name, "<f4" if values.dtype == np.float32 else "<i4"))
+            rows = np.concatenate([rows, values.astype(dtype[-1][1]).view(np.uint8)], axis=1)
     element = PlyElement.describe(rows.view(np.dtype(dtype)).reshape(n), "vertex")
     with atomic_write(path) as file:
         PlyData([element], byte_order="<").write(file)
@@ -142,10 +142,11 @@ def _tensor(values: Table) -> torch.Tensor:
     return torch.from_numpy(values.astype(np.float32, order="C"))  # astype copies: the table can be freed
 
 
-def _integers(vertex: PlyElement, present: list[str], name: str, default: int) -> torch.Tensor:
+def _column(vertex: PlyElement, present: list[str], name: str, default: int) -> torch.Tensor:
+    kind = np.float32 if name == "uncertainty" else np.int32
     if name not in present:
-        return torch.full((vertex.count,), default, dtype=torch.int32)
-    return torch.from_numpy(vertex[name].astype(np.int32))
+        return torch.from_numpy(np.full(vertex.count, default, kind))
+    return torch.from_numpy(vertex[name].astype(kind))
 
 
 def _mend(path: str | Path, opacity: Table, log_scales: Table, quats: Table) -> None:

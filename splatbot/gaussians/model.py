@@ -31,6 +31,9 @@ class GaussianModel:
         sh: (N, K, 3), K = (degree + 1)²; entry 0 is the DC term.
         observations: (N,) int32, how many keyframes support the Gaussian.
         anchors: (N,) int32, keyframe that created it, -1 for none.
+        uncertainty: (N,) standard deviation of the mean along the shortest axis [m], by the depth that was fused into
+            it; 0 where it is taken as exact, as in a map from elsewhere.
+        misses: (N,) int32, how often it was seen through of late, less what supports it again.
 
     Raises:
         InputError: shapes do not fit together.
@@ -43,11 +46,17 @@ class GaussianModel:
     sh: Tensor
     observations: Tensor
     anchors: Tensor
+    uncertainty: Tensor = None  # type: ignore[assignment]  # zeros
+    misses: Tensor = None  # type: ignore[assignment]  # zeros
 
     def __post_init__(self) -> None:
         n = len(self.means)
+        if self.uncertainty is None:
+            self.uncertainty = torch.zeros(n)
+        if self.misses is None:
+            self.misses = torch.zeros(n, dtype=torch.int32)
         shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,)}
-        shapes |= {"observations": (n,), "anchors": (n,)}
+        shapes |= dict.fromkeys(("observations", "anchors", "uncertainty", "misses"), (n,))
         for name, shape in shapes.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise InputError(f"is {tuple(getattr(self, name).shape)}, expected {shape}.", field=name)

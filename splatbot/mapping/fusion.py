@@ -86,7 +86,10 @@ def guessed_gaussians(view: View, keyframe: Keyframe, config: MappingConfig) -> 
     Their depth is a guess, so they have no observation and count as air for collision until a keyframe supports them.
     """
     guess = guess_depth(keyframe.depth)
-    model = new_gaussians(replace(keyframe, depth=guess), (guess > 0) & (view.alpha < config.new_alpha), config)
+    where = (guess > 0) & (view.alpha < config.new_alpha)
+    if keyframe.still is not None:
+        where &= keyframe.still
+    model = new_gaussians(replace(keyframe, depth=guess), where, config)
     model.observations.zero_()
     return model
 
@@ -139,34 +142,3 @@ def _disc_quats(
 def _with_anchor(model: GaussianModel, number: int) -> GaussianModel:
     model.anchors.fill_(number)
     return model
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What a keyframe says of each Gaussian (N,): seen where measured depth puts it, or seen through."""
-
-    supported: Tensor
-    seen_through: Tensor
-
-
-def weigh(model: GaussianModel, keyframe: Keyframe, config: MappingConfig) -> Evidence:
-    """Compare every Gaussian's centre with the depth that the keyframe measured along its ray."""
-    T_camera_world = torch.from_numpy(inverse(keyframe.T_world_camera)).float()
-    points = model.means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    depth, inside = _sample(keyframe.depth, keyframe.camera, points)
-    measured = inside & (depth > 0)
-    tolerance = config.new_depth * depth
-    return Evidence(
-        supported=measured & ((points[:, 2] - depth).abs() < tolerance),
-        seen_through=measured & (points[:, 2] < depth - 2 * tolerance),
-    )
-
-
-def _sample(depth: Tensor, camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Nearest pixel's depth (N,) for points (N, 3) of the camera frame, and which lie inside the image."""
-    z = points[:, 2].clamp_min(1e-6)
-    u = torch.round(camera.fx * points[:, 0] / z + camera.cx)
-    v = torch.round(camera.fy * points[:, 1] / z + camera.cy)
-    inside = (points[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    row, column = torch.where(inside, v, 0).long(), torch.where(inside, u, 0).long()
-    return depth[row, column], inside

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -21,17 +22,25 @@ from splatbot.tracking.reference import Reference
 from splatbot.tracking.tracker import pose_distance
 
 
+class Placed(Protocol):
+    """What has a pose."""
+
+    @property
+    def T_world_camera(self) -> NDArray[np.float64]: ...
+
+
 @dataclass
 class Keyframe:
     """One observation as the map keeps it.
 
     Args:
-        number: position among the keyframes.
+        number: counts all keyframes there have been.
         camera: of the images kept here.
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 [m], 0 missing.
         T_world_camera: (4, 4).
         features: for matching later frames.
+        still: (H, W) bool, pixels that show nothing that moves, depth being 0 elsewhere; None: all.
         reference: for aligning later frames; its depth is the model's once the keyframe has been fused.
     """
 
@@ -42,6 +51,7 @@ class Keyframe:
     T_world_camera: NDArray[np.float64]
     features: Features
     reference: Reference
+    still: Tensor | None = None
 
     @property
     def viewmat(self) -> Tensor:
@@ -72,7 +82,7 @@ def mapping_images(
     return level.camera, rgb, level.depth
 
 
-def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Keyframe], config: MappingConfig) -> bool:
+def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Placed], config: MappingConfig) -> bool:
     """Whether a view is new: farther or turned further from every keyframe than the configuration says."""
     for keyframe in reversed(keyframes):
         moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
 from splatbot.rasterize import rasterization
+
+_GONE = 0.1  # where a keyframe is nearer than the map by more, it shows something that has gone [share of depth]
 
 
 class Refiner:
@@ -32,14 +35,26 @@ class Refiner:
             }
         )
         self._random = np.random.default_rng(seed)
+        self._latest = -1  # number of the latest keyframe that a step was spent on as such
+
+    def state(self) -> Any:
+        """All that steps change besides the model, for :meth:`restore`."""
+        return self.adam.state(), self._random.bit_generator.state, self._latest
+
+    def restore(self, state: Any) -> None:
+        """Go back to a :meth:`state`."""
+        adam, self._random.bit_generator.state, self._latest = state
+        self.adam.restore(adam)
 
     def refine(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
-        """Spend ``iterations`` steps on the model, in place: the latest keyframe first, then at random.
+        """Spend ``iterations`` steps on the model, in place: on the latest keyframe if it has had none, then at random.
 
         Half of the random draws come from the latest ``config.window`` keyframes, half from all, against forgetting.
         """
-        for i in range(iterations if len(model) else 0):
-            self.step(model, keyframes[-1] if i == 0 else self._draw(keyframes))
+        for _ in range(iterations if len(model) else 0):
+            fresh = keyframes[-1].number > self._latest
+            self._latest = keyframes[-1].number
+            self.step(model, keyframes[-1] if fresh else self._draw(keyframes))
 
     def refine_all(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
         """Spend ``iterations`` steps on all keyframes alike."""
@@ -75,6 +90,7 @@ class Refiner:
             keyframe.camera.width,
             keyframe.camera.height,
             render_mode="RGB+ED",
+            depth_mode="plane",  # what tracking is aligned to
         )
         loss = self._loss(renders[0], alphas[0], keyframe)
         grads = torch.autograd.grad(loss, list(parameters.values()))
@@ -86,6 +102,10 @@ class Refiner:
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         observed = keyframe.rgb.float() / 255.0
         covered = alpha[..., 0].detach() > 0.5
+        if keyframe.still is not None:
+            covered &= keyframe.still
+        # What was before the map's surface and is there no more has nothing to say of what is behind.
+        covered &= ~((keyframe.depth > 0) & (render[..., 3].detach() * (1 - _GONE) > keyframe.depth))
         color = self._color_loss(render[..., :3], observed, covered)
         depth = keyframe.depth[..., None]
         ranged = (depth > 0) & covered[..., None]

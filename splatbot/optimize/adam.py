@@ -26,6 +26,8 @@ class GaussianAdam:
     def __init__(self, rates: Mapping[str, float]) -> None:
         self.rates = dict(rates)
         self.steps = torch.zeros(0)
+        self.skipped = 0
+        """Rows that were not stepped because their gradient was not finite, over all steps."""
         self.first: dict[str, Tensor] = {}
         self.second: dict[str, Tensor] = {}
 
@@ -46,6 +48,14 @@ class GaussianAdam:
             for name in PARAMETERS:
                 moments[name] = moments[name][index]
 
+    def state(self) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """The moments and counts as they are, shared: good until a step; :meth:`extend` and :meth:`select` copy."""
+        return self.steps, dict(self.first), dict(self.second)
+
+    def restore(self, state: tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]) -> None:
+        """Go back to a :meth:`state`."""
+        self.steps, self.first, self.second = state[0], dict(state[1]), dict(state[2])
+
     @torch.no_grad()
     def step(self, model: GaussianModel, grads: Mapping[str, Tensor], visible: Tensor) -> None:
         """One step in place, of the rows that ``visible`` (N,) marks; the others keep their bits.
@@ -57,7 +67,7 @@ class GaussianAdam:
             raise InputError(
                 f"knows {len(self.steps)} rows of {len(model)}.", field="adam", hint="call extend() or select() first"
             )
-        adam_step(
+        self.skipped += adam_step(
             {name: getattr(model, name) for name in grads},
             grads,
             self.first,
@@ -81,8 +91,8 @@ def adam_step(
     *,
     betas: tuple[float, float],
     eps: float,
-) -> None:
-    """One step of Adam in place, natively, on the rows that ``visible`` marks.
+) -> int:
+    """One step of Adam in place, natively, on the rows that ``visible`` marks and whose gradient is finite.
 
     Args:
         parameters: (N, ...) each, float32, contiguous; changed in place, as are the moments.
@@ -92,6 +102,9 @@ def adam_step(
         rates: learning rate of each parameter.
         betas: decay of the two moments.
         eps: added to the root of the second moment, > 0.
+
+    Returns:
+        the number of rows that were left alone because a gradient of theirs is not finite.
 
     Raises:
         InputError: a shape, type or layout does not fit.
@@ -110,7 +123,7 @@ def adam_step(
                 raise InputError(f"has a {what} of {got}.", field=name, hint="give the parameter's shape, float32")
         for moments in (first, second):
             _check(name, moments[name], n)
-    native().adam_step(
+    skipped: int = native().adam_step(
         [parameters[name].detach() for name in names],
         [grads[name].detach().contiguous() for name in names],
         [first[name] for name in names],
@@ -121,6 +134,7 @@ def adam_step(
         *betas,
         eps,
     )
+    return skipped
 
 
 def _check(name: str, tensor: Tensor, rows: int) -> None:

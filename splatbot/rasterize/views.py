@@ -41,8 +41,9 @@ def render_view(
         model: the map; its harmonics, of any degree, colour it as seen from the pose.
         camera: intrinsics and size; without distortion.
         T_world_camera: (4, 4) rigid.
-        mode: "rgb" (H, W, 3) in 0..1; "depth" (H, W) [m] along the optical axis; "normal" (H, W, 3) unit vectors in
-            the camera frame that face the camera; "alpha" (H, W) in 0..1. Depth and normal are 0 where alpha < 0.5.
+        mode: "rgb" (H, W, 3) in 0..1; "depth" (H, W) [m] along the optical axis, of the Gaussians' planes; "normal"
+            (H, W, 3) unit vectors in the camera frame that face the camera; "alpha" (H, W) in 0..1. Depth and normal
+            are 0 where alpha < 0.5.
         background: RGB in 0..1 behind the map ("rgb" only).
 
     Raises:
@@ -171,6 +172,7 @@ def _splat(
             width=camera.width,
             height=camera.height,
             render_mode=render_mode,
+            depth_mode="plane",  # blended centres of a slanted surface lie in front of it
         )
     return images[0].numpy(), alphas[0, ..., 0].numpy()
 

@@ -15,7 +15,12 @@ from splatbot.results.metrics import stage_names
 from splatbot.results.scoring import TrajectoryScore
 from splatbot.trajectory import Trajectory
 
-_BANDS = {"lost": (RED, "lost"), "degraded": (ORANGE, "degraded"), "skipped": (INK, "unreadable")}
+_BANDS = {
+    "lost": (RED, "lost"),
+    "degraded": (ORANGE, "degraded"),
+    "skipped": (INK, "unreadable"),
+    "dropped": (INK, "dropped"),
+}
 
 
 @styled
@@ -63,7 +68,7 @@ def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes
 @styled
 def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
     """Milliseconds of every frame, stacked by stage; what no stage accounts for is "other"."""
-    done = [row for row in rows if row.verdict != "skipped"]
+    done = [row for row in rows if row.processed]
     if not done:
         return None
     names = stage_names(done)
@@ -88,7 +93,7 @@ def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
 @styled
 def gaussians_plot(rows: Sequence[FrameRow]) -> bytes | None:
     """Size of the map over the frames, keyframes marked."""
-    done = [row for row in rows if row.verdict != "skipped"]
+    done = [row for row in rows if row.processed]
     if not done:
         return None
     fig, (ax,) = figure(height=2.6)

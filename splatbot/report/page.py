@@ -50,7 +50,9 @@ def report_html(
         _section("Error over time", _image(error_plot(rows, track), "position error over time")),
         _section("Frames in doubt", _doubts(rows)),
         _section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
-        _section("Time per frame", _image(stages_plot(rows), "milliseconds per stage"), _stages(metrics)),
+        _section(
+            "Time per frame", _image(stages_plot(rows), "milliseconds per stage"), _stages(metrics), _pace(metrics)
+        ),
         _section("Map", _image(gaussians_plot(rows), "Gaussians over frames")),
         _section("Simulated sensor effects", _effects(metrics["effects"])),
         _details("Configuration", f"<pre>{html.escape(config.to_yaml())}</pre>"),
@@ -134,6 +136,15 @@ def _stages(metrics: Mapping[str, Any]) -> str:
     rows += [(name, values, values["frames"]) for name, values in metrics["stages"].items()]
     cells = [(name, *(milliseconds(v[p]) for p in ("p50", "p95", "p99")), str(n)) for name, v, n in rows]
     return _table(("stage", "p50", "p95", "p99", "frames"), cells)
+
+
+def _pace(metrics: Mapping[str, Any]) -> str:
+    if metrics["paced"] is None:
+        return ""
+    return _note(
+        f"Frames came {metrics['paced']}: {metrics['late']} were not done when the next one arrived, "
+        f"{metrics['dropped']} were dropped because a newer one had arrived."
+    )
 
 
 def _effects(effects: Sequence[Mapping[str, Any]]) -> str:

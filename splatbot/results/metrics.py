@@ -17,13 +17,15 @@ _PERCENTILES = (50, 95, 99)
 
 def cost_metrics(rows: Sequence[FrameRow]) -> dict[str, Any]:
     """Counts and times of the frames that were processed."""
-    done = [row for row in rows if row.verdict != "skipped"]
+    done = [row for row in rows if row.processed]
     return {
         "frames": len(done),
         "tracked": sum(row.tracked for row in done),
         "degraded": sum(row.verdict == "degraded" for row in done),
         "lost": sum(row.verdict == "lost" for row in done),
-        "skipped": len(rows) - len(done),
+        "skipped": sum(row.verdict == "skipped" for row in rows),
+        "dropped": sum(row.verdict == "dropped" for row in rows),
+        "late": sum(row.late for row in done),
         "keyframes": sum(row.keyframe for row in done),
         "held_out": sum(row.held_out for row in done),
         "ms_per_frame": percentiles([row.ms for row in done]),

@@ -34,7 +34,11 @@ def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) ->
         )
     poses = folder.load_poses()
     track = (
-        score_trajectory(folder.load_trajectory(), reference if reference is not None else log.ground_truth)
+        score_trajectory(
+            folder.load_trajectory(),
+            reference if reference is not None else log.ground_truth,
+            folder.load_covariances(),
+        )
         if poses
         else None
     )
@@ -42,7 +46,7 @@ def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) ->
     model = GaussianModel.load(folder.map)
     views = score_views(log, model, held_out)
     counts = {
-        "frames": sum(row.verdict != "skipped" for row in rows),
+        "frames": sum(row.processed for row in rows),
         "tracked": len(poses),
         "lost": sum(row.verdict == "lost" for row in rows),
         "held_out": len(views.scores),

@@ -4,19 +4,35 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.config import Config
 from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.logs import Log
 from splatbot.results.folder import FrameRow
 from splatbot.run.interrupts import Interrupts
+from splatbot.run.pacing import Arrival, FrameSource
 from splatbot.run.progress import Phase, Progress
 from splatbot.slam import FrameResult, Slam
 from splatbot.trajectory import Trajectory
+
+_DROPPED = "a newer frame had arrived"
+
+
+class FrameSaver(Protocol):
+    """What the loop asks of the one who saves it; ``cost`` says how often that was and how long it took."""
+
+    @property
+    def cost(self) -> dict[str, Any]: ...
+
+    def processed(self, loop: FrameLoop, frame: Frame, index: int) -> None: ...
+
+    def save(self, loop: FrameLoop) -> None: ...
 
 
 @dataclass
@@ -24,8 +40,8 @@ class FrameLoop:
     """The loop over the frames, and what came of them.
 
     Args:
-        log, slam, config: what is run.
-        total: frames to read.
+        source: gives the frames.
+        slam, config: what is run.
         on_bad_frame: "stop" or "skip".
         tell: receives the progress.
         ms: wall-clock milliseconds by frame.
@@ -36,12 +52,12 @@ class FrameLoop:
         crash: what broke unexpectedly.
         first_bad: the first unreadable frame.
         started: clock at the start [s].
+        saver: saves the run while it goes on.
     """
 
-    log: Log
+    source: FrameSource
     slam: Slam
     config: Config
-    total: int
     on_bad_frame: str
     tell: Callable[[Progress], None]
     ms: dict[int, float] = field(default_factory=dict)
@@ -53,25 +69,42 @@ class FrameLoop:
     crash: Exception | None = None
     first_bad: InputError | None = None
     started: float = field(default_factory=time.perf_counter)
+    saver: FrameSaver | None = None
 
     def run(self, interrupts: Interrupts) -> None:
         """Process the frames until they end, ``error``, ``crash`` or a signal; raises nothing."""
         try:
-            for index in range(self.total):
-                if interrupts.requested is not None or not self._step(index):
-                    return
-            self.progress("refining")
-            self.slam.finish()
+            through = self._all_frames(interrupts)
+            if self.saver is not None:
+                self.progress("saving")
+                self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
+            if through:
+                self.progress("refining")
+                self.slam.finish()
         except KeyboardInterrupt:  # the second signal, or one raised by a callback
             interrupts.requested = interrupts.requested or 2
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash
+        finally:
+            self.slam.close()
 
-    def _step(self, index: int) -> bool:
-        """Read and process one frame; False when the log ends here."""
+    def _all_frames(self, interrupts: Interrupts) -> bool:
+        """Whether the log ended, rather than a signal or an unreadable frame ending the run."""
+        with closing(iter(self.source)) as arrivals:
+            for arrival in arrivals:
+                if interrupts.requested is not None or not self._step(arrival):
+                    return False
+        return True
+
+    def _step(self, arrival: Arrival) -> bool:
+        """Process one frame; False when the run ends here."""
+        index = arrival.index
         try:
-            frame = self.log[index]
-        except InputError as error:
+            if isinstance(arrival.frame, InputError):
+                raise arrival.frame
+            result = self._process(arrival.frame, index)
+        except InputError as error:  # unreadable, or of another size
+            self.held_out.discard(index)
             self.first_bad = self.first_bad or error
             if self.on_bad_frame == "stop":
                 self.error = error
@@ -79,10 +112,11 @@ class FrameLoop:
             self.skipped[index] = str(error)
             self.progress("mapping", done=index + 1, skipped=str(error))
             return True
-        result = self._process(frame, index)
         self.keyframes += result.keyframe
         self.lost += result.verdict == "lost"
         self.progress("mapping", done=index + 1, result=result)
+        if self.saver is not None:
+            self.saver.processed(self, arrival.frame, index)
         return True
 
     def _process(self, frame: Frame, index: int) -> FrameResult:
@@ -104,12 +138,14 @@ class FrameLoop:
             Progress(
                 phase=phase,
                 done=self.done if done is None else done,
-                total=self.total,
+                total=self.source.total,
                 elapsed_s=time.perf_counter() - self.started,
                 result=result,
                 skipped=skipped,
                 keyframes=self.keyframes,
                 lost=self.lost,
+                late=len(self.source.late),
+                dropped=len(self.source.dropped),
                 gaussians=results[-1].gaussians if results else 0,
             )
         )
@@ -117,7 +153,7 @@ class FrameLoop:
     @property
     def done(self) -> int:
         """Frames read, or tried."""
-        return len(self.ms) + len(self.skipped)
+        return len(self.ms) + len(self.skipped) + len(self.source.dropped)
 
     def rows(self) -> list[FrameRow]:
         """One row per frame, in the log's order."""
@@ -133,11 +169,21 @@ class FrameLoop:
                 keyframe=bool(r.keyframe),
                 held_out=r.index in self.held_out,
                 gaussians=int(r.gaussians),
+                late=r.index in self.source.late,
+                covariance=None if r.covariance is None else tuple(r.covariance[np.triu_indices(6)].tolist()),
             )
             for r in self.slam.results
         ]
         rows += [FrameRow(index=i, stamp=None, verdict="skipped", reasons=(why,)) for i, why in self.skipped.items()]
+        rows += [FrameRow(index=i, stamp=None, verdict="dropped", reasons=(_DROPPED,)) for i in self.source.dropped]
         return sorted(rows, key=lambda row: row.index)
+
+    def covariances(self) -> NDArray[np.float64] | None:
+        """Covariances (N, 6, 6) of the tracked poses; None where one is not known."""
+        tracked = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
+        if any(covariance is None for covariance in tracked):
+            return None
+        return np.array(tracked, dtype=np.float64).reshape(-1, 6, 6)
 
     def trajectory(self) -> Trajectory:
         """The tracked poses."""

@@ -24,6 +24,7 @@ class Progress:
         keyframes: frames that entered the map so far.
         lost: frames lost so far.
         gaussians: size of the map.
+        late, dropped: frames of a paced run that were not done, or not begun, when the next one arrived.
     """
 
     phase: Phase
@@ -35,3 +36,5 @@ class Progress:
     keyframes: int = 0
     lost: int = 0
     gaussians: int = 0
+    late: int = 0
+    dropped: int = 0

@@ -6,6 +6,7 @@ import gc
 import json
 import os
 import signal
+import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -300,3 +301,48 @@ def test_progress_counts_frames_keyframes_and_losses(log: Log, tmp_path: Path) -
     assert [p.done for p in mapping] == list(range(1, 17))
     assert (mapping[-1].lost, mapping[-1].keyframes) == (1, 13)
     assert [p.phase for p in seen[16:]] == ["refining", "saving", "scoring", "reporting"]
+
+
+def test_a_run_in_real_time_counts_what_it_had_no_time_for(log: Log, tmp_path: Path) -> None:
+    class Slow(OracleSlam):
+        def process(self, frame: Frame, *, hold_out: bool = False) -> Any:
+            time.sleep(0.12 if frame.index == 2 else 0.0)
+            return super().process(frame, hold_out=hold_out)
+
+    assert log.ground_truth is not None
+    seen: list[Progress] = []
+    slam = Slow(log.ground_truth)
+    result = map_log(log, out=tmp_path / "run", slam=slam, rate=20.0, on_progress=seen.append)
+    metrics = result.metrics
+    assert metrics["dropped"] >= 1
+    assert metrics["late"] >= 1
+    assert metrics["frames"] + metrics["dropped"] == 16
+    assert (seen[-1].late, seen[-1].dropped) == (metrics["late"], metrics["dropped"])
+    rows = RunFolder(tmp_path / "run").load_frames()
+    assert [row.index for row in rows] == list(range(16))
+    assert [row.index for row in rows if row.verdict == "dropped"] == [i for i in range(16) if i not in dict(slam.seen)]
+    assert rows[2].late
+    assert "20 Hz" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
+def test_a_rate_that_is_none_is_refused_before_anything_is_read(rate: float, log: Log, tmp_path: Path) -> None:
+    slam = oracle(log)
+    with pytest.raises(InputError, match="rate"):
+        map_log(log, out=tmp_path / "run", slam=slam, rate=rate)
+    assert not slam.seen
+
+
+def test_a_frame_of_another_size_ends_the_run_or_is_left_out(log: Log, tmp_path: Path) -> None:
+    class Strict(OracleSlam):
+        def process(self, frame: Frame, *, hold_out: bool = False) -> Any:
+            if frame.index == 7:
+                raise InputError("is 80 x 60, frames before are 64 x 48.", file="frame 7", field="image size")
+            return super().process(frame, hold_out=hold_out)
+
+    assert log.ground_truth is not None
+    stopped = map_log(log, out=tmp_path / "stop", slam=Strict(log.ground_truth))
+    assert stopped.metrics["frames"] == 7
+    assert stopped.exit_code == 2
+    skipped = map_log(log, out=tmp_path / "skip", slam=Strict(log.ground_truth), on_bad_frame="skip")
+    assert (skipped.metrics["frames"], skipped.metrics["skipped"], skipped.metrics["held_out"]) == (15, 1, 1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.logs import open_log
@@ -146,10 +147,11 @@ def test_a_black_frame_freezes_the_map_and_the_next_good_one_goes_on() -> None:
     after = slam.snapshot()
     assert after.map_version == before.map_version
     assert_same(after.model, before.model)
-    found = slam.process(frames[8])
+    assert slam.process(frames[8]).verdict == "lost"  # found, and not believed before a second frame agrees
+    found = slam.process(frames[9])
     assert found.verdict == "ok"
     assert found.T_world_camera is not None
-    assert pose_distance(poses[8], found.T_world_camera)[0] < 2e-3
+    assert pose_distance(poses[9], found.T_world_camera)[0] < 2e-3
 
 
 def test_black_frames_at_the_start_are_waited_out() -> None:
@@ -188,3 +190,13 @@ def test_nothing_processed_has_an_empty_map() -> None:
     slam.finish()
     assert slam.results == []
     assert len(slam.snapshot().model) == 0
+
+
+def test_a_frame_of_another_size_is_refused_and_the_map_stays() -> None:
+    frames, _ = tabletop()
+    slam = run(frames[:2])
+    before = slam.snapshot().model
+    with pytest.raises(InputError, match=r"80 x 60.*160 x 120"):
+        slam.process(tabletop(width=80)[0][2])
+    assert_same(slam.snapshot().model, before)
+    assert slam.process(frames[2]).verdict == "ok"

@@ -41,7 +41,7 @@ double l1_dssim(const Images& rendered, const Images& target, const std::optiona
   return splatbot::l1_dssim(images, {weight, inside_only}, out);
 }
 
-void adam_step(const std::vector<Values>& values, const std::vector<ConstValues>& gradients,
+std::size_t adam_step(const std::vector<Values>& values, const std::vector<ConstValues>& gradients,
                const std::vector<Values>& first, const std::vector<Values>& second, const std::vector<double>& rates,
                const Chosen& chosen, const Steps& steps, double beta1, double beta2, double eps) {
   const std::size_t n = values.size();
@@ -55,8 +55,8 @@ void adam_step(const std::vector<Values>& values, const std::vector<ConstValues>
                           std::span(gradients[i].data(), gradients[i].size()), rates[i]});
   }
   const nb::gil_scoped_release release;
-  splatbot::adam_step(parameters, std::span(chosen.data(), chosen.size()), std::span(steps.data(), steps.size()),
-                      {beta1, beta2, eps});
+  return splatbot::adam_step(parameters, std::span(chosen.data(), chosen.size()), std::span(steps.data(), steps.size()),
+                             {beta1, beta2, eps});
 }
 
 double multiply_add_peak(double milliseconds) {
@@ -72,7 +72,8 @@ void define_optimize(nb::module_& m) {
         "(1 - w) L1 + w (1 - SSIM) of images (B, H, W, C) under a mask (B, H, W); writes its gradient to rendered.");
   m.def("adam_step", &adam_step, "values"_a.noconvert(), "gradients"_a.noconvert(), "first"_a.noconvert(),
         "second"_a.noconvert(), "rates"_a, "chosen"_a.noconvert(), "steps"_a.noconvert(), "beta1"_a, "beta2"_a, "eps"_a,
-        "One step of Adam, in place, of the rows that `chosen` (N,) marks, with each row's own count of `steps`.");
+        "One step of Adam, in place, of the rows that `chosen` (N,) marks, with each row's own count of `steps`;"
+        " rows whose gradient is not finite are left alone, and their number is returned.");
   m.def("multiply_add_peak", &multiply_add_peak, "milliseconds"_a,
         "GFLOP/s of independent multiply-adds on the kernels and threads in use.");
 }

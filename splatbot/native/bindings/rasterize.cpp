@@ -221,5 +221,7 @@ void define_rasterize(nb::module_& m) {
   m.def("set_isa", [](const std::string& name) { splatbot::set_isa(name); }, "name"_a,
         "Use other kernels; an empty name returns to the default.");
   m.def("num_threads", [] { return splatbot::thread_pool()->size(); }, "Threads that the kernels run on.");
+  m.def("keep_to_this_thread", &splatbot::keep_to_this_thread, "alone"_a,
+        "Whether loops started by the calling thread use no other: leaves the cores to somebody else.");
   m.def("set_num_threads", &splatbot::set_num_threads, "threads"_a, "Change that number; 0 returns to the default.");
 }

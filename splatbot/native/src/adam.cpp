@@ -2,6 +2,7 @@
 #include "splatbot/adam.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <stdexcept>
 #include <vector>
@@ -86,10 +87,22 @@ Scratch& scratch(std::size_t widest) {
   return instance;
 }
 
+// Whether a row's gradients are all finite: 0 times anything else is NaN.
+bool is_finite(const std::vector<AdamGroup>& groups, std::size_t row) {
+  float sum = 0.0F;
+  for (const AdamGroup& group : groups) {
+    const float* const g = group.gradient + row * group.columns;
+    for (std::size_t c = 0; c < group.columns; ++c) {
+      sum += 0.0F * g[c];
+    }
+  }
+  return sum == 0.0F;
+}
+
 }  // namespace
 
-void adam_step(std::span<const AdamParameter> parameters, std::span<const std::uint8_t> chosen, std::span<float> steps,
-               const AdamOptions& options) {
+std::size_t adam_step(std::span<const AdamParameter> parameters, std::span<const std::uint8_t> chosen,
+                      std::span<float> steps, const AdamOptions& options) {
   const std::size_t rows = steps.size();
   require(chosen.size() == rows, "the chosen rows and the step counts differ in number");
   const std::vector<AdamGroup> groups = groups_of(parameters, rows);
@@ -99,6 +112,7 @@ void adam_step(std::span<const AdamParameter> parameters, std::span<const std::u
   }
   const Corrections corrections(options, steps);
   const Kernels& k = kernels();
+  std::atomic<std::size_t> skipped{0};
   thread_pool()->run((rows + kRows - 1) / kRows, [&](std::size_t b) {
     Scratch& s = scratch(widest);
     AdamBlock block{b * kRows,
@@ -111,7 +125,10 @@ void adam_step(std::span<const AdamParameter> parameters, std::span<const std::u
     bool any = false;
     for (std::size_t i = 0; i < block.count; ++i) {
       const std::size_t row = block.begin + i;
-      const bool on = chosen[row] != 0;
+      const bool on = chosen[row] != 0 && is_finite(groups, row);
+      if (!on && chosen[row] != 0) {
+        ++skipped;
+      }
       steps[row] += on ? 1.0F : 0.0F;
       const Corrections::Pair pair = on ? corrections.at(steps[row]) : Corrections::Pair{0.0F, 1.0F};
       s.scales[i] = pair.step_scale;
@@ -124,6 +141,7 @@ void adam_step(std::span<const AdamParameter> parameters, std::span<const std::u
       }
     }
   });
+  return skipped;
 }
 
 }  // namespace splatbot

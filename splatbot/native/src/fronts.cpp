@@ -39,10 +39,8 @@ struct Place {
 
 Place place_of(const RasterState& state, std::int64_t pixel, std::size_t row) {
   const std::int64_t x = pixel % state.view.width, y = pixel / state.view.width;
-  const std::int64_t in_x = x % kTileWidth, in_y = y % kTileHeight;
-  const std::int64_t block = in_y / kBlock * kBlockColumns + in_x / kBlock;
-  return {static_cast<std::uint32_t>(y / kTileHeight * state.columns + x / kTileWidth),
-          static_cast<std::uint32_t>(block * kBlockPixels + in_y % kBlock * kBlock + in_x % kBlock),
+  const int at = pixel_index(static_cast<int>(x % kTileWidth), static_cast<int>(y % kTileHeight));
+  return {static_cast<std::uint32_t>(y / kTileHeight * state.columns + x / kTileWidth), static_cast<std::uint32_t>(at),
           static_cast<std::uint32_t>(row)};
 }
 

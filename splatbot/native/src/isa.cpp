@@ -14,19 +14,27 @@ namespace {
 std::vector<const Kernels*> runnable() {
 #if defined(SPLATBOT_X86)
   __builtin_cpu_init();
+  const bool level2 = __builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt");
+  const bool level3 = level2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+                      __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2");
+  const bool level4 = level3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+                      __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+                      __builtin_cpu_supports("avx512vl");
   std::vector<const Kernels*> found;
-  if (__builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt")) {
-    found.push_back(&v2::kKernels);
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
-        __builtin_cpu_supports("bmi2")) {
-      found.push_back(&v3::kKernels);
-      if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-          __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
-          __builtin_cpu_supports("avx512vl")) {
-        found.push_back(&v4::kKernels);
-      }
+  const auto add_if = [&found](bool runs, const Kernels& kernels) {
+    if (runs) {
+      found.push_back(&kernels);
     }
-  }
+  };
+#if defined(SPLATBOT_HAS_v2)
+  add_if(level2, v2::kKernels);
+#endif
+#if defined(SPLATBOT_HAS_v3)
+  add_if(level3, v3::kKernels);
+#endif
+#if defined(SPLATBOT_HAS_v4)
+  add_if(level4, v4::kKernels);
+#endif
   return found;
 #else
   return {&baseline::kKernels};
@@ -36,7 +44,7 @@ std::vector<const Kernels*> runnable() {
 const Kernels& choose(std::string_view name) {
   const std::vector<const Kernels*> found = runnable();
   if (found.empty()) {
-    throw std::runtime_error("this CPU lacks SSE4.2 and POPCNT (x86-64-v2), which the kernels need");
+    throw std::runtime_error("this CPU runs none of the kernels that were built; they need SSE4.2 and POPCNT (x86-64-v2) at least");
   }
   if (name.empty()) {
     return *found.back();

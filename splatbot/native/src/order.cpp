@@ -3,9 +3,11 @@
 // sorting (tile, depth) keys, and every list comes out in depth order. Both are stable, so the result is one and the
 // same for any division of the work.
 #include <algorithm>
-#include <array>
+#include <bit>
 #include <limits>
+#include <span>
 #include <stdexcept>
+#include <utility>
 
 #include "splatbot/raster_state.hpp"
 #include "splatbot/threads.hpp"
@@ -14,9 +16,26 @@ namespace splatbot {
 
 namespace {
 
-constexpr unsigned kDigitBits = 11;
-constexpr std::size_t kDigits = std::size_t{1} << kDigitBits;
-constexpr unsigned kPasses = 3;
+// How keys are cut into digits: as few passes as the range of depths allows, unless there are so many keys that the
+// places they go to outgrow the cache.
+struct Digits {
+  std::uint32_t least;  // of all keys
+  unsigned bits, passes;
+
+  std::size_t count() const { return std::size_t{1} << bits; }
+  std::size_t of(std::uint32_t key, unsigned pass) const {
+    return ((key - least) >> (pass * bits)) & (count() - 1);
+  }
+};
+
+Digits digits_for(std::uint32_t least, std::uint32_t most, std::size_t size) {
+  constexpr unsigned kFew = 11, kMany = 13;
+  constexpr std::size_t kCached = std::size_t{1} << 18;
+  const auto bits = static_cast<unsigned>(std::bit_width(most - least));
+  constexpr std::size_t kWorthwhile = std::size_t{1} << 15;
+  const unsigned digit = size >= kWorthwhile && bits > 2 * kFew && bits <= 2 * kMany && size <= kCached ? kMany : kFew;
+  return {least, digit, (bits + digit - 1) / digit};
+}
 
 // A share of [0, size).
 struct Range {
@@ -31,33 +50,42 @@ std::size_t parts_for(std::size_t size, const ThreadPool& pool) {
   return std::clamp<std::size_t>(size / kWorthwhile, 1, pool.size());
 }
 
-std::size_t digit_of(std::uint32_t key, unsigned pass) { return (key >> (pass * kDigitBits)) & (kDigits - 1); }
-
-void radix_pass(const KeyedId* from, KeyedId* to, std::size_t size, unsigned pass, std::uint32_t* histogram,
-                std::size_t parts, ThreadPool& pool) {
+void radix_pass(const KeyedId* from, KeyedId* to, std::size_t size, const Digits& digits, unsigned pass,
+                std::uint32_t* histogram, std::size_t parts, ThreadPool& pool) {
+  const std::size_t kinds = digits.count();
   pool.run(parts, [&](std::size_t part) {
-    std::uint32_t* counts = histogram + part * kDigits;
-    std::fill_n(counts, kDigits, 0U);
+    std::uint32_t* counts = histogram + part * kinds;
+    std::fill_n(counts, kinds, 0U);
     const auto [begin, end] = share(size, part, parts);
     for (std::size_t i = begin; i < end; ++i) {
-      ++counts[digit_of(from[i].key, pass)];
+      ++counts[digits.of(from[i].key, pass)];
     }
   });
   std::uint32_t sum = 0;
-  for (std::size_t digit = 0; digit < kDigits; ++digit) {
+  for (std::size_t digit = 0; digit < kinds; ++digit) {
     for (std::size_t part = 0; part < parts; ++part) {
-      const std::uint32_t n = histogram[part * kDigits + digit];
-      histogram[part * kDigits + digit] = sum;
+      const std::uint32_t n = histogram[part * kinds + digit];
+      histogram[part * kinds + digit] = sum;
       sum += n;
     }
   }
   pool.run(parts, [&](std::size_t part) {
-    std::uint32_t* next = histogram + part * kDigits;
+    std::uint32_t* next = histogram + part * kinds;
     const auto [begin, end] = share(size, part, parts);
     for (std::size_t i = begin; i < end; ++i) {
-      to[next[digit_of(from[i].key, pass)]++] = from[i];
+      to[next[digits.of(from[i].key, pass)]++] = from[i];
     }
   });
+}
+
+// The least and the greatest key; 0 and 0 of none.
+std::pair<std::uint32_t, std::uint32_t> key_range(std::span<const KeyedId> keys) {
+  std::uint32_t least = keys.empty() ? 0U : std::numeric_limits<std::uint32_t>::max(), most = 0;
+  for (const KeyedId& each : keys) {
+    least = std::min(least, each.key);
+    most = std::max(most, each.key);
+  }
+  return {least, most};
 }
 
 // Brings the blocks' lists of visible ids together and numbers their pairs.
@@ -111,19 +139,18 @@ void order_by_depth(TileLists& state, ThreadPool& pool) {
   compact(state, pool);
   const std::size_t size = state.order.size();
   const std::size_t parts = parts_for(size, pool);
-  state.histogram.resize(parts * kDigits);
-  KeyedId* from = state.order.data();
-  KeyedId* to = state.order_scratch.data();
-  for (unsigned pass = 0; pass < kPasses; ++pass) {
-    radix_pass(from, to, size, pass, state.histogram.data(), parts, pool);
-    std::swap(from, to);
+  const auto [least, most] = key_range(state.order.span());
+  const Digits digits = digits_for(least, most, size);
+  state.histogram.resize(parts * digits.count());
+  for (unsigned pass = 0; pass < digits.passes; ++pass) {
+    radix_pass(state.order.data(), state.order_scratch.data(), size, digits, pass, state.histogram.data(), parts, pool);
+    std::swap(state.order, state.order_scratch);
   }
-  static_assert(kPasses % 2 == 1, "the sorted list ends in order_scratch");
 }
 
 void list_tiles(TileLists& state, ThreadPool& pool) {
   const std::size_t tiles = state.tiles();
-  const std::size_t size = state.order_scratch.size();
+  const std::size_t size = state.order.size();
   const std::size_t parts = parts_for(size, pool);
   const auto columns = static_cast<std::size_t>(state.columns);
   state.histogram.resize(parts * tiles);
@@ -135,7 +162,7 @@ void list_tiles(TileLists& state, ThreadPool& pool) {
     std::fill_n(counts, tiles, 0U);
     const auto [begin, end] = share(size, part, parts);
     for (std::size_t i = begin; i < end; ++i) {
-      const Placement& p = state.placements[state.order_scratch[i].id];
+      const Placement& p = state.placements[state.order[i].id];
       for (std::size_t y = p.y0; y < std::size_t{p.y0} + p.ny; ++y) {
         for (std::size_t x = p.x0; x < std::size_t{p.x0} + p.nx; ++x) {
           ++counts[y * columns + x];
@@ -157,7 +184,7 @@ void list_tiles(TileLists& state, ThreadPool& pool) {
     std::uint32_t* next = histogram + part * tiles;
     const auto [begin, end] = share(size, part, parts);
     for (std::size_t i = begin; i < end; ++i) {
-      const std::uint32_t id = state.order_scratch[i].id;
+      const std::uint32_t id = state.order[i].id;
       const Placement& p = state.placements[id];
       auto slot = static_cast<std::uint32_t>(state.blocks[id / kProjectBlock].first_pair) + p.slot;
       for (std::size_t y = p.y0; y < std::size_t{p.y0} + p.ny; ++y) {

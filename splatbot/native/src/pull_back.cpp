@@ -44,9 +44,8 @@ void add_background_gradient(const TileLists& lists, const View& view, const flo
   for (std::size_t y = 0; y < height; ++y) {
     for (std::size_t x = 0; x < width; ++x) {
       const std::size_t tile = y / kTileHeight * static_cast<std::size_t>(lists.columns) + x / kTileWidth;
-      const std::size_t in_y = y % kTileHeight, in_x = x % kTileWidth;
-      const std::size_t i = ((in_y / kBlock) * kBlockColumns + in_x / kBlock) * kBlockPixels + in_y % kBlock * kBlock +
-                            in_x % kBlock;
+      const int in_x = static_cast<int>(x % kTileWidth), in_y = static_cast<int>(y % kTileHeight);
+      const auto i = static_cast<std::size_t>(pixel_index(in_x, in_y));
       const double t = static_cast<double>(final_state[tile * tile_size + i]);
       for (std::size_t c = 0; c < out.size(); ++c) {
         out[c] += t * static_cast<double>(grad_colors[(y * width + x) * stride + c]);

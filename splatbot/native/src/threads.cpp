@@ -24,6 +24,8 @@ namespace {
 
 constexpr unsigned kMaxThreads = 1024;
 
+thread_local bool this_thread_alone = false;
+
 #if defined(__linux__)
 // The CPUs that the process might use at its first call; later the calling thread may itself be restricted.
 const cpu_set_t& process_cpus() {
@@ -126,8 +128,8 @@ ThreadPool::~ThreadPool() {
 }
 
 void ThreadPool::run_erased(std::size_t count, Function function, void* context) {
-  const std::unique_lock owner(owner_, std::try_to_lock);
-  if (!owner.owns_lock() || threads_.empty() || count < 2) {
+  std::unique_lock owner(owner_, std::defer_lock);
+  if (this_thread_alone || !owner.try_lock() || threads_.empty() || count < 2) {
     for (std::size_t i = 0; i < count; ++i) {
       function(context, i);
     }
@@ -205,6 +207,8 @@ std::shared_ptr<ThreadPool> thread_pool() {
   }
   return s.pool;
 }
+
+void keep_to_this_thread(bool alone) noexcept { this_thread_alone = alone; }
 
 void set_num_threads(unsigned threads) {
   if (threads > kMaxThreads) {

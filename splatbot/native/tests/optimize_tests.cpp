@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
+#include <limits>
 #include <cstdlib>
 #include <random>
 #include <vector>
@@ -87,10 +88,16 @@ void run_adam(std::size_t rows, std::size_t columns) {
   for (std::size_t i = 0; i < rows; ++i) {
     chosen[i] = i % 4 != 1 ? 1 : 0;
   }
+  std::size_t spoilt = 0;
+  for (std::size_t i = 0; i < rows; i += 7) {
+    gradient[i * columns + i % columns] = i % 2 == 0 ? std::numeric_limits<float>::quiet_NaN() : INFINITY;
+    spoilt += chosen[i];
+    chosen[i] = chosen[i] != 0 ? 2 : 0;
+  }
   const AdamParameter parameter = {values, first, second, gradient, 0.5};
-  adam_step(std::span(&parameter, 1), chosen, steps, {.eps = 1e-12});
+  check(adam_step(std::span(&parameter, 1), chosen, steps, {.eps = 1e-12}) == spoilt, "spoilt gradients are counted");
   for (std::size_t i = 0; i < values.size(); ++i) {
-    const bool on = chosen[i / columns] != 0;
+    const bool on = chosen[i / columns] == 1;
     const float sign = gradient[i] > 0.0F ? 1.0F : gradient[i] < 0.0F ? -1.0F : 0.0F;
     check(std::fabs(values[i] - (on ? 1.0F - 0.5F * sign : 1.0F)) < 1e-5F, "Adam's first step is the rate, chosen rows only");
     check(on || (first[i] == 0.0F && second[i] == 0.0F), "rows that are not chosen keep their moments");

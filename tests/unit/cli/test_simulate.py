@@ -62,7 +62,7 @@ def test_a_run_names_the_effects_of_its_log(
         return OracleSlam(truth, config)
 
     monkeypatch.setattr("splatbot.run.job.Slam", slam)
-    assert run("map", log, "--out", tmp_path / "run", "--quiet").code == 0
+    assert run("map", log, "--out", tmp_path / "run", "--save-every", 0, "--quiet").code == 0
     (row,) = json.loads((tmp_path / "run/metrics.json").read_text())["effects"]
     assert (row["name"], row["why"]) == ("depth_noise", "asked for as depth_noise")
     assert row["frames"] >= 9

@@ -106,12 +106,15 @@ def test_an_empty_model_reads_back_empty(tmp_path: Path) -> None:
 
 def test_bookkeeping_is_kept_on_request_and_ignored_by_plyfile_readers(tmp_path: Path) -> None:
     model = random_model(degree=1)
+    model.uncertainty = 0.01 * torch.rand(len(model))
+    model.misses = torch.arange(len(model), dtype=torch.int32)
+    bookkeeping = ["observations", "anchors", "uncertainty", "misses"]
     save_ply(model, tmp_path / "map.ply", bookkeeping=True)
     back = load_ply(tmp_path / "map.ply")
-    for name in (*STORED, "observations", "anchors"):
+    for name in (*STORED, *bookkeeping):
         assert torch.equal(getattr(back, name), getattr(model, name)), name
     vertex = plyfile.PlyData.read(str(tmp_path / "map.ply"))["vertex"]
-    assert [p.name for p in vertex.properties][-2:] == ["observations", "anchors"]
+    assert [p.name for p in vertex.properties][-4:] == bookkeeping
     assert np.array_equal(columns(vertex, "rot_0", "rot_1", "rot_2", "rot_3"), model.quats.numpy())
 
 

@@ -108,7 +108,7 @@ def test_clones_and_selections_share_no_memory() -> None:
 
 
 def test_bytes_are_those_of_all_arrays() -> None:
-    assert GaussianModel.from_activated(**arrays(10)).nbytes == 10 * 4 * (3 + 4 + 3 + 1 + 3 + 1 + 1)
+    assert GaussianModel.from_activated(**arrays(10)).nbytes == 10 * 4 * (3 + 4 + 3 + 1 + 3 + 4)
 
 
 def test_grey_has_no_dc_coefficient_and_colours_come_back() -> None:

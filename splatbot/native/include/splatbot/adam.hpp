@@ -20,8 +20,9 @@ struct AdamOptions {
 
 // One step of Adam (Kingma & Ba 2015, algorithm 1) of the rows that `chosen` marks, in place; the others keep their
 // bits. `steps` counts each row's own steps, this one included afterwards. Rows are independent, so the result does
-// not depend on the number of threads. Throws std::invalid_argument if sizes do not fit.
-void adam_step(std::span<const AdamParameter> parameters, std::span<const std::uint8_t> chosen, std::span<float> steps,
-               const AdamOptions& options);
+// not depend on the number of threads. A chosen row with a gradient that is not finite is left alone as well; returns the
+// number of those. Throws std::invalid_argument if sizes do not fit.
+std::size_t adam_step(std::span<const AdamParameter> parameters, std::span<const std::uint8_t> chosen,
+                      std::span<float> steps, const AdamOptions& options);
 
 }  // namespace splatbot

@@ -12,15 +12,25 @@
 namespace splatbot {
 
 // Tiles are large because each (Gaussian, tile) pair carries an exact mask of the 4x4-pixel blocks it reaches.
-inline constexpr int kTileWidth = 32;
-inline constexpr int kTileHeight = 16;
+#if !defined(SPLATBOT_TILE_WIDTH)
+#define SPLATBOT_TILE_WIDTH 32
+#define SPLATBOT_TILE_HEIGHT 16
+#endif
+inline constexpr int kTileWidth = SPLATBOT_TILE_WIDTH;
+inline constexpr int kTileHeight = SPLATBOT_TILE_HEIGHT;
 inline constexpr int kBlock = 4;
 inline constexpr int kBlockColumns = kTileWidth / kBlock;
 inline constexpr int kBlockRows = kTileHeight / kBlock;
 inline constexpr int kBlocks = kBlockColumns * kBlockRows;  // one bit each in a std::uint32_t
 inline constexpr int kBlockPixels = kBlock * kBlock;
 inline constexpr int kTilePixels = kTileWidth * kTileHeight;
-static_assert(kBlocks == 32 && kBlockColumns == 8);
+static_assert(kBlocks <= 32 && kTileHeight % 16 == 0);
+
+// Where a tile keeps its pixel (x, y): block by block, 16 to a block, column by column within it, so that what depends
+// on a pixel's line alone is four numbers over and over. Always inlined: the kernels are compiled for several CPUs.
+__attribute__((always_inline)) inline constexpr int pixel_index(int x, int y) {
+  return ((y / kBlock) * kBlockColumns + x / kBlock) * kBlockPixels + (x % kBlock) * kBlock + y % kBlock;
+}
 
 // Gaussians are projected in blocks of this many, whatever the number of threads: sums over them are in fixed order.
 inline constexpr std::size_t kProjectBlock = 1024;

@@ -56,6 +56,10 @@ class ThreadPool {
 // The pool all kernels share: SPLATBOT_NUM_THREADS threads, or as many as the process may run on.
 std::shared_ptr<ThreadPool> thread_pool();
 
+// Whether loops that the calling thread starts are run by it alone, whatever the pool's size: for work in the background
+// that is to leave the other cores to somebody else. Off in a new thread.
+void keep_to_this_thread(bool alone) noexcept;
+
 // Replaces the shared pool; 0 returns to the default. Throws std::invalid_argument above 1024.
 void set_num_threads(unsigned threads);
 

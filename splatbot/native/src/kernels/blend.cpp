@@ -2,20 +2,24 @@
 // Front-to-back blending of one tile. 64 Gaussians at a time: their block masks are found first, then each block goes
 // through the Gaussians that reach it with its transmittance and colours in registers.
 #include "entry.hpp"
+#include "image.hpp"
 #include "reach.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
-// Rows of a chunk: Local, slopes of plane depth, channels.
-constexpr int kRow = 16;
-constexpr int kRowSlopes = 6;
-constexpr int kRowChannels = 8;
+// Rows of a chunk: along the tile's lines as in Lines, then l11, plane depth, channels.
+constexpr int kRowU = 0;
+constexpr int kRowRest = kTileHeight;
+constexpr int kRowL11 = 2 * kTileHeight;
+constexpr int kRowPlane = kRowL11 + 1;
+constexpr int kRowChannels = kRowL11 + 4;
+constexpr int kRow = kRowL11 + 16;
+static_assert(kRowChannels + kRecordChannels <= kRow);
 
 struct Chunk {
   alignas(64) float rows[kChunk][kRow];
-  ChunkEllipses ellipses;
   std::uint32_t masks[kChunk];
   std::uint64_t columns[kBlocks];
 };
@@ -52,41 +56,34 @@ void start(const BlendArgs& args, const TileFrame& frame, int channels, TileStat
 }
 
 template <int C>
-SB_INLINE void load_chunk(const BlendArgs& args, const TileFrame& frame, const Pair* pairs, int n, bool slopes,
-                          Chunk& chunk) {
+SB_INLINE void load_chunk(const BlendArgs& args, const TileFrame& frame, const Pair* pairs, int n, std::uint32_t live,
+                          bool slopes, Chunk& chunk) {
   for (int j = 0; j < n; ++j) {
     const Record& record = args.records[pairs[j].id];
     const float* channels = args.channels + pairs[j].id * args.channel_stride;
     float* row = chunk.rows[j];
-    const Local local = localize(record, frame);
-    std::memcpy(row, &local, sizeof(local));
+    localize(record, frame, row + kRowU, nullptr, row + kRowRest);
+    row[kRowL11] = record.l11;
     std::memcpy(row + kRowChannels, channels, C * sizeof(float));
     if (slopes) {
       const PlaneDepth plane = plane_depth(record, channels, frame);
-      row[kRowSlopes] = plane.slope_x;
-      row[kRowSlopes + 1] = plane.slope_y;
-      row[kRow - 1] = plane.corner;  // at most 6 channels leave it free
+      std::memcpy(row + kRowPlane, &plane, sizeof(plane));
     }
-    ChunkEllipses& e = chunk.ellipses;
-    e.cx[j] = record.mx - static_cast<float>(frame.x0);
-    e.cy[j] = record.my - static_cast<float>(frame.y0);
-    e.l11[j] = record.l11;
-    e.l21[j] = record.l21;
-    e.l22[j] = record.l22;
-    e.reach[j] = record.reach;
-    e.lean[j] = record.lean;
   }
-  const int padded = (n + W - 1) / W * W;
-  for (int j = n; j < padded; ++j) {  // masked out later; any finite ellipse will do
-    ChunkEllipses& e = chunk.ellipses;
-    e.cx[j] = e.cy[j] = e.l21[j] = e.lean[j] = e.reach[j] = 0.0F;
-    e.l11[j] = e.l22[j] = 1.0F;
+  for (int j = 0; j < kChunk; j += W) {
+    const I masks = j < n ? block_masks(load_ellipses(args.records, pairs + j, n - j, frame)) : set1(0);
+    store(chunk.masks + j, masks & set1(static_cast<int>(live)));
+  }
+  for (int j = n; j < kChunk; ++j) {
+    chunk.masks[j] = 0;
   }
 }
 
 template <int C, Extras E>
-SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_t first, F limit, TileState& state) {
+SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, int block, int part, F limit, TileState& state) {
+  const auto first = static_cast<std::size_t>(block * kBlockPixels + part * W);
   const F x = load(kCenters.x + first), y = load(kCenters.y + first);
+  const float* rows = chunk.rows[0] + first_line(block);
   F through = load(state.through + first);
   F transmittance = load(state.transmittance + first);
   F sum[C];
@@ -96,16 +93,18 @@ SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, std::size_
   }
   F weights = load(state.weights + first);
   while (members != 0) {
-    const float* row = chunk.rows[__builtin_ctzll(members)];
+    const int member = __builtin_ctzll(members);
     members &= members - 1;
-    const Alpha a = alpha_at(x, y, row, row + 1, row + 2, row + 3, row + 4, row + 5);
+    const float* row = chunk.rows[member];
+    const float* lines = rows + member * kRow;
+    const AlphaAt a = alpha_at(x, set1(row[kRowL11]), lines + kRowU, lines + kRowRest);
     const Step step = advance(a, through, limit);
     transmittance = select(step.open, through, transmittance);
 #pragma GCC unroll 8
     for (int c = 0; c < C; ++c) {
       F value = set1(row[kRowChannels + c]);
       if (E.plane && c == 0) {
-        value = fma(set1(row[kRowSlopes]), x, fma(set1(row[kRowSlopes + 1]), y, set1(row[kRow - 1])));
+        value = fma(set1(row[kRowPlane]), x, fma(set1(row[kRowPlane + 1]), y, set1(row[kRowPlane + 2])));
       }
       sum[c] = fma(step.weight, value, sum[c]);
     }
@@ -146,25 +145,18 @@ void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile
   std::uint32_t live = live_blocks(state, limit);
   while (at < end && live != 0) {
     const int n = end - at < kChunk ? static_cast<int>(end - at) : kChunk;
-    load_chunk<C>(args, frame, args.pairs + at, n, E.plane, chunk);
+    load_chunk<C>(args, frame, args.pairs + at, n, live, E.plane, chunk);
     for (std::uint32_t next = at + kChunk; next < at + 2 * kChunk && next < end; ++next) {
       __builtin_prefetch(args.records + args.pairs[next].id);
     }
-    block_masks(chunk.ellipses, n, chunk.masks);
-    for (int j = 0; j < n; ++j) {
-      chunk.masks[j] &= live;
-      args.masks[at + static_cast<std::uint32_t>(j)] = chunk.masks[j];
-    }
-    for (int j = n; j < kChunk; ++j) {
-      chunk.masks[j] = 0;
-    }
+    std::memcpy(args.masks + at, chunk.masks, static_cast<std::size_t>(n) * sizeof(chunk.masks[0]));
     transpose_masks(chunk.masks, chunk.columns);
     for (std::uint32_t left = live; left != 0; left &= left - 1) {
       const int block = __builtin_ctz(left);
       const std::uint64_t members = chunk.columns[block];
       if (members != 0) {
         for (int part = 0; part < kParts; ++part) {
-          blend_block<C, E>(chunk, members, static_cast<std::size_t>(block * kBlockPixels + part * W), limit, state);
+          blend_block<C, E>(chunk, members, block, part, limit, state);
         }
       }
     }
@@ -174,34 +166,59 @@ void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile
   args.tile_done[tile] = at - begin;
 }
 
+// Sums to what is asked for: the background behind them, depth divided by the weights.
+void finish(const BlendArgs& args, TileState& state) {
+  const ChannelPass& pass = *args.pass;
+  for (std::size_t i = 0; i < kPlane; i += W) {
+    const F t = load(state.transmittance + i);
+    if (pass.depth_first && args.depth == DepthMode::expected) {
+      const F divisor = max(load(state.weights + i), set1(kExpectedDepthMin));
+      store(state.channels[0] + i, load(state.channels[0] + i) / divisor);
+    }
+    for (int c = pass.depth_first ? 1 : 0; c < pass.count && args.background != nullptr; ++c) {
+      store(state.channels[c] + i, load(state.channels[c] + i) + t * set1(args.background[c]));
+    }
+    store(state.transmittance + i, set1(1.0F) - t);
+  }
+}
+
 void write_tile(const BlendArgs& args, const TileFrame& frame, const TileState& state) {
   const ChannelPass& pass = *args.pass;
+  const auto width = static_cast<std::size_t>(args.view.width);
+  const float* planes[kRecordChannels];
+  for (int c = 0; c < pass.count; ++c) {
+    planes[c] = state.channels[c];
+  }
+  copy_out(frame, width, planes, pass.column.data(), pass.count, args.out_channels, args.out_colors);
+  if (args.write_alphas) {
+    const float* alphas[1] = {state.transmittance};
+    const int column[1] = {0};
+    copy_out(frame, width, alphas, column, 1, 1, args.out_alphas);
+  }
+}
+
+SB_INLINE void expect_writes(const float* from, std::size_t floats) {
+  for (std::size_t i = 0; i < floats; i += 64 / sizeof(float)) {
+    __builtin_prefetch(from + i, 1);
+  }
+}
+
+// Ask for the memory that a tile will be written to: it arrives while the tile is blended.
+void expect_tile(const BlendArgs& args, const TileFrame& frame, std::size_t tile, int channels) {
   for (int y = 0; y < frame.height; ++y) {
-    const std::size_t line = static_cast<std::size_t>(frame.y0 + y) * static_cast<std::size_t>(args.view.width) +
-                             static_cast<std::size_t>(frame.x0);
-    for (int x = 0; x < frame.width; ++x) {
-      const int i = pixel_index(x, y);
-      const float t = state.transmittance[i];
-      float* to = args.out_colors + (line + static_cast<std::size_t>(x)) * static_cast<std::size_t>(args.out_channels);
-      int c = 0;
-      if (pass.depth_first) {
-        const float divisor = state.weights[i] > kExpectedDepthMin ? state.weights[i] : kExpectedDepthMin;
-        to[pass.column[0]] = args.depth == DepthMode::expected ? state.channels[0][i] / divisor : state.channels[0][i];
-        c = 1;
-      }
-      for (; c < pass.count; ++c) {
-        const float behind = args.background != nullptr ? t * args.background[c] : 0.0F;
-        to[pass.column[c]] = state.channels[c][i] + behind;
-      }
-      if (args.write_alphas) {
-        args.out_alphas[line + static_cast<std::size_t>(x)] = 1.0F - t;
-      }
+    const std::size_t line = line_of(frame, static_cast<std::size_t>(args.view.width), y);
+    const auto columns = static_cast<std::size_t>(args.out_channels), pixels = static_cast<std::size_t>(frame.width);
+    expect_writes(args.out_colors + line * columns, pixels * columns);
+    if (args.write_alphas) {
+      expect_writes(args.out_alphas + line, pixels);
     }
   }
+  expect_writes(args.final_state + tile * kFinalSize, static_cast<std::size_t>(1 + channels) * kPlane);
 }
 
 template <int C>
 void blend_channels(const BlendArgs& args, const TileFrame& frame, std::size_t tile, TileState& state) {
+  expect_tile(args, frame, tile, C);
   start(args, frame, C, state);
   const bool depth = args.pass->depth_first;
   const bool expected = depth && args.depth == DepthMode::expected;
@@ -217,13 +234,14 @@ void blend_channels(const BlendArgs& args, const TileFrame& frame, std::size_t t
   } else {
     blend_lists<C, Extras{false, false}>(args, frame, tile, state);
   }
-  write_tile(args, frame, state);
   float* saved = args.final_state + tile * kFinalSize;
   std::memcpy(saved, state.transmittance, sizeof(state.transmittance));
   std::memcpy(saved + kPlane, state.channels, C * sizeof(state.channels[0]));
   if (expected) {
     std::memcpy(saved + kWeightPlane * kPlane, state.weights, sizeof(state.weights));
   }
+  finish(args, state);
+  write_tile(args, frame, state);
 }
 
 }  // namespace

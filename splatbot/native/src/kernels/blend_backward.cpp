@@ -5,7 +5,7 @@
 // without a division by T and in the order and with the masks of the forward pass. The sums of one (Gaussian, tile)
 // pair go to a slot of their own: nothing is shared between threads and nothing depends on their number.
 #include "entry.hpp"
-#include "tile.hpp"
+#include "image.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -17,56 +17,70 @@ struct TileGradient {
   alignas(64) float gradient[kRecordChannels][kTilePixels];
 };
 
-// Gradients to the sums that blend() had before the background was added and expected depth was divided.
-void load_pixel(const BlendBackwardArgs& args, std::size_t pixel, int i, const float* saved, TileGradient& state) {
-  const ChannelPass& pass = *args.forward.pass;
-  const float t = saved[i];
-  float grad_t = args.grad_alphas != nullptr ? -args.grad_alphas[pixel] : 0.0F;
-  float rest = 0.0F;
-  const float* grads = args.grad_colors == nullptr
-                           ? nullptr
-                           : args.grad_colors + pixel * static_cast<std::size_t>(args.forward.out_channels);
-  for (int c = 0; c < pass.count; ++c) {
-    float g = grads == nullptr ? 0.0F : grads[pass.column[static_cast<std::size_t>(c)]];
-    const float sum = saved[(1 + static_cast<std::size_t>(c)) * kPlane + static_cast<std::size_t>(i)];
-    if (c == 0 && pass.depth_first) {
-      if (args.forward.depth == DepthMode::expected) {
-        const float covered = saved[kWeightPlane * kPlane + static_cast<std::size_t>(i)];
-        const bool divided = covered > kExpectedDepthMin;
-        g /= divided ? covered : kExpectedDepthMin;
-        grad_t += divided ? g * sum / covered : 0.0F;
-      }
-    } else if (args.forward.background != nullptr) {
-      grad_t += args.forward.background[c] * g;
-    }
-    state.gradient[c][i] = g;
-    rest += sum * g;
+void load_gradients(const BlendBackwardArgs& args, const TileFrame& frame, int channels, TileGradient& state) {
+  const BlendArgs& f = args.forward;
+  const auto width = static_cast<std::size_t>(f.view.width);
+  const int given = args.grad_colors != nullptr ? f.pass->count : 0;
+  const bool whole = frame.width == kTileWidth && frame.height == kTileHeight;
+  for (int c = whole ? given : 0; c < channels; ++c) {
+    std::memset(state.gradient[c], 0, sizeof(state.gradient[c]));
   }
-  state.through[i] = 1.0F;
-  state.rest[i] = rest + grad_t * t;
+  if (given != 0) {
+    float* planes[kRecordChannels];
+    for (int c = 0; c < given; ++c) {
+      planes[c] = state.gradient[c];
+    }
+    copy_in(frame, width, args.grad_colors, f.out_channels, f.pass->column.data(), given, planes);
+  }
+  if (!whole || args.grad_alphas == nullptr) {
+    std::memset(state.rest, 0, sizeof(state.rest));
+  }
+  if (args.grad_alphas != nullptr) {
+    float* alphas[1] = {state.rest};
+    const int column[1] = {0};
+    copy_in(frame, width, args.grad_alphas, 1, column, 1, alphas);
+  }
 }
 
-template <int C>
-void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, const float* saved, TileGradient& state) {
-  if (frame.width < kTileWidth || frame.height < kTileHeight || args.forward.pass->count < C) {
-    for (int i = 0; i < kTilePixels; ++i) {
-      state.through[i] = 0.0F;
-      state.rest[i] = 0.0F;
-    }
-    for (int c = 0; c < C; ++c) {
-      std::memset(state.gradient[c], 0, sizeof(state.gradient[c]));
+void open_pixels(const BlendArgs& args, const TileFrame& frame, TileGradient& state) {
+  const bool whole = frame.width == kTileWidth && frame.height == kTileHeight && args.mask == nullptr;
+  for (float& through : state.through) {
+    through = whole ? 1.0F : 0.0F;
+  }
+  for (int y = 0; y < frame.height && !whole; ++y) {
+    for (int x = 0; x < frame.width; ++x) {
+      state.through[pixel_index(x, y)] = kept(args, frame.x0 + x, frame.y0 + y) ? 1.0F : 0.0F;
     }
   }
-  for (int y = 0; y < frame.height; ++y) {
-    const std::size_t line =
-        static_cast<std::size_t>(frame.y0 + y) * static_cast<std::size_t>(args.forward.view.width) +
-        static_cast<std::size_t>(frame.x0);
-    for (int x = 0; x < frame.width; ++x) {
-      load_pixel(args, line + static_cast<std::size_t>(x), pixel_index(x, y), saved, state);
-      if (!kept(args.forward, frame.x0 + x, frame.y0 + y)) {
-        state.through[pixel_index(x, y)] = 0.0F;
+}
+
+// Gradients to the sums that blend() had before the background was added and expected depth was divided.
+void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, int channels, const float* saved,
+               TileGradient& state) {
+  const ChannelPass& pass = *args.forward.pass;
+  const float* background = args.forward.background;
+  load_gradients(args, frame, channels, state);
+  open_pixels(args.forward, frame, state);
+  for (std::size_t i = 0; i < kPlane; i += W) {
+    F grad_t = -load(state.rest + i);  // of alphas
+    F rest = set1(0.0F);
+    for (int c = 0; c < pass.count; ++c) {
+      F g = load(state.gradient[c] + i);
+      const F sum = load(saved + (1 + static_cast<std::size_t>(c)) * kPlane + i);
+      if (c == 0 && pass.depth_first) {
+        if (args.forward.depth == DepthMode::expected) {
+          const F covered = load(saved + kWeightPlane * kPlane + i);
+          const M divided = covered > set1(kExpectedDepthMin);
+          g = g / select(divided, covered, set1(kExpectedDepthMin));
+          grad_t = grad_t + zero_unless(divided, g * sum / max(covered, set1(kExpectedDepthMin)));
+          store(state.gradient[0] + i, g);
+        }
+      } else if (background != nullptr) {
+        grad_t = grad_t + set1(background[c]) * g;
       }
+      rest = rest + sum * g;
     }
+    store(state.rest + i, rest + grad_t * load(saved + i));
   }
 }
 
@@ -79,8 +93,8 @@ enum class Sums { none, moments, absolute };
 // if absolute, the absolute gradients of the centre in x (less a factor) and y. Without moments there is no need of
 // the gradient to alpha.
 template <int C, int S, bool Plane, Sums Kind>
-SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDepth& plane, std::uint32_t mask,
-                        F limit, TileGradient& state, float* slot) {
+SB_INLINE void sum_pair(const Record& record, const Lines& lines, const float* channels, const PlaneDepth& plane,
+                        std::uint32_t mask, F limit, TileGradient& state, float* slot) {
   F acc[16];
 #pragma GCC unroll 16
   for (int i = 0; i < 16; ++i) {
@@ -92,9 +106,7 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
 #pragma GCC unroll 4
     for (int part = 0; part < kParts; ++part) {
       const std::size_t first = static_cast<std::size_t>(block * kBlockPixels + part * W);
-      const F x = load(kCenters.x + first), y = load(kCenters.y + first);
-      const Alpha a = alpha_at(x, y, &local.l11, &local.l21, &local.l22,
-                               &local.u0, &local.w0, &local.lo);
+      const AlphaAt a = alpha_at(lines, block, first);
       F through = load(state.through + first);
       const Step step = advance(a, through, limit);
       F along = set1(0.0F);
@@ -103,6 +115,7 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
         const F g = load(state.gradient[c] + first);
         F value = set1(channels[c]);
         if (Plane && c == 0) {
+          const F x = load(kCenters.x + first), y = load(kCenters.y + first);
           value = fma(set1(plane.slope_x), x, fma(set1(plane.slope_y), y, set1(plane.corner)));
         }
         if (Kind != Sums::none) {
@@ -123,16 +136,17 @@ SB_INLINE void sum_pair(const Local& local, const float* channels, const PlaneDe
       const M free = step.open & (a.power <= set1(kAlphaMax));
       const F v = zero_unless(free, fms(step.weight, along, other));
       const F vu = v * a.u;
-      const F vw = v * a.w;
+      const F w = load_quad(lines.w + first_line(block));
+      const F vw = v * w;
       acc[0] = acc[0] + v;
       acc[1] = acc[1] + vu;
       acc[2] = acc[2] + vw;
       acc[3] = fma(vu, a.u, acc[3]);
-      acc[4] = fma(vu, a.w, acc[4]);
-      acc[5] = fma(vw, a.w, acc[5]);
+      acc[4] = fma(vu, w, acc[4]);
+      acc[5] = fma(vw, w, acc[5]);
       if (Kind == Sums::absolute) {
         acc[kAbsolute] = acc[kAbsolute] + abs(vu);
-        acc[kAbsolute + 1] = acc[kAbsolute + 1] + abs(fma(set1(local.l21), vu, set1(local.l22) * vw));
+        acc[kAbsolute + 1] = acc[kAbsolute + 1] + abs(fma(set1(record.l21), vu, set1(record.l22) * vw));
       }
     }
   } while (mask != 0);
@@ -159,10 +173,12 @@ void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::
       __builtin_prefetch(args.slots + static_cast<std::size_t>(f.pairs[at + kAhead].slot) * kSlot, 1);
     }
     const std::size_t id = f.pairs[at].id;
-    const Local local = localize(f.records[id], frame);
+    const Record& record = f.records[id];
+    Lines lines;
+    localize(record, frame, lines);
     const float* channels = f.channels + id * f.channel_stride;
-    const PlaneDepth plane = Plane ? plane_depth(f.records[id], channels, frame) : PlaneDepth{};
-    sum_pair<C, S, Plane, Kind>(local, channels, plane, mask, limit, state, slot);
+    const PlaneDepth plane = Plane ? plane_depth(record, channels, frame) : PlaneDepth{};
+    sum_pair<C, S, Plane, Kind>(record, lines, channels, plane, mask, limit, state, slot);
   }
 }
 
@@ -183,7 +199,7 @@ void backward_sums(const BlendBackwardArgs& args, const TileFrame& frame, std::s
 
 template <int C>
 void backward_channels(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
-  load_tile<C>(args, frame, args.forward.final_state + tile * kFinalSize, state);
+  load_tile(args, frame, C, args.forward.final_state + tile * kFinalSize, state);
   if (args.forward.plane_depth && args.forward.pass->depth_first) {
     backward_sums<C < kRecordChannels ? C : 1, true>(args, frame, tile, state);
   } else {

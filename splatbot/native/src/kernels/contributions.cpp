@@ -20,16 +20,14 @@ void open_pixels(const BlendArgs& args, const TileFrame& frame, Through& through
   }
 }
 
-std::uint32_t count_pair(const Local& local, std::uint32_t mask, F limit, Through& through) {
+std::uint32_t count_pair(const Lines& lines, std::uint32_t mask, F limit, Through& through) {
   std::uint32_t count = 0;
   for (; mask != 0; mask &= mask - 1) {
     const int block = __builtin_ctz(mask);
     for (int part = 0; part < kParts; ++part) {
       const auto first = static_cast<std::size_t>(block * kBlockPixels + part * W);
-      const Alpha a = alpha_at(load(kCenters.x + first), load(kCenters.y + first), &local.l11, &local.l21, &local.l22,
-                               &local.u0, &local.w0, &local.lo);
       F left = load(through.values + first);
-      const Step step = advance(a, left, limit);
+      const Step step = advance(alpha_at(lines, block, first), left, limit);
       store(through.values + first, left);
       count += static_cast<std::uint32_t>(__builtin_popcount(bits(step.weight > set1(0.0F))));
     }
@@ -48,8 +46,9 @@ void contributions(const ContributionArgs& args, std::size_t tile) {
   const std::uint32_t begin = f.tile_begin[tile], done = begin + f.tile_done[tile];
   for (std::uint32_t at = begin; at < f.tile_begin[tile + 1]; ++at) {
     const Pair& pair = f.pairs[at];
-    args.counts[pair.slot] =
-        at < done ? count_pair(localize(f.records[pair.id], frame), f.masks[at], limit, through) : 0U;
+    Lines lines;
+    localize(f.records[pair.id], frame, lines);
+    args.counts[pair.slot] = at < done ? count_pair(lines, f.masks[at], limit, through) : 0U;
   }
 }
 

@@ -21,20 +21,15 @@ void open_pixels(const BlendArgs& args, const TileFrame& frame, Through& through
   }
 }
 
-SB_INLINE Alpha alpha_in(const Local& local, std::size_t first) {
-  return alpha_at(load(kCenters.x + first), load(kCenters.y + first), &local.l11, &local.l21, &local.l22, &local.u0,
-                  &local.w0, &local.lo);
-}
-
 // Names the Gaussian in the pixels of a block that it takes from above to half; true if some pixel is still above.
-bool halve_block(const Local& local, std::uint32_t id, int block, F limit, Through& through, std::int32_t* ids) {
+bool halve_block(const Lines& lines, std::uint32_t id, int block, F limit, Through& through, std::int32_t* ids) {
   const F half = set1(0.5F);
   std::uint32_t above = 0;
   for (int part = 0; part < kParts; ++part) {
     const auto first = static_cast<std::size_t>(block * kBlockPixels + part * W);
     const F before = load(through.values + first);
     F after = before;
-    advance(alpha_in(local, first), after, limit);
+    advance(alpha_at(lines, block, first), after, limit);
     store(through.values + first, after);
     for (std::uint32_t met = bits((before > half) & (after <= half)); met != 0; met &= met - 1) {
       ids[first + static_cast<std::size_t>(__builtin_ctz(met))] = static_cast<std::int32_t>(id);
@@ -63,13 +58,13 @@ struct Wanted {
   }
 };
 
-void pick_block(const FrontArgs& args, const Local& local, std::uint32_t id, int block, std::uint32_t first_entry,
+void pick_block(const FrontArgs& args, const Lines& lines, std::uint32_t id, int block, std::uint32_t first_entry,
                 F limit, Through& through, Wanted& wanted) {
   alignas(64) float weights[W];
   for (int part = 0; part < kParts; ++part) {
     const auto first = static_cast<std::size_t>(block * kBlockPixels + part * W);
     F left = load(through.values + first);
-    const Step step = advance(alpha_in(local, first), left, limit);
+    const Step step = advance(alpha_at(lines, block, first), left, limit);
     store(through.values + first, left);
     store(weights, step.weight);
     std::uint32_t met = bits(step.weight > set1(0.0F)) & (wanted.lanes[block] >> (part * W));
@@ -108,10 +103,11 @@ void medians(const MedianArgs& args, std::size_t tile) {
       continue;
     }
     const std::uint32_t id = f.pairs[at].id;
-    const Local local = localize(f.records[id], frame);
+    Lines lines;
+    localize(f.records[id], frame, lines);
     for (; mask != 0; mask &= mask - 1) {
       const int block = __builtin_ctz(mask);
-      if (!halve_block(local, id, block, limit, through, ids)) {
+      if (!halve_block(lines, id, block, limit, through, ids)) {
         waiting &= ~(1U << block);
       }
     }
@@ -142,9 +138,10 @@ void fronts(const FrontArgs& args, std::size_t tile) {
       continue;
     }
     const std::uint32_t id = f.pairs[at].id;
-    const Local local = localize(f.records[id], frame);
+    Lines lines;
+    localize(f.records[id], frame, lines);
     for (; mask != 0; mask &= mask - 1) {
-      pick_block(args, local, id, __builtin_ctz(mask), first_entry, limit, through, wanted);
+      pick_block(args, lines, id, __builtin_ctz(mask), first_entry, limit, through, wanted);
     }
   }
 }

@@ -2,50 +2,90 @@
 // Which 4x4-pixel blocks of a tile a Gaussian's ellipse meets.
 #pragma once
 
+#include <cstddef>
+
 #include "tile.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
-// Fields of the records of one chunk, side by side.
-struct ChunkEllipses {
-  alignas(64) float cx[kChunk], cy[kChunk];  // centre, from the tile's corner
-  alignas(64) float l11[kChunk], l21[kChunk], l22[kChunk], reach[kChunk], lean[kChunk];
+// W ellipses u^2 + w^2 <= reach^2 (see Record), their centres from the tile's corner.
+struct EllipseLanes {
+  F cx, cy, l11, l21, l22, reach, lean;
 };
 
-// For each of n Gaussians, a bit for each block whose rectangle of pixel centres meets u^2 + w^2 <= reach^2. Exact for
+#if SPLATBOT_SIMD == 512
+// Four floats of each of 16 rows, lane i of out[c] being column c of row i.
+SB_INLINE void load_quads(const float* const (&rows)[W], F (&out)[4]) {
+  for (int k = 0; k < 4; ++k) {
+    __m512 q = _mm512_castps128_ps512(_mm_load_ps(rows[k]));
+    q = _mm512_insertf32x4(q, _mm_load_ps(rows[4 + k]), 1);
+    q = _mm512_insertf32x4(q, _mm_load_ps(rows[8 + k]), 2);
+    out[k] = {_mm512_insertf32x4(q, _mm_load_ps(rows[12 + k]), 3)};
+  }
+  transpose_quads(out);
+}
+#endif
+
+// The ellipses of the first n of W pairs; the last is repeated.
+SB_INLINE EllipseLanes load_ellipses(const Record* records, const Pair* pairs, int n, const TileFrame& frame) {
+  static_assert(offsetof(Record, lean) == 7 * sizeof(float));
+  F first[4], second[4];
+  const float* rows[W];
+  for (int i = 0; i < W; ++i) {
+    rows[i] = &records[pairs[i < n ? i : n - 1].id].mx;
+  }
+#if SPLATBOT_SIMD == 512
+  load_quads(rows, first);
+  for (const float*& row : rows) {
+    row += 4;
+  }
+  load_quads(rows, second);
+#else
+  alignas(64) float lanes[8][W];
+  for (int i = 0; i < W; ++i) {
+    for (int c = 0; c < 8; ++c) {
+      lanes[c][i] = rows[i][c];
+    }
+  }
+  for (int c = 0; c < 4; ++c) {
+    first[c] = load(lanes[c]);
+    second[c] = load(lanes[4 + c]);
+  }
+#endif
+  const F cx = first[0] - set1(static_cast<float>(frame.x0)), cy = first[1] - set1(static_cast<float>(frame.y0));
+  return {cx, cy, first[2], first[3], second[0], second[2], second[3]};
+}
+
+// For each of W Gaussians, a bit for each block whose rectangle of pixel centres meets u^2 + w^2 <= reach^2. Exact for
 // each row of blocks: the ellipse cut by the row's strip is convex, so it meets the blocks that its extent in x spans,
 // and that extent ends at the ellipse's outermost point or, if that is outside, where the strip's nearer edge cuts it.
-SB_INLINE void block_masks(const ChunkEllipses& e, int n, std::uint32_t* masks) {
+SB_INLINE I block_masks(const EllipseLanes& e) {
   constexpr float kMargin = 0.01F;  // [px], against rounding
-  const F zero = set1(0.0F);
-  for (int i = 0; i < n; i += W) {
-    const F cx = load(e.cx + i), cy = load(e.cy + i), l22 = load(e.l22 + i), r = load(e.reach + i);
-    const F lean = load(e.lean + i);
-    const F inverse = set1(1.0F) / load(e.l11 + i);
-    const F shear = load(e.l21 + i) / l22;
-    const F r2 = r * r;
-    I mask = set1(0);
+  constexpr float kShare = 1.0F / kBlock;
+  constexpr float kFirst = 0.5F - kMargin, kLast = static_cast<float>(kBlock) - 0.5F + kMargin;  // of a block's centres
+  const F zero = set1(0.0F), tiny = set1(1e-30F);
+  const F center = e.l22 * e.cy;
+  const F right_of = (e.cx - set1(kFirst)) * set1(kShare), left_of = (e.cx - set1(kLast)) * set1(kShare);  // in blocks
+  const F scale = set1(kShare) * reciprocal(e.l11);
+  const F shear = e.l21 * reciprocal(e.l22);
+  const F r2 = square(e.reach * set1(1.0F + kRootError));  // so that no root comes out too small
+  const F minus_reach = -e.reach, minus_lean = -e.lean;
+  I mask = set1(0);
 #pragma GCC unroll 4
-    for (int row = 0; row < kBlockRows; ++row) {
-      const F top = l22 * (set1(static_cast<float>(kBlock * row) + 0.5F - kMargin) - cy);
-      const F bottom = l22 * (set1(static_cast<float>(kBlock * row + kBlock) - 0.5F + kMargin) - cy);
-      const F low = max(top, -r);
-      const F high = min(bottom, r);
-      const F w_right = min(max(lean, low), high);
-      const F w_left = min(max(-lean, low), high);
-      const F right = fma(sqrt(max(r2 - w_right * w_right, zero)) - shear * w_right, inverse, cx);
-      const F left = fnma(sqrt(max(r2 - w_left * w_left, zero)) + shear * w_left, inverse, cx);
-      const F last = floor((right - set1(0.5F - kMargin)) * set1(1.0F / kBlock));
-      const F first = ceil((left - set1(static_cast<float>(kBlock) - 0.5F + kMargin)) * set1(1.0F / kBlock));
-      const M meets = (low <= high) & (first <= last) & (last >= zero) & (first <= set1(kBlockColumns - 1.0F));
-      const I from = to_int(clamp(first, zero, set1(kBlockColumns - 1.0F)));
-      const I to = to_int(clamp(last, zero, set1(kBlockColumns - 1.0F)));
-      // Bits from..to: 2^(to + 1) - 2^from.
-      const I span = shift_left(set1(2), to) - shift_left(set1(1), from);
-      mask = mask | shift_left(zero_unless(meets, span), set1(kBlockColumns * row));
-    }
-    store(masks + i, mask);
+  for (int row = 0; row < kBlockRows; ++row) {
+    const F low = max(fms(e.l22, set1(static_cast<float>(kBlock * row) + kFirst), center), minus_reach);
+    const F high = min(fms(e.l22, set1(static_cast<float>(kBlock * row) + kLast), center), e.reach);
+    const F w_right = clamp(e.lean, low, high);
+    const F w_left = clamp(minus_lean, low, high);
+    const F right = fma(fnma(shear, w_right, rough_sqrt(max(r2 - w_right * w_right, tiny))), scale, right_of);
+    const F left = fnma(fma(shear, w_left, rough_sqrt(max(r2 - w_left * w_left, tiny))), scale, left_of);
+    const I end = floor_to_int(clamp(right, set1(-1.0F), set1(kBlockColumns - 1.0F))) + set1(1);
+    const I begin = ceil_to_int(clamp(left, zero, set1(static_cast<float>(kBlockColumns))));
+    const M meets = (low <= high) & (end > begin);
+    const I span = shift_left(set1(1), end) - shift_left(set1(1), begin);
+    mask = mask | shift_left(zero_unless(meets, span), set1(kBlockColumns * row));
   }
+  return mask;
 }
 
 // Row j, bit b of 64 masks becomes row b, bit j of 32.

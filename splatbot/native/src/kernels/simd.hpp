@@ -4,6 +4,7 @@
 // product and a sum fuse where fma() says so and nowhere else, so that forward and backward round alike.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 #include <cstring>
 
@@ -32,6 +33,8 @@ struct M {
 
 SB_INLINE F set1(float x) { return {_mm512_set1_ps(x)}; }
 SB_INLINE F load(const float* p) { return {_mm512_loadu_ps(p)}; }
+// Four floats, over and over.
+SB_INLINE F load_quad(const float* p) { return {_mm512_broadcast_f32x4(_mm_loadu_ps(p))}; }
 SB_INLINE void store(float* p, F a) { _mm512_storeu_ps(p, a.v); }
 SB_INLINE F operator+(F a, F b) { return {_mm512_add_ps(a.v, b.v)}; }
 SB_INLINE F operator-(F a, F b) { return {_mm512_sub_ps(a.v, b.v)}; }
@@ -57,6 +60,8 @@ SB_INLINE F mul_zero_unless(M m, F a, F b) { return {_mm512_maskz_mul_ps(m.v, a.
 SB_INLINE std::uint32_t bits(M m) { return m.v; }
 SB_INLINE F min_zero_unless(M m, F a, F b) { return {_mm512_maskz_min_ps(m.v, a.v, b.v)}; }
 SB_INLINE I to_int(F a) { return {_mm512_cvttps_epi32(a.v)}; }
+SB_INLINE I floor_to_int(F a) { return {_mm512_cvt_roundps_epi32(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+SB_INLINE I ceil_to_int(F a) { return {_mm512_cvt_roundps_epi32(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
 SB_INLINE F to_float(I a) { return {_mm512_cvtepi32_ps(a.v)}; }
 SB_INLINE I bit_cast_int(F a) { return {_mm512_castps_si512(a.v)}; }
 SB_INLINE F bit_cast_float(I a) { return {_mm512_castsi512_ps(a.v)}; }
@@ -66,6 +71,7 @@ SB_INLINE I operator+(I a, I b) { return {_mm512_add_epi32(a.v, b.v)}; }
 SB_INLINE I operator-(I a, I b) { return {_mm512_sub_epi32(a.v, b.v)}; }
 SB_INLINE I operator&(I a, I b) { return {_mm512_and_si512(a.v, b.v)}; }
 SB_INLINE M operator==(I a, I b) { return {_mm512_cmpeq_epi32_mask(a.v, b.v)}; }
+SB_INLINE M operator>(I a, I b) { return {_mm512_cmpgt_epi32_mask(a.v, b.v)}; }
 SB_INLINE I operator|(I a, I b) { return {_mm512_or_si512(a.v, b.v)}; }
 template <int N>
 SB_INLINE I shift_left(I a) {
@@ -80,6 +86,39 @@ SB_INLINE I zero_unless(M m, I a) { return {_mm512_maskz_mov_epi32(m.v, a.v)}; }
 SB_INLINE F reciprocal(F a) {  // one Newton step from 14 bits
   const __m512 r = _mm512_rcp14_ps(a.v);
   return {_mm512_mul_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(2.0F)))};
+}
+
+// Square roots of positive numbers with a relative error below kRootError.
+inline constexpr float kRootError = 0x1p-13F;
+SB_INLINE F rough_sqrt(F a) { return {_mm512_mul_ps(a.v, _mm512_rsqrt14_ps(a.v))}; }
+// In each quad of lanes, what four vectors hold of it is a 4x4 matrix: transpose it.
+SB_INLINE void transpose_quads(F (&a)[4]) {
+  const __m512d low01 = _mm512_castps_pd(_mm512_unpacklo_ps(a[0].v, a[1].v));
+  const __m512d high01 = _mm512_castps_pd(_mm512_unpackhi_ps(a[0].v, a[1].v));
+  const __m512d low23 = _mm512_castps_pd(_mm512_unpacklo_ps(a[2].v, a[3].v));
+  const __m512d high23 = _mm512_castps_pd(_mm512_unpackhi_ps(a[2].v, a[3].v));
+  a[0] = {_mm512_castpd_ps(_mm512_unpacklo_pd(low01, low23))};
+  a[1] = {_mm512_castpd_ps(_mm512_unpackhi_pd(low01, low23))};
+  a[2] = {_mm512_castpd_ps(_mm512_unpacklo_pd(high01, high23))};
+  a[3] = {_mm512_castpd_ps(_mm512_unpackhi_pd(high01, high23))};
+}
+
+// The lanes of a matrix of quads, column by column, as four lines `stride` apart; and the way back.
+SB_INLINE void store_lines(float* to, std::size_t stride, F a) {
+  const __m512i across = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+  const __m512 lines = _mm512_permutexvar_ps(across, a.v);
+  _mm_storeu_ps(to, _mm512_castps512_ps128(lines));
+  _mm_storeu_ps(to + stride, _mm512_extractf32x4_ps(lines, 1));
+  _mm_storeu_ps(to + 2 * stride, _mm512_extractf32x4_ps(lines, 2));
+  _mm_storeu_ps(to + 3 * stride, _mm512_extractf32x4_ps(lines, 3));
+}
+SB_INLINE F load_lines(const float* from, std::size_t stride) {
+  const __m512i across = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+  __m512 lines = _mm512_castps128_ps512(_mm_loadu_ps(from));
+  lines = _mm512_insertf32x4(lines, _mm_loadu_ps(from + stride), 1);
+  lines = _mm512_insertf32x4(lines, _mm_loadu_ps(from + 2 * stride), 2);
+  lines = _mm512_insertf32x4(lines, _mm_loadu_ps(from + 3 * stride), 3);
+  return {_mm512_permutexvar_ps(across, lines)};
 }
 
 #elif SPLATBOT_SIMD == 256
@@ -97,6 +136,7 @@ struct M {
 
 SB_INLINE F set1(float x) { return {_mm256_set1_ps(x)}; }
 SB_INLINE F load(const float* p) { return {_mm256_loadu_ps(p)}; }
+SB_INLINE F load_quad(const float* p) { return {_mm256_broadcast_ps(reinterpret_cast<const __m128*>(p))}; }
 SB_INLINE void store(float* p, F a) { _mm256_storeu_ps(p, a.v); }
 SB_INLINE F operator+(F a, F b) { return {_mm256_add_ps(a.v, b.v)}; }
 SB_INLINE F operator-(F a, F b) { return {_mm256_sub_ps(a.v, b.v)}; }
@@ -131,6 +171,7 @@ SB_INLINE I operator+(I a, I b) { return {_mm256_add_epi32(a.v, b.v)}; }
 SB_INLINE I operator-(I a, I b) { return {_mm256_sub_epi32(a.v, b.v)}; }
 SB_INLINE I operator&(I a, I b) { return {_mm256_and_si256(a.v, b.v)}; }
 SB_INLINE M operator==(I a, I b) { return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(a.v, b.v))}; }
+SB_INLINE M operator>(I a, I b) { return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(a.v, b.v))}; }
 SB_INLINE I operator|(I a, I b) { return {_mm256_or_si256(a.v, b.v)}; }
 template <int N>
 SB_INLINE I shift_left(I a) {
@@ -143,6 +184,16 @@ SB_INLINE I shift_right(I a) {
 SB_INLINE I shift_left(I a, I n) { return {_mm256_sllv_epi32(a.v, n.v)}; }
 SB_INLINE I zero_unless(M m, I a) { return {_mm256_and_si256(_mm256_castps_si256(m.v), a.v)}; }
 SB_INLINE F reciprocal(F a) { return set1(1.0F) / a; }
+SB_INLINE void transpose_quads(F (&a)[4]) {
+  const __m256d low01 = _mm256_castps_pd(_mm256_unpacklo_ps(a[0].v, a[1].v));
+  const __m256d high01 = _mm256_castps_pd(_mm256_unpackhi_ps(a[0].v, a[1].v));
+  const __m256d low23 = _mm256_castps_pd(_mm256_unpacklo_ps(a[2].v, a[3].v));
+  const __m256d high23 = _mm256_castps_pd(_mm256_unpackhi_ps(a[2].v, a[3].v));
+  a[0] = {_mm256_castpd_ps(_mm256_unpacklo_pd(low01, low23))};
+  a[1] = {_mm256_castpd_ps(_mm256_unpackhi_pd(low01, low23))};
+  a[2] = {_mm256_castpd_ps(_mm256_unpacklo_pd(high01, high23))};
+  a[3] = {_mm256_castpd_ps(_mm256_unpackhi_pd(high01, high23))};
+}
 
 #else
 
@@ -166,6 +217,7 @@ SB_INLINE F load(const float* p) {
   std::memcpy(&r.v, p, sizeof(r.v));
   return r;
 }
+SB_INLINE F load_quad(const float* p) { return load(p); }
 SB_INLINE void store(float* p, F a) { std::memcpy(p, &a.v, sizeof(a.v)); }
 SB_INLINE void store(std::uint32_t* p, I a) { std::memcpy(p, &a.v, sizeof(a.v)); }
 SB_INLINE F operator+(F a, F b) { return {a.v + b.v}; }
@@ -235,6 +287,7 @@ SB_INLINE I operator+(I a, I b) { return {a.v + b.v}; }
 SB_INLINE I operator-(I a, I b) { return {a.v - b.v}; }
 SB_INLINE I operator&(I a, I b) { return {a.v & b.v}; }
 SB_INLINE M operator==(I a, I b) { return {a.v == b.v}; }
+SB_INLINE M operator>(I a, I b) { return {a.v > b.v}; }
 SB_INLINE I operator|(I a, I b) { return {a.v | b.v}; }
 template <int N>
 SB_INLINE I shift_left(I a) {
@@ -246,10 +299,36 @@ SB_INLINE I shift_right(I a) {
 }
 SB_INLINE I shift_left(I a, I n) { return {a.v << n.v}; }
 SB_INLINE F reciprocal(F a) { return set1(1.0F) / a; }
+SB_INLINE void transpose_quads(F (&a)[4]) {
+  const Vf rows[4] = {a[0].v, a[1].v, a[2].v, a[3].v};
+  for (int i = 0; i < 4; ++i) {
+    a[i] = {Vf{rows[0][i], rows[1][i], rows[2][i], rows[3][i]}};
+  }
+}
 
 #endif
 
 #if SPLATBOT_SIMD != 512
+SB_INLINE I floor_to_int(F a) { return to_int(floor(a)); }
+SB_INLINE I ceil_to_int(F a) { return to_int(ceil(a)); }
+inline constexpr float kRootError = 0.0F;
+SB_INLINE F rough_sqrt(F a) { return sqrt(a); }
+
+SB_INLINE void store_lines(float* to, std::size_t stride, F a) {
+  float lanes[W];
+  store(lanes, a);
+  for (std::size_t i = 0; i < W; ++i) {
+    to[(i % 4) * stride + i / 4] = lanes[i];
+  }
+}
+SB_INLINE F load_lines(const float* from, std::size_t stride) {
+  float lanes[W];
+  for (std::size_t i = 0; i < W; ++i) {
+    lanes[i] = from[(i % 4) * stride + i / 4];
+  }
+  return load(lanes);
+}
+
 // The nearest integer by adding 1.5 x 2^23; for |q| < 2^22 only, which callers ensure or mask out.
 SB_INLINE void split_exponent(F q, F& fraction, F& whole) {
   whole = q + set1(12582912.0F);
@@ -265,23 +344,30 @@ SB_INLINE F clamp(F x, F low, F high) { return min(max(x, low), high); }
 SB_INLINE F square(F x) { return x * x; }
 
 #if SPLATBOT_SIMD == 512
-alignas(64) inline constexpr float kRoots[32] = {  // 2^(k/32)
-    1.0F, 1.0218972F, 1.04427373F, 1.06714046F, 1.09050775F, 1.1143868F, 1.13878858F, 1.1637249F,
-    1.18920708F, 1.21524739F, 1.24185777F, 1.26905096F, 1.29683959F, 1.32523668F, 1.35425556F, 1.38390994F,
-    1.41421354F, 1.44518077F, 1.47682619F, 1.50916445F, 1.54221082F, 1.5759809F, 1.61049032F, 1.64575553F,
-    1.68179286F, 1.71861935F, 1.75625217F, 1.79470909F, 1.8340081F, 1.87416768F, 1.91520655F, 1.95714414F};
+// Bits of 2^(k/32) less k << 18, which exp2() adds again with the exponent.
+alignas(64) inline constexpr std::uint32_t kRoots[32] = {
+    0x3f800000, 0x3f7ecd87, 0x3f7daac3, 0x3f7c980f, 0x3f7b95c2, 0x3f7aa43a, 0x3f79c3d3, 0x3f78f4f0,
+    0x3f7837f0, 0x3f778d3a, 0x3f76f532, 0x3f767043, 0x3f75fed7, 0x3f75a15b, 0x3f75583f, 0x3f7523f6,
+    0x3f7504f3, 0x3f74fbaf, 0x3f7508a4, 0x3f752c4d, 0x3f75672a, 0x3f75b9be, 0x3f76248c, 0x3f76a81e,
+    0x3f7744fd, 0x3f77fbb8, 0x3f78ccdf, 0x3f79b907, 0x3f7ac0c7, 0x3f7be4ba, 0x3f7d257d, 0x3f7e83b3};
 
-// 2^q to 1.2e-7 relative: q = k/32 + n + x, |x| <= 1/64, with 2^(k/32) from a table in two registers and 2^x by a
-// minimax polynomial of degree 2. Fewer multiplications than a longer polynomial: those limit the blend loops.
+// 2^q to 1.2e-7 relative for -126 <= q < 128: q = n + k/32 + x, |x| <= 1/64, with 2^(k/32) from a table in two
+// registers, n added to its exponent and 2^x by a minimax polynomial of degree 2. Few multiplications: those limit the
+// blend loops.
 SB_INLINE F exp2(F q) {
-  const F magic = set1(393216.0F);  // 1.5 x 2^18: the last bit is worth 1/32, so t ends in k
+  const F magic = set1(393216.0F);  // 1.5 x 2^18: the last bit is worth 1/32, so t ends in 32 n + k
   const F t = q + magic;
-  const F whole = t - magic;  // n + k/32, of which scalef takes the floor
-  const F x = q - whole;
+  const F x = q - (t - magic);
   const __m512i k = _mm512_castps_si512(t.v);
-  const F root = {_mm512_permutex2var_ps(_mm512_load_ps(kRoots), k, _mm512_load_ps(kRoots + 16))};
-  const F p = fma(fma(set1(0.240224746F), x, set1(0.693157344F)), x, set1(1.0F));
-  return {_mm512_scalef_ps((p * root).v, whole.v)};
+  const __m512i root = _mm512_permutex2var_epi32(_mm512_load_si512(kRoots), k, _mm512_load_si512(kRoots + 16));
+  const F scale = {_mm512_castsi512_ps(_mm512_add_epi32(root, _mm512_slli_epi32(k, 18)))};
+#if SPLATBOT_EXP_DEGREE == 1  // 2.9e-5
+  return fma(set1(0.693160721F), x, set1(1.00002933F)) * scale;
+#elif SPLATBOT_EXP_DEGREE == 3  // 6e-8, all of it rounding
+  return fma(fma(fma(set1(0.0555041F), x, set1(0.2402265F)), x, set1(0.6931472F)), x, set1(1.0F)) * scale;
+#else
+  return fma(fma(set1(0.240224746F), x, set1(0.693157344F)), x, set1(1.0F)) * scale;
+#endif
 }
 #else
 // 2^q to 7.5e-8 relative (a minimax polynomial of degree 5 on [-1/2, 1/2]).

@@ -184,11 +184,7 @@ SB_INLINE SurfelHit hit_at(F x, F y, const float* row, F near) {
   h.on_disc = (h.disc <= point) & (d > set1(0.0F)) & (along >= near * d);
   h.depth = select(h.on_disc, along * h.inverse, set1(row[kRowZ]));
   const F q = fnma(set1(kHalfLog2e), select(h.on_disc, h.disc, point), set1(row[kRowLo]));
-  h.alpha.u = h.u;
-  h.alpha.w = h.v;
-  h.alpha.power = exp2(max(q, set1(kLog2AlphaMin)));  // below, it is masked out, and exp2 may leave its range
-  h.alpha.alpha = min_zero_unless(q >= set1(kLog2AlphaMin), h.alpha.power, set1(kAlphaMax));
-  h.alpha.left = set1(1.0F) - h.alpha.alpha;
+  h.alpha = alpha_of(max(q, set1(2.0F * kLog2AlphaMin)));  // lower, exp2 may leave its range
   return h;
 }
 

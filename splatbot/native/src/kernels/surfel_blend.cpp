@@ -8,6 +8,12 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
+// Ellipses of one chunk, field by field.
+struct ChunkEllipses {
+  alignas(64) float cx[kChunk], cy[kChunk];  // centre, from the tile's corner
+  alignas(64) float l11[kChunk], l21[kChunk], l22[kChunk], reach[kChunk], lean[kChunk];
+};
+
 struct Chunk {
   alignas(64) float rows[kChunk][kSurfelRow];
   ChunkEllipses ellipses, circles;
@@ -73,10 +79,17 @@ SB_INLINE void load_chunk(const SurfelBlendArgs& args, const TileFrame& frame, c
   }
 }
 
+SB_INLINE void find_masks_of(const ChunkEllipses& e, int n, std::uint32_t* masks) {
+  for (int j = 0; j < n; j += W) {
+    store(masks + j, block_masks({load(e.cx + j), load(e.cy + j), load(e.l11 + j), load(e.l21 + j), load(e.l22 + j),
+                                  load(e.reach + j), load(e.lean + j)}));
+  }
+}
+
 SB_INLINE void find_masks(Chunk& chunk, int n) {
-  block_masks(chunk.ellipses, n, chunk.masks);
+  find_masks_of(chunk.ellipses, n, chunk.masks);
   if (chunk.any_circle) {
-    block_masks(chunk.circles, n, chunk.circle_masks);
+    find_masks_of(chunk.circles, n, chunk.circle_masks);
     for (int j = 0; j < n; ++j) {
       chunk.masks[j] |= chunk.circle_masks[j];
     }

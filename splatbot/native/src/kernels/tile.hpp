@@ -29,34 +29,52 @@ SB_INLINE bool kept(const BlendArgs& args, int x, int y) {
   return args.mask == nullptr || args.mask[(y / args.mask_size) * args.mask_columns + x / args.mask_size] != 0;
 }
 
-// Pixels of a tile are kept block by block, 16 to a block, row by row within it.
-SB_INLINE int pixel_index(int x, int y) {
-  return ((y / kBlock) * kBlockColumns + x / kBlock) * kBlockPixels + (y % kBlock) * kBlock + x % kBlock;
-}
-
-// Pixel centres of a tile relative to its corner, in the order of pixel_index.
+// Pixel centres of a tile relative to its corner, in the order of pixel_index, and those of its lines.
 struct Centers {
-  alignas(64) float x[kTilePixels], y[kTilePixels];
+  alignas(64) float x[kTilePixels], y[kTilePixels], line[kTileHeight];
 
-  constexpr Centers() : x{}, y{} {
+  constexpr Centers() : x{}, y{}, line{} {
     for (int i = 0; i < kTilePixels; ++i) {
       const int block = i / kBlockPixels, lane = i % kBlockPixels;
-      x[i] = static_cast<float>(block % kBlockColumns * kBlock + lane % kBlock) + 0.5F;
-      y[i] = static_cast<float>(block / kBlockColumns * kBlock + lane / kBlock) + 0.5F;
+      x[i] = static_cast<float>(block % kBlockColumns * kBlock + lane / kBlock) + 0.5F;
+      y[i] = static_cast<float>(block / kBlockColumns * kBlock + lane % kBlock) + 0.5F;
+    }
+    for (int i = 0; i < kTileHeight; ++i) {
+      line[i] = static_cast<float>(i) + 0.5F;
     }
   }
 };
 inline constexpr Centers kCenters{};
 
-// A Gaussian as a tile sees it: u and w at the tile's corner.
-struct Local {
-  float l11, l21, l22, u0, w0, lo;
+// The lines of pixels that a block's part crosses begin here in arrays over a tile's lines.
+SB_INLINE int first_line(int block) { return block / kBlockColumns * kBlock; }
+
+// A Gaussian along a tile's lines of pixels: u at the tile's left edge, w, and what they leave of log2(alpha).
+struct Lines {
+  alignas(64) float u[kTileHeight], w[kTileHeight], rest[kTileHeight];
+  float l11;
 };
 
-SB_INLINE Local localize(const Record& record, const TileFrame& frame) {
+SB_INLINE void localize(const Record& record, const TileFrame& frame, float* u, float* w, float* rest) {
   const float dx = static_cast<float>(frame.x0) - record.mx;
   const float dy = static_cast<float>(frame.y0) - record.my;
-  return {record.l11, record.l21, record.l22, record.l11 * dx + record.l21 * dy, record.l22 * dy, record.lo};
+  const F u0 = set1(record.l11 * dx + record.l21 * dy), w0 = set1(record.l22 * dy);
+  const F l21 = set1(record.l21), l22 = set1(record.l22), lo = set1(record.lo);
+#pragma GCC unroll 4
+  for (int i = 0; i < kTileHeight; i += W) {
+    const F y = load(kCenters.line + i);
+    const F across = fma(l22, y, w0);
+    store(u + i, fma(l21, y, u0));
+    store(rest + i, fnma(across, across, lo));
+    if (w != nullptr) {
+      store(w + i, across);
+    }
+  }
+}
+
+SB_INLINE void localize(const Record& record, const TileFrame& frame, Lines& lines) {
+  localize(record, frame, lines.u, lines.w, lines.rest);
+  lines.l11 = record.l11;
 }
 
 // Depth over a Gaussian's footprint, from the tile's corner.
@@ -71,23 +89,34 @@ SB_INLINE PlaneDepth plane_depth(const Record& record, const float* channels, co
 }
 
 struct Alpha {
-  F u, w;
   F power;     // opacity x falloff, before the cap
   F alpha;     // 0 below 1/255
   F left;      // 1 - alpha
 };
 
-// Both passes go through here, so that they decide alike which pixel a Gaussian counts in.
-SB_INLINE Alpha alpha_at(F x, F y, const float* l11, const float* l21, const float* l22, const float* u0,
-                         const float* w0, const float* lo) {
+// Both passes go through here, so that they decide alike which pixel a Gaussian counts in. Where q, the log2 of
+// opacity x falloff, is below that of 1/255, power means nothing.
+SB_INLINE Alpha alpha_of(F q) {
   Alpha a;
-  a.u = fma(set1(*l11), x, fma(set1(*l21), y, set1(*u0)));
-  a.w = fma(set1(*l22), y, set1(*w0));
-  const F q = fnma(a.u, a.u, fnma(a.w, a.w, set1(*lo)));
   a.power = exp2(q);
   a.alpha = min_zero_unless(q >= set1(kLog2AlphaMin), a.power, set1(kAlphaMax));
   a.left = set1(1.0F) - a.alpha;
   return a;
+}
+
+struct AlphaAt : Alpha {
+  F u;
+};
+
+// At pixels of four lines, of which u and rest are given (see Lines).
+SB_INLINE AlphaAt alpha_at(F x, F l11, const float* u, const float* rest) {
+  const F here = fma(l11, x, load_quad(u));
+  return {alpha_of(fnma(here, here, load_quad(rest))), here};
+}
+
+SB_INLINE AlphaAt alpha_at(const Lines& lines, int block, std::size_t first) {
+  const int line = first_line(block);
+  return alpha_at(load(kCenters.x + first), set1(lines.l11), lines.u + line, lines.rest + line);
 }
 
 struct Step {

@@ -1,0 +1,113 @@
+"""How far the depths that a map can be asked for lie from the truth: `python -m splatbot.bench.model_depth [URI]`.
+
+Frames of a synthetic log are mapped at their exact poses; the map's depths are then compared with the exact ones at the
+keyframes' own views and at views half-way between them. Signed, because a bias is what tracking inherits.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.config import Config
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse
+from splatbot.logs.synthetic import PREFIX, SyntheticLog
+from splatbot.mapping.fusion import model_depth, view_of
+from splatbot.mapping.mapper import Mapper
+from splatbot.rasterize import rasterization
+from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import prepare
+
+Depth = NDArray[np.float32]
+
+URI = "synthetic:tabletop?frames=120&effects=depth_noise"
+_EVERY = 10  # frames from one keyframe to the next
+
+
+@dataclass(frozen=True)
+class Bias:
+    """Errors of a depth image [m]: median and mean of the signed, mean of the absolute; share of pixels compared."""
+
+    median: float
+    mean: float
+    l1: float
+    share: float
+
+
+def biases(uri: str, config: Config) -> dict[str, dict[str, Bias]]:
+    """By kind of view and kind of depth."""
+    log = SyntheticLog(uri)
+    exact = SyntheticLog(uri.split("&effects=")[0].split("?effects=")[0])
+    mapper, poses = Mapper(config), log.ground_truth.T_world_camera
+    T_first_world = inverse(poses[0])
+    nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
+    keyframes = list(range(0, len(log), _EVERY))
+    for i in keyframes:
+        mapper.insert(prepare(log[i], config.tracking), T_first_world @ poses[i], nothing)
+    views = {"keyframes": keyframes, "between": [i + _EVERY // 2 for i in keyframes[:-1]]}
+    found: dict[str, dict[str, list[Bias]]] = {}
+    for kind, indices in views.items():
+        for i in indices:
+            truth, seen = exact[i].depth, prepare(log[i], config.tracking).depth
+            shown = _depths(mapper.model, log.camera, T_first_world @ poses[i], seen, config)
+            for name, depth in {"measured": seen, **shown}.items():
+                found.setdefault(kind, {}).setdefault(name, []).append(_bias(depth, truth))
+    return {kind: {name: _mean(rows) for name, rows in table.items()} for kind, table in found.items()}
+
+
+def _depths(
+    model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.float64], seen: Depth, config: Config
+) -> dict[str, Depth]:
+    def render(mode: str, depth_mode: str = "center") -> Depth:
+        renders, alphas, _ = rasterization(
+            *(model.means, model.quats, model.scales, model.opacities, None),
+            torch.from_numpy(inverse(T_world_camera))[None],
+            torch.from_numpy(camera.K_corner)[None],
+            camera.width,
+            camera.height,
+            render_mode=mode,
+            depth_mode=depth_mode,  # type: ignore[arg-type]
+        )
+        return np.asarray(renders[0, ..., 0] * (alphas[0, ..., 0] > 0.5), np.float32)
+
+    view = view_of(model, camera, T_world_camera)
+    return {
+        "blended, centres": render("ED"),
+        "median": render("MD"),
+        "blended, planes": render("ED", "plane"),
+        "reference of tracking": model_depth(view, seen, config.mapping),
+    }
+
+
+def _bias(depth: Depth, truth: Depth) -> Bias:
+    both = (depth > 0) & (truth > 0)
+    error = (depth - truth)[both].astype(np.float64)
+    return Bias(float(np.median(error)), float(error.mean()), float(np.abs(error).mean()), float(both.mean()))
+
+
+def _mean(rows: list[Bias]) -> Bias:
+    pick: Callable[[str], float] = lambda name: float(np.mean([getattr(row, name) for row in rows]))  # noqa: E731
+    return Bias(pick("median"), pick("mean"), pick("l1"), pick("share"))
+
+
+def main(argv: list[str]) -> None:
+    """Print the table for an address, by default a tabletop with a depth camera's noise."""
+    uri = argv[0] if argv else URI
+    if not uri.startswith(PREFIX):
+        raise SystemExit(f"{uri}: needs exact truth; give synthetic:SCENE?...")
+    print(f"{uri}\n{'views':10} {'depth':22} {'median':>9} {'mean':>9} {'L1':>8}  pixels")
+    for kind, table in biases(uri, Config()).items():
+        for name, b in table.items():
+            errors = " ".join(f"{1e3 * e:+6.2f} mm" for e in (b.median, b.mean))
+            print(f"{kind:10} {name:22} {errors} {1e3 * b.l1:5.2f} mm {b.share:6.1%}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

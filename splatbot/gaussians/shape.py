@@ -1,0 +1,30 @@
+"""Orientation and extent of Gaussians, in the world frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from splatbot.gaussians.model import GaussianModel
+
+
+def rotations(model: GaussianModel) -> Tensor:
+    """R_world_gaussian (N, 3, 3)."""
+    w, x, y, z = torch.nn.functional.normalize(model.quats, dim=1).T
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+    ]
+    return torch.stack(rows, 1)
+
+
+def shortest_axes(model: GaussianModel) -> Tensor:
+    """Unit vectors (N, 3): the axis of the least scale of each Gaussian."""
+    return rotations(model)[torch.arange(len(model)), :, model.log_scales.argmin(1)]
+
+
+def covariances(model: GaussianModel) -> Tensor:
+    """(N, 3, 3) [m²]."""
+    half = rotations(model) * model.scales[:, None, :]
+    return half @ half.transpose(1, 2)

@@ -1,0 +1,225 @@
+"""Mapping beside tracking: a thread that takes keyframes in and refines while the tracker goes on."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatbot.gaussians import Snapshot
+from splatbot.mapping.keyframes import Keyframe
+from splatbot.mapping.mapper import Mapper, Observation
+from splatbot.rasterize.native import native
+from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import PreparedFrame
+
+_NICENESS = 5  # of the thread: where cores are short, the tracker goes first
+_SWITCH_S = 5e-4  # a tenth of Python's own: how long the tracker waits for the interpreter while mapping holds it
+_CHUNK = 1  # refinement steps between two looks at what has arrived
+
+
+class MappingWorker:
+    """The face of a :class:`Mapper`, whose work is done in a thread of its own.
+
+    The tracker hands over observations and reads ``keyframes``; it waits for neither fusion nor refinement. New lists
+    of keyframes and new references take the place of old ones by assignment: a reader sees the one or the other. What
+    goes wrong in the thread is raised by the next call of :meth:`wants`, :meth:`insert` or :meth:`finish`.
+
+    Args:
+        mapper: fresh; the worker's alone from here on.
+        backlog: observations that may wait; while so many do, no frame is wanted.
+    """
+
+    def __init__(self, mapper: Mapper, *, backlog: int = 3) -> None:
+        self._mapper = mapper
+        self._backlog = backlog
+        self._waiting: deque[Observation] = deque()
+        self._news = threading.Condition()
+        self._to_look: tuple[PreparedFrame, NDArray[np.float64]] | None = None
+        self._held = False
+        self._ending = False
+        self._error: BaseException | None = None
+        self._published = mapper.snapshot()
+        self._thread: threading.Thread | None = None
+        self._working = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is saved of a paused worker: all but the thread and what it waits with."""
+        return {"_mapper": self._mapper, "_backlog": self._backlog, "_held": self._held}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["_mapper"], backlog=state["_backlog"])  # type: ignore[misc]
+        self._held = state["_held"]
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """Those that frames can be tracked against now."""
+        return self._mapper.keyframes
+
+    @property
+    def size(self) -> int:
+        """Number of Gaussians."""
+        return self._mapper.size
+
+    def wants(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> bool:
+        """As :meth:`Mapper.wants`; False while too many observations wait."""
+        self._raise_error()
+        waiting = list(self._waiting)
+        return len(waiting) < self._backlog and self._mapper.wants(prepared, T_world_camera, waiting)
+
+    def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
+        """Hand over a frame and return at once; only the first is made a keyframe here: nothing is tracked before."""
+        self._raise_error()
+        observation = Observation(prepared, T_world_camera, features, self._mapper.loops.anchor)
+        first = self._mapper.add_keyframe(observation, provisional=True) if self._thread is None else None
+        with self._news:
+            self._waiting.append(observation)
+            self._news.notify()
+        if first is not None:
+            self._start(first)
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """As :meth:`Mapper.memory`; while the thread works, of about now."""
+        return self._mapper.memory
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """As :meth:`Mapper.loop_counts`."""
+        return self._mapper.loop_counts
+
+    @property
+    def has_loop(self) -> bool:
+        """As :meth:`Mapper.has_loop`."""
+        return self._mapper.has_loop
+
+    def close_loops(self) -> dict[int, NDArray[np.float64]]:
+        """As :meth:`Mapper.close_loops`, while paused."""
+        self._to_look = None  # its pose is of the world as it was
+        moved = self._mapper.close_loops()
+        self._publish()
+        return moved
+
+    def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
+        """As :meth:`Mapper.look`, when there is time; the latest frame only."""
+        with self._news:
+            self._to_look = (prepared, T_world_camera)
+            self._news.notify()
+
+    def hold(self, moving: bool) -> None:
+        """As :meth:`Mapper.hold`."""
+        with self._news:
+            self._held = moving
+            self._news.notify()
+
+    def finish(self) -> None:
+        """End the thread once all observations are in the map, then refine in the calling one."""
+        self._end()
+        self._raise_error()
+        self._mapper.finish()
+        self._publish()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """A block in which the thread does nothing; waits until all observations are in the map."""
+        with self._news:
+            self._news.wait_for(lambda: not self._waiting or self._error is not None)
+        self._raise_error()
+        with self._working:
+            yield
+
+    def close(self) -> None:
+        """End the thread once all observations are in the map; what went wrong in it has been or is not raised."""
+        self._end()
+
+    def snapshot(self) -> Snapshot:
+        """The map as it was published last: after each keyframe's fusion, and when refinement has caught up."""
+        return self._published
+
+    def _publish(self) -> None:
+        self._published = replace(self._mapper.snapshot(), map_version=self._published.map_version + 1)
+
+    def _start(self, first: Keyframe) -> None:
+        sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_S))
+        self._thread = threading.Thread(target=self._run, args=(first,), name="mapping", daemon=True)
+        self._thread.start()
+
+    def _end(self) -> None:
+        with self._news:
+            self._ending = True
+            self._news.notify()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise RuntimeError("mapping has failed in its thread; the map is as it was before") from self._error
+
+    def _run(self, first: Keyframe) -> None:
+        _stand_back()
+        try:
+            self._fuse(first)
+            while (work := self._next()) is not None:
+                with self._working:
+                    work()
+        except BaseException as error:  # raised where somebody can act on it
+            with self._news:
+                self._error = error
+                self._news.notify_all()
+
+    def _next(self) -> Callable[[], None] | None:
+        """What is to be done now: new observations first; waits while there is nothing; None: the end."""
+        with self._news:
+            while True:
+                if self._waiting:
+                    return self._take
+                if self._ending:
+                    return None
+                if self._to_look is not None:
+                    return self._look
+                if self._mapper.owed and not self._held:
+                    return self._refine
+                self._news.wait()
+
+    def _take(self) -> None:
+        # It leaves the queue after it has become a keyframe: one of the two must keep its like from being wanted.
+        keyframe = self._mapper.add_keyframe(self._waiting[0], provisional=True)
+        self._fuse(keyframe)
+
+    def _fuse(self, keyframe: Keyframe) -> None:
+        observation = self._waiting[0]
+        self._mapper.fuse(keyframe)
+        self._mapper.make_reference(observation, keyframe)
+        self._mapper.look_for_loops(observation, keyframe)
+        self._publish()
+        with self._news:
+            self._waiting.popleft()
+            self._news.notify_all()
+
+    def _look(self) -> None:
+        with self._news:
+            frame, self._to_look = self._to_look, None
+        if frame is not None:
+            self._mapper.look(*frame)
+
+    def _refine(self) -> None:
+        self._mapper.refine(_CHUNK)
+        if not self._mapper.owed:
+            self._publish()
+
+
+def _stand_back() -> None:
+    """Leave cores and interpreter to the tracker: one native thread, one of torch, and a lower priority."""
+    native().keep_to_this_thread(True)
+    torch.set_num_threads(1)
+    with suppress(OSError, AttributeError):  # elsewhere than on Linux a priority is not a thread's own
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)

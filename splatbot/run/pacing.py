@@ -1,0 +1,187 @@
+"""Frames of a log as they are asked for, or as a camera would give them: each at its time, gone when the next comes."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from splatbot.errors import InputError
+from splatbot.frame import Frame
+from splatbot.logs import Log
+
+_AHEAD = 8  # frames decoded in advance: they bound memory
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Frame ``index`` of a log, or the error that reading it met."""
+
+    index: int
+    frame: Frame | InputError
+
+
+class FrameSource:
+    """The first ``total`` frames of a log, each when it is asked for.
+
+    Args:
+        first: the frame to begin with; a run that is resumed has processed those before.
+        dropped: frames that nobody took before a newer one arrived.
+        late: frames that were still being worked on when a newer one arrived.
+    """
+
+    def __init__(self, log: Log, total: int) -> None:
+        self.log = log
+        self.total = total
+        self.first = 0
+        self.dropped: list[int] = []
+        self.late: set[int] = set()
+
+    @property
+    def pace(self) -> str | None:
+        """How frames are timed, for reports; None: as they are asked for."""
+        return None
+
+    def __iter__(self) -> Generator[Arrival, None, None]:
+        return (read(self.log, index) for index in range(self.first, self.total))
+
+
+class PacedSource(FrameSource):
+    """The frames at the times of their stamps, or at ``rate`` [Hz]; the newest arrived is given, older ones drop out.
+
+    A thread decodes ahead. While the log itself cannot keep up (ray-casting a scene takes longer than a frame), the
+    clock stands still: what is measured is the one who takes the frames.
+    """
+
+    def __init__(self, log: Log, total: int, rate: float | None = None) -> None:
+        super().__init__(log, total)
+        self.rate = rate
+
+    @property
+    def pace(self) -> str | None:
+        """By the stamps or at a rate."""
+        return "by stamps" if self.rate is None else f"{self.rate:g} Hz"
+
+    def __iter__(self) -> Generator[Arrival, None, None]:
+        reader, clock = _Reader(self.log, self.first, self.total), _Schedule(self.rate)
+        try:
+            while (arrival := reader.take(clock)) is not None:
+                clock.sleep_until(arrival)
+                if isinstance(arrival.frame, Frame) and self._superseded(reader, clock):
+                    self.dropped.append(arrival.index)
+                    continue
+                yield arrival
+                if self._superseded(reader, clock):
+                    self.late.add(arrival.index)
+        finally:
+            reader.stop()
+
+    @staticmethod
+    def _superseded(reader: _Reader, clock: _Schedule) -> bool:
+        """Whether a newer frame has arrived."""
+        newer = reader.peek()
+        return newer is not None and clock.due(newer) <= time.perf_counter()
+
+
+def read(log: Log, index: int) -> Arrival:
+    """Read one frame; an InputError is part of the answer."""
+    try:
+        return Arrival(index, log[index])
+    except InputError as error:
+        return Arrival(index, error)
+
+
+class _Schedule:
+    """When frames arrive [s, of time.perf_counter]; the first does at once."""
+
+    def __init__(self, rate: float | None) -> None:
+        self._rate = rate
+        self._start = 0.0  # of frame 0, or of stamp 0
+        self._begun = False
+        self._latest = 0.0
+
+    def due(self, arrival: Arrival) -> float:
+        """When a frame arrives: never before an earlier one; one that could not be read comes with the one before."""
+        if self._rate is not None:
+            return self._start + arrival.index / self._rate
+        return (
+            max(self._latest, self._start + arrival.frame.stamp) if isinstance(arrival.frame, Frame) else self._latest
+        )
+
+    def waited(self, arrival: Arrival, since: float) -> None:
+        """Somebody waited ``since`` then for the log to give ``arrival``; the clock stood still meanwhile."""
+        now = time.perf_counter()
+        if not self._begun:
+            self._begin(arrival, now)
+        self._start += max(0.0, now - max(since, self.due(arrival)))
+
+    def _begin(self, arrival: Arrival, now: float) -> None:
+        self._latest = now
+        if self._rate is not None:
+            self._start = now - arrival.index / self._rate
+        elif isinstance(arrival.frame, Frame):
+            self._start = now - arrival.frame.stamp
+        self._begun = self._rate is not None or isinstance(arrival.frame, Frame)
+
+    def sleep_until(self, arrival: Arrival) -> None:
+        """Wait for a frame's time."""
+        self._latest = self.due(arrival)
+        time.sleep(max(0.0, self._latest - time.perf_counter()))
+
+
+class _Reader:
+    """Decodes ahead, in a thread of its own."""
+
+    def __init__(self, log: Log, first: int, total: int) -> None:
+        self._log = log
+        self._first, self._total = first, total
+        self._ready: deque[Arrival] = deque()
+        self._change = threading.Condition()
+        self._left = max(0, total - first)
+        self._stopped = False
+        self._crash: Exception | None = None
+        threading.Thread(target=self._run, name="reading", daemon=True).start()
+
+    def take(self, clock: _Schedule) -> Arrival | None:
+        """The next frame, waiting for it if need be; None after the last."""
+        with self._change:
+            since = time.perf_counter() if not self._ready else math.inf
+            self._change.wait_for(lambda: self._ready or self._left == 0 or self._crash)
+            if not self._ready:
+                if self._crash is not None:
+                    raise self._crash
+                return None
+            arrival = self._ready.popleft()
+            self._change.notify_all()
+        clock.waited(arrival, since)
+        return arrival
+
+    def peek(self) -> Arrival | None:
+        """The frame after, if it has been decoded."""
+        with self._change:
+            return self._ready[0] if self._ready else None
+
+    def stop(self) -> None:
+        """Decode no more."""
+        with self._change:
+            self._stopped = True
+            self._change.notify_all()
+
+    def _run(self) -> None:
+        try:
+            for index in range(self._first, self._total):
+                arrival = read(self._log, index)
+                with self._change:
+                    self._change.wait_for(lambda: len(self._ready) < _AHEAD or self._stopped)
+                    if self._stopped:
+                        return
+                    self._ready.append(arrival)
+                    self._left -= 1
+                    self._change.notify_all()
+        except Exception as crash:  # a bug in a reader: raised where the frames are taken
+            with self._change:
+                self._crash = crash
+                self._change.notify_all()

@@ -1,0 +1,114 @@
+"""Things that move: kept out while they do, mapped once they stay, and gone from the map after they went."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from splatbot.frame import Frame
+from splatbot.geometry import inverse
+from splatbot.logs import open_log
+from splatbot.logs.synthetic import SyntheticLog
+from splatbot.mapping.fusion import view_of
+from splatbot.mapping.mapper import Mapper
+from splatbot.slam import Slam
+from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import prepare
+from tests.rgbd import CAMERA, small_config, wall_frame
+
+NO_FEATURES = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
+
+
+def with_thing(frame: Frame, u: int, depth: float = 0.6, half: int = 15) -> Frame:
+    """A dark square before the wall."""
+    rgb, z = frame.rgb.copy(), frame.depth.copy()
+    rgb[60 - half : 60 + half, u - half : u + half] = (20, 20, 60)
+    z[60 - half : 60 + half, u - half : u + half] = depth
+    return replace(frame, rgb=rgb, depth=z)
+
+
+def show(mapper: Mapper, frame: Frame, stamp: float, *, keyframe: bool = False) -> None:
+    prepared = prepare(replace(frame, stamp=stamp), mapper.config.tracking)
+    if keyframe:
+        mapper.insert(prepared, np.eye(4), NO_FEATURES)
+    else:
+        mapper.look(prepared, np.eye(4))
+
+
+def nearer_than(mapper: Mapper, depth: float) -> int:
+    return int(((mapper.model.means[:, 2] < depth) & (mapper.model.opacities > 0.05)).sum())
+
+
+def test_what_passes_by_in_free_space_enters_neither_map_nor_reference() -> None:
+    mapper, wall = Mapper(small_config()), wall_frame(np.eye(4))
+    show(mapper, wall, 0.0, keyframe=True)
+    before = len(mapper.model)
+    show(mapper, with_thing(wall, 80), 0.3, keyframe=True)
+    assert nearer_than(mapper, 0.8) == 0
+    assert len(mapper.model) < 1.02 * before
+    keyframe = mapper.keyframes[-1]
+    assert keyframe.still is not None
+    assert not keyframe.still[50:70, 70:90].any()
+    assert keyframe.still[:, :40].all()
+    for level in keyframe.reference.levels:
+        assert level.points[:, 2].min() > 0.9
+
+
+def test_what_has_stayed_for_a_second_is_mapped() -> None:
+    mapper, wall = Mapper(small_config()), wall_frame(np.eye(4))
+    show(mapper, wall, 0.0, keyframe=True)
+    for k in range(6):
+        show(mapper, with_thing(wall, 80), 0.2 + 0.2 * k)
+    assert nearer_than(mapper, 0.8) == 0
+    show(mapper, with_thing(wall, 80), 1.4, keyframe=True)
+    assert nearer_than(mapper, 0.8) > 50
+
+
+def test_what_keeps_moving_never_settles() -> None:
+    mapper, wall = Mapper(small_config()), wall_frame(np.eye(4))
+    show(mapper, wall, 0.0, keyframe=True)
+    for k in range(12):
+        show(mapper, with_thing(wall, 30 + 9 * k, half=10), 0.2 + 0.2 * k, keyframe=k % 4 == 3)
+    assert nearer_than(mapper, 0.8) == 0
+
+
+def test_a_new_thing_in_space_never_seen_is_mapped_at_once() -> None:
+    mapper, wall = Mapper(small_config()), wall_frame(np.eye(4))
+    masked = replace(wall, depth=np.where(np.arange(160) < 90, wall.depth, np.float32(0)).astype(np.float32))
+    show(mapper, masked, 0.0, keyframe=True)
+    show(mapper, with_thing(wall, 125), 0.3, keyframe=True)
+    assert nearer_than(mapper, 0.8) > 50
+
+
+def test_what_has_gone_leaves_no_ghost_after_a_second_of_looks_and_what_it_hid_is_wanted() -> None:
+    mapper, wall = Mapper(small_config()), wall_frame(np.eye(4))
+    show(mapper, with_thing(wall, 80), 0.0, keyframe=True)
+    assert nearer_than(mapper, 0.8) > 50
+    for k in range(5):
+        show(mapper, wall, 0.2 + 0.2 * k)
+    assert nearer_than(mapper, 0.8) == 0
+    prepared = prepare(wall, mapper.config.tracking)
+    assert mapper.wants(prepared, np.eye(4))
+    show(mapper, wall, 1.2, keyframe=True)
+    assert not mapper.wants(prepared, np.eye(4))
+    view = view_of(mapper.model, CAMERA, np.eye(4))
+    assert float((view.depth - 1.0).abs().max()) < 0.02
+    assert float(view.rgb[50:70, 70:90].mean()) > 0.35  # the wall's colours, not the dark thing's
+
+
+def test_a_hand_that_crosses_leaves_no_trace_in_the_map_and_tracking_goes_on() -> None:
+    log = open_log("synthetic:tabletop_crossing?width=160&height=120&frames=60&rate=15&event=0.8")
+    assert isinstance(log, SyntheticLog)
+    slam = Slam(small_config(mapping__refine_iterations=4))
+    truth = [inverse(log.ground_truth.T_world_camera[0]) @ T for T in log.ground_truth.T_world_camera]
+    for frame, T in zip(log, truth, strict=True):
+        result = slam.process(frame)
+        assert result.T_world_camera is not None, frame.index
+        assert np.linalg.norm(result.T_world_camera[:3, 3] - T[:3, 3]) < 8e-3, frame.index
+    last = log[len(log) - 1]
+    view = view_of(slam.snapshot().model, last.camera, truth[-1])
+    ghost = (last.depth > 0) & (view.depth.numpy() < 0.85 * last.depth) & (view.alpha.numpy() > 0.5)
+    solid = cv2.morphologyEx(ghost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    assert not solid.any()  # edges of things are soft by a pixel, a hand is 20 pixels wide

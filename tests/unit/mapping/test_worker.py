@@ -1,0 +1,196 @@
+"""Mapping in a thread: the tracker never waits for it, nothing is lost at the end, and what goes wrong is told."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import se3_exp
+from splatbot.mapping.keyframes import Keyframe
+from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.worker import MappingWorker
+from splatbot.slam import Slam
+from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import prepare
+from tests.rgbd import Array, small_config, tabletop, wall_frame
+
+NO_FEATURES = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
+
+
+def at(x: float) -> Array:
+    return se3_exp([x, 0, 0, 0, 0, 0])
+
+
+def insert(worker: MappingWorker, T: Array) -> None:
+    worker.insert(prepare(wall_frame(T), small_config().tracking), T, NO_FEATURES)
+
+
+def wants(worker: MappingWorker, T: Array) -> bool:
+    return worker.wants(prepare(wall_frame(T), small_config().tracking), T)
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    for _ in range(2000):
+        if true():
+            return
+        time.sleep(0.005)
+    pytest.fail("the worker did not get there in 10 s")
+
+
+@pytest.fixture(autouse=True)
+def _restore_threads() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def mapper() -> Mapper:
+    return Mapper(small_config())
+
+
+def test_what_was_handed_over_is_in_the_map_once_finished(mapper: Mapper) -> None:
+    worker = MappingWorker(mapper)
+    for x in (0.0, 0.4, 0.8):
+        insert(worker, at(x))
+    worker.finish()
+    assert [k.number for k in worker.keyframes] == [0, 1, 2]
+    assert set(worker.snapshot().model.anchors.tolist()) == {0, 1, 2}
+    assert len(worker.snapshot().model) == worker.size
+    assert mapper.owed == 0
+
+
+def test_a_worker_that_is_alone_makes_the_map_that_the_mapper_makes() -> None:
+    config = small_config(mapping__refine_iterations=0)
+    alone, worker = Mapper(config), MappingWorker(Mapper(config))
+    for x in (0.0, 0.4):
+        alone.insert(prepare(wall_frame(at(x)), config.tracking), at(x), NO_FEATURES)
+        insert(worker, at(x))
+    worker.finish()
+    alone.finish()
+    assert torch.equal(worker.snapshot().model.means, alone.snapshot().model.means)
+    assert torch.equal(worker.snapshot().model.opacity_logits, alone.snapshot().model.opacity_logits)
+
+
+def test_handing_over_does_not_wait_for_fusion(mapper: Mapper, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = threading.Event()
+    fuse = mapper.fuse
+
+    def slow(keyframe: Keyframe) -> None:
+        gate.wait(10)
+        fuse(keyframe)
+
+    monkeypatch.setattr(mapper, "fuse", slow)
+    worker = MappingWorker(mapper)
+    insert(worker, at(0.0))  # would not return before the gate opens
+    assert len(worker.keyframes) == 1
+    assert len(worker.keyframes[0].reference.levels) == 3  # so the next frame can be tracked already
+    assert len(worker.snapshot().model) == 0
+    gate.set()
+    worker.close()
+    assert len(worker.snapshot().model) > 300
+
+
+def test_a_view_that_waits_is_not_wanted_again_and_too_many_waiting_are_too_many(
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = threading.Event()
+    monkeypatch.setattr(mapper, "fuse", lambda keyframe: gate.wait(10))
+    worker = MappingWorker(mapper, backlog=3)
+    for x in (0.0, 0.4):
+        assert wants(worker, at(x))
+        insert(worker, at(x))
+        assert not wants(worker, at(x))
+    assert wants(worker, at(0.8))
+    insert(worker, at(0.8))
+    assert not wants(worker, at(1.2))
+    gate.set()
+    wait_until(lambda: wants(worker, at(1.2)))
+    worker.close()
+
+
+def test_the_keyframes_that_a_reader_holds_do_not_change_under_it(mapper: Mapper) -> None:
+    worker = MappingWorker(mapper)
+    insert(worker, at(0.0))
+    held = worker.keyframes
+    insert(worker, at(0.4))
+    worker.finish()
+    assert len(held) == 1
+    assert len(worker.keyframes) == 2
+
+
+def test_what_goes_wrong_in_the_thread_is_told_and_the_last_published_map_stays(
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker = MappingWorker(mapper)
+    insert(worker, at(0.0))
+    wait_until(lambda: worker.snapshot().map_version == 2)  # fused, refined
+    kept = worker.snapshot()
+
+    def broken(keyframe: Keyframe) -> None:
+        raise ValueError("broken on purpose")
+
+    monkeypatch.setattr(mapper, "fuse", broken)
+    insert(worker, at(0.4))
+    with pytest.raises(RuntimeError, match="mapping has failed") as told:
+        wait_until(lambda: wants(worker, at(0.0)))
+    assert isinstance(told.value.__cause__, ValueError)
+    with pytest.raises(RuntimeError):
+        worker.finish()
+    worker.close()
+    assert worker.snapshot() is kept
+
+
+def test_refinement_waits_while_the_robot_moves_and_catches_up_once_it_stands(mapper: Mapper) -> None:
+    worker = MappingWorker(mapper)
+    worker.hold(True)
+    insert(worker, at(0.0))
+    wait_until(lambda: len(worker.snapshot().model) > 0)
+    time.sleep(0.05)
+    assert mapper.owed == mapper.config.mapping.refine_iterations
+    worker.hold(False)
+    wait_until(lambda: mapper.owed == 0)
+    worker.close()
+
+
+def test_closing_a_worker_that_never_began_or_twice_does_nothing(mapper: Mapper) -> None:
+    worker = MappingWorker(mapper)
+    worker.close()
+    worker.close()
+    worker.finish()
+    assert len(worker.snapshot().model) == 0
+
+
+def test_slam_with_a_mapping_thread_tracks_and_maps_the_tabletop() -> None:
+    frames, poses = tabletop()
+    slam = Slam(small_config(mapping__threaded=True))
+    for frame in frames:
+        slam.process(frame)
+    slam.finish()
+    for result, truth in zip(slam.results, poses, strict=True):
+        assert result.T_world_camera is not None
+        assert np.linalg.norm(result.T_world_camera[:3, 3] - truth[:3, 3]) < 3e-3
+    assert isinstance(slam.snapshot().model, GaussianModel)
+    assert len(slam.snapshot().model) > 1500
+
+
+def test_a_moving_robot_s_map_is_refined_once_it_stands_also_without_a_thread() -> None:
+    frames, _ = tabletop()
+
+    def joints(frame: Frame, angle: float) -> Frame:
+        return replace(frame, joints=np.array([angle]))
+
+    slam = Slam(small_config())
+    slam.process(joints(frames[0], 0.0))
+    assert slam.process(joints(frames[10], 0.5)).keyframe
+    assert slam._mapper.owed == slam.config.mapping.refine_iterations  # type: ignore[union-attr]
+    slam.process(joints(frames[11], 0.5))
+    assert slam._mapper.owed == 0  # type: ignore[union-attr]

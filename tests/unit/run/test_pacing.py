@@ -1,0 +1,101 @@
+"""Paced frames: each at its time, the newest only, and a slow log is not the tracker's fault."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatbot.errors import InputError, LogError
+from splatbot.frame import Frame
+from splatbot.logs.base import LogBase
+from splatbot.run.pacing import FrameSource, PacedSource
+from tests.rgbd import CAMERA
+
+PERIOD = 0.05
+
+
+class Stream(LogBase):
+    """Frames every 50 ms; some cannot be read, and decoding may take its time."""
+
+    def __init__(self, n: int, *, bad: tuple[int, ...] = (), decode_s: float = 0.0, crash: bool = False) -> None:
+        self.n, self.bad, self.decode_s, self.crash = n, bad, decode_s, crash
+        self.read_by: set[str] = set()
+
+    def __len__(self) -> int:
+        return self.n
+
+    def _decode(self, index: int) -> Frame:
+        self.read_by.add(threading.current_thread().name)
+        time.sleep(self.decode_s)
+        if index in self.bad:
+            raise LogError("is damaged.", file=f"{index}.png")
+        if self.crash:
+            raise RuntimeError("crashed on purpose")
+        rgb, depth = np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32)
+        return Frame(100.0 + PERIOD * index, rgb, depth, CAMERA, index)
+
+
+def source(log: Any, *, paced: bool = True, rate: float | None = None) -> FrameSource:
+    return PacedSource(log, len(log), rate) if paced else FrameSource(log, len(log))
+
+
+def test_without_pacing_every_frame_comes_when_asked_for_and_errors_in_their_place() -> None:
+    arrivals = list(source(Stream(4, bad=(2,)), paced=False))
+    assert [a.index for a in arrivals] == [0, 1, 2, 3]
+    assert [isinstance(a.frame, InputError) for a in arrivals] == [False, False, True, False]
+
+
+@pytest.mark.parametrize("rate", [None, 1 / PERIOD])
+def test_frames_come_at_their_times_and_none_is_dropped_or_late_where_there_is_time(rate: float | None) -> None:
+    frames = source(Stream(5), rate=rate)
+    start = time.perf_counter()
+    assert [a.index for a in frames] == [0, 1, 2, 3, 4]
+    assert time.perf_counter() - start > 4 * PERIOD - 0.01
+    assert frames.dropped == []
+
+
+def test_while_one_frame_is_worked_on_the_next_ones_pass_and_are_counted() -> None:
+    log = Stream(8)
+    frames = source(log)
+    taken = []
+    for arrival in frames:
+        taken.append(arrival.index)
+        if arrival.index == 1:
+            time.sleep(3.5 * PERIOD)  # frames 2, 3 and 4 arrive meanwhile
+    assert taken[:2] == [0, 1]
+    assert 4 <= taken[2] <= 5
+    assert frames.dropped == [i for i in range(8) if i not in taken]
+    assert 1 in frames.late
+    assert log.read_by == {"reading"}
+
+
+def test_a_log_slower_than_its_own_pace_costs_no_frame() -> None:
+    frames = source(Stream(4, decode_s=2 * PERIOD))
+    assert [a.index for a in frames] == [0, 1, 2, 3]
+    assert frames.dropped == []
+    assert frames.late == set()
+
+
+def test_a_frame_that_cannot_be_read_has_its_place_also_when_it_is_the_first() -> None:
+    arrivals = list(source(Stream(4, bad=(0, 2))))
+    assert [(a.index, isinstance(a.frame, InputError)) for a in arrivals][:2] == [(0, True), (1, False)]
+
+
+def test_a_bug_of_a_reader_is_raised_where_the_frames_are_taken() -> None:
+    with pytest.raises(RuntimeError, match="crashed on purpose"):
+        list(source(Stream(3, crash=True)))
+
+
+def test_a_source_that_is_left_early_ends_its_thread() -> None:
+    arrivals = iter(source(Stream(100)))
+    next(arrivals)
+    arrivals.close()
+    for _ in range(200):
+        if not any(t.name == "reading" for t in threading.enumerate()):
+            return
+        time.sleep(0.01)
+    pytest.fail("the reading thread goes on")
