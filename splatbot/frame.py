@@ -11,6 +11,43 @@ from splatbot.camera import Camera
 from splatbot.errors import InputError
 
 
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """What a robot knows of the camera's pose before its image is looked at: joints, wheels, an inertial sensor.
+
+    Exactly one of the two poses is given.
+
+    Args:
+        covariance: (6, 6) of the twist (translation [m], rotation [rad]) in this frame's camera.
+        T_world_camera: (4, 4) in the frame of the map, whose origin is the first camera.
+        T_previous_camera: (4, 4) of this camera in that of the frame before.
+
+    Raises:
+        InputError: none or both poses are given, one is not rigid, or the covariance is not positive definite.
+    """
+
+    covariance: NDArray[np.float64]
+    T_world_camera: NDArray[np.float64] | None = None
+    T_previous_camera: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        given = [T for T in (self.T_world_camera, self.T_previous_camera) if T is not None]
+        if len(given) != 1:
+            raise InputError(
+                f"{len(given)} poses are given.", field="prior", hint="give T_world_camera or T_previous_camera"
+            )
+        T, C = np.asarray(given[0], np.float64), np.asarray(self.covariance, np.float64)
+        rigid = T.shape == (4, 4) and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
+        if not rigid or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
+            raise InputError("is no rigid transform (4, 4).", field="prior", hint="give a rotation and a translation")
+        if C.shape != (6, 6) or not np.isfinite(C).all() or not np.allclose(C, C.T) or np.linalg.eigvalsh(C)[0] <= 0:
+            raise InputError(
+                "is not a positive definite matrix (6, 6).",
+                field="prior covariance",
+                hint="give variances in m² and rad², none of them 0",
+            )
+
+
 @dataclass(frozen=True)
 class Frame:
     """A colour image and the depth registered to it.
@@ -23,6 +60,9 @@ class Frame:
         camera: intrinsics of both images; undistorted.
         index: position in the log.
         joints: joint positions (n,) [rad] at ``stamp``, where a robot told them.
+        mask: (H, W) bool, True where the pixel may be used; None uses all. What it leaves out (a gripper, the robot's
+            own arm) is neither tracked nor mapped.
+        prior: what is known of the pose already.
         source: what the frame came from (for messages).
 
     Raises:
@@ -35,6 +75,8 @@ class Frame:
     camera: Camera
     index: int = 0
     joints: NDArray[np.float64] | None = None
+    mask: NDArray[np.bool_] | None = None
+    prior: PosePrior | None = None
     source: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
@@ -65,6 +107,13 @@ class Frame:
                 field="image size",
                 hint="correct width and height of the intrinsics, or resize the images",
             )
+        if self.mask is not None and (self.mask.dtype != np.bool_ or self.mask.shape != size):
+            raise InputError(
+                f"is {self.mask.dtype} {self.mask.shape}.",
+                file=where,
+                field="mask",
+                hint=f"give {size} bool, True where a pixel may be used",
+            )
         if not np.isfinite(self.depth).all():
             object.__setattr__(self, "depth", np.nan_to_num(self.depth, nan=0.0, posinf=0.0, neginf=0.0))
         if (self.depth < 0).any():
@@ -77,5 +126,5 @@ class Frame:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Pixels (H, W) that have a depth."""
-        return self.depth > 0
+        """Pixels (H, W) that have a depth and are not masked."""
+        return self.depth > 0 if self.mask is None else (self.depth > 0) & self.mask

@@ -72,6 +72,15 @@ def inverse(T: ArrayLike) -> Array:
     return out
 
 
+def adjoint(T_a_b: ArrayLike) -> Array:
+    """Matrix (6, 6) that takes a twist (translation, rotation) of frame b to frame a: T exp(ξ) T⁻¹ = exp(Ad ξ)."""
+    M = np.asarray(T_a_b, dtype=np.float64)
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = M[:3, :3]
+    A[:3, 3:] = skew(M[:3, 3]) @ M[:3, :3]
+    return A
+
+
 def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
     """Points (..., 3) [m] of frame b in frame a."""
     M = np.asarray(T_a_b, dtype=np.float64)
@@ -121,6 +130,14 @@ def rotation_to_quat(R: ArrayLike) -> Array:
     q = np.take_along_axis(rows, pivot[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
+
+
+def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
+    """Hamilton products (..., 4) wxyz: the rotation ``b``, then ``a``."""
+    p, q = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
+    w = pw * qw - np.sum(pv * qv, axis=-1, keepdims=True)
+    return np.concatenate([w, pw * qv + qw * pv + np.cross(pv, qv)], axis=-1)
 
 
 def pose_from_quat(translation: ArrayLike, quat: ArrayLike) -> Array:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from splatbot.config import Config
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
+from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.motion import JointMotion
 from splatbot.mapping.worker import MappingWorker
@@ -32,6 +35,8 @@ class FrameResult:
         stage_ms: milliseconds by stage.
         keyframe: whether the frame entered the map.
         gaussians: size of the map afterwards.
+        skipped: tracking stages that there was no time for.
+        covariance: (6, 6) of the pose, see :attr:`splatbot.tracking.estimate.PoseEstimate.covariance`; None when lost.
     """
 
     index: int
@@ -43,6 +48,8 @@ class FrameResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
     keyframe: bool = False
     gaussians: int = 0
+    skipped: tuple[str, ...] = ()
+    covariance: NDArray[np.float64] | None = None
 
 
 class Slam:
@@ -60,6 +67,7 @@ class Slam:
         self._mapper = MappingWorker(mapper) if self.config.mapping.threaded else mapper
         self._looked = -math.inf
         self._size: tuple[int, int] | None = None
+        self._growing = True
         self._motion = JointMotion(self.config.mapping.still)
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
@@ -72,16 +80,19 @@ class Slam:
         """
         self._check_size(frame)
         start = time.perf_counter()
+        if self._growing and self._mapper.has_loop:
+            self._close_loops()
         prepared = prepare(frame, self.config.tracking)
         prepared_at = time.perf_counter()
         estimate = self._track(prepared, hold_out)
         tracked_at = time.perf_counter()
-        self._mapper.hold(self._motion.update(frame.stamp, frame.joints))
+        if self._growing:
+            self._mapper.hold(self._motion.update(frame.stamp, frame.joints))
         placed = estimate.verdict != "lost"
-        keyframe = placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
+        keyframe = self._growing and placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
         if keyframe:
             self._map(prepared, estimate)
-        elif estimate.verdict == "ok" and not hold_out and self._looks(frame.stamp):
+        elif self._growing and estimate.verdict == "ok" and not hold_out and self._looks(frame.stamp):
             self._mapper.look(prepared, estimate.T_world_camera)
         stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
         stage_ms["mapping"] = 1e3 * (time.perf_counter() - tracked_at)
@@ -95,17 +106,58 @@ class Slam:
             stage_ms=stage_ms,
             keyframe=keyframe,
             gaussians=self._mapper.size,
+            skipped=estimate.skipped,
+            covariance=estimate.covariance if placed else None,
         )
         self.results.append(result)
         return result
 
     def finish(self) -> None:
         """Spend the last refinement on the map once the stream has ended."""
-        self._mapper.finish()
+        if self._growing:
+            self._mapper.finish()
+        else:
+            self._mapper.close()
+
+    def localise_only(self) -> None:
+        """From here on frames are placed in the map as it is, which nothing changes; the next may be anywhere in it.
+
+        ``results`` begins anew, and the world stays the map's.
+
+        Raises:
+            InputError: there is no map yet.
+        """
+        if not self._mapper.keyframes:
+            raise InputError("the map has no keyframes.", field="map", hint="map a log first")
+        self._growing = False
+        self._size = None
+        self.results = []
+        self._tracker.forget()
 
     def close(self) -> None:
         """End the mapping thread, if there is one, once what has been handed to it is in the map."""
         self._mapper.close()
+
+    def paused(self) -> AbstractContextManager[None]:
+        """A block in which nothing changes: what has been handed to a mapping thread is in the map, and it waits."""
+        return self._mapper.paused()
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """Bytes held: "gaussians_bytes" (bookkeeping included), "optimiser_bytes", "keyframe_images_bytes" and
+        "keyframe_tracking_bytes" (features, sampled pixels).
+        """
+        return self._mapper.memory
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """How many places were recognised ("closed"), and how many only looked like it ("rejected")."""
+        return self._mapper.loop_counts
+
+    @property
+    def keyframes(self) -> Sequence[Keyframe]:
+        """What frames are tracked against."""
+        return self._mapper.keyframes
 
     def snapshot(self) -> Snapshot:
         """The map as it is now, immutable."""
@@ -137,6 +189,20 @@ class Slam:
         self._looked = stamp
         return True
 
+    def _close_loops(self) -> None:
+        """Move the map's pieces where the loops want them, and with them the poses found so far and the tracker."""
+        with self._mapper.paused():
+            correction = self._mapper.close_loops()
+        number, moved = -1, []
+        for result in self.results:
+            number += result.keyframe
+            T, known = result.T_world_camera, correction.get(number)
+            moved.append(result if T is None or known is None else replace(result, T_world_camera=known @ T))
+        self.results = moved
+        if number in correction:
+            self._tracker.move(correction[number])
+
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)
+        self._tracker.remember(features, estimate)
         self._mapper.insert(prepared, estimate.T_world_camera, features)

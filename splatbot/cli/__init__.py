@@ -26,9 +26,18 @@ COMMANDS = {
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
-    "bench": _Command("splatbot.cli.bench", "bench", "Measure speed, and what accuracy costs in time."),
+    "bench raster": _Command(
+        "splatbot.cli.bench_raster", "bench_raster", "Measure the rasterizer's speed, and what accuracy costs in time."
+    ),
+    "bench tracking": _Command(
+        "splatbot.cli.bench_tracking",
+        "bench_tracking",
+        "Measure tracking: error against milliseconds, beside other trackers.",
+    ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
+
+_GROUPS = {"bench": "Measure speed, and what accuracy costs in time; `splatbot bench --help` lists the benchmarks."}
 
 _DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers a robot's questions.
 
@@ -66,20 +75,31 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _dispatch(words: list[str]) -> Any:
     import tyro
 
-    if words and words[0] in COMMANDS:
-        command = COMMANDS[words[0]]
-        function = getattr(importlib.import_module(command.module), command.function)
-        return tyro.cli(
-            function,
-            prog=f"splatbot {words[0]}",
-            description=_description(function),
-            args=words[1:],
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
+    for length in (1, 2):
+        name = " ".join(words[:length])
+        if name in COMMANDS:
+            return _run(name, words[length:])
     # No known command: tyro prints the help, or names the nearest command, and leaves.
-    outline = {name: _outline(command) for name, command in COMMANDS.items()}
+    group = words[0] if words and words[0] in _GROUPS else ""
     return tyro.extras.subcommand_cli_from_dict(
-        outline, prog="splatbot", description=_DESCRIPTION, args=words or ["--help"]
+        {name: _outline(summary) for name, summary in _summaries(group).items()},
+        prog=f"splatbot {group}".strip(),
+        description=_GROUPS.get(group, _DESCRIPTION),
+        args=words[bool(group) :] or ["--help"],
+    )
+
+
+def _run(name: str, words: list[str]) -> Any:
+    import tyro
+
+    command = COMMANDS[name]
+    function = getattr(importlib.import_module(command.module), command.function)
+    return tyro.cli(
+        function,
+        prog=f"splatbot {name}",
+        description=_description(function),
+        args=words,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )
 
 
@@ -88,9 +108,17 @@ def _description(function: Callable[..., Any]) -> str:
     return inspect.cleandoc(function.__doc__ or "").split("\nArgs:")[0].rstrip()
 
 
-def _outline(command: _Command) -> Callable[[], None]:
+def _summaries(group: str) -> dict[str, str]:
+    """What the help of a group of commands lists; the group "" is the program."""
+    if group:
+        words = {name: name.removeprefix(f"{group} ") for name in COMMANDS if name.startswith(f"{group} ")}
+        return {word: COMMANDS[name].summary for name, word in words.items()}
+    return {name: command.summary for name, command in COMMANDS.items() if " " not in name} | _GROUPS
+
+
+def _outline(summary: str) -> Callable[[], None]:
     def outline() -> None:
         raise AssertionError("only its docstring is used")
 
-    outline.__doc__ = command.summary
+    outline.__doc__ = summary
     return outline

@@ -12,6 +12,7 @@ import tyro
 
 if TYPE_CHECKING:
     from splatbot.run import RunResult
+    from splatbot.run.state import SavedRun
 
 
 def map_log_command(
@@ -22,25 +23,32 @@ def map_log_command(
     overrides: Annotated[
         tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction
     ] = (),
+    budget_ms: Annotated[float | None, tyro.conf.arg(metavar="MS")] = None,
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     realtime: bool = False,
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None,
+    save_every: Annotated[float, tyro.conf.arg(metavar="S")] = 30.0,
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
+    localise: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     dump_config: bool = False,
     quiet: bool = False,
 ) -> int:
     """Turn an RGB-D log into a map of Gaussians.
 
     Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml and report.html.
-    Ctrl-C saves what has been mapped so far; so does a frame that cannot be read.
+    Ctrl-C saves what has been mapped so far; so does a frame that cannot be read. Every 30 s, and when the frames are
+    through, the whole state is saved too (RUN/state), for --resume and --localise.
 
     Examples:
         splatbot map recordings/desk
         splatbot map recordings/desk --out runs/desk --set mapping.max_gaussians=50000
         splatbot map rgbd_dataset_freiburg1_desk --camera tum_fr1
-        splatbot map recordings/desk --realtime --rate 30
+        splatbot map recordings/desk --budget-ms 30 --realtime --rate 30
         splatbot map "synthetic:tabletop?frames=40" --out runs/tabletop
+        splatbot map --resume runs/desk
+        splatbot map recordings/desk_again --localise runs/desk
         splatbot map --dump-config > mine.yaml
 
     Args:
@@ -48,22 +56,35 @@ def map_log_command(
         out: folder to write; by default runs/NAME-TIME, with a link runs/latest.
         config: YAML file; environment variables (SPLATBOT_MAPPING__MAX_GAUSSIANS=...) and then --set override it.
         overrides: one key of the configuration, as in mapping.max_gaussians=50000.
+        budget_ms: time for tracking one frame, 100 by default; 30, 300 and 1000 have other settings. As --set
+            tracking.budget_ms=MS; counted in work, so that runs repeat, unless --realtime.
         camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         on_bad_frame: what to do about a frame that cannot be read: save and stop, or leave it out.
         max_frames: read only the first N frames.
         realtime: give frames at the times of their stamps, map beside tracking, drop frames there is no time for.
         rate: the same at so many frames per second.
+        save_every: seconds between two saves of the state; 0: never, not even at the end.
+        resume: go on with a run that was killed, interrupted or cut short, into its own folder unless --out is given;
+            LOG only if the log has moved.
+        localise: place the frames in the map of this run instead of building one; the first may be anywhere in it, and
+            is not believed before the second agrees.
         dump_config: print the configuration in force and leave.
         quiet: no progress and no summary, only errors.
     """
     from splatbot.config import load_config
     from splatbot.errors import InputError
 
-    settings = load_config(config, overrides=_parse_overrides(overrides))
+    given = _parse_overrides(overrides) | ({} if budget_ms is None else {"tracking.budget_ms": budget_ms})
+    settings = load_config(config, overrides=given)
     if dump_config:
         print(settings.to_yaml(), end="")
         return 0
-    if not log:
+    if resume is not None and localise is not None:
+        raise InputError("excludes --resume.", field="--localise", hint="give the one or the other")
+    if (resume or localise) and (config or given):
+        hint = "leave --config, --set and --budget-ms out, or map the log anew"
+        raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
+    if not log and resume is None:
         raise InputError("is missing.", field="LOG", hint="name a recording: splatbot map LOG")
     if max_frames is not None and max_frames < 1:
         raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
@@ -72,6 +93,9 @@ def map_log_command(
     from splatbot.logs import open_log
     from splatbot.run import map_log
 
+    saved = _saved_run(resume, localise)
+    if resume is not None and saved is not None:
+        log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
     recording = open_log(log, camera=camera)
     folder = out if out is not None else Path("runs") / f"{_slug(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     with progress_display(quiet=quiet) as on_progress:
@@ -84,6 +108,9 @@ def map_log_command(
             max_frames=max_frames,
             realtime=realtime,
             rate=rate,
+            save_every=save_every if save_every > 0 else None,
+            resume=saved if resume is not None else None,
+            localise=saved if localise is not None else None,
             source={"camera": _lasting(camera) if camera else None},
         )
     if out is None:
@@ -93,6 +120,13 @@ def map_log_command(
     if result.error is not None:
         print(f"error: {result.error}", file=sys.stderr)
     return result.exit_code
+
+
+def _saved_run(resume: Path | None, localise: Path | None) -> SavedRun | None:
+    from splatbot.run.state import SavedRun
+
+    folder = resume or localise
+    return SavedRun.load(folder) if folder is not None else None
 
 
 def _parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:

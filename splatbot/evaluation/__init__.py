@@ -1,16 +1,19 @@
 """How good a trajectory, an image or a depth image is."""
 
+from splatbot.evaluation.consistency import Consistency, nees
 from splatbot.evaluation.geometry import DepthError, depth_error
 from splatbot.evaluation.image import psnr, ssim
 from splatbot.evaluation.trajectory import AbsoluteError, RelativeError, absolute_error, align, relative_error
 
 __all__ = [
     "AbsoluteError",
+    "Consistency",
     "DepthError",
     "RelativeError",
     "absolute_error",
     "align",
     "depth_error",
+    "nees",
     "psnr",
     "relative_error",
     "ssim",

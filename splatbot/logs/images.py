@@ -56,6 +56,24 @@ def read_depth(path: Path, units_per_metre: float, *, empty: bool = False) -> ND
     return depth
 
 
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Mask (H, W), True where the image is not black.
+
+    Raises:
+        LogError: no such file, truncated, corrupt, or not one channel of 8 bits.
+    """
+    image = _decode(path, "mask", cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint8:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise LogError(
+            f"has {channels} channel(s) of {image.dtype}.",
+            file=path,
+            field="mask",
+            hint="write a grey 8-bit PNG: white where a pixel may be used, black where not",
+        )
+    return image > 0
+
+
 def _decode(path: Path, field: str, flags: int) -> NDArray[Any]:
     try:
         data = path.read_bytes()

@@ -33,8 +33,8 @@ class RgbdReader:
         self._undistort = Undistorter(calibration.camera) if calibration.camera.distortion else None
         self.camera: Camera = self._undistort.camera if self._undistort else calibration.camera
 
-    def read(self, index: int, stamp: float, color: Path, depth: Path) -> Frame:
-        """The frame of two files.
+    def read(self, index: int, stamp: float, color: Path, depth: Path, mask: NDArray[np.bool_] | None = None) -> Frame:
+        """The frame of two files, and a mask (H, W) of the distorted image.
 
         Raises:
             LogError: a file is damaged, sizes differ, there is no valid depth, or (frame 0) its unit is implausible.
@@ -42,12 +42,20 @@ class RgbdReader:
         rgb = read_color(color)
         z = read_depth(depth, self.calibration.depth_scale, empty=self._empty_depth)
         self._check_sizes(rgb, z, color, depth)
+        if mask is not None and mask.shape != z.shape:
+            raise LogError(
+                f"the mask is {mask.shape[1]}x{mask.shape[0]}, the image {z.shape[1]}x{z.shape[0]}.",
+                file=color,
+                field="mask size",
+                hint="write masks at the colour image's size",
+            )
         if index == 0 and z.any():
             self._check_unit(z, depth)
         if self._undistort:
             rgb, z = self._undistort.color(rgb), self._undistort.depth(z)
+            mask = None if mask is None else self._undistort.mask(mask)
         try:
-            return Frame(stamp, rgb, z, self.camera, index, source=str(color))
+            return Frame(stamp, rgb, z, self.camera, index, mask=mask, source=str(color))
         except InputError as error:
             raise LogError(error.message, file=depth, field=error.field, hint=error.hint) from error
 

@@ -16,6 +16,7 @@ from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration, read_calibration
 from splatbot.logs.effects import read_account
 from splatbot.logs.index import Entry, associate, read_index
+from splatbot.logs.masks import find_masks
 from splatbot.logs.presets import PRESETS, find_calibration
 from splatbot.logs.rgbd import RgbdReader
 from splatbot.trajectory import Trajectory
@@ -37,6 +38,9 @@ class TumLog(LogBase):
     sensor's two streams ran freely (as TUM's own), drop-outs are normal: skip. Either way they are counted in
     ``unpaired`` and logged. A depth image without colour is never missed, only logged.
 
+    `mask.png` (for all frames) or `mask.txt` (lines `stamp path`, one mask for each frame) name pixels that may be used
+    (white) and that must not be (black): the gripper in view, the robot's own arm.
+
     Raises:
         LogError: a list is missing, empty or malformed, nothing can be associated, or `effects.json` is damaged.
         CameraError: there are no usable intrinsics.
@@ -56,6 +60,7 @@ class TumLog(LogBase):
             missing = "error" if lockstep else "skip"
         kept = [i for i in range(len(colors)) if i in pairs or missing == "error"]
         self._frames: list[tuple[Entry, Entry | None]] = [(colors[i], pairs.get(i)) for i in kept]
+        self._masks = find_masks(self.folder)
         self._effects, blanks_depth = read_account(self.folder)
         self._reader = RgbdReader(self._calibration(camera), empty_depth=blanks_depth)
         self._report(len(colors), len(pairs))
@@ -92,7 +97,8 @@ class TumLog(LogBase):
         color, depth = self._frames[index]
         if depth is None:
             raise self._no_partner(color)
-        return self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path)
+        mask = None if self._masks is None else self._masks.at(color.stamp)
+        return self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path, mask)
 
     def _pair(self, colors: list[Entry]) -> dict[int, Entry]:
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))

@@ -28,6 +28,11 @@ class Undistorter:
         out = cv2.remap(rgb, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(out, dtype=np.uint8)
 
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(H, W) of the distorted camera to (H, W) of ``camera``; pixels that the sensor did not see are False."""
+        out = cv2.remap(mask.astype(np.uint8), *self._map, cv2.INTER_NEAREST, borderValue=0)
+        return np.asarray(out > 0)
+
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """(H, W) [m] of the distorted camera to (H, W) [m] of ``camera``."""
         out = cv2.remap(depth, *self._map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,9 +14,13 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, weigh
 from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
-from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images
+from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images, resized
+from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
+from splatbot.mapping.loop import View as LoopView
+from splatbot.mapping.memory import memory_of
 from splatbot.mapping.merge import merge_alike
 from splatbot.mapping.moving import Movers
 from splatbot.mapping.prune import fittest, worth_keeping
@@ -31,11 +34,19 @@ _REVEALED = 0.03  # share of a frame that the map has nothing of, from which on 
 
 @dataclass(frozen=True)
 class Observation:
-    """A frame that is to become a keyframe: its images, T_world_camera (4, 4) and features."""
+    """A frame that is to become a keyframe.
+
+    Args:
+        prepared: its images.
+        T_world_camera: (4, 4).
+        features: of it.
+        anchor: number of the keyframe that frames were near to before.
+    """
 
     prepared: PreparedFrame
     T_world_camera: NDArray[np.float64]
     features: Features
+    anchor: int | None = None
 
 
 class Mapper:
@@ -47,6 +58,7 @@ class Mapper:
         self.model = GaussianModel.empty()
         self.owed = 0
         """Refinement steps that keyframes have called for and that were not spent yet."""
+        self.loops = LoopCloser(config)
         self._refiner = Refiner(config.mapping, config.seed)
         self._refiner.adam.extend(self.model)
         self._movers = Movers(config.mapping.settle)
@@ -72,19 +84,57 @@ class Mapper:
             return False
         if self._revealed and not waiting:
             return True
-        return is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
+        new = is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
+        return self.loops.is_bridge(T_world_camera, self.keyframes) or new
 
     def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
         """Fuse a frame into the map, refine, and make it a reference for tracking.
 
         An exception leaves keyframes and map as they were.
         """
-        observation = Observation(prepared, T_world_camera, features)
+        observation = Observation(prepared, T_world_camera, features, self.loops.anchor)
         with self._undone_on_error():
             keyframe = self.add_keyframe(observation)
             self.fuse(keyframe)
             self.refine(0 if self._held else self.owed)
             self.make_reference(observation, keyframe)
+        self.look_for_loops(observation, keyframe)
+
+    def look_for_loops(self, observation: Observation, keyframe: Keyframe) -> None:
+        """Whether a keyframe shows a place seen before; :meth:`close_loops` acts on it."""
+        view = LoopView(observation.prepared, observation.T_world_camera, observation.features, observation.anchor)
+        self.loops.add(keyframe, view, self.keyframes)
+
+    def close_loops(self) -> dict[int, NDArray[np.float64]]:
+        """Move keyframes and their Gaussians where the pose graph has them; T_new_old (4, 4) by keyframe number.
+
+        Nobody may track or map meanwhile. Empty when no loop waits.
+        """
+        correction = self.loops.correction
+        if correction is None:
+            return {}
+        self.keyframes = [move_keyframe(keyframe, correction) for keyframe in self.keyframes]
+        self.model = move_gaussians(self.model, correction)
+        self.loops.moved(correction)
+        self.owed += self.config.mapping.refine_iterations
+        self.refine(0 if self._held else self.owed)
+        self._version += 1
+        return correction
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """Bytes held, by what for."""
+        return memory_of(self.model, self._refiner.adam, self.keyframes)
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """Loops that were "closed", and "rejected" ones."""
+        return {"closed": self.loops.closed, "rejected": self.loops.rejected}
+
+    @property
+    def has_loop(self) -> bool:
+        """Whether :meth:`close_loops` has something to do."""
+        return self.loops.correction is not None
 
     def hold(self, moving: bool) -> None:
         """Whether refinement is to wait, because the robot moves; steps owed are spent once it stands."""
@@ -103,6 +153,10 @@ class Mapper:
     def close(self) -> None:
         """Nothing goes on in the background that would have to be ended."""
 
+    def paused(self) -> AbstractContextManager[None]:
+        """Nothing goes on in the background that would have to wait."""
+        return nullcontext()
+
     def snapshot(self) -> Snapshot:
         """The map as it is, copied."""
         return Snapshot(self.model.clone(), self._version, self._stamp)
@@ -116,7 +170,8 @@ class Mapper:
         if provisional:
             levels, n_pixels = observation.prepared.levels, self.config.tracking.n_pixels
             keyframe.reference = make_reference(levels, observation.T_world_camera, n_pixels)
-        self.keyframes = [*self.keyframes, keyframe]  # a new list: the tracker may be reading the old one
+        # A new list: the tracker may be reading the old one.
+        self.keyframes = without_redundant([*self.keyframes, keyframe], self.config.mapping.max_keyframes)
         self._stamp = observation.prepared.frame.stamp
         return keyframe
 
@@ -162,7 +217,7 @@ class Mapper:
         view = view_of(self.model, levels[0].camera, keyframe.T_world_camera)
         depth = model_depth(view, levels[0].depth, self.config.mapping)
         if keyframe.still is not None:
-            depth = np.where(_resized(keyframe.still.numpy(), depth.shape), depth, np.float32(0))
+            depth = np.where(resized(keyframe.still.numpy(), depth.shape), depth, np.float32(0))
         n_pixels = self.config.tracking.n_pixels
         keyframe.reference = make_reference(with_depth(levels, depth), keyframe.T_world_camera, n_pixels)
 
@@ -183,14 +238,16 @@ class Mapper:
         self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features
     ) -> Keyframe:
         camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
+        mask = prepared.frame.mask
         return Keyframe(
-            number=len(self.keyframes),
+            number=self.keyframes[-1].number + 1 if self.keyframes else 0,
             camera=camera,
             rgb=torch.from_numpy(np.ascontiguousarray(rgb)),
             depth=torch.from_numpy(depth),
             T_world_camera=T_world_camera,
             features=features,
             reference=Reference(T_world_camera, ()),
+            still=None if mask is None else torch.from_numpy(resized(mask, depth.shape)),
         )
 
     def _weigh(self, depth: torch.Tensor, camera: Camera, T_world_camera: NDArray[np.float64]) -> None:
@@ -208,7 +265,7 @@ class Mapper:
             self._stamp,
         )
         if moving.any():
-            keyframe.still = ~moving
+            keyframe.still = ~moving if keyframe.still is None else keyframe.still & ~moving
             keyframe.depth = torch.where(moving, 0.0, keyframe.depth)
 
     def _add(self, keyframe: Keyframe, view: View) -> None:
@@ -233,10 +290,3 @@ class Mapper:
     def _select(self, index: torch.Tensor) -> None:
         self.model = self.model.select(index)
         self._refiner.adam.select(index)
-
-
-def _resized(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The mask at another size, by the nearest pixel."""
-    if mask.shape == shape:
-        return mask
-    return cv2.resize(mask.astype(np.uint8), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST) > 0

@@ -6,9 +6,10 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,6 +50,15 @@ class MappingWorker:
         self._error: BaseException | None = None
         self._published = mapper.snapshot()
         self._thread: threading.Thread | None = None
+        self._working = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is saved of a paused worker: all but the thread and what it waits with."""
+        return {"_mapper": self._mapper, "_backlog": self._backlog, "_held": self._held}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["_mapper"], backlog=state["_backlog"])  # type: ignore[misc]
+        self._held = state["_held"]
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -69,7 +79,7 @@ class MappingWorker:
     def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
         """Hand over a frame and return at once; only the first is made a keyframe here: nothing is tracked before."""
         self._raise_error()
-        observation = Observation(prepared, T_world_camera, features)
+        observation = Observation(prepared, T_world_camera, features, self._mapper.loops.anchor)
         first = self._mapper.add_keyframe(observation, provisional=True) if self._thread is None else None
         with self._news:
             self._waiting.append(observation)
@@ -83,6 +93,27 @@ class MappingWorker:
             self._to_look = (prepared, T_world_camera)
             self._news.notify()
 
+    @property
+    def memory(self) -> dict[str, int]:
+        """As :meth:`Mapper.memory`; while the thread works, of about now."""
+        return self._mapper.memory
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """As :meth:`Mapper.loop_counts`."""
+        return self._mapper.loop_counts
+
+    @property
+    def has_loop(self) -> bool:
+        """As :meth:`Mapper.has_loop`."""
+        return self._mapper.has_loop
+
+    def close_loops(self) -> dict[int, NDArray[np.float64]]:
+        """As :meth:`Mapper.close_loops`, while paused."""
+        moved = self._mapper.close_loops()
+        self._publish()
+        return moved
+
     def hold(self, moving: bool) -> None:
         """As :meth:`Mapper.hold`."""
         with self._news:
@@ -95,6 +126,15 @@ class MappingWorker:
         self._raise_error()
         self._mapper.finish()
         self._publish()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """A block in which the thread does nothing; waits until all observations are in the map."""
+        with self._news:
+            self._news.wait_for(lambda: not self._waiting or self._error is not None)
+        self._raise_error()
+        with self._working:
+            yield
 
     def close(self) -> None:
         """End the thread once all observations are in the map; what went wrong in it has been or is not raised."""
@@ -128,9 +168,12 @@ class MappingWorker:
         try:
             self._fuse(first)
             while (work := self._next()) is not None:
-                work()
+                with self._working:
+                    work()
         except BaseException as error:  # raised where somebody can act on it
-            self._error = error
+            with self._news:
+                self._error = error
+                self._news.notify_all()
 
     def _next(self) -> Callable[[], None] | None:
         """What is to be done now: new observations first; waits while there is nothing; None: the end."""
@@ -155,8 +198,11 @@ class MappingWorker:
         observation = self._waiting[0]
         self._mapper.fuse(keyframe)
         self._mapper.make_reference(observation, keyframe)
-        self._waiting.popleft()
+        self._mapper.look_for_loops(observation, keyframe)
         self._publish()
+        with self._news:
+            self._waiting.popleft()
+            self._news.notify_all()
 
     def _look(self) -> None:
         with self._news:

@@ -38,6 +38,8 @@ class FrameRow:
         held_out: whether the frame was kept out of the map, to be scored against it.
         gaussians: size of the map afterwards.
         late: whether, in a paced run, the next frame arrived before this one was done.
+        covariance: of the pose, as in :class:`splatbot.slam.FrameResult`: the 21 values of the upper triangle, by rows;
+            None where there is no pose.
     """
 
     index: int
@@ -51,6 +53,7 @@ class FrameRow:
     held_out: bool = False
     gaussians: int = 0
     late: bool = False
+    covariance: tuple[float, ...] | None = None
 
     @property
     def processed(self) -> bool:
@@ -169,8 +172,12 @@ class RunFolder:
         Raises:
             FormatError: ``frames.jsonl`` and ``trajectory.tum`` do not belong together.
         """
-        indices = [row.index for row in self.load_frames() if row.tracked]
-        poses = list(self.load_trajectory().T_world_camera) if indices else []
+        rows = [row for row in self.load_frames() if row.tracked]
+        indices = [row.index for row in rows]
+        trajectory = self.load_trajectory() if rows else None
+        poses = list(trajectory.T_world_camera) if trajectory is not None else []
+        if trajectory is not None and len(rows) < len(poses) and self._was_killed():
+            poses = poses[: len(rows)]  # between writing the one file and the other
         if len(indices) != len(poses):
             raise FormatError(
                 f"has {len(poses)} poses, {self.frames.name} has {len(indices)} tracked frames.",
@@ -178,6 +185,20 @@ class RunFolder:
                 hint="restore the file, or run `splatbot map` again",
             )
         return dict(zip(indices, poses, strict=True))
+
+    def load_covariances(self) -> NDArray[np.float64] | None:
+        """Covariances (N, 6, 6) of the tracked frames; None of a run that did not write them."""
+        packed = [row.covariance for row in self.load_frames() if row.tracked]
+        if not packed or any(values is None or len(values) != 21 for values in packed):
+            return None
+        full = np.zeros((len(packed), 6, 6))
+        upper = np.triu_indices(6)
+        full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = np.array(packed)
+        return full
+
+    def _was_killed(self) -> bool:
+        """Whether the run neither ended nor was interrupted."""
+        return self.metrics.is_file() and not self.load_metrics().get("finished", True)
 
     def _save_trajectory(self, trajectory: Trajectory) -> None:
         if len(trajectory):

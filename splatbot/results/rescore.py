@@ -34,7 +34,11 @@ def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) ->
         )
     poses = folder.load_poses()
     track = (
-        score_trajectory(folder.load_trajectory(), reference if reference is not None else log.ground_truth)
+        score_trajectory(
+            folder.load_trajectory(),
+            reference if reference is not None else log.ground_truth,
+            folder.load_covariances(),
+        )
         if poses
         else None
     )

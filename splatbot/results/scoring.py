@@ -9,7 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.errors import InputError
-from splatbot.evaluation import AbsoluteError, RelativeError, absolute_error, depth_error, psnr, relative_error, ssim
+from splatbot.evaluation import (
+    AbsoluteError,
+    Consistency,
+    RelativeError,
+    absolute_error,
+    depth_error,
+    nees,
+    psnr,
+    relative_error,
+    ssim,
+)
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
 from splatbot.logs import Log
@@ -26,18 +36,25 @@ class TrajectoryScore:
     Args:
         absolute: ATE, with the M associated frames.
         relative: RPE; None with fewer than two of them.
+        consistency: NEES; None with fewer than two of them, or where covariances are not known.
         estimate: (M, 3) [m] their camera centres, aligned to the reference.
         reference: (K, 3) [m] camera centres of the reference over the time of the run.
     """
 
     absolute: AbsoluteError
     relative: RelativeError | None
+    consistency: Consistency | None
     estimate: NDArray[np.float64]
     reference: NDArray[np.float64]
 
 
-def score_trajectory(estimate: Trajectory, reference: Trajectory | None) -> TrajectoryScore | None:
-    """Compare trajectories after SE(3) alignment; None where no stamps belong together or there is no reference."""
+def score_trajectory(
+    estimate: Trajectory, reference: Trajectory | None, covariances: NDArray[np.float64] | None = None
+) -> TrajectoryScore | None:
+    """Compare trajectories after SE(3) alignment; None where no stamps belong together or there is no reference.
+
+    ``covariances`` (N, 6, 6) are those of the estimated poses, see :func:`splatbot.evaluation.nees`.
+    """
     if reference is None or len(estimate) == 0:
         return None
     try:
@@ -46,9 +63,11 @@ def score_trajectory(estimate: Trajectory, reference: Trajectory | None) -> Traj
         return None
     associated = np.isin(estimate.stamps, absolute.stamps)
     during = (reference.stamps >= estimate.stamps[0] - 0.1) & (reference.stamps <= estimate.stamps[-1] + 0.1)
+    several = len(absolute.errors) > 1
     return TrajectoryScore(
         absolute=absolute,
-        relative=relative_error(reference, estimate) if len(absolute.errors) > 1 else None,
+        relative=relative_error(reference, estimate) if several else None,
+        consistency=nees(reference, estimate, covariances) if several and covariances is not None else None,
         estimate=transform_points(absolute.T_reference_estimate, estimate.positions[associated]),
         reference=reference.positions[during],
     )
@@ -64,6 +83,7 @@ def trajectory_metrics(score: TrajectoryScore | None) -> dict[str, float | None]
         "ate_max_m": score.absolute.max if score else None,
         "ate_frames": len(score.absolute.errors) if score else 0,
         "rpe_trans_rmse_m": relative.trans_rmse if relative else None,
+        "nees": score.consistency.mean if score and score.consistency else None,
         "rpe_rot_rmse_deg": float(np.rad2deg(relative.rot_rmse)) if relative else None,
     }
 

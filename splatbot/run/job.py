@@ -18,6 +18,8 @@ from splatbot.run.loop import FrameLoop
 from splatbot.run.outcome import Outcome
 from splatbot.run.pacing import FrameSource, PacedSource
 from splatbot.run.progress import Progress
+from splatbot.run.saving import Saver, resume_loop
+from splatbot.run.state import Checkpoint, SavedRun
 from splatbot.slam import Slam
 
 
@@ -49,6 +51,9 @@ def map_log(
     max_frames: int | None = None,
     realtime: bool = False,
     rate: float | None = None,
+    save_every: float | None = None,
+    resume: SavedRun | None = None,
+    localise: SavedRun | None = None,
     source: dict[str, Any] | None = None,
     effects: Sequence[Mapping[str, Any]] | None = None,
 ) -> RunResult:
@@ -66,23 +71,36 @@ def map_log(
         on_progress: called after every frame and at every phase.
         on_bad_frame: what to do about a frame that cannot be read.
         max_frames: read no more frames than this.
+        localise: place the frames in this run's map, which stays as it is; the trajectory is in its world. The run's
+            configuration is taken.
         realtime: give frames at the times of their stamps, as a camera would, map in a thread beside tracking, and drop
             frames that there is no time for; they and those done late are counted.
         rate: give frames at this rate [Hz] instead of their stamps'; implies ``realtime``.
+        save_every: save the whole state into ``out/state`` whenever so many seconds have passed, and at the end; a run
+            that is killed loses what came after the last save. None: never.
+        resume: go on where this run was saved; ``log`` must be its log, and ``config`` and ``slam`` are the run's.
         source: what else it takes to open the log again, kept beside its uri in ``metrics.json`` under "log".
         effects: the account of the sensor effects that the log's frames went through; None takes the log's own.
 
     Raises:
-        LogError: the log is empty, or no frame could be read; nothing is written then.
+        LogError: the log is empty, no frame could be read, or it is not the log of ``resume``; nothing is written then.
         InputError: ``out`` cannot be written.
         KeyboardInterrupt: interrupted before the first frame was mapped.
     """
+    if resume is not None:
+        resume.place.check(log)
+        config, slam = resume.config, resume.slam
+    if localise is not None:
+        config, slam = localise.config, localise.slam
+        slam.localise_only()
     config = config or (slam.config if slam else Config())
     realtime = realtime or rate is not None
     if rate is not None and not 0 < rate < 1e4:
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")
     if realtime and slam is None:
-        config = config.model_copy(update={"mapping": config.mapping.model_copy(update={"threaded": True})})
+        threaded = config.mapping.model_copy(update={"threaded": True})
+        by_the_clock = config.tracking.model_copy(update={"deterministic": False})
+        config = config.model_copy(update={"mapping": threaded, "tracking": by_the_clock})
     folder = RunFolder.create(out)
     total = len(log) if max_frames is None else min(len(log), max_frames)
     if total == 0:
@@ -90,22 +108,33 @@ def map_log(
     truth = log.ground_truth  # now: a damaged file must not cost the user a whole run
     frames = PacedSource(log, total, rate) if realtime else FrameSource(log, total)
     loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, on_progress or (lambda _: None))
+    if resume is not None:
+        resume_loop(loop, resume)
     with Interrupts() as interrupts:
+
+        def outcome() -> Outcome:
+            return Outcome(
+                loop=loop,
+                source=source or {},
+                localised_in=str(localise.folder.resolve()) if localise is not None else None,
+                effects=list(log.effects if effects is None else effects),
+                interrupts=interrupts,
+                model=loop.slam.snapshot().model,
+                rows=loop.rows(),
+                costs=cost_metrics(loop.rows()),
+                trajectory=loop.trajectory(),
+                track=score_trajectory(loop.trajectory(), truth, loop.covariances()),
+            )
+
+        if save_every is not None and localise is None:
+            checkpoint = Checkpoint(folder.path, save_every)
+            loop.saver = Saver(checkpoint, log, (source or {}).get("camera"), lambda: outcome().save_files(folder))
         loop.run(interrupts)
         if not loop.slam.results:
             raise loop.crash or loop.error or loop.first_bad or KeyboardInterrupt()
-        outcome = Outcome(
-            loop=loop,
-            source=source or {},
-            effects=list(log.effects if effects is None else effects),
-            interrupts=interrupts,
-            model=loop.slam.snapshot().model,
-            rows=loop.rows(),
-            costs=cost_metrics(loop.rows()),
-            trajectory=loop.trajectory(),
-            track=score_trajectory(loop.trajectory(), truth),
-        )
-        outcome.save(folder)
+        ended = outcome()
+        ended.finished = True
+        ended.save(folder)
     if loop.crash is not None:
         raise loop.crash
-    return RunResult(folder.path, outcome.metrics(), error=loop.error, signal=interrupts.requested)
+    return RunResult(folder.path, ended.metrics(), error=loop.error, signal=interrupts.requested)

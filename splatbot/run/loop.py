@@ -6,8 +6,10 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.config import Config
 from splatbot.errors import InputError
@@ -20,6 +22,17 @@ from splatbot.slam import FrameResult, Slam
 from splatbot.trajectory import Trajectory
 
 _DROPPED = "a newer frame had arrived"
+
+
+class FrameSaver(Protocol):
+    """What the loop asks of the one who saves it; ``cost`` says how often that was and how long it took."""
+
+    @property
+    def cost(self) -> dict[str, Any]: ...
+
+    def processed(self, loop: FrameLoop, frame: Frame, index: int) -> None: ...
+
+    def save(self, loop: FrameLoop) -> None: ...
 
 
 @dataclass
@@ -39,6 +52,7 @@ class FrameLoop:
         crash: what broke unexpectedly.
         first_bad: the first unreadable frame.
         started: clock at the start [s].
+        saver: saves the run while it goes on.
     """
 
     source: FrameSource
@@ -55,11 +69,16 @@ class FrameLoop:
     crash: Exception | None = None
     first_bad: InputError | None = None
     started: float = field(default_factory=time.perf_counter)
+    saver: FrameSaver | None = None
 
     def run(self, interrupts: Interrupts) -> None:
         """Process the frames until they end, ``error``, ``crash`` or a signal; raises nothing."""
         try:
-            if self._all_frames(interrupts):
+            through = self._all_frames(interrupts)
+            if self.saver is not None:
+                self.progress("saving")
+                self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
+            if through:
                 self.progress("refining")
                 self.slam.finish()
         except KeyboardInterrupt:  # the second signal, or one raised by a callback
@@ -96,6 +115,8 @@ class FrameLoop:
         self.keyframes += result.keyframe
         self.lost += result.verdict == "lost"
         self.progress("mapping", done=index + 1, result=result)
+        if self.saver is not None:
+            self.saver.processed(self, arrival.frame, index)
         return True
 
     def _process(self, frame: Frame, index: int) -> FrameResult:
@@ -149,12 +170,20 @@ class FrameLoop:
                 held_out=r.index in self.held_out,
                 gaussians=int(r.gaussians),
                 late=r.index in self.source.late,
+                covariance=None if r.covariance is None else tuple(r.covariance[np.triu_indices(6)].tolist()),
             )
             for r in self.slam.results
         ]
         rows += [FrameRow(index=i, stamp=None, verdict="skipped", reasons=(why,)) for i, why in self.skipped.items()]
         rows += [FrameRow(index=i, stamp=None, verdict="dropped", reasons=(_DROPPED,)) for i in self.source.dropped]
         return sorted(rows, key=lambda row: row.index)
+
+    def covariances(self) -> NDArray[np.float64] | None:
+        """Covariances (N, 6, 6) of the tracked poses; None where one is not known."""
+        tracked = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
+        if any(covariance is None for covariance in tracked):
+            return None
+        return np.array(tracked, dtype=np.float64).reshape(-1, 6, 6)
 
     def trajectory(self) -> Trajectory:
         """The tracked poses."""

@@ -31,23 +31,29 @@ class Outcome:
     trajectory: Trajectory
     track: TrajectoryScore | None
     views: ViewScores = field(default_factory=ViewScores)
+    finished: bool = False
+    localised_in: str | None = None
 
     def save(self, folder: RunFolder) -> None:
         """Save first; then score and report, which a signal may cut short without loss."""
         self.loop.progress("saving")
         with self.interrupts.held():
-            folder.save(
-                config=self.loop.config,
-                rows=self.rows,
-                trajectory=self.trajectory,
-                model=self.model,
-                metrics=self.metrics(),
-            )
+            self.save_files(folder)
         self.interrupts.release()
         try:
             self._score_and_report(folder)
         except KeyboardInterrupt:
             folder.save_metrics(self.metrics())
+
+    def save_files(self, folder: RunFolder) -> None:
+        """Write all that takes no scoring."""
+        folder.save(
+            config=self.loop.config,
+            rows=self.rows,
+            trajectory=self.trajectory,
+            model=self.model,
+            metrics=self.metrics(),
+        )
 
     def _score_and_report(self, folder: RunFolder) -> None:
         self.loop.progress("scoring")
@@ -78,6 +84,11 @@ class Outcome:
             "map_bytes": self.model.nbytes,
             "paced": self.loop.source.pace,
             "effects": self.effects,
+            "memory": self.loop.slam.memory,
+            "loops": self.loop.slam.loop_counts,
+            "finished": self.finished,
+            "localised_in": self.localised_in,
+            "saves": self.loop.saver.cost if self.loop.saver is not None else None,
             "interrupted": self.interrupts.requested is not None,
             "error": str(error) if error else None,
             "log": {"name": log.name, "frames": len(log), "uri": _lasting(log.uri), **self.source},

@@ -28,6 +28,7 @@ class FrameSource:
     """The first ``total`` frames of a log, each when it is asked for.
 
     Args:
+        first: the frame to begin with; a run that is resumed has processed those before.
         dropped: frames that nobody took before a newer one arrived.
         late: frames that were still being worked on when a newer one arrived.
     """
@@ -35,6 +36,7 @@ class FrameSource:
     def __init__(self, log: Log, total: int) -> None:
         self.log = log
         self.total = total
+        self.first = 0
         self.dropped: list[int] = []
         self.late: set[int] = set()
 
@@ -44,7 +46,7 @@ class FrameSource:
         return None
 
     def __iter__(self) -> Generator[Arrival, None, None]:
-        return (read(self.log, index) for index in range(self.total))
+        return (read(self.log, index) for index in range(self.first, self.total))
 
 
 class PacedSource(FrameSource):
@@ -64,7 +66,7 @@ class PacedSource(FrameSource):
         return "by stamps" if self.rate is None else f"{self.rate:g} Hz"
 
     def __iter__(self) -> Generator[Arrival, None, None]:
-        reader, clock = _Reader(self.log, self.total), _Schedule(self.rate)
+        reader, clock = _Reader(self.log, self.first, self.total), _Schedule(self.rate)
         try:
             while (arrival := reader.take(clock)) is not None:
                 clock.sleep_until(arrival)
@@ -81,7 +83,9 @@ class PacedSource(FrameSource):
     def _superseded(reader: _Reader, clock: _Schedule) -> bool:
         """Whether a newer frame has arrived."""
         newer = reader.peek()
-        return newer is not None and clock.due(newer) <= time.perf_counter()
+        if newer is None or not isinstance(newer.frame, Frame):  # what cannot be read takes nobody's place
+            return False
+        return clock.due(newer) <= time.perf_counter()
 
 
 def read(log: Log, index: int) -> Arrival:
@@ -133,12 +137,12 @@ class _Schedule:
 class _Reader:
     """Decodes ahead, in a thread of its own."""
 
-    def __init__(self, log: Log, total: int) -> None:
+    def __init__(self, log: Log, first: int, total: int) -> None:
         self._log = log
-        self._total = total
+        self._first, self._total = first, total
         self._ready: deque[Arrival] = deque()
         self._change = threading.Condition()
-        self._left = total
+        self._left = max(0, total - first)
         self._stopped = False
         self._crash: Exception | None = None
         threading.Thread(target=self._run, name="reading", daemon=True).start()
@@ -170,7 +174,7 @@ class _Reader:
 
     def _run(self) -> None:
         try:
-            for index in range(self._total):
+            for index in range(self._first, self._total):
                 arrival = read(self._log, index)
                 with self._change:
                     self._change.wait_for(lambda: len(self._ready) < _AHEAD or self._stopped)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,34 @@ class Alignment:
 
     Args:
         T_world_camera: (4, 4).
-        information: (6, 6) of the twist (t [m], ω [rad]) that left-multiplies T_camera_world, at the last step.
+        information: (6, 6) of the twist (t [m], ω [rad]) that left-multiplies T_camera_world, at the last step, as
+            the noise model has it; a prior's left out.
+        curvature: (6, 6) of the robust cost at the pose: less than the information by what outlying residuals lack.
+        spread: (6, 6) sum of g gᵀ over the cells of the image, g the gradient of the residuals in one cell.
+        cells: how many cells have residuals.
+    """
+
+    T_world_camera: Array
+    information: Array
+    curvature: Array
+    spread: Array
+    cells: int
+
+    def at(self, T_world_camera: Array) -> Alignment:
+        """The same numbers at another pose."""
+        return replace(self, T_world_camera=T_world_camera)
+
+
+_FULL_PIXELS = 4800  # of a reference that ``dense_weight`` is meant for
+
+
+@dataclass(frozen=True)
+class SoftPrior:
+    """What is known of T_world_camera (4, 4) before a frame is looked at.
+
+    Args:
+        T_world_camera: (4, 4).
+        information: (6, 6) of the twist (t [m], ω [rad]) in the camera's frame; zero in directions it knows nothing of.
     """
 
     T_world_camera: Array
@@ -77,27 +104,30 @@ def align(
     gate: float,
     features: FeaturePose | None = None,
     camera: Camera | None = None,
+    prior: SoftPrior | None = None,
 ) -> Alignment:
     """Align a frame to references, coarse to fine, in C++.
 
     Dense residuals are correlated between neighbouring pixels (blur, rolling shutter, depth registered a moment
     earlier), so they count ``config.dense_weight`` each, against reprojected features (``features`` with the
-    ``camera`` of their pixels), which count one.
+    ``camera`` of their pixels), which count one. More pixels measure the same better; they bring no more that is
+    independent, so together they weigh as 4800 do.
     """
     matches = None
     if features is not None and camera is not None:
         matches = (features.points, features.pixels, _intrinsics(camera))
-    T_camera_world, information = _native.align(
+    T_camera_world, information, curvature, spread, cells = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
         matches,
+        None if prior is None else (inverse(prior.T_world_camera), prior.information),
         inverse(T_world_camera),
         settings_of(config, photometric=photometric, gate=gate),
-        config.dense_weight,
+        config.dense_weight * _FULL_PIXELS / config.n_pixels,
         config.iterations,
         finest,
     )
-    return Alignment(inverse(T_camera_world), information)
+    return Alignment(inverse(T_camera_world), information, curvature, spread, cells)
 
 
 def _level_arrays(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float, float, float]]:

@@ -22,10 +22,11 @@ MIN_INLIERS = 20
 _MAX_REPROJECTION = 3.0  # [px]
 _MATCH_RATIO = 0.8  # Lowe's ratio test
 _MIN_SPREAD = 0.05  # standard deviation of matched pixels across their narrowest direction [image width]
+_PATCH = 31  # [px] that an ORB descriptor looks at on the finest level
 _MATCH_BITS = 64  # descriptors that differ in more of their 256 bits are strangers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Features:
     """Keypoints of one image.
 
@@ -53,10 +54,19 @@ class FeaturePose:
     matches: int
 
 
-def detect(rgb: NDArray[np.uint8], depth: Image, camera: Camera, n_features: int) -> Features:
-    """ORB keypoints of an image, with 3-D points where a depth of the same surface lies within two pixels."""
+def detect(
+    rgb: NDArray[np.uint8], depth: Image, camera: Camera, n_features: int, mask: NDArray[np.bool_] | None = None
+) -> Features:
+    """ORB keypoints of an image, with 3-D points where a depth of the same surface lies within two pixels.
+
+    None is nearer to a pixel that ``mask`` (H, W) leaves out than its descriptor reaches.
+    """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.ORB.create(nfeatures=n_features, fastThreshold=10).detectAndCompute(gray, None)
+    usable = None
+    if mask is not None:
+        gray[~mask] = 128  # coarse levels of ORB's pyramid reach further than the margin: let them see nothing there
+        usable = cv2.erode(mask.astype(np.uint8), np.ones((_PATCH, _PATCH), np.uint8))
+    keypoints, descriptors = cv2.ORB.create(nfeatures=n_features, fastThreshold=10).detectAndCompute(gray, usable)
     if descriptors is None:
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
     pixels = np.array([k.pt for k in keypoints], dtype=np.float32)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from splatbot.config import TrackingConfig
 from splatbot.geometry import inverse
 from splatbot.tracking.align import residuals
+from splatbot.tracking.degeneracy import WeakDirections
 from splatbot.tracking.prepare import Level
 from splatbot.tracking.reference import Reference
 
@@ -23,6 +24,8 @@ _INLIER = 3.0  # [σ]
 # A frame of less contrast than this share of the reference's shows nothing: a covered lens, the dark, a lost image. The
 # exposure fit would explain it by a gain near 0, at any pose.
 _MIN_CONTRAST = 0.1
+# On a table, or before a wall, depth agrees wherever the camera slides along it; colour does not.
+_FEW_PHOTOMETRIC = 0.55
 
 
 @dataclass(frozen=True)
@@ -80,8 +83,10 @@ def _contrast(gray: Array, reference_gray: Array) -> float:
     return float(gray.std()) / spread if spread > 1e-6 else 1.0
 
 
-def verdict_of(health: Health, information: Array, config: TrackingConfig) -> tuple[Verdict, tuple[str, ...]]:
-    """The verdict and what speaks against the pose."""
+def verdict_of(
+    health: Health, information: Array, weak: WeakDirections | None, config: TrackingConfig
+) -> tuple[Verdict, tuple[str, ...]]:
+    """The verdict and what speaks against a pose that was found with an information matrix (6, 6)."""
     lost, doubts = [], []
     # Comparisons are written so that NaN speaks against the pose.
     if not health.overlap >= config.min_overlap:
@@ -91,16 +96,12 @@ def verdict_of(health: Health, information: Array, config: TrackingConfig) -> tu
         lost.append(f"only {inliers:.0%} of the residuals are inliers")
     if not health.contrast >= _MIN_CONTRAST:
         lost.append(f"the image is blank: {health.contrast:.0%} of the reference's contrast")
+    if not health.photometric_inliers >= _FEW_PHOTOMETRIC:
+        doubts.append(f"only {health.photometric_inliers:.0%} of the colours agree")
     if not np.isfinite(information).all():
         lost.append("the alignment is not finite")
-    elif not _is_constrained(information, config.min_eigen_ratio):
-        doubts.append("translation is hardly constrained in one direction")
+    elif weak is not None:
+        doubts.append(weak.reason)
     if lost:
-        return "lost", tuple(lost + doubts)
+        return "lost", tuple(lost)
     return ("degraded", tuple(doubts)) if doubts else ("ok", ())
-
-
-def _is_constrained(information: Array, min_ratio: float) -> bool:
-    """Whether the translation is known in its weakest direction, against its strongest."""
-    eigenvalues = np.linalg.eigvalsh(information[:3, :3])
-    return bool(eigenvalues[0] > min_ratio * eigenvalues[2])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -22,7 +23,10 @@ _LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of 
 
 @dataclass(frozen=True)
 class Level:
-    """One pyramid level: grey (H, W) in 0..1, depth (H, W) [m] with 0 missing, and the camera of that size."""
+    """One pyramid level: grey (H, W) in 0..1, depth (H, W) [m] with 0 missing, and the camera of that size.
+
+    Grey is NaN where it may not be used.
+    """
 
     gray: Image
     depth: Image
@@ -31,11 +35,16 @@ class Level:
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame, its plausible depth (H, W) [m] at full size, and its pyramid, finest level first."""
+    """A frame, its plausible depth (H, W) [m] at full size, and its pyramid, finest level first.
+
+    What the frame's mask leaves out has no depth, and NaN as its grey. ``started`` is :func:`time.perf_counter` when
+    work on the frame began.
+    """
 
     frame: Frame
     depth: Image
     levels: tuple[Level, ...]
+    started: float = field(default_factory=time.perf_counter, compare=False)
 
 
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
@@ -43,8 +52,13 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
 
     It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
     """
+    started = time.perf_counter()
     depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
+    if frame.mask is not None:
+        depth = np.where(frame.mask, depth, np.float32(0))
     gray = np.multiply(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.float32(1 / 255), dtype=np.float32)
+    if frame.mask is not None:
+        gray[~frame.mask] = np.nan  # and so is all that is smoothed or interpolated from it
     level = Level(gray, depth, frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
@@ -52,7 +66,7 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     levels = [Level(smooth, level.depth, level.camera)]
     while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
         levels.append(halve(levels[-1]))
-    return PreparedFrame(frame, depth, tuple(levels))
+    return PreparedFrame(frame, depth, tuple(levels), started)
 
 
 def valid_depth(depth: Image, near: float, far: float) -> Image:
@@ -67,6 +81,13 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
 def valid_share(prepared: PreparedFrame) -> float:
     """Share of the pixels that have a usable depth."""
     return float((prepared.levels[0].depth > 0).mean())
+
+
+def typical_depth(prepared: PreparedFrame) -> float:
+    """Median depth [m] of what is seen; 1 where nothing has a depth."""
+    coarse = prepared.levels[-1].depth
+    measured = coarse[coarse > 0]
+    return float(np.median(measured)) if len(measured) else 1.0
 
 
 def halve(level: Level) -> Level:

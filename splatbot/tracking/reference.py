@@ -40,10 +40,10 @@ def sample_level(level: Level, n_pixels: int) -> ReferencePoints:
     occlusion boundaries, where colour belongs to one surface and depth to another.
     """
     normals = normals_of(level.depth, level.camera)
-    good = (normals**2).sum(-1) > 0.25
+    good = ((normals**2).sum(-1) > 0.25) & np.isfinite(level.gray)
     gx = cv2.Scharr(level.gray, cv2.CV_32F, 1, 0)
     gy = cv2.Scharr(level.gray, cv2.CV_32F, 0, 1)
-    strength = np.where(good, np.hypot(gx, gy), -1.0)
+    strength = np.where(good, np.nan_to_num(np.hypot(gx, gy)), -1.0)  # NaN beside masked pixels
     height, width = level.gray.shape
     tile = max(2, round(float(np.sqrt(2.0 * height * width / n_pixels))))
     rows, columns = height // tile, width // tile

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Sequence
+from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.config import TrackingConfig
-from splatbot.geometry import inverse, so3_log
-from splatbot.tracking.align import align
-from splatbot.tracking.features import Expectation, FeaturePose, Features, detect, match_pose
-from splatbot.tracking.health import Health, Verdict, measure, verdict_of
-from splatbot.tracking.predict import ConstantVelocity
+from splatbot.tracking.attempt import Attempt
+from splatbot.tracking.budget import Budget, Costs
+from splatbot.tracking.candidate import Judged
+from splatbot.tracking.estimate import PoseEstimate
+from splatbot.tracking.features import Features, detect
+from splatbot.tracking.predict import ConstantVelocity, Prediction
 from splatbot.tracking.prepare import PreparedFrame, valid_share
-from splatbot.tracking.reference import Reference
+from splatbot.tracking.priors import fill_weak_directions, fuse, is_believable, sigmas_off
+from splatbot.tracking.recover import KeyframeSearch, Sighting, is_sure
+from splatbot.tracking.uncertainty import Uncertainty, world_uncertainty
+from splatbot.tracking.views import TrackedKeyframe, order_by_distance, pose_distance
+from splatbot.tracking.wide import WideStage
+
+__all__ = ["PoseEstimate", "TrackedKeyframe", "Tracker", "order_by_distance", "pose_distance"]
 
 Array = NDArray[np.float64]
 
@@ -26,184 +31,134 @@ Array = NDArray[np.float64]
 _BLANK = 0.005
 
 
-class TrackedKeyframe(Protocol):
-    """What the tracker asks of a keyframe."""
-
-    @property
-    def features(self) -> Features: ...
-
-    @property
-    def reference(self) -> Reference: ...
-
-
-@dataclass(frozen=True)
-class PoseEstimate:
-    """Pose of one frame: T_world_camera (4, 4), who found it, and how much it is to be believed."""
-
-    T_world_camera: Array
-    verdict: Verdict
-    reasons: tuple[str, ...]
-    stage: str
-    health: Health | None = None
-    features: Features | None = None
-    stage_ms: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    stage: str
-    T_world_camera: Array
-    information: Array
-    references: Sequence[Reference]
-
-
 class Tracker:
-    """Finds poses of frames; remembers only the motion."""
+    """Finds poses of frames; remembers the last motion, and how well keyframes are known."""
 
     def __init__(self, config: TrackingConfig) -> None:
         self.config = config
         self.motion = ConstantVelocity()
         self._lost = False
+        self._known: WeakKeyDictionary[Features, Uncertainty] = WeakKeyDictionary()
+        self._last_covariance: Array = np.zeros((6, 6))  # of the last pose against its keyframes
+        self._costs = None if config.deterministic else Costs()
+        self._wide = WideStage(config)
+        self._search = KeyframeSearch()
+        self._sighting: Sighting | None = None
 
     def start(self, prepared: PreparedFrame) -> PoseEstimate:
         """The pose of the first frame, which defines the world; "lost" when it has too little depth or is blank."""
         share = valid_share(prepared)
         if share < self.config.min_valid:
             return PoseEstimate(np.eye(4), "lost", (f"only {share:.1%} of the pixels have a usable depth",), "start")
-        if float(prepared.levels[0].gray.std()) < _BLANK:
+        if not float(np.nanstd(prepared.levels[0].gray)) >= _BLANK:
             return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")
         self.motion.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the last frame could not be placed."""
+        return self._lost
+
+    def forget(self) -> None:
+        """The next frame may be anywhere: nothing is known of the motion."""
+        self.motion = ConstantVelocity()
+        self._lost = True
+
+    def move(self, T_new_old: Array) -> None:
+        """The map was moved where the camera is; the motion goes on from there."""
+        self.motion.move(T_new_old)
+
+    def remember(self, features: Features, estimate: PoseEstimate) -> None:
+        """That the frame with these features becomes a keyframe: poses found with it inherit its uncertainty."""
+        self._known[features] = estimate.uncertainty
+
     def track(self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe]) -> PoseEstimate:
         """The pose of a frame; "lost" when no candidate explains it."""
-        clock = _Clock()
-        T_predicted = self.motion.predict(prepared.frame.stamp)
-        with clock("geometric"):
-            candidate = self._geometric(prepared, keyframes, T_predicted)
-        features, matched = None, None
-        if self._needs_features(prepared, candidate, T_predicted):
-            with clock("features"):
-                features = self.detect(prepared)
-                matched = self._match(features, prepared, keyframes, candidate.T_world_camera)
-        with clock("direct"):
-            candidates = [self._direct(prepared, candidate, matched)]
-            if matched is not None:
-                found = self._nearest(keyframes, matched.T_world_camera)
-                start = _Candidate("features", matched.T_world_camera, np.zeros((6, 6)), found)
-                candidates.append(self._direct(prepared, start, matched))
-        with clock("health"):
-            best, health = self._choose(prepared, candidates)
-            verdict, reasons = verdict_of(health, best.information, self.config)
-        self._remember(prepared.frame.stamp, best.T_world_camera, verdict)
-        return PoseEstimate(best.T_world_camera, verdict, reasons, best.stage, health, features, clock.ms)
+        frame, budget = prepared.frame, Budget(self.config.budget_ms, self._costs, prepared.started)
+        budget.count("prepare", frame.camera.width * frame.camera.height)
+        search = self._search if self._lost else None
+        attempt = Attempt(self.config, prepared, keyframes, budget, self._wide, search)
+        own = self.motion.prediction(frame.stamp, self._last_covariance)
+        if self._sighting is not None:
+            own = replace(own, T_world_camera=self._sighting.T_world_camera)
+        told = None if frame.prior is None else self.motion.told(frame.prior, self._last_covariance)
+        pose = attempt.run(told or own, self.motion.T_world_camera)
+        if told is None:
+            pose = fill_weak_directions(pose, own)
+            uncertainty = self._uncertainty(pose)
+        else:
+            pose, uncertainty = self._with_prior(attempt, pose, told, own)
+        pose = self._conclude(frame.stamp, pose, told)
+        return PoseEstimate(
+            T_world_camera=pose.T_world_camera,
+            verdict=pose.verdict,
+            reasons=pose.reasons,
+            stage=pose.candidate.stage,
+            uncertainty=uncertainty,
+            health=pose.health,
+            features=attempt.features,
+            stage_ms=budget.ms,
+            skipped=tuple(budget.skipped),
+        )
 
     def detect(self, prepared: PreparedFrame) -> Features:
         """Keypoints of a frame, with depth."""
-        return detect(prepared.frame.rgb, prepared.depth, prepared.frame.camera, self.config.n_features)
+        frame = prepared.frame
+        return detect(frame.rgb, prepared.depth, frame.camera, self.config.n_features, frame.mask)
 
-    def _geometric(
-        self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_world_camera: Array
-    ) -> _Candidate:
-        """Projective point-to-plane alignment on the coarse levels, from the predicted pose."""
-        references = self._nearest(keyframes, T_world_camera)
-        found = align(
-            prepared.levels,
-            references,
-            T_world_camera,
-            self.config,
-            photometric=False,
-            finest=min(1, len(prepared.levels) - 1),
-            gate=2 * self.config.gate,
-        )
-        return _Candidate("geometric", found.T_world_camera, found.information, references)
+    def _with_prior(
+        self, attempt: Attempt, pose: Judged, told: Prediction, own: Prediction
+    ) -> tuple[Judged, Uncertainty]:
+        """The pose and a prior together; without a prior that what is seen speaks against."""
+        against = self._uncertainty(pose).covariance if told.absolute else pose.covariance
+        off = sigmas_off(pose, told, against) if pose.verdict != "lost" else np.inf
+        if not is_believable(off):
+            again = attempt.run(own, self.motion.T_world_camera)
+            if (again.verdict == "lost", again.health.score) <= (pose.verdict == "lost", pose.health.score):
+                pose = again
+            if pose.verdict != "lost":
+                said = "far" if not np.isfinite(off) else f"{off:.0f} σ"
+                pose = pose.noted(f"the prior is {said} off: left out")
+            pose = fill_weak_directions(pose, own)
+            return pose, self._uncertainty(pose)
+        pose = fill_weak_directions(pose, told)
+        if pose.weak is not None and told.absolute:
+            return pose, self._uncertainty(pose)
+        if told.absolute:
+            known = self._uncertainty(pose)
+            T, random = fuse(pose, told, known.random)
+            return pose.corrected(T, pose.covariance), Uncertainty(random, known.moved, known.turned)
+        pose = pose.corrected(*fuse(pose, told, pose.covariance))
+        return pose, self._uncertainty(pose)
 
-    def _direct(self, prepared: PreparedFrame, start: _Candidate, matched: FeaturePose | None) -> _Candidate:
-        """Photometric, depth and feature residuals together, down to the finest level."""
-        found = align(
-            prepared.levels,
-            start.references,
-            start.T_world_camera,
-            self.config,
-            photometric=True,
-            finest=0,
-            gate=self.config.gate,
-            features=matched,
-            camera=prepared.frame.camera,
-        )
-        return _Candidate(f"{start.stage}+direct", found.T_world_camera, found.information, start.references)
+    def _uncertainty(self, pose: Judged) -> Uncertainty:
+        """Of a pose in the world: its own and that of its keyframes."""
+        nothing = Uncertainty()
+        known = [(v.reference.T_world_camera, self._known.get(v.features, nothing)) for v in pose.candidate.views]
+        return world_uncertainty(pose.T_world_camera, pose.covariance, known)
 
-    def _needs_features(self, prepared: PreparedFrame, candidate: _Candidate, T_predicted: Array) -> bool:
-        if self.config.features == "always" or self._lost:
-            return True
-        moved, turned = pose_distance(T_predicted, self.motion.T_world_camera)
-        if moved > self.config.features_motion or turned > self.config.features_rotation:
-            return True
-        health = self._measure(prepared, candidate)
-        return verdict_of(health, candidate.information, self.config)[0] != "ok"
-
-    def _match(
-        self, features: Features, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe], T_expected: Array
-    ) -> FeaturePose | None:
-        """Match with the nearest keyframes, the latest and the first: near to where they are expected, else anywhere.
-
-        When lost, with as many again, and anywhere at once.
-        """
-        n = self.config.match_keyframes * (4 if self._lost else 1)
-        chosen = [*order_by_distance(keyframes, T_expected)[:n], 0, len(keyframes) - 1]
-        views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in sorted(set(chosen))]
-        camera = prepared.frame.camera
-        if not self._lost:
-            expected = Expectation(T_expected, self.config.match_radius * camera.width)
-            near = match_pose(features, views, camera, expected)
-            if near is not None and len(near.points) >= self.config.match_enough:
-                return near
-        return match_pose(features, views, camera)
-
-    def _nearest(self, keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[Reference]:
-        order = order_by_distance(keyframes, T_world_camera)
-        return [keyframes[k].reference for k in order[: self.config.reference_keyframes]]
-
-    def _measure(self, prepared: PreparedFrame, candidate: _Candidate) -> Health:
-        index = min(1, len(prepared.levels) - 1)
-        return measure(prepared.levels[index], index, candidate.references, candidate.T_world_camera, self.config)
-
-    def _choose(self, prepared: PreparedFrame, candidates: Sequence[_Candidate]) -> tuple[_Candidate, Health]:
-        measured = [(candidate, self._measure(prepared, candidate)) for candidate in candidates]
-        return min(measured, key=lambda pair: pair[1].score)
-
-    def _remember(self, stamp: float, T_world_camera: Array, verdict: Verdict) -> None:
-        self._lost = verdict == "lost"
+    def _conclude(self, stamp: float, pose: Judged, told: Prediction | None) -> Judged:
+        """Remember the pose; once lost, only when the next frame agrees with it."""
         if self._lost:
-            self.motion.forget_velocity()
+            pose = self._confirmed(stamp, pose)
+        self._lost = pose.verdict == "lost"
+        if self._lost:
+            self.motion.forget_velocity(told)
         else:
-            self.motion.update(stamp, T_world_camera)
+            self._search.restart()
+            self.motion.update(stamp, pose.T_world_camera)
+            self._last_covariance = pose.covariance
+        return pose
 
-
-def pose_distance(T_world_a: Array, T_world_b: Array) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between two poses."""
-    T_a_b = inverse(T_world_a) @ T_world_b
-    return float(np.linalg.norm(T_a_b[:3, 3])), float(np.linalg.norm(so3_log(T_a_b[:3, :3])))
-
-
-def order_by_distance(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[int]:
-    """Indices of keyframes, nearest first; one radian counts as half a metre."""
-
-    def distance(k: int) -> float:
-        moved, turned = pose_distance(keyframes[k].reference.T_world_camera, T_world_camera)
-        return moved + 0.5 * turned
-
-    return sorted(range(len(keyframes)), key=distance)
-
-
-class _Clock:
-    """Milliseconds by stage."""
-
-    def __init__(self) -> None:
-        self.ms: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
+    def _confirmed(self, stamp: float, pose: Judged) -> Judged:
+        """A pose found while lost, if the frame before was found near to it; else it is a sighting, and still lost."""
+        before, self._sighting = self._sighting, None
+        if pose.verdict == "lost":
+            return pose
+        if is_sure(pose):
+            if before is not None and before.agrees(stamp, pose.T_world_camera):
+                return pose
+            self._sighting = Sighting(stamp, pose.T_world_camera)
+            return replace(pose, verdict="lost", reasons=("found again, the next frame must confirm it",))
+        return replace(pose, verdict="lost", reasons=(*pose.reasons, "not explained well enough to begin anew"))

@@ -39,6 +39,16 @@ class OracleSlam(Slam):
         self._points: list[NDArray[np.float64]] = []
         self._colors: list[NDArray[np.float64]] = []
 
+    @property
+    def memory(self) -> dict[str, int]:
+        """Not counted."""
+        return {}
+
+    @property
+    def loop_counts(self) -> dict[str, int]:
+        """It has none."""
+        return {"closed": 0, "rejected": 0}
+
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """The reference's pose; the frame's pixels enter the map unless it is held out or lost."""
         if frame.index == self._crash_at:

@@ -56,6 +56,8 @@ using LevelArrays = std::tuple<Image, Image, Intrinsics>;
 using PointArrays = std::tuple<Rows3, Rows3, Vector>;
 using ReferenceArrays = std::pair<Pose, std::vector<PointArrays>>;
 using MatchArrays = std::tuple<Points, Pixels, Intrinsics>;
+using Information = nb::ndarray<const double, nb::shape<6, 6>, nb::c_contig, nb::device::cpu>;
+using PriorArrays = std::pair<Pose, Information>;
 
 }  // namespace
 
@@ -95,8 +97,8 @@ void define_align(nb::module_& m) {
   m.def(
       "align",
       [](const std::vector<LevelArrays>& levels, const std::vector<ReferenceArrays>& references,
-         const std::optional<MatchArrays>& matches, Pose T_camera_world, const splatbot::AlignSettings& settings,
-         double dense_weight, int iterations, std::size_t finest) {
+         const std::optional<MatchArrays>& matches, const std::optional<PriorArrays>& prior, Pose T_camera_world,
+         const splatbot::AlignSettings& settings, double dense_weight, int iterations, std::size_t finest) {
         std::vector<splatbot::AlignImage> images;
         for (const auto& [gray, depth, intrinsics] : levels) images.push_back(image_of(gray, depth, intrinsics));
         std::vector<splatbot::AlignReference> known;
@@ -112,18 +114,24 @@ void define_align(nb::module_& m) {
           if (points.shape(0) != pixels.shape(0)) throw nb::value_error("points and pixels differ in length");
           match = {.fx = k[0], .fy = k[1], .cx = k[2], .cy = k[3], .points = span_of(points), .pixels = span_of(pixels)};
         }
+        splatbot::AlignPrior known_before;
+        if (prior) {
+          std::copy_n(prior->first.data(), 16, known_before.T_camera_world.begin());
+          std::copy_n(prior->second.data(), 36, known_before.information.begin());
+        }
         const splatbot::AlignPlan plan{
             .settings = settings, .dense_weight = dense_weight, .iterations = iterations, .finest = finest};
         splatbot::AlignResult result;
         {
           nb::gil_scoped_release release;
-          result = splatbot::align(images, known, match, fixed<16>(T_camera_world), plan);
+          result = splatbot::align(images, known, match, prior ? &known_before : nullptr, fixed<16>(T_camera_world), plan);
         }
-        return nb::make_tuple(copy(result.T_camera_world, {4, 4}), copy(result.H, {6, 6}));
+        return nb::make_tuple(copy(result.T_camera_world, {4, 4}), copy(result.H, {6, 6}), copy(result.curvature, {6, 6}), copy(result.spread, {6, 6}),
+                              result.cells);
       },
-      "levels"_a, "references"_a, "matches"_a.none(), "T_camera_world"_a.noconvert(), "settings"_a, "dense_weight"_a,
+      "levels"_a, "references"_a, "matches"_a.none(), "prior"_a.none(), "T_camera_world"_a.noconvert(), "settings"_a, "dense_weight"_a,
       "iterations"_a, "finest"_a,
       "Gauss-Newton over the levels (gray, depth, (fx, fy, cx, cy)), fine to coarse, against references (T_world_reference, "
-      "[(points, normals, gray)] per level) and matches (points, pixels, (fx, fy, cx, cy)). Returns "
-      "(T_camera_world, H (6, 6)).");
+      "[(points, normals, gray)] per level) matches (points, pixels, (fx, fy, cx, cy)) and a prior (T_camera_world, information (6, 6)). Returns "
+      "(T_camera_world, H (6, 6), curvature (6, 6), spread (6, 6), cells).");
 }

@@ -52,6 +52,78 @@ Mat4 se3_exp(const Vec6& xi) {
   return T;
 }
 
+Mat4 inverse(std::span<const double, 16> T) {
+  Mat4 R{};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      R[4 * i + j] = T[4 * j + i];
+      R[4 * i + 3] -= T[4 * j + i] * T[4 * j + 3];
+    }
+  }
+  R[15] = 1.0;
+  return R;
+}
+
+// Twist (t, ω) of a pose that turns by less than π; the translation to first order in ω.
+Vec6 se3_log_near(std::span<const double, 16> T) {
+  const double v[3] = {0.5 * (T[9] - T[6]), 0.5 * (T[2] - T[8]), 0.5 * (T[4] - T[1])};  // sin θ times the axis
+  const double sine = std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), cosine = 0.5 * (T[0] + T[5] + T[10] - 1.0);
+  const double scale = sine < 1e-6 ? 1.0 : std::atan2(sine, cosine) / sine;
+  const double w[3] = {scale * v[0], scale * v[1], scale * v[2]}, t[3] = {T[3], T[7], T[11]};
+  return {t[0] - 0.5 * (w[1] * t[2] - w[2] * t[1]), t[1] - 0.5 * (w[2] * t[0] - w[0] * t[2]),
+          t[2] - 0.5 * (w[0] * t[1] - w[1] * t[0]), w[0], w[1], w[2]};
+}
+
+// Σ ψ' / Σ ψ(r)/r over Student-t residuals r/σ: how much of their weights is curvature (Huber 1967).
+struct Curving {
+  double curvature = 0.0, weight = 0.0;
+
+  void add(double r, double nu) {
+    const double sum = nu + r * r;
+    curvature += (nu + 1.0) * (nu - r * r) / (sum * sum);
+    weight += (nu + 1.0) / sum;
+  }
+
+  void add(std::span<const float> residuals, double nu) {
+    for (const float r : residuals)
+      if (!std::isnan(r)) add(r, nu);
+  }
+
+  // Half of all residuals beyond σ √ν would leave no minimum; a tenth keeps the covariance finite.
+  double share() const { return weight > 0.0 ? std::max(curvature / weight, 0.1) : 1.0; }
+};
+
+// Gradients by cell of the current image.
+class Cells {
+ public:
+  static constexpr int kCount = kAlignCellColumns * kAlignCellRows;
+
+  // Cell of a place in an image of that size, -1 outside.
+  static int of(double u, double v, double width, double height) {
+    if (!(u >= 0 && v >= 0 && u < width && v < height)) return -1;
+    return static_cast<int>(v * kAlignCellRows / height) * kAlignCellColumns +
+           static_cast<int>(u * kAlignCellColumns / width);
+  }
+
+  void add(int cell, const Vec6& g) {
+    for (int i = 0; i < 6; ++i) sums_[cell][i] += g[i];
+    used_[cell] = true;
+  }
+
+  void report(AlignResult& result) const {
+    for (int c = 0; c < kCount; ++c) {
+      if (!used_[c]) continue;
+      ++result.cells;
+      for (int i = 0; i < 6; ++i)
+        for (int j = 0; j < 6; ++j) result.spread[6 * i + j] += sums_[c][i] * sums_[c][j];
+    }
+  }
+
+ private:
+  std::array<Vec6, kCount> sums_{};
+  std::array<bool, kCount> used_{};
+};
+
 struct Normal {
   Mat6 H{};
   Vec6 g{};
@@ -104,9 +176,51 @@ class DenseTerm {
       const double c0 = coupling_[2 * i], c1 = coupling_[2 * i + 1];
       const double k0 = c0 * inverse_[0] + c1 * inverse_[1], k1 = c0 * inverse_[1] + c1 * inverse_[2];
       for (int j = 0; j < 6; ++j)
-        total.H[6 * i + j] += plan.dense_weight * (s.H[8 * i + j] - k0 * coupling_[2 * j] - k1 * coupling_[2 * j + 1]);
+        H_[6 * i + j] = plan.dense_weight * (s.H[8 * i + j] - k0 * coupling_[2 * j] - k1 * coupling_[2 * j + 1]);
       total.g[i] += plan.dense_weight * (s.g[i] - k0 * residual_[0] - k1 * residual_[1]);
     }
+    for (int i = 0; i < 36; ++i) total.H[i] += H_[i];
+  }
+
+  // Gradients of this term by cell, and its curvature, exposure marginalised as in `add`, which came before.
+  void scatter(std::span<const double, 16> T_camera_world, const AlignPlan& plan, Cells& cells, Mat6& curvature) const {
+    Mat6 H_geometric{};
+    Curving of_photometric, of_geometric;
+    const Mat4 T = multiply(T_camera_world, T_world_reference_);
+    const std::vector<std::vector<std::size_t>> members = by_cell(T);
+    std::vector<float> points, normals, gray, r_photometric, r_geometric;
+    for (int c = 0; c < Cells::kCount; ++c) {
+      points.clear();
+      normals.clear();
+      gray.clear();
+      for (const std::size_t i : members[c]) {
+        points.insert(points.end(), &points_.points[3 * i], &points_.points[3 * i] + 3);
+        normals.insert(normals.end(), &points_.normals[3 * i], &points_.normals[3 * i] + 3);
+        gray.push_back(points_.gray[i]);
+      }
+      if (gray.empty()) continue;
+      r_photometric.resize(gray.size());
+      r_geometric.resize(gray.size());
+      const AlignSums s = linearize_alignment(image_, {points, normals, gray}, T, a_, b_, plan.settings, r_photometric,
+                                              r_geometric);
+      if (s.photometric + s.geometric == 0) continue;
+      of_photometric.add(r_photometric, plan.settings.nu);
+      of_geometric.add(r_geometric, plan.settings.nu);
+      Vec6 g{};
+      for (int i = 0; i < 6; ++i) {
+        const double k0 = coupling_[2 * i] * inverse_[0] + coupling_[2 * i + 1] * inverse_[1];
+        const double k1 = coupling_[2 * i] * inverse_[1] + coupling_[2 * i + 1] * inverse_[2];
+        g[i] = plan.dense_weight * (s.g[i] - k0 * s.g[6] - k1 * s.g[7]);
+      }
+      cells.add(c, g);
+    }
+    AlignSettings geometric = plan.settings;
+    geometric.use_photometric = false;
+    const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, geometric, {}, {});
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) H_geometric[6 * i + j] = plan.dense_weight * s.H[8 * i + j];
+    for (int i = 0; i < 36; ++i)
+      curvature[i] += of_photometric.share() * (H_[i] - H_geometric[i]) + of_geometric.share() * H_geometric[i];
   }
 
   // Back-substitute the exposure that belongs to a twist step.
@@ -121,6 +235,21 @@ class DenseTerm {
   }
 
  private:
+  // Indices of the points that land in each cell.
+  std::vector<std::vector<std::size_t>> by_cell(const Mat4& T) const {
+    std::vector<std::vector<std::size_t>> members(Cells::kCount);
+    for (std::size_t i = 0; i < points_.gray.size(); ++i) {
+      const float* p = &points_.points[3 * i];
+      const double z = T[8] * p[0] + T[9] * p[1] + T[10] * p[2] + T[11];
+      if (!(z > 1e-3)) continue;
+      const double u = image_.fx * (T[0] * p[0] + T[1] * p[1] + T[2] * p[2] + T[3]) / z + image_.cx;
+      const double v = image_.fy * (T[4] * p[0] + T[5] * p[1] + T[6] * p[2] + T[7]) / z + image_.cy;
+      const int cell = Cells::of(u, v, image_.width, image_.height);
+      if (cell >= 0) members[cell].push_back(i);
+    }
+    return members;
+  }
+
   const AlignImage& image_;
   const AlignPoints& points_;
   std::span<const double, 16> T_world_reference_;
@@ -128,10 +257,12 @@ class DenseTerm {
   std::array<double, 3> inverse_{};
   std::array<double, 2> residual_{};
   std::array<double, 12> coupling_{};
+  Mat6 H_{};
 };
 
-// Reprojection residuals, σ = 1 px, Student-t weights.
-void add_matches(const AlignMatches& m, std::span<const double, 16> T, Normal& total) {
+// Reprojection residuals, σ = 1 px, Student-t weights: calls take(index, w, Ju, Jv, ru, rv) for each match in view.
+template <typename Take>
+void for_matches(const AlignMatches& m, std::span<const double, 16> T, Take take) {
   for (std::size_t i = 0; i < m.points.size() / 3; ++i) {
     const double *p = &m.points[3 * i], *pixel = &m.pixels[2 * i];
     const double x = T[0] * p[0] + T[1] * p[1] + T[2] * p[2] + T[3];
@@ -142,11 +273,46 @@ void add_matches(const AlignMatches& m, std::span<const double, 16> T, Normal& t
     const double ru = m.fx * x * iz + m.cx - pixel[0], rv = m.fy * y * iz + m.cy - pixel[1];
     const double w = 5.0 / (4.0 + ru * ru + rv * rv);
     const double ux = m.fx * iz, uz = -m.fx * x * iz * iz, vy = m.fy * iz, vz = -m.fy * y * iz * iz;
-    const double Ju[6] = {ux, 0.0, uz, uz * y, ux * z - uz * x, -ux * y};
-    const double Jv[6] = {0.0, vy, vz, vz * y - vy * z, -vz * x, vy * x};
+    const Vec6 Ju = {ux, 0.0, uz, uz * y, ux * z - uz * x, -ux * y};
+    const Vec6 Jv = {0.0, vy, vz, vz * y - vy * z, -vz * x, vy * x};
+    take(i, w, Ju, Jv, ru, rv);
+  }
+}
+
+void add_matches(const AlignMatches& m, std::span<const double, 16> T, Normal& total) {
+  for_matches(m, T, [&](std::size_t, double w, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
     for (int a = 0; a < 6; ++a) {
       for (int b = 0; b < 6; ++b) total.H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
       total.g[a] += w * (Ju[a] * ru + Jv[a] * rv);
+    }
+  });
+}
+
+// The matches' pixels are of the full image, which is as wide as the finest level's, or a multiple of it.
+void scatter_matches(const AlignMatches& m, std::span<const double, 16> T, const AlignImage& finest, Cells& cells,
+                     Mat6& curvature) {
+  const double scale = m.fx / finest.fx;
+  Mat6 H{};
+  Curving curving;
+  for_matches(m, T, [&](std::size_t i, double w, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
+    const int cell = Cells::of(m.pixels[2 * i], m.pixels[2 * i + 1], scale * finest.width, scale * finest.height);
+    Vec6 g{};
+    for (int a = 0; a < 6; ++a) g[a] = w * (Ju[a] * ru + Jv[a] * rv);
+    if (cell >= 0) cells.add(cell, g);
+    for (int a = 0; a < 6; ++a)
+      for (int b = 0; b < 6; ++b) H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
+    curving.add(std::hypot(ru, rv), 4.0);
+  });
+  for (int i = 0; i < 36; ++i) curvature[i] += curving.share() * H[i];
+}
+
+// To first order: the twist from the prior to the pose is small where the prior is kept.
+void add_prior(const AlignPrior& prior, std::span<const double, 16> T_camera_world, Normal& total) {
+  const Vec6 off = se3_log_near(multiply(T_camera_world, inverse(prior.T_camera_world)));
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j < 6; ++j) {
+      total.H[6 * i + j] += prior.information[6 * i + j];
+      total.g[i] += prior.information[6 * i + j] * off[j];
     }
   }
 }
@@ -208,7 +374,8 @@ AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& refere
 }
 
 AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,
-                  const AlignMatches& matches, std::span<const double, 16> T_start, const AlignPlan& plan) {
+                  const AlignMatches& matches, const AlignPrior* prior, std::span<const double, 16> T_start,
+                  const AlignPlan& plan) {
   AlignResult result;
   std::copy(T_start.begin(), T_start.end(), result.T_camera_world.begin());
   for (std::size_t level = levels.size(); level-- > plan.finest;) {
@@ -221,10 +388,17 @@ AlignResult align(std::span<const AlignImage> levels, std::span<const AlignRefer
       for (DenseTerm& term : terms) term.add(result.T_camera_world, plan, total);
       add_matches(matches, result.T_camera_world, total);
       result.H = total.H;
+      if (prior != nullptr) add_prior(*prior, result.T_camera_world, total);
       const Vec6 step = total.solve();
       result.T_camera_world = multiply(se3_exp(step), result.T_camera_world);
       for (DenseTerm& term : terms) term.follow(step);
       if (std::all_of(step.begin(), step.end(), [](double s) { return std::abs(s) < kStepDone; })) break;
+    }
+    if (level == plan.finest) {
+      Cells cells;
+      for (const DenseTerm& term : terms) term.scatter(result.T_camera_world, plan, cells, result.curvature);
+      scatter_matches(matches, result.T_camera_world, levels[level], cells, result.curvature);
+      cells.report(result);
     }
   }
   return result;

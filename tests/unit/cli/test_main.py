@@ -33,10 +33,11 @@ def test_help_imports_nothing_heavy(words: list[str]) -> None:
 
 
 def test_the_help_lists_every_command(run: RunCommand) -> None:
-    answer = run("--help")
-    assert answer.code == 0
     for name, command in COMMANDS.items():
-        assert name in answer.out
+        *group, word = name.split()
+        answer = run(*group, "--help")
+        assert answer.code == 0
+        assert word in answer.out
         assert command.summary.split()[0] in answer.out
 
 
@@ -48,7 +49,7 @@ def test_no_words_at_all_show_the_help(run: RunCommand) -> None:
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("serve", "demo")])
 def test_every_command_shows_examples_and_explains_every_option(run: RunCommand, name: str) -> None:
-    answer = run(name, "--help")
+    answer = run(*name.split(), "--help")
     assert answer.code == 0
     assert f"splatbot {name}" in answer.out.split("Examples:")[1]
     command = COMMANDS[name]

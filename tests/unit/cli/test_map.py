@@ -146,3 +146,22 @@ def test_a_loss_is_shown_at_once(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_phases_after_the_frames_are_named() -> None:
     assert describe(Progress("scoring", 5, 5, 1.0), 0.0) == "scoring ..."
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["--resume", "a", "--localise", "b"], "--resume"),
+        (["--resume", "a", "--set", "seed=3"], "keeps its configuration"),
+        (["--resume", "nowhere"], "run.state"),
+        (["LOG", "--localise", "nowhere"], "run.state"),
+    ],
+)
+def test_a_saved_run_that_cannot_be_used_is_told_before_anything_is_written(
+    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], what: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = run("map", *words)
+    assert answer.code == 2
+    assert what in answer.err
+    assert list(tmp_path.iterdir()) == []

@@ -92,7 +92,7 @@ def test_a_first_frame_without_depth_or_without_an_image_is_refused_with_the_rea
 
 
 @pytest.mark.parametrize("has_depth", [False, True])
-def test_black_frames_are_lost_with_the_reason_and_the_next_good_one_is_found(has_depth: bool) -> None:
+def test_black_frames_are_lost_with_the_reason_and_the_second_good_one_is_believed(has_depth: bool) -> None:
     run = Run()
     for i in (1, 2):
         run.track(run.frames[i])
@@ -102,9 +102,11 @@ def test_black_frames_are_lost_with_the_reason_and_the_next_good_one_is_found(ha
         assert estimate.verdict == "lost"
         assert any("blank" in reason for reason in estimate.reasons)
         assert np.isfinite(estimate.T_world_camera).all()
-    found = run.track(run.frames[5])
+    sighted = run.track(run.frames[5])
+    assert (sighted.verdict, sighted.reasons) == ("lost", ("found again, the next frame must confirm it",))
+    found = run.track(run.frames[6])
     assert found.verdict == "ok"
-    assert run.error(found, 5)[0] < 1.5e-3
+    assert run.error(found, 6)[0] < 1.5e-3
 
 
 def test_a_lost_frame_does_not_move_the_prediction() -> None:

@@ -13,7 +13,7 @@ namespace splatbot {
 struct AlignImage {
   int width = 0, height = 0;
   double fx = 0, fy = 0, cx = 0, cy = 0;
-  std::span<const float> gray;   // (H, W) intensity
+  std::span<const float> gray;   // (H, W) intensity, NaN where it may not be used
   std::span<const float> depth;  // (H, W) [m], 0 = missing
 };
 
@@ -64,6 +64,12 @@ struct AlignMatches {
   std::span<const double> pixels;  // (M, 2)
 };
 
+// What is known of the pose besides: where it should be, and the information of the twist (t, ω) that left-multiplies it.
+struct AlignPrior {
+  std::array<double, 16> T_camera_world;
+  std::array<double, 36> information{};  // (6, 6)
+};
+
 struct AlignPlan {
   AlignSettings settings;
   double dense_weight = 1.0;  // of a dense residual against a match's, whose σ is 1 px: neighbours are correlated
@@ -73,12 +79,21 @@ struct AlignPlan {
 
 struct AlignResult {
   std::array<double, 16> T_camera_world;
-  std::array<double, 36> H{};  // (6, 6) information of the last linearisation
+  std::array<double, 36> H{};       // (6, 6) information of the last linearisation, the prior's left out
+  std::array<double, 36> curvature{};  // (6, 6) of the robust cost: less than H by what outlying residuals do not curve
+  std::array<double, 36> spread{};  // (6, 6) Σ g gᵀ over the cells of the image, g the gradient of a cell's residuals
+  std::size_t cells = 0;            // cells that have residuals
 };
 
 // Gauss-Newton over the levels, coarse to fine. Each reference has its own exposure, which is marginalised (Schur
-// complement) and follows the step; it starts neutral on every level.
+// complement) and follows the step; it starts neutral on every level. `prior` may be null.
+//
+// The spread is taken at the result, over kAlignCells cells: what residuals of one cell have in common (blur, a depth
+// that is wrong all over a surface) counts as often as it occurs, whatever the noise model says. With C the curvature,
+// C⁻¹ spread C⁻¹ is the cluster-robust covariance (Huber 1967; Liang and Zeger 1986).
+constexpr int kAlignCellColumns = 8, kAlignCellRows = 6;
 AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,
-                  const AlignMatches& matches, std::span<const double, 16> T_camera_world, const AlignPlan& plan);
+                  const AlignMatches& matches, const AlignPrior* prior, std::span<const double, 16> T_camera_world,
+                  const AlignPlan& plan);
 
 }  // namespace splatbot

@@ -177,22 +177,24 @@ void linearize(const LinearizeArgs& args, LinearizeSums& sums) {
 
     if (args.use_photometric) {
       const Sample s = sample_gray(args.gray, args.width, index, a, b);
+      // Masked pixels are NaN, and so is what is interpolated from one.
+      const M seen = used & (abs(s.value) + abs(s.du) + abs(s.dv) < set1(1e6F));
       const F reference = load(gray.values + k);
       const F r = s.value - fma(set1(args.gain), reference, set1(args.offset));
       const F gx = s.du * set1(args.fx) * iz, gy = s.dv * set1(args.fy) * iz;
       const F gz = -(fma(gx, qx, gy * qy) * iz);
       const F rows_of_J[8] = {gx, gy, gz, fms(gz, qy, gy * qz), fms(gx, qz, gz * qx), fms(gy, qx, gx * qy), -reference, -one};
       for (int i = 0; i < 8; ++i) {
-        store(photo.J[i].values + k, zero_unless(used, rows_of_J[i]));
+        store(photo.J[i].values + k, zero_unless(seen, rows_of_J[i]));
       }
-      store(photo.r.values + k, zero_unless(used, r));
-      weigh(args, used, r, set1(args.sigma_gray), photo.weight.values + k, ratio.values + k, cost);
+      store(photo.r.values + k, zero_unless(seen, r));
+      weigh(args, seen, r, set1(args.sigma_gray), photo.weight.values + k, ratio.values + k, cost);
       if (args.residual_photometric != nullptr) {
         for (int i = k; i < k + W && i < args.count; ++i) {
           args.residual_photometric[i] = ratio.values[i];
         }
       }
-      sums.photometric += static_cast<std::size_t>(__builtin_popcount(bits(used)));
+      sums.photometric += static_cast<std::size_t>(__builtin_popcount(bits(seen)));
     }
     if (args.use_geometric) {
       const F ax = load(nx.values + k), ay = load(ny.values + k), az = load(nz.values + k);

@@ -1,0 +1,179 @@
+"""Tracking on recorded logs: error against milliseconds, for each time budget and beside other trackers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.bench.machine import describe_machine
+from splatbot.bench.odometry import Odometry, tracking_peers
+from splatbot.bench.results import Results
+from splatbot.bench.stress import run_stress
+from splatbot.bench.timing import memory_peak
+from splatbot.bench.tracking_plot import plot_tracking
+from splatbot.config import Config, TrackingConfig
+from splatbot.evaluation import absolute_error, relative_error
+from splatbot.frame import Frame
+from splatbot.logs import Log
+from splatbot.slam import Slam
+from splatbot.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+BUDGETS = (30.0, 100.0, 300.0, 1000.0)  # [ms]
+ATE, RPE, RPE_ROT, TRACKED, LOST = "ATE", "RPE", "RPE, rotation", "tracked", "lost"
+PERCENTILES, RESIDENT = (50, 95, 99), "peak resident memory"
+FRAME_MS = "tracking and mapping p50"
+
+
+@dataclass(frozen=True)
+class TrackingPlan:
+    """What to run.
+
+    Args:
+        budgets: time budgets per frame [ms] (``tracking.budget_ms``).
+        peers: whether to run the other trackers too.
+        max_frames: read no more frames of a log; None reads all.
+        config: what the runs share; the budget is set on top.
+        stress: whether to run the hard synthetic logs, with ``stress_frames`` frames of ``stress_width`` pixels each.
+        say: told what is being done.
+    """
+
+    budgets: Sequence[float] = BUDGETS
+    peers: bool = True
+    max_frames: int | None = None
+    config: Config | None = None
+    stress: bool = False
+    stress_frames: int = 90
+    stress_width: int = 640
+    say: Callable[[str], None] = lambda _: None
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One row of the comparison: a tracker, its name among peers (None: splatbot), a setting and a note."""
+
+    peer: str | None
+    setting: str
+    note: str
+    make: Callable[[], Odometry]
+
+
+@dataclass
+class Outcome:
+    """What a tracker made of a log: milliseconds by frame, the poses it gave, and memory."""
+
+    ms: list[float]
+    trajectory: Trajectory
+    frames: int
+    resident: int | None
+    with_mapping_ms: list[float]
+
+
+class SlamOdometry:
+    """splatbot as a tracker; its milliseconds are told apart from those of mapping."""
+
+    def __init__(self, config: Config) -> None:
+        self.slam = Slam(config)
+
+    def track(self, frame: Frame) -> Array | None:
+        """See :class:`Odometry`."""
+        return self.slam.process(frame).T_world_camera
+
+    @property
+    def last_tracking_ms(self) -> float:
+        """Milliseconds that the last frame's pose took, mapping left out."""
+        return sum(ms for stage, ms in self.slam.results[-1].stage_ms.items() if stage != "mapping")
+
+    def refined(self) -> Trajectory:
+        """The trajectory as it is once the log has ended."""
+        found = [(r.stamp, r.T_world_camera) for r in self.slam.results if r.T_world_camera is not None]
+        return _trajectory([stamp for stamp, _ in found], [T for _, T in found])
+
+
+def run_tracking(logs: Sequence[Log], plan: TrackingPlan, folder: Path) -> Results:
+    """Run every contender on every log, score it, and write ``tracking.json``, ``tracking.csv`` and the plot."""
+    folder.mkdir(parents=True, exist_ok=True)
+    results = Results(describe_machine((1,), peak_ms=20))
+    for log in logs:
+        for contender in contenders(plan):
+            plan.say(f"{log.name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
+            add_rows(results, log, contender, run_log(log, contender.make(), plan.max_frames))
+    if plan.stress:
+        config = plan.config or Config()
+        run_stress(results, config, frames=plan.stress_frames, width=plan.stress_width, say=plan.say)
+    results.write_json(folder / "tracking.json")
+    results.write_csv(folder / "tracking.csv")
+    if logs:
+        plot_tracking(results, folder)
+    return results
+
+
+def contenders(plan: TrackingPlan) -> Iterator[Contender]:
+    """splatbot with each budget, then its peers."""
+    for budget in plan.budgets if "budget_ms" in TrackingConfig.model_fields else ():
+        config = _with_budget(plan.config, budget)
+        yield Contender(None, f"{budget:g} ms", "", lambda config=config: SlamOdometry(config))  # type: ignore[misc]
+    if "budget_ms" not in TrackingConfig.model_fields:
+        yield Contender(None, "default", "", lambda: SlamOdometry(plan.config or Config()))
+    for peer in tracking_peers() if plan.peers else ():
+        yield Contender(peer.name, "", peer.note, peer.make)
+
+
+def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> Outcome:
+    """Track the frames of a log; decoding is not timed."""
+    count = len(log) if max_frames is None else min(len(log), max_frames)
+    ms, whole, stamps, poses = [], [], [], []
+    with memory_peak() as peak:
+        for index in range(count):
+            frame = log[index]
+            start = time.perf_counter()
+            T_world_camera = odometry.track(frame)
+            whole.append(1e3 * (time.perf_counter() - start))
+            ms.append(odometry.last_tracking_ms if isinstance(odometry, SlamOdometry) else whole[-1])
+            if T_world_camera is not None:
+                stamps.append(frame.stamp)
+                poses.append(T_world_camera)
+    trajectory = odometry.refined() if isinstance(odometry, SlamOdometry) else _trajectory(stamps, poses)
+    return Outcome(ms, trajectory, count, peak(), whole)
+
+
+def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome) -> None:
+    """The figures of one run. ATE is RMSE over all tracked frames, SE(3)-aligned; RPE from frame to frame."""
+    case = f"{log.name}, {contender.setting}" if contender.setting else log.name
+
+    def add(metric: str, value: float | None, unit: str, note: str | None = None) -> None:
+        results.add(case, metric, value, unit, peer=contender.peer, note=note or None)
+
+    truth, tracked = log.ground_truth, outcome.trajectory
+    if truth is None or len(tracked) < 3:
+        why = "no reference" if truth is None else "tracked fewer than three frames"
+        for metric in (ATE, RPE, RPE_ROT):
+            add(metric, None, "mm", why)
+    else:
+        relative = relative_error(truth, tracked)
+        add(ATE, 1e3 * absolute_error(truth, tracked).rmse, "mm", contender.note)
+        add(RPE, 1e3 * relative.trans_rmse, "mm")
+        add(RPE_ROT, float(np.degrees(relative.rot_rmse)), "°")
+    add(TRACKED, 100.0 * len(tracked) / outcome.frames, "%")
+    add(LOST, outcome.frames - len(tracked), "")
+    for p in PERCENTILES:
+        add(f"p{p}", float(np.percentile(outcome.ms, p)), "ms")
+    if contender.peer is None:
+        add(FRAME_MS, float(np.median(outcome.with_mapping_ms)), "ms")
+    add(RESIDENT, None if outcome.resident is None else outcome.resident / 1e6, "MB")
+
+
+def _with_budget(config: Config | None, budget_ms: float) -> Config:
+    values = (config or Config()).model_dump(mode="json")  # where null stands for what a budget decides
+    values["tracking"]["budget_ms"] = budget_ms
+    return Config.model_validate(values)
+
+
+def _trajectory(stamps: Sequence[float], poses: Sequence[Array]) -> Trajectory:
+    return Trajectory(np.array(stamps), np.array(poses, dtype=np.float64).reshape(-1, 4, 4))

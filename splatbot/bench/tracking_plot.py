@@ -1,0 +1,49 @@
+"""Error against milliseconds, a panel per log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+from splatbot.bench.results import Results
+
+DEFAULT_SETTINGS = ("default", "100 ms")
+
+
+def plot_tracking(results: Results, out: Path) -> None:
+    """``tracking.png``, ``.svg``: ATE against the median of milliseconds; ours joined, the default marked."""
+    logs = list(dict.fromkeys(row.case.partition(",")[0] for row in results.rows))
+    figure, axes = plt.subplots(1, max(1, len(logs)), figsize=(4.6 * max(1, len(logs)), 3.8), squeeze=False)
+    for axis, log in zip(axes[0], logs, strict=False):
+        points = _points(results, log)
+        ours = sorted((ms, error) for peer, _, ms, error in points if peer is None)
+        axis.plot([ms for ms, _ in ours], [error for _, error in ours], "o-", color="#2a6f97", label="splatbot")
+        for peer, setting, ms, error in points:
+            axis.annotate(peer or setting, (ms, error), textcoords="offset points", xytext=(5, 5), fontsize=8)
+            if peer is not None:
+                axis.plot([ms], [error], "s", color="#8d99ae")
+            elif setting in DEFAULT_SETTINGS:
+                axis.plot([ms], [error], "o", color="#d1495b", markersize=9)
+        axis.set(title=log, xlabel="median per frame [ms]", ylabel="ATE RMSE [mm]", xscale="log", yscale="log")
+        axis.grid(alpha=0.3, which="both")
+    figure.tight_layout()
+    for suffix in ("png", "svg"):
+        figure.savefig(out / f"tracking.{suffix}", dpi=130)
+    plt.close(figure)
+
+
+def _points(results: Results, log: str) -> list[tuple[str | None, str, float, float]]:
+    """(peer, setting, milliseconds, error [mm]) of the runs on a log that have both."""
+    points = []
+    for row in results.rows:
+        name, _, setting = row.case.partition(", ")
+        if name != log or row.metric != "ATE" or row.value is None:
+            continue
+        ms = results.find(row.case, "p50", row.peer)
+        if ms is not None:
+            points.append((row.peer, setting, ms, row.value))
+    return points

@@ -1,0 +1,42 @@
+"""Figures of a benchmark as tables on stdout."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from splatbot.bench.results import Row
+
+_FILE_WIDTH = 160  # [characters] where there is no terminal to ask
+
+
+def wide_console() -> Console:
+    """Stdout, as wide as the terminal, or 160 characters in a file."""
+    return Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
+
+
+def figure_table(title: str, rows: Iterable[Row], metrics: Sequence[str]) -> Table:
+    """A line per case and peer, a column per metric; a case without figures shows why."""
+    table = Table(title=title)
+    grouped: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        grouped.setdefault(f"{row.case}: {row.peer}" if row.peer else row.case, {})[row.metric] = row
+    table.add_column("case")
+    for metric in metrics:
+        table.add_column(metric, justify="right")
+    for case, found in grouped.items():
+        cells = [figure_text(found[metric]) if metric in found else "" for metric in metrics]
+        if any(cells):
+            table.add_row(case, *cells)
+    return table
+
+
+def figure_text(row: Row) -> str:
+    if row.value is None:
+        return row.note or "-"
+    median = f" ({row.value + row.spread:.2f})" if row.spread is not None else ""
+    digits = f"{row.value:.2f}" if row.unit == "ms" else f"{row.value:.3g}"
+    return f"{digits}{median}" if row.unit == "ms" else f"{digits} {row.unit}".rstrip()

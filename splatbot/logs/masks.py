@@ -1,0 +1,75 @@
+"""Masks of a log in TUM layout: pixels that show the robot itself, or anything else that must not be used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import LogError
+from splatbot.logs.images import read_mask
+from splatbot.logs.index import Entry, read_index
+
+Mask = NDArray[np.bool_]
+
+MAX_DIFFERENCE = 0.02  # [s], as between colour and depth
+
+
+class MaskSource(Protocol):
+    """Where masks come from."""
+
+    def at(self, stamp: float) -> Mask:
+        """The mask (H, W) of the image taken then [s]; True where a pixel may be used."""
+        ...
+
+
+class FixedMask:
+    """One mask for all frames: `mask.png`."""
+
+    def __init__(self, path: Path) -> None:
+        self._mask = read_mask(path)
+
+    def at(self, stamp: float) -> Mask:
+        """The mask, whenever."""
+        return self._mask
+
+
+class ListedMasks:
+    """A mask for each frame: `mask.txt`, lines `stamp path` as in depth.txt."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._entries = read_index(path)
+        self._stamps = np.array([entry.stamp for entry in self._entries])
+
+    def at(self, stamp: float) -> Mask:
+        """The mask nearest in time.
+
+        Raises:
+            LogError: there is none within 0.02 s, or it cannot be read.
+        """
+        entry = self._nearest(stamp)
+        if abs(entry.stamp - stamp) > MAX_DIFFERENCE:
+            raise LogError(
+                f"no mask within {MAX_DIFFERENCE} s of stamp {stamp:.6f}.",
+                file=self._path,
+                field="stamps",
+                hint="list a mask for every image (white where it may be used), or give one `mask.png` for all",
+            )
+        return read_mask(self._path.parent / entry.path)
+
+    def _nearest(self, stamp: float) -> Entry:
+        return self._entries[int(np.abs(self._stamps - stamp).argmin())]
+
+
+def find_masks(folder: Path) -> MaskSource | None:
+    """What a log's folder says of masks: `mask.txt`, else `mask.png`, else nothing.
+
+    Raises:
+        LogError: either is damaged.
+    """
+    if (folder / "mask.txt").exists():
+        return ListedMasks(folder / "mask.txt")
+    return FixedMask(folder / "mask.png") if (folder / "mask.png").exists() else None

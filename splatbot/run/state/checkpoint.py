@@ -1,0 +1,205 @@
+"""Saving a run while it goes on, and opening what was saved."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from splatbot import __version__
+from splatbot.config import Config
+from splatbot.errors import FormatError, LogError
+from splatbot.frame import Frame
+from splatbot.logs import Log
+from splatbot.run.state.container import read_container, write_container
+from splatbot.run.state.journal import Entry, Journal, read_entry
+from splatbot.run.state.tree import Decoder, Encoder
+from splatbot.slam import Slam
+
+FOLDER, FILE = "state", "run.state"
+_HINT = "restore the folder from a copy, or map the log again"
+
+
+@dataclass(frozen=True)
+class LogPlace:
+    """Which log a run reads, how far it has come, and how to tell that the log is still the same.
+
+    Args:
+        name, uri, frames: of the log; ``camera`` is what it was opened with beside the uri.
+        next_index: the first frame that has not been processed.
+        last_index, last_stamp, last_checksum: the last frame that has: position, time [s] and CRC-32 of its pixels;
+            None before there is one.
+    """
+
+    name: str
+    uri: str
+    frames: int
+    camera: str | None
+    next_index: int
+    last_index: int | None = None
+    last_stamp: float | None = None
+    last_checksum: int | None = None
+
+    def check(self, log: Log) -> None:
+        """That ``log`` begins with the frames that were processed.
+
+        Raises:
+            LogError: it does not.
+        """
+        hint = "give the log that the run was begun with, or map this one into a folder of its own"
+        if len(log) < self.next_index:
+            raise LogError(
+                f"has {len(log)} frames, {self.next_index} were mapped.", file=log.uri, field="frames", hint=hint
+            )
+        if self.last_index is None:
+            return
+        frame = log[self.last_index]
+        if frame.stamp != self.last_stamp:
+            was = f"is at {frame.stamp:.9g} s, was at {self.last_stamp:.9g} s when it was mapped."
+            raise LogError(was, file=log.uri, field=f"frame {self.last_index}", hint=hint)
+        if checksum(frame) != self.last_checksum:
+            raise LogError(
+                "shows something else than when it was mapped.",
+                file=log.uri,
+                field=f"frame {self.last_index}",
+                hint=hint,
+            )
+
+
+def checksum(frame: Frame) -> int:
+    """CRC-32 of a frame's colour and depth."""
+    return zlib.crc32(np.ascontiguousarray(frame.depth).data, zlib.crc32(np.ascontiguousarray(frame.rgb).data))
+
+
+class Checkpoint:
+    """Saves a run into ``run/state``; the save before stays whole until the new one is.
+
+    Keyframes' images, features and sampled pixels are appended once to a journal; the map, the poses and all else go
+    into one new file each time, which replaces the last by renaming.
+
+    Args:
+        run: the run's folder.
+        every_s: least time between two saves [s].
+    """
+
+    def __init__(self, run: Path, every_s: float) -> None:
+        self.folder = run / FOLDER
+        self.every_s = every_s
+        self.saves = 0
+        self.seconds = 0.0
+        self._journal = Journal(self.folder, _unused_number(self.folder))
+        self._saved_at = time.perf_counter()
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time for the next save."""
+        return time.perf_counter() - self._saved_at >= self.every_s
+
+    def save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
+        """Save a run between two frames."""
+        start = time.perf_counter()
+        with slam.paused():
+            self._save(slam, loop, place, config)
+        self._saved_at = time.perf_counter()
+        self.saves += 1
+        self.seconds += self._saved_at - start
+
+    def _save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._journal.begin()
+        lasting = {id(owner) for owner in _lasting_arrays(slam)}
+
+        def keep(owner: object, array: NDArray[Any]) -> Entry | None:
+            return self._journal.put(owner, array) if id(owner) in lasting else None
+
+        encoder = Encoder(config, keep)
+        header = {
+            "tree": encoder.encode({"slam": slam, "loop": dict(loop)}),
+            "splatbot": __version__,
+            "config": config.to_yaml(),
+            "log": {f.name: getattr(place, f.name) for f in fields(place)},
+            "images": self._journal.path.name,
+        }
+        self._journal.sync()
+        write_container(self.folder / FILE, header, encoder.arrays)
+        self._journal.finish()
+
+
+@dataclass(frozen=True)
+class SavedRun:
+    """A run as it was when it was saved last.
+
+    Args:
+        folder: of the run.
+        config: that it was begun with.
+        place: how far it has come in which log.
+        slam: to go on with.
+        loop: counters of the loop over the frames, by name.
+    """
+
+    folder: Path
+    config: Config
+    place: LogPlace
+    slam: Slam
+    loop: dict[str, Any]
+
+    @classmethod
+    def load(cls, run: str | Path) -> SavedRun:
+        """Open the state of a run's folder.
+
+        Raises:
+            FormatError: there is none, or it is damaged or of another version.
+        """
+        folder = Path(run)
+        path = folder / FOLDER / FILE
+        header, arrays = read_container(path)
+        try:
+            config = Config.model_validate(yaml.safe_load(header["config"]))
+            place = LogPlace(**header["log"])
+            kept = partial(read_entry, path.parent / header["images"])
+            values = Decoder(config, arrays, kept).decode(header["tree"])
+            slam, loop = values["slam"], values["loop"]
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, ValidationError) as error:
+            why = f"does not fit this version of splatbot ({error})."
+            by = header.get("splatbot", "another version")
+            hint = f"open it with splatbot {by}, or map the log again"
+            raise FormatError(why, file=path, hint=hint) from error
+        for missing in _differences(Slam(config), slam):
+            raise FormatError(f"has no {missing}: it is of another version.", file=path, hint=_HINT)
+        return cls(folder, config, place, slam, loop)
+
+
+def _unused_number(folder: Path) -> int:
+    """Of a journal: greater than those there are, which an earlier state may need until the first save is whole."""
+    used = [path.stem.partition("-")[2] for path in folder.glob("images-*.bin")]
+    return 1 + max((int(number) for number in used if number.isdigit()), default=-1)
+
+
+def _lasting_arrays(slam: Slam) -> Iterator[object]:
+    """Arrays of keyframes that are replaced, never changed in place: images, features, sampled pixels."""
+    for keyframe in slam.keyframes:
+        yield from (keyframe.rgb, keyframe.depth, *vars(keyframe.features).values())
+        for level in keyframe.reference.levels:
+            yield from vars(level).values()
+
+
+def _differences(fresh: object, saved: object, path: str = "slam") -> Iterator[str]:
+    """Attributes of a fresh object, and of the plain objects in it, that a saved one lacks."""
+    if not type(fresh).__module__.startswith("splatbot.") or not hasattr(fresh, "__dict__"):
+        return
+    if is_dataclass(fresh) or type(fresh).__module__ == "splatbot.config":
+        return
+    for name, value in vars(fresh).items():
+        if not hasattr(saved, name):
+            yield f"{path}.{name}"
+        else:
+            yield from _differences(value, getattr(saved, name), f"{path}.{name}")

@@ -1,0 +1,205 @@
+"""The stages on one frame, within its budget."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.config import TrackingConfig
+from splatbot.tracking.align import SoftPrior, align
+from splatbot.tracking.budget import Budget
+from splatbot.tracking.candidate import Candidate, Judged, judge, score
+from splatbot.tracking.features import Expectation, FeaturePose, Features, detect, match_pose
+from splatbot.tracking.health import verdict_of
+from splatbot.tracking.predict import Prediction
+from splatbot.tracking.prepare import PreparedFrame
+from splatbot.tracking.recover import KeyframeSearch
+from splatbot.tracking.views import TrackedKeyframe, nearest, order_by_distance, pose_distance
+from splatbot.tracking.wide import WideStage
+
+Array = NDArray[np.float64]
+Work = tuple[str, float]
+
+_FEWER = (1.0, 0.5, 0.25)  # shares of the keypoints, the largest that there is time for
+
+
+class Attempt:
+    """Runs the stages on a frame, from one prediction or another.
+
+    Args:
+        features: keypoints of the frame, once they have been looked for.
+    """
+
+    def __init__(
+        self,
+        config: TrackingConfig,
+        prepared: PreparedFrame,
+        keyframes: Sequence[TrackedKeyframe],
+        budget: Budget,
+        wide: WideStage,
+        search: KeyframeSearch | None,
+    ) -> None:
+        self.config = config
+        self.features: Features | None = None
+        self._prepared = prepared
+        self._keyframes = keyframes
+        self._budget = budget
+        self._wide = wide
+        self._search = search  # given while lost
+
+    def run(self, prediction: Prediction, T_before: Array) -> Judged:
+        """The best pose from a prediction; ``T_before`` is where the camera was last."""
+        start = self._geometric(prediction)
+        starts, matched = [start], None
+        doubtful = self._is_doubtful(start, prediction.T_world_camera, T_before)
+        if doubtful or self.config.features == "always":
+            matched = self._match(start.T_world_camera)
+            if matched is not None:
+                starts.append(self._start("features", matched.T_world_camera, start))
+        if doubtful and matched is None and self.config.wide == "needed":
+            starts += self._register(start)
+        candidates = [self._direct(begun, matched) for begun in starts if begun is start or self._fits_one_more()]
+        with self._budget.run("health", self._health_units * len(candidates)):
+            return judge(self._prepared, candidates, self.config)
+
+    def _geometric(self, prediction: Prediction) -> Candidate:
+        """Projective point-to-plane alignment on the coarse levels, held to the prediction where it sees nothing."""
+        finest = min(1, len(self._prepared.levels) - 1)
+        with self._budget.run("geometric", self._steps(finest)):
+            views = self._nearest(prediction.T_world_camera)
+            found = align(
+                self._prepared.levels,
+                [view.reference for view in views],
+                prediction.T_world_camera,
+                self.config,
+                photometric=False,
+                finest=finest,
+                gate=2 * self.config.gate,
+                prior=SoftPrior(
+                    prediction.T_world_camera, np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
+                ),
+            )
+        return Candidate("geometric", found, views)
+
+    def _direct(self, start: Candidate, matched: FeaturePose | None) -> Candidate:
+        """Photometric, depth and feature residuals together, down to the finest level."""
+        if not self._budget.fits(*self._direct_work(matched), self._health_work):
+            self._budget.skip("direct")
+            return start
+        with self._budget.run("direct", self._steps(0)):
+            found = align(
+                self._prepared.levels,
+                start.references,
+                start.T_world_camera,
+                self.config,
+                photometric=True,
+                finest=0,
+                gate=self.config.gate,
+                features=matched,
+                camera=self._prepared.frame.camera,
+            )
+        if matched is not None:
+            self._budget.count("matches", self._direct_work(matched)[1][1])
+        return Candidate(f"{start.stage}+direct", found, start.views)
+
+    def _is_doubtful(self, start: Candidate, T_predicted: Array, T_before: Array) -> bool:
+        """Whether the geometric stage may have been led astray: lost, fast, or not explained by where it led."""
+        if self._search is not None:
+            return True
+        moved, turned = pose_distance(T_predicted, T_before)
+        if moved > self.config.features_motion or turned > self.config.features_rotation:
+            return True
+        with self._budget.run("health", self._health_units):
+            health = score(self._prepared, start, self.config)
+        return verdict_of(health, start.found.information, None, self.config)[0] != "ok"
+
+    def _match(self, T_expected: Array) -> FeaturePose | None:
+        """Pose from features, with as many keypoints as there is time for."""
+        n = self._keypoints()
+        if n is None:
+            self._budget.skip("features")
+            return None
+        if self.features is None:
+            frame = self._prepared.frame
+            with self._budget.run("detect", n, under="features"):
+                self.features = detect(frame.rgb, self._prepared.depth, frame.camera, n, frame.mask)
+        if self._search is not None:
+            return self._search.find(self.features, self._keyframes, self._prepared.frame.camera, self._budget)
+        return self._match_near(self.features, T_expected)
+
+    def _match_near(self, features: Features, T_expected: Array) -> FeaturePose | None:
+        """Match with the nearest keyframes, the latest and the first: near to where they should be, or anywhere."""
+        keyframes, camera = self._keyframes, self._prepared.frame.camera
+        chosen = sorted(
+            {*order_by_distance(keyframes, T_expected)[: self.config.match_keyframes], 0, len(keyframes) - 1}
+        )
+        views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in chosen]
+        units = len(features) * sum(len(known) for known, _ in views)
+        with self._budget.run("match near", units, under="features"):
+            near = match_pose(features, views, camera, Expectation(T_expected, self.config.match_radius * camera.width))
+        if near is not None and len(near.points) >= self.config.match_enough:
+            return near
+        if not self._budget.fits(
+            ("match all", units), *self._direct_work(near) * 2, self._health_work, self._health_work
+        ):
+            self._budget.skip("features anywhere")
+            return near
+        with self._budget.run("match all", units, under="features"):
+            return match_pose(features, views, camera)
+
+    def _keypoints(self) -> int | None:
+        """How many keypoints there is time to find and match, with two alignments to follow."""
+        known = sum(len(view.features) for view in self._keyframes) / len(self._keyframes)
+        views = min(self.config.match_keyframes + 2, len(self._keyframes))
+        ends = (*self._direct_work(None) * 2, self._health_work, self._health_work)
+        for share in _FEWER:
+            n = round(share * self.config.n_features)
+            if self.features is not None:
+                n = len(self.features)
+            work: list[Work] = [("match near", n * known * views), ("matches", 0.5 * n * views * self._n_steps)]
+            if self.features is None:
+                work.append(("detect", n))
+            if self._budget.fits(*work, *ends):
+                return n
+        return None
+
+    def _register(self, start: Candidate) -> list[Candidate]:
+        """Poses by registration with the nearest keyframe, if there is time."""
+        if not self._budget.fits(("wide", self.config.wide_points), *self._direct_work(None) * 2, self._health_work):
+            self._budget.skip("wide")
+            return []
+        with self._budget.run("wide", self.config.wide_points):
+            T = self._wide.register(self._prepared, start.views[0], start.T_world_camera)
+        return [] if T is None else [self._start("wide", T, start)]
+
+    def _start(self, stage: str, T_world_camera: Array, like: Candidate) -> Candidate:
+        return Candidate(stage, like.found.at(T_world_camera), self._nearest(T_world_camera))
+
+    def _nearest(self, T_world_camera: Array) -> list[TrackedKeyframe]:
+        return nearest(self._keyframes, T_world_camera, self.config.reference_keyframes)
+
+    def _fits_one_more(self) -> bool:
+        return self._budget.fits(*self._direct_work(None), self._health_work, self._health_work)
+
+    @property
+    def _n_steps(self) -> int:
+        return self.config.iterations * len(self._prepared.levels)
+
+    def _steps(self, finest: int) -> float:
+        """Points times references, levels and steps of an alignment."""
+        references = min(self.config.reference_keyframes, len(self._keyframes))
+        return self.config.n_pixels * references * self.config.iterations * (len(self._prepared.levels) - finest)
+
+    def _direct_work(self, matched: FeaturePose | None) -> tuple[Work, Work]:
+        matches = 0 if matched is None else len(matched.points)
+        return ("direct", self._steps(0)), ("matches", float(matches * self._n_steps))
+
+    @property
+    def _health_units(self) -> float:
+        return float(self.config.n_pixels * min(self.config.reference_keyframes, len(self._keyframes)))
+
+    @property
+    def _health_work(self) -> Work:
+        return ("health", self._health_units)

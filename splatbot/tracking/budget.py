@@ -1,0 +1,109 @@
+"""The anytime contract: a stage that does not fit the time left is not started."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_RECENT = 40  # runs of a stage that its cost is judged by
+_SHARE = 0.95  # of them it must have cost no more
+_UNKNOWN = 1.5  # times the table's cost is expected of a stage that has not run yet
+
+# Milliseconds of each stage on one idle Zen 4 core: fixed, and per unit of work. Deterministic mode counts by this
+# table alone; otherwise it only relates runs of different sizes, and the clock has the say.
+_TABLE: dict[str, tuple[float, float]] = {
+    "prepare": (0.2, 5.0e-6),  # pixels of the frame
+    "geometric": (0.1, 1.0e-5),  # points, times references, levels and steps
+    "direct": (0.1, 1.5e-5),  # points, times references, levels and steps
+    "matches": (0.0, 2.5e-5),  # matched features, times levels and steps
+    "health": (0.1, 6.0e-5),  # points, times references
+    "detect": (3.5, 1.8e-3),  # keypoints
+    "match near": (1.2, 1.3e-6),  # keypoints, times keypoints of a keyframe
+    "match all": (0.8, 2.3e-6),  # keypoints, times keypoints of a keyframe
+    "vote": (0.0, 0.5),  # keyframes
+    "wide": (3.0, 6.0e-3),  # points
+}
+
+
+def table_ms(stage: str, units: float) -> float:
+    """What a stage is expected to cost for so many units of its work, by the fixed table [ms]."""
+    fixed, per_unit = _TABLE[stage]
+    return fixed + per_unit * units
+
+
+class Costs:
+    """What stages have cost lately, against the table; kept from frame to frame."""
+
+    def __init__(self) -> None:
+        self._ratios: dict[str, list[float]] = {}
+
+    def record(self, stage: str, units: float, ms: float) -> None:
+        """That a stage took so long."""
+        recent = self._ratios.setdefault(stage, [])
+        recent.append(ms / table_ms(stage, units))
+        del recent[:-_RECENT]
+
+    def p95_ms(self, stage: str, units: float) -> float:
+        """What 95 % of recent runs would have cost at most for this work [ms]."""
+        ratios = sorted(self._ratios.get(stage, ()))
+        if not ratios:
+            return _UNKNOWN * table_ms(stage, units)
+        return table_ms(stage, units) * ratios[min(math.ceil(_SHARE * len(ratios)), len(ratios)) - 1]
+
+
+class Budget:
+    """The time of one frame.
+
+    Args:
+        limit_ms: how much there is.
+        costs: of earlier frames; None counts by the table instead of the clock, so that the same frames get the same
+            stages on any machine.
+        started: :func:`time.perf_counter` when work on the frame began.
+
+    ``ms`` are wall-clock milliseconds by stage, in either mode; ``skipped`` names what there was no time for.
+    """
+
+    def __init__(self, limit_ms: float, costs: Costs | None, started: float) -> None:
+        self.limit_ms = limit_ms
+        self.ms: dict[str, float] = {}
+        self.skipped: list[str] = []
+        self._costs = costs
+        self._started = started
+        self._counted = 0.0
+
+    @property
+    def left_ms(self) -> float:
+        """Milliseconds until the deadline."""
+        spent = self._counted if self._costs is None else 1e3 * (time.perf_counter() - self._started)
+        return self.limit_ms - spent
+
+    def cost_ms(self, stage: str, units: float) -> float:
+        """What to expect of a stage: the 95th percentile, or the table's figure."""
+        return table_ms(stage, units) if self._costs is None else self._costs.p95_ms(stage, units)
+
+    def fits(self, *work: tuple[str, float]) -> bool:
+        """Whether stages, each with its units of work, can be done one after the other in the time left."""
+        return sum(self.cost_ms(stage, units) for stage, units in work) <= self.left_ms
+
+    def skip(self, what: str) -> None:
+        """Note that there is no time for something."""
+        if what not in self.skipped:
+            self.skipped.append(what)
+
+    def count(self, stage: str, units: float) -> None:
+        """Charge work that was done before, or within another stage."""
+        self._counted += table_ms(stage, units)
+
+    @contextmanager
+    def run(self, stage: str, units: float, under: str | None = None) -> Iterator[None]:
+        """Do a stage: its cost is charged and remembered, and shown ``under`` that name."""
+        start = time.perf_counter()
+        yield
+        ms = 1e3 * (time.perf_counter() - start)
+        name = under or stage
+        self.ms[name] = self.ms.get(name, 0.0) + ms
+        self._counted += table_ms(stage, units)
+        if self._costs is not None:
+            self._costs.record(stage, units, ms)

@@ -1,0 +1,48 @@
+"""Keyframes as tracking sees them, and which of them are near."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.geometry import inverse, so3_log
+from splatbot.tracking.features import Features
+from splatbot.tracking.reference import Reference
+
+Array = NDArray[np.float64]
+
+
+class TrackedKeyframe(Protocol):
+    """What the tracker asks of a keyframe."""
+
+    @property
+    def features(self) -> Features: ...
+
+    @property
+    def reference(self) -> Reference: ...
+
+
+def pose_distance(T_world_a: Array, T_world_b: Array) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between two poses."""
+    T_a_b = inverse(T_world_a) @ T_world_b
+    return float(np.linalg.norm(T_a_b[:3, 3])), float(np.linalg.norm(so3_log(T_a_b[:3, :3])))
+
+
+def order_by_distance(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[int]:
+    """Indices of keyframes, nearest first; one radian counts as half a metre."""
+    if not keyframes:
+        return []
+    poses = np.stack([keyframe.reference.T_world_camera for keyframe in keyframes])
+    moved = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+    R = poses[:, :3, :3].transpose(0, 2, 1) @ T_world_camera[:3, :3]
+    sine = np.linalg.norm(R - R.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8)
+    turned = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1))
+    return [int(k) for k in np.argsort(moved + 0.5 * turned, kind="stable")]
+
+
+def nearest(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array, n: int) -> list[TrackedKeyframe]:
+    """The n nearest keyframes."""
+    return [keyframes[k] for k in order_by_distance(keyframes, T_world_camera)[:n]]

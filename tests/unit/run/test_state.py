@@ -1,0 +1,257 @@
+"""Saving a run and going on with it: the same bits, and clear words when something does not fit."""
+
+from __future__ import annotations
+
+import shutil
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pytest
+import torch
+
+from splatbot.camera import Camera
+from splatbot.config import Config, MappingConfig
+from splatbot.errors import FormatError, InputError, LogError
+from splatbot.geometry import inverse
+from splatbot.logs import open_log
+from splatbot.run import Progress, map_log
+from splatbot.run.state import SavedRun
+from splatbot.run.state.journal import Journal, read_entry
+from splatbot.run.state.pixels import pack, unpack
+from splatbot.run.state.tree import Decoder, Encoder
+from splatbot.slam import Slam
+from splatbot.tracking.places import likeliest, votes
+from splatbot.tracking.tracker import pose_distance
+from tests.rgbd import small_config
+
+LOG = "synthetic:tabletop?width=160&height=120&frames=14"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was not interrupted."""
+    out = tmp_path_factory.mktemp("whole")
+    map_log(open_log(LOG), out=out, config=small_config())
+    return out
+
+
+@pytest.fixture(scope="module")
+def half(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that ended after half of the frames."""
+    out = tmp_path_factory.mktemp("half")
+    map_log(open_log(LOG), out=out, config=small_config(), max_frames=7, save_every=0.0)
+    return out
+
+
+@pytest.fixture
+def copy(half: Path, tmp_path: Path) -> Path:
+    """The half run, to be damaged or gone on with."""
+    shutil.copytree(half, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_a_resumed_run_is_bit_for_bit_the_uninterrupted_one(whole: Path, copy: Path) -> None:
+    saved = SavedRun.load(copy)
+    assert saved.place.next_index == 7
+    map_log(open_log(LOG), out=copy, resume=saved)
+    for name in ("trajectory.tum", "map.ply", "config.yaml"):
+        assert (copy / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_a_run_resumed_three_times_is_still_the_same(whole: Path, tmp_path: Path) -> None:
+    map_log(open_log(LOG), out=tmp_path, config=small_config(), max_frames=3, save_every=0.0)
+    for frames in (4, 9, 14):
+        map_log(open_log(LOG), out=tmp_path, resume=SavedRun.load(tmp_path), max_frames=frames, save_every=1e9)
+    assert (tmp_path / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()
+    assert len(list((tmp_path / "state").iterdir())) == 2
+
+
+def test_a_paced_run_is_resumed_with_its_counts(tmp_path: Path) -> None:
+    map_log(open_log(LOG), out=tmp_path, config=small_config(), max_frames=7, rate=4.0, save_every=0.0)
+    saved = SavedRun.load(tmp_path)
+    assert saved.config.mapping.threaded
+    result = map_log(open_log(LOG), out=tmp_path, resume=saved, rate=4.0)
+    counts = result.metrics
+    assert counts["frames"] + counts["dropped"] == 14
+    assert counts["lost"] == 0
+    assert counts["ate_rmse_m"] < 2e-3
+
+
+def test_saving_does_not_change_the_run(whole: Path, tmp_path: Path) -> None:
+    map_log(open_log(LOG), out=tmp_path, config=small_config(), save_every=0.0)
+    assert (tmp_path / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
+
+
+def test_images_are_written_once(tmp_path: Path) -> None:
+    sizes: list[tuple[int, int]] = []
+
+    def watch(progress: Progress) -> None:
+        journal = next((tmp_path / "state").glob("images-*.bin"), None)
+        if journal is not None and progress.phase == "mapping":
+            sizes.append((progress.keyframes, journal.stat().st_size))
+
+    map_log(open_log(LOG), out=tmp_path, config=small_config(), save_every=0.0, on_progress=watch)
+    (few, small), (many, large) = sizes[0], sizes[-1]
+    assert many > few
+    assert large < 1.5 * small * many / few
+
+
+def test_the_world_stays_the_maps_when_a_log_is_only_localised(copy: Path, tmp_path: Path) -> None:
+    log = open_log("synthetic:tabletop?width=160&height=120&frames=9")
+    saved = SavedRun.load(copy)
+    before = saved.slam.snapshot().model.clone()
+    shifted = [replace(log[i], index=i - 4) for i in range(4, 9)]  # begins where the map's first frame is not
+    slam = saved.slam
+    slam.localise_only()
+    truth = log.ground_truth
+    assert truth is not None
+    assert slam.process(shifted[0]).reasons == ("found again, the next frame must confirm it",)
+    for frame in shifted[1:]:
+        T = slam.process(frame).T_world_camera
+        assert T is not None
+        exact = inverse(truth.T_world_camera[0]) @ truth.T_world_camera[frame.index + 4]
+        assert pose_distance(exact, T)[0] < 3e-3
+    slam.finish()
+    assert torch.equal(slam.snapshot().model.means, before.means)
+    assert torch.equal(slam.snapshot().model.observations, before.observations)
+
+
+def test_a_localised_log_says_in_which_map(copy: Path, tmp_path: Path) -> None:
+    result = map_log(open_log(LOG), out=tmp_path / "again", localise=SavedRun.load(copy), max_frames=5)
+    assert result.metrics["localised_in"] == str(copy.resolve())
+    assert result.metrics["keyframes"] == 0
+    assert result.metrics["ate_rmse_m"] < 2e-3
+
+
+def test_an_empty_map_cannot_be_localised_in() -> None:
+    with pytest.raises(InputError, match="no keyframes"):
+        Slam(small_config()).localise_only()
+
+
+def test_the_place_that_looks_alike_gets_most_votes(half: Path) -> None:
+    keyframes = SavedRun.load(half).slam.keyframes
+    for k, keyframe in enumerate(keyframes):
+        assert likeliest(keyframe.features, keyframes, 1) == [k]
+    assert votes(keyframes[0].features, []).shape == (0,)
+
+
+@pytest.mark.parametrize("name", ["run.state", "images-0.bin"])
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.4, 0.999])
+def test_a_state_that_is_cut_off_is_refused_with_its_file(copy: Path, name: str, share: float) -> None:
+    path = copy / "state" / name
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(FormatError, match=name):
+        SavedRun.load(copy)
+
+
+@pytest.mark.parametrize("name", ["run.state", "images-0.bin"])
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.95])
+def test_a_flipped_bit_is_found(copy: Path, name: str, share: float) -> None:
+    path = copy / "state" / name
+    data = bytearray(path.read_bytes())
+    data[int(share * len(data))] ^= 0x10
+    path.write_bytes(bytes(data))
+    with pytest.raises(FormatError, match=name):
+        SavedRun.load(copy)
+
+
+def test_a_folder_without_a_state_says_how_to_get_one(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="--save-every"):
+        SavedRun.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("uri", "what"),
+    [
+        ("synthetic:tabletop?width=160&height=120&frames=5", "frames"),
+        ("synthetic:tabletop?width=160&height=120&frames=14&rate=20", "frame 6"),
+        ("synthetic:tabletop?width=160&height=120&frames=14&arc=20", "frame 6"),
+    ],
+)
+def test_another_log_than_the_one_begun_with_is_refused(copy: Path, uri: str, what: str) -> None:
+    with pytest.raises(LogError, match=what):
+        map_log(open_log(uri), out=copy, resume=SavedRun.load(copy))
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8),
+        np.array([[1.5, np.nan, -0.0], [np.inf, 1e-40, 3.0]], np.float32),
+        np.arange(6, dtype=np.float64).reshape(2, 3),
+        np.zeros((0, 32), np.uint8),
+        np.float32(3.0).reshape(()),
+    ],
+)
+def test_arrays_are_packed_without_losing_a_bit(array: Any) -> None:
+    again = unpack(pack(array, compress=True))
+    assert again.dtype == array.dtype
+    assert again.shape == array.shape
+    assert again.tobytes() == array.tobytes()
+
+
+def test_values_of_every_kind_come_back_and_shared_ones_stay_shared() -> None:
+    config = Config()
+    camera = Camera(1.0, 2.0, 3.0, 4.0, 5, 6)
+    generator = np.random.default_rng(3)
+    generator.random(5)
+    shared = np.arange(3.0)
+    value: dict[str, Any] = {
+        "plain": [None, True, 3, -2.5, "text", float("nan"), float("inf")],
+        "nested": (1, {2: {3.5}}, deque([4])),
+        "shared": [shared, shared, torch.arange(3)],
+        "object": camera,
+        "section": config.mapping,
+        "random": generator,
+    }
+    encoder = Encoder(config, lambda owner, array: None)
+    tree = encoder.encode(value)
+    back = Decoder(config, [a.copy() for a in encoder.arrays], lambda entry: shared).decode(tree)
+    assert back["plain"][:5] == value["plain"][:5]
+    assert np.isnan(back["plain"][5])
+    assert back["nested"] == value["nested"]
+    assert back["shared"][0] is back["shared"][1]
+    assert torch.equal(back["shared"][2], torch.arange(3))
+    assert back["object"] == camera
+    assert back["section"] is config.mapping
+    assert back["random"].random() == generator.random()
+
+
+def test_what_is_known_of_an_object_that_only_others_hold_is_saved_with_it() -> None:
+    key = Camera(1.0, 2.0, 3.0, 4.0, 5, 6)
+    encoder = Encoder(Config(), lambda owner, array: None)
+    tree = encoder.encode([key, WeakKeyDictionary({key: 7})])
+    held, weak = Decoder(Config(), [], lambda entry: np.zeros(0)).decode(tree)
+    assert weak[held] == 7
+
+
+@pytest.mark.parametrize("value", [open, object(), np.array([object()]), Path(), MappingConfig(stride=7)])
+def test_what_cannot_be_saved_is_refused_not_dropped(value: object) -> None:
+    with pytest.raises(TypeError):
+        Encoder(Config(), lambda owner, array: None).encode({"value": value})
+
+
+@pytest.mark.parametrize("name", ["os:system", "splatbot.slam:time", "splatbot.slam:Nothing", "splatbot.cli:main"])
+def test_a_state_makes_no_object_but_those_of_the_slam(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        Decoder(Config(), [], lambda entry: np.zeros(0)).decode({"$": "object", "class": name, "is": {}})
+
+
+def test_a_journal_that_is_mostly_waste_is_begun_anew(tmp_path: Path) -> None:
+    journal = Journal(tmp_path)
+    kept = np.arange(10.0)
+    for round_ in range(4):
+        journal.begin()
+        entry = journal.put(kept, kept)
+        journal.put(np.full(50, float(round_)), np.full(50, float(round_)))
+        journal.sync()
+        journal.finish()
+        assert [p.name for p in tmp_path.iterdir()] == [journal.path.name]
+        assert np.array_equal(read_entry(journal.path, entry), kept)
+    assert journal.number > 0
+    assert journal.path.stat().st_size < 4 * 50 * 8

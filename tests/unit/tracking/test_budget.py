@@ -1,0 +1,107 @@
+"""The anytime contract: what does not fit is not started, and what is skipped is told."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.config import TrackingConfig, load_config
+from splatbot.tracking.budget import Budget, Costs, table_ms
+from tests.unit.tracking.test_tracker import Run
+
+
+def test_a_budget_buys_pixels_steps_and_keypoints_by_one_table() -> None:
+    rows = [TrackingConfig(budget_ms=ms) for ms in (30, 99, 100, 300, 1000, 5000)]
+    assert [row.n_pixels for row in rows] == sorted(row.n_pixels for row in rows)
+    assert rows[0].n_pixels == rows[1].n_pixels < rows[2].n_pixels == 4800
+    assert [row.iterations for row in rows] == sorted(row.iterations for row in rows)
+    assert [row.n_features for row in rows] == sorted(row.n_features for row in rows)
+
+
+def test_what_is_given_is_not_changed_by_the_budget_and_null_leaves_it_to_it() -> None:
+    given = load_config(environ={}, overrides={"tracking.budget_ms": 30, "tracking.n_pixels": 777})
+    assert (given.tracking.n_pixels, given.tracking.n_features) == (777, TrackingConfig(budget_ms=30).n_features)
+    left = load_config(environ={}, overrides={"tracking.budget_ms": 300, "tracking.n_pixels": None})
+    assert left.tracking.n_pixels == TrackingConfig(budget_ms=300).n_pixels
+
+
+def test_the_95th_percentile_of_recent_runs_is_what_a_stage_is_expected_to_cost() -> None:
+    costs = Costs()
+    for i in range(40):
+        costs.record("direct", 1000.0, 2.0 * table_ms("direct", 1000.0) if i % 10 == 0 else table_ms("direct", 1000.0))
+    assert costs.p95_ms("direct", 1000.0) == pytest.approx(2.0 * table_ms("direct", 1000.0))
+    assert costs.p95_ms("direct", 5000.0) == pytest.approx(2.0 * table_ms("direct", 5000.0))
+    for _ in range(40):
+        costs.record("direct", 1000.0, table_ms("direct", 1000.0))
+    assert costs.p95_ms("direct", 1000.0) == pytest.approx(table_ms("direct", 1000.0))
+
+
+def test_time_that_has_passed_is_not_left() -> None:
+    budget = Budget(50.0, Costs(), time.perf_counter() - 0.045)
+    assert budget.left_ms <= 5.0
+    assert not budget.fits(("detect", 2000))
+    counted = Budget(50.0, None, time.perf_counter() - 10.0)
+    assert counted.left_ms == 50.0
+    with counted.run("detect", 1000):
+        pass
+    assert counted.left_ms == pytest.approx(50.0 - table_ms("detect", 1000))
+
+
+def test_without_time_for_features_the_frame_is_tracked_without_and_says_so() -> None:
+    """The table's costs: 5 ms are enough for alignment and not for finding keypoints."""
+    run = Run(tracking__budget_ms=5)
+    estimate = run.track(run.frames[1])
+    assert estimate.verdict == "ok"
+    assert "features" in estimate.skipped
+    assert "features" not in estimate.stage_ms
+    assert estimate.features is None
+    assert run.error(estimate, 1)[0] < 1.5e-3
+
+
+def test_with_little_time_there_are_fewer_keypoints() -> None:
+    plenty, little = Run(width=320), Run(width=320, tracking__budget_ms=8)
+    many, few = plenty.track(plenty.frames[1]).features, little.track(little.frames[1]).features
+    assert many is not None
+    assert few is not None
+    assert len(few) < 0.7 * len(many)
+
+
+def test_slow_stages_are_left_out_once_they_are_known_to_be_slow() -> None:
+    run = Run(tracking__deterministic=False, tracking__budget_ms=1000)
+    assert "features" in run.track(run.frames[1]).stage_ms
+    costs = run.tracker._costs
+    assert costs is not None
+    for _ in range(40):
+        costs.record("detect", 600, 5000.0)
+    estimate = run.track(run.frames[2])
+    assert "features" in estimate.skipped
+    assert estimate.verdict == "ok"
+
+
+def test_counted_work_gives_the_same_bits_however_slow_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    fast, slow = Run(tracking__budget_ms=12), Run(tracking__budget_ms=12)
+    poses = [fast.track(fast.frames[i]).T_world_camera for i in range(1, 6)]
+    clock = time.perf_counter
+    monkeypatch.setattr(time, "perf_counter", lambda: 1000 * clock())
+    again = [slow.track(slow.frames[i]).T_world_camera for i in range(1, 6)]
+    assert np.array_equal(poses, again)
+
+
+def test_a_lost_camera_is_found_within_a_small_budget_by_keyframes_in_turn() -> None:
+    """One keyframe at a time fits; the one that shows the frame is not the latest."""
+    run = Run(width=320, tracking__budget_ms=14, tracking__n_features=400)
+    for i in (2, 4, 6, 8, 10, 11):
+        run.keyframes.append(run.keyframe(run.prepare(run.frames[i]), run.poses[i]))
+    dark = replace(run.frames[1], rgb=np.zeros_like(run.frames[1].rgb), depth=np.zeros_like(run.frames[1].depth))
+    assert run.track(dark).verdict == "lost"
+    verdicts = []
+    for step in range(8):
+        estimate = run.track(replace(run.frames[1], stamp=1.0 + step / 30))
+        verdicts.append(estimate.verdict)
+        if estimate.verdict == "ok":
+            break
+    assert verdicts[-1] == "ok", verdicts
+    assert run.error(estimate, 1)[0] < 2e-3

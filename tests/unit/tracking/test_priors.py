@@ -1,0 +1,104 @@
+"""External priors: used as well as they are known, and left out when what is seen speaks against them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.frame import PosePrior
+from splatbot.geometry import inverse, se3_exp
+from splatbot.tracking.align import Alignment
+from splatbot.tracking.candidate import Candidate, Judged
+from splatbot.tracking.health import Health
+from splatbot.tracking.predict import ConstantVelocity, Prediction
+from splatbot.tracking.priors import fuse, is_believable, sigmas_off
+from tests.rgbd import wall_frame
+from tests.unit.tracking.test_tracker import Run
+
+SURE = np.diag([1e-6] * 3 + [1e-6] * 3)  # 1 mm, 0.06°
+
+
+def pose(twist: list[float]) -> Judged:
+    found = Alignment(se3_exp(twist), np.eye(6), np.eye(6), np.eye(6), 48)
+    return Judged(Candidate("direct", found, []), Health(1, 1, 1, 0.5, 1), "ok", (), None, np.eye(6))
+
+
+def test_fusion_is_the_information_weighted_mean_and_the_parallel_sum_of_covariances() -> None:
+    C, P = np.diag([1.0, 4.0, 1.0, 1.0, 2.0, 1.0]) * 1e-6, np.diag([3.0, 1.0, 1.0, 1.0, 2.0, 9.0]) * 1e-6
+    there = np.array([1e-3, 2e-3, 0, 0, 0, 0])
+    T, covariance = fuse(pose([0.0] * 6), Prediction(se3_exp(there), P), C)
+    np.testing.assert_allclose(covariance, np.linalg.inv(np.linalg.inv(C) + np.linalg.inv(P)), atol=1e-15)
+    np.testing.assert_allclose(
+        T[:3, 3], (np.linalg.inv(np.linalg.inv(C) + np.linalg.inv(P)) @ np.linalg.inv(P) @ there)[:3]
+    )
+
+
+def test_the_gate_is_the_distance_that_one_right_prior_in_ten_thousand_exceeds() -> None:
+    rng = np.random.default_rng(0)
+    d2 = (rng.standard_normal((400_000, 6)) ** 2).sum(1)
+    share = np.mean([not is_believable(d) for d in np.sqrt(np.sort(d2)[-200:])]) * 200 / len(d2)
+    assert share == pytest.approx(1e-4, rel=0.35)
+    off = sigmas_off(pose([0.0] * 6), Prediction(se3_exp([0.01, 0, 0, 0, 0, 0]), SURE), SURE)
+    assert off == pytest.approx(0.01 / np.sqrt(2e-6))
+
+
+def test_relative_motions_of_lost_frames_add_up() -> None:
+    motion, step = ConstantVelocity(), se3_exp([0.02, 0, 0.01, 0, 0.05, 0])
+    motion.update(0.0, np.eye(4))
+    prior = PosePrior(SURE, T_previous_camera=step)
+    for _ in range(3):
+        told = motion.told(prior, np.zeros((6, 6)))
+        motion.forget_velocity(told)
+    again = motion.told(prior, np.zeros((6, 6)))
+    np.testing.assert_allclose(again.T_world_camera, step @ step @ step @ step, atol=1e-12)
+    assert again.covariance[0, 0] > 3.9e-6
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_a_right_prior_finds_a_frame_that_jumped_beyond_what_features_and_alignment_bridge(absolute: bool) -> None:
+    """10 cm in one frame at 30 Hz, features off."""
+    run = Run(tracking__features="needed", tracking__features_motion=10.0, tracking__features_rotation=10.0)
+    run.track(run.frames[1])
+    T = run.poses[9]
+    prior = (
+        PosePrior(SURE, T_world_camera=T) if absolute else PosePrior(SURE, T_previous_camera=inverse(run.poses[1]) @ T)
+    )
+    estimate = run.track(replace(run.frames[9], prior=prior))
+    assert estimate.verdict == "ok", estimate.reasons
+    assert run.error(estimate, 9)[0] < 2e-3
+    assert not estimate.reasons
+
+
+@pytest.mark.parametrize("shift", [0.02, 0.3])
+@pytest.mark.parametrize("absolute", [True, False])
+def test_a_wrong_prior_is_left_out_and_reported(absolute: bool, shift: float) -> None:
+    """20 and 300 of its own standard deviations."""
+    run = Run()
+    run.track(run.frames[1])
+    wrong = run.poses[2] @ se3_exp([shift, -shift, 0.5 * shift, 0, 0, 0])
+    prior = (
+        PosePrior(SURE, T_world_camera=wrong)
+        if absolute
+        else PosePrior(SURE, T_previous_camera=inverse(run.poses[1]) @ wrong)
+    )
+    estimate = run.track(replace(run.frames[2], prior=prior))
+    assert estimate.verdict == "ok", estimate.reasons
+    assert run.error(estimate, 2)[0] < 1.5e-3
+    assert any("the prior is" in reason and "left out" in reason for reason in estimate.reasons)
+
+
+def test_on_a_blank_wall_the_prior_stands_in_where_the_wall_says_nothing() -> None:
+    run = Run(tracking__features="needed", tracking__features_motion=10.0, tracking__features_rotation=10.0)
+    camera = run.frames[0].camera
+    here, there = (wall_frame(T, textured=False, camera=camera) for T in (np.eye(4), se3_exp([0.05, 0, 0, 0, 0, 0])))
+    run.keyframes = [run.keyframe(run.prepare(here), np.eye(4))]
+    run.tracker.motion.update(0.0, np.eye(4))
+    told = PosePrior(np.diag([1e-4] * 3 + [1e-4] * 3), T_previous_camera=se3_exp([0.05, 0, 0, 0, 0, 0]))
+    estimate = run.track(replace(there, stamp=1 / 30, prior=told))
+    assert estimate.verdict == "degraded"
+    assert estimate.T_world_camera[0, 3] == pytest.approx(0.05, abs=2e-3)
+    deviations = np.sqrt(np.diag(estimate.covariance))
+    assert deviations[0] == pytest.approx(1e-2, rel=0.3)
+    assert deviations[2] < 2e-3

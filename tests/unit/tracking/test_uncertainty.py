@@ -1,0 +1,119 @@
+"""Covariances of poses: calibrated where the noise is known, composed as random errors compose, finite everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.config import TrackingConfig
+from splatbot.geometry import inverse, se3_exp, se3_log
+from splatbot.tracking.align import Alignment, align
+from splatbot.tracking.prepare import Level, prepare
+from splatbot.tracking.reference import make_reference
+from splatbot.tracking.uncertainty import Uncertainty, alignment_covariance, world_uncertainty
+from tests.rgbd import CAMERA, Array, rays_of, tabletop, wall_depth, wall_frame
+
+CONFIG = TrackingConfig(n_pixels=2000)
+
+
+def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: float, depth_noise: float) -> Level:
+    """Three textured walls that meet, with white noise."""
+    depths = [wall_depth(CAMERA, T_world_camera, n, d) for n, d in (((0.5, 0, 1), 1.2), ((-0.5, 0.4, 1), 1.2))]
+    z = np.minimum(*depths) + depth_noise * rng.standard_normal((120, 160))
+    exact = np.minimum(*depths)
+    points = (rays_of(CAMERA) * exact[..., None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    x, y, w = np.moveaxis(points, -1, 0)
+    gray = 0.5 + 0.15 * np.sin(31 * x + 9 * w) + 0.15 * np.sin(27 * y - 8 * x)
+    gray = gray + gray_noise * rng.standard_normal(gray.shape)
+    return Level(gray.astype(np.float32), z.astype(np.float32), CAMERA)
+
+
+def test_the_spread_of_the_residuals_tells_the_error_whatever_the_noise_model_says() -> None:
+    """White noise of other strengths than configured: C⁻¹ S C⁻¹ alone has a NEES / 6 of 1."""
+    rng, T = np.random.default_rng(1), se3_exp([0.004, -0.003, 0.005, 0.004, -0.003, 0.002])
+    for gray_noise, depth_noise in ((0.01, 0.002), (0.04, 0.0005)):
+        values = []
+        for _ in range(40):
+            reference = make_reference((corner_levels(np.eye(4), rng, 0.0, 0.0),), np.eye(4), CONFIG.n_pixels)
+            level = corner_levels(T, rng, gray_noise, depth_noise)
+            found = align([level], [reference], T, CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+            C = np.linalg.inv(found.curvature)
+            off = se3_log(inverse(found.T_world_camera) @ T)
+            robust = C @ found.spread @ C * found.cells / (found.cells - 6)
+            values.append(off @ np.linalg.solve(robust, off) / 6)
+            assert off @ np.linalg.solve(alignment_covariance(found), off) / 6 < values[-1]
+        assert 0.5 < np.mean(values) < 2.0
+
+
+def test_the_covariance_is_symmetric_positive_and_grows_as_pixels_go() -> None:
+    frames, poses = tabletop()
+    levels = prepare(frames[1], CONFIG).levels
+    sizes = []
+    for n in (4000, 1000, 250):
+        reference = make_reference(prepare(frames[0], CONFIG).levels, poses[0], n)
+        found = align(levels, [reference], poses[1], CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+        covariance = alignment_covariance(found)
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance)[0] > 0
+        sizes.append(np.trace(covariance[:3, :3]))
+    assert sizes[0] < sizes[1] < sizes[2]
+
+
+def test_without_any_information_the_covariance_is_large_and_finite_and_of_nan_it_is_nan() -> None:
+    nothing = Alignment(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 0)
+    covariance = alignment_covariance(nothing)
+    assert np.linalg.eigvalsh(covariance)[0] >= 100.0
+    assert np.isfinite(covariance).all()
+    assert np.isnan(alignment_covariance(replace(nothing, information=np.full((6, 6), np.nan)))).all()
+
+
+def test_a_blank_wall_is_not_known_along_itself() -> None:
+    wall = prepare(wall_frame(np.eye(4), textured=False), CONFIG)
+    reference = make_reference(wall.levels, np.eye(4), 1000)
+    found = align(wall.levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+    deviations = np.sqrt(np.diag(alignment_covariance(found)))
+    assert deviations[2] < 2e-3
+    assert deviations[:2].min() > 1.0
+
+
+def test_errors_of_a_keyframe_are_carried_to_the_poses_found_with_it() -> None:
+    """Against 20,000 random errors of both, composed as transforms."""
+    rng = np.random.default_rng(2)
+    T_world_keyframe = se3_exp([0.5, -0.2, 0.3, 0.2, 0.6, -0.1])
+    T_world_camera = T_world_keyframe @ se3_exp([0.3, 0.1, -0.2, 0.1, -0.4, 0.2])
+    A, B = rng.standard_normal((2, 6, 6)) * 1e-3
+    carried = world_uncertainty(T_world_camera, B @ B.T, [(T_world_keyframe, Uncertainty(A @ A.T))])
+    T_keyframe_camera = inverse(T_world_keyframe) @ T_world_camera
+    samples = [
+        se3_log(
+            inverse(T_world_camera)
+            @ T_world_keyframe
+            @ se3_exp(A @ rng.standard_normal(6))
+            @ T_keyframe_camera
+            @ se3_exp(B @ rng.standard_normal(6))
+        )
+        for _ in range(20_000)
+    ]
+    np.testing.assert_allclose(carried.random, np.cov(np.array(samples).T), atol=4e-7)
+
+
+def test_two_keyframes_with_one_error_do_not_average_it_out() -> None:
+    known = Uncertainty(np.diag([1e-6] * 3 + [1e-8] * 3), moved=1.0, turned=2.0)
+    one = world_uncertainty(np.eye(4), np.zeros((6, 6)), [(np.eye(4), known)])
+    two = world_uncertainty(np.eye(4), np.zeros((6, 6)), [(np.eye(4), known)] * 2)
+    np.testing.assert_allclose(two.random, one.random, rtol=1e-12)
+    assert two.moved == pytest.approx(1.0)
+
+
+def test_the_covariance_grows_with_the_length_of_the_chain() -> None:
+    step, known, T = se3_exp([0.1, 0, 0, 0, 0.1, 0]), Uncertainty(), np.eye(4)
+    sizes = []
+    for _ in range(10):
+        before, T = T, T @ step
+        known = world_uncertainty(T, np.diag([1e-6] * 6), [(before, known)])
+        sizes.append(np.trace(known.covariance[:3, :3]))
+    assert (np.diff(sizes) > 0).all()
+    assert known.moved == pytest.approx(10 * np.linalg.norm(step[:3, 3]))
+    assert known.turned == pytest.approx(1.0)

@@ -1,0 +1,56 @@
+"""Registration of point clouds: beyond the reach of alignment, and no word of its own about success."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.config import TrackingConfig
+from splatbot.geometry import se3_exp
+from splatbot.tracking.tracker import pose_distance
+from splatbot.tracking.wide import WideStage, cloud_of, points_of
+from tests.unit.tracking.test_tracker import Run
+
+
+@pytest.mark.parametrize("twist", [[0.08, 0, 0, 0, 0.087, 0], [0.0, 0.1, 0.05, 0.1, 0, 0], [0.1, 0, 0, 0, 0, 0.15]])
+def test_a_start_10_cm_and_8_degrees_off_is_brought_to_a_centimetre(twist: list[float]) -> None:
+    run = Run(width=320)
+    stage = WideStage(TrackingConfig(wide_points=3000))
+    found = stage.register(run.prepare(run.frames[2]), run.keyframes[0], run.poses[2] @ se3_exp(twist))
+    assert found is not None
+    moved, turned = pose_distance(run.poses[2], found)
+    assert moved < 0.012
+    assert turned < np.radians(0.7)
+
+
+def test_a_frame_without_depth_has_no_pose_from_registration() -> None:
+    run = Run()
+    empty = run.prepare(replace(run.frames[1], depth=np.zeros_like(run.frames[1].depth)))
+    assert WideStage(TrackingConfig()).register(empty, run.keyframes[0], np.eye(4)) is None
+
+
+def test_clouds_too_far_apart_to_touch_have_none_either() -> None:
+    run = Run()
+    away = se3_exp([30.0, 0, 0, 0, 0, 0])
+    assert WideStage(TrackingConfig()).register(run.prepare(run.frames[1]), run.keyframes[0], away) is None
+
+
+def test_points_are_about_as_many_as_asked_for_and_too_few_make_no_cloud() -> None:
+    run = Run(width=320)
+    assert 600 < len(points_of(run.prepare(run.frames[0]), 1000)) < 1700
+    assert cloud_of(np.zeros((5, 3))) is None
+
+
+def test_a_fast_motion_is_bridged_without_features_by_registration() -> None:
+    """A jump of 10 cm and 7°, and keyframes whose features have no depth: alignment alone would not find it."""
+    run = Run(width=320)
+    view = run.keyframes[0]
+    run.keyframes = [replace(view, features=replace(view.features, points=np.full_like(view.features.points, np.nan)))]
+    run.tracker.motion.update(run.frames[0].stamp, se3_exp([0.1, 0, 0, 0, 0.12, 0]))
+    run.tracker.motion.forget_velocity()
+    estimate = run.track(run.frames[1])
+    assert "wide" in estimate.stage_ms
+    assert estimate.verdict == "ok", estimate.reasons
+    assert run.error(estimate, 1)[0] < 2e-3
