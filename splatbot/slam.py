@@ -182,16 +182,6 @@ class Slam:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
 
-<<<<<<< HEAD
-=======
-    def _looks(self, stamp: float) -> bool:
-        """Whether it is time to look at a frame that is no keyframe."""
-        if 0 <= stamp - self._looked < self.config.mapping.look_every:
-            return False
-        self._looked = stamp
-        return True
-
->>>>>>> h-m
     def _close_loops(self) -> None:
         """Move the map's pieces where the loops want them, and with them the poses found so far and the tracker."""
         with self._mapper.paused():
@@ -204,7 +194,6 @@ class Slam:
         self.results = moved
         if number in correction:
             self._tracker.move(correction[number])
-<<<<<<< HEAD
 
     def _looks(self, stamp: float) -> bool:
         """Whether it is time to look at a frame that is no keyframe."""
@@ -212,8 +201,6 @@ class Slam:
             return False
         self._looked = stamp
         return True
-=======
->>>>>>> h-m
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
         features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)

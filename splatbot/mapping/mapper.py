@@ -17,11 +17,7 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, weigh
 from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
-<<<<<<< HEAD
-from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images
-=======
 from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images, resized
->>>>>>> h-m
 from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
 from splatbot.mapping.loop import View as LoopView
 from splatbot.mapping.memory import memory_of
@@ -86,17 +82,10 @@ class Mapper:
         """
         if valid_share(prepared) < self.config.tracking.min_valid:
             return False
-<<<<<<< HEAD
         bridge = self.loops.is_bridge(T_world_camera, self.keyframes)
         if bridge or (self._revealed and not waiting):
             return True
         return is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
-=======
-        if self._revealed and not waiting:
-            return True
-        new = is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
-        return self.loops.is_bridge(T_world_camera, self.keyframes) or new
->>>>>>> h-m
 
     def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
         """Fuse a frame into the map, refine, and make it a reference for tracking.

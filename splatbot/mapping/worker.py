@@ -87,15 +87,6 @@ class MappingWorker:
         if first is not None:
             self._start(first)
 
-<<<<<<< HEAD
-=======
-    def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
-        """As :meth:`Mapper.look`, when there is time; the latest frame only."""
-        with self._news:
-            self._to_look = (prepared, T_world_camera)
-            self._news.notify()
-
->>>>>>> h-m
     @property
     def memory(self) -> dict[str, int]:
         """As :meth:`Mapper.memory`; while the thread works, of about now."""
@@ -117,15 +108,12 @@ class MappingWorker:
         moved = self._mapper.close_loops()
         self._publish()
         return moved
-<<<<<<< HEAD
 
     def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
         """As :meth:`Mapper.look`, when there is time; the latest frame only."""
         with self._news:
             self._to_look = (prepared, T_world_camera)
             self._news.notify()
-=======
->>>>>>> h-m
 
     def hold(self, moving: bool) -> None:
         """As :meth:`Mapper.hold`."""
