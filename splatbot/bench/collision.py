@@ -13,6 +13,7 @@ import open3d as o3d
 import torch
 from numpy.typing import NDArray
 
+from splatbot.bench.collision_maps import audit_mapped_log, audit_run
 from splatbot.bench.collision_peers import mesh_of, run_brute_force, run_mesh_peers
 from splatbot.bench.collision_plots import plot_accuracy
 from splatbot.bench.machine import describe_machine
@@ -44,6 +45,7 @@ class CollisionPlan:
         peers: measure other implementations too.
         quick: tiny: whether it runs, not how fast.
         say: told what goes on.
+        run: a run folder of `splatbot map`, to compare with its log's raw depth; None: none.
     """
 
     counts: tuple[int, ...] = (10_000, 50_000, 200_000, 500_000)
@@ -54,6 +56,7 @@ class CollisionPlan:
     peers: bool = False
     quick: bool = False
     say: Say = field(default=lambda text: None)
+    run: Path | None = None
 
     @classmethod
     def quick_plan(cls, *, peers: bool = False, say: Say = lambda text: None) -> CollisionPlan:
@@ -96,6 +99,17 @@ def run_collision(plan: CollisionPlan, out: Path) -> Results:
         ("errors against exact truth", lambda: run_errors(plan, results, scene, arm)),
         ("floaters", lambda: run_floaters(plan, results, scene, arm)),
     ]
+    frames, width, spheres = (3, 80, 200) if plan.quick else (30, 320, 20_000)
+    sigmas = (2.0,) if plan.quick else (1.0, 1.5, 2.0, 3.0)
+    parts.append(
+        (
+            "a map of a noisy log",
+            lambda: audit_mapped_log(results, frames=frames, width=width, spheres=spheres, n_sigmas=sigmas),
+        )
+    )
+    if plan.run is not None:
+        folder = plan.run
+        parts.append(("a recorded log", lambda: audit_run(results, folder, out, points=100_000)))
     if plan.peers:
         parts.append(("peers", lambda: run_peers(plan, results, scene, arm)))
     for name, part in parts:

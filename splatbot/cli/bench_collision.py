@@ -19,6 +19,7 @@ def bench_collision(
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     peers: bool = False,
     threads: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (1, 2),
+    run: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     quick: bool = False,
 ) -> int:
     """Measure the collision field and an arm of spheres in it.
@@ -29,6 +30,7 @@ def bench_collision(
     Examples:
         splatbot bench collision
         splatbot bench collision --peers
+        splatbot bench collision --run runs/latest
         splatbot bench collision --quick --json figures.json
 
     Args:
@@ -36,6 +38,7 @@ def bench_collision(
         json: another place for the JSON file.
         peers: measure other ways to ask for collisions beside it (minutes).
         threads: how many threads to measure with.
+        run: a run folder of splatbot map, whose field is compared with its log's raw depth.
         quick: tiny scenes, to see whether it runs.
     """
     from splatbot.errors import InputError
@@ -56,7 +59,7 @@ def bench_collision(
         progress.print(f"[dim]{text} ...[/dim]", highlight=False)
 
     plan = CollisionPlan.quick_plan(say=say) if quick else CollisionPlan(say=say)
-    results = run_collision(replace(plan, thread_counts=tuple(threads), peers=peers), folder)
+    results = run_collision(replace(plan, thread_counts=tuple(threads), peers=peers, run=run), folder)
     if json is not None:
         results.write_json(json)
     _print(results, folder)
@@ -82,6 +85,8 @@ def _print(results: Results, folder: Path) -> None:
         ("Floaters", "gate"),
     ):
         console.print(_by_case(title, results.select(prefix)))
+    maps = [row for row in own if row.case.startswith("mapped") or row.case.endswith("points in free space")]
+    console.print(_by_metric("Maps made from images", maps))
     rest = [row for row in results.rows if row.case.startswith(("points against", "configurations, "))]
     if rest:
         table = Table("case", "metric", "whose", "figure", title="Beside peers")

@@ -48,6 +48,11 @@ class Scene:
         self._still = _Body(surfaces)
         self._moving = {name: (thing.pose, _Body(thing.surfaces)) for name, thing in (moving or {}).items()}
 
+    @property
+    def surfaces(self) -> list[Surface]:
+        """What does not move."""
+        return self._still.surfaces
+
     def objects(self, t: float) -> dict[str, Array]:
         """T_world_object (4, 4) of each moving object that is there at time ``t`` [s]."""
         poses = {name: pose(t) for name, (pose, _) in self._moving.items()}

@@ -1,0 +1,171 @@
+"""The collision field of maps that were made from images: against true shapes, and against the raw depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+import open3d as o3d
+from matplotlib import pyplot as plt
+from numpy.typing import NDArray
+
+from splatbot.bench.results import Results
+from splatbot.camera import Camera
+from splatbot.collision import GaussianCollisionField
+from splatbot.collision.evidence import measured_depths
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import transform_points
+from splatbot.logs import open_log
+from splatbot.logs.scenes.tabletop import tabletop
+from splatbot.logs.synthetic import SyntheticLog
+from splatbot.protocols import Array
+from splatbot.results.folder import RunFolder
+from splatbot.slam import Slam
+
+NOISY = "effects=depth_noise;depth_holes"
+
+
+def audit_mapped_log(results: Results, *, frames: int, width: int, spheres: int, n_sigmas: tuple[float, ...]) -> None:
+    """Map a noisy synthetic table top, then ask random spheres in free space and compare with the true shapes.
+
+    A sphere counts as seen if the true surface nearest to it was seen by a camera, from its true pose. The map's own
+    surface error is how far points of the seen surface lie from the field's ellipsoids.
+    """
+    log = open_log(f"synthetic:tabletop?frames={frames}&width={width}&height={width * 3 // 4}&{NOISY}")
+    assert isinstance(log, SyntheticLog)
+    slam = Slam()
+    for frame in log:
+        slam.process(frame)
+    slam.finish()
+    snapshot = slam.snapshot()
+    poses = log.ground_truth.T_world_camera
+    T_map_world = np.linalg.inv(poses[0])  # a map's world is its first camera
+    truth = _true_shapes()
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.55, -0.40, 0.0], [0.55, 0.35, 0.35], (3 * spheres, 3))
+    distance, nearest = _closest(truth, points)
+    outside = truth.compute_occupancy(_tensor(points), nsamples=3).numpy() == 0
+    points, distance, nearest = (x[outside][:spheres] for x in (points, distance, nearest))
+    radii = rng.uniform(0.02, 0.08, len(points))
+    seen = _seen(log, nearest, truth, poses)
+    for n_sigma in n_sigmas:
+        field = GaussianCollisionField(snapshot, n_sigma)
+        hit = field.in_collision(np.c_[transform_points(T_map_world, points), radii])
+        surface = np.maximum(field.clearance(transform_points(T_map_world, nearest[seen])).distance, 0)
+        case = f"mapped noisy log, n_sigma {n_sigma:g}"
+        results.add(case, "Gaussians", float(len(field)), "")
+        for share in (50, 95, 99, 100):
+            results.add(
+                case, f"surface error in seen space, {share} %", 1e3 * float(np.percentile(surface, share)), "mm"
+            )
+        for name, part in (("seen", seen), ("unseen", ~seen)):
+            room, struck = (distance - radii)[part], hit[part]
+            free, false = ~struck & (room <= 0), struck & (room > 0)
+            results.add(case, f"false free in {name} space", 100.0 * float(free.mean()), "%")
+            deepest = 1e3 * float(-room[free].min()) if free.any() else 0.0
+            results.add(case, f"deepest false free in {name} space", deepest, "mm")
+            results.add(case, f"false hit in {name} space", 100.0 * float(false.mean()), "%")
+            largest = 1e3 * float(room[false].max()) if false.any() else 0.0
+            results.add(case, f"largest false hit in {name} space", largest, "mm")
+
+
+def _true_shapes() -> o3d.t.geometry.RaycastingScene:
+    scene = o3d.t.geometry.RaycastingScene()
+    for surface in tabletop().surfaces:
+        vertices, triangles = surface.mesh.vertices.astype(np.float32), surface.mesh.triangles.astype(np.uint32)
+        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
+    return scene
+
+
+def _closest(scene: o3d.t.geometry.RaycastingScene, points: Array) -> tuple[Array, Array]:
+    """Unsigned distances (P,) and nearest points (P, 3)."""
+    at = scene.compute_closest_points(_tensor(points))["points"].numpy().astype(np.float64)
+    return np.linalg.norm(at - points, axis=1), at
+
+
+def _seen(log: SyntheticLog, points: Array, truth: o3d.t.geometry.RaycastingScene, poses: Array) -> NDArray[np.bool_]:
+    """Whether each point of the true surface (P, 3) is what some frame's measured depth shows."""
+    seen = np.zeros(len(points), np.bool_)
+    for frame, T in zip(log, poses, strict=False):
+        rows, measured, z = measured_depths(points, frame.depth, frame.camera, T)
+        seen[rows[np.abs(measured - z) < 0.02]] = True
+    return seen
+
+
+def _tensor(points: Array) -> o3d.core.Tensor:
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
+
+
+def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observations: int = 1) -> None:
+    """A mapped recording: clearance at random points in free space against the nearest of all raw depths.
+
+    Points are drawn along the rays of random pixels, before the measured depth. Writes ``NAME-field.jpg``: a slice
+    of the field beside the picture that it cuts.
+    """
+    folder = RunFolder(run)
+    name = str(folder.load_metrics()["log"]["name"])
+    log = open_log(str(folder.load_metrics()["log"]["uri"]))
+    poses = folder.load_poses()
+    field = GaussianCollisionField(GaussianModel.load(run / "map.ply"), min_observations=min_observations)
+    rng = np.random.default_rng(0)
+    clouds, free = [], []
+    each = -(-points // len(poses))
+    for index, T in sorted(poses.items()):
+        frame = log[index]
+        v, u = np.nonzero(np.isfinite(frame.depth) & (frame.depth > 0))
+        clouds.append(_lifted(frame.depth, u[::3], v[::3], frame.camera, T))
+        chosen = rng.integers(0, len(u), each)
+        surface = _lifted(frame.depth, u[chosen], v[chosen], frame.camera, T)
+        free.append(T[:3, 3] + rng.uniform(0.1, 0.95, (each, 1)) * (surface - T[:3, 3]))
+    cloud, queries = np.concatenate(clouds), np.concatenate(free)[:points]
+    raw = _nearest(cloud, queries)
+    error = np.abs(field.clearance(queries).distance - raw)
+    case = f"{name}, {len(queries)} points in free space"
+    results.add(case, "Gaussians", float(len(field)), "")
+    for share in (50, 90, 95):
+        results.add(case, f"clearance against raw depth, {share} %", 1e3 * float(np.percentile(error, share)), "mm")
+    _picture(field, log[min(poses)], poses[min(poses)], cloud, out / f"{name}-field.jpg")
+
+
+def _lifted(depth: NDArray[np.float32], u: NDArray[np.int64], v: NDArray[np.int64], camera: Camera, T: Array) -> Array:
+    z = depth[v, u].astype(np.float64)
+    return transform_points(T, np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1))
+
+
+def _nearest(cloud: Array, queries: Array) -> Array:
+    """Distance (P,) to the nearest of a cloud (N, 3)."""
+    search = o3d.core.nns.NearestNeighborSearch(_tensor(cloud))
+    search.knn_index()
+    _, squared = search.knn_search(_tensor(queries), 1)
+    return np.sqrt(squared.numpy()[:, 0].astype(np.float64))
+
+
+def _picture(field: GaussianCollisionField, frame: Frame, T: Array, cloud: Array, path: Path) -> None:
+    """The vertical plane through the middle of the first view: clearance, what was measured near it, and the view."""
+    valid = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
+    far = 1.5 * float(np.median(valid))
+    half = far * frame.camera.height / frame.camera.fy / 2
+    z, y = np.meshgrid(np.linspace(0.05, far, 360), np.linspace(-half, half, 240))
+    plane = transform_points(T, np.stack([np.zeros(z.size), y.ravel(), z.ravel()], axis=1))
+    distance = field.clearance(plane, cut=0.5).distance.reshape(z.shape)
+    local = transform_points(np.linalg.inv(T), cloud)
+    near = local[np.abs(local[:, 0]) < 0.004]
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), width_ratios=(1, 1.5))
+    axes[0].imshow(frame.rgb)
+    axes[0].axvline(frame.camera.cx, color="#d1495b")
+    axes[0].set_axis_off()
+    shown = axes[1].pcolormesh(z, y, np.minimum(distance, 0.3), cmap="viridis", vmin=-0.02, vmax=0.3, shading="auto")
+    axes[1].contour(
+        z, y, np.minimum(distance, 0.5), levels=[0.0, 0.05, 0.1], colors=["w", "0.8", "0.6"], linewidths=0.8
+    )
+    axes[1].plot(near[::5, 2], near[::5, 1], ",", color="#d1495b", alpha=0.5)
+    axes[1].set(xlim=(0.05, far), ylim=(half, -half), xlabel="forward [m]", ylabel="down [m]")
+    axes[1].set_aspect("equal")
+    figure.colorbar(shown, ax=axes[1], label="clearance [m]", shrink=0.8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
