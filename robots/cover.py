@@ -55,8 +55,8 @@ def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
     """Greedy: of the candidates on a grid inside, each as large as fits plus the slack, that which covers most is next.
 
     What no candidate covers is covered by balls of radius ``slack`` on the surface itself. Points of the surface stand
-    for a neighbourhood of a quarter of the slack (their spacing, and the cells that they are thinned by), by which every
-    ball is taken to be smaller.
+    for a neighbourhood of a quarter of the slack (their spacing and that of the cells they are thinned by), by which
+    every ball is taken to be smaller.
     """
     spacing = slack / 8
     left = _thinned(shape.surface(spacing), spacing / 2)

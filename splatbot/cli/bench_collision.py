@@ -25,7 +25,7 @@ def bench_collision(
     """Measure the collision field and an arm of spheres in it.
 
     Build, update, memory, questions a second; false free and false hit against exact truth, over n_sigma and over how
-    edges are checked; what floaters block; the map of a noisy log against its true shapes.
+    edges are checked; what floaters block.
 
     Examples:
         splatbot bench collision
@@ -38,7 +38,7 @@ def bench_collision(
         json: another place for the JSON file.
         peers: measure other ways to ask for collisions beside it (minutes).
         threads: how many threads to measure with.
-        run: a run folder of `splatbot map`, whose field is compared with its log's raw depth.
+        run: a run folder of splatbot map, whose field is compared with its log's raw depth.
         quick: tiny scenes, to see whether it runs.
     """
     from splatbot.errors import InputError

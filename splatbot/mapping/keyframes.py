@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -40,7 +40,7 @@ class Keyframe:
         depth: (H, W) float32 [m], 0 missing.
         T_world_camera: (4, 4).
         features: for matching later frames.
-        still: (H, W) bool, pixels that show nothing that moves, depth being 0 elsewhere; None: all.
+        still: (H, W) bool, pixels that show nothing that moves or is masked, depth being 0 elsewhere; None: all.
         reference: for aligning later frames; its depth is the model's once the keyframe has been fused.
     """
 
@@ -67,13 +67,15 @@ class Keyframe:
 def mapping_images(
     frame: Frame, config: MappingConfig, tracking: TrackingConfig
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.float32]]:
-    """Camera, colour and valid depth of a frame, halved until at most ``config.max_width`` wide."""
+    """Camera, colour and valid, unmasked depth of a frame, halved until at most ``config.max_width`` wide."""
     rgb = frame.rgb
     level = Level(
         np.zeros(frame.depth.shape, np.float32),
         valid_depth(frame.depth, tracking.min_depth, tracking.max_depth),
         frame.camera,
     )
+    if frame.mask is not None:
+        level = replace(level, depth=np.where(frame.mask, level.depth, np.float32(0)))
     while level.camera.width > config.max_width:
         level = halve(level)
         width, height = level.camera.width, level.camera.height
@@ -89,3 +91,11 @@ def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Placed]
         if moved < config.keyframe_translation and turned < config.keyframe_rotation:
             return False
     return True
+
+
+def resized(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The mask at another size (rows, columns): true where all that a pixel covers is."""
+    if mask.shape == shape:
+        return mask
+    share = cv2.resize(mask.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    return np.asarray(share > 0.999)

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, weigh
 from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
-from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images
+from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images, resized
 from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
 from splatbot.mapping.loop import View as LoopView
 from splatbot.mapping.memory import memory_of
@@ -218,7 +217,7 @@ class Mapper:
         view = view_of(self.model, levels[0].camera, keyframe.T_world_camera)
         depth = model_depth(view, levels[0].depth, self.config.mapping)
         if keyframe.still is not None:
-            depth = np.where(_resized(keyframe.still.numpy(), depth.shape), depth, np.float32(0))
+            depth = np.where(resized(keyframe.still.numpy(), depth.shape), depth, np.float32(0))
         n_pixels = self.config.tracking.n_pixels
         keyframe.reference = make_reference(with_depth(levels, depth), keyframe.T_world_camera, n_pixels)
 
@@ -239,6 +238,7 @@ class Mapper:
         self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features
     ) -> Keyframe:
         camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
+        mask = prepared.frame.mask
         return Keyframe(
             number=self.keyframes[-1].number + 1 if self.keyframes else 0,
             camera=camera,
@@ -247,6 +247,7 @@ class Mapper:
             T_world_camera=T_world_camera,
             features=features,
             reference=Reference(T_world_camera, ()),
+            still=None if mask is None else torch.from_numpy(resized(mask, depth.shape)),
         )
 
     def _weigh(self, depth: torch.Tensor, camera: Camera, T_world_camera: NDArray[np.float64]) -> None:
@@ -264,7 +265,7 @@ class Mapper:
             self._stamp,
         )
         if moving.any():
-            keyframe.still = ~moving
+            keyframe.still = ~moving if keyframe.still is None else keyframe.still & ~moving
             keyframe.depth = torch.where(moving, 0.0, keyframe.depth)
 
     def _add(self, keyframe: Keyframe, view: View) -> None:
@@ -289,10 +290,3 @@ class Mapper:
     def _select(self, index: torch.Tensor) -> None:
         self.model = self.model.select(index)
         self._refiner.adam.select(index)
-
-
-def _resized(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The mask at another size, by the nearest pixel."""
-    if mask.shape == shape:
-        return mask
-    return cv2.resize(mask.astype(np.uint8), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST) > 0

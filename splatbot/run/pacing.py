@@ -83,7 +83,9 @@ class PacedSource(FrameSource):
     def _superseded(reader: _Reader, clock: _Schedule) -> bool:
         """Whether a newer frame has arrived."""
         newer = reader.peek()
-        return newer is not None and clock.due(newer) <= time.perf_counter()
+        if newer is None or not isinstance(newer.frame, Frame):  # what cannot be read takes nobody's place
+            return False
+        return clock.due(newer) <= time.perf_counter()
 
 
 def read(log: Log, index: int) -> Arrival:

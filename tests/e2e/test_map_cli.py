@@ -18,7 +18,7 @@ from splatbot.trajectory import Trajectory
 from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot
 
 BAD = 6  # the frame that is damaged
-FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html"}
+FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "state"}
 
 
 def truncated_png(log: Path) -> None:

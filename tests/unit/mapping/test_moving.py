@@ -112,3 +112,13 @@ def test_a_hand_that_crosses_leaves_no_trace_in_the_map_and_tracking_goes_on() -
     ghost = (last.depth > 0) & (view.depth.numpy() < 0.85 * last.depth) & (view.alpha.numpy() > 0.5)
     solid = cv2.morphologyEx(ghost.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     assert not solid.any()  # edges of things are soft by a pixel, a hand is 20 pixels wide
+
+
+def test_what_a_frame_s_mask_leaves_out_is_not_mapped_nor_guessed() -> None:
+    mapper, wall = Mapper(small_config()), wall_frame(np.eye(4))
+    mask = np.ones((120, 160), dtype=np.bool_)
+    mask[40:80, 60:100] = False
+    show(mapper, replace(wall, mask=mask), 0.0, keyframe=True)
+    u, v = CAMERA.project(mapper.model.means.double().numpy()).T
+    assert len(mapper.model) > 1000
+    assert not ((u > 62) & (u < 98) & (v > 42) & (v < 78)).any()
