@@ -16,22 +16,9 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.collision.field import SCALE_FLOOR
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel, Snapshot
+from tests.unit.collision.oracle import gaussians as _model
 
 ERROR_BOUND = 1.5e-6  # of the class docstring: times L / least scale
-
-
-def _model(
-    means: object, scales: object, quats: object | None = None, opacities: object | None = None
-) -> GaussianModel:
-    m = np.atleast_2d(np.asarray(means, dtype=np.float64))
-    n = len(m)
-    return GaussianModel.from_activated(
-        means=m,
-        scales=np.broadcast_to(np.asarray(scales, dtype=np.float64), (n, 3)).copy(),
-        quats=np.tile([1.0, 0, 0, 0], (n, 1)) if quats is None else np.asarray(quats),
-        opacities=np.full(n, 0.9) if opacities is None else np.asarray(opacities),
-        colors=np.full((n, 3), 0.5),
-    )
 
 
 def _random(n: int, rng: np.random.Generator, least: float = 1e-3, extent: float = 1.0) -> GaussianModel:
