@@ -48,17 +48,11 @@ def bench_collision(
 
     from dataclasses import replace
 
-    from rich.console import Console
-
     from splatbot.bench.collision import CollisionPlan, run_collision
+    from splatbot.cli.bench_tables import say_progress
 
     folder = out if out is not None else Path("runs") / "bench-collision"
-    progress = Console(stderr=True)
-
-    def say(text: str) -> None:
-        progress.print(f"[dim]{text} ...[/dim]", highlight=False)
-
-    plan = CollisionPlan.quick_plan(say=say) if quick else CollisionPlan(say=say)
+    plan = CollisionPlan.quick_plan(say=say_progress) if quick else CollisionPlan(say=say_progress)
     results = run_collision(replace(plan, thread_counts=tuple(threads), peers=peers, run=run), folder)
     if json is not None:
         results.write_json(json)
@@ -70,13 +64,12 @@ def _print(results: Results, folder: Path) -> None:
     """A table of speed with a column per case, one of errors with a line per case, and the peers."""
     from rich.table import Table
 
-    from splatbot.cli.bench_tables import wide_console
+    from splatbot.cli.bench_tables import warn_if_busy, wide_console
 
     console = wide_console()
     machine = results.machine
     console.print(f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}")
-    if machine["load_1min"] is not None and machine["load_1min"] > 0.5:
-        console.print(f"[yellow]the machine was busy (load {machine['load_1min']}): times are upper bounds[/yellow]")
+    warn_if_busy(console, machine)
     own = [row for row in results.rows if row.peer is None]
     console.print(_by_metric("Speed and memory", [row for row in own if " Gaussians, " in row.case]))
     for title, prefix in (

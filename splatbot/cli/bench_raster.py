@@ -52,17 +52,11 @@ def bench_raster(
 
     from dataclasses import replace
 
-    from rich.console import Console
-
     from splatbot.bench.raster import RasterPlan, run_raster
+    from splatbot.cli.bench_tables import say_progress
 
     folder = out if out is not None else Path("runs") / "bench-raster"
-    progress = Console(stderr=True)
-
-    def say(text: str) -> None:
-        progress.print(f"[dim]{text} ...[/dim]", highlight=False)
-
-    plan = RasterPlan.quick_plan(say=say) if quick else RasterPlan(say=say)
+    plan = RasterPlan.quick_plan(say=say_progress) if quick else RasterPlan(say=say_progress)
     results = run_raster(
         replace(plan, thread_counts=tuple(threads), peers=peers, splat=splat, variants=variants), folder
     )
@@ -73,7 +67,7 @@ def bench_raster(
 
 
 def _print(results: Results, folder: Path) -> None:
-    from splatbot.cli.bench_tables import figure_table, figure_text, wide_console
+    from splatbot.cli.bench_tables import figure_table, figure_text, warn_if_busy, wide_console
 
     console = wide_console()
     machine = results.machine
@@ -81,8 +75,7 @@ def _print(results: Results, folder: Path) -> None:
         f"{gflops:.0f} GFLOP/s on {n}" for n, gflops in machine["fma_peak_gflops"][machine["isa"]].items()
     )
     console.print(f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}, peak {peaks} threads")
-    if machine["load_1min"] is not None and machine["load_1min"] > 0.5:
-        console.print(f"[yellow]the machine was busy (load {machine['load_1min']}): times are upper bounds[/yellow]")
+    warn_if_busy(console, machine)
     prefixes = ("effect", "sweep", "growth")
     own = [r for r in results.rows if r.peer is None and not r.case.startswith(prefixes)]
     console.print(figure_table("Milliseconds, least (median)", own, (*_TIMES, "state memory", "peak memory", *_SHARES)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -16,6 +17,18 @@ _FILE_WIDTH = 160  # [characters] where there is no terminal to ask
 def wide_console() -> Console:
     """Stdout, as wide as the terminal, or 160 characters in a file."""
     return Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
+
+
+def say_progress(text: str) -> None:
+    """What is being measured, on stderr."""
+    Console(stderr=True).print(f"[dim]{text} ...[/dim]", highlight=False)
+
+
+def warn_if_busy(console: Console, machine: Mapping[str, Any]) -> None:
+    """Other programs took time: say what that makes of the figures."""
+    load = machine["load_1min"]
+    if load is not None and load > 0.5:
+        console.print(f"[yellow]the machine was busy (load {load}): times are upper bounds[/yellow]")
 
 
 def figure_table(title: str, rows: Iterable[Row], metrics: Sequence[str]) -> Table:

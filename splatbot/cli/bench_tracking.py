@@ -60,13 +60,11 @@ def bench_tracking(
     if not budgets or min(budgets) <= 0:
         raise InputError(f"is {budgets}.", field="--budgets", hint="give milliseconds, as in 30 100")
 
-    from rich.console import Console
-
     from splatbot.bench.tracking import TrackingPlan, run_tracking
+    from splatbot.cli.bench_tables import say_progress
     from splatbot.config import load_config
     from splatbot.logs import open_log
 
-    progress = Console(stderr=True)
     folder = out if out is not None else Path("runs") / "bench-tracking"
     plan = TrackingPlan(
         budgets=budgets,
@@ -74,7 +72,7 @@ def bench_tracking(
         max_frames=max_frames,
         config=load_config(config),
         stress=stress,
-        say=lambda text: progress.print(f"[dim]{text} ...[/dim]", highlight=False),
+        say=say_progress,
     )
     results = run_tracking([open_log(log, camera=camera) for log in logs], plan, folder)
     if json is not None:
@@ -89,13 +87,12 @@ def _print(results: Results, folder: Path) -> None:
     from splatbot.bench.stress import AFTER, DEGRADED, RECOVERY, SILENT, STRESS, VIEWS, WORST
     from splatbot.bench.stress import LOST as STRESS_LOST
     from splatbot.bench.tracking import ATE, FRAME_MS, LOST, PERCENTILES, RESIDENT, RPE, RPE_ROT, TRACKED
-    from splatbot.cli.bench_tables import figure_table, wide_console
+    from splatbot.cli.bench_tables import figure_table, warn_if_busy, wide_console
 
     console = wide_console()
     machine = results.machine
     console.print(f"{machine['cpu']}, {machine['cpus']} CPUs")
-    if machine["load_1min"] is not None and machine["load_1min"] > 0.5:
-        console.print(f"[yellow]the machine was busy (load {machine['load_1min']}): times are upper bounds[/yellow]")
+    warn_if_busy(console, machine)
     metrics = (ATE, RPE, RPE_ROT, TRACKED, LOST, *(f"p{p}" for p in PERCENTILES), FRAME_MS, RESIDENT)
     hard = results.select(STRESS)
     if not hard or len(results.rows) > len(hard):
