@@ -125,7 +125,7 @@ SB_INLINE void write(const ProjectArgs& args, std::size_t first, int n, M keep, 
   float* records = whole ? &args.records[first].mx : tail;
   store_group(records, 16, 0, {w.record[0], w.record[1], w.record[2], w.record[3]});
   store_group(records, 16, 1, {w.record[4], w.record[5], w.record[6], w.record[7]});
-  const bool few = args.n_passes == 1 && (args.sh_degree >= 0 || args.channels == 3 || args.passes[0].count == 1);
+  const bool few = args.n_passes == 1 && (args.sh_degree >= 0 || args.channels == 3 || (args.passes[0].depth_first && args.passes[0].count == 1));
   if (few) {
     F channels[8];
     few_channels(args, w, first, n, channels);
