@@ -14,10 +14,12 @@ from splatbot.planning.problem import (
     PoseGoal,
     StartError,
 )
+from splatbot.planning.rrt_star import GaussianRRTStar
 
 __all__ = [
     "Cause",
     "Certificate",
+    "GaussianRRTStar",
     "Goal",
     "GoalError",
     "JointGoal",

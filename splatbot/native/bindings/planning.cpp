@@ -5,11 +5,14 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
 
+#include <algorithm>
 #include <stdexcept>
 
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "splatbot/planning/arm_space.hpp"
+#include "splatbot/planning/clearance.hpp"
+#include "splatbot/planning/ik.hpp"
 
 using namespace nb::literals;
 
@@ -24,6 +27,8 @@ using splatbot::planning::PlanLimits;
 using splatbot::planning::Planner;
 using splatbot::planning::Tree;
 using Numbers = Array<const double, nb::shape<-1>>;
+using Target = Array<const double, nb::shape<3, 4>>;
+using Targets = Array<const double, nb::shape<-1, 3, 4>>;
 using Configurations = Array<const double, nb::shape<-1, -1>>;
 
 // A planner and how many joints it plans for.
@@ -78,6 +83,42 @@ class ArmPlanner {
 }  // namespace
 
 void define_planning(nb::module_& m) {
+  m.def(
+      "inverse_kinematics",
+      [](const Arm& arm, Targets targets, Target tool, Numbers lower, Numbers upper, Configurations starts, int most) {
+        const auto joints = static_cast<std::size_t>(arm.joints());
+        const std::size_t n = targets.shape(0);
+        if (starts.shape(0) != n || starts.shape(1) != joints || lower.shape(0) != joints || upper.shape(0) != joints) {
+          throw nb::value_error("targets, starts and limits do not fit");
+        }
+        std::vector<double> q(starts.data(), starts.data() + starts.size()), miss(2 * n);
+        {
+          const nb::gil_scoped_release release;
+          for (std::size_t i = 0; i < n; ++i) {
+            splatbot::planning::IkGoal goal;
+            std::copy_n(targets.data() + 12 * i, 12, goal.target);
+            std::copy_n(tool.data(), 12, goal.tool);
+            const auto left = splatbot::planning::solve_ik(arm, goal, span_of(lower), span_of(upper), most,
+                                                           std::span(q).subspan(joints * i, joints));
+            miss[2 * i] = left.position;
+            miss[2 * i + 1] = left.angle;
+          }
+        }
+        return nb::make_tuple(owned(std::move(q), {n, joints}), owned(std::move(miss), {n, 2}));
+      },
+      "arm"_a, "targets"_a.noconvert(), "tool"_a.noconvert(), "lower"_a.noconvert(), "upper"_a.noconvert(),
+      "starts"_a.noconvert(), "most"_a, "Joint values (N, J) and what they miss the targets (N, 3, 4) by (N, 2) [m, rad]");
+  m.def(
+      "path_clearance",
+      [](const Arm& arm, const CollisionField& field, Configurations path, double cut, int most) {
+        if (path.shape(1) != static_cast<std::size_t>(arm.joints()) || path.shape(0) < 2) {
+          throw nb::value_error("the path has another number of joints, or is no path");
+        }
+        const nb::gil_scoped_release release;
+        return splatbot::planning::path_clearance(arm, field, span_of(path), cut, most).least;
+      },
+      "arm"_a, "field"_a, "path"_a.noconvert(), "cut"_a, "most"_a,
+      "A lower bound [m] of the room along a path (N, J), from at most so many configurations");
   nb::class_<ArmPlanner>(m, "ArmPlanner", "RRT* for an arm in a field; one run at a time")
       .def(
           "__init__",

@@ -57,6 +57,9 @@ PlanEnd Planner::run(std::span<const double> start, std::span<const double> goal
 }
 
 void Planner::shorten(const Configuration& path, int attempts, const Stop& stop) {
+  if (path.size() < 3 * space_->size()) {
+    return;  // a straight line
+  }
   Shortcut shortcut(*space_, path);
   shortcut.leave_out();
   int idle = 0;
