@@ -137,7 +137,7 @@ def _solve(arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Arr
     """Joint values (S, J) for the pose moved by offsets (S, 6) = (translation, rotation vector), and what they miss."""
     targets = np.tile(T, (len(starts), 1, 1))
     targets[:, :3, 3] += offsets[:, :3] @ T[:3, :3].T
-    targets[:, :3, :3] = T[:3, :3] @ so3_exp(offsets[:, 3:])
+    targets[:, :3, :3] = T[:3, :3] @ np.stack([so3_exp(turn) for turn in offsets[:, 3:]])
     chain = arm.robot.chain
     q, miss = inverse_kinematics(
         arm.native,

@@ -110,15 +110,15 @@ void define_planning(nb::module_& m) {
       "starts"_a.noconvert(), "most"_a, "Joint values (N, J) and what they miss the targets (N, 3, 4) by (N, 2) [m, rad]");
   m.def(
       "path_clearance",
-      [](const Arm& arm, const CollisionField& field, Configurations path, double cut, int most) {
+      [](const Arm& arm, const CollisionField& field, Configurations path, double cut, int rounds) {
         if (path.shape(1) != static_cast<std::size_t>(arm.joints()) || path.shape(0) < 2) {
           throw nb::value_error("the path has another number of joints, or is no path");
         }
         const nb::gil_scoped_release release;
-        return splatbot::planning::path_clearance(arm, field, span_of(path), cut, most).least;
+        return splatbot::planning::path_clearance(arm, field, span_of(path), cut, rounds);
       },
-      "arm"_a, "field"_a, "path"_a.noconvert(), "cut"_a, "most"_a,
-      "A lower bound [m] of the room along a path (N, J), from at most so many configurations");
+      "arm"_a, "field"_a, "path"_a.noconvert(), "cut"_a, "rounds"_a,
+      "A lower bound [m] of the room along a path (N, J)");
   nb::class_<ArmPlanner>(m, "ArmPlanner", "RRT* for an arm in a field; one run at a time")
       .def(
           "__init__",

@@ -3,71 +3,73 @@
 
 #include <algorithm>
 #include <cmath>
-#include <queue>
+#include <limits>
 #include <vector>
+
+#include "splatbot/kernels.hpp"
 
 namespace splatbot::planning {
 
 namespace {
 
-constexpr double kClose = 0.1;    // relative difference of the bounds to be content with
-constexpr double kFinest = 5e-4;  // [m] and absolute
+constexpr std::size_t kLooks = 8;  // configurations of each edge, for an upper bound
+constexpr float kEps = 2e-4F;      // [m]
 
-struct Stretch {
-  double bound, middle, half, moves;  // `moves`: farthest that any sphere goes along the whole edge [m]
-  std::size_t edge;
-};
-
-struct Wider {
-  bool operator()(const Stretch& a, const Stretch& b) const { return a.bound > b.bound; }
-};
+// The least room of configurations along the path.
+double least_seen(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut) {
+  const auto joints = static_cast<std::size_t>(arm.joints());
+  const std::size_t edges = path.size() / joints - 1;
+  std::vector<double> q;
+  for (std::size_t e = 0; e < edges; ++e) {
+    for (std::size_t i = 0; i <= kLooks; ++i) {
+      for (std::size_t j = 0; j < joints; ++j) {
+        const double a = path[e * joints + j], b = path[(e + 1) * joints + j];
+        q.push_back(a + static_cast<double>(i) / kLooks * (b - a));
+      }
+    }
+  }
+  std::vector<ArmClearance> rooms(q.size() / joints);
+  arm.clearance(field, q, cut, rooms);
+  double least = cut;
+  for (const ArmClearance& room : rooms) {
+    least = std::min(least, room.distance);
+  }
+  return least;
+}
 
 }  // namespace
 
-PathClearance path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int most) {
+double path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int rounds) {
   const auto joints = static_cast<std::size_t>(arm.joints());
-  const ArmView& view = arm.view();
-  std::vector<double> q(joints);
-  PathClearance answer{cut, cut, 0};
-  std::priority_queue<Stretch, std::vector<Stretch>, Wider> open;
-  const auto ask = [&](Stretch s) {
-    for (std::size_t j = 0; j < joints; ++j) {
-      const double a = path[s.edge * joints + j], b = path[(s.edge + 1) * joints + j];
-      q[j] = a + s.middle * (b - a);
+  const std::size_t edges = path.size() / joints - 1;
+  const auto spheres = static_cast<std::size_t>(arm.spheres());
+  ArmView larger = arm.view();
+  std::vector<float> radius(spheres);
+  larger.radius = radius.data();
+  larger.pairs = 0;
+  const auto certified = [&](double margin) {
+    for (std::size_t s = 0; s < spheres; ++s) {
+      radius[s] = std::nextafter(arm.view().radius[s] + static_cast<float>(margin), std::numeric_limits<float>::infinity());
     }
-    ArmClearance room;
-    const double reach = std::min(cut + s.half * s.moves, 2.0 * cut);
-    arm.clearance(field, q, reach, {&room, 1});
-    ++answer.asked;
-    const double here = std::min(room.distance, reach);
-    answer.found = std::min(answer.found, here);
-    s.bound = here - s.half * s.moves - 2.0 * kArmRounding;
-    open.push(s);
-  };
-  for (std::size_t e = 0; e + 1 < path.size() / joints; ++e) {
-    double moves = 0.0;
-    for (int i = view.first_sphere; i < view.spheres; ++i) {
-      double sum = 0.0;
-      for (std::size_t j = 0; j < joints; ++j) {
-        sum += std::abs(path[(e + 1) * joints + j] - path[e * joints + j]) *
-               static_cast<double>(view.reach[static_cast<std::size_t>(i) * joints + j]);
+    for (std::size_t e = 0; e < edges; ++e) {
+      ArmEdge edge;
+      const double* from = path.data() + e * joints;
+      kernels().arm->certify(larger, &field.view(), from, from + joints, kEps, 0, 1, &edge);
+      if (edge.verdict != kArmFree) {
+        return false;
       }
-      moves = std::max(moves, sum);
     }
-    ask({0.0, 0.5, 0.5, moves, e});
+    return true;
+  };
+  double low = 0.0, high = least_seen(arm, field, path, cut);
+  if (high >= cut && certified(cut)) {
+    return cut;
   }
-  while (!open.empty()) {
-    const Stretch s = open.top();
-    answer.least = std::min(cut, s.bound);
-    if (s.bound >= answer.found - std::max(kFinest, kClose * answer.found) || answer.asked + 2 > most) {
-      break;
-    }
-    open.pop();
-    for (const double side : {-0.5, 0.5}) {
-      ask({0.0, s.middle + side * s.half, 0.5 * s.half, s.moves, s.edge});
-    }
+  for (int i = 0; i < rounds && high > 0.0; ++i) {
+    const double middle = 0.5 * (low + high);
+    (certified(middle) ? low : high) = middle;
   }
-  return answer;
+  return low;
 }
 
 }  // namespace splatbot::planning

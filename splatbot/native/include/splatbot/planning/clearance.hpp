@@ -8,15 +8,8 @@
 
 namespace splatbot::planning {
 
-struct PathClearance {
-  double least;  // [m] a proven lower bound of the room along the path
-  double found;  // [m] the least room of the configurations looked at: an upper bound
-  int asked;     // configurations looked at
-};
-
-// Branch and bound over the stretches of a path (N, joints): room at a stretch's middle less what any sphere moves from
-// there to its ends, halved where that is least, until both bounds are within a tenth of each other or `most`
-// configurations were asked. Room beyond `cut` [m] is not told apart.
-PathClearance path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int most);
+// A proven lower bound [m] of the room to the map along a path (N, joints), at most `cut`; 0 if there is none. Found by
+// certifying the path for an arm with larger spheres, larger by what halving an interval suggests `rounds` times.
+double path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int rounds);
 
 }  // namespace splatbot::planning
