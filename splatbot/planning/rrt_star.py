@@ -19,7 +19,7 @@ from splatbot.protocols import Array, RobotKinematics
 CLEARANCE_CUT = 0.1  # [m]; more room than this is not told apart
 _CLEARANCE_ROUNDS = 6  # of halving: clearance to 2 %
 _RESERVE = 7e-4  # [s] of the budget kept for the certificate
-_FINEST = 2e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
+_FINEST = 4e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
 _ENDS = (None, PlanStatus.PLANNING_FAILED, PlanStatus.TIMED_OUT, PlanStatus.PREEMPTED)
 
 
@@ -43,7 +43,7 @@ class GaussianRRTStar:
         eps: room [m] below which an edge is not certified.
 
     Raises:
-        InputError: as :class:`splatbot.collision.RobotSpheres`; eps is not above 2e-5 m.
+        InputError: as :class:`splatbot.collision.RobotSpheres`; eps is not above 4e-5 m.
     """
 
     def __init__(
@@ -135,14 +135,12 @@ class GaussianRRTStar:
 
     def certificate(self, waypoints: Array) -> Certificate:
         """What can be promised of a path (N, J): whether all its edges are free, and the room along it."""
-        edges = self.arm.certify(self.field, waypoints[:-1], waypoints[1:], eps=self._eps)
-        certified = not edges.in_collision.any()
-        room = (
-            path_clearance(self.arm.native, self.field.native, waypoints, CLEARANCE_CUT, _CLEARANCE_ROUNDS)
-            if certified
-            else 0.0
-        )
-        return Certificate(certified, self._eps, max(0.0, room), self.margin, self.field.map_version)
+        # The trees' edges were checked in the direction they grew; rounding may make a difference to the other one.
+        for eps in (self._eps, self._eps / 4):
+            if not self.arm.certify(self.field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
+                room = path_clearance(self.arm.native, self.field.native, waypoints, CLEARANCE_CUT, _CLEARANCE_ROUNDS)
+                return Certificate(True, eps, room, self.margin, self.field.map_version)
+        return Certificate(False, self._eps, 0.0, self.margin, self.field.map_version)
 
     def _planner(self, eps: float) -> ArmPlanner:
         chain = self.robot.chain
@@ -187,6 +185,8 @@ class GaussianRRTStar:
             waypoints = np.repeat(waypoints, 2, axis=0)
         history[:, 0] += before
         path = Path(waypoints, float(cost), self.certificate(waypoints))
+        if not path.certificate.certified:
+            return self._failure(PlanStatus.PLANNING_FAILED, None, "the path found is not certified.", begin)
         return self._answer(PlanStatus.SUCCESS, path, history, None, "", begin)
 
     def _failure(self, status: PlanStatus, cause: Cause | None, reason: str, begin: float) -> PlanResult:

@@ -49,12 +49,15 @@ class Planner {
   std::uint64_t edges() const noexcept { return space_->edges() - edges_before_; }
 
  private:
-  void publish(double seconds);
+  PlanEnd search(const PlanLimits& limits, const Stop& stop);
+  void improve(const PlanLimits& limits, const Stop& stop);
   void shorten(const Configuration& path, int attempts, const Stop& stop);
-  void improve(std::span<const double> start, const PlanLimits& limits, const Stop& stop);
-  bool local(double* q);
+  bool near_best(double* q);
+  void publish(double seconds);
+  void forget_best();
 
   std::shared_ptr<Space> space_;
+  Configuration start_;
   std::unique_ptr<Sampler> sampler_;
   std::unique_ptr<Star> star_;
   std::unique_ptr<Connect> connect_;
