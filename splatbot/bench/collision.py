@@ -13,7 +13,8 @@ import open3d as o3d
 import torch
 from numpy.typing import NDArray
 
-from splatbot.bench.collision_maps import audit_mapped_log, audit_run
+from splatbot.bench.collision_mapped import audit_mapped_log
+from splatbot.bench.collision_maps import audit_run
 from splatbot.bench.collision_peers import mesh_of, run_brute_force, run_mesh_peers
 from splatbot.bench.collision_plots import plot_accuracy
 from splatbot.bench.machine import describe_machine
@@ -101,12 +102,14 @@ def run_collision(plan: CollisionPlan, out: Path) -> Results:
         ("errors against exact truth", lambda: run_errors(plan, results, scene, arm)),
         ("floaters", lambda: run_floaters(plan, results, scene, arm)),
     ]
-    frames, width, spheres = (3, 80, 200) if plan.quick else (30, 320, 20_000)
+    frames, width, count = (3, 80, 200) if plan.quick else (30, 320, 50_000)
     sigmas = (2.0,) if plan.quick else (1.0, 1.5, 2.0, 3.0)
     parts.append(
         (
             "a map of a noisy log",
-            lambda: audit_mapped_log(results, frames=frames, width=width, spheres=spheres, n_sigmas=sigmas),
+            lambda: audit_mapped_log(
+                results, frames=frames, width=width, spheres=count, configurations=count, n_sigmas=sigmas
+            ),
         )
     )
     if plan.run is not None:
