@@ -42,6 +42,7 @@ class Arm {
 
   int joints() const noexcept { return view_.joints; }
   int spheres() const noexcept { return view_.spheres; }
+  const ArmView& view() const noexcept { return view_; }
 
   // Poses T_world_link (C, J + 1, 4, 4) and centres (C, S, 3) of configurations (C, J), in float64.
   void forward(std::span<const double> q, std::span<double> poses) const;
