@@ -22,6 +22,7 @@ struct ArmSpec {
   std::span<const std::int32_t> pairs;      // (M, 2) links that may not touch
   std::span<const double> base;             // (3, 4) T_world_base
   bool base_in_map;                         // whether the base's spheres are tested against the map
+  double margin = 0.0;                      // [m] added to every radius against the map, not against the arm itself
 };
 
 // Clearance of one configuration [m] and where it is least.
