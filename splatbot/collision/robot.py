@@ -192,10 +192,10 @@ class RobotSpheres:
         Raises:
             InputError: as :meth:`certify`, or the fields differ in n_sigma.
         """
-        return self._without_pairs.certify(now.added_since(before), start, end, eps=eps)
+        return self.without_pairs.certify(now.added_since(before), start, end, eps=eps)
 
     @cached_property
-    def _without_pairs(self) -> RobotSpheres:
+    def without_pairs(self) -> RobotSpheres:
         """The same arm, which may touch itself."""
         return RobotSpheres(
             _Unpaired(self), T_world_base=self.T_world_base, base_in_map=self.base_in_map, margin=self.margin

@@ -14,6 +14,7 @@ from splatbot.planning.problem import (
     PoseGoal,
     StartError,
 )
+from splatbot.planning.replan import Replanner, Update
 from splatbot.planning.rrt_star import GaussianRRTStar
 
 __all__ = [
@@ -29,5 +30,7 @@ __all__ = [
     "PlanningError",
     "PlanningProblem",
     "PoseGoal",
+    "Replanner",
     "StartError",
+    "Update",
 ]

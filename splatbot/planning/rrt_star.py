@@ -27,10 +27,10 @@ class GaussianRRTStar:
     """Plans an arm's way among the Gaussians of one state of a map.
 
     Every edge of its trees is certified all along, against the map and against the arm itself
-    (:meth:`splatbot.collision.RobotSpheres.certify`), so that a path is certified when it is found. The first comes from
-    RRT-Connect; both of its trees then become one, which RRT* (Karaman and Frazzoli, IJRR 2011) rewires with samples
-    from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path and by
-    RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
+    (:meth:`splatbot.collision.RobotSpheres.certify`), so that a path is certified when it is found. The first path is
+    that of RRT-Connect; both of its trees then become one, which RRT* (Karaman and Frazzoli, IJRR 2011) rewires with
+    samples from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path
+    and by RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
 
     Args:
         field: the map.
@@ -71,6 +71,7 @@ class GaussianRRTStar:
         )
         self._eps = eps  # of the problem at hand
         self._native = self._planner(eps)
+        self._goals: Array | None = None  # of the last search
 
     def plan(
         self,
@@ -88,7 +89,7 @@ class GaussianRRTStar:
             goal: see :mod:`splatbot.planning.problem`; an array (J,) or (K, J) is a set of configurations.
             budget_ms: that the whole call may take, inverse kinematics and certificate included.
             seed: of the samples.
-            iterations: of the trees' growth; where they, not the time, end the search, the same call gives the same path.
+            iterations: of the trees' growth; where they, not the time, end the search, equal calls give equal paths.
 
         Returns:
             A path with its certificate, or the reason why there is none. The time being up is no failure once there is
@@ -109,10 +110,58 @@ class GaussianRRTStar:
         if not len(goals.q):
             return self._failure(goals.status, goals.cause, goals.reason, begin)
         self._prepare(np.concatenate([q[None], goals.q]))
+        self._goals = goals.q
         left = max(1e-4, 1e-3 * budget_ms - (time.perf_counter() - begin) - _RESERVE)
         before = time.perf_counter() - begin
         end = self._native.run(q, goals.q, left, 2**62 if iterations is None else iterations, seed, 0.0)
         return self._result(end, q, goals.q, before, begin)
+
+    def plan_again(
+        self,
+        field: GaussianCollisionField,
+        before: GaussianCollisionField,
+        start: ArrayLike,
+        *,
+        budget_ms: float = 10.0,
+        seed: int = 0,
+    ) -> PlanResult:
+        """Plans to the goals of the last :meth:`plan` with its old tree on a later field, which is this planner's then.
+
+        Args:
+            field: of the later map.
+            before: the field that the tree stands on: only what ``field`` has beyond it is asked of the tree's edges.
+            start: (J,) on the last path, or anywhere: then the tree begins anew.
+            budget_ms: that the call may take.
+            seed: of the samples.
+
+        Raises:
+            StartError: the start is of another shape or not finite.
+            InputError: nothing was planned before, the fields differ in n_sigma, or budget_ms is not above 0.
+        """
+        begin = time.perf_counter()
+        _check_budget(budget_ms, None)
+        if self._goals is None:
+            raise InputError("was not called before.", field="plan", hint="plan first")
+        self.field = field
+        q = self._start(start)
+        failed = self._bad_start(q, begin)
+        if failed is not None:
+            return failed
+        goals = goal_configurations(self.arm, field, self._goals, near=q, seed=seed, until=begin)
+        if not len(goals.q):
+            return self._failure(goals.status, goals.cause, goals.reason, begin)
+        added = field.added_since(before)
+        left = max(1e-4, 1e-3 * budget_ms - (time.perf_counter() - begin) - _RESERVE)
+        spent = time.perf_counter() - begin
+        end = self._native.rerun(q, field.native, added.native, self.arm.without_pairs.native, left, 2**62, seed)
+        return self._result(end, q, goals.q, spent, begin)
+
+    def room_to(self, field: GaussianCollisionField, waypoints: Array, cut: float, eps: float) -> float | None:
+        """Room [m] along a path (N, J) to a field alone, the arm itself left out, up to ``cut``; None: not free."""
+        arm = self.arm.without_pairs
+        if arm.certify(field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
+            return None
+        return float(path_clearance(arm.native, field.native, waypoints, max(cut, eps), _CLEARANCE_ROUNDS))
 
     def cancel(self) -> None:
         """Ends the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""

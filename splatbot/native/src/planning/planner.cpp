@@ -45,14 +45,50 @@ void Planner::publish(double seconds) {
 PlanEnd Planner::run(std::span<const double> start, std::span<const double> goals, const PlanLimits& limits) {
   const Stop stop(limits.seconds, &cancelled_);
   random_ = Random(limits.seed);
+  goals_.assign(goals.begin(), goals.end());
+  begin(start);
+  forget_best();
+  return search(limits, stop);
+}
+
+// A tree of the start alone.
+void Planner::begin(std::span<const double> start) {
   start_.assign(start.begin(), start.end());
-  sampler_ = std::make_unique<Sampler>(*space_, start, goals);
-  star_ = std::make_unique<Star>(*space_, *sampler_, start, kStarRange);
+  sampler_ = std::make_unique<Sampler>(*space_, start_, goals_);
+  star_ = std::make_unique<Star>(*space_, *sampler_, start_, kStarRange);
   connect_ = std::make_unique<Connect>(*space_, *sampler_, kConnectRange);
   edges_before_ = space_->edges();
   iterations_ = 0;
+}
+
+PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLimits& limits) {
+  const Stop stop(limits.seconds, &cancelled_);
+  random_ = Random(limits.seed);
+  Configuration orphans;
+  star_->cut(added, stop, orphans);
+  edges_before_ = space_->edges();
+  iterations_ = 0;
   forget_best();
+  if (star_->start_from(start.data())) {
+    start_.assign(start.begin(), start.end());
+    *sampler_ = Sampler(*space_, start_, goals_);
+  } else {
+    begin(start);
+  }
+  if (std::isfinite(star_->best())) {
+    publish(stop.elapsed());
+  }
+  join(orphans, stop);
   return search(limits, stop);
+}
+
+// Configurations that were in the tree: what still can be reached of them.
+void Planner::join(const Configuration& orphans, const Stop& stop) {
+  for (std::size_t i = 0; i < orphans.size() && !stop.now(); i += space_->size()) {
+    if (star_->grow(orphans.data() + i, stop)) {
+      publish(stop.elapsed());
+    }
+  }
 }
 
 // Until there is a path, and then until time is up.
