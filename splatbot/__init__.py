@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from splatbot.frame import Frame
     from splatbot.gaussians import GaussianModel
     from splatbot.logs import open_log
+    from splatbot.planning import GaussianRRTStar
     from splatbot.rasterize import rasterization, rasterization_2dgs
     from splatbot.slam import Slam
 
@@ -23,6 +24,7 @@ _HOME = {
     "Frame": "splatbot.frame",
     "GaussianModel": "splatbot.gaussians",
     "GaussianCollisionField": "splatbot.collision",
+    "GaussianRRTStar": "splatbot.planning",
     "Slam": "splatbot.slam",
     "SplatbotError": "splatbot.errors",
     "load_config": "splatbot.config",
@@ -36,6 +38,7 @@ __all__ = [
     "Frame",
     "GaussianCollisionField",
     "GaussianModel",
+    "GaussianRRTStar",
     "Slam",
     "SplatbotError",
     "load_config",

@@ -13,7 +13,8 @@ import open3d as o3d
 import torch
 from numpy.typing import NDArray
 
-from splatbot.bench.collision_maps import audit_mapped_log, audit_run
+from splatbot.bench.collision_mapped import audit_mapped_log
+from splatbot.bench.collision_maps import audit_run
 from splatbot.bench.collision_peers import mesh_of, run_brute_force, run_mesh_peers
 from splatbot.bench.collision_plots import plot_accuracy
 from splatbot.bench.machine import describe_machine
@@ -94,17 +95,21 @@ def run_collision(plan: CollisionPlan, out: Path) -> Results:
             plan.say(case)
             with threads(n):
                 run_speed(plan, results, case, model, arm, q)
+                if count == plan.reference:
+                    run_speed(plan, results, f"{case}, packed", model, arm, q, packed=True)
         results.write_json(out / "collision.json")
     parts: list[tuple[str, Callable[[], None]]] = [
         ("errors against exact truth", lambda: run_errors(plan, results, scene, arm)),
         ("floaters", lambda: run_floaters(plan, results, scene, arm)),
     ]
-    frames, width, spheres = (3, 80, 200) if plan.quick else (30, 320, 20_000)
+    frames, width, count = (3, 80, 200) if plan.quick else (30, 320, 50_000)
     sigmas = (2.0,) if plan.quick else (1.0, 1.5, 2.0, 3.0)
     parts.append(
         (
             "a map of a noisy log",
-            lambda: audit_mapped_log(results, frames=frames, width=width, spheres=spheres, n_sigmas=sigmas),
+            lambda: audit_mapped_log(
+                results, frames=frames, width=width, spheres=count, configurations=count, n_sigmas=sigmas
+            ),
         )
     )
     if plan.run is not None:
@@ -123,12 +128,19 @@ def run_collision(plan: CollisionPlan, out: Path) -> Results:
 
 
 def run_speed(
-    plan: CollisionPlan, results: Results, case: str, model: GaussianModel, arm: RobotSpheres, q: Array
+    plan: CollisionPlan,
+    results: Results,
+    case: str,
+    model: GaussianModel,
+    arm: RobotSpheres,
+    q: Array,
+    *,
+    packed: bool = False,
 ) -> None:
     """Build, update, memory, and questions a second."""
     rng = np.random.default_rng(1)
-    results.add_time(case, "build", measure(lambda: GaussianCollisionField(model), runs=plan.runs))
-    field = GaussianCollisionField(model)
+    results.add_time(case, "build", measure(lambda: GaussianCollisionField(model, packed=packed), runs=plan.runs))
+    field = GaussianCollisionField(model, packed=packed)
     results.add(case, "memory", field.nbytes / 1e6, "MB")
     later, changed = _keyframe(model, rng)
     results.add_time(
@@ -180,7 +192,7 @@ def run_errors(plan: CollisionPlan, results: Results, scene: Tabletop, arm: Robo
     truth = Truth(scene, plan.truth_step)
     q = apart_from_itself(arm, panda().random(int(1.6 * plan.audited), rng))[: plan.audited]
     rooms = truth.rooms(arm, q)
-    few = slice(0, max(1, len(q) // 5))
+    few = slice(None, max(1, len(q) // 5))
     for count in plan.counts:
         model = scene.gaussians(count)
         for n_sigma in (0.5, 1.0, 1.5, 2.0, 3.0) if count == plan.reference else (2.0,):
@@ -191,7 +203,15 @@ def run_errors(plan: CollisionPlan, results: Results, scene: Tabletop, arm: Robo
             spent = _seconds(arm.check, field, q[part])
             add_audit(results, case, audit(field, arm, q[part], rooms[part]))
             results.add(case, "a configuration", 1e6 * spent / len(q[part]), "us")
-    field = GaussianCollisionField(scene.gaussians(plan.reference))
+    model = scene.gaussians(plan.reference)
+    for packed in (False, True):
+        field = GaussianCollisionField(model, packed=packed)
+        case = f"{SWEEP} storage of {plan.reference} Gaussians: {'packed' if packed else 'float32 (default)'}"
+        spent = _seconds(arm.check, field, q[few])
+        add_audit(results, case, audit(field, arm, q[few], rooms[few]))
+        results.add(case, "a configuration", 1e6 * spent / len(q[few]), "us")
+        results.add(case, "memory", field.nbytes / 1e6, "MB")
+    field = GaussianCollisionField(model)
     run_edges(plan, results, truth, arm, field, q)
 
 

@@ -1,4 +1,4 @@
-"""The collision field of maps that were made from images: against true shapes, and against the raw depth."""
+"""The collision field of a mapped recording against its raw depth."""
 
 from __future__ import annotations
 
@@ -15,89 +15,12 @@ from numpy.typing import NDArray
 from splatbot.bench.results import Results
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField
-from splatbot.collision.evidence import measured_depths
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
 from splatbot.logs import open_log
-from splatbot.logs.scenes.tabletop import tabletop
-from splatbot.logs.synthetic import SyntheticLog
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
-from splatbot.slam import Slam
-
-NOISY = "effects=depth_noise;depth_holes"
-
-
-def audit_mapped_log(results: Results, *, frames: int, width: int, spheres: int, n_sigmas: tuple[float, ...]) -> None:
-    """Map a noisy synthetic table top, then ask random spheres in free space and compare with the true shapes.
-
-    A sphere counts as seen if the true surface nearest to it was seen by a camera, from its true pose. The map's own
-    surface error is how far points of the seen surface lie from the field's ellipsoids.
-    """
-    log = open_log(f"synthetic:tabletop?frames={frames}&width={width}&height={width * 3 // 4}&{NOISY}")
-    assert isinstance(log, SyntheticLog)
-    slam = Slam()
-    for frame in log:
-        slam.process(frame)
-    slam.finish()
-    snapshot = slam.snapshot()
-    poses = log.ground_truth.T_world_camera
-    T_map_world = np.linalg.inv(poses[0])  # a map's world is its first camera
-    truth = _true_shapes()
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-0.55, -0.40, 0.0], [0.55, 0.35, 0.35], (3 * spheres, 3))
-    distance, nearest = _closest(truth, points)
-    outside = truth.compute_occupancy(_tensor(points), nsamples=3).numpy() == 0
-    points, distance, nearest = (x[outside][:spheres] for x in (points, distance, nearest))
-    radii = rng.uniform(0.02, 0.08, len(points))
-    seen = _seen(log, nearest, truth, poses)
-    for n_sigma in n_sigmas:
-        field = GaussianCollisionField(snapshot, n_sigma)
-        hit = field.in_collision(np.c_[transform_points(T_map_world, points), radii])
-        surface = np.maximum(field.clearance(transform_points(T_map_world, nearest[seen])).distance, 0)
-        case = f"mapped noisy log, n_sigma {n_sigma:g}"
-        results.add(case, "Gaussians", float(len(field)), "")
-        for share in (50, 95, 99, 100):
-            results.add(
-                case, f"surface error in seen space, {share} %", 1e3 * float(np.percentile(surface, share)), "mm"
-            )
-        for name, part in (("seen", seen), ("unseen", ~seen)):
-            room, struck = (distance - radii)[part], hit[part]
-            free, false = ~struck & (room <= 0), struck & (room > 0)
-            results.add(case, f"false free in {name} space", 100.0 * float(free.mean()), "%")
-            deepest = 1e3 * float(-room[free].min()) if free.any() else 0.0
-            results.add(case, f"deepest false free in {name} space", deepest, "mm")
-            results.add(case, f"false hit in {name} space", 100.0 * float(false.mean()), "%")
-            largest = 1e3 * float(room[false].max()) if false.any() else 0.0
-            results.add(case, f"largest false hit in {name} space", largest, "mm")
-
-
-def _true_shapes() -> o3d.t.geometry.RaycastingScene:
-    scene = o3d.t.geometry.RaycastingScene()
-    for surface in tabletop().surfaces:
-        vertices, triangles = surface.mesh.vertices.astype(np.float32), surface.mesh.triangles.astype(np.uint32)
-        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
-    return scene
-
-
-def _closest(scene: o3d.t.geometry.RaycastingScene, points: Array) -> tuple[Array, Array]:
-    """Unsigned distances (P,) and nearest points (P, 3)."""
-    at = scene.compute_closest_points(_tensor(points))["points"].numpy().astype(np.float64)
-    return np.linalg.norm(at - points, axis=1), at
-
-
-def _seen(log: SyntheticLog, points: Array, truth: o3d.t.geometry.RaycastingScene, poses: Array) -> NDArray[np.bool_]:
-    """Whether each point of the true surface (P, 3) is what some frame's measured depth shows."""
-    seen = np.zeros(len(points), np.bool_)
-    for frame, T in zip(log, poses, strict=False):
-        rows, measured, z = measured_depths(points, frame.depth, frame.camera, T)
-        seen[rows[np.abs(measured - z) < 0.02]] = True
-    return seen
-
-
-def _tensor(points: Array) -> o3d.core.Tensor:
-    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
 
 
 def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observations: int = 1) -> None:
@@ -169,3 +92,7 @@ def _picture(field: GaussianCollisionField, frame: Frame, T: Array, cloud: Array
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _tensor(points: Array) -> o3d.core.Tensor:
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))

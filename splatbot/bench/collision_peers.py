@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 import torch
+from numpy.typing import NDArray
 
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
@@ -21,6 +22,7 @@ from splatbot.logs.shapes import Mesh, box, cylinder, sphere
 from splatbot.protocols import Array
 
 Say = Callable[[str], None]
+OCTREE_VOXEL = 0.01  # [m]
 _CHUNK = 50  # points at once against all Gaussians: 100,000 of them make 60 MB
 
 
@@ -71,6 +73,7 @@ def run_mesh_peers(results: Results, scene: Tabletop, arm: RobotSpheres, q: Arra
         ("coal BVH", _coal_mesh),
         ("coal octree 1 cm", _coal_octree),
         ("python-fcl BVH", _fcl_mesh),
+        ("python-fcl octree 1 cm", _fcl_octree),
         ("Open3D distance", _open3d),
     ):
         say(f"{case}: {name}")
@@ -87,11 +90,8 @@ def run_mesh_peers(results: Results, scene: Tabletop, arm: RobotSpheres, q: Arra
         results.add(case, "build", 1e3 * built, "ms", peer=name)
         results.add(case, "configurations a second", len(q) / spent, "1/s", peer=name)
         results.add(case, "share in collision", 100.0 * float(np.mean(hits)), "%", peer=name)
-    absent = importlib.util.find_spec("vamp") is None
-    note = (
-        "absent: vamp is not installed (it has no wheel)" if absent else "installed, but not driven by this benchmark"
-    )
-    results.add(case, "configurations a second", None, "1/s", peer="VAMP", note=note)
+    say(f"{case}: VAMP")
+    _run_vamp(results, case, scene, q)
 
 
 Ask = Callable[[Array, Array], list[bool]]
@@ -109,8 +109,17 @@ def _coal_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
 
 def _coal_octree(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
     coal = importlib.import_module("coal")
-    points = scene.gaussians(100_000).means.numpy().astype(np.float64)
-    return _coal_spheres(coal, coal.makeOctree(points, 0.01))
+    return _coal_spheres(coal, coal.makeOctree(_points_of(scene), OCTREE_VOXEL))
+
+
+def mesh_checker(scene: Tabletop) -> Ask:
+    """Coal's, of spheres (C, S, 3) and their radii (S,) [m] against the shapes' mesh."""
+    return _coal_mesh(*mesh_of(scene), scene)
+
+
+def octree_checker(scene: Tabletop) -> Ask:
+    """The same against an octree of points on the shapes."""
+    return _coal_octree(*mesh_of(scene), scene)
 
 
 def _coal_spheres(coal: Any, world: Any) -> Ask:
@@ -140,6 +149,38 @@ def _fcl_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
     model.beginModel(len(vertices), len(triangles))
     model.addSubModel(vertices, triangles)
     model.endModel()
+    return _fcl_spheres(fcl, model)
+
+
+def _fcl_octree(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
+    fcl = importlib.import_module("fcl")
+    data = octomap_bytes(_points_of(scene), OCTREE_VOXEL)  # which it takes as signed numbers
+    return _fcl_spheres(fcl, fcl.OcTree(OCTREE_VOXEL, np.frombuffer(data, np.int8).tolist()))
+
+
+def octomap_bytes(points: Array, voxel: float) -> bytes:
+    """OctoMap's binary tree of 16 levels (Hornung et al. 2013) with the voxels of points (P, 3) [m] occupied.
+
+    A node is two bytes, two bits a child: (0, 0) unknown, (0, 1) occupied, (1, 1) a node, which follows depth first.
+    """
+    keys = np.unique(np.floor(points / voxel).astype(np.int64) + (1 << 15), axis=0)
+    found = bytearray()
+
+    def write(part: NDArray[np.int64], level: int) -> None:
+        bits = (part >> level) & 1
+        child = bits[:, 0] + 2 * bits[:, 1] + 4 * bits[:, 2]
+        present = [part[child == i] for i in range(8)]
+        word = sum((0b10 if level == 0 else 0b11) << (2 * i) for i in range(8) if len(present[i]))
+        found.extend(word.to_bytes(2, "little"))
+        for below in present:
+            if level and len(below):
+                write(below, level - 1)
+
+    write(keys, 15)
+    return bytes(found)
+
+
+def _fcl_spheres(fcl: Any, model: Any) -> Ask:
     world = fcl.CollisionObject(model, fcl.Transform())
 
     def ask(centers: Array, radii: Array) -> list[bool]:
@@ -170,6 +211,38 @@ def _open3d(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
         return [bool(hit) for hit in (distance <= radii).any(axis=1)]
 
     return ask
+
+
+def _points_of(scene: Tabletop) -> Array:
+    """A cloud (about 100,000, 3) [m] of the shapes' surfaces."""
+    points: Array = scene.gaussians(100_000).means.numpy().astype(np.float64)
+    return points
+
+
+def _run_vamp(results: Results, case: str, scene: Tabletop, q: Array) -> None:
+    """VAMP's own Panda against a CAPT of the cloud, thinned to 2 cm, points of 2.5 mm: its defaults."""
+    try:
+        vamp = importlib.import_module("vamp")
+        robot = vamp.panda
+        least, most = robot.min_max_radii()
+        kept, _ = vamp.filter_pointcloud(
+            _points_of(scene).tolist(), 0.02, 2.0, [0.0, 0.0, 0.0], [-2.0, -2.0, -2.0], [2.0, 2.0, 2.0], True
+        )
+        world = vamp.Environment()
+        start = time.perf_counter()
+        world.add_pointcloud(kept, least, most, 0.0025)
+        built = time.perf_counter() - start
+        start = time.perf_counter()
+        hits = [not robot.validate(row, world) for row in q.tolist()]
+        spent = time.perf_counter() - start
+    except (ImportError, AttributeError, TypeError) as error:
+        missing = importlib.util.find_spec("vamp") is None
+        note = "absent: vamp is not installed (it has no wheel)" if missing else f"of another interface: {error}"
+        results.add(case, "configurations a second", None, "1/s", peer="VAMP CAPT 2 cm", note=note)
+        return
+    results.add(case, "build", 1e3 * built, "ms", peer="VAMP CAPT 2 cm")
+    results.add(case, "configurations a second", len(q) / spent, "1/s", peer="VAMP CAPT 2 cm")
+    results.add(case, "share in collision", 100.0 * float(np.mean(hits)), "%", peer="VAMP CAPT 2 cm")
 
 
 def mesh_of(scene: Tabletop) -> tuple[Array, Array]:

@@ -74,6 +74,7 @@ def _print(results: Results, folder: Path) -> None:
     console.print(_by_metric("Speed and memory", [row for row in own if " Gaussians, " in row.case]))
     for title, prefix in (
         ("Configurations against exact truth", "sweep n_sigma"),
+        ("Packed, against exact truth", "sweep storage"),
         ("Edges against exact truth", "sweep edges"),
         ("Floaters", "gate"),
     ):

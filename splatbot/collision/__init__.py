@@ -5,6 +5,7 @@ from splatbot.collision.bodies import boxes_in_collision, capsules_in_collision
 from splatbot.collision.esdf import Esdf, esdf
 from splatbot.collision.evidence import Evidence, gather_evidence
 from splatbot.collision.field import GaussianCollisionField
+from splatbot.collision.margin import SurfaceError, surface_error
 from splatbot.collision.probability import ProbabilityResult, collision_probability
 from splatbot.collision.robot import ArmClearanceResult, ConfigurationResult, EdgeResult, RobotSpheres
 from splatbot.collision.unknown import UnknownSpace, find_unknown
@@ -21,6 +22,7 @@ __all__ = [
     "NeighboursResult",
     "ProbabilityResult",
     "RobotSpheres",
+    "SurfaceError",
     "UnknownSpace",
     "boxes_in_collision",
     "capsules_in_collision",
@@ -28,4 +30,5 @@ __all__ = [
     "esdf",
     "find_unknown",
     "gather_evidence",
+    "surface_error",
 ]

@@ -75,7 +75,8 @@ class RobotSpheres:
         opening: of the gripper [m]; None: as wide as it goes.
         attached: (A, 4) spheres (x, y, z, radius) [m] of a held object, in the frame of the last link.
         base_in_map: test the base's own spheres against the map too; where it stands, the map usually holds its stand.
-        margin: added to every radius [m].
+        margin: room [m] that every sphere shall have to the map, as if it were larger by it; the arm may come nearer to
+            itself. See :func:`splatbot.collision.surface_error`.
 
     Raises:
         InputError: T_world_base is no rigid pose, attached or margin make no sense, or the arm is too large for the
@@ -96,8 +97,9 @@ class RobotSpheres:
             raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
         self.robot = robot
         self.base_in_map = base_in_map
+        self.margin = float(margin)
         self.T_world_base = _rigid(np.eye(4) if T_world_base is None else T_world_base)
-        self.spheres = _with(robot.spheres(opening), len(robot.chain), attached, margin)
+        self.spheres = _with(robot.spheres(opening), len(robot.chain), attached)
         self.pairs = np.ascontiguousarray(robot.self_collision_pairs, dtype=np.int32).reshape(-1, 2)
         chain = robot.chain
         try:
@@ -111,6 +113,7 @@ class RobotSpheres:
                 pairs=self.pairs,
                 base=np.ascontiguousarray(self.T_world_base[:3]),
                 base_in_map=base_in_map,
+                margin=self.margin,
             )
         except ValueError as error:
             raise InputError(f"{error}.", field=robot.name, hint="give an arm of fewer parts") from error
@@ -135,7 +138,7 @@ class RobotSpheres:
         return ConfigurationResult(verdict >= 0, *self._links(verdict), _version(field))
 
     def clearance(self, field: GaussianCollisionField, q: ArrayLike, *, cut: float = np.inf) -> ArmClearanceResult:
-        """The room (C,) that configurations (C, J) have to the map, with its gradient in joint space.
+        """The room (C,) that configurations (C, J) have to the map, less the margin, with its gradient in joint space.
 
         Args:
             field: the map.
@@ -189,12 +192,14 @@ class RobotSpheres:
         Raises:
             InputError: as :meth:`certify`, or the fields differ in n_sigma.
         """
-        return self._without_pairs.certify(now.added_since(before), start, end, eps=eps)
+        return self.without_pairs.certify(now.added_since(before), start, end, eps=eps)
 
     @cached_property
-    def _without_pairs(self) -> RobotSpheres:
+    def without_pairs(self) -> RobotSpheres:
         """The same arm, which may touch itself."""
-        return RobotSpheres(_Unpaired(self), T_world_base=self.T_world_base, base_in_map=self.base_in_map)
+        return RobotSpheres(
+            _Unpaired(self), T_world_base=self.T_world_base, base_in_map=self.base_in_map, margin=self.margin
+        )
 
     def sample(
         self, field: GaussianCollisionField | None, start: ArrayLike, end: ArrayLike, *, samples: int = 32
@@ -254,8 +259,8 @@ class _Unpaired:
         return self._spheres
 
 
-def _with(spheres: LinkSpheres, last: int, attached: ArrayLike | None, margin: float) -> LinkSpheres:
-    """The spheres with those of a held object, each larger by the margin."""
+def _with(spheres: LinkSpheres, last: int, attached: ArrayLike | None) -> LinkSpheres:
+    """The spheres with those of a held object."""
     held = (
         np.zeros((0, 4)) if attached is None else rows(np.asarray(attached), "attached", 4, "metres (x, y, z, radius)")
     )
@@ -264,7 +269,7 @@ def _with(spheres: LinkSpheres, last: int, attached: ArrayLike | None, margin: f
     return LinkSpheres(
         np.concatenate([spheres.link, np.full(len(held), last, np.int32)]),
         np.concatenate([spheres.centers, held[:, :3]]),
-        np.concatenate([spheres.radii, held[:, 3]]) + margin,
+        np.concatenate([spheres.radii, held[:, 3]]),
     )
 
 

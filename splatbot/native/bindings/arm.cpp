@@ -62,13 +62,13 @@ void define_arm(nb::module_& m) {
       .def(
           "__init__",
           [](Arm* self, Joints joints, Kinds prismatic, Numbers travel, Links link, Points centers, Numbers radii,
-             Pairs pairs, Base base, bool base_in_map) {
+             Pairs pairs, Base base, bool base_in_map, double margin) {
             new (self) Arm({span_of(joints), span_of(prismatic), span_of(travel), span_of(link), span_of(centers),
-                            span_of(radii), span_of(pairs), span_of(base), base_in_map});
+                            span_of(radii), span_of(pairs), span_of(base), base_in_map, margin});
           },
           nb::kw_only(), "joints"_a.noconvert(), "prismatic"_a.noconvert(), "travel"_a.noconvert(),
           "link"_a.noconvert(), "centers"_a.noconvert(), "radii"_a.noconvert(), "pairs"_a.noconvert(),
-          "base"_a.noconvert(), "base_in_map"_a)
+          "base"_a.noconvert(), "base_in_map"_a, "margin"_a = 0.0)
       .def(
           "forward",
           [](const Arm& self, Configurations q) {

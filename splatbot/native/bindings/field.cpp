@@ -70,14 +70,14 @@ void define_field(nb::module_& m) {
       .def(
           "__init__",
           [](CollisionField* self, InN3 means, InN4 quats, InN3 scales, Ids ids, float n_sigma, float voxel,
-             std::size_t max_voxels) {
+             std::size_t max_voxels, bool packed) {
             const auto solids = solids_of(means, quats, scales, ids);
-            const splatbot::FieldOptions options{n_sigma, voxel, max_voxels};
+            const splatbot::FieldOptions options{n_sigma, voxel, max_voxels, packed};
             nb::gil_scoped_release release;
             new (self) CollisionField(solids, options);
           },
           "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(), "ids"_a.noconvert(), nb::kw_only(),
-          "n_sigma"_a, "voxel"_a, "max_voxels"_a)
+          "n_sigma"_a, "voxel"_a, "max_voxels"_a, "packed"_a = false)
       .def(
           "updated",
           [](const CollisionField& self, Ids removed, InN3 means, InN4 quats, InN3 scales, Ids ids) {

@@ -45,6 +45,7 @@ Arm::Arm(const ArmSpec& spec) {
   require(pairs <= kMostPairs, "an arm has at most 256 pairs of links that may not touch");
   require(spec.joints.size() == 12 * joints && spec.travel.size() == joints, "joints, kinds and travel differ in number");
   require(spec.centers.size() == 3 * spheres && spec.radii.size() == spheres, "links, centres and radii differ in number");
+  require(spec.margin >= 0.0, "the margin is negative");
   require(spec.base.size() == 12, "the base is not a pose");
   exact_.resize(joints);
   joint_.resize(joints);
@@ -147,6 +148,7 @@ Arm::Arm(const ArmSpec& spec) {
     view_.center[i] = center_[i].data();
   }
   view_.radius = radius_.data();
+  view_.margin = rounded_up(spec.margin);
   view_.link_begin = begin_.data();
   view_.enclosing = enclosing_.data();
   view_.pairs = static_cast<int>(pairs);
@@ -270,7 +272,8 @@ void Arm::clearance(const CollisionField& field, std::span<const double> q, doub
           continue;
         }
         const double limit = std::min(cut, best.distance);
-        const double reach = limit + exact_radii_[s];
+        const double radius = exact_radii_[s] + static_cast<double>(view_.margin);
+        const double reach = limit + radius;
         if (reach < 0.0 || static_cast<double>(bound[s]) > reach) {
           if (reach >= 0.0) {
             continue;
@@ -278,9 +281,8 @@ void Arm::clearance(const CollisionField& field, std::span<const double> q, doub
         }
         NearestSolid found;
         k.nearest(field.view(), {at.data() + 3 * s, nullptr}, rounded_up(std::max(reach, 0.0)), 0, 1, &found);
-        if (found.id >= 0 && found.distance - exact_radii_[s] < best.distance &&
-            found.distance - exact_radii_[s] <= cut) {
-          best.distance = found.distance - exact_radii_[s];
+        if (found.id >= 0 && found.distance - radius < best.distance && found.distance - radius <= cut) {
+          best.distance = found.distance - radius;
           std::copy(std::begin(found.normal), std::end(found.normal), best.normal);
           std::copy_n(at.data() + 3 * s, 3, best.center);
           best.sphere = static_cast<std::int32_t>(s);

@@ -44,6 +44,11 @@ SolidBox box_of(const SolidBlock& block) {
   return box;
 }
 
+std::size_t own_bytes(const SolidBlock& block) {
+  return block.leaves.size() * sizeof(SolidLeaf) + block.packed.size() * sizeof(PackedLeaf) +
+         block.nodes.size() * sizeof(SolidNode);
+}
+
 }  // namespace
 
 CollisionField::CollisionField(const Solids& solids, const FieldOptions& options) : options_(options) {
@@ -55,21 +60,38 @@ CollisionField::CollisionField(const Solids& solids, const FieldOptions& options
   blocks_.resize(runs.size());
   thread_pool()->run(runs.size(), [&](std::size_t b) {
     blocks_[b] = make_block(runs[b].key, std::span(order).subspan(runs[b].begin, runs[b].end - runs[b].begin),
-                            [&](std::size_t i) { return make_item(solids, i, n_sigma); });
+                            [&](std::size_t i) { return make_item(solids, i, n_sigma); }, options_.packed);
   });
-  std::int32_t most = -1;
-  for (const std::int32_t id : solids.ids) {
-    most = std::max(most, id);
-  }
-  block_of_.assign(static_cast<std::size_t>(most + 1), -1);
-  for (std::size_t b = 0; b < runs.size(); ++b) {
-    for (std::size_t i = runs[b].begin; i < runs[b].end; ++i) {
-      block_of_[static_cast<std::size_t>(solids.ids[order[i].index])] = static_cast<std::int32_t>(b);
-    }
+  if (!options_.packed) {
+    block_of_ = blocks_by_id();
   }
   size_ = solids.ids.size();
   grid_ = make_grid(blocks_, options_);
   finish();
+}
+
+std::vector<std::int32_t> CollisionField::blocks_by_id() const {
+  std::vector<std::int32_t> found;
+  const auto note = [&](const std::int32_t* ids, std::size_t b) {
+    for (int lane = 0; lane < kFan && ids[lane] >= 0; ++lane) {
+      const auto id = static_cast<std::size_t>(ids[lane]);
+      if (id >= found.size()) {
+        found.resize(std::max(id + 1, found.size() + found.size() / 2), -1);
+      }
+      found[id] = static_cast<std::int32_t>(b);
+    }
+  };
+  for (std::size_t b = 0; b < blocks_.size(); ++b) {
+    if (blocks_[b]) {
+      std::for_each(blocks_[b]->leaves.begin(), blocks_[b]->leaves.end(), [&](const auto& leaf) { note(leaf.id, b); });
+      std::for_each(blocks_[b]->packed.begin(), blocks_[b]->packed.end(), [&](const auto& leaf) { note(leaf.id, b); });
+    }
+  }
+  while (!found.empty() && found.back() < 0) {
+    found.pop_back();
+  }
+  found.shrink_to_fit();
+  return found;
 }
 
 std::shared_ptr<const CollisionField> CollisionField::added_since(const CollisionField& earlier) const {
@@ -121,7 +143,7 @@ std::shared_ptr<const CollisionField> CollisionField::added_since(const Collisio
       added.size(), [&](std::size_t i) { return added[i].key; }, [&](std::size_t i) { return added[i].id; }, order);
   for (const BlockRun& run : runs) {
     field->blocks_.push_back(make_block(run.key, std::span(order).subspan(run.begin, run.end - run.begin),
-                                        [&](std::size_t i) { return added[i]; }));
+                                        [&](std::size_t i) { return added[i]; }, options_.packed));
   }
   field->size_ = added.size();
   field->finish();
@@ -133,7 +155,9 @@ void CollisionField::finish() {
   views_.assign(blocks_.size(), {});
   for (std::size_t b = 0; b < blocks_.size(); ++b) {
     if (blocks_[b]) {
-      views_[b] = {blocks_[b]->nodes.data(), blocks_[b]->leaves.data()};
+      const SolidBlock& block = *blocks_[b];
+      views_[b] = {block.nodes.data(), block.leaves.data(), block.packed.empty() ? nullptr : block.packed.data(),
+                   {block.corner[0], block.corner[1], block.corner[2]}};
       order.emplace_back(blocks_[b]->key, static_cast<std::int32_t>(b));
     }
   }
@@ -164,7 +188,7 @@ std::shared_ptr<const CollisionField> CollisionField::updated(std::span<const st
   const std::shared_ptr<CollisionField> next(new CollisionField());
   next->options_ = options_;
   next->blocks_ = blocks_;
-  next->block_of_ = block_of_;
+  next->block_of_ = options_.packed ? blocks_by_id() : block_of_;
   std::vector<SolidItem> items = make_items(inserted, options_.n_sigma);
   std::unordered_map<std::uint64_t, std::int32_t> slots;
   for (std::size_t b = 0; b < blocks_.size(); ++b) {
@@ -191,6 +215,7 @@ std::shared_ptr<const CollisionField> CollisionField::updated(std::span<const st
   }
   float box[6];
   clear_box(box);
+  SolidLeaf room;
   for (std::size_t b = 0; b < blocks_.size(); ++b) {
     if (stale[b] == 0) {
       continue;
@@ -198,10 +223,11 @@ std::shared_ptr<const CollisionField> CollisionField::updated(std::span<const st
     const SolidBlock& block = *blocks_[b];
     std::vector<SolidItem> kept;
     append_items(block, kept);
-    for (const SolidLeaf& leaf : block.leaves) {  // only what goes changes the grid
+    for (std::size_t l = 0; l < leaf_count(block); ++l) {  // only what goes changes the grid
+      const SolidLeaf& leaf = leaf_at(block, l, room);
       for (int lane = 0; lane < kFan && leaf.id[lane] >= 0; ++lane) {
         if (next->block_of_[static_cast<std::size_t>(leaf.id[lane])] != static_cast<std::int32_t>(b)) {
-          widen(box, box_of(leaf, lane));
+          widen(box, box_of(leaf, lane, packing_error(block, leaf, lane)));
         }
       }
     }
@@ -237,17 +263,18 @@ std::shared_ptr<const CollisionField> CollisionField::updated(std::span<const st
   thread_pool()->run(runs.size(), [&](std::size_t r) {
     next->blocks_[static_cast<std::size_t>(places[r])] =
         make_block(runs[r].key, std::span(order).subspan(runs[r].begin, runs[r].end - runs[r].begin),
-                   [&](std::size_t i) { return items[i]; });
+                   [&](std::size_t i) { return items[i]; }, options_.packed);
   });
   for (std::size_t r = 0; r < runs.size(); ++r) {
     for (std::size_t i = runs[r].begin; i < runs[r].end; ++i) {
       next->block_of_[static_cast<std::size_t>(items[order[i].index].id)] = places[r];
     }
     const SolidBlock& block = *next->blocks_[static_cast<std::size_t>(places[r])];
-    for (const SolidLeaf& leaf : block.leaves) {
+    for (std::size_t l = 0; l < leaf_count(block); ++l) {
+      const SolidLeaf& leaf = leaf_at(block, l, room);
       for (int lane = 0; lane < kFan && leaf.id[lane] >= 0; ++lane) {
         if (fresh[static_cast<std::size_t>(leaf.id[lane])] != 0) {
-          widen(box, box_of(leaf, lane));
+          widen(box, box_of(leaf, lane, packing_error(block, leaf, lane)));
         }
       }
     }
@@ -264,6 +291,9 @@ std::shared_ptr<const CollisionField> CollisionField::updated(std::span<const st
   } else {
     next->grid_ = grid_;
   }
+  if (options_.packed) {
+    std::vector<std::int32_t>().swap(next->block_of_);
+  }
   next->finish();
   return next;
 }
@@ -272,8 +302,7 @@ std::size_t CollisionField::bytes() const {
   std::size_t sum = block_of_.size() * sizeof(std::int32_t) + top_.size() * sizeof(SolidNode) +
                     views_.size() * sizeof(SolidBlockView);
   for (const auto& block : blocks_) {
-    sum += block ? sizeof(SolidBlock) + block->leaves.size() * sizeof(SolidLeaf) + block->nodes.size() * sizeof(SolidNode)
-                 : 0;
+    sum += block ? sizeof(SolidBlock) + own_bytes(*block) : 0;
   }
   return sum + (grid_ ? grid_->marks.size() + grid_->bound.size() : 0);
 }
@@ -282,7 +311,7 @@ std::size_t CollisionField::shared_bytes(const CollisionField& other) const {
   std::size_t sum = 0;
   for (std::size_t b = 0; b < std::min(blocks_.size(), other.blocks_.size()); ++b) {
     if (blocks_[b] && blocks_[b] == other.blocks_[b]) {
-      sum += blocks_[b]->leaves.size() * sizeof(SolidLeaf) + blocks_[b]->nodes.size() * sizeof(SolidNode);
+      sum += own_bytes(*blocks_[b]);
     }
   }
   return sum;

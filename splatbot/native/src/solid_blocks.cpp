@@ -8,6 +8,7 @@
 #include <limits>
 #include <unordered_map>
 
+#include "splatbot/packing.hpp"
 #include "splatbot/threads.hpp"
 
 namespace splatbot {
@@ -30,17 +31,72 @@ std::uint64_t spread(std::uint64_t x) {
   return (x | x << 2) & 0x1249249249249249;
 }
 
-std::uint64_t key_of(const float* mean, float longest) {
-  std::uint64_t block = 0, place = 0;
+constexpr float kHalfBlocks = 1 << (kBlockBits - 1);
+
+std::uint64_t place_of(const float* mean) {
+  std::uint64_t place = 0;
   for (int k = 0; k < 3; ++k) {
     const float at = mean[k] / kBlockEdge;
-    const float cell = std::floor(at);
-    constexpr float half = 1 << (kBlockBits - 1);
-    block |= spread(static_cast<std::uint64_t>(std::clamp(cell, -half, half - 2.0F) + half)) << k;
     constexpr float parts = 1 << kInBlockBits;
-    place |= spread(static_cast<std::uint64_t>(std::clamp((at - cell) * parts, 0.0F, parts - 1.0F))) << k;
+    place |= spread(static_cast<std::uint64_t>(std::clamp((at - std::floor(at)) * parts, 0.0F, parts - 1.0F))) << k;
   }
-  return (longest > kBlockEdge ? kLargeBlock : block) << kPlaceBits | place;
+  return place;
+}
+
+std::uint64_t key_of(const float* mean, float longest) {
+  std::uint64_t block = 0;
+  for (int k = 0; k < 3; ++k) {
+    const float cell = std::floor(mean[k] / kBlockEdge);
+    block |= spread(static_cast<std::uint64_t>(std::clamp(cell, -kHalfBlocks, kHalfBlocks - 2.0F) + kHalfBlocks)) << k;
+  }
+  return (longest > kBlockEdge ? kLargeBlock : block) << kPlaceBits | place_of(mean);
+}
+
+// The corner of the cube that a mean lies in; false where a block is no cube, which cannot be packed.
+bool corner_of(std::uint64_t key, const float* mean, float* corner) {
+  bool cube = key != kLargeBlock;
+  for (int k = 0; k < 3; ++k) {
+    const float cell = std::floor(mean[k] / kBlockEdge);
+    cube = cube && std::abs(cell) < kHalfBlocks - 2.0F;
+    corner[k] = cell * kBlockEdge;
+  }
+  return cube;
+}
+
+std::uint32_t packed_turn(const float* quat) {
+  std::uint32_t which = 0;
+  for (std::uint32_t k = 1; k < 4; ++k) {
+    which = std::abs(quat[k]) > std::abs(quat[which]) ? k : which;
+  }
+  const float sign = quat[which] < 0.0F ? -1.0F : 1.0F;
+  std::uint32_t turn = which << 30, shift = 0;
+  for (std::uint32_t k = 0; k < 4; ++k) {
+    if (k != which) {
+      const float code = std::round(sign * quat[k] / kTurnStep + 511.5F);
+      turn |= static_cast<std::uint32_t>(std::clamp(code, 0.0F, 1023.0F)) << shift;
+      shift += 10;
+    }
+  }
+  return turn;
+}
+
+// Rounded up.
+std::uint32_t packed_axis(float axis) {
+  const float x = std::max(axis, kPackedLeast);
+  std::uint32_t bits;
+  std::memcpy(&bits, &x, sizeof(bits));
+  return (bits - kAxisBase + (1U << 17) - 1U) >> 17;
+}
+
+void pack_lane(PackedLeaf& leaf, int lane, const SolidItem& item, const float* corner, std::int32_t id) {
+  leaf.axes[lane] = 0;
+  for (int k = 0; k < 3; ++k) {
+    const float steps = std::round((item.mean[k] - corner[k]) / kPackedStep);
+    leaf.mean[k][lane] = static_cast<std::uint16_t>(std::clamp(steps, 0.0F, 65535.0F));
+    leaf.axes[lane] |= packed_axis(item.axes[k]) << (10 * k);
+  }
+  leaf.turn[lane] = item.packed ? item.turn : packed_turn(item.quat);
+  leaf.id[lane] = id;
 }
 
 // Rounded up by more than the scale and the product were rounded.
@@ -102,6 +158,8 @@ SolidItem make_item(const Solids& s, std::size_t i, float n_sigma) {
   }
   item.key = key_of(item.mean, longest);
   item.id = s.ids[i];
+  item.turn = 0;
+  item.packed = false;
   return item;
 }
 
@@ -114,23 +172,25 @@ std::vector<SolidItem> make_items(const Solids& solids, float n_sigma) {
 }
 
 void append_items(const SolidBlock& block, std::vector<SolidItem>& items) {
-  for (const SolidLeaf& leaf : block.leaves) {
+  SolidLeaf room;
+  for (std::size_t l = 0; l < leaf_count(block); ++l) {
+    const SolidLeaf& leaf = leaf_at(block, l, room);
     for (int lane = 0; lane < kFan; ++lane) {
       if (leaf.id[lane] < 0) {
         continue;
       }
       SolidItem item;
-      float longest = 0.0F;
       for (int k = 0; k < 3; ++k) {
         item.mean[k] = leaf.mean[k][lane];
         item.axes[k] = leaf.axes[k][lane];
-        longest = std::max(longest, item.axes[k]);
       }
       for (int k = 0; k < 4; ++k) {
         item.quat[k] = leaf.quat[k][lane];
       }
       item.id = leaf.id[lane];
-      item.key = key_of(item.mean, longest);
+      item.key = block.key << kPlaceBits | place_of(item.mean);
+      item.packed = !block.packed.empty();
+      item.turn = item.packed ? block.packed[l].turn[lane] : 0;
       items.push_back(item);
     }
   }
@@ -198,7 +258,22 @@ void axes_of(const SolidLeaf& leaf, int lane, float R[9]) {
   std::copy(std::begin(rows), std::end(rows), R);
 }
 
-SolidBox box_of(const SolidLeaf& leaf, int lane) {
+std::size_t leaf_count(const SolidBlock& block) { return std::max(block.leaves.size(), block.packed.size()); }
+
+const SolidLeaf& leaf_at(const SolidBlock& block, std::size_t i, SolidLeaf& room) {
+  if (block.packed.empty()) {
+    return block.leaves[i];
+  }
+  unpack(block.packed[i], block.corner, room);
+  return room;
+}
+
+float packing_error(const SolidBlock& block, const SolidLeaf& leaf, int lane) {
+  const float longest = std::max({leaf.axes[0][lane], leaf.axes[1][lane], leaf.axes[2][lane]});
+  return block.packed.empty() ? 0.0F : kPackedOff + kPackedTurn * longest;
+}
+
+SolidBox box_of(const SolidLeaf& leaf, int lane, float more) {
   float R[9];
   axes_of(leaf, lane, R);
   const float longest = std::max({leaf.axes[0][lane], leaf.axes[1][lane], leaf.axes[2][lane]});
@@ -210,7 +285,7 @@ SolidBox box_of(const SolidLeaf& leaf, int lane) {
       squared += part * part;
     }
     const float mean = leaf.mean[k][lane];
-    const float half = std::sqrt(squared) * (1.0F + 2e-6F) + 1e-6F * longest;
+    const float half = std::sqrt(squared) * (1.0F + 2e-6F) + 1e-6F * longest + more;
     const float away = 2.4e-7F * std::abs(mean);
     box.low[k] = mean - half - away;
     box.high[k] = mean + half + away;
@@ -268,12 +343,17 @@ std::vector<SolidNode> make_tree(std::span<const SolidBox> boxes) {
 }
 
 std::shared_ptr<const SolidBlock> make_block(std::uint64_t key, std::span<const SolidPlace> order,
-                                             const std::function<SolidItem(std::size_t)>& item_at) {
+                                             const std::function<SolidItem(std::size_t)>& item_at, bool packed) {
   auto block = std::make_shared<SolidBlock>();
   block->key = key;
   block->count = order.size();
-  block->leaves.resize((order.size() + kFan - 1) / kFan);
-  std::vector<SolidBox> boxes(block->leaves.size());
+  std::vector<SolidBox> boxes((order.size() + kFan - 1) / kFan);
+  if (packed && corner_of(key, item_at(order[0].index).mean, block->corner)) {
+    block->packed.resize(boxes.size());
+  } else {
+    block->leaves.resize(boxes.size());
+  }
+  SolidLeaf room;
   for (std::size_t l = 0; l < boxes.size(); ++l) {
     std::array<SolidBox, kFan> own;
     const std::size_t used = std::min<std::size_t>(kFan, order.size() - l * kFan);
@@ -282,8 +362,15 @@ std::shared_ptr<const SolidBlock> make_block(std::uint64_t key, std::span<const 
       const bool real = static_cast<std::size_t>(lane) < used;
       const SolidItem item = real ? item_at(order[l * kFan + static_cast<std::size_t>(lane)].index) : first;
       first = lane == 0 ? item : first;
-      put_lane(block->leaves[l], lane, item, real ? item.id : -1);
-      own[static_cast<std::size_t>(lane)] = real ? box_of(block->leaves[l], lane) : own[0];
+      if (block->packed.empty()) {
+        put_lane(block->leaves[l], lane, item, real ? item.id : -1);
+      } else {
+        pack_lane(block->packed[l], lane, item, block->corner, real ? item.id : -1);
+      }
+    }
+    const SolidLeaf& leaf = leaf_at(*block, l, room);
+    for (int lane = 0; lane < static_cast<int>(used); ++lane) {
+      own[static_cast<std::size_t>(lane)] = box_of(leaf, lane, packing_error(*block, leaf, lane));
     }
     boxes[l] = hull({own.data(), used});
   }

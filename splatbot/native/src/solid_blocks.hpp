@@ -16,6 +16,8 @@ struct SolidItem {
   std::uint64_t key;  // block, then the place in it along a Morton curve
   float mean[3], quat[4], axes[3];
   std::int32_t id;
+  std::uint32_t turn;  // of one that was packed already: packing anew would turn it again
+  bool packed;
 };
 
 inline constexpr int kPlaceBits = 21;
@@ -43,7 +45,11 @@ std::vector<BlockRun> sort_into_blocks(std::size_t count, const std::function<st
                                        std::vector<SolidPlace>& order);
 
 std::shared_ptr<const SolidBlock> make_block(std::uint64_t key, std::span<const SolidPlace> order,
-                                             const std::function<SolidItem(std::size_t)>& item_at);
+                                             const std::function<SolidItem(std::size_t)>& item_at, bool packed);
+
+// The leaves of a block, whichever way it keeps them: in it, or unpacked into `room`.
+std::size_t leaf_count(const SolidBlock& block);
+const SolidLeaf& leaf_at(const SolidBlock& block, std::size_t i, SolidLeaf& room);
 
 // A tree over boxes: nodes with the root first; leaf i is child ~i.
 struct SolidBox {
@@ -52,8 +58,11 @@ struct SolidBox {
 std::vector<SolidNode> make_tree(std::span<const SolidBox> boxes);
 SolidBox hull(std::span<const SolidBox> boxes);
 
-// The box of one ellipsoid, rounded outwards.
-SolidBox box_of(const SolidLeaf& leaf, int lane);
+// How far the surface of a packed block's ellipsoid may be from where it seems [m]; 0 for others.
+float packing_error(const SolidBlock& block, const SolidLeaf& leaf, int lane);
+
+// The box of one ellipsoid, rounded outwards, `more` [m] wider to every side.
+SolidBox box_of(const SolidLeaf& leaf, int lane, float more);
 void axes_of(const SolidLeaf& leaf, int lane, float axes[9]);  // columns: unit vectors of the semi-axes
 
 }  // namespace splatbot

@@ -84,7 +84,7 @@ bool all_marked(BoundGrid& grid, const Range& r) {
 // Marks the voxels that an ellipsoid may touch: those not parted from it by a plane across one of its axes.
 class Marker {
  public:
-  Marker(BoundGrid& grid, const SolidLeaf& leaf, int lane) : grid_(grid) {
+  Marker(BoundGrid& grid, const SolidLeaf& leaf, int lane, float more) : grid_(grid) {
     float R[9];
     axes_of(leaf, lane, R);
     for (int j = 0; j < 3; ++j) {
@@ -99,7 +99,7 @@ class Marker {
       mean_[k] = leaf.mean[k][lane] - grid.origin[k];
       most = std::max({most, std::abs(leaf.mean[k][lane]), std::abs(grid.origin[k])});
     }
-    slack_ = 1e-6F * (most + static_cast<float>(std::max({grid.size[0], grid.size[1], grid.size[2]})) * grid.voxel);
+    slack_ = more + 1e-6F * (most + static_cast<float>(std::max({grid.size[0], grid.size[1], grid.size[2]})) * grid.voxel);
   }
 
   void mark(const Range& r) {
@@ -158,12 +158,15 @@ void mark_block(BoundGrid& grid, const SolidBlock& block, const Range& range) {
   if (intersection(voxels_of(grid, block.low, block.high), range).empty()) {
     return;
   }
-  for (const SolidLeaf& leaf : block.leaves) {
+  SolidLeaf room;
+  for (std::size_t l = 0; l < leaf_count(block); ++l) {
+    const SolidLeaf& leaf = leaf_at(block, l, room);
     for (int lane = 0; lane < kFan && leaf.id[lane] >= 0; ++lane) {
-      const SolidBox box = box_of(leaf, lane);
+      const float more = packing_error(block, leaf, lane);
+      const SolidBox box = box_of(leaf, lane, more);
       const Range touched = intersection(voxels_of(grid, box.low, box.high), range);
       if (!touched.empty() && !all_marked(grid, touched)) {
-        Marker(grid, leaf, lane).mark(touched);
+        Marker(grid, leaf, lane, more).mark(touched);
       }
     }
   }
@@ -236,10 +239,12 @@ bool reaches_out(const BoundGrid& grid, BlockList blocks) {
 // Where the Gaussians' means are, but for a share at either end of each axis, with a margin; false if there is none.
 bool extent(BlockList blocks, double aside, float* low, float* high) {
   std::vector<float> along[3];
+  SolidLeaf room;
   for (const auto& block : blocks) {
-    for (std::size_t l = 0; block && l < block->leaves.size(); ++l) {
+    for (std::size_t l = 0; block && l < leaf_count(*block); ++l) {
+      const SolidLeaf& leaf = leaf_at(*block, l, room);
       for (int k = 0; k < 3; ++k) {
-        const float* means = block->leaves[l].mean[k];
+        const float* means = leaf.mean[k];
         const auto [least, most] = std::minmax_element(means, means + kFan);
         along[k].insert(along[k].end(), {*least, *most});
       }
@@ -288,6 +293,9 @@ std::shared_ptr<BoundGrid> make_grid(BlockList blocks, const FieldOptions& optio
   grid->open = reaches_out(*grid, blocks);
   mark(*grid, blocks, whole(*grid));
   fill_bounds(*grid, whole(*grid));
+  if (options.packed) {
+    std::vector<std::uint8_t>().swap(grid->marks);
+  }
   return grid;
 }
 
@@ -311,7 +319,11 @@ bool outgrown(const BoundGrid& grid, BlockList blocks) {
 
 void refresh(BoundGrid& grid, BlockList blocks, const float box[6]) {
   const Range range = intersection(voxels_of(grid, box, box + 3), whole(grid));
-  if (!range.empty()) {
+  const bool unmarked = grid.marks.empty();
+  if (unmarked) {
+    grid.marks.assign(whole(grid).count(), 0);
+    mark(grid, blocks, whole(grid));
+  } else if (!range.empty()) {
     clear_marks(grid, range);
     mark(grid, blocks, range);
   }
@@ -321,6 +333,9 @@ void refresh(BoundGrid& grid, BlockList blocks, const float box[6]) {
     fill_bounds(grid, whole(grid));
   } else if (!range.empty()) {
     fill_bounds(grid, range);
+  }
+  if (unmarked) {
+    std::vector<std::uint8_t>().swap(grid.marks);
   }
 }
 

@@ -367,6 +367,7 @@ int main() {
     run_all(isa);
     run_surfels(isa);
     check_cameras(isa);
+    check_collision(isa);
     run_variants(isa);
     run_optimize();
   }

@@ -187,6 +187,25 @@ def test_what_the_gripper_holds_is_tested_and_so_is_how_wide_it_is_open(field: G
     assert margin.check(field, q).in_collision[bare].all()
 
 
+def test_a_margin_is_room_to_the_map_and_not_to_the_arm_itself(field: GaussianCollisionField, isa: str) -> None:
+    rng = np.random.default_rng(9)
+    q = panda().random(3000, rng)
+    bare, wide = RobotSpheres(panda()), RobotSpheres(panda(), margin=0.03)
+    np.testing.assert_array_equal(bare.check(None, q).in_collision, wide.check(None, q).in_collision)
+    apart = q[~bare.check(None, q).in_collision]
+    room = bare.clearance(field, apart).distance
+    np.testing.assert_allclose(wide.clearance(field, apart).distance, room - 0.03, atol=2e-6)
+    hit = wide.check(field, apart).in_collision
+    assert hit[room <= 0.03].all()
+    assert not hit[room > 0.03 + 1e-4].any()
+    start = apart[room > 0.03][:100]
+    end = start + 0.1
+    free = ~wide.certify(field, start, end).in_collision
+    assert free.any()
+    middle = start + 0.5 * (end - start)
+    assert (bare.clearance(field, middle[free]).distance > 0.03).all()
+
+
 def test_a_robot_and_a_map_moved_together_give_the_same_answers() -> None:
     rng = np.random.default_rng(8)
     model = SCENE.gaussians(5000)

@@ -22,6 +22,7 @@ struct ArmSpec {
   std::span<const std::int32_t> pairs;      // (M, 2) links that may not touch
   std::span<const double> base;             // (3, 4) T_world_base
   bool base_in_map;                         // whether the base's spheres are tested against the map
+  double margin = 0.0;                      // [m] added to every radius against the map, not against the arm itself
 };
 
 // Clearance of one configuration [m] and where it is least.
@@ -41,6 +42,7 @@ class Arm {
 
   int joints() const noexcept { return view_.joints; }
   int spheres() const noexcept { return view_.spheres; }
+  const ArmView& view() const noexcept { return view_; }
 
   // Poses T_world_link (C, J + 1, 4, 4) and centres (C, S, 3) of configurations (C, J), in float64.
   void forward(std::span<const double> q, std::span<double> poses) const;

@@ -25,6 +25,7 @@ struct ArmView {
   double base_t[3];  // of T_world_base
   const float* center[3];
   const float* radius;              // with the error of float32 in it
+  float margin;                     // [m] more against the map
   const std::int32_t* link_begin;   // (joints + 2,)
   const float* enclosing;           // (joints + 1, 4): a ball around each link's spheres; radius < 0: none
   int pairs;

@@ -18,6 +18,7 @@ struct FieldOptions {
   float n_sigma = 2.0F;      // where an ellipsoid's surface is
   float voxel = 0.02F;       // [m] of the grid; 0: no grid. Made larger where max_voxels asks for it
   std::size_t max_voxels = 2'000'000;
+  bool packed = false;  // less memory, larger errors; see packing.hpp
 };
 
 // Gaussians as the field takes them. Values must be finite, quaternions not zero, ids not negative.
@@ -28,13 +29,13 @@ struct Solids {
   std::span<const std::int32_t> ids;  // (N,), each once
 };
 
-inline constexpr float kBlockEdge = 0.125F;  // [m]; where a mean lies says which block it belongs to
-
 // The Gaussians whose means lie in one cube of space (those too large for a cube: in one block of their own).
 struct SolidBlock {
   std::uint64_t key;
   std::size_t count;
-  std::vector<SolidLeaf> leaves;
+  std::vector<SolidLeaf> leaves;   // one of the two is empty
+  std::vector<PackedLeaf> packed;
+  float corner[3] = {};            // of the packed means
   std::vector<SolidNode> nodes;
   float low[3], high[3], reach[3];
 };
@@ -44,7 +45,7 @@ struct BoundGrid {
   float origin[3];
   float voxel;
   bool open;  // some ellipsoid reaches outside: no bound goes beyond the rim
-  std::vector<std::uint8_t> marks, bound;
+  std::vector<std::uint8_t> marks, bound;  // a packed field keeps no marks
 };
 
 class CollisionField {
@@ -75,11 +76,12 @@ class CollisionField {
  private:
   CollisionField() = default;
   void finish();
+  std::vector<std::int32_t> blocks_by_id() const;
 
   FieldOptions options_;
   std::size_t size_ = 0;
   std::vector<std::shared_ptr<const SolidBlock>> blocks_;  // a slot stays empty when its last Gaussian goes
-  std::vector<std::int32_t> block_of_;                     // by id; -1: none
+  std::vector<std::int32_t> block_of_;                     // by id; -1: none. A packed field makes it anew
   std::vector<SolidNode> top_;
   std::vector<SolidBlockView> views_;
   std::shared_ptr<const BoundGrid> grid_;

@@ -195,6 +195,7 @@ struct AdamBlock {
 
 struct FieldKernels;  // field_kernels.hpp
 struct ArmKernels;    // arm_kernels.hpp
+struct PlanKernels;   // planning/kernels.hpp
 
 struct Kernels {
   const char* name;
@@ -214,6 +215,7 @@ struct Kernels {
   float (*multiply_add)(std::size_t rounds);  // kMultiplyAddFlops x lanes x rounds floating-point operations
   const FieldKernels* field;
   const ArmKernels* arm;
+  const PlanKernels* plan;
   int lanes;
 };
 

@@ -7,6 +7,7 @@
 namespace splatbot {
 
 inline constexpr int kFan = 16;  // ellipsoids to a leaf, children to a node
+inline constexpr float kBlockEdge = 0.125F;  // [m]; where a mean lies says which block it belongs to
 
 // Sixteen ellipsoids, each quantity contiguous over them. Rotation and semi-axes are kept apart: a packed inverse
 // covariance in float32 loses flat ones. Unused lanes repeat lane 0 with an id of -1.
@@ -14,6 +15,14 @@ struct alignas(64) SolidLeaf {
   float mean[3][kFan];  // world [m], bit for bit as the model holds them
   float quat[4][kFan];  // unit, wxyz
   float axes[3][kFan];  // semi-axes of the n-sigma ellipsoid [m], rounded up
+  std::int32_t id[kFan];
+};
+
+// The same in less memory; see packing.hpp.
+struct alignas(32) PackedLeaf {
+  std::uint16_t mean[3][kFan];  // from the block's corner, in steps
+  std::uint32_t turn[kFan];     // three components of the quaternion, 10 bits each, then which is left out
+  std::uint32_t axes[kFan];     // 10 bits each
   std::int32_t id[kFan];
 };
 
@@ -29,6 +38,8 @@ struct alignas(64) SolidNode {
 struct SolidBlockView {
   const SolidNode* nodes;  // the first is the root
   const SolidLeaf* leaves;
+  const PackedLeaf* packed;  // in place of leaves, or null
+  float corner[3];           // of the packed means [m]
 };
 
 // Proven lower bounds of the distance from any point of a voxel to any ellipsoid, as squares of voxels.

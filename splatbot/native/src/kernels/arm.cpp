@@ -79,10 +79,11 @@ SB_INLINE std::uint32_t check_self(const ArmView& arm, const Placed& placed, std
 SB_INLINE std::uint32_t check_field(const ArmView& arm, const SolidsView& field, const Placed& placed,
                                     std::uint32_t alive, std::int32_t* verdict) {
   for (int s = arm.spheres - 1; s >= arm.first_sphere && alive != 0; --s) {  // the hand first
-    std::uint32_t open = not_proven(arm, field.grid, placed.at[s], set1(arm.radius[s]), alive);
+    const float radius = arm.radius[s] + arm.margin;
+    std::uint32_t open = not_proven(arm, field.grid, placed.at[s], set1(radius), alive);
     for (; open != 0; open &= open - 1) {
       const int lane = __builtin_ctz(open);
-      if (tree_hit(field, split_of(arm, placed.at[s], lane), arm.radius[s])) {
+      if (tree_hit(field, split_of(arm, placed.at[s], lane), radius)) {
         alive &= ~(1U << lane);
         verdict[lane] = s;
       }
@@ -297,14 +298,15 @@ class Certifier {
     const F moves = fma(speed_of(twist, placed_.at[s]) * set1(1.0F + 1e-5F), w, set1(0.5F * motion_.bend[s]) * w * w) + set1(2e-6F);
     alignas(64) float room[W];
     store(room, moves);
-    std::uint32_t open = not_proven(arm_, field_->grid, placed_.at[s], set1(arm_.radius[s]) + moves, mine), found = 0;
+    const float radius = arm_.radius[s] + arm_.margin;
+    std::uint32_t open = not_proven(arm_, field_->grid, placed_.at[s], set1(radius) + moves, mine), found = 0;
     for (; open != 0; open &= open - 1) {
       const int lane = __builtin_ctz(open);
       const Split p = split_of(arm_, placed_.at[s], lane);
-      if (!tree_hit(*field_, p, arm_.radius[s] + room[lane])) {
+      if (!tree_hit(*field_, p, radius + room[lane])) {
         continue;
       }
-      if (room[lane] <= eps_ || tree_hit(*field_, p, arm_.radius[s])) {
+      if (room[lane] <= eps_ || tree_hit(*field_, p, radius)) {
         reject(s, lane, head);
         return 0;
       }

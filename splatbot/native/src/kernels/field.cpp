@@ -9,12 +9,20 @@ namespace {
 
 constexpr float kInfinity = __builtin_inff();
 
+// An ellipsoid: where it is kept, and its name.
+struct Found {
+  std::int32_t block = -1, leaf = 0, lane = 0, id = -1;
+};
+
 struct Seen {
   float bound;
-  const SolidLeaf* leaf;
-  int lane;
-  std::int32_t id;
+  Found solid;
 };
+
+// Whether `id` goes before one found already that is as near: the lowest wins, that of an unused lane never.
+SB_INLINE bool goes_before(std::int32_t id, const Found& found) {
+  return found.block >= 0 && static_cast<std::uint32_t>(id) < static_cast<std::uint32_t>(found.id);
+}
 
 // Unused children lie infinitely far off.
 template <class Search>
@@ -32,6 +40,7 @@ SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
   if (s.top == nullptr) {
     return;
   }
+  SolidLeaf room;
   Place stack[kStack];
   int n = 0;
   stack[n++] = {-1, 0, 0.0F};
@@ -42,7 +51,7 @@ SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
       continue;
     }
     if (place.node < 0) {
-      search.leaf(s.blocks[place.block].leaves[~place.node], p);
+      search.leaf(leaf_of(s.blocks[place.block], ~place.node, room), p, {place.block, ~place.node, 0, -1});
       continue;
     }
     const SolidNode& node = node_at(s, place);
@@ -74,8 +83,7 @@ SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
 struct NearestSearch {
   float best;  // certified lower bound of the signed distance so far, or the cut
   float slack;
-  const SolidLeaf* found = nullptr;
-  int lane = 0;
+  Found found = {};
 
   SB_INLINE float limit() const {
     const float reach = best + slack;
@@ -83,7 +91,7 @@ struct NearestSearch {
   }
   SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
 
-  SB_INLINE void leaf(const SolidLeaf& leaf, const Split& p) {
+  SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
     alignas(64) float d[W];
     for (int at = 0; at < kFan; at += W) {
       const Local l = local_of(leaf, p, at);
@@ -95,12 +103,10 @@ struct NearestSearch {
       store(d, distance_bound<8>(l));
       for (std::uint32_t m = near; m != 0; m &= m - 1) {
         const int i = __builtin_ctz(m);
-        const bool equal = d[i] == best && found != nullptr &&
-                           static_cast<std::uint32_t>(leaf.id[at + i]) < static_cast<std::uint32_t>(found->id[lane]);
-        if (d[i] < best || equal) {
+        const std::int32_t id = leaf.leaf->id[at + i];
+        if (d[i] < best || (d[i] == best && goes_before(id, found))) {
           best = d[i];
-          found = &leaf;
-          lane = at + i;
+          found = {at_leaf.block, at_leaf.leaf, at + i, id};
         }
       }
     }
@@ -120,14 +126,15 @@ struct KSearch {
   }
   SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
 
-  SB_INLINE void leaf(const SolidLeaf& leaf, const Split& p) {
+  SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
     alignas(64) float d[W];
     for (int at = 0; at < kFan; at += W) {
       const Local l = local_of(leaf, p, at);
       store(d, distance_bound<8>(l));
       for (int i = 0; i < W; ++i) {
-        if (leaf.id[at + i] >= 0 && d[i] <= worst()) {
-          insert({d[i], &leaf, at + i, leaf.id[at + i]});
+        const std::int32_t id = leaf.leaf->id[at + i];
+        if (id >= 0 && d[i] <= worst()) {
+          insert({d[i], {at_leaf.block, at_leaf.leaf, at + i, id}});
         }
       }
     }
@@ -144,7 +151,9 @@ struct KSearch {
     seen[at] = next;
   }
 
-  static bool before(const Seen& a, const Seen& b) { return a.bound < b.bound || (a.bound == b.bound && a.id < b.id); }
+  static bool before(const Seen& a, const Seen& b) {
+    return a.bound < b.bound || (a.bound == b.bound && a.solid.id < b.solid.id);
+  }
 };
 
 // Bounds are squared distances in units of the n-sigma ellipsoids.
@@ -152,8 +161,7 @@ struct MahalanobisSearch {
   float best = kInfinity;  // squared
   float slack;
   float n_sigma;
-  const SolidLeaf* found = nullptr;
-  int lane = 0;
+  Found found = {};
 
   SB_INLINE float limit() const { return best * (1.0F + 1e-5F); }
 
@@ -169,7 +177,7 @@ struct MahalanobisSearch {
     return select(most > set1(0.0F), size * size, set1(0.0F));
   }
 
-  SB_INLINE void leaf(const SolidLeaf& leaf, const Split& p) {
+  SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
     alignas(64) float d[W];
     for (int at = 0; at < kFan; at += W) {
       const Local l = local_of(leaf, p, at);
@@ -182,12 +190,10 @@ struct MahalanobisSearch {
       store(d, squared);
       for (; near != 0; near &= near - 1) {
         const int i = __builtin_ctz(near);
-        const bool equal = d[i] == best && found != nullptr &&
-                           static_cast<std::uint32_t>(leaf.id[at + i]) < static_cast<std::uint32_t>(found->id[lane]);
-        if (d[i] < best || equal) {
+        const std::int32_t id = leaf.leaf->id[at + i];
+        if (d[i] < best || (d[i] == best && goes_before(id, found))) {
           best = d[i];
-          found = &leaf;
-          lane = at + i;
+          found = {at_leaf.block, at_leaf.leaf, at + i, id};
         }
       }
     }
@@ -197,9 +203,14 @@ struct MahalanobisSearch {
 // One ellipsoid in float64.
 struct Exact {
   double v[3], a[3], R[9], mean[3];
+  double off;  // of packing
 };
 
-Exact exact_of(const SolidLeaf& leaf, int lane, const double* p) {
+Exact exact_of(const SolidsView& s, const Found& found, const double* p) {
+  SolidLeaf room;
+  const LeafView view = leaf_of(s.blocks[found.block], found.leaf, room);
+  const SolidLeaf& leaf = *view.leaf;
+  const int lane = found.lane;
   Exact e;
   double q[4], norm = 0.0;
   for (int k = 0; k < 4; ++k) {
@@ -216,6 +227,8 @@ Exact exact_of(const SolidLeaf& leaf, int lane, const double* p) {
     e.a[k] = static_cast<double>(leaf.axes[k][lane]);
     d[k] = p[k] - e.mean[k];
   }
+  const double longest = e.a[0] > e.a[1] ? e.a[0] : e.a[1];
+  e.off = static_cast<double>(view.off) + static_cast<double>(view.turn) * (e.a[2] > longest ? e.a[2] : longest);
   for (int i = 0; i < 9; ++i) {
     e.R[i] = R[i];
   }
@@ -276,7 +289,7 @@ void solve(const Exact& e, NearestSolid& out) {
   }
 }
 
-// Certified and smooth: the float64 distance of the winner less what float32 may have hidden of its rivals, or, should
+// Certified and smooth: the float64 distance of the winner less what float32 and packing may have hidden, or, should
 // the bound not have come that close, the bound itself.
 double certified(const Exact& e, double exact, double bound) {
   double size = e.a[0];
@@ -286,7 +299,7 @@ double certified(const Exact& e, double exact, double bound) {
   for (int k = 0; k < 3; ++k) {
     size += e.v[k] < 0.0 ? -e.v[k] : e.v[k];
   }
-  const double lower = exact - 3.0 * static_cast<double>(kRounding) * size;
+  const double lower = exact - 3.0 * static_cast<double>(kRounding) * size - e.off;
   return lower <= bound ? lower : bound;
 }
 
@@ -313,11 +326,11 @@ void field_nearest(const SolidsView& s, const SphereQueries& q, float cut, std::
       continue;
     }
     walk(s, p, search);
-    if (search.found != nullptr) {
-      const Exact e = exact_of(*search.found, search.lane, center);
+    if (search.found.block >= 0) {
+      const Exact e = exact_of(s, search.found, center);
       solve(e, answer);
       answer.distance = certified(e, answer.distance, static_cast<double>(search.best)) - static_cast<double>(r);
-      answer.id = search.found->id[search.lane];
+      answer.id = search.found.id;
     }
   }
 }
@@ -337,11 +350,11 @@ void field_k_nearest(const SolidsView& s, const SphereQueries& q, int k, float c
       id[at] = -1;
       if (j < search.count) {
         const Seen& seen = search.seen[j];
-        const Exact e = exact_of(*seen.leaf, seen.lane, center);
+        const Exact e = exact_of(s, seen.solid, center);
         NearestSolid solved;
         solve(e, solved);
         distance[at] = certified(e, solved.distance, static_cast<double>(seen.bound)) - static_cast<double>(r);
-        id[at] = seen.id;
+        id[at] = seen.solid.id;
       }
     }
   }
@@ -355,14 +368,14 @@ void field_mahalanobis(const SolidsView& s, const double* points, std::size_t be
     walk(s, p, search);
     distance[i] = static_cast<double>(kInfinity);
     id[i] = -1;
-    if (search.found != nullptr) {
-      const Exact e = exact_of(*search.found, search.lane, points + 3 * i);
+    if (search.found.block >= 0) {
+      const Exact e = exact_of(s, search.found, points + 3 * i);
       double squared = 0.0;
       for (int k = 0; k < 3; ++k) {
         squared += (e.v[k] / e.a[k]) * (e.v[k] / e.a[k]);
       }
       distance[i] = static_cast<double>(s.n_sigma) * __builtin_sqrt(squared);
-      id[i] = search.found->id[search.lane];
+      id[i] = search.found.id;
     }
   }
 }

@@ -30,15 +30,17 @@ SB_INLINE F box_squared(const SolidNode& node, const Split& p, int at) {
   return fma(x, x, fma(y, y, z * z));
 }
 
-SB_INLINE void prefetch(const SolidLeaf* leaf) {
-  const char* p = reinterpret_cast<const char*>(leaf);
-  for (int i = 0; i < 10; ++i) {
+SB_INLINE void prefetch(const SolidBlockView& block, std::int32_t leaf) {
+  const bool packed = block.packed != nullptr;
+  const char* p = packed ? reinterpret_cast<const char*>(block.packed + leaf)
+                         : reinterpret_cast<const char*>(block.leaves + leaf);
+  for (int i = 0; i < (packed ? 4 : 10); ++i) {  // up to the ids
     __builtin_prefetch(p + 64 * i);
   }
 }
 
 // Whether the ball of radius r around p may touch one of the leaf's ellipsoids; false is proven.
-SB_INLINE bool touches(const SolidLeaf& leaf, const Split& p, float r) {
+SB_INLINE bool touches(const LeafView& leaf, const Split& p, float r) {
   const float reach = (r + p.slack) * (1.0F + 1e-5F);
   for (int at = 0; at < kFan; at += W) {
     const Local l = local_of(leaf, p, at);
@@ -89,6 +91,7 @@ SB_INLINE bool tree_hit(const SolidsView& s, const Split& p, float r) {
   }
   const float reach = (r + p.slack) * (1.0F + 1e-5F) + 1e-12F;
   const F reach2 = set1(reach * reach);
+  SolidLeaf room;
   Place stack[kStack];
   int n = 0;
   stack[n++] = {-1, 0, 0.0F};
@@ -106,18 +109,18 @@ SB_INLINE bool tree_hit(const SolidsView& s, const Split& p, float r) {
       }
       continue;
     }
-    const SolidLeaf* leaves = s.blocks[place.block].leaves;
+    const SolidBlockView& block = s.blocks[place.block];
     for (std::uint32_t m = met; m != 0; m &= m - 1) {
       const std::int32_t child = node.child[__builtin_ctz(m)];
       if (child < 0) {
-        prefetch(leaves + ~child);
+        prefetch(block, ~child);
       }
     }
     for (; met != 0; met &= met - 1) {
       const std::int32_t child = node.child[__builtin_ctz(met)];
       if (child >= 0) {
         stack[n++] = {place.block, child, 0.0F};
-      } else if (touches(leaves[~child], p, r)) {
+      } else if (touches(leaf_of(block, ~child, room), p, r)) {
         return true;
       }
     }

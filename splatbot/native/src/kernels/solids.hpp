@@ -9,6 +9,7 @@
 #pragma once
 
 #include "simd.hpp"
+#include "splatbot/packing.hpp"
 #include "splatbot/solids.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
@@ -40,12 +41,28 @@ SB_INLINE Split split(const double* p) {
   return s;
 }
 
+// A leaf, and how far packing may have moved its ellipsoids: off, and turn times the longest semi-axis.
+struct LeafView {
+  const SolidLeaf* leaf;
+  float off, turn;
+};
+
+SB_INLINE LeafView leaf_of(const SolidBlockView& block, std::int32_t i, SolidLeaf& room) {
+  if (block.packed == nullptr) {
+    return {block.leaves + i, 0.0F, 0.0F};
+  }
+  unpack(block.packed[i], block.corner, room);
+  return {&room, kPackedOff, kPackedTurn};
+}
+
 struct Local {
   F v[3];  // the point in the ellipsoids' frames
   F a[3];
+  F off;  // of packing
 };
 
-SB_INLINE Local local_of(const SolidLeaf& leaf, const Split& p, int at) {
+SB_INLINE Local local_of(const LeafView& view, const Split& p, int at) {
+  const SolidLeaf& leaf = *view.leaf;
   const F x = (set1(p.hi[0]) - load(leaf.mean[0] + at)) + set1(p.lo[0]);
   const F y = (set1(p.hi[1]) - load(leaf.mean[1] + at)) + set1(p.lo[1]);
   const F z = (set1(p.hi[2]) - load(leaf.mean[2] + at)) + set1(p.lo[2]);
@@ -61,6 +78,7 @@ SB_INLINE Local local_of(const SolidLeaf& leaf, const Split& p, int at) {
   for (int k = 0; k < 3; ++k) {
     l.a[k] = load(leaf.axes[k] + at);
   }
+  l.off = fma(set1(view.turn), max(l.a[0], max(l.a[1], l.a[2])), set1(view.off));
   return l;
 }
 
@@ -76,8 +94,9 @@ SB_INLINE F box_squared(const Local& l) {
 
 SB_INLINE F least_axis(const Local& l) { return min(l.a[0], min(l.a[1], l.a[2])); }
 
+// What is taken off a distance, for rounding and packing.
 SB_INLINE F rounding(const Local& l, F least) {
-  return set1(kRounding) * ((absolute(l.v[0]) + absolute(l.v[1])) + (absolute(l.v[2]) + least));
+  return fma(set1(kRounding), (absolute(l.v[0]) + absolute(l.v[1])) + (absolute(l.v[2]) + least), l.off);
 }
 
 // Lower bounds of the signed distances to the ellipsoids after `Steps` Newton steps.

@@ -2,6 +2,7 @@
 #include "arm_entry.hpp"
 #include "entry.hpp"
 #include "field_entry.hpp"
+#include "planning_entry.hpp"
 #include "surfel_entry.hpp"
 
 #define SB_TEXT(name) #name
@@ -13,6 +14,7 @@ namespace {
 const FieldKernels kField = {field_hits, field_nearest, field_k_nearest, field_mahalanobis,
                              field_grid_bounds, bound_columns, bound_slice};
 const ArmKernels kArm = {arm_configurations, arm_certify, arm_sample, arm_centers};
+const PlanKernels kPlan = {plan_squared_distances};
 }  // namespace
 
 extern const Kernels kKernels;
@@ -36,6 +38,7 @@ const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
                           .multiply_add = multiply_add,
                           .field = &kField,
                           .arm = &kArm,
+                          .plan = &kPlan,
                           .lanes = SPLATBOT_SIMD / 32};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,0 +1,78 @@
+// SPDX-License-Identifier: Apache-2.0
+// A first path by RRT-Connect, shortened, then RRT* over the union of its trees until time is up.
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <memory>
+#include <mutex>
+#include <span>
+#include <vector>
+
+#include "splatbot/planning/star.hpp"
+
+namespace splatbot::planning {
+
+struct PlanLimits {
+  double seconds = 0.028;
+  std::uint64_t iterations = ~std::uint64_t{0};  // of the trees' growth; makes the answer depend on the seed alone
+  std::uint64_t seed = 0;
+  double good_enough = 0.0;  // a cost at which to stop
+};
+
+enum class PlanEnd { improved, exhausted, timed_out, cancelled };  // improved: there is a path
+
+struct Improvement {
+  double seconds, cost;
+};
+
+struct BestPath {
+  Configuration waypoints;  // (N, dims); empty: none yet
+  double cost;
+  std::vector<Improvement> history;
+};
+
+class Planner {
+ public:
+  explicit Planner(std::shared_ptr<Space> space);
+
+  // From the start to one of the goals (K, dims), all free. The tree is kept until the next call.
+  PlanEnd run(std::span<const double> start, std::span<const double> goals, const PlanLimits& limits);
+
+  // The same after the space has changed: what `added` says is in the way now is cut off, the rest of the last run's tree
+  // is kept, and planning goes on from `start`, which is on the last best path, or from anywhere. Edges of the tree are
+  // asked of `added` alone.
+  PlanEnd rerun(std::span<const double> start, Space& added, const PlanLimits& limits);
+
+  // The following may be called while run() is busy in another thread.
+  BestPath best() const;
+  void cancel() noexcept { cancelled_.store(true, std::memory_order_relaxed); }
+
+  // Of the last run.
+  const Tree* tree() const noexcept { return star_ ? &star_->tree() : nullptr; }
+  std::uint64_t iterations() const noexcept { return iterations_; }
+  std::uint64_t edges() const noexcept { return space_->edges() - edges_before_; }
+
+ private:
+  PlanEnd search(const PlanLimits& limits, const Stop& stop);
+  void improve(const PlanLimits& limits, const Stop& stop);
+  void shorten(const Configuration& path, int attempts, const Stop& stop);
+  bool near_best(double* q);
+  void publish(double seconds);
+  void forget_best();
+  void begin(std::span<const double> start);
+  void join(const Configuration& orphans, const Stop& stop);
+
+  std::shared_ptr<Space> space_;
+  Configuration start_, goals_;
+  std::unique_ptr<Sampler> sampler_;
+  std::unique_ptr<Star> star_;
+  std::unique_ptr<Connect> connect_;
+  Random random_{0};
+  std::atomic<bool> cancelled_{false};
+  std::uint64_t iterations_ = 0, edges_before_ = 0;
+  mutable std::mutex mutex_;
+  BestPath best_;
+};
+
+}  // namespace splatbot::planning

@@ -1,0 +1,11 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "splatbot/planning/kernels.hpp"
+
+namespace splatbot::SPLATBOT_KERNELS {
+
+void plan_squared_distances(const float* coordinates, std::size_t stride, std::size_t dims, const float* q,
+                            std::size_t count, float* out);
+
+}  // namespace splatbot::SPLATBOT_KERNELS

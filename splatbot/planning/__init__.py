@@ -1,0 +1,36 @@
+"""How the arm gets from one configuration to another among the Gaussians."""
+
+from splatbot.planning.problem import (
+    Cause,
+    Certificate,
+    Goal,
+    GoalError,
+    JointGoal,
+    Path,
+    PlanningError,
+    PlanningProblem,
+    PlanResult,
+    PlanStatus,
+    PoseGoal,
+    StartError,
+)
+from splatbot.planning.replan import Replanner, Update
+from splatbot.planning.rrt_star import GaussianRRTStar
+
+__all__ = [
+    "Cause",
+    "Certificate",
+    "GaussianRRTStar",
+    "Goal",
+    "GoalError",
+    "JointGoal",
+    "Path",
+    "PlanResult",
+    "PlanStatus",
+    "PlanningError",
+    "PlanningProblem",
+    "PoseGoal",
+    "Replanner",
+    "StartError",
+    "Update",
+]
