@@ -18,7 +18,7 @@ from splatbot.protocols import Array, RobotKinematics
 
 CLEARANCE_CUT = 0.1  # [m]; more room than this is not told apart
 _CLEARANCE_ROUNDS = 6  # of halving: clearance to 2 %
-_RESERVE = 7e-4  # [s] of the budget kept for the certificate
+_RESERVE = 7e-4  # [s] of the budget kept for the certificate, at most a third of it
 _FINEST = 4e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
 _ENDS = (None, PlanStatus.PLANNING_FAILED, PlanStatus.TIMED_OUT, PlanStatus.PREEMPTED)
 
@@ -111,8 +111,8 @@ class GaussianRRTStar:
             return self._failure(goals.status, goals.cause, goals.reason, begin)
         self._prepare(np.concatenate([q[None], goals.q]))
         self._goals = goals.q
-        left = max(1e-4, 1e-3 * budget_ms - (time.perf_counter() - begin) - _RESERVE)
         before = time.perf_counter() - begin
+        left = _for_search(budget_ms, before)
         end = self._native.run(q, goals.q, left, 2**62 if iterations is None else iterations, seed, 0.0)
         return self._result(end, q, goals.q, before, begin)
 
@@ -151,8 +151,8 @@ class GaussianRRTStar:
         if not len(goals.q):
             return self._failure(goals.status, goals.cause, goals.reason, begin)
         added = field.added_since(before)
-        left = max(1e-4, 1e-3 * budget_ms - (time.perf_counter() - begin) - _RESERVE)
         spent = time.perf_counter() - begin
+        left = _for_search(budget_ms, spent)
         end = self._native.rerun(q, field.native, added.native, self.arm.without_pairs.native, left, 2**62, seed)
         return self._result(end, q, goals.q, spent, begin)
 
@@ -263,6 +263,12 @@ class GaussianRRTStar:
             int(self._native.nodes) if searched else 0,
             self.field.map_version,
         )
+
+
+def _for_search(budget_ms: float, spent: float) -> float:
+    """Seconds of the budget that are left for the search."""
+    budget = 1e-3 * budget_ms
+    return max(1e-4, budget - spent - min(_RESERVE, budget / 3))
 
 
 def _check_budget(budget_ms: float, iterations: int | None) -> None:
