@@ -56,6 +56,11 @@ class PlanningPlan:
     quick: bool = False
     say: Say = field(default=lambda text: None)
 
+    @property
+    def weighed(self) -> int:
+        """Gaussians of the map whose memory is told."""
+        return self.gaussians if self.quick else 150_000
+
     @classmethod
     def quick_plan(cls, *, peers: bool = False, say: Say = lambda text: None) -> PlanningPlan:
         """A run of seconds."""
@@ -81,9 +86,7 @@ def run_planning(plan: PlanningPlan, out: Path) -> Results:
             results.write_json(out / "planning.json")
         plan.say("maps that change")
         run_changes(plan, results, model, wanted)
-        results.add("memory", "Gaussians", model.nbytes / 1e6, "MB")
-        results.add("memory", "field", planner.field.nbytes / 1e6, "MB")
-        results.add("memory", "planner's tree after the longest budget", planner.nbytes / 1e6, "MB")
+        add_memory(results, scene.gaussians(plan.weighed), planner)
         theirs: dict[str, dict[float, Array]] = {}
         if plan.peers:
             theirs = run_peers(results, scene, planner, wanted, plan.peers_ms, costs, audit, truth, plan.say)
@@ -205,6 +208,16 @@ def changed(before: GaussianCollisionField, model: GaussianModel, at: Array) -> 
     part.means[:] = torch.from_numpy(at + rng.uniform(-0.04, 0.04, (500, 3))).float()
     later = GaussianModel.concatenate([model, part])
     return before.updated(later, np.arange(len(later)) >= len(model))
+
+
+def add_memory(results: Results, model: GaussianModel, planner: GaussianRRTStar) -> None:
+    """Bytes of a map, its field, and the tree that the planner has grown."""
+    case = f"memory, {len(model):,} Gaussians"
+    field_ = GaussianCollisionField(model)
+    parts = {"Gaussians": model.nbytes, "field": field_.nbytes, "tree after the longest budget": planner.nbytes}
+    for name, size in parts.items():
+        results.add(case, name, size / 1e6, "MB")
+    results.add(case, "together", sum(parts.values()) / 1e6, "MB")
 
 
 def spread(

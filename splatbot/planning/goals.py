@@ -20,6 +20,7 @@ EXACT = 1e-6  # [m], [rad] that a posture may miss its pose by
 _BATCH = 16  # starts between two looks at the clock
 _ROUNDS = 80  # of each start
 _MOST = 512  # starts
+_FEWEST = 128  # before a pose is given up
 _APART = 0.05  # [rad or m]; postures nearer than this in every joint are one
 
 
@@ -121,7 +122,7 @@ def _postures(
         elif not reached:
             nearest = int(np.argmin(miss.sum(axis=1)))
             missed = miss[nearest] if miss[nearest].sum() < missed.sum() else missed
-        if len(found) >= goal.postures or (time.perf_counter() >= until and tried):
+        if len(found) >= goal.postures or (time.perf_counter() >= until and (found or tried >= _FEWEST)):
             break
     if found:
         q = np.array(found[: goal.postures])

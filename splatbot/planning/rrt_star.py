@@ -13,10 +13,20 @@ from splatbot.collision.robot import EPS
 from splatbot.errors import InputError
 from splatbot.planning.causes import beyond_limits, blocked_line, collision
 from splatbot.planning.goals import goal_configurations
-from splatbot.planning.problem import Cause, Certificate, Goal, Path, PlanResult, PlanStatus, StartError
+from splatbot.planning.problem import (
+    Cause,
+    Certificate,
+    Goal,
+    Path,
+    PlanningProblem,
+    PlanResult,
+    PlanStatus,
+    StartError,
+)
 from splatbot.protocols import Array, RobotKinematics
 
 CLEARANCE_CUT = 0.1  # [m]; more room than this is not told apart
+POSTURES_SHARE = 0.25  # of the budget for postures that reach a pose, once there is one
 _CLEARANCE_ROUNDS = 6  # of halving: clearance to 2 %
 _RESERVE = 7e-4  # [s] of the budget kept for the certificate, at most a third of it
 _FINEST = 4e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
@@ -38,7 +48,7 @@ class GaussianRRTStar:
         T_world_base: (4, 4) pose of its base.
         opening: of the gripper [m]; None: as wide as it goes.
         attached: (A, 4) spheres (x, y, z, radius) [m] of a held object in the frame of the last link.
-        margin: that the arm keeps from the map and from itself [m]; each sphere's radius grows by it.
+        margin: room that the arm keeps to the map [m]; it may come nearer to itself.
         base_in_map: see :class:`splatbot.collision.RobotSpheres`.
         eps: room [m] below which an edge is not certified.
 
@@ -106,7 +116,9 @@ class GaussianRRTStar:
         failed = self._bad_start(q, begin)
         if failed is not None:
             return failed
-        goals = goal_configurations(self.arm, self.field, goal, near=q, seed=seed, until=begin + 0.5e-3 * budget_ms)
+        goals = goal_configurations(
+            self.arm, self.field, goal, near=q, seed=seed, until=begin + POSTURES_SHARE * 1e-3 * budget_ms
+        )
         if not len(goals.q):
             return self._failure(goals.status, goals.cause, goals.reason, begin)
         self._prepare(np.concatenate([q[None], goals.q]))
@@ -115,6 +127,12 @@ class GaussianRRTStar:
         left = _for_search(budget_ms, before)
         end = self._native.run(q, goals.q, left, 2**62 if iterations is None else iterations, seed, 0.0)
         return self._result(end, q, goals.q, before, begin)
+
+    def solve(
+        self, problem: PlanningProblem, *, budget_ms: float = 28.0, seed: int = 0, iterations: int | None = None
+    ) -> PlanResult:
+        """As :meth:`plan`, of a problem."""
+        return self.plan(problem.start, problem.goal, budget_ms=budget_ms, seed=seed, iterations=iterations)
 
     def plan_again(
         self,
@@ -218,7 +236,7 @@ class GaussianRRTStar:
 
     def _prepare(self, ends: Array) -> None:
         """A planner whose eps lets it leave and reach configurations (K, J) that nearly touch something."""
-        room = float(self.arm.clearance(self.field, ends, cut=4 * self.eps).distance.min())
+        room = float(self.arm.native.clearance(self.field.native, ends, 4 * self.eps)[0].min())
         eps = max(_FINEST, min(self.eps, room / 4))
         if eps != self._eps:
             self._eps, self._native = eps, self._planner(eps)

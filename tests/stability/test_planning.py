@@ -12,7 +12,7 @@ from splatbot.planning import GaussianRRTStar, PlanStatus, PoseGoal
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from tests.unit.planning.test_rrt_star import LEFT, RIGHT
-from tests.unit.planning.toys import RADIUS, Slider, around_the_ball, ball_world
+from tests.unit.planning.toys import RADIUS, Slider, around_the_ball, ball_world, cause_of
 
 
 def _balls(means: Array, scales: Array) -> GaussianCollisionField:
@@ -106,13 +106,11 @@ def test_a_robot_inside_the_map_is_told_by_what_and_how_deep() -> None:
     planner = GaussianRRTStar(GaussianCollisionField(model), panda())
     result = planner.plan(LEFT, RIGHT)
     assert result.status is PlanStatus.START_STATE_IN_COLLISION
-    assert result.cause is not None
-    assert result.cause.gaussian == 0
-    assert result.cause.depth > 2.0
+    assert cause_of(result).gaussian == 0
+    assert cause_of(result).depth > 2.0
     slider = GaussianRRTStar(GaussianCollisionField(ball_world()), Slider(2))
     result = slider.plan([0.0, 0.0], [0.8, 0.0])
-    assert result.cause is not None
-    assert result.cause.depth == pytest.approx(0.22, abs=1e-4)
+    assert cause_of(result).depth == pytest.approx(0.22, abs=1e-4)
 
 
 def test_maps_and_bases_a_kilometre_away_are_planned_in_as_well() -> None:

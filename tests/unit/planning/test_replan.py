@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.planning import GaussianRRTStar, PlanStatus, Replanner
-from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from tests.unit.planning.test_rrt_star import LEFT, RIGHT
-from tests.unit.planning.toys import Slider, ball_world
+from tests.unit.planning.toys import Slider, ball_world, cause_of
 
 START, GOAL = np.array([-0.8, 0.0]), np.array([0.8, 0.0])
 
 
-def _with_ball(model: GaussianModel, at: list[float], sigma: float) -> tuple[GaussianModel, Array]:
+def _with_ball(model: GaussianModel, at: list[float], sigma: float) -> tuple[GaussianModel, NDArray[np.bool_]]:
     """The model with one more round Gaussian, and what changed."""
     ball = ball_world()
     ball.means[:] = ball.means.new_tensor([at])
@@ -111,8 +111,7 @@ def test_a_repair_begins_where_the_arm_is(replanner: Replanner) -> None:
 def test_a_goal_that_is_now_in_the_map_is_told_as_such(replanner: Replanner) -> None:
     update = replanner.update(_later(replanner, [0.8, 0.0, 0.0], 0.05))
     assert update.result.status is PlanStatus.GOAL_IN_COLLISION
-    assert update.result.cause is not None
-    assert update.result.cause.gaussian == 1
+    assert cause_of(update.result).gaussian == 1
     with pytest.raises(InputError, match="plan first"):
         replanner.update(replanner.planner.field)
 
