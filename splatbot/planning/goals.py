@@ -64,10 +64,10 @@ def goal_configurations(
         return _postures(arm, field, goal, near, seed, until)
     q = _configurations(goal.q if isinstance(goal, JointGoal) else goal, len(arm.robot.chain))
     chain = arm.robot.chain
-    inside = ((q >= chain.lower) & (q <= chain.upper)).all(axis=1)
+    causes = [beyond_limits(chain, one) for one in q]
+    inside = np.array([cause is None for cause in causes])
     if not inside.any():
-        cause = beyond_limits(chain, q[0])
-        return Goals(q[:0], PlanStatus.GOAL_STATE_INVALID, cause, f"{cause}.")
+        return Goals(q[:0], PlanStatus.GOAL_STATE_INVALID, causes[0], f"{causes[0]}.")
     return _free(arm, field, q[inside])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -42,6 +43,8 @@ class GaussianRRTStar:
     samples from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path
     and by RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
 
+    One search at a time: calls from several threads wait for one another, outside of their budgets.
+
     Args:
         field: the map.
         robot: the arm.
@@ -70,7 +73,7 @@ class GaussianRRTStar:
     ) -> None:
         if not _FINEST <= eps < np.inf:
             raise InputError(f"is {eps}.", field="eps", hint=f"give metres, at least {_FINEST:g}")
-        self.field, self.robot, self.margin, self.eps = field, robot, margin, eps
+        self._field, self.robot, self.margin, self.eps = field, robot, margin, eps
         self.arm = RobotSpheres(
             robot,
             T_world_base=T_world_base,
@@ -82,6 +85,21 @@ class GaussianRRTStar:
         self._eps = eps  # of the problem at hand
         self._native = self._planner(eps)
         self._goals: Array | None = None  # of the last search
+        self._searching = threading.Lock()
+
+    @property
+    def field(self) -> GaussianCollisionField:
+        """The map. One that is assigned holds for the searches that follow."""
+        return self._field
+
+    @field.setter
+    def field(self, field: GaussianCollisionField) -> None:
+        with self._searching:
+            self._look_at(field)
+
+    def _look_at(self, field: GaussianCollisionField) -> None:
+        self._field = field
+        self._native.look_at(field.native)
 
     def plan(
         self,
@@ -110,8 +128,14 @@ class GaussianRRTStar:
             GoalError: the goal is, or makes no sense for this robot.
             InputError: budget_ms or iterations are not above 0.
         """
-        begin = time.perf_counter()
         _check_budget(budget_ms, iterations)
+        with self._searching:
+            return self._plan(start, goal, budget_ms, seed, iterations)
+
+    def _plan(
+        self, start: ArrayLike, goal: Goal | ArrayLike, budget_ms: float, seed: int, iterations: int | None
+    ) -> PlanResult:
+        begin = time.perf_counter()
         q = self._start(start)
         failed = self._bad_start(q, begin)
         if failed is not None:
@@ -156,11 +180,22 @@ class GaussianRRTStar:
             StartError: the start is of another shape or not finite.
             InputError: nothing was planned before, the fields differ in n_sigma, or budget_ms is not above 0.
         """
-        begin = time.perf_counter()
         _check_budget(budget_ms, None)
+        with self._searching:
+            return self._plan_again(field, before, start, budget_ms, seed)
+
+    def _plan_again(
+        self,
+        field: GaussianCollisionField,
+        before: GaussianCollisionField,
+        start: ArrayLike,
+        budget_ms: float,
+        seed: int,
+    ) -> PlanResult:
+        begin = time.perf_counter()
         if self._goals is None:
             raise InputError("was not called before.", field="plan", hint="plan first")
-        self.field = field
+        self._look_at(field)
         q = self._start(start)
         failed = self._bad_start(q, begin)
         if failed is not None:
@@ -192,13 +227,15 @@ class GaussianRRTStar:
 
     def tree(self) -> tuple[Array, NDArray[np.int32], Array]:
         """Nodes (N, J), their parents (N,), -1 for the root, and costs from it (N,), of the last search."""
-        q, parent, cost = self._native.tree()
+        with self._searching:
+            q, parent, cost = self._native.tree()
         return q, parent, cost
 
     @property
     def nbytes(self) -> int:
         """Bytes of the tree of the last search."""
-        return int(self._native.bytes)
+        with self._searching:
+            return int(self._native.bytes)
 
     def certificate(self, waypoints: Array) -> Certificate:
         """What can be promised of a path (N, J): whether all its edges are free, and the room along it."""

@@ -56,6 +56,14 @@ def test_a_path_far_from_what_is_new_stands_on_the_new_version(replanner: Replan
     assert after.certificate.clearance == pytest.approx(before.certificate.clearance)
 
 
+def test_later_searches_are_on_the_later_map(replanner: Replanner) -> None:
+    later = _later(replanner, [0.0, -0.3 * _side(replanner), 0.0], 0.1)
+    assert replanner.update(later).kept
+    path = replanner.plan(GOAL, [0.0, -0.7 * _side(replanner)], budget_ms=100).unwrap()
+    assert path.certificate.map_version == later.map_version
+    assert not replanner.planner.arm.check(later, path.at(np.linspace(0, 1, 4001))).in_collision.any()
+
+
 def test_what_comes_close_lowers_the_promised_clearance_and_no_more(replanner: Replanner) -> None:
     # The path is taut around the ball, so a second one must come nearer than that to matter.
     careful = Replanner(GaussianRRTStar(GaussianCollisionField(ball_world()), Slider(2)))

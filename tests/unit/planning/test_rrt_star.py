@@ -164,6 +164,22 @@ def test_a_search_can_be_watched_and_cancelled_from_another_thread(planner: Gaus
     assert results[0].seconds < 50
 
 
+def test_several_threads_may_ask_one_planner(planner: GaussianRRTStar) -> None:
+    alone = [planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=k).unwrap().waypoints for k in range(6)]
+    found: dict[int, Array] = {}
+
+    def ask(k: int) -> None:
+        found[k] = planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=k).unwrap().waypoints
+
+    threads = [threading.Thread(target=ask, args=(k,)) for k in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    for k in range(6):
+        np.testing.assert_array_equal(found[k], alone[k])
+
+
 def test_a_cancelled_search_without_a_path_says_so(ball: GaussianCollisionField) -> None:
     planner = GaussianRRTStar(ball, Slider(2))
     planner.cancel()
@@ -208,6 +224,13 @@ def test_joints_beyond_their_limits_are_named(planner: GaussianRRTStar) -> None:
     for result in (start, goal):
         assert cause_of(result).joint == 3
         assert cause_of(result).depth == pytest.approx(0.25)
+
+
+def test_a_joint_that_its_encoder_reads_a_hair_beyond_the_limit_is_no_failure(planner: GaussianRRTStar) -> None:
+    start = LEFT.copy()
+    start[6] = planner.robot.chain.lower[6] - 1e-9
+    path = planner.plan(start, RIGHT, budget_ms=100).unwrap()
+    np.testing.assert_array_equal(path.waypoints[0], start)
 
 
 def test_a_goal_that_cannot_be_reached_times_out_and_names_what_blocks_the_straight_way() -> None:
