@@ -15,6 +15,8 @@ from splatbot.planning.problem import (
     StartError,
 )
 from splatbot.planning.rrt_star import GaussianRRTStar
+from splatbot.planning.timing import time_path
+from splatbot.planning.trajectory import State, Trajectory
 
 __all__ = [
     "Cause",
@@ -30,4 +32,7 @@ __all__ = [
     "PlanningProblem",
     "PoseGoal",
     "StartError",
+    "State",
+    "Trajectory",
+    "time_path",
 ]
