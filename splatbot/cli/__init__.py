@@ -40,6 +40,11 @@ COMMANDS = {
         "bench_collision",
         "Measure the collision field: questions a second, and errors against exact truth.",
     ),
+    "bench planning": _Command(
+        "splatbot.cli.bench_planning",
+        "bench_planning",
+        "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
+    ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 

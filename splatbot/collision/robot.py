@@ -192,7 +192,7 @@ class RobotSpheres:
         Raises:
             InputError: as :meth:`certify`, or the fields differ in n_sigma.
         """
-        return self._without_pairs.certify(now.added_since(before), start, end, eps=eps)
+        return self.without_pairs.certify(now.added_since(before), start, end, eps=eps)
 
     def grown(self, by: float) -> RobotSpheres:
         """The same arm with every sphere larger by ``by`` [m], against the map and against itself."""
@@ -209,7 +209,7 @@ class RobotSpheres:
         return np.asarray(self.native.reach(), dtype=np.float64)
 
     @cached_property
-    def _without_pairs(self) -> RobotSpheres:
+    def without_pairs(self) -> RobotSpheres:
         """The same arm, which may touch itself."""
         return RobotSpheres(
             _Respheres(self, self.spheres, np.zeros((0, 2), np.int32)),

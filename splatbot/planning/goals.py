@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatbot._native import inverse_kinematics
 from splatbot.collision import GaussianCollisionField, RobotSpheres
@@ -133,9 +133,7 @@ def _postures(
     return Goals(np.zeros((0, len(chain))), PlanStatus.NO_IK_SOLUTION, None, why)
 
 
-def _solve(
-    arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Array
-) -> tuple[Array, NDArray[np.float64]]:
+def _solve(arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Array) -> tuple[Array, Array]:
     """Joint values (S, J) for the pose moved by offsets (S, 6) = (translation, rotation vector), and what they miss."""
     targets = np.tile(T, (len(starts), 1, 1))
     targets[:, :3, 3] += offsets[:, :3] @ T[:3, :3].T

@@ -19,7 +19,7 @@ from splatbot.protocols import Array, RobotKinematics
 CLEARANCE_CUT = 0.1  # [m]; more room than this is not told apart
 _CLEARANCE_ROUNDS = 6  # of halving: clearance to 2 %
 _RESERVE = 7e-4  # [s] of the budget kept for the certificate
-_FINEST = 2e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
+_FINEST = 4e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
 _ENDS = (None, PlanStatus.PLANNING_FAILED, PlanStatus.TIMED_OUT, PlanStatus.PREEMPTED)
 
 
@@ -27,10 +27,10 @@ class GaussianRRTStar:
     """Plans an arm's way among the Gaussians of one state of a map.
 
     Every edge of its trees is certified all along, against the map and against the arm itself
-    (:meth:`splatbot.collision.RobotSpheres.certify`), so that a path is certified when it is found. The first comes from
-    RRT-Connect; both of its trees then become one, which RRT* (Karaman and Frazzoli, IJRR 2011) rewires with samples
-    from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path and by
-    RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
+    (:meth:`splatbot.collision.RobotSpheres.certify`), so that a path is certified when it is found. The first path is
+    that of RRT-Connect; both of its trees then become one, which RRT* (Karaman and Frazzoli, IJRR 2011) rewires with
+    samples from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path
+    and by RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
 
     Args:
         field: the map.
@@ -43,7 +43,7 @@ class GaussianRRTStar:
         eps: room [m] below which an edge is not certified.
 
     Raises:
-        InputError: as :class:`splatbot.collision.RobotSpheres`; eps is not above 2e-5 m.
+        InputError: as :class:`splatbot.collision.RobotSpheres`; eps is not above 4e-5 m.
     """
 
     def __init__(
@@ -71,6 +71,7 @@ class GaussianRRTStar:
         )
         self._eps = eps  # of the problem at hand
         self._native = self._planner(eps)
+        self._goals: Array | None = None  # of the last search
 
     def plan(
         self,
@@ -88,7 +89,7 @@ class GaussianRRTStar:
             goal: see :mod:`splatbot.planning.problem`; an array (J,) or (K, J) is a set of configurations.
             budget_ms: that the whole call may take, inverse kinematics and certificate included.
             seed: of the samples.
-            iterations: of the trees' growth; where they, not the time, end the search, the same call gives the same path.
+            iterations: of the trees' growth; where they, not the time, end the search, equal calls give equal paths.
 
         Returns:
             A path with its certificate, or the reason why there is none. The time being up is no failure once there is
@@ -109,10 +110,58 @@ class GaussianRRTStar:
         if not len(goals.q):
             return self._failure(goals.status, goals.cause, goals.reason, begin)
         self._prepare(np.concatenate([q[None], goals.q]))
+        self._goals = goals.q
         left = max(1e-4, 1e-3 * budget_ms - (time.perf_counter() - begin) - _RESERVE)
         before = time.perf_counter() - begin
         end = self._native.run(q, goals.q, left, 2**62 if iterations is None else iterations, seed, 0.0)
         return self._result(end, q, goals.q, before, begin)
+
+    def plan_again(
+        self,
+        field: GaussianCollisionField,
+        before: GaussianCollisionField,
+        start: ArrayLike,
+        *,
+        budget_ms: float = 10.0,
+        seed: int = 0,
+    ) -> PlanResult:
+        """Plans to the goals of the last :meth:`plan` with its old tree on a later field, which is this planner's then.
+
+        Args:
+            field: of the later map.
+            before: the field that the tree stands on: only what ``field`` has beyond it is asked of the tree's edges.
+            start: (J,) on the last path, or anywhere: then the tree begins anew.
+            budget_ms: that the call may take.
+            seed: of the samples.
+
+        Raises:
+            StartError: the start is of another shape or not finite.
+            InputError: nothing was planned before, the fields differ in n_sigma, or budget_ms is not above 0.
+        """
+        begin = time.perf_counter()
+        _check_budget(budget_ms, None)
+        if self._goals is None:
+            raise InputError("was not called before.", field="plan", hint="plan first")
+        self.field = field
+        q = self._start(start)
+        failed = self._bad_start(q, begin)
+        if failed is not None:
+            return failed
+        goals = goal_configurations(self.arm, field, self._goals, near=q, seed=seed, until=begin)
+        if not len(goals.q):
+            return self._failure(goals.status, goals.cause, goals.reason, begin)
+        added = field.added_since(before)
+        left = max(1e-4, 1e-3 * budget_ms - (time.perf_counter() - begin) - _RESERVE)
+        spent = time.perf_counter() - begin
+        end = self._native.rerun(q, field.native, added.native, self.arm.without_pairs.native, left, 2**62, seed)
+        return self._result(end, q, goals.q, spent, begin)
+
+    def room_to(self, field: GaussianCollisionField, waypoints: Array, cut: float, eps: float) -> float | None:
+        """Room [m] along a path (N, J) to a field alone, the arm itself left out, up to ``cut``; None: not free."""
+        arm = self.arm.without_pairs
+        if arm.certify(field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
+            return None
+        return float(path_clearance(arm.native, field.native, waypoints, max(cut, eps), _CLEARANCE_ROUNDS))
 
     def cancel(self) -> None:
         """Ends the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""
@@ -135,14 +184,12 @@ class GaussianRRTStar:
 
     def certificate(self, waypoints: Array) -> Certificate:
         """What can be promised of a path (N, J): whether all its edges are free, and the room along it."""
-        edges = self.arm.certify(self.field, waypoints[:-1], waypoints[1:], eps=self._eps)
-        certified = not edges.in_collision.any()
-        room = (
-            path_clearance(self.arm.native, self.field.native, waypoints, CLEARANCE_CUT, _CLEARANCE_ROUNDS)
-            if certified
-            else 0.0
-        )
-        return Certificate(certified, self._eps, max(0.0, room), self.margin, self.field.map_version)
+        # The trees' edges were checked in the direction they grew; rounding may make a difference to the other one.
+        for eps in (self._eps, self._eps / 4):
+            if not self.arm.certify(self.field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
+                room = path_clearance(self.arm.native, self.field.native, waypoints, CLEARANCE_CUT, _CLEARANCE_ROUNDS)
+                return Certificate(True, eps, room, self.margin, self.field.map_version)
+        return Certificate(False, self._eps, 0.0, self.margin, self.field.map_version)
 
     def _planner(self, eps: float) -> ArmPlanner:
         chain = self.robot.chain
@@ -187,6 +234,8 @@ class GaussianRRTStar:
             waypoints = np.repeat(waypoints, 2, axis=0)
         history[:, 0] += before
         path = Path(waypoints, float(cost), self.certificate(waypoints))
+        if not path.certificate.certified:
+            return self._failure(PlanStatus.PLANNING_FAILED, None, "the path found is not certified.", begin)
         return self._answer(PlanStatus.SUCCESS, path, history, None, "", begin)
 
     def _failure(self, status: PlanStatus, cause: Cause | None, reason: str, begin: float) -> PlanResult:

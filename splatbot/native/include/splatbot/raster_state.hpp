@@ -3,6 +3,7 @@
 
 #include <array>
 #include <cstdint>
+#include <limits>
 #include <vector>
 
 #include "splatbot/buffer.hpp"
@@ -74,6 +75,7 @@ struct alignas(64) ProjectedBlock {
   std::uint64_t pairs = 0;
   std::uint64_t first_pair = 0;
   std::uint32_t first_visible = 0;
+  std::uint32_t least_key = std::numeric_limits<std::uint32_t>::max(), most_key = 0;  // bits of the depths in view
   int fault_field = -1;  // means, quats, scales, covars, opacities, colors
   std::size_t fault_row = 0;
 };

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows of arrays to lanes of vectors and back, and what the projections share besides.
+// What the projections share.
 #pragma once
 
 #include "project.hpp"
+#include "rows.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -47,55 +48,6 @@ bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedB
     }
   }
   return false;
-}
-
-// Rows [first, first + n) of an (N, width) array, transposed; the last row is repeated to W.
-template <int Width>
-SB_INLINE void load_lanes(const float* rows, std::size_t first, int n, F (&out)[Width]) {
-  alignas(64) float lanes[Width][W];
-  for (int i = 0; i < W; ++i) {
-    const float* row = rows + (first + static_cast<std::size_t>(i < n ? i : n - 1)) * Width;
-    for (int c = 0; c < Width; ++c) {
-      lanes[c][i] = row[c];
-    }
-  }
-  for (int c = 0; c < Width; ++c) {
-    out[c] = load(lanes[c]);
-  }
-}
-
-// The same for any rows.
-template <int Width>
-SB_INLINE void gather_lanes(const float* rows, const std::uint32_t* ids, int n, F (&out)[Width]) {
-  alignas(64) float lanes[Width][W];
-  for (int i = 0; i < W; ++i) {
-    const float* row = rows + static_cast<std::size_t>(ids[i < n ? i : n - 1]) * Width;
-    for (int c = 0; c < Width; ++c) {
-      lanes[c][i] = row[c];
-    }
-  }
-  for (int c = 0; c < Width; ++c) {
-    out[c] = load(lanes[c]);
-  }
-}
-
-SB_INLINE void put(float* to, float value, bool add) { *to = add ? *to + value : value; }
-
-template <int Width>
-SB_INLINE void scatter_lanes(float* rows, const std::uint32_t* ids, int n, const F (&values)[Width], bool add) {
-  if (rows == nullptr) {
-    return;
-  }
-  alignas(64) float lanes[Width][W];
-  for (int c = 0; c < Width; ++c) {
-    store(lanes[c], values[c]);
-  }
-  for (int i = 0; i < n; ++i) {
-    float* row = rows + static_cast<std::size_t>(ids[i]) * Width;
-    for (int c = 0; c < Width; ++c) {
-      put(row + c, lanes[c][i], add);
-    }
-  }
 }
 
 // Gradients of the camera's rotation, translation and intrinsics, lane by lane until the end.

@@ -7,13 +7,20 @@
 
 #include "splatbot/planning/shortcut.hpp"
 
-#include <cstdlib>
-
 namespace splatbot::planning {
 
 namespace {
+
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-double knob(const char* name, double value) { const char* t = std::getenv(name); return t ? std::atof(t) : value; }
+constexpr double kConnectRange = 1.5, kStarRange = 2.0;  // [rad] longest new edges
+constexpr double kLocalShare = 0.5;                      // of RRT*'s samples that are near the best path
+constexpr int kRound = 60;                               // samples between two rounds of shortcuts or restarts
+constexpr int kAttempts = 30, kFirstAttempts = 100;      // shortcuts tried in a row
+constexpr int kIdle = 30;                                // vain ones before it is left
+constexpr std::uint64_t kRestartSamples = 200;
+constexpr double kRestartBound = 1.3;  // times the best cost: shortcuts may make the path better than the best
+constexpr std::size_t kFewNodes = 1000;
+
 }  // namespace
 
 Planner::Planner(std::shared_ptr<Space> space) : space_(std::move(space)) {}
@@ -21,6 +28,11 @@ Planner::Planner(std::shared_ptr<Space> space) : space_(std::move(space)) {}
 BestPath Planner::best() const {
   const std::lock_guard lock(mutex_);
   return best_;
+}
+
+void Planner::forget_best() {
+  const std::lock_guard lock(mutex_);
+  best_ = {{}, kInfinity, {}};
 }
 
 void Planner::publish(double seconds) {
@@ -32,28 +44,73 @@ void Planner::publish(double seconds) {
 
 PlanEnd Planner::run(std::span<const double> start, std::span<const double> goals, const PlanLimits& limits) {
   const Stop stop(limits.seconds, &cancelled_);
-  const double kRange = knob("P_RANGE", 1.5);
   random_ = Random(limits.seed);
-  sampler_ = std::make_unique<Sampler>(*space_, start, goals);
-  star_ = std::make_unique<Star>(*space_, *sampler_, start, knob("P_STAR_RANGE", 2.0));
-  connect_ = std::make_unique<Connect>(*space_, *sampler_, kRange);
+  goals_.assign(goals.begin(), goals.end());
+  begin(start);
+  forget_best();
+  return search(limits, stop);
+}
+
+// A tree of the start alone.
+void Planner::begin(std::span<const double> start) {
+  start_.assign(start.begin(), start.end());
+  sampler_ = std::make_unique<Sampler>(*space_, start_, goals_);
+  star_ = std::make_unique<Star>(*space_, *sampler_, start_, kStarRange);
+  connect_ = std::make_unique<Connect>(*space_, *sampler_, kConnectRange);
   edges_before_ = space_->edges();
-  {
-    const std::lock_guard lock(mutex_);
-    best_ = {{}, kInfinity, {}};
+  iterations_ = 0;
+}
+
+PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLimits& limits) {
+  const Stop stop(limits.seconds, &cancelled_);
+  random_ = Random(limits.seed);
+  Configuration orphans;
+  star_->cut(added, stop, orphans);
+  edges_before_ = space_->edges();
+  iterations_ = 0;
+  forget_best();
+  if (star_->start_from(start.data())) {
+    start_.assign(start.begin(), start.end());
+    *sampler_ = Sampler(*space_, start_, goals_);
+  } else {
+    begin(start);
   }
-  std::uint64_t left = limits.iterations;
-  const bool met = connect_->run(start, random_, stop, kInfinity, left);
-  iterations_ = limits.iterations - left;
-  if (met) {
-    star_->adopt(*connect_);
+  if (std::isfinite(star_->best())) {
     publish(stop.elapsed());
-    improve(start, limits, stop);
-    cancelled_.store(false);
-    return PlanEnd::improved;
+  }
+  join(orphans, stop);
+  return search(limits, stop);
+}
+
+// Configurations that were in the tree: what still can be reached of them.
+void Planner::join(const Configuration& orphans, const Stop& stop) {
+  for (std::size_t i = 0; i < orphans.size() && !stop.now(); i += space_->size()) {
+    if (star_->grow(orphans.data() + i, stop)) {
+      publish(stop.elapsed());
+    }
+  }
+}
+
+// Until there is a path, and then until time is up.
+PlanEnd Planner::search(const PlanLimits& limits, const Stop& stop) {
+  if (!std::isfinite(star_->best()) && iterations_ < limits.iterations) {
+    std::uint64_t left = limits.iterations - iterations_;
+    const bool met = connect_->run(start_, random_, stop, kInfinity, left);
+    iterations_ = limits.iterations - left;
+    if (met) {
+      star_->adopt(*connect_);
+      publish(stop.elapsed());
+    }
+  }
+  const bool found = std::isfinite(star_->best());
+  if (found) {
+    improve(limits, stop);
   }
   const bool cancelled = cancelled_.exchange(false);
-  return cancelled ? PlanEnd::cancelled : left == 0 ? PlanEnd::exhausted : PlanEnd::timed_out;
+  return found                                 ? PlanEnd::improved
+         : cancelled                           ? PlanEnd::cancelled
+         : iterations_ >= limits.iterations    ? PlanEnd::exhausted
+                                               : PlanEnd::timed_out;
 }
 
 void Planner::shorten(const Configuration& path, int attempts, const Stop& stop) {
@@ -62,56 +119,50 @@ void Planner::shorten(const Configuration& path, int attempts, const Stop& stop)
   }
   Shortcut shortcut(*space_, path);
   shortcut.leave_out();
-  int idle = 0;
-  for (int i = 0; i < attempts && idle < knob("P_IDLE", 30) && !stop.now(); ++i) {
-    idle = shortcut.improve(random_) ? 0 : idle + 1;
+  int vain = 0;
+  for (int i = 0; i < attempts && vain < kIdle && !stop.now(); ++i) {
+    vain = shortcut.improve(random_) ? 0 : vain + 1;
   }
-  shortcut.leave_out();
   if (star_->insert(shortcut.waypoints())) {
     publish(stop.elapsed());
   }
 }
 
-void Planner::improve(std::span<const double> start, const PlanLimits& limits, const Stop& stop) {
+void Planner::improve(const PlanLimits& limits, const Stop& stop) {
+  const double straight = sampler_->to_goal(start_.data()) * (1.0 + 1e-9);  // nothing is shorter
+  const double enough = std::max(limits.good_enough, straight);
   Configuration q(space_->size());
-  shorten(star_->path(), static_cast<int>(knob("P_SHORT0", 100)), stop);
-  const double p_local = knob("P_LOCAL", 0.3);
-  const int every = static_cast<int>(knob("P_RESTART", 20));
-  const int attempts = static_cast<int>(knob("P_SHORT", 60));
-  std::size_t pruned = 1000;
-  int round = 0;
-  while (iterations_ < limits.iterations && !stop.now() && star_->best() > limits.good_enough) {
-    ++iterations_;
-    ++round;
-    if (every > 0 && round % every == 0) {
-      std::uint64_t left = static_cast<std::uint64_t>(knob("P_RITER", 200));
-      if (connect_->run(start, random_, stop, star_->best() * knob("P_BOUND", 1.3), left)) {
-        shorten(connect_->path(), attempts, stop);
+  shorten(star_->path(), kFirstAttempts, stop);
+  std::size_t settled = kFewNodes;
+  for (int round = 1; iterations_ < limits.iterations && star_->best() > enough && !stop.now(); ++round, ++iterations_) {
+    if (round % kRound == 0) {
+      std::uint64_t left = kRestartSamples;
+      if (connect_->run(start_, random_, stop, star_->best() * kRestartBound, left)) {
+        shorten(connect_->path(), kAttempts, stop);
       }
       continue;
     }
-    if (every > 0 && round % every == every / 2) {
-      shorten(star_->path(), attempts, stop);
+    if (round % kRound == kRound / 2) {
+      shorten(star_->path(), kAttempts, stop);
       continue;
     }
-    const bool sampled = random_.uniform() < p_local ? local(q.data()) : sampler_->informed(random_, star_->best(), q.data());
+    const bool sampled = random_.uniform() < kLocalShare ? near_best(q.data())
+                                                         : sampler_->informed(random_, star_->best(), q.data());
     if (sampled && star_->grow(q.data(), stop)) {
       publish(stop.elapsed());
     }
-    if (star_->tree().size() > 2 * pruned) {
+    if (star_->tree().size() > 2 * settled) {
       star_->prune();
-      pruned = std::max<std::size_t>(1000, star_->tree().size());
+      settled = std::max(kFewNodes, star_->tree().size());
     }
   }
 }
 
-// Near the best path. False: out of limits.
-bool Planner::local(double* q) {
-  const Configuration path = star_->path();
-  const std::size_t dims = space_->size(), edges = path.size() / dims - 1;
-  const std::size_t edge = random_.below(edges);
-  const double t = random_.uniform();
-  const double spread = 0.3 * std::exp(-3.0 * random_.uniform());
+// A sample near the best path. False: it is out of the limits.
+bool Planner::near_best(double* q) {
+  const Configuration& path = best_.waypoints;  // which this thread alone changes
+  const std::size_t dims = space_->size(), edge = random_.below(path.size() / dims - 1);
+  const double t = random_.uniform(), spread = 0.3 * std::exp(-3.0 * random_.uniform());
   for (std::size_t d = 0; d < dims; ++d) {
     const double a = path[edge * dims + d], b = path[(edge + 1) * dims + d];
     q[d] = a + t * (b - a) + spread * random_.normal();
