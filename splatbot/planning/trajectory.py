@@ -81,6 +81,11 @@ class Trajectory:
             columns.append(value if order == 0 else np.where(inside[..., None], value, 0.0))
         return State(times, *columns)
 
+    def reference(self, t: float) -> tuple[Array, Array]:
+        """Position and velocity (J,) at a time [s], as controllers ask for it."""
+        state = self.at(t)
+        return state.position, state.velocity
+
     def sampled(self, rate: float = 1000.0) -> State:
         """States at a rate [Hz], the end included."""
         if not 0.0 < rate < np.inf:
