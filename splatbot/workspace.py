@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError, InputError
@@ -109,18 +109,25 @@ def find_workspace(*places: str | Path | None) -> Workspace | None:
     return None
 
 
-def fit_workspace(model: GaussianModel, *, seed: int = 0) -> Workspace:
-    """The widest upward surface of a map by RANSAC (Fischler and Bolles 1981), and a base and a box on it.
+def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), seed: int = 0) -> Workspace:
+    """The widest upward surface below the first camera by RANSAC (Fischler and Bolles 1981), a base and a box on it.
 
-    Upwards is what the first camera, the world's origin, had above it (its -y): of two planes the one that leans less
-    from it counts for more, so that a camera that looks steeply down at a wall's foot may take the wall. The base is
-    proposed 55 cm from the middle of the surface on the camera's side, x towards the middle. Both are estimates to be
-    corrected by hand.
+    Of two planes the one that leans less from ``up`` counts for more. The base is proposed 55 cm from the middle of the
+    surface on the camera's side, x towards the middle. Both are estimates to be corrected by hand.
+
+    Args:
+        model: a map whose world is its first camera.
+        up: (3,) roughly upwards in it; -y is right for a camera that looks ahead, -z for one that looks straight down.
+        seed: of what is tried.
 
     Raises:
-        InputError: fewer than 100 Gaussians, or no plane holds a twentieth of them.
+        InputError: fewer than 100 Gaussians, no direction, or no plane holds a twentieth of them.
     """
     points = model.means.double().numpy()
+    upward = np.asarray(up, dtype=np.float64)
+    if upward.shape != (3,) or not np.isfinite(upward).all() or not upward.any():
+        raise InputError(f"is {up}.", field="up", hint="give three numbers, as 0 -1 0")
+    upward = upward / np.linalg.norm(upward)
     if len(points) < 100:
         raise InputError(f"has {len(points)} Gaussians.", field="map", hint="map a log with a table or a floor in view")
     rng = np.random.default_rng(seed)
@@ -128,11 +135,11 @@ def fit_workspace(model: GaussianModel, *, seed: int = 0) -> Workspace:
     best, most, count = np.zeros(4), 0.0, 0
     for trio in rng.integers(0, len(some), (_TRIALS, 3)):
         a, b, c = some[trio]
-        plane = _through(np.cross(b - a, c - a), a)
-        if plane is None:
+        plane = _through(np.cross(b - a, c - a), a, upward)
+        if plane is None or plane[3] <= 0.0:
             continue
         held = int((np.abs(some @ plane[:3] + plane[3]) < _THICK).sum())
-        weight = held * float(-plane[1]) ** _UPRIGHT
+        weight = held * float(plane[:3] @ upward) ** _UPRIGHT
         if weight > most:
             best, most, count = plane, weight, held
     if count < len(some) / 20:
@@ -140,18 +147,18 @@ def fit_workspace(model: GaussianModel, *, seed: int = 0) -> Workspace:
     for _ in range(5):  # least squares on what it holds
         on = points[np.abs(points @ best[:3] + best[3]) < _THICK]
         middle = on.mean(axis=0)
-        refined = _through(np.linalg.svd(on - middle, full_matrices=False)[2][2], middle)
+        refined = _through(np.linalg.svd(on - middle, full_matrices=False)[2][2], middle, upward)
         best = best if refined is None else refined
     return _around(best, points[np.abs(points @ best[:3] + best[3]) < _THICK])
 
 
-def _through(normal: Array, point: Array) -> Array | None:
-    """The plane (4,) through a point, its normal turned to the first camera's upwards; None of three in a row."""
+def _through(normal: Array, point: Array, up: Array) -> Array | None:
+    """The plane (4,) through a point, its normal turned upwards; None of three in a row."""
     length = float(np.linalg.norm(normal))
     if length < 1e-9:
         return None
     n = normal / length
-    n = -n if n[1] > 0 else n
+    n = -n if n @ up < 0 else n
     return np.append(n, -float(n @ point))
 
 

@@ -18,6 +18,7 @@ def info(
     /,
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     fit_plane: bool = False,
+    up: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y Z")] = (0.0, -1.0, 0.0),
 ) -> int:
     """Say what is in a map, a log or a run.
 
@@ -34,6 +35,7 @@ def info(
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         fit_plane: estimate where the map's table or floor is, and propose where a robot may stand, in a scene.yaml
             beside the map, if there is none yet.
+        up: with --fit-plane, roughly upwards in the first camera: 0 -1 0 if it looked ahead, 0 0 -1 straight down.
     """
     from splatbot.cli.tables import print_table
 
@@ -43,7 +45,7 @@ def info(
     if place.is_file():
         print_table(describe_map(place), title=str(place))
         if fit_plane:
-            print_table(fit_scene(place), title=str(place.parent / "scene.yaml"))
+            print_table(fit_scene(place, up), title=str(place.parent / "scene.yaml"))
         return 0
     if fit_plane:
         from splatbot.errors import InputError
@@ -55,7 +57,7 @@ def info(
     return 0
 
 
-def fit_scene(path: Path) -> list[tuple[str, str]]:
+def fit_scene(path: Path, up: tuple[float, float, float]) -> list[tuple[str, str]]:
     """The workspace beside a map file, as names and values; estimated and written if there is none.
 
     Raises:
@@ -68,7 +70,7 @@ def fit_scene(path: Path) -> list[tuple[str, str]]:
     from splatbot.workspace import NAME, find_workspace, fit_workspace
 
     known = find_workspace(path)
-    found = fit_workspace(GaussianModel.load(path)) if known is None else known
+    found = fit_workspace(GaussianModel.load(path), up=up) if known is None else known
     if known is None:
         found.save(path.parent / NAME)
 

@@ -96,5 +96,7 @@ def test_a_map_without_an_upward_surface_is_refused() -> None:
     )  # fmt: skip
     with pytest.raises(InputError, match="no upward surface"):
         fit_workspace(model)
+    with pytest.raises(InputError, match="up"):
+        fit_workspace(model, up=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="Gaussians"):
         fit_workspace(GaussianModel.empty())
