@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 # Error of a pose against the keyframes it was aligned to = (what the noise model says + what the residuals show), times
 # what neither sees: errors that cells have in common, and the keyframe's own, which all its frames share. One number
 # for all logs, from the NEES of synthetic ones of several scenes and trajectories (docs/tracking.md).
-_UNSEEN = 2.0
+_UNSEEN = 1.0
 # Information that any pose has: it is within some 30 m and turns of where it was looked for.
 _LEAST = 1e-3
 # Calibration of lens and depth is good to this share: such an error is the same in every frame, so along a path it adds
