@@ -59,9 +59,7 @@ class SoftPrior:
     information: Array
 
 
-def settings_of(
-    config: TrackingConfig, *, photometric: bool, gate: float, doubt: float = 1.0
-) -> _native.AlignSettings:
+def settings_of(config: TrackingConfig, *, photometric: bool, gate: float, doubt: float = 1.0) -> _native.AlignSettings:
     """The noise model as the kernels take it, with depth ``doubt`` times as uncertain; geometric residuals are on."""
     return _native.AlignSettings(
         photometric=photometric,

@@ -261,7 +261,7 @@ def test_a_known_offset_on_a_textured_wall_is_recovered(name: str) -> None:
     levels = prepare(wall_frame(truth, normal=normal), CONFIG).levels
     moved, turned = pose_distance(truth, aligned(levels, reference, np.eye(4)))
     assert moved < 3e-4
-    assert turned < 2e-4
+    assert turned < 3e-4
 
 
 @pytest.mark.parametrize("photometric", [False, True])
