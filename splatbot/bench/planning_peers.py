@@ -156,8 +156,8 @@ class _Ompl:
         setup.setStateValidityChecker(lambda state: self._states(self._read(state)))
         information = setup.getSpaceInformation()
         information.setStateValidityCheckingResolution(RESOLUTION / self._space.getMaximumExtent())
-        validator = None if self._edges is None else self._validator(information)
-        if validator is not None:
+        if self._edges is not None:
+            validator = self._validator(information, self._edges)
             information.setMotionValidator(validator)
         setup.setStartAndGoalStates(self._state(problem.start), self._state(problem.goal))
         objective = self._base.PathLengthOptimizationObjective(information)
@@ -173,11 +173,10 @@ class _Ompl:
         path = setup.getSolutionPath()
         return np.concatenate([self._read(path.getState(i)) for i in range(path.getStateCount())]), spent
 
-    def _validator(self, information: Any) -> Any:
-        read, edges = self._read, self._edges
-        assert edges is not None
+    def _validator(self, information: Any, edges: Callable[[Array, Array], bool]) -> Any:
+        read = self._read
 
-        class Certified(self._base.MotionValidator):  # type: ignore[misc, name-defined]
+        class Certified(self._base.MotionValidator):  # type: ignore[name-defined]
             def checkMotion(self, a: Any, b: Any, *rest: Any) -> bool:
                 return edges(read(a), read(b))
 

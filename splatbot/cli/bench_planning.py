@@ -66,7 +66,7 @@ def bench_planning(
 
 
 def _print(results: Results, folder: Path) -> None:
-    from splatbot.cli.bench_tables import metric_table, warn_if_busy, wide_console
+    from splatbot.cli.bench_tables import figure_table, metric_table, warn_if_busy, wide_console
 
     console = wide_console()
     machine = results.machine
@@ -78,5 +78,5 @@ def _print(results: Results, folder: Path) -> None:
     for title, part in (("Peers", False), ("Costs as parts of a peer's", True)):
         rows = [row for row in results.rows if row.peer is not None and ("against" in row.case) == part]
         if rows:
-            console.print(metric_table(title, rows))
+            console.print(figure_table(title, rows, list(dict.fromkeys(row.metric for row in rows))))
     console.print(f"written to {folder}")

@@ -61,8 +61,9 @@ def metric_table(title: str, rows: Iterable[Row]) -> Table:
     cases: dict[str, None] = {}
     for row in rows:
         case = f"{row.case}: {row.peer}" if row.peer else row.case
-        text = (row.note or "-") if row.value is None else f"{row.value:.4g}"
-        cells.setdefault(f"{row.metric} [{row.unit}]", {})[case] = text
+        counted = row.unit.startswith("of ")
+        text = (row.note or "-") if row.value is None else f"{row.value:.4g}{' ' + row.unit if counted else ''}"
+        cells.setdefault(row.metric if counted else f"{row.metric} [{row.unit}]", {})[case] = text
         cases[case] = None
     table = Table(title=title)
     table.add_column("")

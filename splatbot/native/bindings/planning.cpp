@@ -88,6 +88,8 @@ class ArmPlanner {
     return nb::make_tuple(owned(std::move(q), {n, joints_}), owned(std::move(parent), {n}), owned(std::move(cost), {n}));
   }
 
+  void look_at(std::shared_ptr<CollisionField> field) { space_->look_at(std::move(field)); }
+
   Planner& planner() { return planner_; }
 
  private:
@@ -147,6 +149,7 @@ void define_planning(nb::module_& m) {
       .def("rerun", &ArmPlanner::rerun, "start"_a.noconvert(), "field"_a, "added"_a, "unpaired"_a, "seconds"_a,
            "iterations"_a, "seed"_a, "The same in a later field with the tree of the last run")
       .def("best", &ArmPlanner::best, "Waypoints (N, J), cost, history (H, 2); from any thread")
+      .def("look_at", &ArmPlanner::look_at, "field"_a, "Another field from the next run on; not while one is busy")
       .def("cancel", [](ArmPlanner& self) { self.planner().cancel(); }, "From any thread")
       .def("tree", &ArmPlanner::tree, "Nodes (N, J), parents (N), costs (N) of the last run")
       .def_prop_ro("iterations", [](ArmPlanner& self) { return self.planner().iterations(); })

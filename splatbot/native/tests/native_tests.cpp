@@ -368,6 +368,7 @@ int main() {
     run_surfels(isa);
     check_cameras(isa);
     check_collision(isa);
+    check_planning();
     run_variants(isa);
     run_optimize();
   }

@@ -11,7 +11,7 @@ from splatbot.geometry import pose_from_quat, so3_log
 from splatbot.planning import GaussianRRTStar, GoalError, JointGoal, PlanStatus, PoseGoal
 from splatbot.robots.panda import panda
 from tests.unit.planning.test_rrt_star import LEFT, RIGHT
-from tests.unit.planning.toys import Slider, ball_world
+from tests.unit.planning.toys import Slider, ball_world, cause_of
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +60,8 @@ def test_a_pose_in_the_table_names_what_the_arm_would_touch(planner: GaussianRRT
     T[2, 3] = 0.0
     result = planner.plan(LEFT, PoseGoal(T), budget_ms=100)
     assert result.status is PlanStatus.GOAL_IN_COLLISION
-    assert result.cause.link >= 0
-    assert result.cause.depth > 0
+    assert cause_of(result).link >= 0
+    assert cause_of(result).depth > 0
 
 
 def test_poses_that_make_no_sense_are_refused(planner: GaussianRRTStar) -> None:

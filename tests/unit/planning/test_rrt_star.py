@@ -13,10 +13,10 @@ from splatbot._native import set_num_threads
 from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
-from splatbot.planning import GaussianRRTStar, GoalError, PlanningError, PlanStatus, StartError
+from splatbot.planning import GaussianRRTStar, GoalError, PlanningError, PlanningProblem, PlanStatus, StartError
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
-from tests.unit.planning.toys import Slider, around_the_ball, ball_world
+from tests.unit.planning.toys import Slider, around_the_ball, ball_world, cause_of
 
 # Two places of the hand close above the table, with things between them.
 LEFT = np.array([-0.26, 0.79, 1.15, -2.5, 0.29, 3.06, -2.15])
@@ -132,6 +132,12 @@ def test_a_seed_and_a_number_of_iterations_give_one_path_on_any_number_of_thread
     assert not np.array_equal(found[0], other.unwrap().waypoints)
 
 
+def test_a_problem_is_solved_as_its_start_and_goal_are(planner: GaussianRRTStar) -> None:
+    one = planner.solve(PlanningProblem(LEFT, RIGHT), budget_ms=60_000, iterations=200, seed=5).unwrap()
+    other = planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=5).unwrap()
+    np.testing.assert_array_equal(one.waypoints, other.waypoints)
+
+
 def test_a_margin_is_kept(field: GaussianCollisionField) -> None:
     plain, careful = (GaussianRRTStar(field, panda(), margin=m) for m in (0.0, 0.02))
     path = careful.plan(LEFT, RIGHT, budget_ms=200.0).unwrap()
@@ -154,8 +160,24 @@ def test_a_search_can_be_watched_and_cancelled_from_another_thread(planner: Gaus
     assert cost == pytest.approx(_length(waypoints))
     assert history[-1, 1] == cost
     assert results[0].status is PlanStatus.SUCCESS
-    assert results[0].path.cost <= cost
+    assert results[0].unwrap().cost <= cost
     assert results[0].seconds < 50
+
+
+def test_several_threads_may_ask_one_planner(planner: GaussianRRTStar) -> None:
+    alone = [planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=k).unwrap().waypoints for k in range(6)]
+    found: dict[int, Array] = {}
+
+    def ask(k: int) -> None:
+        found[k] = planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=k).unwrap().waypoints
+
+    threads = [threading.Thread(target=ask, args=(k,)) for k in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    for k in range(6):
+        np.testing.assert_array_equal(found[k], alone[k])
 
 
 def test_a_cancelled_search_without_a_path_says_so(ball: GaussianCollisionField) -> None:
@@ -177,7 +199,7 @@ def test_failures_name_what_is_in_the_way(planner: GaussianRRTStar, field: Gauss
         assert result.status is status
         assert result.path is None
         assert result.seconds < 1
-        cause = result.cause
+        cause = cause_of(result)
         nearest = planner.arm.clearance(field, in_map[None])
         assert cause.link == nearest.link[0]
         assert cause.gaussian == nearest.index[0]
@@ -189,9 +211,9 @@ def test_failures_name_what_is_in_the_way(planner: GaussianRRTStar, field: Gauss
     in_itself = q[verdict.in_collision & (verdict.other >= 0)][0]
     result = planner.plan(in_itself, RIGHT)
     assert result.status is PlanStatus.START_STATE_IN_COLLISION
-    assert result.cause.other >= 0
-    assert result.cause.gaussian == -1
-    assert result.cause.depth > 0
+    assert cause_of(result).other >= 0
+    assert cause_of(result).gaussian == -1
+    assert cause_of(result).depth > 0
 
 
 def test_joints_beyond_their_limits_are_named(planner: GaussianRRTStar) -> None:
@@ -200,8 +222,15 @@ def test_joints_beyond_their_limits_are_named(planner: GaussianRRTStar) -> None:
     start, goal = planner.plan(far, RIGHT), planner.plan(LEFT, far)
     assert (start.status, goal.status) == (PlanStatus.START_STATE_INVALID, PlanStatus.GOAL_STATE_INVALID)
     for result in (start, goal):
-        assert result.cause.joint == 3
-        assert result.cause.depth == pytest.approx(0.25)
+        assert cause_of(result).joint == 3
+        assert cause_of(result).depth == pytest.approx(0.25)
+
+
+def test_a_joint_that_its_encoder_reads_a_hair_beyond_the_limit_is_no_failure(planner: GaussianRRTStar) -> None:
+    start = LEFT.copy()
+    start[6] = planner.robot.chain.lower[6] - 1e-9
+    path = planner.plan(start, RIGHT, budget_ms=100).unwrap()
+    np.testing.assert_array_equal(path.waypoints[0], start)
 
 
 def test_a_goal_that_cannot_be_reached_times_out_and_names_what_blocks_the_straight_way() -> None:
@@ -217,8 +246,8 @@ def test_a_goal_that_cannot_be_reached_times_out_and_names_what_blocks_the_strai
     planner = GaussianRRTStar(GaussianCollisionField(ring), Slider(2))
     result = planner.plan([0.0, 0.0], [0.8, 0.0], budget_ms=50)
     assert result.status is PlanStatus.TIMED_OUT
-    assert result.cause.gaussian == 0
-    assert result.cause.link == 2
+    assert cause_of(result).gaussian == 0
+    assert cause_of(result).link == 2
     exhausted = planner.plan([0.0, 0.0], [0.8, 0.0], budget_ms=60_000, iterations=100)
     assert exhausted.status is PlanStatus.PLANNING_FAILED
     assert exhausted.iterations == 100

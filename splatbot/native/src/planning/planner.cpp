@@ -35,11 +35,15 @@ void Planner::forget_best() {
   best_ = {{}, kInfinity, {}};
 }
 
-void Planner::publish(double seconds) {
+void Planner::publish(double seconds) { publish(star_->path(), star_->best(), seconds); }
+
+void Planner::publish(Configuration waypoints, double cost, double seconds) {
   const std::lock_guard lock(mutex_);
-  best_.waypoints = star_->path();
-  best_.cost = star_->best();
-  best_.history.push_back({seconds, best_.cost});
+  if (cost < best_.cost) {
+    best_.waypoints = std::move(waypoints);
+    best_.cost = cost;
+    best_.history.push_back({seconds, cost});
+  }
 }
 
 PlanEnd Planner::run(std::span<const double> start, std::span<const double> goals, const PlanLimits& limits) {
@@ -64,16 +68,24 @@ void Planner::begin(std::span<const double> start) {
 PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLimits& limits) {
   const Stop stop(limits.seconds, &cancelled_);
   random_ = Random(limits.seed);
+  start_.assign(start.begin(), start.end());
+  *sampler_ = Sampler(*space_, start_, goals_);
+  edges_before_ = space_->edges();
+  forget_best();
+  // A new path is sooner found than the tree is asked.
+  std::uint64_t left = limits.iterations;
+  const bool met = connect_->run(start_, random_, stop, kInfinity, left);
+  iterations_ = limits.iterations - left;
+  if (met) {
+    publish(connect_->path(), connect_->cost(), stop.elapsed());
+  }
   Configuration orphans;
   star_->cut(added, stop, orphans);
-  edges_before_ = space_->edges();
-  iterations_ = 0;
-  forget_best();
-  if (star_->start_from(start.data())) {
-    start_.assign(start.begin(), start.end());
-    *sampler_ = Sampler(*space_, start_, goals_);
-  } else {
-    begin(start);
+  if (!star_->start_from(start.data())) {
+    star_ = std::make_unique<Star>(*space_, *sampler_, start_, kStarRange);
+  }
+  if (met) {
+    star_->adopt(*connect_);
   }
   if (std::isfinite(star_->best())) {
     publish(stop.elapsed());
@@ -102,8 +114,8 @@ PlanEnd Planner::search(const PlanLimits& limits, const Stop& stop) {
       publish(stop.elapsed());
     }
   }
-  const bool found = std::isfinite(star_->best());
-  if (found) {
+  const bool found = std::isfinite(best_.cost);
+  if (std::isfinite(star_->best())) {
     improve(limits, stop);
   }
   const bool cancelled = cancelled_.exchange(false);
@@ -167,6 +179,7 @@ bool Planner::near_best(double* q) {
     const double a = path[edge * dims + d], b = path[(edge + 1) * dims + d];
     q[d] = a + t * (b - a) + spread * random_.normal();
   }
+  space_->settle(q);
   return space_->contains(q);
 }
 

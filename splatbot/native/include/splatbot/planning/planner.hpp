@@ -59,6 +59,7 @@ class Planner {
   void shorten(const Configuration& path, int attempts, const Stop& stop);
   bool near_best(double* q);
   void publish(double seconds);
+  void publish(Configuration waypoints, double cost, double seconds);
   void forget_best();
   void begin(std::span<const double> start);
   void join(const Configuration& orphans, const Stop& stop);
