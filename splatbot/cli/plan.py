@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from splatbot.planning import PlanResult, Trajectory
     from splatbot.robots.robot import RobotModel
 
+_REACH = 1.0  # [m] around the base in which a margin is looked for
 Pose = tuple[float, float, float, float, float, float, float]
 
 
@@ -52,7 +53,8 @@ def plan(
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml beside the map (see
             `splatbot info --fit-plane`).
-        margin: room [m] to keep from the map; "auto", for a run folder: what its own depth images say of its surfaces.
+        margin: room [m] to keep from the map; "auto", for a run folder: the error of its surfaces within a metre of
+            the base, as its own depth images tell.
         n_sigma: where the surface of a Gaussian is.
         budget_ms: time to plan.
         seed: of the search.
@@ -76,7 +78,7 @@ def plan(
     model = GaussianModel.load(file)
     field = GaussianCollisionField(model, n_sigma)
     T_world_base = _base(base, map)
-    planner = GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=_margin(margin, map, field))
+    planner = GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=_margin(margin, map, field, T_world_base))
     wanted: Any = (
         _joints(goal, arm, "--goal")
         if goal is not None
@@ -145,13 +147,13 @@ def _base(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
     return known.T_world_base
 
 
-def _margin(text: str, map_: Path, field: GaussianCollisionField) -> float:
+def _margin(text: str, map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
     import math
 
     from splatbot.errors import InputError
 
     if text == "auto":
-        return _own_margin(map_, field)
+        return _own_margin(map_, field, T_world_base)
     try:
         value = float(text)
     except ValueError:
@@ -161,11 +163,13 @@ def _margin(text: str, map_: Path, field: GaussianCollisionField) -> float:
     return value
 
 
-def _own_margin(map_: Path, field: GaussianCollisionField) -> float:
+def _own_margin(map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
+    """Of 99.9 % of what the run measured within a metre of the base, without what mapping leaves out."""
     from splatbot.collision import surface_error
     from splatbot.errors import InputError
     from splatbot.logs import open_log
     from splatbot.results.folder import RunFolder
+    from splatbot.tracking.prepare import valid_depth
 
     if not map_.is_dir():
         raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
@@ -174,8 +178,10 @@ def _own_margin(map_: Path, field: GaussianCollisionField) -> float:
     log = open_log(str(source["uri"]), camera=source.get("camera"))
     poses = sorted(run.load_poses().items())
     some = poses[:: max(1, len(poses) // 40)]
+    bounds = run.load_config().tracking
     frames = ((log[index], T) for index, T in some)
-    return surface_error(field, ((frame.depth, frame.camera, T) for frame, T in frames)).share(0.999)
+    views = ((valid_depth(frame.depth, bounds.min_depth, bounds.max_depth), frame.camera, T) for frame, T in frames)
+    return surface_error(field, views, around=[*T_world_base[:3, 3], _REACH]).share(0.999)
 
 
 def _summary(result: PlanResult, trajectory: Trajectory) -> dict[str, Any]:
