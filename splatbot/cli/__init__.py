@@ -25,6 +25,9 @@ COMMANDS = {
     "info": _Command("splatbot.cli.info", "info", "Say what is in a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "plan": _Command(
+        "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
+    ),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
     "bench raster": _Command(
