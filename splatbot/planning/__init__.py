@@ -16,6 +16,8 @@ from splatbot.planning.problem import (
 )
 from splatbot.planning.replan import Replanner, Update
 from splatbot.planning.rrt_star import GaussianRRTStar
+from splatbot.planning.timing import time_path
+from splatbot.planning.trajectory import State, Trajectory
 
 __all__ = [
     "Cause",
@@ -32,5 +34,8 @@ __all__ = [
     "PoseGoal",
     "Replanner",
     "StartError",
+    "State",
+    "Trajectory",
     "Update",
+    "time_path",
 ]

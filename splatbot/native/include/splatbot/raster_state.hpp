@@ -47,9 +47,6 @@ inline constexpr int kSlot = 16;
 inline constexpr int kAbsolute = 14;
 static_assert(kMoments + kRecordChannels <= kAbsolute && kAbsolute + 2 <= kSlot);
 
-// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy.
-inline constexpr int kCameraSums = 16;
-
 // What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
 inline constexpr int kFinalPlanes = 2 + kRecordChannels;
 inline constexpr int kWeightPlane = 1 + kRecordChannels;  // for expected depth only

@@ -50,11 +50,11 @@ bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedB
   return false;
 }
 
-// Gradients of the camera's rotation, translation and intrinsics, lane by lane until the end.
+// Gradients of the camera's rotation, translation, intrinsics and motion, lane by lane until the end.
 class CameraSums {
  public:
   SB_INLINE void add(const F (&rotation)[9], const F (&translation)[3], const F (&intrinsics)[4], int n) {
-    alignas(64) float lanes[kCameraSums][W];
+    alignas(64) float lanes[kStill][W];
     for (int i = 0; i < 9; ++i) {
       store(lanes[i], rotation[i]);
     }
@@ -64,9 +64,19 @@ class CameraSums {
     for (int i = 0; i < 4; ++i) {
       store(lanes[12 + i], intrinsics[i]);
     }
-    for (int k = 0; k < kCameraSums; ++k) {
+    for (int k = 0; k < kStill; ++k) {
       for (int i = 0; i < W; ++i) {
         sums_[k][i] += i < n ? static_cast<double>(lanes[k][i]) : 0.0;
+      }
+    }
+  }
+
+  SB_INLINE void add_motion(const F (&motion)[kMotionSums], int n) {
+    alignas(64) float lanes[W];
+    for (int k = 0; k < kMotionSums; ++k) {
+      store(lanes, motion[k]);
+      for (int i = 0; i < n; ++i) {
+        sums_[kStill + k][i] += static_cast<double>(lanes[i]);
       }
     }
   }
@@ -81,6 +91,7 @@ class CameraSums {
   }
 
  private:
+  static constexpr int kStill = kCameraSums - kMotionSums;
   double sums_[kCameraSums][W] = {};
 };
 

@@ -22,6 +22,7 @@ struct LaneGradients {
   F mean2d[2];
   F rotation[9], translation[3];  // of the camera; mean less origin times translation is yet to be added
   F intrinsics[4];                // fx, fy, cx, cy
+  MotionLanes moved;              // of a rolling shutter
 };
 
 // Sum of a Gaussian's slots in the order of its tiles, on top of what earlier passes left.
@@ -211,13 +212,19 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const View& view,
   if constexpr (P == Projection::pinhole) {
     through_pinhole(g, cam, o, image, of_covar, camera, gp, ga, out);
   } else {
+    const bool moves = P == Projection::unscented && camera && view.lens.shutter != Shutter::global;
     if constexpr (P == Projection::unscented) {
-      pull_back_unscented(g, view, o, image, gp, ga, out.scale);
+      pull_back_unscented(g, view, o, image, gp, ga, out.scale, moves ? &out.moved : nullptr);
     } else {
       through_affine<P>(g, cam, o, lens, image, of_covar, gp, ga, out);
     }
     if (camera) {
       into_intrinsics(cam, o, image, out);
+    }
+    if (moves) {
+      const int across = ShutterTime(view).axis;
+      out.intrinsics[across] = out.intrinsics[across] + out.moved.focal;
+      out.intrinsics[2 + across] = out.intrinsics[2 + across] + out.moved.center;
     }
   }
   out.mean2d[0] = image.mx;
@@ -400,6 +407,9 @@ void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
     write_gradients(args, ids, n, grads, sums, root);
     if (args.camera != nullptr) {
       camera_sums.add(grads.rotation, grads.translation, grads.intrinsics, n);
+      if (args.forward.view.lens.shutter != Shutter::global) {
+        camera_sums.add_motion(grads.moved.motion, n);
+      }
     }
   }
   if (args.camera != nullptr && args.last) {

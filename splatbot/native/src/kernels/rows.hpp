@@ -10,6 +10,8 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 #if defined(SPLATBOT_X86)
 using Quad = __m128;
+
+SB_INLINE Quad load_pair(const float* p) { return _mm_castsi128_ps(_mm_loadl_epi64(reinterpret_cast<const __m128i_u*>(p))); }
 #else
 using Quad = float __attribute__((vector_size(16)));
 #endif
@@ -21,10 +23,10 @@ SB_INLINE Quad load_quad_of(const float* p) {
   if constexpr (Width == 4) {
     return _mm_loadu_ps(p);
   } else if constexpr (Width == 2) {
-    return _mm_castpd_ps(_mm_load_sd(reinterpret_cast<const double*>(p)));
+    return load_pair(p);
   } else {
     static_assert(Width == 3);
-    return _mm_insert_ps(_mm_castpd_ps(_mm_load_sd(reinterpret_cast<const double*>(p))), _mm_load_ss(p + 2), 0x20);
+    return _mm_insert_ps(load_pair(p), _mm_load_ss(p + 2), 0x20);
   }
 #else
   Quad q = {};
@@ -40,7 +42,7 @@ SB_INLINE void store_quad_of(float* p, Quad q) {
     _mm_storeu_ps(p, q);
   } else {
     static_assert(Width == 2 || Width == 3);
-    _mm_storel_pi(reinterpret_cast<__m64*>(p), q);
+    _mm_storel_epi64(reinterpret_cast<__m128i_u*>(p), _mm_castps_si128(q));
     if constexpr (Width == 3) {
       _mm_store_ss(p + 2, _mm_movehl_ps(q, q));
     }
