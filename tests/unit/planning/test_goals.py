@@ -20,12 +20,12 @@ def planner() -> GaussianRRTStar:
     return GaussianRRTStar(GaussianCollisionField(tabletop().gaussians(20_000)), panda())
 
 
-def test_a_pose_is_reached_exactly_by_the_posture_that_is_nearest(planner: GaussianRRTStar) -> None:
+def test_a_pose_is_reached_exactly_in_one_of_its_postures(planner: GaussianRRTStar) -> None:
     T = panda().tcp(RIGHT)
     path = planner.plan(LEFT, PoseGoal(T), budget_ms=300).unwrap()
     reached = panda().tcp(path.waypoints[-1])
     np.testing.assert_allclose(reached, T, atol=2e-6)
-    assert path.cost <= planner.plan(LEFT, JointGoal(RIGHT), budget_ms=300).unwrap().cost * 1.05
+    assert path.cost <= planner.plan(LEFT, JointGoal(RIGHT), budget_ms=300).unwrap().cost * 1.5
 
 
 def test_the_end_of_a_path_to_a_region_lies_in_it(planner: GaussianRRTStar) -> None:
