@@ -54,6 +54,7 @@ class TwinResult:
         timestep: [s].
         rate: of the controller [Hz].
         seconds: that it took [s].
+        physics_seconds: of it in MuJoCo and in the effects [s].
         real_time: simulated over real time.
         tracking: None without a robot.
         touches: what the arm touched.
@@ -73,6 +74,7 @@ class TwinResult:
     timestep: float
     rate: float
     seconds: float
+    physics_seconds: float
     real_time: float
     tracking: Tracking | None
     touches: tuple[Touch, ...]
@@ -101,6 +103,7 @@ class _Log:
     errors: list[Array] = field(default_factory=list)
     digest: Any = field(default_factory=hashlib.sha256)
     overload: float = 0.0
+    physics: float = 0.0
 
 
 class Twin:
@@ -174,6 +177,7 @@ class Twin:
         motion: JointMotion | None = None,
         *,
         progress: Callable[[float], None] | None = None,
+        watch: Callable[[Any, float], None] | None = None,
         until_touch: bool = False,
     ) -> TwinResult:
         """Follow a motion from a reset.
@@ -181,6 +185,7 @@ class Twin:
         Args:
             motion: by default the moves of the scene's task.
             progress: called about fifty times with the share that is done; may call :meth:`stop`.
+            watch: called with MuJoCo's data and the time [s] after every control period, to look and not to touch.
             until_touch: stop when the arm touches anything.
 
         Raises:
@@ -194,11 +199,17 @@ class Twin:
         count = max(1, round(motion.duration * self.rate))
         log = _Log(Touches(self.world), Room(self.world), Things(self.world, self.data, 1.0 / self.rate))
         begin = clock.perf_counter()
-        done = self._run(motion, count, log, progress, until_touch)
+        done = self._run(motion, count, log, progress, watch, until_touch)
         return self._result(motion, done, count, log, clock.perf_counter() - begin)
 
     def _run(
-        self, motion: JointMotion, count: int, log: _Log, progress: Callable[[float], None] | None, until_touch: bool
+        self,
+        motion: JointMotion,
+        count: int,
+        log: _Log,
+        progress: Callable[[float], None] | None,
+        watch: Callable[[Any, float], None] | None,
+        until_touch: bool,
     ) -> int:
         period = 1.0 / self.rate
         q, v, a, opening = targets_of(motion, count, period)
@@ -207,6 +218,7 @@ class Twin:
         log.room.look(self.data, 0.0)
         for k in range(count):
             now = (k + 1) * period
+            start = clock.perf_counter()
             for hook in self.hooks:
                 hook.on_step(self.data, k * period)
             if self.follower is not None:
@@ -215,6 +227,9 @@ class Twin:
                     target = hook.on_targets(target)
                 self.follower.command(self.data, target, v[k], a[k], None if opening is None else float(opening[k]))
             mujoco.mj_step(self.world.model, self.data, self.substeps)
+            log.physics += clock.perf_counter() - start
+            if watch is not None:
+                watch(self.data, now)
             if self.follower is not None:
                 log.errors.append(self.data.qpos[self.follower.qpos] - q[k])
                 log.overload = max(log.overload, float((np.abs(self.data.actuator_force) / limits).max()))
@@ -252,6 +267,7 @@ class Twin:
             timestep=self.timestep,
             rate=self.rate,
             seconds=seconds,
+            physics_seconds=log.physics,
             real_time=simulated / max(seconds, 1e-9),
             tracking=tracking,
             touches=tuple(log.touches.found),

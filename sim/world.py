@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.errors import ConfigError, InputError
+from splatbot.geometry import rotation_to_quat
 from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot
 from splatbot.sim.clutter import add_ellipsoids, load_parts
 from splatbot.sim.effects.physics import Decision, Hook, effects_for, physics_effect
-from splatbot.sim.scene import Scene, SceneObject
+from splatbot.sim.scene import CameraSection, Scene, SceneObject
 from splatbot.sim.solids import quat_of
 
 OBJECT = "object/"
+CAMERA = "camera"
 _MOVABLE_MASS = 0.2  # [kg]
 
 
@@ -127,6 +129,10 @@ def _draft(scene: Scene, robot: RobotModel | None) -> Draft:
     draft = Draft(scene, spec, arm)
     if scene.robot is not None and arm is not None:
         _place_robot(draft, arm)
+    light = spec.visual.headlight
+    light.diffuse, light.ambient = [0.7] * 3, [0.35] * 3
+    if scene.camera is not None:
+        _add_camera(spec, scene.camera)
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     for thing in scene.objects:
         draft.bodies[thing.name] = _add_object(draft, thing)
@@ -153,6 +159,15 @@ def _place_robot(draft: Draft, arm: RobotModel) -> None:
     for body in draft.robot_bodies:
         for geom in body.geoms:
             geom.condim, geom.rgba = 1, [0.9, 0.9, 0.92, 1.0]
+
+
+def _add_camera(spec: Any, section: CameraSection) -> None:
+    from splatbot.sim.camera import pose_of
+
+    T = pose_of(section)
+    camera = spec.worldbody.add_camera(name=CAMERA, pos=T[:3, 3].tolist(), fovy=float(np.degrees(section.fov_y)))
+    camera.quat = rotation_to_quat(T[:3, :3] @ np.diag([1.0, -1.0, -1.0]))  # MuJoCo's y is up, z backwards
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = section.width, section.height
 
 
 def _add_object(draft: Draft, thing: SceneObject) -> Any:

@@ -50,7 +50,7 @@ class Lighting(PhysicsEffect):
         """The lamps look down at the origin, and the headlight goes."""
         if not draft.scene.lights:
             return
-        draft.spec.visual.headlight.diffuse = [0.15, 0.15, 0.15]
+        draft.spec.visual.headlight.diffuse = [0.15] * 3
         for light in draft.scene.lights:
             down = -np.array(light.at) / max(float(np.linalg.norm(light.at)), 1e-9)
             lamp = draft.spec.worldbody.add_light(pos=list(light.at), dir=down.tolist())

@@ -47,10 +47,12 @@ def _attach(draft: Draft, thing: SceneObject) -> None:
     radius = float(0.1 * (size / (cells - 1)).min())
     spacing = (size - 2 * radius) / (cells - 1)
     mass = float(size.prod() * shape.density)
-    text = f"""<mujoco><worldbody><body name="{thing.name}"><flexcomp name="{thing.name}" type="grid" dim="3" dof="trilinear"
-      count="{_text(cells)}" spacing="{_text(spacing)}" mass="{mass:.9g}" radius="{radius:.9g}"
-      rgba="{_text(thing.color)} 1"><contact selfcollide="none" friction="{thing.friction:.9g} 0.005 0.0001"/>
-      <elasticity young="{shape.young:.9g}" poisson="{shape.poisson:.9g}" damping="0.002"/></flexcomp></body></worldbody></mujoco>"""
+    grid = f'type="grid" dim="3" dof="trilinear" count="{_text(cells)}" spacing="{_text(spacing)}"'
+    text = f"""<mujoco><worldbody><body name="{thing.name}">
+      <flexcomp name="{thing.name}" {grid} mass="{mass:.9g}" radius="{radius:.9g}" rgba="{_text(thing.color)} 1">
+        <contact selfcollide="none" friction="{thing.friction:.9g} 0.005 0.0001"/>
+        <elasticity young="{shape.young:.9g}" poisson="{shape.poisson:.9g}" damping="0.002"/>
+      </flexcomp></body></worldbody></mujoco>"""
     frame = draft.spec.worldbody.add_frame(pos=list(thing.at), quat=quat_of(thing.rpy))
     draft.spec.attach(mujoco.MjSpec.from_string(text), frame=frame, prefix="object/")
 
