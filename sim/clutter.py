@@ -97,14 +97,14 @@ def load_parts(scene: Scene) -> tuple[Scene, MapParts | None]:
     return scene.model_copy(update={"objects": (*scene.objects, *parts.objects)}), parts
 
 
-def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> Any:
-    """A fixed body with a geom for each."""
-    body = spec.worldbody.add_body(name="object/map")
+def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
+    """A geom for each, in the world itself: 2,000 in a body of their own take twice the time, asleep eight times."""
+    geoms = []
     for center, axes, quat in zip(ellipsoids.centers, ellipsoids.axes, ellipsoids.quats, strict=True):
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, pos=center, size=axes, quat=quat, condim=1, rgba=[0.6, 0.6, 0.65, 1.0]
-        )
-    return body
+        geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, pos=center, size=axes, quat=quat)
+        geom.condim, geom.rgba = 1, [0.6, 0.6, 0.65, 1.0]
+        geoms.append(geom)
+    return geoms
 
 
 def _table(support: Support) -> SceneObject:

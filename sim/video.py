@@ -25,7 +25,7 @@ class Video:
         size = (camera.camera.width, camera.camera.height)
         self._file = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, size)
         if not self._file.isOpened():
-            raise InputError("cannot be written.", file=path, field="--video", hint="name a .mp4 in a folder that exists")
+            raise InputError("cannot be written.", file=path, field="--video", hint="name a .mp4 in an existing folder")
         self._last: Any = None
         self.frames = 0
 

@@ -22,6 +22,7 @@ from splatbot.sim.solids import quat_of
 
 OBJECT = "object/"
 CAMERA = "camera"
+MAP = "map"
 _MOVABLE_MASS = 0.2  # [kg]
 
 
@@ -35,8 +36,7 @@ class Draft:
         robot: the arm, or None.
         robot_bodies: its bodies.
         bodies: each object's body, by its name.
-        map_geoms: of the map's clutter.
-        map_bodies: that hold them.
+        map_geoms: of the map's clutter, in the world itself.
     """
 
     scene: Scene
@@ -45,7 +45,6 @@ class Draft:
     robot_bodies: list[Any] = field(default_factory=list)
     bodies: dict[str, Any] = field(default_factory=dict)
     map_geoms: list[Any] = field(default_factory=list)
-    map_bodies: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +96,7 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
     scene, parts = load_parts(scene)
     draft = _draft(scene, robot)
     if parts is not None and len(parts.ellipsoids.centers):
-        body = add_ellipsoids(draft.spec, parts.ellipsoids)
-        draft.map_bodies, draft.map_geoms = (body,), list(body.geoms)
+        draft.map_geoms = add_ellipsoids(draft.spec, parts.ellipsoids)
     notes = parts.notes if parts is not None else ()
     decisions = effects_for(scene)
     on = [physics_effect(d.name) for d in decisions if d.on]
@@ -202,7 +200,7 @@ def _compiled(draft: Draft) -> Any:
 
 def _mounts(draft: Draft, model: Any) -> tuple[tuple[str, str], ...]:
     """Excludes contacts of the first moving link, which turns in its place, with the fixed things it stands in."""
-    if draft.robot is None or not draft.scene.objects + draft.map_bodies:
+    if draft.robot is None:
         return ()
     fixed = [draft.bodies[t.name] for t in draft.scene.objects if t.name in draft.bodies and not (t.movable or t.path)]
     data = mujoco.MjData(model)
@@ -210,10 +208,12 @@ def _mounts(draft: Draft, model: Any) -> tuple[tuple[str, str], ...]:
     mujoco.mj_kinematics(model, data)
     link = model.body(draft.robot_bodies[1].name)
     found = []
-    for body in (*fixed, *draft.map_bodies):
+    if draft.map_geoms:
+        fixed.append(draft.spec.worldbody)
+    for body in fixed:
         if _meet(model, data, link, model.body(body.name)):
             draft.spec.add_exclude(bodyname1=link.name, bodyname2=body.name)
-            found.append((str(link.name), str(body.name).removeprefix(OBJECT)))
+            found.append((str(link.name), _owner(body.name)))
     return tuple(found)
 
 
@@ -228,8 +228,12 @@ def _geoms(body: Any) -> range:
 
 def _owners(model: Any) -> tuple[tuple[str, ...], NDArray[np.bool_]]:
     names = [str(model.body(int(body)).name) for body in model.geom_bodyid]
-    robot = np.array([not name.startswith(OBJECT) for name in names], dtype=np.bool_)
-    return tuple(name.removeprefix(OBJECT) for name in names), robot
+    robot = np.array([not name.startswith(OBJECT) and name != "world" for name in names], dtype=np.bool_)
+    return tuple(_owner(name) for name in names), robot
+
+
+def _owner(body: str) -> str:
+    return MAP if body == "world" else str(body).removeprefix(OBJECT)
 
 
 def robot_joints(model: Any, robot: RobotModel) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import mujoco
@@ -18,9 +19,8 @@ from splatbot.bench.twin_paths import DEPTH, try_paths
 from splatbot.protocols import Array
 from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.panda import panda
-from splatbot.sim.clutter import map_parts
 from splatbot.sim.ledger import ledger
-from splatbot.sim.scene import Clutter, Scene, load_scene, make_scene, scene_names
+from splatbot.sim.scene import Scene, load_scene, make_scene, scene_names
 from splatbot.sim.twin import Twin
 
 Say = Callable[[str], None]
@@ -86,31 +86,31 @@ def _step_costs(results: Results, plan: TwinPlan) -> None:
     cost = step_us(forced.world.model, forced.data, plan.steps)
     results.add("empty scene, contact and drag forced on", "step", cost, "us")
     for name, ellipsoids in (("2,000 map geoms, robot, 4 objects", 2000), ("500 map geoms, robot, 4 objects", 500)):
-        scene = cluttered(ellipsoids, 2000 if plan.quick else plan.gaussians)
-        for state, forbid in (("awake", ("sleep",)), ("asleep", ())):
-            twin = Twin(scene.with_effects(forbid=forbid), timestep=_STEP)
-            twin.world.model.opt.timestep = _STEP
-            mujoco.mj_step(twin.world.model, twin.data, 1500)
-            cost = step_us(twin.world.model, twin.data, plan.steps)
-            note = f"{twin.world.model.ngeom} geoms, {int(twin.data.ncon)} contacts"
-            results.add(f"{name}, {state}", "step", cost, "us", note=note)
+        with TemporaryDirectory() as temporary:
+            scene = cluttered(ellipsoids, 2000 if plan.quick else plan.gaussians, Path(temporary))
+            _cluttered_steps(results, plan, name, scene)
 
 
-def cluttered(ellipsoids: int, gaussians: int) -> Scene:
+def _cluttered_steps(results: Results, plan: TwinPlan, name: str, scene: Scene) -> None:
+    for state, forbid in (("awake", ("sleep",)), ("asleep", ())):
+        twin = Twin(scene.with_effects(forbid=forbid), timestep=_STEP)
+        twin.world.model.opt.timestep = _STEP
+        mujoco.mj_step(twin.world.model, twin.data, 1500)
+        cost = step_us(twin.world.model, twin.data, plan.steps)
+        note = f"{twin.world.model.ngeom} geoms, {int(twin.data.ncon)} contacts"
+        results.add(f"{name}, {state}", "step", cost, "us", note=note)
+
+
+def cluttered(ellipsoids: int, gaussians: int, folder: Path) -> Scene:
     """The table top's map as at most so many ellipsoids and a plane, with a robot and four free boxes."""
-    parts = map_parts(tabletop().gaussians(gaussians), Clutter(file="", objects=False, ellipsoids=ellipsoids), np.zeros(3))
-    e = parts.ellipsoids
-    shapes = [
-        {"kind": "ellipsoid", "axes": axes.tolist(), "at": center.tolist(), "rpy": _rpy(quat)}
-        for center, axes, quat in zip(e.centers, e.axes, e.quats, strict=True)
-    ]
+    file = folder / "map.ply"
+    tabletop().gaussians(gaussians).save(file)
     boxes = [
         {"name": f"box{i}", "shapes": [{"kind": "box", "size": [0.05] * 3}], "at": at, "movable": True}
         for i, at in enumerate(([0.25, 0.0, 0.027], [0.3, 0.45, 0.027], [0.3, -0.5, 0.027], [0.8, -0.4, 0.027]))
     ]
-    table = [thing.model_dump() for thing in parts.objects]
-    things = [{"name": "clutter", "shapes": shapes}, *boxes, *table]
-    return make_scene({"name": "cluttered", "objects": things})
+    clutter = {"file": str(file), "objects": False, "ellipsoids": ellipsoids}
+    return make_scene({"name": "cluttered", "map": clutter, "objects": boxes})
 
 
 def step_us(model: Any, data: Any, steps: int) -> float:
@@ -178,11 +178,3 @@ def _paths(results: Results, plan: TwinPlan) -> None:
     results.add(case, f"pushed {1e3 * DEPTH:g} mm in", trials.pushed, "")
     results.add(case, "seen as contact", trials.seen, "", note="of those pushed")
     results.add(case, "faster than real time", trials.real_time, "x")
-
-
-def _rpy(quat: Array) -> list[float]:
-    """Roll, pitch, yaw [rad] of a quaternion wxyz."""
-    from splatbot.geometry import quat_to_rotation
-
-    R = quat_to_rotation(quat)
-    return [float(np.arctan2(R[2, 1], R[2, 2])), float(np.arcsin(np.clip(-R[2, 0], -1, 1))), float(np.arctan2(R[1, 0], R[0, 0]))]

@@ -53,9 +53,7 @@ class PathTrials:
 
 def truth_scene(table: Tabletop) -> Scene:
     """The shapes themselves as a scene: nothing of it comes from a map."""
-    things = [
-        {"name": f"thing{i}", "shapes": [_shape(solid)], **_place(solid)} for i, solid in enumerate(table.solids)
-    ]
+    things = [{"name": f"thing{i}", "shapes": [_shape(solid)], **_place(solid)} for i, solid in enumerate(table.solids)]
     return make_scene({"name": "truth", "objects": things})
 
 
@@ -140,10 +138,11 @@ def _capsules(robot: RobotModel) -> list[tuple[int, Capsule]]:
     """Of the moving links, and of the fingers on the last one, in its frame."""
     found = [(s.link, s) for s in robot.shapes if isinstance(s, Capsule) and s.link > 0]
     if robot.gripper is not None:
+        opened = np.array([0.0, robot.gripper.stroke, 0.0])
         for T in robot.gripper.T_link_finger:
             for s in robot.gripper.shapes:
                 if isinstance(s, Capsule):
-                    ends = np.array([s.start, s.end]) + [0.0, robot.gripper.stroke, 0.0]
+                    ends = np.array([s.start, s.end]) + opened
                     a, b = ends @ T[:3, :3].T + T[:3, 3]
                     found.append((len(robot), Capsule(len(robot), tuple(a), tuple(b), s.radius)))
     return found

@@ -87,7 +87,9 @@ def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
     from splatbot.sim.scene import load_scene, make_scene
 
     if (name is None) == (map is None):
-        raise InputError("needs either a scene or a map.", field="--scene", hint="splatbot twin --list names the scenes")
+        raise InputError(
+            "needs either a scene or a map.", field="--scene", hint="splatbot twin --list names the scenes"
+        )
     values: dict[str, Any] = {}
     if map is not None:
         values = {"name": map.stem, "map": {"file": str(map.resolve())}}
