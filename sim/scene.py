@@ -232,7 +232,7 @@ class Scene(Section):
         forced = [n for n in (*self.effects.force, *force) if n not in forbid]
         forbidden = [n for n in (*self.effects.forbid, *forbid) if n not in force]
         values = self.model_dump() | {"effects": {"force": forced, "forbid": forbidden}, "folder": self.folder}
-        return Scene.model_validate(values)
+        return make_scene(values)
 
 
 def scene_names() -> tuple[str, ...]:

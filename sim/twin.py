@@ -24,6 +24,7 @@ from splatbot.sim.world import World, build_world
 
 _ROOM_EVERY = 0.02  # [s] between looks at the room around the arm
 _SOFT_CONTACTS = 0.008  # [s]; with longer steps contacts give way visibly
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in ("BADQPOS", "BADQVEL", "BADQACC")]
 _DEEP = 0.005  # [m] of overlap that a result warns of
 
 
@@ -56,7 +57,7 @@ class TwinResult:
         seconds: that it took [s].
         physics_seconds: of it in MuJoCo and in the effects [s].
         real_time: simulated over real time.
-        tracking: None without a robot.
+        tracking: None without a robot, or where physics was unstable from the first.
         touches: what the arm touched.
         near: the least room around the arm, looked at every 20 ms.
         dropped: objects that fell.
@@ -104,6 +105,10 @@ class _Log:
     digest: Any = field(default_factory=hashlib.sha256)
     overload: float = 0.0
     physics: float = 0.0
+
+
+# MuJoCo would write every warning into a file in the working directory; results carry what matters of them.
+mujoco.set_mju_user_warning(lambda text: None)
 
 
 class Twin:
@@ -228,6 +233,8 @@ class Twin:
                 self.follower.command(self.data, target, v[k], a[k], None if opening is None else float(opening[k]))
             mujoco.mj_step(self.world.model, self.data, self.substeps)
             log.physics += clock.perf_counter() - start
+            if self._broken():
+                return k
             if watch is not None:
                 watch(self.data, now)
             if self.follower is not None:
@@ -285,6 +292,8 @@ class Twin:
     def _tracking(self, motion: JointMotion, log: _Log, done: int) -> Tracking:
         assert self.world.robot is not None
         errors = np.array(log.errors)
+        if not len(errors):
+            return None
         q = motion.at(np.arange(1, done + 1) / self.rate)[0]
         reached, wanted = (self.world.robot.tcp(at[:: max(1, done // 200)])[:, :3, 3] for at in (q + errors, q))
         return Tracking(
@@ -294,14 +303,14 @@ class Twin:
             tcp=float(np.linalg.norm(reached - wanted, axis=-1).max()),
         )
 
+    def _broken(self) -> bool:
+        """Whether MuJoCo met values that are not finite or beyond all bounds, and began anew or went on with them."""
+        return any(self.data.warning[kind].number for kind in _BAD) or not np.isfinite(self.data.qpos).all()
+
     def _warnings(self, log: _Log) -> tuple[str, ...]:
         found = []
-        for kind in ("BADQPOS", "BADQVEL", "BADQACC"):
-            if self.data.warning[int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}"))].number:
-                found.append(
-                    f"physics became unstable ({kind}) and MuJoCo began anew: believe nothing; take steps below "
-                    f"{1e3 * self.timestep:g} ms, or softer motors"
-                )
+        if self._broken():
+            found.append(f"physics became unstable and was stopped: take steps below {1e3 * self.timestep:g} ms")
         if self.timestep > _SOFT_CONTACTS and "contact" in self.world.on:
             found.append(f"steps of {1e3 * self.timestep:g} ms: contacts give way; 2 ms are right")
         deepest = max((touch.depth for touch in log.touches.found), default=0.0)

@@ -23,6 +23,8 @@ from splatbot.sim.twin import Twin
 MARGIN = 0.005  # [m] that plans keep: the arm follows to a millimetre
 DEPTH = 0.01  # [m] that pushed paths go into an obstacle
 _ALONG = 13  # points on a capsule's axis
+_SPARE = 20  # problems more than paths are wanted: for some no path is found in time
+_LEAVES = 12  # places at which a path may be left
 _SHARE = 0.6  # of the joints' limits of velocity and acceleration
 
 
@@ -66,9 +68,13 @@ def try_paths(count: int, *, gaussians: int, budget_ms: float, say: Callable[[st
     twin = Twin(truth_scene(table))
     planned = certified = touched = pushed = seen = 0
     least, simulated, spent = np.inf, 0.0, 0.0
-    for i, problem in enumerate(problems(robot, planner.arm, field, truth, count, seed)):
-        if i % 20 == 0:
-            say(f"path {i} of {count}")
+    asked = 0
+    for i, problem in enumerate(problems(robot, planner.arm, field, truth, count + _SPARE, seed)):
+        if planned == count:
+            break
+        if planned % 20 == 0:
+            say(f"path {planned} of {count}")
+        asked += 1
         path = planner.plan(problem.start, problem.goal, budget_ms=budget_ms, seed=seed + i).path
         if path is None:
             continue
@@ -82,7 +88,7 @@ def try_paths(count: int, *, gaussians: int, budget_ms: float, say: Callable[[st
         if into is not None:
             pushed += 1
             seen += bool(twin.follow(timed(into, robot.chain), until_touch=True).touches)
-    return PathTrials(planned, count, certified, touched, float(least), pushed, seen, simulated / max(spent, 1e-9))
+    return PathTrials(planned, asked, certified, touched, float(least), pushed, seen, simulated / max(spent, 1e-9))
 
 
 def timed(waypoints: Array, chain: KinematicChain) -> JointMotion:
@@ -111,18 +117,27 @@ def arm_room(robot: RobotModel, table: Tabletop, q: Array) -> Array:
 def push(waypoints: Array, robot: RobotModel, table: Tabletop, depth: float) -> Array | None:
     """The path up to where it has least room, and from there down the room's gradient until ``depth`` [m] deep.
 
-    None if a limit of the joints, or a place where no joint leads deeper, is met before.
+    Where a limit of the joints, or a place from which no joint leads deeper, is met before, it leaves the path
+    elsewhere; None if that helps nowhere.
     """
     share = np.linspace(0.0, len(waypoints) - 1, 20 * len(waypoints))
     edge = np.minimum(share.astype(int), len(waypoints) - 2)
     q = waypoints[edge] + (share - edge)[:, None] * (waypoints[edge + 1] - waypoints[edge])
-    k = int(np.argmin(arm_room(robot, table, q)))
-    at = q[k].copy()
+    nearest = np.argsort(arm_room(robot, table, q), kind="stable")
+    for k in nearest[:: max(1, len(nearest) // _LEAVES)]:
+        out = _deeper(q[k], robot, table, depth)
+        if out is not None:
+            return np.concatenate([waypoints[: edge[k] + 1], out])
+    return None
+
+
+def _deeper(start: Array, robot: RobotModel, table: Tabletop, depth: float) -> Array | None:
+    at = start.copy()
     out = [at.copy()]
     for _ in range(400):
         room = float(arm_room(robot, table, at[None])[0])
         if room <= -depth:
-            return np.concatenate([waypoints[: edge[k] + 1], np.array(out)])
+            return np.array(out)
         probes = at + 1e-5 * np.eye(len(at))
         slope = (arm_room(robot, table, probes) - room) / 1e-5
         length = float(np.linalg.norm(slope))

@@ -45,7 +45,7 @@ def twin(
 
     Args:
         scene: a shipped scene (--list) or a YAML file.
-        map: a Gaussian map whose world is the robot's (z up, base at the origin): table, objects and clutter are fitted.
+        map: a Gaussian map in the robot's frame (z up, base at the origin): table, objects, clutter are fitted.
         trajectory: ROS JointTrajectory as JSON, or CSV; by default the moves of the scene's task.
         json: file for the whole result.
         video: MP4 of what the scene's camera sees.
