@@ -218,7 +218,7 @@ def load_config(
     Raises:
         ConfigError: a file is missing or is no YAML mapping, or a key is unknown or a value out of range.
     """
-    values: dict[str, Any] = _read_yaml(Path(path)) if path is not None else {}
+    values: dict[str, Any] = read_yaml(Path(path)) if path is not None else {}
     for name, text in (os.environ if environ is None else environ).items():
         keys = name.removeprefix(_ENV_PREFIX).lower().split("__")
         if name.startswith(_ENV_PREFIX) and keys[0] in Config.model_fields:
@@ -235,7 +235,12 @@ def load_config(
         ) from error
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping that a YAML file holds; {} of an empty one.
+
+    Raises:
+        ConfigError: it cannot be read, is not YAML or no mapping.
+    """
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -87,6 +87,17 @@ def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
     return np.asarray(points_b, dtype=np.float64) @ M[:3, :3].T + M[:3, 3]
 
 
+def look_at(eye: Array, target: Array) -> Array:
+    """T_world_camera (4, 4) at ``eye`` (3,), facing ``target`` (3,) [m], upright: z is up in the world."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = eye
+    return T
+
+
 def quat_to_rotation(quat: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz of any positive norm.
 

@@ -26,6 +26,7 @@ from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres, gather_evidence
 from splatbot.collision.robot import EPS
 from splatbot.gaussians import GaussianModel
+from splatbot.geometry import look_at
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 
@@ -289,16 +290,6 @@ def depth_views(scene: Tabletop, count: int) -> Iterator[tuple[NDArray[np.float3
         rays = np.concatenate([np.broadcast_to(eye, along.shape), along @ T[:3, :3].T], axis=-1).astype(np.float32)
         depth = ray.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()  # z: the rays have z = 1
         yield np.where(np.isfinite(depth), depth, 5.0).astype(np.float32), camera, T
-
-
-def look_at(eye: Array, target: Array) -> Array:
-    """T_world_camera (4, 4) of a camera that looks at a target, z up in the world."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-    return T
 
 
 def run_peers(plan: CollisionPlan, results: Results, scene: Tabletop, arm: RobotSpheres) -> None:

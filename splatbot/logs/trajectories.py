@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.geometry import Array, so3_exp
+from splatbot.geometry import Array, look_at, so3_exp
 
 Path = Callable[[float], Array]
 """T_world_camera (4, 4) at a time [s]."""
@@ -212,17 +212,6 @@ def _circuit(stage: Stage, angle: float) -> Array:
 TRAJECTORIES: dict[str, Callable[[Stage, Shooting], Path]] = {
     path.__name__: path for path in (orbit, arm, arm_stops, handheld, rotation, forward, steps, loop, laps)
 }
-
-
-def look_at(eye: Array, target: Array) -> Array:
-    """T_world_camera (4, 4) at ``eye`` (3,), facing ``target`` (3,) [m], upright: z is up in the world."""
-    forward_ = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward_, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([right, np.cross(forward_, right), forward_])
-    T[:3, 3] = eye
-    return T
 
 
 def _moved(T: Array, move: Array | list[float], turn: Array) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
-from splatbot.geometry import inverse, transform_points
+from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import Trajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view, to_png
@@ -96,18 +96,8 @@ def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *,
     scene = GaussianModel.concatenate([model.select(torch.from_numpy(near)), *ghosts])
     camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
     return to_png(
-        render_view(scene, camera, arm.T_world_base @ _look(_EYE, _TARGET), background=(0.09, 0.1, 0.12)), "rgb"
+        render_view(scene, camera, arm.T_world_base @ look_at(_EYE, _TARGET), background=(0.09, 0.1, 0.12)), "rgb"
     )
-
-
-def _look(eye: Array, target: Array) -> Array:
-    """The pose (4, 4) of a camera at an eye that looks at a target, in a frame whose z is up."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-    return T
 
 
 def _balls(centers: Array, radii: Array, color: Array, opacity: float) -> GaussianModel:
