@@ -31,6 +31,10 @@ class Mapper(Protocol):
         """The map as it is now."""
         ...
 
+    def close(self) -> None:
+        """End what it runs in the background."""
+        ...
+
 
 class LiveMapping:
     """One thread that feeds a log to a mapper and publishes a snapshot at every keyframe.
@@ -75,6 +79,8 @@ class LiveMapping:
             self._store.set_state(self._map_id, "failed", "unexpected error; the service's log says more")
         else:
             self._store.set_state(self._map_id, "ended")
+        finally:
+            self._mapper.close()
 
     def _feed(self) -> None:
         for frame in self._source:

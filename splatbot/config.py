@@ -52,6 +52,12 @@ class TrackingConfig(_Section):
     sigma_gray: float = Field(default=0.02, gt=0, description="noise of a grey value in 0..1")
     sigma_depth_floor: float = Field(default=1e-3, gt=0, description="σ_z = floor + quad z² [m]")
     sigma_depth_quad: float = Field(default=2e-3, ge=0, description="σ_z = floor + quad z² [1/m]")
+    depth_doubt: float = Field(
+        default=10.0,
+        ge=1,
+        description="beside colour, depth counts as if its σ were so many times as large: filters, calibration and "
+        "another moment than the colour's put all of its pixels off together",
+    )
     gate: float = Field(default=0.05, gt=0, description="larger depth differences are another surface [m]")
     dense_weight: float = Field(
         default=0.03,

@@ -163,6 +163,11 @@ class Slam:
         return self._mapper.loop_counts
 
     @property
+    def skipped_gradients(self) -> int:
+        """How often refinement left a Gaussian as it was because its gradient was not finite."""
+        return self._mapper.skipped_gradients
+
+    @property
     def keyframes(self) -> Sequence[Keyframe]:
         """What frames are tracked against."""
         return self._mapper.keyframes

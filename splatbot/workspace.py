@@ -126,7 +126,7 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
     points = model.means.double().numpy()
     upward = np.asarray(up, dtype=np.float64)
     if upward.shape != (3,) or not np.isfinite(upward).all() or not upward.any():
-        raise InputError(f"is {up}.", field="up", hint="give three numbers, as 0 -1 0")
+        raise InputError(f"is {upward.tolist()}.", field="up", hint="give three numbers, as 0 -1 0")
     upward = upward / np.linalg.norm(upward)
     if len(points) < 100:
         raise InputError(f"has {len(points)} Gaussians.", field="map", hint="map a log with a table or a floor in view")

@@ -25,8 +25,15 @@ COMMANDS = {
     "info": _Command("splatbot.cli.info", "info", "Say what is in a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "plan": _Command(
+        "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
+    ),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
+    "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
+    "bench twin": _Command(
+        "splatbot.cli.bench_twin", "bench_twin", "Measure the twin: cost of each effect, error against the time step."
+    ),
     "bench raster": _Command(
         "splatbot.cli.bench_raster", "bench_raster", "Measure the rasterizer's speed, and what accuracy costs in time."
     ),

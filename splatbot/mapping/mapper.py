@@ -132,6 +132,11 @@ class Mapper:
         return {"closed": self.loops.closed, "rejected": self.loops.rejected}
 
     @property
+    def skipped_gradients(self) -> int:
+        """Gradients that were not finite, and so moved nothing."""
+        return self._refiner.adam.skipped
+
+    @property
     def has_loop(self) -> bool:
         """Whether :meth:`close_loops` has something to do."""
         return self.loops.correction is not None

@@ -98,6 +98,11 @@ class MappingWorker:
         return self._mapper.loop_counts
 
     @property
+    def skipped_gradients(self) -> int:
+        """As :attr:`Mapper.skipped_gradients`."""
+        return self._mapper.skipped_gradients
+
+    @property
     def has_loop(self) -> bool:
         """As :meth:`Mapper.has_loop`."""
         return self._mapper.has_loop

@@ -262,10 +262,12 @@ def least_room(arm: RobotSpheres, field: GaussianCollisionField, control: Array)
     spline = Trajectory(arm.robot.chain.names, control, 1.0, Certificate(False, 0.0, 0.0, 0.0, -1))
     low, best = np.inf, CLEARANCE_CUT
     while len(middle):
-        room = np.minimum(arm.clearance(field, spline.at(middle).position, cut=CLEARANCE_CUT).distance, CLEARANCE_CUT)
-        best = min(best, float(room.min()))
         at = np.interp(np.stack([middle - half, middle, middle + half]), np.arange(spans + 1), way)
-        bound = room - np.maximum(at[2] - at[1], at[1] - at[0])
+        moves = np.maximum(at[2] - at[1], at[1] - at[0])
+        cut = CLEARANCE_CUT + float(moves.max())  # so far that what is beyond needs no halving
+        room = np.minimum(arm.native.clearance(field.native, spline.at(middle).position, cut)[0], cut)
+        best = min(best, float(room.min()))
+        bound = np.minimum(room - moves, CLEARANCE_CUT)
         open_ = bound < 0.98 * best - 1e-4
         low = min(low, float(bound[~open_].min()) if (~open_).any() else np.inf)
         if half[0] < _FINEST:

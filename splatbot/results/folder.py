@@ -40,6 +40,7 @@ class FrameRow:
         late: whether, in a paced run, the next frame arrived before this one was done.
         covariance: of the pose, as in :class:`splatbot.slam.FrameResult`: the 21 values of the upper triangle, by rows;
             None where there is no pose.
+        skipped: tracking stages that there was no time for.
     """
 
     index: int
@@ -54,6 +55,7 @@ class FrameRow:
     gaussians: int = 0
     late: bool = False
     covariance: tuple[float, ...] | None = None
+    skipped: tuple[str, ...] = ()
 
     @property
     def processed(self) -> bool:

@@ -171,6 +171,7 @@ class FrameLoop:
                 gaussians=int(r.gaussians),
                 late=r.index in self.source.late,
                 covariance=None if r.covariance is None else tuple(r.covariance[np.triu_indices(6)].tolist()),
+                skipped=tuple(r.skipped),
             )
             for r in self.slam.results
         ]

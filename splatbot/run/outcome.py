@@ -86,6 +86,7 @@ class Outcome:
             "effects": self.effects,
             "memory": self.loop.slam.memory,
             "loops": self.loop.slam.loop_counts,
+            "skipped_gradients": self.loop.slam.skipped_gradients,
             "finished": self.finished,
             "localised_in": self.localised_in,
             "saves": self.loop.saver.cost if self.loop.saver is not None else None,

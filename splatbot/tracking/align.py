@@ -59,14 +59,14 @@ class SoftPrior:
     information: Array
 
 
-def settings_of(config: TrackingConfig, *, photometric: bool, gate: float) -> _native.AlignSettings:
-    """The noise model as the kernels take it; the geometric residuals are always on."""
+def settings_of(config: TrackingConfig, *, photometric: bool, gate: float, doubt: float = 1.0) -> _native.AlignSettings:
+    """The noise model as the kernels take it, with depth ``doubt`` times as uncertain; geometric residuals are on."""
     return _native.AlignSettings(
         photometric=photometric,
         geometric=True,
         sigma_gray=config.sigma_gray,
-        sigma_depth_floor=config.sigma_depth_floor,
-        sigma_depth_quad=config.sigma_depth_quad,
+        sigma_depth_floor=doubt * config.sigma_depth_floor,
+        sigma_depth_quad=doubt * config.sigma_depth_quad,
         gate=gate,
     )
 
@@ -111,7 +111,8 @@ def align(
     Dense residuals are correlated between neighbouring pixels (blur, rolling shutter, depth registered a moment
     earlier), so they count ``config.dense_weight`` each, against reprojected features (``features`` with the
     ``camera`` of their pixels), which count one. More pixels measure the same better; they bring no more that is
-    independent, so together they weigh as 4800 do.
+    independent, so together they weigh as 4800 do. Beside colour, depth is taken for ``config.depth_doubt`` times as
+    uncertain as its pixels' noise.
     """
     matches = None
     if features is not None and camera is not None:
@@ -122,7 +123,7 @@ def align(
         matches,
         None if prior is None else (inverse(prior.T_world_camera), prior.information),
         inverse(T_world_camera),
-        settings_of(config, photometric=photometric, gate=gate),
+        settings_of(config, photometric=photometric, gate=gate, doubt=config.depth_doubt if photometric else 1.0),
         config.dense_weight * _FULL_PIXELS / config.n_pixels,
         config.iterations,
         finest,

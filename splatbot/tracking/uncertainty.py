@@ -13,10 +13,6 @@ from splatbot.tracking.align import Alignment
 
 Array = NDArray[np.float64]
 
-# Error of a pose against the keyframes it was aligned to = (what the noise model says + what the residuals show), times
-# what neither sees: errors that cells have in common, and the keyframe's own, which all its frames share. One number
-# for all logs, from the NEES of synthetic ones of several scenes and trajectories (docs/tracking.md).
-_UNSEEN = 2.0
 # Information that any pose has: it is within some 30 m and turns of where it was looked for.
 _LEAST = 1e-3
 # Calibration of lens and depth is good to this share: such an error is the same in every frame, so along a path it adds
@@ -50,7 +46,7 @@ def alignment_covariance(found: Alignment) -> Array:
     """Covariance (6, 6) of a pose against its references, twist (t [m], ω [rad]) in the camera's frame.
 
     Cluster-robust (Huber 1967; Liang and Zeger 1986) over the cells of the image, with the factor for few clusters:
-    C⁻¹ S C⁻¹ n/(n - 6), C the curvature and S the spread, plus the noise model's own H⁻¹; twice that. Where H says
+    C⁻¹ S C⁻¹ n/(n - 6), C the curvature and S the spread, plus the noise model's own H⁻¹. Where H says
     nothing the covariance is large, and finite; NaN where H is.
     """
     if not np.isfinite(found.information).all():
@@ -58,7 +54,7 @@ def alignment_covariance(found: Alignment) -> Array:
     few = found.cells / max(found.cells - 6, 1)
     model = np.linalg.inv(found.information + _LEAST * np.eye(6))
     C_inverse = np.linalg.inv(found.curvature + _LEAST * np.eye(6))
-    return _symmetric(np.asarray(_UNSEEN * (model + few * C_inverse @ found.spread @ C_inverse), dtype=np.float64))
+    return _symmetric(np.asarray(model + few * C_inverse @ found.spread @ C_inverse, dtype=np.float64))
 
 
 def world_uncertainty(

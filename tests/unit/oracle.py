@@ -49,6 +49,11 @@ class OracleSlam(Slam):
         """It has none."""
         return {"closed": 0, "rejected": 0}
 
+    @property
+    def skipped_gradients(self) -> int:
+        """None: nothing is refined."""
+        return 0
+
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """The reference's pose; the frame's pixels enter the map unless it is held out or lost."""
         if frame.index == self._crash_at:
@@ -73,6 +78,7 @@ class OracleSlam(Slam):
             stage_ms={"track": 2.0, "map": 3.0 if keyframe else 0.0},
             keyframe=keyframe,
             gaussians=sum(map(len, self._points)),
+            skipped=("features",) if verdict == "degraded" else (),
         )
         self.results.append(result)
         return result

@@ -79,6 +79,13 @@ def test_a_run_leaves_every_file_and_every_documented_metric(log: Log, tmp_path:
     assert result.metrics["stages"]["track"]["p50"] == 2.0
 
 
+def test_stages_without_time_and_gradients_left_out_are_told(log: Log, tmp_path: Path) -> None:
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log, degraded=(6,)))
+    lines = (tmp_path / "run" / "frames.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["skipped"] for line in lines[5:7]] == [[], ["features"]]
+    assert result.metrics["skipped_gradients"] == 0
+
+
 def test_held_out_frames_never_enter_the_map_and_are_scored(log: Log, tmp_path: Path) -> None:
     slam = oracle(log)
     result = map_log(log, out=tmp_path / "run", slam=slam)

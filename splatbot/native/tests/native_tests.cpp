@@ -362,6 +362,7 @@ void check_pool() {
 int main() {
   check_pool();
   check_errors();
+  check_path_speed();
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);

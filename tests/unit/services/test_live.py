@@ -57,6 +57,7 @@ class _Mapper:
         self.frames = 0
         self.keyframes = 0
         self.finished = False
+        self.closed = False
 
     def process(self, frame: Frame) -> FrameResult:
         keyframe = self.frames % 2 == 0
@@ -66,6 +67,9 @@ class _Mapper:
 
     def finish(self) -> None:
         self.finished = True
+
+    def close(self) -> None:
+        self.closed = True
 
     def snapshot(self) -> Snapshot:
         model = GaussianModel.empty()
@@ -77,10 +81,10 @@ class _Mapper:
         return Snapshot(model, version)
 
 
-def _follow(log: _Log) -> tuple[MapStore, LiveMapping]:
+def _follow(log: _Log, mapper: _Mapper | None = None) -> tuple[MapStore, LiveMapping]:
     store = MapStore()
     store.add("live", source=log.name, state="mapping")
-    mapping = LiveMapping(store, "live", log, _Mapper())
+    mapping = LiveMapping(store, "live", log, mapper or _Mapper())
     mapping.start()
     return store, mapping
 
@@ -105,6 +109,14 @@ def test_a_log_that_breaks_leaves_what_was_mapped_and_says_why(error: Exception,
     served = store.get("live")
     assert (served.state, served.detail, served.map_version) == ("failed", told, 3)
     assert len(served.ready.model) == 3
+
+
+@pytest.mark.parametrize("error", [None, LogError("is cut off."), RuntimeError("a bug")])
+def test_the_mapper_s_own_thread_is_ended_however_the_log_ends(error: Exception | None) -> None:
+    mapper = _Mapper()
+    _, mapping = _follow(_Log(broken=5, error=error), mapper)
+    assert mapping.wait(10)
+    assert mapper.closed
 
 
 def test_stopping_ends_after_the_frame_in_work() -> None:

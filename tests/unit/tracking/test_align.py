@@ -227,7 +227,8 @@ def test_marginalising_exposure_gives_the_step_of_the_whole_system(problem: Prob
     whole[6:, 6:] += 100 * np.eye(2)  # the weak anchor of exposure; its gradient vanishes at gain 1, offset 0
     marginal = whole[:6, :6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], whole[6:, :6])
     gradient = g[:6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], g[6:])
-    config = CONFIG.model_copy(update={"iterations": 1, "dense_weight": 1.0, "n_pixels": 4800, "dense_share": 0.0})
+    plain = {"iterations": 1, "dense_weight": 1.0, "n_pixels": 4800, "dense_share": 0.0, "depth_doubt": 1.0}
+    config = CONFIG.model_copy(update=plain)
     reference = Reference(np.eye(4), (sampled,))
     found = align([level], [reference], inverse(problem.T), config, photometric=True, finest=0, gate=GATE)
     np.testing.assert_allclose(found.information, marginal, rtol=1e-6, atol=1e-6 * np.abs(marginal).max())
@@ -259,8 +260,8 @@ def test_a_known_offset_on_a_textured_wall_is_recovered(name: str) -> None:
     truth = se3_exp(OFFSETS[name])
     levels = prepare(wall_frame(truth, normal=normal), CONFIG).levels
     moved, turned = pose_distance(truth, aligned(levels, reference, np.eye(4)))
-    assert moved < 2e-4
-    assert turned < 2e-4
+    assert moved < 3e-4
+    assert turned < 3e-4
 
 
 @pytest.mark.parametrize("photometric", [False, True])

@@ -32,13 +32,14 @@ def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: f
 
 def test_the_spread_of_the_residuals_tells_the_error_whatever_the_noise_model_says() -> None:
     """White noise of other strengths than configured: C⁻¹ S C⁻¹ alone has a NEES / 6 near 1."""
+    config = CONFIG.model_copy(update={"depth_doubt": 1.0})  # all the noise there is is the pixels' own
     rng, T = np.random.default_rng(1), se3_exp([0.004, -0.003, 0.005, 0.004, -0.003, 0.002])
     for gray_noise, depth_noise in ((0.01, 0.002), (0.04, 0.0005)):
         values = []
         for _ in range(40):
             reference = make_reference((corner_levels(np.eye(4), rng, 0.0, 0.0),), np.eye(4), CONFIG.n_pixels)
             level = corner_levels(T, rng, gray_noise, depth_noise)
-            found = align([level], [reference], T, CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+            found = align([level], [reference], T, config, photometric=True, finest=0, gate=CONFIG.gate)
             C = np.linalg.inv(found.curvature)
             off = se3_log(inverse(found.T_world_camera) @ T)
             robust = C @ found.spread @ C * found.cells / (found.cells - 6)
@@ -74,7 +75,7 @@ def test_a_blank_wall_is_not_known_along_itself() -> None:
     reference = make_reference(wall.levels, np.eye(4), 1000)
     found = align(wall.levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
     deviations = np.sqrt(np.diag(alignment_covariance(found)))
-    assert deviations[2] < 2e-3
+    assert deviations[2] < 5e-3
     assert deviations[:2].min() > 1.0
 
 

@@ -1,0 +1,92 @@
+"""Gaussians merged to few ellipsoids: fine within the arm's reach, coarser beyond."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatbot.geometry import rotation_to_quat
+from splatbot.protocols import Array
+
+REACH = 0.9  # [m] from the base, as far as an arm of this size reaches
+_TANGENT, _NORMAL = 2.2, 1.0  # sigmas: wide enough to close gaps, thin enough not to lift what rests on them
+_THINNEST = 1e-3  # [m]
+_FINEST = 0.005  # [m] cell where there are few Gaussians
+_GROWTH = 1.15  # from one size of cells to the next
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoids:
+    """E ellipsoids.
+
+    Args:
+        centers: (E, 3) [m].
+        axes: (E, 3) half-axes [m].
+        quats: (E, 4) wxyz.
+        error: mean distance of the Gaussians' centres from the surface of their ellipsoid [m].
+        worst: the 95th percentile [m].
+    """
+
+    centers: Array
+    axes: Array
+    quats: Array
+    error: float
+    worst: float
+
+
+def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: int) -> Ellipsoids:
+    """At most ``limit`` ellipsoids for Gaussians; each has the mean and covariance of those in its cell of space.
+
+    Cells have one size within 0.9 m of ``base`` and grow with the distance beyond.
+
+    Args:
+        means: (N, 3) [m].
+        covariances: (N, 3, 3) [m²].
+        weights: (N,).
+        base: (3,) of the robot [m].
+        limit: how many there may be.
+    """
+    empty = np.zeros((0, 3))
+    if limit == 0 or not len(means):
+        return Ellipsoids(empty, empty, np.zeros((0, 4)), 0.0, 0.0)
+    size = _FINEST
+    while True:
+        cell = _cells(means, base, size)
+        if int(cell.max()) < limit:
+            break
+        size *= _GROWTH
+    count = int(cell.max()) + 1
+    total = np.bincount(cell, weights, count)
+    centers = np.stack([np.bincount(cell, weights * means[:, k], count) / total for k in range(3)], axis=1)
+    away = means - centers[cell]
+    spread = covariances + away[:, :, None] * away[:, None, :]
+    merged = np.stack(
+        [np.bincount(cell, weights * spread[:, i, j], count) / total for i in range(3) for j in range(3)], 1
+    )
+    values, R = np.linalg.eigh(merged.reshape(-1, 3, 3))
+    R[np.linalg.det(R) < 0, :, 0] *= -1
+    axes = np.sqrt(np.maximum(values, 0)) * [_NORMAL, _TANGENT, _TANGENT]
+    axes = np.maximum(axes, _THINNEST)
+    distance = np.abs(_distance(np.einsum("nij,ni->nj", R[cell], away), axes[cell]))
+    return Ellipsoids(
+        centers, axes, rotation_to_quat(R), float(distance.mean()), float(np.percentile(distance, 95))
+    )  # fmt: skip
+
+
+def _cells(means: Array, base: Array, size: float) -> np.ndarray:
+    """A number for each Gaussian's cell: shells of doubling cells, by distance beyond the reach."""
+    beyond = np.maximum(np.linalg.norm(means - base, axis=1) - REACH, 0.0)
+    shell = np.minimum(np.ceil(np.log2(1.0 + beyond / (0.5 * REACH))), 6).astype(np.int64)
+    index = np.floor(means / (size * 2.0**shell)[:, None]).astype(np.int64)
+    return np.asarray(np.unique(np.c_[shell, index], axis=0, return_inverse=True)[1]).ravel()
+
+
+def _distance(p: Array, axes: Array) -> Array:
+    """Signed distance of points to axis-aligned ellipsoids, to first order (Quilez): k0 (k0 - 1) / k1.
+
+    Inside, no point is farther from the surface than along the shortest axis.
+    """
+    k0 = np.linalg.norm(p / axes, axis=1)
+    k1 = np.maximum(np.linalg.norm(p / axes**2, axis=1), 1e-12)
+    return np.maximum(k0 * (k0 - 1.0) / k1, -axes.min(axis=1) * np.sqrt(np.maximum(1.0 - k0**2, 0.0)))

@@ -1,0 +1,101 @@
+"""Primitives that fit a cluster of surface points, and how well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from splatbot.protocols import Array
+
+_PLAIN = 1.3  # a hull is taken only where every primitive's error is this many times larger
+_TRIM = 1.0  # [%] of the points that may stick out of a box or cylinder on each side
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A shape for a cluster that stands on the plane z = 0.
+
+    Args:
+        shape: values of a shape of :mod:`splatbot.sim.solids`, in the object's frame.
+        at: (3,) where the object's frame is [m].
+        error: mean distance of the points from its surface [m].
+        worst: the 95th percentile [m].
+    """
+
+    shape: dict[str, Any]
+    at: Array
+    error: float
+    worst: float
+
+
+def fit(points: Array, floor: float) -> Fit:
+    """The shape with the least mean error for points (P, 3) [m] that stand on the height ``floor``.
+
+    Tried are an upright box, an upright cylinder, a ball and, where they all fail, the convex hull.
+    """
+    low = min(floor, float(points[:, 2].min())) if floor > points[:, 2].min() - 0.03 else float(points[:, 2].min())
+    high = float(np.percentile(points[:, 2], 100 - _TRIM))
+    fits = [_box(points, low, high), _cylinder(points, low, high), _ball(points)]
+    best = min(fits, key=lambda f: f.error)
+    hull = _hull(points)
+    return hull if best.error > _PLAIN * max(hull.error, 2e-3) else best
+
+
+def _box(points: Array, low: float, high: float) -> Fit:
+    _, _, degrees = cv2.minAreaRect(points[:, :2].astype(np.float32))
+    yaw = float(np.radians(degrees))
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    q = points @ R
+    ends = np.percentile(q, [_TRIM, 100 - _TRIM], axis=0)
+    ends[:, 2] = low, high
+    middle, half = ends.mean(axis=0), np.maximum(np.diff(ends, axis=0)[0] / 2, 1e-3)
+    away = np.abs(q - middle) - half
+    distance = np.linalg.norm(np.maximum(away, 0), axis=1) + np.minimum(away.max(axis=1), 0)
+    return _fit({"kind": "box", "size": (2 * half).tolist(), "rpy": [0.0, 0.0, yaw]}, R @ middle, distance)
+
+
+def _cylinder(points: Array, low: float, high: float) -> Fit:
+    center, radius = _circle(points[:, :2])
+    across = np.linalg.norm(points[:, :2] - center, axis=1) - radius
+    along = np.abs(points[:, 2] - (low + high) / 2) - (high - low) / 2
+    away = np.stack([across, along], axis=1)
+    distance = np.linalg.norm(np.maximum(away, 0), axis=1) + np.minimum(away.max(axis=1), 0)
+    shape = {"kind": "cylinder", "radius": radius, "height": max(high - low, 2e-3)}
+    return _fit(shape, np.array([*center, (low + high) / 2]), distance)
+
+
+def _circle(points: Array) -> tuple[Array, float]:
+    """About the middle of the smallest circle, with nearly all points inside: robust to filled lids."""
+    (x, y), _ = cv2.minEnclosingCircle(points.astype(np.float32))
+    center = np.array([x, y])
+    return center, max(float(np.percentile(np.linalg.norm(points - center, axis=1), 100 - _TRIM)), 1e-3)
+
+
+def _ball(points: Array) -> Fit:
+    """Least squares in |p|² = 2 c·p + (r² - |c|²)."""
+    A = np.c_[2 * points, np.ones(len(points))]
+    x = np.linalg.lstsq(A, (points**2).sum(axis=1), rcond=None)[0]
+    radius = float(np.sqrt(max(x[3] + x[:3] @ x[:3], 1e-6)))
+    return _fit({"kind": "sphere", "radius": radius}, x[:3], np.linalg.norm(points - x[:3], axis=1) - radius)
+
+
+def _hull(points: Array) -> Fit:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    mesh, _ = cloud.compute_convex_hull()
+    middle = points.mean(axis=0)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    distance = scene.compute_distance(o3d.core.Tensor.from_numpy(points.astype(np.float32))).numpy().astype(np.float64)
+    corners = np.asarray(mesh.vertices) - middle
+    return _fit({"kind": "mesh", "points": corners.tolist()}, middle, distance)
+
+
+def _fit(shape: dict[str, Any], at: Array, distance: Array) -> Fit:
+    away = np.abs(distance)
+    return Fit(shape, at, float(away.mean()), float(np.percentile(away, 95)))

@@ -1,0 +1,164 @@
+"""The shapes that objects of a scene are made of, and what they are in MuJoCo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import mujoco
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from splatbot.errors import ConfigError
+from splatbot.geometry import rotation_to_quat
+from splatbot.protocols import Array
+
+Vec3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class _Solid(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    at: Vec3 = Field(default=(0.0, 0.0, 0.0), description="in the object's frame [m]")
+    rpy: Vec3 = Field(default=(0.0, 0.0, 0.0), description="roll, pitch, yaw [rad]")
+
+    def geom(self, spec: Any, folder: Path) -> dict[str, Any]:
+        """What ``MjsBody.add_geom`` takes."""
+        kind, size = self._sizes(spec, folder)
+        return {"type": kind, "size": [*size, 0.0, 0.0][:3], "pos": list(self.at), "quat": quat_of(self.rpy)}
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        raise NotImplementedError
+
+
+class Plane(_Solid):
+    """An endless plane; its normal is z."""
+
+    kind: Literal["plane"]
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        return mujoco.mjtGeom.mjGEOM_PLANE, [0.0, 0.0, 0.01]
+
+
+class Box(_Solid):
+    """A box; ``size`` is its length, width and height [m]."""
+
+    kind: Literal["box"]
+    size: tuple[Positive, Positive, Positive]
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        return mujoco.mjtGeom.mjGEOM_BOX, [s / 2 for s in self.size]
+
+
+class Sphere(_Solid):
+    """A ball."""
+
+    kind: Literal["sphere"]
+    radius: Positive
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        return mujoco.mjtGeom.mjGEOM_SPHERE, [self.radius]
+
+
+class Cylinder(_Solid):
+    """A cylinder along z about its middle."""
+
+    kind: Literal["cylinder"]
+    radius: Positive
+    height: Positive
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        return mujoco.mjtGeom.mjGEOM_CYLINDER, [self.radius, self.height / 2]
+
+
+class Capsule(_Solid):
+    """A capsule along z about its middle; ``height`` without the caps."""
+
+    kind: Literal["capsule"]
+    radius: Positive
+    height: Positive
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        return mujoco.mjtGeom.mjGEOM_CAPSULE, [self.radius, self.height / 2]
+
+
+class Ellipsoid(_Solid):
+    """An ellipsoid of three half-axes [m]."""
+
+    kind: Literal["ellipsoid"]
+    axes: tuple[Positive, Positive, Positive]
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        return mujoco.mjtGeom.mjGEOM_ELLIPSOID, list(self.axes)
+
+
+class Mesh(_Solid):
+    """The convex hull of a mesh file (OBJ, STL), or of points (P, 3) [m]."""
+
+    kind: Literal["mesh"]
+    file: str | None = None
+    points: tuple[Vec3, ...] = ()
+    scale: Positive = 1.0
+
+    def geom(self, spec: Any, folder: Path) -> dict[str, Any]:
+        """What ``MjsBody.add_geom`` takes; adds the mesh to ``spec``."""
+        name = f"mesh{len(list(spec.meshes))}"
+        if self.file is not None:
+            path = folder / self.file
+            if not path.is_file():
+                raise ConfigError(
+                    "is not there.", file=path, field="mesh.file", hint="name it relative to the scene file"
+                )
+            spec.add_mesh(name=name, file=str(path.resolve()), scale=[self.scale] * 3)
+        elif len(self.points) >= 4:
+            spec.add_mesh(name=name, uservert=(self.scale * np.asarray(self.points)).ravel().tolist())
+        else:
+            raise ConfigError("has neither a file nor four points.", field="mesh", hint="give file or points")
+        pose = {"pos": list(self.at), "quat": quat_of(self.rpy)}
+        return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name, **pose}
+
+
+class Soft(_Solid):
+    """A box of elastic material.
+
+    Args:
+        size: [m].
+        cells: nodes along each side; more bend more finely and cost more.
+        young: Young's modulus [Pa].
+        poisson: Poisson's ratio.
+        density: [kg/m³].
+    """
+
+    kind: Literal["soft"]
+    size: tuple[Positive, Positive, Positive]
+    cells: tuple[int, int, int] = (4, 4, 4)
+    young: Positive = 2e4
+    poisson: Annotated[float, Field(ge=0, lt=0.5)] = 0.2
+    density: Positive = 100.0
+
+    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+        return mujoco.mjtGeom.mjGEOM_BOX, [s / 2 for s in self.size]
+
+
+Shape = Annotated[
+    Plane | Box | Sphere | Cylinder | Capsule | Ellipsoid | Mesh | Soft,
+    Field(discriminator="kind"),
+]
+
+
+def rotation_of(rpy: Vec3) -> Array:
+    """Rotation (3, 3) Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def quat_of(rpy: Vec3) -> list[float]:
+    """Quaternion wxyz of roll, pitch, yaw [rad]."""
+    return [float(v) for v in rotation_to_quat(rotation_of(rpy))]

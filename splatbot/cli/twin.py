@@ -1,0 +1,197 @@
+"""`splatbot twin`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from splatbot.sim.ledger import Entry
+    from splatbot.sim.scene import Scene
+    from splatbot.sim.twin import TwinResult
+
+
+def twin(
+    scene: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None,
+    map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    force: Annotated[tuple[str, ...], tyro.conf.arg(metavar="EFFECT"), tyro.conf.UseAppendAction] = (),
+    forbid: Annotated[tuple[str, ...], tyro.conf.arg(metavar="EFFECT"), tyro.conf.UseAppendAction] = (),
+    timestep: Annotated[float | None, tyro.conf.arg(metavar="S")] = None,
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    no_costs: bool = False,
+    list_: Annotated[bool, tyro.conf.arg(name="list")] = False,
+    quiet: bool = False,
+) -> int:
+    """Try a motion in a scene's physics before the robot moves.
+
+    Says how well the arm followed, what it touched, how near it came to the rest and what fell; which physics was on,
+    why, and what each effect cost. Only what the scene calls for is simulated. Exit code 1: something was touched.
+
+    Examples:
+        splatbot twin --list
+        splatbot twin --scene mug_hanging --video mug.mp4
+        splatbot twin --scene wiping --forbid backlash --json result.json
+        splatbot twin --map runs/latest/map.ply --trajectory plan.json
+        splatbot twin --scene my_scene.yaml --seed 3
+
+    Args:
+        scene: a shipped scene (--list) or a YAML file.
+        map: a Gaussian map in the robot's frame (z up, base at the origin): table, objects, clutter are fitted.
+        trajectory: ROS JointTrajectory as JSON, or CSV; by default the moves of the scene's task.
+        json: file for the whole result.
+        video: MP4 of what the scene's camera sees.
+        force: physics that is on whatever the scene calls for; once for each.
+        forbid: physics that is off.
+        timestep: longest step of physics [s]: accuracy for time.
+        seed: of where movable objects stand, within millimetres, and of the camera's noise; 0: where the scene says.
+        no_costs: do not measure what each effect cost (a run for each).
+        list_: print the scenes and the physics and leave.
+        quiet: print only errors.
+    """
+    if video is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # before anything imports mujoco
+    if list_:
+        _print_lists()
+        return 0
+    from splatbot.sim.ledger import ledger
+    from splatbot.sim.motion import load_motion
+    from splatbot.sim.twin import Twin
+
+    chosen = _scene(scene, map, with_camera=video is not None).with_effects(force=force, forbid=forbid)
+    it = Twin(chosen, timestep=timestep, seed=seed)
+    motion = None
+    if trajectory is not None and it.world.robot is not None:
+        motion = load_motion(trajectory, it.world.robot)
+    with _film(video, it.world, seed) as film, _progress(quiet) as show:
+        result = it.follow(motion, progress=show, watch=film)
+        sensor = film.report() if film is not None else []
+    entries = ledger(it, result, motion, costs=not no_costs)
+    if json is not None:
+        _write(json, result, entries, sensor)
+    if not quiet:
+        _print(result, entries, video)
+    return 1 if _harm(chosen, result) else 0
+
+
+def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
+    from splatbot.errors import InputError
+    from splatbot.sim.scene import load_scene, make_scene
+
+    if (name is None) == (map is None):
+        raise InputError(
+            "needs either a scene or a map.", field="--scene", hint="splatbot twin --list names the scenes"
+        )
+    values: dict[str, Any] = {}
+    if map is not None:
+        values = {"name": map.stem, "map": {"file": str(map.resolve())}}
+    else:
+        assert name is not None
+        found = load_scene(name)
+        if found.camera is not None or not with_camera:
+            return found
+        values = found.model_dump() | {"folder": found.folder}
+    if with_camera:
+        values["camera"] = {"at": [1.5, -0.9, 0.9], "look_at": [0.35, 0.0, 0.25], "width": 640, "height": 480}
+    return make_scene(values)
+
+
+def _harm(scene: Scene, result: TwinResult) -> bool:
+    """Whether the arm touched what its task does not speak of touching, or something fell or went wrong."""
+    may_touch = scene.task.kind in ("push", "grasp", "hang", "wipe", "squeeze")
+    return bool((result.touches and not may_touch) or any("unstable" in text for text in result.warnings))
+
+
+@contextmanager
+def _film(path: Path | None, world: Any, seed: int) -> Iterator[Any]:
+    if path is None:
+        yield None
+        return
+    from splatbot.sim.camera import TwinCamera
+    from splatbot.sim.video import Video
+
+    video = Video(path, TwinCamera(world, seed=seed))
+    try:
+        yield video
+    finally:
+        video.close()
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[float], None] | None]:
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task("simulating", total=1.0)
+        yield lambda share: bars.update(task, completed=share)
+
+
+def _write(path: Path, result: TwinResult, entries: list[Entry], sensor: list[dict[str, Any]]) -> None:
+    import json as text
+    from dataclasses import asdict
+
+    from splatbot.atomic import atomic_write
+
+    values = result.to_dict()
+    del values["decisions"]
+    values |= {"effects": [asdict(entry) for entry in entries], "sensor_effects": sensor}
+    with atomic_write(path) as file:
+        file.write(text.dumps(values, indent=1).encode() + b"\n")
+
+
+def _print(result: TwinResult, entries: list[Entry], video: Path | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    console.print(
+        f"{result.scene}: {result.duration:.2f} s in {result.steps} steps of {1e3 * result.timestep:g} ms, "
+        f"{result.real_time:.1f} times faster than real time"
+    )
+    for note in result.notes:
+        console.print(f"  {note}")
+    if result.tracking is not None:
+        t = result.tracking
+        console.print(
+            f"tracking: {1e3 * t.rms:.2f} mrad RMS, {1e3 * t.largest:.2f} at most; tool {1e3 * t.tcp:.2f} mm at most"
+        )
+    near = result.near
+    where = f" ({near.part} and {near.other} at {near.time:.2f} s)" if near.part else " or more"
+    console.print(f"room around the arm: {1e3 * near.room:.1f} mm{where}")
+    for touch in result.touches:
+        console.print(
+            f"touch: {touch.part} and {touch.other}, {touch.first:.3f} to {touch.last:.3f} s, "
+            f"{1e3 * touch.depth:.2f} mm deep, {touch.force:.1f} N"
+        )
+    for name in result.dropped:
+        console.print(f"fell: {name}")
+    for text in result.warnings:
+        console.print(f"[yellow]warning: {text}[/yellow]")
+    table = Table("effect", "on", "why", "ms", "us a step")
+    for entry in entries:
+        cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
+        table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
+    console.print(table)
+    if video is not None:
+        console.print(f"written to {video}")
+
+
+def _print_lists() -> None:
+    from splatbot.cli.tables import print_table
+    from splatbot.sim.effects.physics import PHYSICS, physics_effect
+    from splatbot.sim.scene import load_scene, scene_names
+
+    print_table([(name, load_scene(name).about) for name in scene_names()], title="scenes")
+    print_table([(name, physics_effect(name).cost) for name in PHYSICS], title="physics, and what it costs")

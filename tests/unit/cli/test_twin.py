@@ -1,0 +1,95 @@
+"""`splatbot twin`: what it says, what it writes, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from splatbot.bench.tabletop import tabletop
+from splatbot.robots.panda import panda
+from splatbot.sim.effects.physics import PHYSICS
+from tests.unit.cli.conftest import RunCommand
+
+pytest.importorskip("mujoco")
+
+
+def test_the_result_holds_tracking_touches_and_the_ledger_with_costs(run: RunCommand, tmp_path: Path) -> None:
+    answer = run("twin", "--scene", "wiping", "--forbid", "backlash", "--json", tmp_path / "r.json")
+    assert answer.code == 0  # to wipe is to touch
+    values = json.loads((tmp_path / "r.json").read_text())
+    assert {touch["other"] for touch in values["touches"]} >= {"board"}
+    assert values["tracking"]["tcp"] > 1e-3
+    effects = {entry["name"]: entry for entry in values["effects"]}
+    assert list(effects) == list(PHYSICS)
+    assert effects["backlash"]["by"] == "forbidden"
+    assert effects["backlash"]["ms"] is None
+    assert all(isinstance(entry["ms"], float) for entry in effects.values() if entry["on"])
+    assert "room around the arm" in answer.out
+
+
+def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path) -> None:
+    tabletop().gaussians(8000).save(tmp_path / "map.ply")
+    home, into = panda().home.tolist(), [0.0, 0.9, 0.0, -1.4, 0.0, 2.3, 0.785]
+    header = ["time", *(f"position.{name}" for name in panda().chain.names)]
+    rows = [",".join(map(str, [t, *q])) for t, q in ((0.0, home), (1.0, into), (1.5, into))]
+    (tmp_path / "plan.csv").write_text("\n".join([",".join(header), *rows]))
+    answer = run("twin", "--map", tmp_path / "map.ply", "--trajectory", tmp_path / "plan.csv", "--no-costs")
+    assert answer.code == 1
+    assert "touch: " in answer.out
+    assert " and map" in answer.out
+    assert "Gaussians as" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "needs either a scene or a map"),
+        (("--scene", "empty", "--map", "a.ply"), "needs either a scene or a map"),
+        (("--scene", "kitchen"), "there is no scene 'kitchen'"),
+        (("--scene", "empty", "--force", "magic"), "there is no 'magic'"),
+        (("--scene", "empty", "--timestep", "1"), "give seconds in 0..0.05"),
+        (("--scene", "empty", "--trajectory", "nowhere.json"), "nowhere.json: cannot be read"),
+    ],
+)
+def test_wrong_input_is_named_and_ends_with_2(run: RunCommand, words: tuple[str, ...], message: str) -> None:
+    answer = run("twin", *words)
+    assert answer.code == 2
+    assert message in answer.err
+
+
+def test_the_list_names_scenes_and_physics(run: RunCommand) -> None:
+    answer = run("twin", "--list")
+    assert answer.code == 0
+    for word in ("mug_hanging", "shelf_bin", "soft_bodies", "backlash"):
+        assert word in answer.out
+
+
+def test_a_film_shows_the_arm_move_or_it_is_said_why_there_is_none(tmp_path: Path) -> None:
+    """In a process of its own: MUJOCO_GL must be set before mujoco is imported."""
+    import cv2
+
+    command = [
+        sys.executable,
+        "-m",
+        "splatbot",
+        "twin",
+        "--scene",
+        "empty",
+        "--no-costs",
+        "--video",
+        str(tmp_path / "a.mp4"),
+    ]
+    env = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL")}
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    if done.returncode != 0:
+        assert "MuJoCo cannot draw here" in done.stderr
+        pytest.skip("no EGL here; the command says so")
+    film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    frames = [film.read()[1] for _ in range(int(film.get(cv2.CAP_PROP_FRAME_COUNT)))]
+    assert len(frames) == pytest.approx(2.6 * 25, abs=2)
+    assert float(abs(frames[0].astype(float) - frames[-1]).mean()) > 1.0

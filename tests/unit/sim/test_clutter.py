@@ -1,0 +1,119 @@
+"""A map becomes a table, objects and ellipsoids that are where its surfaces are."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
+from splatbot.errors import ConfigError, InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.sim.clutter import MapParts, map_parts
+from splatbot.sim.maps.ellipsoids import merge
+from splatbot.sim.maps.plane import find_support
+from splatbot.sim.scene import Clutter, make_scene
+from splatbot.sim.twin import Twin
+
+pytest.importorskip("mujoco")
+
+TABLE = Block((0.6, 0.0, -0.02), (0.8, 1.0, 0.04))
+CARTON = Block((0.45, 0.10, 0.06), (0.10, 0.07, 0.12), 0.4)
+CAN = Can((0.60, -0.20, 0.0), 0.035, 0.12)
+BALL = Ball((0.55, 0.30, 0.05), 0.05)
+WALL = Block((0.95, 0.0, 0.40), (0.04, 0.9, 0.60))
+
+
+@cache
+def scanned() -> GaussianModel:
+    return Tabletop((TABLE, CARTON, CAN, BALL, WALL)).gaussians(20_000)
+
+
+@cache
+def parts() -> MapParts:
+    return map_parts(scanned(), Clutter(file="scan.ply"), np.zeros(3))
+
+
+def test_the_table_is_found_to_a_tenth_of_a_millimetre_and_level() -> None:
+    (table,) = (t for t in parts().objects if t.name == "map-table")
+    assert abs(table.at[2]) < 1e-3  # the table's top is at 0
+    assert np.abs(table.rpy[:2]).max() < 2e-3
+
+
+def test_things_on_the_table_are_what_they_are() -> None:
+    kinds = sorted(thing.shapes[0].kind for thing in parts().objects)
+    assert kinds == ["box", "cylinder", "plane", "sphere"]
+    by_kind = {thing.shapes[0].kind: thing for thing in parts().objects}
+    np.testing.assert_allclose(by_kind["sphere"].at, BALL.center, atol=2e-3)
+    np.testing.assert_allclose(by_kind["cylinder"].at, [0.60, -0.20, 0.06], atol=4e-3)
+    np.testing.assert_allclose(by_kind["box"].at, CARTON.center, atol=4e-3)
+    np.testing.assert_allclose(sorted(by_kind["box"].shapes[0].size), sorted(CARTON.size), atol=6e-3)  # type: ignore[union-attr]
+
+
+def test_the_rest_is_at_most_as_many_ellipsoids_as_asked_for_and_near_the_surface() -> None:
+    """How far the ellipsoids' flat sides are from the true surfaces: of the wall, and of the table's rim and bottom."""
+    found = parts().ellipsoids
+    assert 200 < len(found.centers) <= 2000
+    tips = (
+        found.centers[:, None]
+        + np.array([-1.0, 1.0])[None, :, None] * (found.axes[:, :1] * _first_axes(found.quats))[:, None]
+    )
+    outside = np.abs(Tabletop((TABLE, WALL)).distance(tips.reshape(-1, 3)))
+    assert float(np.percentile(outside, 95)) < 0.01
+    assert float(np.median(outside)) < 0.003
+    assert found.error < 0.004
+
+
+def test_every_gaussian_has_a_label_and_notes_tell_the_errors() -> None:
+    labels = parts().labels
+    assert len(labels) == len(scanned())
+    assert set(labels.tolist()) >= {-1, 0, 1, 2, 3}
+    assert len(parts().notes) == 5
+    assert all("mm" in note for note in parts().notes)
+
+
+def test_fewer_ellipsoids_are_larger_and_err_more() -> None:
+    rng = np.random.default_rng(0)
+    turn = rng.uniform(0, 2 * np.pi, 4000)
+    points = np.c_[0.3 * np.cos(turn), 0.3 * np.sin(turn), rng.uniform(0, 0.4, 4000)]
+    spread = np.tile(np.eye(3) * 1e-6, (4000, 1, 1))
+    many, few = (merge(points, spread, np.ones(4000), np.zeros(3), limit) for limit in (1000, 50))
+    assert len(few.centers) <= 50 < len(many.centers) <= 1000
+    assert few.error > 1.5 * many.error
+
+
+def test_a_scene_of_a_map_runs_and_the_arm_touches_its_wall(tmp_path: Path) -> None:
+    scanned().save(tmp_path / "scan.ply")
+    moves = [{"t": 1.5, "tcp": [0.75, 0.0, 0.45], "rpy": [0.0, 1.5707963, 0.0]}, {"t": 2.5, "tcp": [0.80, 0.0, 0.45],
+             "rpy": [0.0, 1.5707963, 0.0]}]  # fmt: skip
+    scene = make_scene(
+        {"name": "scan", "map": {"file": str(tmp_path / "scan.ply")}, "task": {"kind": "reach", "moves": moves}}
+    )
+    result = Twin(scene).follow(until_touch=True)
+    assert result.near.room < 0.12
+    assert len(result.notes) == 5
+
+
+def test_a_part_of_the_map_without_gaussians_is_an_error() -> None:
+    with pytest.raises(InputError, match=r"none of .* Gaussians is between"):
+        map_parts(scanned(), Clutter(file="scan.ply", low=(5, 5, 5), high=(6, 6, 6)), np.zeros(3))
+
+
+def test_a_wall_is_no_support_and_a_few_points_are_none() -> None:
+    rng = np.random.default_rng(1)
+    wall = np.c_[np.zeros(500), rng.uniform(-1, 1, (500, 2))]
+    assert find_support(wall) is None
+    assert find_support(wall[:10]) is None
+
+
+def test_a_map_that_is_not_there_is_named() -> None:
+    with pytest.raises((ConfigError, InputError), match=r"nowhere\.ply"):
+        Twin(make_scene({"name": "x", "map": {"file": "nowhere.ply"}}))
+
+
+def _first_axes(quats: np.ndarray) -> np.ndarray:
+    from splatbot.geometry import quat_to_rotation
+
+    return quat_to_rotation(quats)[:, :, 0]

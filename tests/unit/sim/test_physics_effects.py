@@ -1,0 +1,116 @@
+"""A scene gets the physics it calls for, and no other."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import cache
+
+import numpy as np
+import pytest
+
+from splatbot.sim.effects.physics import PHYSICS, effects_for, physics_effect
+from splatbot.sim.scene import load_scene, scene_names
+from splatbot.sim.twin import Twin, TwinResult
+
+pytest.importorskip("mujoco")
+
+CALLED_FOR = {
+    "empty": set(),
+    "tabletop_clutter": {"contact", "friction", "sleep"},
+    "shelf_bin": {"contact", "friction", "sleep"},
+    "mug_hanging": {"contact", "friction", "gripper_compliance", "torque_limits", "sleep"},
+    "wiping": {"contact", "friction", "torque_limits", "actuator_lag", "joint_friction", "backlash"},
+    "dynamic_obstacle": {"contact", "friction", "fluid_drag", "moving_obstacles", "lighting"},
+    "soft_object": {"soft_bodies", "contact", "friction", "gripper_compliance", "torque_limits"},
+}
+LISTED = [(scene, name) for scene, names in CALLED_FOR.items() for name in sorted(names)]
+
+
+@cache
+def run(scene: str, *, force: tuple[str, ...] = (), forbid: tuple[str, ...] = ()) -> TwinResult:
+    return Twin(load_scene(scene).with_effects(force=force, forbid=forbid)).follow()
+
+
+def test_every_shipped_scene_is_spoken_of_here() -> None:
+    assert set(scene_names()) == set(CALLED_FOR)
+
+
+@pytest.mark.parametrize("scene", sorted(CALLED_FOR))
+def test_a_shipped_scene_runs_and_its_ledger_lists_only_what_it_calls_for(scene: str) -> None:
+    result = run(scene)
+    assert result.stopped is None
+    assert {d.name for d in result.decisions if d.on} == CALLED_FOR[scene]
+    assert [d.name for d in result.decisions] == list(PHYSICS)
+    assert all(d.why for d in result.decisions)
+    assert not any("unstable" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize(("scene", "name"), LISTED)
+def test_without_an_effect_that_a_scene_calls_for_its_observable_changes(scene: str, name: str) -> None:
+    without = run(scene, forbid=(name,))
+    (decision,) = (d for d in without.decisions if d.name == name)
+    assert not decision.on
+    assert decision.by == "forbidden"
+    observable = physics_effect(name).observable
+    change = abs(without.figures[observable] - run(scene).figures[observable])
+    assert change > 1e-3 * abs(run(scene).figures[observable])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "contact",
+        "friction",
+        "soft_bodies",
+        "moving_obstacles",
+        "fluid_drag",
+        "actuator_lag",
+        "joint_friction",
+        "lighting",
+    ],
+)
+def test_physics_that_cannot_apply_changes_no_bit_when_it_is_forced_on(name: str) -> None:
+    forced = run("empty", force=(name,))
+    (decision,) = (d for d in forced.decisions if d.name == name)
+    assert decision.on
+    assert decision.by == "forced"
+    assert forced.digest == run("empty").digest
+
+
+def test_forced_contact_looks_for_what_might_touch_and_forced_drag_computes_its_forces() -> None:
+    """What costs time is really done: the flags and the medium are in the model."""
+    scene = load_scene("empty")
+    plain = Twin(scene).world.model
+    forced = Twin(scene.with_effects(force=("contact", "fluid_drag"))).world.model
+    assert plain.opt.disableflags & 16
+    assert not forced.opt.disableflags & 16
+    assert plain.opt.density == 0
+    assert forced.opt.density > 0
+
+
+def test_what_stands_still_is_never_tested_against_what_stands_still() -> None:
+    model = Twin(load_scene("shelf_bin")).world.model
+    fixed = np.asarray(model.body_weldid)[np.asarray(model.geom_bodyid)] == 0
+    fixed &= ~Twin(load_scene("shelf_bin")).world.of_robot
+    assert fixed.sum() == 11
+    assert (np.asarray(model.geom_conaffinity)[fixed] == 0).all()
+
+
+def test_the_latest_word_on_an_effect_counts() -> None:
+    scene = load_scene("tabletop_clutter").with_effects(forbid=("sleep",))
+    assert {d.name: d.on for d in effects_for(scene)}["sleep"] is False
+    again = scene.with_effects(force=("sleep",))
+    assert {d.name: d.on for d in effects_for(again)}["sleep"] is True
+
+
+def test_sensor_effects_that_nobody_asked_for_are_not_even_imported() -> None:
+    code = (
+        "import sys; from splatbot.sim.scene import load_scene; from splatbot.sim.twin import Twin\n"
+        "from splatbot.sim.motion import hold\n"
+        "t = Twin(load_scene('empty')); t.follow(hold(t.world.robot.home, 0.05))\n"
+        "names = ('motion_blur', 'exposure', 'depth_noise', 'depth_holes', 'blackout', 'frame_drops')\n"
+        "print([n for n in names if f'splatbot.sim.effects.{n}' in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
