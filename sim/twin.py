@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import time as clock
 from collections.abc import Callable
@@ -109,6 +110,7 @@ class _Log:
 
 # MuJoCo would write every warning into a file in the working directory; results carry what matters of them.
 mujoco.set_mju_user_warning(lambda text: None)
+atexit.register(mujoco.set_mju_user_warning, None)  # else it outlives the modules that it refers to
 
 
 class Twin:
@@ -289,7 +291,7 @@ class Twin:
             notes=self.world.notes,
         )
 
-    def _tracking(self, motion: JointMotion, log: _Log, done: int) -> Tracking:
+    def _tracking(self, motion: JointMotion, log: _Log, done: int) -> Tracking | None:
         assert self.world.robot is not None
         errors = np.array(log.errors)
         if not len(errors):

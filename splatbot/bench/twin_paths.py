@@ -118,7 +118,7 @@ def push(waypoints: Array, robot: RobotModel, table: Tabletop, depth: float) -> 
     """The path up to where it has least room, and from there down the room's gradient until ``depth`` [m] deep.
 
     Where a limit of the joints, or a place from which no joint leads deeper, is met before, it leaves the path
-    elsewhere; None if that helps nowhere.
+    elsewhere, or in a random direction; None if that helps nowhere.
     """
     share = np.linspace(0.0, len(waypoints) - 1, 20 * len(waypoints))
     edge = np.minimum(share.astype(int), len(waypoints) - 2)
@@ -128,6 +128,22 @@ def push(waypoints: Array, robot: RobotModel, table: Tabletop, depth: float) -> 
         out = _deeper(q[k], robot, table, depth)
         if out is not None:
             return np.concatenate([waypoints[: edge[k] + 1], out])
+    k = int(nearest[0])
+    out = _straight_in(q[k], robot, table, depth)
+    return None if out is None else np.concatenate([waypoints[: edge[k] + 1], out])
+
+
+def _straight_in(start: Array, robot: RobotModel, table: Tabletop, depth: float) -> Array | None:
+    """Along the first of a hundred random directions of the joints that leads ``depth`` [m] into something."""
+    rng = np.random.default_rng(0)
+    far = np.linspace(0.0, 1.0, 251)[:, None]
+    for _ in range(100):
+        direction = rng.standard_normal(len(start))
+        q = start + far * direction / np.linalg.norm(direction)
+        q = q[((q >= robot.chain.lower) & (q <= robot.chain.upper)).all(axis=1)]
+        deep = np.flatnonzero(arm_room(robot, table, q) <= -depth)
+        if len(deep):
+            return np.stack([q[0], q[deep[0]]])
     return None
 
 
