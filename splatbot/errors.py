@@ -60,6 +60,13 @@ class ConfigError(InputError):
     """A configuration file, environment variable or flag is wrong."""
 
 
+class ControllerError(SplatbotError):
+    """A controller cannot do what it is asked (CONTROL_FAILED)."""
+
+    http_status = 409
+    code = -4
+
+
 class MapNotFoundError(SplatbotError):
     """No map of that name."""
 

@@ -1,8 +1,9 @@
-"""What the core asks of a robot: its kinematics and the spheres that stand for its links."""
+"""What the core asks of a robot: kinematics, spheres that stand for its links, a controller, a gripper."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -77,4 +78,111 @@ class RobotKinematics(Protocol):
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
         """The spheres with the gripper opened by ``opening`` [m]; None: as wide as it goes."""
+        ...
+
+
+class MotionState(StrEnum):
+    """What a controller is doing."""
+
+    IDLE = "idle"
+    MOVING = "moving"
+    DONE = "done"
+    STOPPED = "stopped"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """What a controller tells of itself at one period.
+
+    Args:
+        time: since the trajectory began [s].
+        position, velocity: (J,) measured [rad or m, and per s].
+        desired: (J,) where the trajectory has it.
+        state: what it is doing.
+        fault: why it stands still, if it is at fault.
+    """
+
+    time: float
+    position: Array
+    velocity: Array
+    desired: Array
+    state: MotionState
+    fault: str = ""
+
+    @property
+    def error(self) -> float:
+        """The largest difference between measured and desired [rad or m]."""
+        return float(np.abs(self.position - self.desired).max())
+
+
+class TimedPath(Protocol):
+    """What a controller follows: a curve in joint space with its time."""
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        ...
+
+    def reference(self, t: float) -> tuple[Array, Array]:
+        """Position and velocity (J,) at a time [s] since the start; at rest at the ends before and after."""
+        ...
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """An arm that follows trajectories: a driver, a twin, a recording, or a fake.
+
+    Time passes by :meth:`step`, one period at a time; a driver's waits for its robot's.
+    """
+
+    @property
+    def period(self) -> float:
+        """Between two steps [s]."""
+        ...
+
+    def send(self, trajectory: TimedPath) -> None:
+        """Begin to follow a trajectory from where the arm is.
+
+        Raises:
+            ControllerError: at fault, moving, or the trajectory begins elsewhere.
+        """
+        ...
+
+    def step(self) -> Feedback:
+        """Let one period pass."""
+        ...
+
+    def stop(self) -> None:
+        """Come to rest; told at the latest by the next step."""
+        ...
+
+    def reset(self) -> None:
+        """Clear a fault."""
+        ...
+
+
+@runtime_checkable
+class Gripper(Protocol):
+    """Fingers that open and close."""
+
+    @property
+    def stroke(self) -> float:
+        """Widest opening [m]."""
+        ...
+
+    def move(self, opening: float, *, force: float | None = None) -> None:
+        """Go towards an opening [m], with at most a force [N]."""
+        ...
+
+    def opening(self) -> float:
+        """Between the fingers now [m]."""
+        ...
+
+    def holds(self) -> bool:
+        """Whether something keeps the fingers from the opening that they were sent to."""
+        ...
+
+    def stop(self) -> None:
+        """Stay where they are."""
         ...

@@ -112,6 +112,16 @@ def _coal_octree(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
     return _coal_spheres(coal, coal.makeOctree(_points_of(scene), OCTREE_VOXEL))
 
 
+def mesh_checker(scene: Tabletop) -> Ask:
+    """Coal's, of spheres (C, S, 3) and their radii (S,) [m] against the shapes' mesh."""
+    return _coal_mesh(*mesh_of(scene), scene)
+
+
+def octree_checker(scene: Tabletop) -> Ask:
+    """The same against an octree of points on the shapes."""
+    return _coal_octree(*mesh_of(scene), scene)
+
+
 def _coal_spheres(coal: Any, world: Any) -> Ask:
     request, fixed = coal.CollisionRequest(), coal.Transform3s()
 

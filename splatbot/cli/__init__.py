@@ -25,6 +25,9 @@ COMMANDS = {
     "info": _Command("splatbot.cli.info", "info", "Say what is in a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "plan": _Command(
+        "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
+    ),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
     "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
@@ -43,6 +46,11 @@ COMMANDS = {
         "splatbot.cli.bench_collision",
         "bench_collision",
         "Measure the collision field: questions a second, and errors against exact truth.",
+    ),
+    "bench planning": _Command(
+        "splatbot.cli.bench_planning",
+        "bench_planning",
+        "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
     ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }

@@ -53,3 +53,22 @@ def figure_text(row: Row) -> str:
     median = f" ({row.value + row.spread:.2f})" if row.spread is not None else ""
     digits = f"{row.value:.2f}" if row.unit == "ms" else f"{row.value:.3g}"
     return f"{digits}{median}" if row.unit == "ms" else f"{digits} {row.unit}".rstrip()
+
+
+def metric_table(title: str, rows: Iterable[Row]) -> Table:
+    """A line per metric, a column per case and peer; a figure that is missing shows why."""
+    cells: dict[str, dict[str, str]] = {}
+    cases: dict[str, None] = {}
+    for row in rows:
+        case = f"{row.case}: {row.peer}" if row.peer else row.case
+        counted = row.unit.startswith("of ")
+        text = (row.note or "-") if row.value is None else f"{row.value:.4g}{' ' + row.unit if counted else ''}"
+        cells.setdefault(row.metric if counted else f"{row.metric} [{row.unit}]", {})[case] = text
+        cases[case] = None
+    table = Table(title=title)
+    table.add_column("")
+    for case in cases:
+        table.add_column(case, justify="right")
+    for metric, values in cells.items():
+        table.add_row(metric, *(values.get(case, "") for case in cases))
+    return table

@@ -17,6 +17,8 @@ def info(
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|LOG")],
     /,
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
+    fit_plane: bool = False,
+    up: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y Z")] = (0.0, -1.0, 0.0),
 ) -> int:
     """Say what is in a map, a log or a run.
 
@@ -26,10 +28,14 @@ def info(
         splatbot info recordings/desk
         splatbot info runs/latest
         splatbot info map.ply
+        splatbot info runs/latest --fit-plane
 
     Args:
         path: a map file, a folder in TUM or Replica layout, synthetic:SCENE, or a run folder (its map).
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
+        fit_plane: estimate where the map's table or floor is, and propose where a robot may stand, in a scene.yaml
+            beside the map, if there is none yet.
+        up: with --fit-plane, roughly upwards in the first camera: 0 -1 0 if it looked ahead, 0 0 -1 straight down.
     """
     from splatbot.cli.tables import print_table
 
@@ -38,11 +44,48 @@ def info(
         place = place / "map.ply"
     if place.is_file():
         print_table(describe_map(place), title=str(place))
+        if fit_plane:
+            print_table(fit_scene(place, up), title=str(place.parent / "scene.yaml"))
         return 0
+    if fit_plane:
+        from splatbot.errors import InputError
+
+        raise InputError("needs a map.", field="--fit-plane", hint="map the log first: splatbot map LOG")
     from splatbot.logs import open_log
 
     print_table(describe_log(open_log(path, camera=camera)), title=path)
     return 0
+
+
+def fit_scene(path: Path, up: tuple[float, float, float]) -> list[tuple[str, str]]:
+    """The workspace beside a map file, as names and values; estimated and written if there is none.
+
+    Raises:
+        InputError: the map has no upward surface.
+        FormatError: the map or a scene.yaml is damaged.
+    """
+    import numpy as np
+
+    from splatbot.gaussians import GaussianModel
+    from splatbot.workspace import NAME, find_workspace, fit_workspace
+
+    known = find_workspace(path)
+    found = fit_workspace(GaussianModel.load(path), up=up) if known is None else known
+    if known is None:
+        found.save(path.parent / NAME)
+
+    def text(values: np.ndarray | None) -> str:
+        return "not known" if values is None else " ".join(f"{x:.3f}" for x in np.ravel(values))
+
+    T = found.T_world_base
+    return [
+        ("from", "estimated, written" if known is None else "the file"),
+        ("gravity", text(found.gravity)),
+        ("support plane n, d", text(found.support_plane)),
+        ("base at [m]", text(None if T is None else T[:3, 3])),
+        ("base's x, z", text(None if T is None else T[:3, [0, 2]].T)),
+        ("workspace, from the base [m]", text(found.box)),
+    ]
 
 
 def describe_map(path: Path) -> list[tuple[str, str]]:

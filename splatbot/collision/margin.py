@@ -6,10 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from splatbot.camera import Camera
 from splatbot.collision.field import GaussianCollisionField
+from splatbot.collision.inputs import rows
 from splatbot.errors import InputError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
@@ -39,7 +40,10 @@ class SurfaceError:
 
 
 def surface_error(
-    field: GaussianCollisionField, views: Iterable[tuple[NDArray[np.float32], Camera, Array]]
+    field: GaussianCollisionField,
+    views: Iterable[tuple[NDArray[np.float32], Camera, Array]],
+    *,
+    around: ArrayLike | None = None,
 ) -> SurfaceError:
     """Ask the field at what was measured: up to 5,000 pixels of each view, evenly spaced.
 
@@ -49,10 +53,12 @@ def surface_error(
     Args:
         field: the map.
         views: depth (H, W) [m, 0 or NaN: none], camera and T_world_camera (4, 4) of each, as tracked.
+        around: (x, y, z, radius) [m, world]: only what lies in this ball counts, as all that an arm reaches; None: all.
 
     Raises:
-        InputError: a depth image is not of its camera's size, or no view has any depth.
+        InputError: a depth image is not of its camera's size, or no view has any depth there.
     """
+    ball = None if around is None else rows(np.atleast_2d(np.asarray(around)), "around", 4, "(x, y, z, radius)")[0]
     found = []
     for depth, camera, T_world_camera in views:
         if depth.shape != (camera.height, camera.width):
@@ -62,6 +68,8 @@ def surface_error(
         z = depth[v[some], u[some]].astype(np.float64)
         ray = np.stack([(u[some] - camera.cx) / camera.fx, (v[some] - camera.cy) / camera.fy, np.ones(len(some))], 1)
         points = transform_points(T_world_camera, ray * z[:, None])
+        if ball is not None:
+            points = points[np.linalg.norm(points - ball[:3], axis=1) <= ball[3]]
         found.append(np.clip(field.clearance(points, cut=_CUT).distance, 0.0, _CUT))
     if not sum(map(len, found)):
         raise InputError("have no depth.", field="views", hint="give the depth images that the map was made of")

@@ -192,13 +192,30 @@ class RobotSpheres:
         Raises:
             InputError: as :meth:`certify`, or the fields differ in n_sigma.
         """
-        return self._without_pairs.certify(now.added_since(before), start, end, eps=eps)
+        return self.without_pairs.certify(now.added_since(before), start, end, eps=eps)
+
+    def grown(self, by: float) -> RobotSpheres:
+        """The same arm with every sphere larger by ``by`` [m], against the map and against itself."""
+        return RobotSpheres(
+            _Respheres(self, LinkSpheres(self.spheres.link, self.spheres.centers, self.spheres.radii + by), self.pairs),
+            T_world_base=self.T_world_base,
+            base_in_map=self.base_in_map,
+            margin=self.margin,
+        )
 
     @cached_property
-    def _without_pairs(self) -> RobotSpheres:
+    def reach(self) -> Array:
+        """How far (S, J) each sphere's centre moves at most as each joint turns by 1 rad or slides by 1 m [m]."""
+        return np.asarray(self.native.reach(), dtype=np.float64)
+
+    @cached_property
+    def without_pairs(self) -> RobotSpheres:
         """The same arm, which may touch itself."""
         return RobotSpheres(
-            _Unpaired(self), T_world_base=self.T_world_base, base_in_map=self.base_in_map, margin=self.margin
+            _Respheres(self, self.spheres, np.zeros((0, 2), np.int32)),
+            T_world_base=self.T_world_base,
+            base_in_map=self.base_in_map,
+            margin=self.margin,
         )
 
     def sample(
@@ -247,13 +264,13 @@ class RobotSpheres:
         return np.where(np.arange(q.shape[1]) < link[:, None], gradient, 0.0)
 
 
-class _Unpaired:
-    """A robot with another's spheres and no pairs."""
+class _Respheres:
+    """A robot with other spheres, or other pairs of links that may not touch."""
 
-    def __init__(self, arm: RobotSpheres) -> None:
+    def __init__(self, arm: RobotSpheres, spheres: LinkSpheres, pairs: NDArray[np.int32]) -> None:
         self.name, self.chain = arm.robot.name, arm.robot.chain
-        self.self_collision_pairs = np.zeros((0, 2), np.int32)
-        self._spheres = arm.spheres
+        self.self_collision_pairs = pairs
+        self._spheres = spheres
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
         return self._spheres

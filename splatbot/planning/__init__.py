@@ -14,7 +14,10 @@ from splatbot.planning.problem import (
     PoseGoal,
     StartError,
 )
+from splatbot.planning.replan import Replanner, Update
 from splatbot.planning.rrt_star import GaussianRRTStar
+from splatbot.planning.timing import time_path
+from splatbot.planning.trajectory import State, Trajectory
 
 __all__ = [
     "Cause",
@@ -29,5 +32,10 @@ __all__ = [
     "PlanningError",
     "PlanningProblem",
     "PoseGoal",
+    "Replanner",
     "StartError",
+    "State",
+    "Trajectory",
+    "Update",
+    "time_path",
 ]

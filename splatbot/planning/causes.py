@@ -9,13 +9,14 @@ from splatbot.planning.problem import Cause
 from splatbot.protocols import Array, KinematicChain
 
 LOOK = 0.05  # [m] around the arm, for what is in the way
+LIMIT_SLACK = 1e-6  # [rad or m] that a start or goal may be beyond a limit, as encoders at a stop read
 
 
 def beyond_limits(chain: KinematicChain, q: Array) -> Cause | None:
     """The joint of ``q`` (J,) that is farthest out of its limits; None if all are within."""
     beyond = np.maximum(chain.lower - q, q - chain.upper)
     joint = int(np.argmax(beyond))
-    return Cause(joint=joint, depth=float(beyond[joint])) if beyond[joint] > 0 else None
+    return Cause(joint=joint, depth=float(beyond[joint])) if beyond[joint] > LIMIT_SLACK else None
 
 
 def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cause:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatbot._native import inverse_kinematics
 from splatbot.collision import GaussianCollisionField, RobotSpheres
@@ -20,6 +20,7 @@ EXACT = 1e-6  # [m], [rad] that a posture may miss its pose by
 _BATCH = 16  # starts between two looks at the clock
 _ROUNDS = 80  # of each start
 _MOST = 512  # starts
+_FEWEST = 128  # before a pose is given up
 _APART = 0.05  # [rad or m]; postures nearer than this in every joint are one
 
 
@@ -63,10 +64,10 @@ def goal_configurations(
         return _postures(arm, field, goal, near, seed, until)
     q = _configurations(goal.q if isinstance(goal, JointGoal) else goal, len(arm.robot.chain))
     chain = arm.robot.chain
-    inside = ((q >= chain.lower) & (q <= chain.upper)).all(axis=1)
+    causes = [beyond_limits(chain, one) for one in q]
+    inside = np.array([cause is None for cause in causes])
     if not inside.any():
-        cause = beyond_limits(chain, q[0])
-        return Goals(q[:0], PlanStatus.GOAL_STATE_INVALID, cause, f"{cause}.")
+        return Goals(q[:0], PlanStatus.GOAL_STATE_INVALID, causes[0], f"{causes[0]}.")
     return _free(arm, field, q[inside])
 
 
@@ -121,7 +122,7 @@ def _postures(
         elif not reached:
             nearest = int(np.argmin(miss.sum(axis=1)))
             missed = miss[nearest] if miss[nearest].sum() < missed.sum() else missed
-        if len(found) >= goal.postures or (time.perf_counter() >= until and tried):
+        if len(found) >= goal.postures or (time.perf_counter() >= until and (found or tried >= _FEWEST)):
             break
     if found:
         q = np.array(found[: goal.postures])
@@ -133,7 +134,7 @@ def _postures(
     return Goals(np.zeros((0, len(chain))), PlanStatus.NO_IK_SOLUTION, None, why)
 
 
-def _solve(arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Array) -> tuple[Array, NDArray[np.float64]]:
+def _solve(arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Array) -> tuple[Array, Array]:
     """Joint values (S, J) for the pose moved by offsets (S, 6) = (translation, rotation vector), and what they miss."""
     targets = np.tile(T, (len(starts), 1, 1))
     targets[:, :3, 3] += offsets[:, :3] @ T[:3, :3].T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -13,12 +14,22 @@ from splatbot.collision.robot import EPS
 from splatbot.errors import InputError
 from splatbot.planning.causes import beyond_limits, blocked_line, collision
 from splatbot.planning.goals import goal_configurations
-from splatbot.planning.problem import Cause, Certificate, Goal, Path, PlanResult, PlanStatus, StartError
+from splatbot.planning.problem import (
+    Cause,
+    Certificate,
+    Goal,
+    Path,
+    PlanningProblem,
+    PlanResult,
+    PlanStatus,
+    StartError,
+)
 from splatbot.protocols import Array, RobotKinematics
 
 CLEARANCE_CUT = 0.1  # [m]; more room than this is not told apart
+POSTURES_SHARE = 0.25  # of the budget for postures that reach a pose, once there is one
 _CLEARANCE_ROUNDS = 6  # of halving: clearance to 2 %
-_RESERVE = 7e-4  # [s] of the budget kept for the certificate
+_RESERVE = 7e-4  # [s] of the budget kept for the certificate, at most a third of it
 _FINEST = 4e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
 _ENDS = (None, PlanStatus.PLANNING_FAILED, PlanStatus.TIMED_OUT, PlanStatus.PREEMPTED)
 
@@ -27,10 +38,12 @@ class GaussianRRTStar:
     """Plans an arm's way among the Gaussians of one state of a map.
 
     Every edge of its trees is certified all along, against the map and against the arm itself
-    (:meth:`splatbot.collision.RobotSpheres.certify`), so that a path is certified when it is found. The first comes from
-    RRT-Connect; both of its trees then become one, which RRT* (Karaman and Frazzoli, IJRR 2011) rewires with samples
-    from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path and by
-    RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
+    (:meth:`splatbot.collision.RobotSpheres.certify`), so that a path is certified when it is found. The first path is
+    that of RRT-Connect; both of its trees then become one, which RRT* (Karaman and Frazzoli, IJRR 2011) rewires with
+    samples from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path
+    and by RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
+
+    One search at a time: calls from several threads wait for one another, outside of their budgets.
 
     Args:
         field: the map.
@@ -38,7 +51,7 @@ class GaussianRRTStar:
         T_world_base: (4, 4) pose of its base.
         opening: of the gripper [m]; None: as wide as it goes.
         attached: (A, 4) spheres (x, y, z, radius) [m] of a held object in the frame of the last link.
-        margin: that the arm keeps from the map and from itself [m]; each sphere's radius grows by it.
+        margin: room that the arm keeps to the map [m]; it may come nearer to itself.
         base_in_map: see :class:`splatbot.collision.RobotSpheres`.
         eps: room [m] below which an edge is not certified.
 
@@ -60,7 +73,7 @@ class GaussianRRTStar:
     ) -> None:
         if not _FINEST <= eps < np.inf:
             raise InputError(f"is {eps}.", field="eps", hint=f"give metres, at least {_FINEST:g}")
-        self.field, self.robot, self.margin, self.eps = field, robot, margin, eps
+        self._field, self.robot, self.margin, self.eps = field, robot, margin, eps
         self.arm = RobotSpheres(
             robot,
             T_world_base=T_world_base,
@@ -71,6 +84,22 @@ class GaussianRRTStar:
         )
         self._eps = eps  # of the problem at hand
         self._native = self._planner(eps)
+        self._goals: Array | None = None  # of the last search
+        self._searching = threading.Lock()
+
+    @property
+    def field(self) -> GaussianCollisionField:
+        """The map. One that is assigned holds for the searches that follow."""
+        return self._field
+
+    @field.setter
+    def field(self, field: GaussianCollisionField) -> None:
+        with self._searching:
+            self._look_at(field)
+
+    def _look_at(self, field: GaussianCollisionField) -> None:
+        self._field = field
+        self._native.look_at(field.native)
 
     def plan(
         self,
@@ -88,7 +117,7 @@ class GaussianRRTStar:
             goal: see :mod:`splatbot.planning.problem`; an array (J,) or (K, J) is a set of configurations.
             budget_ms: that the whole call may take, inverse kinematics and certificate included.
             seed: of the samples.
-            iterations: of the trees' growth; where they, not the time, end the search, the same call gives the same path.
+            iterations: of the trees' growth; where they, not the time, end the search, equal calls give equal paths.
 
         Returns:
             A path with its certificate, or the reason why there is none. The time being up is no failure once there is
@@ -99,20 +128,93 @@ class GaussianRRTStar:
             GoalError: the goal is, or makes no sense for this robot.
             InputError: budget_ms or iterations are not above 0.
         """
-        begin = time.perf_counter()
         _check_budget(budget_ms, iterations)
+        with self._searching:
+            return self._plan(start, goal, budget_ms, seed, iterations)
+
+    def _plan(
+        self, start: ArrayLike, goal: Goal | ArrayLike, budget_ms: float, seed: int, iterations: int | None
+    ) -> PlanResult:
+        begin = time.perf_counter()
         q = self._start(start)
         failed = self._bad_start(q, begin)
         if failed is not None:
             return failed
-        goals = goal_configurations(self.arm, self.field, goal, near=q, seed=seed, until=begin + 0.5e-3 * budget_ms)
+        goals = goal_configurations(
+            self.arm, self.field, goal, near=q, seed=seed, until=begin + POSTURES_SHARE * 1e-3 * budget_ms
+        )
         if not len(goals.q):
             return self._failure(goals.status, goals.cause, goals.reason, begin)
         self._prepare(np.concatenate([q[None], goals.q]))
-        left = max(1e-4, 1e-3 * budget_ms - (time.perf_counter() - begin) - _RESERVE)
+        self._goals = goals.q
         before = time.perf_counter() - begin
+        left = _for_search(budget_ms, before)
         end = self._native.run(q, goals.q, left, 2**62 if iterations is None else iterations, seed, 0.0)
         return self._result(end, q, goals.q, before, begin)
+
+    def solve(
+        self, problem: PlanningProblem, *, budget_ms: float = 28.0, seed: int = 0, iterations: int | None = None
+    ) -> PlanResult:
+        """As :meth:`plan`, of a problem."""
+        return self.plan(problem.start, problem.goal, budget_ms=budget_ms, seed=seed, iterations=iterations)
+
+    def plan_again(
+        self,
+        field: GaussianCollisionField,
+        before: GaussianCollisionField,
+        start: ArrayLike,
+        *,
+        budget_ms: float = 10.0,
+        seed: int = 0,
+    ) -> PlanResult:
+        """Plans to the goals of the last :meth:`plan` with its old tree on a later field, which is this planner's then.
+
+        Args:
+            field: of the later map.
+            before: the field that the tree stands on: only what ``field`` has beyond it is asked of the tree's edges.
+            start: (J,) on the last path, or anywhere: then the tree begins anew.
+            budget_ms: that the call may take.
+            seed: of the samples.
+
+        Raises:
+            StartError: the start is of another shape or not finite.
+            InputError: nothing was planned before, the fields differ in n_sigma, or budget_ms is not above 0.
+        """
+        _check_budget(budget_ms, None)
+        with self._searching:
+            return self._plan_again(field, before, start, budget_ms, seed)
+
+    def _plan_again(
+        self,
+        field: GaussianCollisionField,
+        before: GaussianCollisionField,
+        start: ArrayLike,
+        budget_ms: float,
+        seed: int,
+    ) -> PlanResult:
+        begin = time.perf_counter()
+        if self._goals is None:
+            raise InputError("was not called before.", field="plan", hint="plan first")
+        self._look_at(field)
+        q = self._start(start)
+        failed = self._bad_start(q, begin)
+        if failed is not None:
+            return failed
+        goals = goal_configurations(self.arm, field, self._goals, near=q, seed=seed, until=begin)
+        if not len(goals.q):
+            return self._failure(goals.status, goals.cause, goals.reason, begin)
+        added = field.added_since(before)
+        spent = time.perf_counter() - begin
+        left = _for_search(budget_ms, spent)
+        end = self._native.rerun(q, field.native, added.native, self.arm.without_pairs.native, left, 2**62, seed)
+        return self._result(end, q, goals.q, spent, begin)
+
+    def room_to(self, field: GaussianCollisionField, waypoints: Array, cut: float, eps: float) -> float | None:
+        """Room [m] along a path (N, J) to a field alone, the arm itself left out, up to ``cut``; None: not free."""
+        arm = self.arm.without_pairs
+        if arm.certify(field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
+            return None
+        return float(path_clearance(arm.native, field.native, waypoints, max(cut, eps), _CLEARANCE_ROUNDS))
 
     def cancel(self) -> None:
         """Ends the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""
@@ -125,13 +227,15 @@ class GaussianRRTStar:
 
     def tree(self) -> tuple[Array, NDArray[np.int32], Array]:
         """Nodes (N, J), their parents (N,), -1 for the root, and costs from it (N,), of the last search."""
-        q, parent, cost = self._native.tree()
+        with self._searching:
+            q, parent, cost = self._native.tree()
         return q, parent, cost
 
     @property
     def nbytes(self) -> int:
         """Bytes of the tree of the last search."""
-        return int(self._native.bytes)
+        with self._searching:
+            return int(self._native.bytes)
 
     def certificate(self, waypoints: Array) -> Certificate:
         """What can be promised of a path (N, J): whether all its edges are free, and the room along it."""
@@ -169,7 +273,7 @@ class GaussianRRTStar:
 
     def _prepare(self, ends: Array) -> None:
         """A planner whose eps lets it leave and reach configurations (K, J) that nearly touch something."""
-        room = float(self.arm.clearance(self.field, ends, cut=4 * self.eps).distance.min())
+        room = float(self.arm.native.clearance(self.field.native, ends, 4 * self.eps)[0].min())
         eps = max(_FINEST, min(self.eps, room / 4))
         if eps != self._eps:
             self._eps, self._native = eps, self._planner(eps)
@@ -214,6 +318,12 @@ class GaussianRRTStar:
             int(self._native.nodes) if searched else 0,
             self.field.map_version,
         )
+
+
+def _for_search(budget_ms: float, spent: float) -> float:
+    """Seconds of the budget that are left for the search."""
+    budget = 1e-3 * budget_ms
+    return max(1e-4, budget - spent - min(_RESERVE, budget / 3))
 
 
 def _check_budget(budget_ms: float, iterations: int | None) -> None:

@@ -41,9 +41,9 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         grad_renders, grad_alphas = grads
         if grad_renders is None and grad_alphas is None:
-            return (None,) * 14
+            return (None,) * 15
         inputs = Inputs(ctx.layout, *ctx.saved_tensors)
-        wanted = Wanted(ctx.needs_input_grad[:9], *ctx.centers.wanted())
+        wanted = Wanted(ctx.needs_input_grad[:10], *ctx.centers.wanted())
         found = run_backward(inputs, ctx.options, ctx.states, grad_renders, grad_alphas, wanted)
         means2d = ctx.centers.receive(found.means2d, found.absolute2d)
         gradients = found.inputs

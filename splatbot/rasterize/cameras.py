@@ -5,32 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from splatbot.errors import InputError
-from splatbot.geometry import so3_exp, so3_log
 from splatbot.rasterize.native import native
+from splatbot.rasterize.shutter import Motion, RollingShutterType, motion_between, shutter_of
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS: tuple[CameraModel, ...] = ("pinhole", "ortho", "fisheye")
 NO_LIMIT = 1e30
-_MAX_TURN = math.pi / 2  # [rad] between the first and the last line; more than any camera does
-
-
-class RollingShutterType(Enum):
-    """Order in which a camera reads its lines; gsplat's names."""
-
-    GLOBAL = 0
-    ROLLING_TOP_TO_BOTTOM = 1
-    ROLLING_LEFT_TO_RIGHT = 2
-    ROLLING_BOTTOM_TO_TOP = 3
-    ROLLING_RIGHT_TO_LEFT = 4
 
 
 @dataclass(frozen=True)
@@ -105,30 +92,26 @@ class CameraSettings:
             raise InputError("is of no use to a global shutter.", field="viewmats_rs", hint="give rolling_shutter")
 
 
-def shutter_of(value: Any) -> RollingShutterType:
-    """The shutter of that name, global if None; accepts gsplat's own enumeration.
+class Cameras(NamedTuple):
+    """What the kernels are given of the cameras.
 
-    Raises:
-        InputError: an unknown name.
+    Args:
+        lenses: of each view; None for plain pinholes.
+        viewmats: (..., C, 4, 4); with a rolling shutter, half-way between the first and the last line, float64.
+        motion: (..., C, 9) of a rolling shutter, see ``Motion.flat``; None for a global one.
     """
-    name = "GLOBAL" if value is None else value if isinstance(value, str) else getattr(value, "name", None)
-    if not isinstance(name, str) or name not in RollingShutterType.__members__:
-        names = ", ".join(RollingShutterType.__members__)
-        raise InputError(f"is {value!r}.", field="rolling_shutter", hint=f"one of {names}")
-    return RollingShutterType[name]
+
+    lenses: tuple[Any, ...] | None
+    viewmats: Tensor
+    motion: Tensor | None = None
 
 
-def lenses_of(
-    settings: CameraSettings, viewmats: Tensor, Ks: Tensor, near_plane: float
-) -> tuple[tuple[Any, ...] | None, Tensor]:
-    """The native lens of each view, None for plain pinholes, and the views' poses, of the shape of ``viewmats``.
-
-    With a rolling shutter the pose returned is that half-way between the first and the last line, float64.
+def cameras_of(settings: CameraSettings, viewmats: Tensor, near_plane: float) -> Cameras:
+    """The cameras of all views.
 
     Args:
         settings: of all views; tensors have the leading dimensions of ``viewmats``.
         viewmats: (..., C, 4, 4) world to camera.
-        Ks: (..., C, 3, 3) [px].
         near_plane: [m].
 
     Raises:
@@ -136,10 +119,10 @@ def lenses_of(
     """
     settings.check()
     if settings.plain:
-        return None, viewmats
+        return Cameras(None, viewmats)
     views = tuple(viewmats.shape[:-2])
     if not settings.with_ut:
-        return (native().Lens.affine(settings.model),) * math.prod(views), viewmats
+        return Cameras((native().Lens.affine(settings.model),) * math.prod(views), viewmats)
     params = UnscentedTransformParameters() if settings.ut_params is None else settings.ut_params
     sigma = UnscentedTransformParameters(params.alpha, params.beta, params.kappa).sigma()
     radial = _coefficients("radial_coeffs", settings.radial_coeffs, views, 4 if settings.model == "fisheye" else 6)
@@ -153,54 +136,19 @@ def lenses_of(
         for k, p, s in zip(radial, tangential, thin_prism, strict=True)
     )
     if settings.viewmats_rs is None:
-        return lenses, viewmats
-    for name, tensor in (("viewmats", viewmats), ("viewmats_rs", settings.viewmats_rs), ("Ks", Ks)):
-        if tensor.requires_grad:
-            hint = f"pass {name}.detach(), or a global shutter"
-            raise InputError("receives no gradient under a rolling shutter.", field=name, hint=hint)
-    return _roll(lenses, settings, viewmats)
+        return Cameras(lenses, viewmats)
+    motion = _motion(settings, viewmats)
+    shutter = shutter_of(settings.rolling_shutter).value
+    parts = (t.detach().reshape(-1, 3).tolist() for t in motion.flat().split(3, -1))
+    rolled = tuple(lens.rolling(shutter, *of_view) for lens, *of_view in zip(lenses, *parts, strict=True))
+    return Cameras(rolled, motion.middle, motion.flat())
 
 
-def _roll(lenses: tuple[Any, ...], settings: CameraSettings, viewmats: Tensor) -> tuple[tuple[Any, ...], Tensor]:
+def _motion(settings: CameraSettings, viewmats: Tensor) -> Motion:
     last = settings.viewmats_rs
     if last is None or tuple(last.shape) != tuple(viewmats.shape) or not last.isfinite().all():
         raise InputError("does not fit viewmats.", field="viewmats_rs", hint="give finite poses of the same shape")
-    shutter = shutter_of(settings.rolling_shutter).value
-    firsts, lasts = (poses.reshape(-1, 4, 4).double().numpy() for poses in (viewmats, last))
-    motions = [middle_pose(a, b) for a, b in zip(firsts, lasts, strict=True)]
-    rolled = tuple(
-        lens.rolling(shutter, m.turn.tolist(), m.step.tolist(), m.middle[:3, 3].tolist())
-        for lens, m in zip(lenses, motions, strict=True)
-    )
-    middles = np.stack([m.middle for m in motions]) if motions else np.zeros((0, 4, 4))
-    return rolled, torch.from_numpy(middles).reshape(viewmats.shape)
-
-
-@dataclass(frozen=True)
-class Motion:
-    """From one pose to another: half-way (4, 4), rotation vector (3,) [rad] and translation (3,) [m] in between."""
-
-    middle: NDArray[np.float64]
-    turn: NDArray[np.float64]
-    step: NDArray[np.float64]
-
-
-def middle_pose(first: NDArray[np.float64], last: NDArray[np.float64]) -> Motion:
-    """World-to-camera poses in between: rotation by the shortest way at constant speed, translation linearly.
-
-    Raises:
-        InputError: they are more than 90 degrees apart.
-    """
-    turn = so3_log(last[:3, :3] @ first[:3, :3].T)
-    angle = float(np.linalg.norm(turn))
-    if angle > _MAX_TURN:
-        raise InputError(
-            f"is turned by {math.degrees(angle):.0f} degrees against viewmats.", field="viewmats_rs", hint="at most 90"
-        )
-    middle = np.eye(4)
-    middle[:3, :3] = so3_exp(0.5 * turn) @ first[:3, :3]
-    middle[:3, 3] = 0.5 * (first[:3, 3] + last[:3, 3])
-    return Motion(middle, turn, last[:3, 3] - first[:3, 3])
+    return motion_between(viewmats, last)
 
 
 def pinhole_limit(radial: Sequence[float] | NDArray[np.float64]) -> float:

@@ -66,6 +66,7 @@ class Inputs:
     viewmats: Tensor
     Ks: Tensor
     backgrounds: Tensor | None
+    motion: Tensor | None = None  # of rolling shutters, float64; the kernels read it from the lenses
     masks: Tensor | None = None  # uint8
 
     def tensors(self) -> tuple[Tensor | None, ...]:
@@ -80,6 +81,7 @@ class Inputs:
             self.viewmats,
             self.Ks,
             self.backgrounds,
+            self.motion,
         )
 
     def detached(self) -> Inputs:
@@ -138,7 +140,7 @@ def check_inputs(
         masks = _check_masks(masks, (*batch, c, -(-size[1] // tile_size), -(-size[0] // tile_size)))
 
     opacities = _floats("opacities", opacities, (*batch, n))
-    tensors = (means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds, masks)
+    tensors = (means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds, None, masks)
     flat = [t if t is None or not batch else t.reshape(-1, *t.shape[len(batch) :]) for t in tensors]
     return Inputs(Layout(batch, c, n, view_colors), *flat)  # type: ignore[arg-type]
 

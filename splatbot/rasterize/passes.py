@@ -109,9 +109,9 @@ def run_backward(
     # Zeros only where a view adds to rows that no view wrote.
     fresh = torch.zeros if layout.view_colors and layout.n_cameras > 1 else torch.empty
     colors = None if shape[5] is None else fresh(inputs.colors.shape, dtype=torch.float32)
-    wants_camera = shape[6] is not None or shape[7] is not None
+    wants_camera = shape[6] is not None or shape[7] is not None or shape[9] is not None
     views = len(states)
-    camera = torch.zeros(views, 16, dtype=torch.float64) if wants_camera else None
+    camera = torch.zeros(views, native().CAMERA_SUMS, dtype=torch.float64) if wants_camera else None
     channels = 3 if options.sh_degree >= 0 else inputs.colors.shape[-1]
     backgrounds = None if shape[8] is None else torch.zeros(views, channels, dtype=torch.float64)
     n = layout.n_gaussians
@@ -141,7 +141,8 @@ def run_backward(
     camera_grads = camera_gradients(camera, shape[6], shape[7])
     if backgrounds is not None and inputs.backgrounds is not None:
         backgrounds = backgrounds.to(torch.float32).reshape(inputs.backgrounds.shape)
-    return Gradients([*geometry_grads, colors, *camera_grads, backgrounds], means2d, absolute2d)
+    motion = None if camera is None or shape[9] is None else camera[:, 16:].reshape(shape[9].shape)
+    return Gradients([*geometry_grads, colors, *camera_grads, backgrounds, motion], means2d, absolute2d)
 
 
 def camera_gradients(
@@ -150,7 +151,7 @@ def camera_gradients(
     """Gradients to viewmats and Ks, each None where None is given, of their shapes and types.
 
     Args:
-        camera: (views, 16), as the kernels sum it: rotation, translation, fx, fy, cx, cy.
+        camera: (views, CAMERA_SUMS), as the kernels sum it: rotation, translation, fx, fy, cx, cy, motion.
     """
     grad_viewmats = grad_Ks = None
     if camera is not None and viewmats is not None:
@@ -160,6 +161,6 @@ def camera_gradients(
         grad_viewmats = grad_viewmats.to(viewmats.dtype).reshape(viewmats.shape)
     if camera is not None and Ks is not None:
         grad_Ks = torch.zeros(len(camera), 3, 3, dtype=torch.float64)
-        grad_Ks[:, 0, 0], grad_Ks[:, 1, 1], grad_Ks[:, 0, 2], grad_Ks[:, 1, 2] = camera[:, 12:].unbind(-1)
+        grad_Ks[:, 0, 0], grad_Ks[:, 1, 1], grad_Ks[:, 0, 2], grad_Ks[:, 1, 2] = camera[:, 12:16].unbind(-1)
         grad_Ks = grad_Ks.to(Ks.dtype).reshape(Ks.shape)
     return grad_viewmats, grad_Ks

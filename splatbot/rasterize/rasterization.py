@@ -15,7 +15,7 @@ from splatbot.rasterize.cameras import (
     CameraSettings,
     RollingShutterType,
     UnscentedTransformParameters,
-    lenses_of,
+    cameras_of,
 )
 from splatbot.rasterize.centers import Centers
 from splatbot.rasterize.gsplat_backend import rasterization_gsplat
@@ -147,8 +147,7 @@ def rasterization(
         thin_prism_coeffs: (..., C, 4) s1..s4 of a pinhole.
         rolling_shutter: order in which lines are read; the poses are then ``viewmats`` at the first line's centre and
             ``viewmats_rs`` at the last's, in between rotation turns evenly and translation is linear. A point is seen
-            when its own, unrounded, line is read (gsplat rounds the line down). Depth is that half-way. Poses and
-            Ks receive no gradient and are refused if they ask for one.
+            when its own, unrounded, line is read (gsplat rounds the line down). Depth is that half-way.
         viewmats_rs: (..., C, 4, 4), see there.
         ut_params: spread of the sigma points.
         return_normals: ``meta["normals"]`` (..., C, H, W, 3): the Gaussians' shortest axes, unit vectors in the world
@@ -193,9 +192,12 @@ def rasterization(
     if options.sparse_grad and inputs.layout.batch:
         raise InputError("is set beside batch dimensions.", field="sparse_grad", hint="render one scene at a time")
     settings = CameraSettings(camera_model, *(arguments[name] for name in _CAMERA))
-    lenses, poses = lenses_of(settings, inputs.viewmats, inputs.Ks, options.near_plane)
+    cameras = cameras_of(settings, inputs.viewmats, options.near_plane)
     _check_camera_goes_with(settings, covars, depth_mode)
-    inputs, options = replace(inputs, viewmats=poses), replace(options, lenses=lenses)
+    inputs, options = (
+        replace(inputs, viewmats=cameras.viewmats, motion=cameras.motion),
+        replace(options, lenses=cameras.lenses),
+    )
     renders, alphas, meta = _render(inputs, options)
     if render_mode.endswith("MD"):
         renders = _with_median(inputs, options, renders if wants_color else None, meta)

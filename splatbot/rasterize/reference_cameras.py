@@ -179,7 +179,7 @@ def _pose_between(first: Tensor, last: Tensor, time: Tensor) -> Tensor:
     """Poses (..., 4, 4) at times (...,) in 0..1: a share of the rotation in between (Rodrigues)."""
     between = last[:3, :3] @ first[:3, :3].T
     angle = torch.arccos((0.5 * (between.diagonal().sum() - 1)).clamp(-1, 1))
-    K = (between - between.T) / (2 * angle.sin() if float(angle) > 1e-9 else 1.0)
+    K = (between - between.T) / (2 * angle.sin() if float(angle.detach()) > 1e-9 else 1.0)
     a = (time * angle)[..., None, None]
     turned = (torch.eye(3, dtype=first.dtype) + a.sin() * K + (1 - a.cos()) * K @ K) @ first[:3, :3]
     moved = first[:3, 3] + time[..., None] * (last[:3, 3] - first[:3, 3])

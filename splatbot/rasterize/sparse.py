@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
-from splatbot.rasterize.cameras import CameraSettings, lenses_of
+from splatbot.rasterize.cameras import CameraSettings, cameras_of
 from splatbot.rasterize.inputs import check_inputs
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import native
@@ -220,7 +220,7 @@ def visible_gaussians(
         settings = CameraSettings(camera_model, **camera)
     except TypeError as error:
         raise InputError(f"are not all known ({error}).", field="options", hint="see rasterization") from error
-    lenses, poses = lenses_of(settings, inputs.viewmats, inputs.Ks, float(near_plane))
+    lenses, poses, _ = cameras_of(settings, inputs.viewmats, float(near_plane))
     seen = torch.zeros(len(poses), len(means), dtype=torch.bool)
     for c in range(len(poses)):
         found = native().visible_gaussians(

@@ -97,7 +97,7 @@ class RasterizeSurfels(torch.autograd.Function):
         # Zeros only where the second view adds to rows that the first did not write.
         new_colors = torch.zeros if options.view_colors and len(ctx.states) > 1 else torch.empty
         grad_colors = new_colors(colors.shape, dtype=torch.float32) if need[4] else None
-        camera = torch.zeros(len(ctx.states), 16, dtype=torch.float64) if need[5] or need[6] else None
+        camera = torch.zeros(len(ctx.states), native().CAMERA_SUMS, dtype=torch.float64) if need[5] or need[6] else None
         grad_backgrounds = torch.zeros(backgrounds.shape, dtype=torch.float64) if need[7] else None
         grad_shift = torch.empty(len(ctx.states), len(means), 2) if need[8] else None
         for i, state in enumerate(ctx.states):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,6 +15,8 @@ from torch import Tensor
 
 from splatbot.rasterize.native import native
 from tests.scenes import NAMES, Scene, compare, hard_scene, relative_l2
+
+TESTS = Path(__file__).parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -117,3 +120,23 @@ def test_an_environment_that_cannot_be_honoured_is_an_error_that_names_it(
         check=True,
     )
     assert variable in done.stdout
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("isa", [isa for isa in native().available_isas() if isa != native().isa()])
+def test_the_rasterizer_keeps_its_promises_on_lesser_instruction_sets(isa: str) -> None:
+    suites = [
+        str(TESTS / name)
+        for name in (
+            "unit/rasterize",
+            "stability/test_rasterizer.py",
+            "stability/test_cameras.py",
+            "stability/test_surfels.py",
+        )
+    ]
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "not long", "-p", "no:cacheprovider", *suites]
+    done = subprocess.run(
+        command, cwd=TESTS.parent, env=os.environ | {"SPLATBOT_ISA": isa}, capture_output=True, text=True, timeout=500
+    )
+    assert done.returncode == 0, done.stdout[-4000:]
+    assert " passed" in done.stdout

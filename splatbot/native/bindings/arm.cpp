@@ -109,6 +109,14 @@ void define_arm(nb::module_& m) {
           },
           "q"_a.noconvert(), "The same as the kernels see them, in float32")
       .def(
+          "reach",
+          [](const Arm& self) {
+            const splatbot::ArmView& view = self.view();
+            const auto spheres = static_cast<std::size_t>(view.spheres), joints = static_cast<std::size_t>(view.joints);
+            return owned(std::vector<float>(view.reach, view.reach + spheres * joints), {spheres, joints});
+          },
+          "The farthest that each sphere's centre can be from each joint's axis (S, J) [m]; 1 for joints that slide")
+      .def(
           "configurations",
           [](const Arm& self, const CollisionField* field, Configurations q) {
             check(self, q);

@@ -11,6 +11,7 @@ void define_depth(nanobind::module_& m);
 void define_field(nanobind::module_& m);
 void define_matching(nanobind::module_& m);
 void define_optimize(nanobind::module_& m);
+void define_path_speed(nanobind::module_& m);
 void define_planning(nanobind::module_& m);
 void define_rasterize(nanobind::module_& m);
 void define_lens(nanobind::module_& m);

@@ -13,6 +13,7 @@ NB_MODULE(_native, m) {
   define_field(m);
   define_matching(m);
   define_optimize(m);
+  define_path_speed(m);
   define_planning(m);
   define_rasterize(m);
   define_lens(m);

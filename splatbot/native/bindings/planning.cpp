@@ -36,7 +36,10 @@ class ArmPlanner {
  public:
   ArmPlanner(const Arm& arm, std::shared_ptr<const CollisionField> field, std::span<const double> lower,
              std::span<const double> upper, float eps)
-      : joints_(lower.size()), planner_(std::make_shared<ArmSpace>(arm, std::move(field), lower, upper, eps)) {}
+      : joints_(lower.size()),
+        space_(std::make_shared<ArmSpace>(arm, std::move(field), lower, upper, eps)),
+        planner_(space_),
+        eps_(eps) {}
 
   int run(Numbers start, Configurations goals, double seconds, std::uint64_t iterations, std::uint64_t seed,
           double good_enough) {
@@ -45,6 +48,18 @@ class ArmPlanner {
     }
     const nb::gil_scoped_release release;
     return static_cast<int>(planner_.run(span_of(start), span_of(goals), {seconds, iterations, seed, good_enough}));
+  }
+
+  // `unpaired` is the same arm, which may touch itself: what is new in the map says nothing of that.
+  int rerun(Numbers start, std::shared_ptr<CollisionField> field, std::shared_ptr<CollisionField> added,
+            const Arm& unpaired, double seconds, std::uint64_t iterations, std::uint64_t seed) {
+    if (start.shape(0) != joints_ || planner_.tree() == nullptr) {
+      throw nb::value_error("the start has another number of joints, or nothing was planned before");
+    }
+    const nb::gil_scoped_release release;
+    space_->look_at(std::move(field));
+    ArmSpace delta(unpaired, std::move(added), {space_->lower(), joints_}, {space_->upper(), joints_}, eps_);
+    return static_cast<int>(planner_.rerun(span_of(start), delta, {seconds, iterations, seed, 0.0}));
   }
 
   // Waypoints (N, J) and history (H, 2).
@@ -73,11 +88,15 @@ class ArmPlanner {
     return nb::make_tuple(owned(std::move(q), {n, joints_}), owned(std::move(parent), {n}), owned(std::move(cost), {n}));
   }
 
+  void look_at(std::shared_ptr<CollisionField> field) { space_->look_at(std::move(field)); }
+
   Planner& planner() { return planner_; }
 
  private:
   std::size_t joints_;
+  std::shared_ptr<ArmSpace> space_;
   Planner planner_;
+  float eps_;
 };
 
 }  // namespace
@@ -127,7 +146,10 @@ void define_planning(nb::module_& m) {
           "arm"_a, "field"_a.none(), "lower"_a.noconvert(), "upper"_a.noconvert(), "eps"_a, nb::keep_alive<1, 2>())
       .def("run", &ArmPlanner::run, "start"_a.noconvert(), "goals"_a.noconvert(), "seconds"_a, "iterations"_a, "seed"_a,
            "good_enough"_a, "How it ended: 0 a path, 1 iterations used up, 2 time used up, 3 cancelled")
+      .def("rerun", &ArmPlanner::rerun, "start"_a.noconvert(), "field"_a, "added"_a, "unpaired"_a, "seconds"_a,
+           "iterations"_a, "seed"_a, "The same in a later field with the tree of the last run")
       .def("best", &ArmPlanner::best, "Waypoints (N, J), cost, history (H, 2); from any thread")
+      .def("look_at", &ArmPlanner::look_at, "field"_a, "Another field from the next run on; not while one is busy")
       .def("cancel", [](ArmPlanner& self) { self.planner().cancel(); }, "From any thread")
       .def("tree", &ArmPlanner::tree, "Nodes (N, J), parents (N), costs (N) of the last run")
       .def_prop_ro("iterations", [](ArmPlanner& self) { return self.planner().iterations(); })

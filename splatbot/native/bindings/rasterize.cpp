@@ -68,7 +68,7 @@ void backward(const State& state, const InN3& means, const std::optional<InN4>& 
               const std::optional<OutAny>& grad_means, const std::optional<OutAny>& grad_quats,
               const std::optional<OutAny>& grad_scales, const std::optional<OutAny>& grad_covars,
               const std::optional<OutAny>& grad_opacities, const std::optional<OutAny>& grad_colors,
-              const std::optional<Array<double, nb::shape<16>>>& grad_camera,
+              const std::optional<Array<double, nb::shape<splatbot::kCameraSums>>>& grad_camera,
               const std::optional<Array<double, nb::shape<-1>>>& grad_background,
               const std::optional<OutAny>& grad_means2d, const std::optional<OutAny>& absolute_means2d,
               bool accumulate) {
@@ -216,6 +216,7 @@ void define_rasterize(nb::module_& m) {
         nb::arg("grad_means2d").noconvert().none(), nb::arg("absolute_means2d").noconvert().none(), "accumulate"_a,
         "Write (or add) the gradients whose arrays are given.");
 
+  m.attr("CAMERA_SUMS") = splatbot::kCameraSums;
   m.def("isa", [] { return std::string(splatbot::isa()); }, "The kernels in use: v2, v3, v4 or baseline.");
   m.def("available_isas", &splatbot::available_isas, "The kernels this CPU can run, the simplest first.");
   m.def("set_isa", [](const std::string& name) { splatbot::set_isa(name); }, "name"_a,

@@ -54,7 +54,7 @@ void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, c
               const std::optional<In2>& grad_distortion, const std::optional<OutAny>& out_means,
               const std::optional<OutAny>& out_quats, const std::optional<OutAny>& out_scales,
               const std::optional<OutAny>& out_opacities, const std::optional<OutAny>& out_colors,
-              const std::optional<Array<double, nb::shape<16>>>& out_camera,
+              const std::optional<Array<double, nb::shape<splatbot::kCameraSums>>>& out_camera,
               const std::optional<Array<double, nb::shape<-1>>>& out_background,
               const std::optional<OutAny>& out_means2d, bool accumulate) {
   const splatbot::Gaussians surfels = gaussians_of(means, quats, scales, std::nullopt, opacities, colors, sh_degree);

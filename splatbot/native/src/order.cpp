@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Depth order by one radix sort of all Gaussians in view, then tile lists by a stable counting scatter: cheaper than
-// sorting (tile, depth) keys, and every list comes out in depth order. Both are stable, so the result is one and the
-// same for any division of the work.
+// Depth order, then tile lists by a stable counting scatter: cheaper than sorting (tile, depth) keys, and every list comes
+// out in depth order. Each thread sorts a share of its own by radix, and sorted shares are merged in pairs: few loops,
+// because a sleeping thread takes tens of microseconds to wake. All of it is stable, so the result is one and the same
+// for any division of the work.
 #include <algorithm>
 #include <bit>
 #include <limits>
@@ -50,46 +51,63 @@ std::size_t parts_for(std::size_t size, const ThreadPool& pool) {
   return std::clamp<std::size_t>(size / kWorthwhile, 1, pool.size());
 }
 
-void radix_pass(const KeyedId* from, KeyedId* to, std::size_t size, const Digits& digits, unsigned pass,
-                std::uint32_t* histogram, std::size_t parts, ThreadPool& pool) {
-  const std::size_t kinds = digits.count();
-  pool.run(parts, [&](std::size_t part) {
-    std::uint32_t* counts = histogram + part * kinds;
-    std::fill_n(counts, kinds, 0U);
-    const auto [begin, end] = share(size, part, parts);
-    for (std::size_t i = begin; i < end; ++i) {
-      ++counts[digits.of(from[i].key, pass)];
-    }
-  });
+// One pass over a share; the counts are of its own.
+void radix_pass(std::span<const KeyedId> from, KeyedId* to, const Digits& digits, unsigned pass,
+                std::span<std::uint32_t> counts) {
+  std::fill(counts.begin(), counts.end(), 0U);
+  for (const KeyedId& each : from) {
+    ++counts[digits.of(each.key, pass)];
+  }
   std::uint32_t sum = 0;
-  for (std::size_t digit = 0; digit < kinds; ++digit) {
-    for (std::size_t part = 0; part < parts; ++part) {
-      const std::uint32_t n = histogram[part * kinds + digit];
-      histogram[part * kinds + digit] = sum;
-      sum += n;
-    }
+  for (std::uint32_t& count : counts) {
+    const std::uint32_t n = count;
+    count = sum;
+    sum += n;
   }
-  pool.run(parts, [&](std::size_t part) {
-    std::uint32_t* next = histogram + part * kinds;
-    const auto [begin, end] = share(size, part, parts);
-    for (std::size_t i = begin; i < end; ++i) {
-      to[next[digits.of(from[i].key, pass)]++] = from[i];
-    }
-  });
+  for (const KeyedId& each : from) {
+    to[counts[digits.of(each.key, pass)]++] = each;
+  }
 }
 
-// The least and the greatest key; 0 and 0 of none.
-std::pair<std::uint32_t, std::uint32_t> key_range(std::span<const KeyedId> keys) {
-  std::uint32_t least = keys.empty() ? 0U : std::numeric_limits<std::uint32_t>::max(), most = 0;
-  for (const KeyedId& each : keys) {
-    least = std::min(least, each.key);
-    most = std::max(most, each.key);
+// How many of the first k of a merge come from `a`, the first among equals.
+std::size_t taken(std::span<const KeyedId> a, std::span<const KeyedId> b, std::size_t k) {
+  std::size_t low = k > b.size() ? k - b.size() : 0, high = std::min(k, a.size());
+  while (low < high) {
+    const std::size_t i = (low + high) / 2;
+    if (a[i].key <= b[k - i - 1].key) {
+      low = i + 1;
+    } else {
+      high = i;
+    }
   }
-  return {least, most};
+  return low;
 }
 
-// Brings the blocks' lists of visible ids together and numbers their pairs.
-void compact(TileLists& state, ThreadPool& pool) {
+// Entries [begin, end) of a merge. From both ends at once: either chain of comparisons waits for its last.
+void merge(std::span<const KeyedId> a, std::span<const KeyedId> b, std::size_t begin, std::size_t end, KeyedId* to) {
+  const std::size_t a_begin = taken(a, b, begin), a_end = taken(a, b, end);
+  const KeyedId *i = a.data() + a_begin, *i_end = a.data() + a_end;
+  const KeyedId *j = b.data() + (begin - a_begin), *j_end = b.data() + (end - a_end);
+  KeyedId *head = to + begin, *tail = to + end;
+  while (i_end - i > 1 && j_end - j > 1) {  // at least one each way
+    const bool second = j->key < i->key;
+    *head++ = second ? *j : *i;
+    j += second;
+    i += !second;
+    const bool first = j_end[-1].key < i_end[-1].key;
+    *--tail = first ? i_end[-1] : j_end[-1];
+    i_end -= first;
+    j_end -= !first;
+  }
+  while (i != i_end && j != j_end) {
+    const bool second = j->key < i->key;
+    *head++ = second ? *j++ : *i++;
+  }
+  std::copy(j, j_end, std::copy(i, i_end, head));
+}
+
+// Sizes of everything that comes, and where each block's share begins.
+void number(TileLists& state) {
   std::uint32_t visible = 0;
   std::uint64_t pairs = 0;
   for (ProjectedBlock& block : state.blocks) {
@@ -106,15 +124,36 @@ void compact(TileLists& state, ThreadPool& pool) {
   state.order_scratch.resize(visible);
   state.pairs.resize(pairs);
   state.masks.resize(pairs);
-  pool.run(state.blocks.size(), [&](std::size_t b) {
-    const ProjectedBlock& block = state.blocks[b];
-    const std::uint32_t* from = state.visible.data() + b * kProjectBlock;
-    for (std::uint32_t i = 0; i < block.visible; ++i) {
-      const std::uint32_t id = from[i];
-      state.ids[block.first_visible + i] = id;
-      state.order[block.first_visible + i] = {state.placements[id].depth_bits, id};
+}
+
+// A contiguous share of the Gaussians in view, brought together from whole blocks and sorted.
+struct SortShare {
+  std::size_t begin, size;  // of state.order
+
+  SortShare(const TileLists& state, Range blocks) : begin(at(state, blocks.begin)), size(at(state, blocks.end) - begin) {}
+
+  static std::size_t at(const TileLists& state, std::size_t block) {
+    return block < state.blocks.size() ? state.blocks[block].first_visible : state.order.size();
+  }
+};
+
+// Writes ids and, sorted, the share: to order after an even number of passes, else to order_scratch.
+void sort_share(TileLists& state, Range blocks, const Digits& digits, std::span<std::uint32_t> counts) {
+  const SortShare share(state, blocks);
+  KeyedId *from = state.order.data() + share.begin, *to = state.order_scratch.data() + share.begin;
+  KeyedId* next = from;
+  for (std::size_t b = blocks.begin; b < blocks.end; ++b) {
+    const std::uint32_t* ids = state.visible.data() + b * kProjectBlock;
+    std::uint32_t* compacted = state.ids.data() + state.blocks[b].first_visible;
+    for (std::uint32_t i = 0; i < state.blocks[b].visible; ++i) {
+      compacted[i] = ids[i];
+      *next++ = {state.placements[ids[i]].depth_bits, ids[i]};
     }
-  });
+  }
+  for (unsigned pass = 0; pass < digits.passes; ++pass) {
+    radix_pass({from, share.size}, to, digits, pass, counts);
+    std::swap(from, to);
+  }
 }
 
 }  // namespace
@@ -136,14 +175,37 @@ std::size_t TileLists::bytes() const noexcept {
 }
 
 void order_by_depth(TileLists& state, ThreadPool& pool) {
-  compact(state, pool);
+  number(state);
   const std::size_t size = state.order.size();
-  const std::size_t parts = parts_for(size, pool);
-  const auto [least, most] = key_range(state.order.span());
-  const Digits digits = digits_for(least, most, size);
+  const std::size_t parts = std::min(parts_for(size, pool), state.blocks.size());
+  std::uint32_t least = std::numeric_limits<std::uint32_t>::max(), most = 0;
+  for (const ProjectedBlock& block : state.blocks) {
+    least = std::min(least, block.least_key);
+    most = std::max(most, block.most_key);
+  }
+  const Digits digits = digits_for(std::min(least, most), most, size);
   state.histogram.resize(parts * digits.count());
-  for (unsigned pass = 0; pass < digits.passes; ++pass) {
-    radix_pass(state.order.data(), state.order_scratch.data(), size, digits, pass, state.histogram.data(), parts, pool);
+  const auto blocks_of = [&](std::size_t first, std::size_t last) {
+    return Range{state.blocks.size() * first / parts, state.blocks.size() * last / parts};
+  };
+  pool.run(parts, [&](std::size_t part) {
+    sort_share(state, blocks_of(part, part + 1), digits,
+               state.histogram.span().subspan(part * digits.count(), digits.count()));
+  });
+  if (digits.passes % 2 == 1) {
+    std::swap(state.order, state.order_scratch);
+  }
+  for (std::size_t run = 1; run < parts; run *= 2) {  // parts of a sorted run
+    const std::size_t merges = (parts + 2 * run - 1) / (2 * run), pieces = (parts + merges - 1) / merges;
+    pool.run(merges * pieces, [&](std::size_t task) {
+      const std::size_t first = task / pieces * 2 * run;
+      const std::size_t middle = std::min(first + run, parts), last = std::min(first + 2 * run, parts);
+      const SortShare a(state, blocks_of(first, middle));
+      const std::size_t end = SortShare(state, blocks_of(first, last)).size;
+      const std::span<const KeyedId> all{state.order.data() + a.begin, end};
+      const auto [from, to] = share(end, task % pieces, pieces);
+      merge(all.first(a.size), all.subspan(a.size), from, to, state.order_scratch.data() + a.begin);
+    });
     std::swap(state.order, state.order_scratch);
   }
 }

@@ -362,12 +362,14 @@ void check_pool() {
 int main() {
   check_pool();
   check_errors();
+  check_path_speed();
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);
     run_surfels(isa);
     check_cameras(isa);
     check_collision(isa);
+    check_planning();
     run_variants(isa);
     run_optimize();
   }

@@ -13,4 +13,6 @@ inline void promise(bool kept, const std::string& what) {
 }
 
 void check_cameras(const std::string& isa);
+void check_planning();
 void check_collision(const std::string& isa);
+void check_path_speed();

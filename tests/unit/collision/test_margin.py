@@ -45,6 +45,17 @@ def test_no_ball_that_the_margin_enlarges_is_called_free_where_it_reaches_into_w
     assert not field.in_collision(np.c_[centers, radii]).all()
 
 
+def test_only_what_lies_around_a_place_counts_if_one_is_given() -> None:
+    field = _wall(1.0)
+    depth = np.full((60, 80), 1.0, np.float32)
+    depth[:, 40:] = 0.9  # the right half is off by 10 cm
+    views = [(depth, CAMERA, np.eye(4))]
+    assert surface_error(field, views).share(1.0) > 0.08
+    assert surface_error(field, views, around=[-0.4, 0.0, 1.0, 0.3]).share(1.0) == 0.0
+    with pytest.raises(InputError, match="no depth"):
+        surface_error(field, views, around=[0.0, 0.0, 9.0, 0.3])
+
+
 def test_views_without_depth_or_of_another_size_are_refused() -> None:
     field = _wall(1.0)
     with pytest.raises(InputError, match="no depth"):

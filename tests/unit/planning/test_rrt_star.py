@@ -13,10 +13,10 @@ from splatbot._native import set_num_threads
 from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
-from splatbot.planning import GaussianRRTStar, GoalError, PlanningError, PlanStatus, StartError
+from splatbot.planning import GaussianRRTStar, GoalError, PlanningError, PlanningProblem, PlanStatus, StartError
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
-from tests.unit.planning.toys import Slider, around_the_ball, ball_world
+from tests.unit.planning.toys import Slider, around_the_ball, ball_world, cause_of
 
 # Two places of the hand close above the table, with things between them.
 LEFT = np.array([-0.26, 0.79, 1.15, -2.5, 0.29, 3.06, -2.15])
@@ -68,14 +68,17 @@ def test_rewiring_leads_nearly_straight_to_what_the_start_can_see(ball: Gaussian
     seen &= straight > 0
     assert seen.sum() > 50
     assert (cost >= straight * (1 - 1e-12)).all()
-    assert np.median(cost[seen] / straight[seen]) < 1.01 and (cost[seen] < 1.3 * straight[seen]).all()
+    assert np.median(cost[seen] / straight[seen]) < 1.01
+    assert (cost[seen] < 1.3 * straight[seen]).all()
 
 
 def test_every_node_costs_what_its_edges_add_up_to_and_no_way_runs_in_a_circle(planner: GaussianRRTStar) -> None:
     result = planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=2000)
     q, parent, cost = planner.tree()
     assert len(q) == result.nodes > 50
-    assert parent[0] == -1 and (parent[1:] >= 0).all() and cost[0] == 0.0
+    assert parent[0] == -1
+    assert (parent[1:] >= 0).all()
+    assert cost[0] == 0.0
     np.testing.assert_array_equal(q[0], LEFT)
     edges = np.linalg.norm(q[1:] - q[parent[1:]], axis=1)
     np.testing.assert_allclose(cost[1:], cost[parent[1:]] + edges, rtol=1e-12)
@@ -97,7 +100,8 @@ def test_a_path_is_free_between_its_waypoints_and_its_cost_is_its_length(planner
     path = result.unwrap()
     np.testing.assert_array_equal(path.waypoints[[0, -1]], [LEFT, RIGHT])
     assert path.cost == pytest.approx(_length(path.waypoints), rel=1e-12)
-    assert path.certificate.certified and path.certificate.map_version == planner.field.map_version
+    assert path.certificate.certified
+    assert path.certificate.map_version == planner.field.map_version
     along = path.at(np.linspace(0, 1, 4001))
     assert not planner.arm.check(planner.field, along).in_collision.any()
     room = planner.arm.clearance(planner.field, along, cut=0.2).distance.min()
@@ -107,8 +111,10 @@ def test_a_path_is_free_between_its_waypoints_and_its_cost_is_its_length(planner
 def test_better_paths_come_one_after_the_other(planner: GaussianRRTStar) -> None:
     result = planner.plan(LEFT, RIGHT, budget_ms=100.0)
     seconds, cost = result.history.T
-    assert (np.diff(seconds) >= 0).all() and (np.diff(cost) < 0).all()
-    assert cost[-1] == result.unwrap().cost and seconds[-1] <= result.seconds
+    assert (np.diff(seconds) >= 0).all()
+    assert (np.diff(cost) < 0).all()
+    assert cost[-1] == result.unwrap().cost
+    assert seconds[-1] <= result.seconds
 
 
 def test_a_seed_and_a_number_of_iterations_give_one_path_on_any_number_of_threads(
@@ -126,11 +132,18 @@ def test_a_seed_and_a_number_of_iterations_give_one_path_on_any_number_of_thread
     assert not np.array_equal(found[0], other.unwrap().waypoints)
 
 
+def test_a_problem_is_solved_as_its_start_and_goal_are(planner: GaussianRRTStar) -> None:
+    one = planner.solve(PlanningProblem(LEFT, RIGHT), budget_ms=60_000, iterations=200, seed=5).unwrap()
+    other = planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=5).unwrap()
+    np.testing.assert_array_equal(one.waypoints, other.waypoints)
+
+
 def test_a_margin_is_kept(field: GaussianCollisionField) -> None:
     plain, careful = (GaussianRRTStar(field, panda(), margin=m) for m in (0.0, 0.02))
     path = careful.plan(LEFT, RIGHT, budget_ms=200.0).unwrap()
     room = plain.arm.clearance(field, path.at(np.linspace(0, 1, 2001)), cut=0.1).distance.min()
-    assert room >= 0.02 and path.certificate.margin == 0.02
+    assert room >= 0.02
+    assert path.certificate.margin == 0.02
 
 
 def test_a_search_can_be_watched_and_cancelled_from_another_thread(planner: GaussianRRTStar) -> None:
@@ -144,15 +157,35 @@ def test_a_search_can_be_watched_and_cancelled_from_another_thread(planner: Gaus
     planner.cancel()
     thread.join(20)
     assert not thread.is_alive()
-    assert cost == pytest.approx(_length(waypoints)) and history[-1, 1] == cost
-    assert results[0].status is PlanStatus.SUCCESS and results[0].path.cost <= cost and results[0].seconds < 50
+    assert cost == pytest.approx(_length(waypoints))
+    assert history[-1, 1] == cost
+    assert results[0].status is PlanStatus.SUCCESS
+    assert results[0].unwrap().cost <= cost
+    assert results[0].seconds < 50
+
+
+def test_several_threads_may_ask_one_planner(planner: GaussianRRTStar) -> None:
+    alone = [planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=k).unwrap().waypoints for k in range(6)]
+    found: dict[int, Array] = {}
+
+    def ask(k: int) -> None:
+        found[k] = planner.plan(LEFT, RIGHT, budget_ms=60_000, iterations=200, seed=k).unwrap().waypoints
+
+    threads = [threading.Thread(target=ask, args=(k,)) for k in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    for k in range(6):
+        np.testing.assert_array_equal(found[k], alone[k])
 
 
 def test_a_cancelled_search_without_a_path_says_so(ball: GaussianCollisionField) -> None:
     planner = GaussianRRTStar(ball, Slider(2))
     planner.cancel()
     result = planner.plan([-0.8, 0.0], [0.8, 0.0])
-    assert result.status is PlanStatus.PREEMPTED and not result
+    assert result.status is PlanStatus.PREEMPTED
+    assert not result
 
 
 def test_failures_name_what_is_in_the_way(planner: GaussianRRTStar, field: GaussianCollisionField) -> None:
@@ -163,10 +196,13 @@ def test_failures_name_what_is_in_the_way(planner: GaussianRRTStar, field: Gauss
         (planner.plan(in_map, RIGHT), PlanStatus.START_STATE_IN_COLLISION),
         (planner.plan(LEFT, in_map), PlanStatus.GOAL_IN_COLLISION),
     ):
-        assert result.status is status and result.path is None and result.seconds < 1
-        cause = result.cause
+        assert result.status is status
+        assert result.path is None
+        assert result.seconds < 1
+        cause = cause_of(result)
         nearest = planner.arm.clearance(field, in_map[None])
-        assert cause.link == nearest.link[0] and cause.gaussian == nearest.index[0]
+        assert cause.link == nearest.link[0]
+        assert cause.gaussian == nearest.index[0]
         assert cause.depth == pytest.approx(-nearest.distance[0])
         assert f"link {cause.link}" in result.reason
         with pytest.raises(PlanningError, match="Fix:") as raised:
@@ -175,7 +211,9 @@ def test_failures_name_what_is_in_the_way(planner: GaussianRRTStar, field: Gauss
     in_itself = q[verdict.in_collision & (verdict.other >= 0)][0]
     result = planner.plan(in_itself, RIGHT)
     assert result.status is PlanStatus.START_STATE_IN_COLLISION
-    assert result.cause.other >= 0 and result.cause.gaussian == -1 and result.cause.depth > 0
+    assert cause_of(result).other >= 0
+    assert cause_of(result).gaussian == -1
+    assert cause_of(result).depth > 0
 
 
 def test_joints_beyond_their_limits_are_named(planner: GaussianRRTStar) -> None:
@@ -184,7 +222,15 @@ def test_joints_beyond_their_limits_are_named(planner: GaussianRRTStar) -> None:
     start, goal = planner.plan(far, RIGHT), planner.plan(LEFT, far)
     assert (start.status, goal.status) == (PlanStatus.START_STATE_INVALID, PlanStatus.GOAL_STATE_INVALID)
     for result in (start, goal):
-        assert result.cause.joint == 3 and result.cause.depth == pytest.approx(0.25)
+        assert cause_of(result).joint == 3
+        assert cause_of(result).depth == pytest.approx(0.25)
+
+
+def test_a_joint_that_its_encoder_reads_a_hair_beyond_the_limit_is_no_failure(planner: GaussianRRTStar) -> None:
+    start = LEFT.copy()
+    start[6] = planner.robot.chain.lower[6] - 1e-9
+    path = planner.plan(start, RIGHT, budget_ms=100).unwrap()
+    np.testing.assert_array_equal(path.waypoints[0], start)
 
 
 def test_a_goal_that_cannot_be_reached_times_out_and_names_what_blocks_the_straight_way() -> None:
@@ -199,9 +245,12 @@ def test_a_goal_that_cannot_be_reached_times_out_and_names_what_blocks_the_strai
     )
     planner = GaussianRRTStar(GaussianCollisionField(ring), Slider(2))
     result = planner.plan([0.0, 0.0], [0.8, 0.0], budget_ms=50)
-    assert result.status is PlanStatus.TIMED_OUT and result.cause.gaussian == 0 and result.cause.link == 2
+    assert result.status is PlanStatus.TIMED_OUT
+    assert cause_of(result).gaussian == 0
+    assert cause_of(result).link == 2
     exhausted = planner.plan([0.0, 0.0], [0.8, 0.0], budget_ms=60_000, iterations=100)
-    assert exhausted.status is PlanStatus.PLANNING_FAILED and exhausted.iterations == 100
+    assert exhausted.status is PlanStatus.PLANNING_FAILED
+    assert exhausted.iterations == 100
 
 
 def test_of_several_goals_those_out_of_the_way_are_left_out(planner: GaussianRRTStar) -> None:

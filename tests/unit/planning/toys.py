@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
+from splatbot.planning import Cause, PlanResult
 from splatbot.protocols import Array, KinematicChain, LinkSpheres
 
 RADIUS = 0.02  # [m] of the robot's only sphere
@@ -65,6 +66,12 @@ def ball_world() -> GaussianModel:
         opacities=np.array([0.9]),
         colors=np.full((1, 3), 0.5),
     )
+
+
+def cause_of(result: PlanResult) -> Cause:
+    """What is in the way, which there must be."""
+    assert result.cause is not None
+    return result.cause
 
 
 def around_the_ball(far: float) -> float:

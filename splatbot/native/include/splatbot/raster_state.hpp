@@ -3,6 +3,7 @@
 
 #include <array>
 #include <cstdint>
+#include <limits>
 #include <vector>
 
 #include "splatbot/buffer.hpp"
@@ -46,9 +47,6 @@ inline constexpr int kSlot = 16;
 inline constexpr int kAbsolute = 14;
 static_assert(kMoments + kRecordChannels <= kAbsolute && kAbsolute + 2 <= kSlot);
 
-// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy.
-inline constexpr int kCameraSums = 16;
-
 // What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
 inline constexpr int kFinalPlanes = 2 + kRecordChannels;
 inline constexpr int kWeightPlane = 1 + kRecordChannels;  // for expected depth only
@@ -74,6 +72,7 @@ struct alignas(64) ProjectedBlock {
   std::uint64_t pairs = 0;
   std::uint64_t first_pair = 0;
   std::uint32_t first_visible = 0;
+  std::uint32_t least_key = std::numeric_limits<std::uint32_t>::max(), most_key = 0;  // bits of the depths in view
   int fault_field = -1;  // means, quats, scales, covars, opacities, colors
   std::size_t fault_row = 0;
 };

@@ -92,10 +92,15 @@ std::optional<Fault> rasterize_forward(const Gaussians& gaussians, const View& v
 std::optional<Fault> find_visible(const Gaussians& gaussians, const View& view, const RasterOptions& options,
                                   std::vector<std::uint32_t>& ids);
 
+// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy; then those of a rolling
+// shutter's turn, step and pivot (see Lens), 0 for others.
+inline constexpr int kMotionSums = 9;
+inline constexpr int kCameraSums = 16 + kMotionSums;
+
 // Where gradients go; an empty span is not computed. With `accumulate`, they are added to what is there.
 struct Gradients {
   std::span<float> means, quats, scales, covars, opacities, colors;
-  std::span<double> camera;      // (16,): dL/d(world-to-camera rotation row-major, translation, fx, fy, cx, cy)
+  std::span<double> camera;      // (kCameraSums,): dL/d(world-to-camera rotation row-major, translation, fx, fy, cx, cy, ...)
   std::span<double> background;  // (channels,)
   std::span<float> means2d;      // (N, 2): to the projected centres; never accumulated
   std::span<float> absolute2d;   // (N, 2): the same, of absolute values pixel by pixel (AbsGS, Ye et al. 2024)

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows of arrays to lanes of vectors and back, and what the projections share besides.
+// What the projections share.
 #pragma once
 
 #include "project.hpp"
+#include "rows.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -49,60 +50,11 @@ bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedB
   return false;
 }
 
-// Rows [first, first + n) of an (N, width) array, transposed; the last row is repeated to W.
-template <int Width>
-SB_INLINE void load_lanes(const float* rows, std::size_t first, int n, F (&out)[Width]) {
-  alignas(64) float lanes[Width][W];
-  for (int i = 0; i < W; ++i) {
-    const float* row = rows + (first + static_cast<std::size_t>(i < n ? i : n - 1)) * Width;
-    for (int c = 0; c < Width; ++c) {
-      lanes[c][i] = row[c];
-    }
-  }
-  for (int c = 0; c < Width; ++c) {
-    out[c] = load(lanes[c]);
-  }
-}
-
-// The same for any rows.
-template <int Width>
-SB_INLINE void gather_lanes(const float* rows, const std::uint32_t* ids, int n, F (&out)[Width]) {
-  alignas(64) float lanes[Width][W];
-  for (int i = 0; i < W; ++i) {
-    const float* row = rows + static_cast<std::size_t>(ids[i < n ? i : n - 1]) * Width;
-    for (int c = 0; c < Width; ++c) {
-      lanes[c][i] = row[c];
-    }
-  }
-  for (int c = 0; c < Width; ++c) {
-    out[c] = load(lanes[c]);
-  }
-}
-
-SB_INLINE void put(float* to, float value, bool add) { *to = add ? *to + value : value; }
-
-template <int Width>
-SB_INLINE void scatter_lanes(float* rows, const std::uint32_t* ids, int n, const F (&values)[Width], bool add) {
-  if (rows == nullptr) {
-    return;
-  }
-  alignas(64) float lanes[Width][W];
-  for (int c = 0; c < Width; ++c) {
-    store(lanes[c], values[c]);
-  }
-  for (int i = 0; i < n; ++i) {
-    float* row = rows + static_cast<std::size_t>(ids[i]) * Width;
-    for (int c = 0; c < Width; ++c) {
-      put(row + c, lanes[c][i], add);
-    }
-  }
-}
-
-// Gradients of the camera's rotation, translation and intrinsics, lane by lane until the end.
+// Gradients of the camera's rotation, translation, intrinsics and motion, lane by lane until the end.
 class CameraSums {
  public:
   SB_INLINE void add(const F (&rotation)[9], const F (&translation)[3], const F (&intrinsics)[4], int n) {
-    alignas(64) float lanes[kCameraSums][W];
+    alignas(64) float lanes[kStill][W];
     for (int i = 0; i < 9; ++i) {
       store(lanes[i], rotation[i]);
     }
@@ -112,9 +64,19 @@ class CameraSums {
     for (int i = 0; i < 4; ++i) {
       store(lanes[12 + i], intrinsics[i]);
     }
-    for (int k = 0; k < kCameraSums; ++k) {
+    for (int k = 0; k < kStill; ++k) {
       for (int i = 0; i < W; ++i) {
         sums_[k][i] += i < n ? static_cast<double>(lanes[k][i]) : 0.0;
+      }
+    }
+  }
+
+  SB_INLINE void add_motion(const F (&motion)[kMotionSums], int n) {
+    alignas(64) float lanes[W];
+    for (int k = 0; k < kMotionSums; ++k) {
+      store(lanes, motion[k]);
+      for (int i = 0; i < n; ++i) {
+        sums_[kStill + k][i] += static_cast<double>(lanes[i]);
       }
     }
   }
@@ -129,6 +91,7 @@ class CameraSums {
   }
 
  private:
+  static constexpr int kStill = kCameraSums - kMotionSums;
   double sums_[kCameraSums][W] = {};
 };
 

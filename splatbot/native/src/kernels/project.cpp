@@ -45,10 +45,11 @@ SB_INLINE void plane_slopes(const GaussianLanes& g, const CameraLanes& cam, cons
   slope[1] = zero_unless(known, slope[1] * shrink);
 }
 
-struct Lanes {
-  alignas(64) float mx[W], my[W], l11[W], l21[W], l22[W], lo[W], reach[W], lean[W];
-  alignas(64) float z[W], slope_x[W], slope_y[W];
-  alignas(64) std::uint32_t corner[W], size[W];  // x in the low half, y in the high half
+// What is written of W Gaussians in view.
+struct Written {
+  F record[8];  // as Record's first eight
+  F depth, slope[2];
+  I corner, size;  // tiles; x in the low half, y in the high half
 };
 
 // Rows of a few floats; a loop of unknown length would cost more than the copy.
@@ -65,49 +66,97 @@ SB_INLINE void copy_few(float* to, const float* from, int n) {
   }
 }
 
-SB_INLINE void write_channels(const ProjectArgs& args, std::size_t id, const Lanes& lanes, int lane) {
+// The channels of all passes, where they are not one depth and three colours.
+SB_INLINE void write_channels(const ProjectArgs& args, std::size_t id, float depth, float slope_x, float slope_y) {
   for (int p = 0; p < args.n_passes; ++p) {
     const ChannelPass& pass = args.passes[p];
     float* to = p == 0 ? args.records[id].channels
                        : args.more_channels + (static_cast<std::size_t>(p - 1) * args.count + id) * kRecordChannels;
-    const int depth = pass.depth_first ? 1 : 0;
+    const int first = pass.depth_first ? 1 : 0;
     const float* from = args.colors + id * static_cast<std::size_t>(args.channels) + pass.first_color;
     std::memset(to, 0, kRecordChannels * sizeof(float));
-    to[0] = lanes.z[lane];
+    to[0] = depth;
     if (args.sh_degree < 0) {  // else harmonics() writes them
-      copy_few(to + depth, from, pass.count - depth);
+      copy_few(to + first, from, pass.count - first);
     }
     if (pass.depth_first && args.options.plane_depth) {
-      to[kRecordChannels - 2] = lanes.slope_x[lane];
-      to[kRecordChannels - 1] = lanes.slope_y[lane];
+      to[kRecordChannels - 2] = slope_x;
+      to[kRecordChannels - 1] = slope_y;
     }
   }
 }
 
-SB_INLINE void write_lane(const ProjectArgs& args, std::size_t id, const Lanes& lanes, int lane, ProjectedBlock& out) {
-  Record& record = args.records[id];
-  record.mx = lanes.mx[lane];
-  record.my = lanes.my[lane];
-  record.l11 = lanes.l11[lane];
-  record.l21 = lanes.l21[lane];
-  record.l22 = lanes.l22[lane];
-  record.lo = lanes.lo[lane];
-  record.reach = lanes.reach[lane];
-  record.lean = lanes.lean[lane];
-  write_channels(args, id, lanes, lane);
-  Placement& place = args.placements[id];
-  const std::uint32_t corner = lanes.corner[lane], size = lanes.size[lane];
-  place.x0 = static_cast<std::uint16_t>(corner);
-  place.y0 = static_cast<std::uint16_t>(corner >> 16);
-  place.nx = static_cast<std::uint16_t>(size);
-  place.ny = static_cast<std::uint16_t>(size >> 16);
-  place.slot = static_cast<std::uint32_t>(out.pairs);
-  std::memcpy(&place.depth_bits, &lanes.z[lane], sizeof(float));
-  out.pairs += std::uint64_t{size & 0xffffU} * (size >> 16);
+// Columns 4 g .. 4 g + 3 of rows of `stride` floats.
+SB_INLINE void store_group(float* rows, std::size_t stride, std::size_t g, const F (&columns)[4]) {
+  store_rows<4>([&](int i) { return rows + static_cast<std::size_t>(i) * stride + 4 * g; }, columns);
+}
+
+// Channels of Gaussians whose only pass has at most one depth and three colours.
+SB_INLINE void few_channels(const ProjectArgs& args, const Written& w, std::size_t first, int n, F (&out)[8]) {
+  const F zero = set1(0.0F);
+  F color[3] = {zero, zero, zero};
+  if (args.sh_degree < 0 && args.channels == 3) {  // else harmonics() writes them, or there are none
+    load_lanes<3>(args.colors, first, n, color);
+  }
+  const bool depth = args.passes[0].depth_first;
+  const bool slopes = depth && args.options.plane_depth;
+  const F all[8] = {depth ? w.depth : color[0], depth ? color[0] : color[1], depth ? color[1] : color[2],
+                    depth ? color[2] : zero,    zero,                        zero,
+                    slopes ? w.slope[0] : zero, slopes ? w.slope[1] : zero};
+  for (int c = 0; c < 8; ++c) {
+    out[c] = all[c];
+  }
+}
+
+// Records and placements of the rows from `first` on, W of each or those in view; the others' are not looked at but for
+// a placement of no tiles.
+SB_INLINE void write(const ProjectArgs& args, std::size_t first, int n, M keep, std::uint32_t kept, const Written& w,
+                     ProjectedBlock& out) {
+  static_assert(sizeof(Record) == 16 * sizeof(float) && sizeof(Placement) == 4 * sizeof(float));
+  alignas(64) std::uint32_t sizes[W], slots[W];
+  const I size = zero_unless(keep, w.size);
+  store(sizes, size);
+  for (int i = 0; i < W; ++i) {
+    slots[i] = static_cast<std::uint32_t>(out.pairs);
+    out.pairs += i < n ? std::uint64_t{sizes[i] & 0xffffU} * (sizes[i] >> 16) : 0;
+  }
+  alignas(64) float tail[W * 16];  // of fewer than W Gaussians: on the way to their rows
+  const bool whole = n == W;
+  float* records = whole ? &args.records[first].mx : tail;
+  store_group(records, 16, 0, {w.record[0], w.record[1], w.record[2], w.record[3]});
+  store_group(records, 16, 1, {w.record[4], w.record[5], w.record[6], w.record[7]});
+  const bool few = args.n_passes == 1 && (args.sh_degree >= 0 || args.channels == 3 || (args.passes[0].depth_first && args.passes[0].count == 1));
+  if (few) {
+    F channels[8];
+    few_channels(args, w, first, n, channels);
+    store_group(records, 16, 2, {channels[0], channels[1], channels[2], channels[3]});
+    store_group(records, 16, 3, {channels[4], channels[5], channels[6], channels[7]});
+  }
+  if (!whole) {
+    std::memcpy(&args.records[first], tail, static_cast<std::size_t>(n) * sizeof(Record));
+  }
+  if (!few) {
+    alignas(64) float depth[W], slope_x[W], slope_y[W];
+    store(depth, w.depth);
+    store(slope_x, w.slope[0]);
+    store(slope_y, w.slope[1]);
+    for (std::uint32_t left = kept; left != 0; left &= left - 1) {
+      const int i = __builtin_ctz(left);
+      write_channels(args, first + static_cast<std::size_t>(i), depth[i], slope_x[i], slope_y[i]);
+    }
+  }
+  float slot_bits[W];
+  std::memcpy(slot_bits, slots, sizeof(slots));
+  float* placements = whole ? reinterpret_cast<float*>(&args.placements[first]) : tail;
+  store_group(placements, 4, 0,
+              {bit_cast_float(zero_unless(keep, w.corner)), bit_cast_float(size), load(slot_bits), w.depth});
+  if (!whole) {
+    std::memcpy(&args.placements[first], tail, static_cast<std::size_t>(n) * sizeof(Placement));
+  }
 }
 
 // Extent of the ellipse in tiles, clamped to the image.
-SB_INLINE void cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Lanes& lanes) {
+SB_INLINE void cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Written& w) {
   const F zero = set1(0.0F);
   const F left = mx - rx, right = mx + rx, top = my - ry, bottom = my + ry;
   const F last_x = set1(static_cast<float>(args.columns - 1));
@@ -116,8 +165,8 @@ SB_INLINE void cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Lane
   const I x1 = to_int(clamp(floor(right * set1(1.0F / kTileWidth)), zero, last_x));
   const I y0 = to_int(clamp(floor(top * set1(1.0F / kTileHeight)), zero, last_y));
   const I y1 = to_int(clamp(floor(bottom * set1(1.0F / kTileHeight)), zero, last_y));
-  store(lanes.corner, x0 | shift_left<16>(y0));
-  store(lanes.size, (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1)));
+  w.corner = x0 | shift_left<16>(y0);
+  w.size = (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1));
 }
 
 // Where the box about the ellipse, in whole pixels from its centre, meets the image: gsplat's test of visibility.
@@ -136,9 +185,13 @@ SB_INLINE void load_covars(const float* rows, std::size_t first, int n, F (&out)
   }
 }
 
+struct DepthRange {
+  F least = set1(3.4e38F), most = set1(0.0F);
+};
+
 template <Projection P>
 void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t first, int n, std::uint32_t* visible,
-                   ProjectedBlock& out) {
+                   DepthRange& depths, ProjectedBlock& out) {
   GaussianLanes g;
   F opacity[1];
   load_lanes<3>(args.means, first, n, g.mean);
@@ -164,7 +217,7 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
       opacity[0] = opacity[0] * sqrt(antialias_squared(o));
       keep = keep & (opacity[0] >= set1(kAlphaMin));
     }
-    Lanes lanes;
+    Written w;
     const F lo = log2(max(opacity[0], set1(kAlphaMin)));
     const F reach = sqrt(max(lo - set1(kLog2AlphaMin), set1(0.0F)));
     const Root root = root_of_inverse(o);
@@ -178,44 +231,49 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
     const F radius_y = ceil(min(sigmas, set1(kMaxSigmas)) * root.sy);
     const F clip = set1(args.options.radius_clip);
     const F huge = set1(3e38F);
-    cover_tiles(args, o.mx, o.my, rx, ry, lanes);
+    cover_tiles(args, o.mx, o.my, rx, ry, w);
     keep = keep & meets_image(args.view, o.mx, o.my, radius_x, radius_y) & (o.det > set1(0.0F)) & (o.det < huge) &
            (o.c00 < huge) & (o.c11 < huge) & (max(radius_x, radius_y) > clip);
     keep = keep & (root.l11 > set1(0.0F)) & (root.l11 < huge) & (root.l22 > set1(0.0F));
     kept = bits(keep) & wanted;
-    store(lanes.mx, o.mx);
-    store(lanes.my, o.my);
-    store(lanes.l11, root.l11);
-    store(lanes.l21, root.l21);
-    store(lanes.l22, root.l22);
-    store(lanes.lo, lo);
-    store(lanes.reach, reach_safe);
-    store(lanes.lean, reach_safe * o.c01 / (sx * root.sy));
-    store(lanes.z, o.p[2]);
+    const F record[8] = {o.mx, o.my, root.l11, root.l21, root.l22, lo, reach_safe, reach_safe * o.c01 / (sx * root.sy)};
+    for (int c = 0; c < 8; ++c) {
+      w.record[c] = record[c];
+    }
+    w.depth = o.p[2];
+    w.slope[0] = w.slope[1] = set1(0.0F);
     if (args.options.plane_depth) {
-      F slope[2];
-      plane_slopes(g, cam, o, slope);
-      store(lanes.slope_x, slope[0]);
-      store(lanes.slope_y, slope[1]);
+      plane_slopes(g, cam, o, w.slope);
     }
+    write(args, first, n, keep, kept, w, out);
+    depths.least = min(depths.least, select(keep, w.depth, depths.least));
+    depths.most = max(depths.most, select(keep, w.depth, depths.most));
     for (std::uint32_t left = kept; left != 0; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      const std::size_t id = first + static_cast<std::size_t>(lane);
-      write_lane(args, id, lanes, lane, out);
-      visible[out.visible++] = static_cast<std::uint32_t>(id);
+      visible[out.visible++] = static_cast<std::uint32_t>(first) + static_cast<std::uint32_t>(__builtin_ctz(left));
     }
+    return;
   }
-  for (std::uint32_t left = wanted & ~kept; left != 0; left &= left - 1) {
-    args.placements[first + static_cast<std::size_t>(__builtin_ctz(left))] = Placement{};
-  }
+  std::memset(static_cast<void*>(args.placements + first), 0, static_cast<std::size_t>(n) * sizeof(Placement));
 }
 
 template <Projection P>
 void project_all(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
   const CameraLanes cam(args.view);
+  DepthRange depths;
   for (std::size_t first = begin; first < end; first += W) {
     const std::size_t left = end - first;
-    project_lanes<P>(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, out);
+    project_lanes<P>(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, depths, out);
+  }
+  float least[W], most[W];
+  store(least, depths.least);
+  store(most, depths.most);
+  for (int i = 1; i < W; ++i) {
+    least[0] = least[i] < least[0] ? least[i] : least[0];
+    most[0] = most[i] > most[0] ? most[i] : most[0];
+  }
+  if (out.visible != 0) {
+    std::memcpy(&out.least_key, least, sizeof(float));
+    std::memcpy(&out.most_key, most, sizeof(float));
   }
 }
 

@@ -11,10 +11,10 @@ namespace splatbot::SPLATBOT_KERNELS {
 namespace {
 
 struct LaneSums {
-  alignas(64) float moments[kMoments][W];
-  alignas(64) float depth[W];
-  alignas(64) float slope_x[W], slope_y[W];    // of plane depth, else 0
-  alignas(64) float absolute_x[W], absolute_y[W];
+  F moments[kMoments];
+  F depth;
+  F slope[2];     // of plane depth, else 0
+  F absolute[2];  // if wanted
 };
 
 struct LaneGradients {
@@ -22,6 +22,7 @@ struct LaneGradients {
   F mean2d[2];
   F rotation[9], translation[3];  // of the camera; mean less origin times translation is yet to be added
   F intrinsics[4];                // fx, fy, cx, cy
+  MotionLanes moved;              // of a rolling shutter
 };
 
 // Sum of a Gaussian's slots in the order of its tiles, on top of what earlier passes left.
@@ -66,14 +67,14 @@ SB_INLINE ImageGradients from_sums(const LaneSums& sums, const Root& root, const
   const F l11 = root.l11, l21 = root.l21, l22 = root.l22;
   // With z = B d and log(alpha) = log(opacity) - |z|^2 / (2 k^2): d/d mean = B^T z / k^2 and
   // d/d covariance = B^T z z^T B / (2 k^4).
-  const F su = load(sums.moments[1]), sw = load(sums.moments[2]);
-  const F suu = load(sums.moments[3]), suw = load(sums.moments[4]), sww = load(sums.moments[5]);
+  const F su = sums.moments[1], sw = sums.moments[2];
+  const F suu = sums.moments[3], suw = sums.moments[4], sww = sums.moments[5];
   constexpr float kInverse = 1.0F / kHalfLog2e;
   ImageGradients g;
-  g.z = load(sums.depth);
+  g.z = sums.depth;
   // Plane depth at a pixel falls by the slope as the centre moves.
-  g.mx = fnma(load(sums.slope_x), g.z, set1(kInverse) * l11 * su);
-  g.my = fnma(load(sums.slope_y), g.z, set1(kInverse) * fma(l21, su, l22 * sw));
+  g.mx = fnma(sums.slope[0], g.z, set1(kInverse) * l11 * su);
+  g.my = fnma(sums.slope[1], g.z, set1(kInverse) * fma(l21, su, l22 * sw));
   const F half = set1(0.5F * kInverse * kInverse);
   g.g00 = half * l11 * l11 * suu;
   g.g01 = half * l11 * fma(l21, suu, l22 * suw);
@@ -82,7 +83,7 @@ SB_INLINE ImageGradients from_sums(const LaneSums& sums, const Root& root, const
     // log(opacity) holds log(q) / 2 with q = det_sharp / det; none where q is held at its least.
     const F q = antialias_squared(o);
     const M free = q > set1(kMinAntialias * kMinAntialias);
-    const F h = zero_unless(free, set1(0.5F) * load(sums.moments[0]) / (q * o.det));
+    const F h = zero_unless(free, set1(0.5F) * sums.moments[0] / (q * o.det));
     g.g00 = fma(h, fnma(q, o.c11, o.s11), g.g00);
     g.g11 = fma(h, fnma(q, o.c00, o.s00), g.g11);
     g.g01 = fnma(h, fnma(q, o.c01, o.c01), g.g01);
@@ -211,13 +212,19 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const View& view,
   if constexpr (P == Projection::pinhole) {
     through_pinhole(g, cam, o, image, of_covar, camera, gp, ga, out);
   } else {
+    const bool moves = P == Projection::unscented && camera && view.lens.shutter != Shutter::global;
     if constexpr (P == Projection::unscented) {
-      pull_back_unscented(g, view, o, image, gp, ga, out.scale);
+      pull_back_unscented(g, view, o, image, gp, ga, out.scale, moves ? &out.moved : nullptr);
     } else {
       through_affine<P>(g, cam, o, lens, image, of_covar, gp, ga, out);
     }
     if (camera) {
       into_intrinsics(cam, o, image, out);
+    }
+    if (moves) {
+      const int across = ShutterTime(view).axis;
+      out.intrinsics[across] = out.intrinsics[across] + out.moved.focal;
+      out.intrinsics[2 + across] = out.intrinsics[2 + across] + out.moved.center;
     }
   }
   out.mean2d[0] = image.mx;
@@ -266,13 +273,13 @@ void write_gradients(const ProjectBackwardArgs& args, const std::uint32_t* ids, 
   if (args.opacities != nullptr) {
     F opacity[1];
     gather_lanes<1>(args.forward.opacities, ids, n, opacity);
-    const F gradient[1] = {load(sums.moments[0]) / opacity[0]};
+    const F gradient[1] = {sums.moments[0] / opacity[0]};
     scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
   }
   scatter_lanes<2>(args.means2d, ids, n, grads.mean2d, false);
   if (args.absolute2d != nullptr) {
     const F scale = set1(1.0F / kHalfLog2e);
-    const F absolute[2] = {scale * root.l11 * load(sums.absolute_x), scale * load(sums.absolute_y)};
+    const F absolute[2] = {scale * root.l11 * sums.absolute[0], scale * sums.absolute[1]};
     scatter_lanes<2>(args.absolute2d, ids, n, absolute, false);
   }
 }
@@ -299,50 +306,63 @@ void zero_rows(const ProjectBackwardArgs& args, std::size_t begin, std::size_t e
   }
 }
 
-// The sums of W Gaussians, lane by lane; colour gradients are written on the way.
-void collect(const ProjectBackwardArgs& args, const ProjectedBlock& block, const std::uint32_t* ids, int n,
-             LaneSums& lanes) {
-  alignas(64) float sums[kSlot];
-  const bool plane = args.forward.options.plane_depth && args.forward.options.depth != DepthMode::none;
-  for (int i = 0; i < W; ++i) {
-    if (i >= n) {
-      for (auto& moment : lanes.moments) {
-        moment[i] = 0.0F;
-      }
-      lanes.depth[i] = lanes.slope_x[i] = lanes.slope_y[i] = lanes.absolute_x[i] = lanes.absolute_y[i] = 0.0F;
-      continue;
+// A Gaussian's sums of this pass and of those before, where several passes share it; kept for those to come.
+SB_INLINE void carry(const ProjectBackwardArgs& args, std::size_t id, float* sums) {
+  float* carried = args.carried + id * kSlot;  // moments, then depth, then absolute gradients
+  if (!args.first) {
+    for (int k = 0; k <= kMoments; ++k) {
+      sums[k] += carried[k];
     }
-    const std::size_t id = ids[i];
-    sum_slots(args, block, id, sums);
+    sums[kAbsolute] += carried[kAbsolute];
+    sums[kAbsolute + 1] += carried[kAbsolute + 1];
+  }
+  std::memcpy(carried, sums, kSlot * sizeof(float));
+}
+
+// The sums of W Gaussians, zeros beyond n; colour gradients are written on the way.
+SB_INLINE void collect(const ProjectBackwardArgs& args, const ProjectedBlock& block, const std::uint32_t* ids, int n,
+                       LaneSums& out) {
+  static_assert(kMoments == 6 && kAbsolute == 14);
+  alignas(64) float sums[W][kSlot];
+  const bool depth = args.depth_in_pass && args.channel_sums > 0;
+  for (int i = 0; i < n; ++i) {
+    sum_slots(args, block, ids[i], sums[i]);
     if (args.colors != nullptr) {
-      write_colors(args, id, sums);
+      write_colors(args, ids[i], sums[i]);
     }
-    float depth = args.depth_in_pass && args.channel_sums > 0 ? sums[kMoments] : 0.0F;
-    if (args.carried != nullptr) {  // moments, then depth, then absolute gradients
-      float* carried = args.carried + id * kSlot;
-      if (!args.first) {
-        for (int k = 0; k < kMoments; ++k) {
-          sums[k] += carried[k];
-        }
-        depth += carried[kMoments];
-        sums[kAbsolute] += carried[kAbsolute];
-        sums[kAbsolute + 1] += carried[kAbsolute + 1];
-      }
-      for (int k = 0; k < kMoments; ++k) {
-        carried[k] = sums[k];
-      }
-      carried[kMoments] = depth;
-      carried[kAbsolute] = sums[kAbsolute];
-      carried[kAbsolute + 1] = sums[kAbsolute + 1];
+    if (!depth) {
+      sums[i][kMoments] = 0.0F;
     }
-    for (int k = 0; k < kMoments; ++k) {
-      lanes.moments[k][i] = sums[k];
+    if (args.carried != nullptr) {
+      carry(args, ids[i], sums[i]);
     }
-    lanes.depth[i] = depth;
-    lanes.absolute_x[i] = sums[kAbsolute];
-    lanes.absolute_y[i] = sums[kAbsolute + 1];
-    lanes.slope_x[i] = plane ? args.forward.records[id].channels[kRecordChannels - 2] : 0.0F;
-    lanes.slope_y[i] = plane ? args.forward.records[id].channels[kRecordChannels - 1] : 0.0F;
+  }
+  for (int i = n; i < W; ++i) {
+    std::memset(sums[i], 0, sizeof(sums[i]));
+  }
+  const auto group = [&](int g, F(&to)[4]) { load_rows<4>([&](int i) { return sums[i] + 4 * g; }, to); };
+  F first[4], second[4];
+  group(0, first);
+  group(1, second);
+  for (int k = 0; k < 4; ++k) {
+    out.moments[k] = first[k];
+  }
+  out.moments[4] = second[0];
+  out.moments[5] = second[1];
+  out.depth = second[2];
+  if (args.absolute2d != nullptr) {
+    F last[4];
+    group(3, last);
+    out.absolute[0] = last[2];
+    out.absolute[1] = last[3];
+  }
+  out.slope[0] = out.slope[1] = set1(0.0F);
+  if (args.forward.options.plane_depth && args.forward.options.depth != DepthMode::none) {
+    F last[4];
+    const Record* records = args.forward.records;
+    load_rows<4>([&](int i) { return records[ids[i < n ? i : n - 1]].channels + kRecordChannels - 4; }, last);
+    out.slope[0] = last[2];
+    out.slope[1] = last[3];
   }
 }
 
@@ -387,6 +407,9 @@ void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
     write_gradients(args, ids, n, grads, sums, root);
     if (args.camera != nullptr) {
       camera_sums.add(grads.rotation, grads.translation, grads.intrinsics, n);
+      if (args.forward.view.lens.shutter != Shutter::global) {
+        camera_sums.add_motion(grads.moved.motion, n);
+      }
     }
   }
   if (args.camera != nullptr && args.last) {

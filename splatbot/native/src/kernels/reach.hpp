@@ -4,6 +4,7 @@
 
 #include <cstddef>
 
+#include "rows.hpp"
 #include "tile.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
@@ -13,19 +14,6 @@ struct EllipseLanes {
   F cx, cy, l11, l21, l22, reach, lean;
 };
 
-#if SPLATBOT_SIMD == 512
-// Four floats of each of 16 rows, lane i of out[c] being column c of row i.
-SB_INLINE void load_quads(const float* const (&rows)[W], F (&out)[4]) {
-  for (int k = 0; k < 4; ++k) {
-    __m512 q = _mm512_castps128_ps512(_mm_load_ps(rows[k]));
-    q = _mm512_insertf32x4(q, _mm_load_ps(rows[4 + k]), 1);
-    q = _mm512_insertf32x4(q, _mm_load_ps(rows[8 + k]), 2);
-    out[k] = {_mm512_insertf32x4(q, _mm_load_ps(rows[12 + k]), 3)};
-  }
-  transpose_quads(out);
-}
-#endif
-
 // The ellipses of the first n of W pairs; the last is repeated.
 SB_INLINE EllipseLanes load_ellipses(const Record* records, const Pair* pairs, int n, const TileFrame& frame) {
   static_assert(offsetof(Record, lean) == 7 * sizeof(float));
@@ -34,24 +22,8 @@ SB_INLINE EllipseLanes load_ellipses(const Record* records, const Pair* pairs, i
   for (int i = 0; i < W; ++i) {
     rows[i] = &records[pairs[i < n ? i : n - 1].id].mx;
   }
-#if SPLATBOT_SIMD == 512
-  load_quads(rows, first);
-  for (const float*& row : rows) {
-    row += 4;
-  }
-  load_quads(rows, second);
-#else
-  alignas(64) float lanes[8][W];
-  for (int i = 0; i < W; ++i) {
-    for (int c = 0; c < 8; ++c) {
-      lanes[c][i] = rows[i][c];
-    }
-  }
-  for (int c = 0; c < 4; ++c) {
-    first[c] = load(lanes[c]);
-    second[c] = load(lanes[4 + c]);
-  }
-#endif
+  load_rows<4>([&](int i) { return rows[i]; }, first);
+  load_rows<4>([&](int i) { return rows[i] + 4; }, second);
   const F cx = first[0] - set1(static_cast<float>(frame.x0)), cy = first[1] - set1(static_cast<float>(frame.y0));
   return {cx, cy, first[2], first[3], second[0], second[2], second[3]};
 }

@@ -155,6 +155,8 @@ SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const L
   place.ny = static_cast<std::uint16_t>(size >> 16);
   place.slot = static_cast<std::uint32_t>(out.pairs);
   std::memcpy(&place.depth_bits, &r.z, sizeof(float));
+  out.least_key = place.depth_bits < out.least_key ? place.depth_bits : out.least_key;
+  out.most_key = place.depth_bits > out.most_key ? place.depth_bits : out.most_key;
   out.pairs += std::uint64_t{size & 0xffffU} * (size >> 16);
 }
 

@@ -14,7 +14,7 @@ namespace {
 const FieldKernels kField = {field_hits, field_nearest, field_k_nearest, field_mahalanobis,
                              field_grid_bounds, bound_columns, bound_slice};
 const ArmKernels kArm = {arm_configurations, arm_certify, arm_sample, arm_centers};
-const PlanKernels kPlan = {plan_squared_distances};
+const PlanKernels kPlan = {plan_squared_distances, plan_first_at_most, plan_least};
 }  // namespace
 
 extern const Kernels kKernels;

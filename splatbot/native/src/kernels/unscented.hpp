@@ -188,9 +188,17 @@ SB_INLINE void turn_by(const Lens& lens, D s, D (&r)[9]) {
   r[7] += a * w[0];
 }
 
+// What a point seen through a rolling shutter depends on besides the point, at the time s it was read.
+struct Reading {
+  D s, r[9], turned[3];  // time, rotation since s = 0, and the point turned by it about the pivot
+  D whole[2][3];         // derivative of the pixel by the point in the camera frame of that time
+  D by_line[2];          // derivative of the pixel by its line, were that shifted
+  D line;                // pixel coordinate along which lines are read
+};
+
 // Through a shutter that reads line after line: the pose is that of the time at which the pixel, which depends on the
 // pose, is read. Newton's method on the time; the derivative is that of the implicit function.
-SB_APART Sight see_rolling(const View& view, const D (&p)[3]) {
+SB_APART Sight see_rolling(const View& view, const D (&p)[3], Reading* kept) {
   constexpr int kSteps = 8;
   const Lens& lens = view.lens;
   const ShutterTime time(view);
@@ -234,11 +242,68 @@ SB_APART Sight see_rolling(const View& view, const D (&p)[3]) {
         for (int k = 0; k < 3; ++k) {
           sight.j[i][k] = whole[0] * r[k] + whole[1] * r[3 + k] + whole[2] * r[6 + k];
         }
+        if (kept != nullptr) {
+          std::memcpy(kept->whole[i], whole, sizeof(whole));
+          kept->by_line[i] = drift[i] * slope / lag;
+        }
+      }
+      if (kept != nullptr) {
+        kept->s = s;
+        std::memcpy(kept->r, r, sizeof(r));
+        std::memcpy(kept->turned, turned, sizeof(turned));
+        kept->line = sight.u[time.axis];
       }
       return sight;
     }
     s = d_clamp(s + (bounded - s) / lag, -0.5, 0.5);
   }
+}
+
+// Gradients of a rolling shutter's turn, step and pivot, of the focal length and the principal point across its lines.
+struct MotionGradient {
+  D turn[3], step[3], pivot[3], focal, center;
+};
+
+// From the gradient to a pixel. The rotation by s turn changes by s J dturn, with J the left Jacobian of SO(3) (Sola et
+// al. 2018, eq. 145), by series: the angle is at most pi/4.
+SB_APART void pull_back_reading(const View& view, const Reading& at, D u0, D u1, MotionGradient& to) {
+  const Lens& lens = view.lens;
+  D g[3], back[3], tau[3];
+  for (int k = 0; k < 3; ++k) {
+    g[k] = u0 * at.whole[0][k] + u1 * at.whole[1][k];
+  }
+  for (int k = 0; k < 3; ++k) {
+    back[k] = at.r[k] * g[0] + at.r[3 + k] * g[1] + at.r[6 + k] * g[2];
+    to.pivot[k] += g[k] - back[k];
+    to.step[k] += at.s * g[k];
+  }
+  const double* w = lens.turn;
+  const D a2 = at.s * at.s * (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
+  D versine = wide(1.0), excess = wide(1.0);  // 2 (1 - cos a) / a^2, 6 (a - sin a) / a^3
+  for (int n = 10; n >= 1; --n) {
+    versine = 1.0 - versine * a2 / ((2.0 * n + 1.0) * (2.0 * n + 2.0));
+    excess = 1.0 - excess * a2 / ((2.0 * n + 2.0) * (2.0 * n + 3.0));
+  }
+  D once[3], twice[3];
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    tau[i] = at.turned[j] * g[k] - at.turned[k] * g[j];
+  }
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    once[i] = w[j] * tau[k] - w[k] * tau[j];
+  }
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    twice[i] = w[j] * once[k] - w[k] * once[j];
+    to.turn[i] += at.s * (tau[i] - 0.5 * versine * at.s * once[i] + excess / 6.0 * at.s * at.s * twice[i]);
+  }
+  const ShutterTime time(view);
+  const double c = static_cast<double>(time.axis == 0 ? view.cx : view.cy);
+  const double f = static_cast<double>(time.axis == 0 ? view.fx : view.fy);
+  const D shifted = u0 * at.by_line[0] + u1 * at.by_line[1];
+  to.focal += shifted * (at.line - c) / f;
+  to.center += shifted;
 }
 
 struct SigmaPoints {
@@ -248,7 +313,9 @@ struct SigmaPoints {
   DMask seen;
 };
 
-SB_APART SigmaPoints sigma_points(const View& view, const GaussianLanes& g, const Projected& o, int half) {
+// `readings`: of the centre and of the points ahead and behind on each axis; null if not wanted.
+SB_APART SigmaPoints sigma_points(const View& view, const GaussianLanes& g, const Projected& o, int half,
+                                  Reading* readings) {
   const Lens& lens = view.lens;
   const bool rolling = lens.shutter != Shutter::global;
   SigmaPoints s;
@@ -259,7 +326,10 @@ SB_APART SigmaPoints sigma_points(const View& view, const GaussianLanes& g, cons
     p[c] = static_cast<double>(row[0]) * mean[0] + static_cast<double>(row[1]) * mean[1] +
            static_cast<double>(row[2]) * mean[2] + static_cast<double>(view.translation[c]);
   }
-  s.center = rolling ? see_rolling(view, p) : see(view, p);
+  const auto look = [&](const D(&point)[3], int which) {
+    return rolling ? see_rolling(view, point, readings == nullptr ? nullptr : readings + which) : see(view, point);
+  };
+  s.center = look(p, 0);
   s.seen = s.center.seen;
   s.mean[0] = s.mean[1] = wide(0.0);
   for (int k = 0; k < 3; ++k) {
@@ -270,8 +340,8 @@ SB_APART SigmaPoints sigma_points(const View& view, const GaussianLanes& g, cons
       ahead[c] = p[c] + s.offset[k][c];
       behind[c] = p[c] - s.offset[k][c];
     }
-    s.plus[k] = rolling ? see_rolling(view, ahead) : see(view, ahead);
-    s.minus[k] = rolling ? see_rolling(view, behind) : see(view, behind);
+    s.plus[k] = look(ahead, 1 + 2 * k);
+    s.minus[k] = look(behind, 2 + 2 * k);
     s.seen = s.seen & s.plus[k].seen & s.minus[k].seen;
     for (int i = 0; i < 2; ++i) {
       s.plus[k].u[i] -= s.center.u[i];
@@ -292,7 +362,7 @@ SB_INLINE void project_unscented(const GaussianLanes& g, const CameraLanes& cam,
   alignas(64) float mx[W], my[W], s00[W], c01[W], s11[W], sharp[W], seen[W];
   const double weight = view.lens.weight, excess = view.lens.excess;
   for (int half = 0; half < 2; ++half) {
-    const SigmaPoints s = sigma_points(view, g, o, half);
+    const SigmaPoints s = sigma_points(view, g, o, half, nullptr);
     D c[3] = {excess * s.mean[0] * s.mean[0], excess * s.mean[0] * s.mean[1], excess * s.mean[1] * s.mean[1]};
     for (int k = 0; k < 3; ++k) {
       const Sight* const pair[2] = {&s.plus[k], &s.minus[k]};
@@ -321,20 +391,28 @@ SB_INLINE void project_unscented(const GaussianLanes& g, const CameraLanes& cam,
   o.det = zero_unless(load(seen) > set1(0.5F), o.det);
 }
 
-// Gradients in the camera frame: of the centre, of the Gaussian's axes (Projected::a), of its scales; `image` holds
-// those of its 2D mean, its depth, and of c00, twice c01 and c11.
+// What a camera in motion gets besides, lane by lane.
+struct MotionLanes {
+  F motion[kMotionSums];
+  F focal, center;  // across the lines
+};
+
+// Gradients in the camera frame: of the centre, of the Gaussian's axes (Projected::a), of its scales, and of the motion
+// unless that is null; `image` holds those of its 2D mean, its depth, and of c00, twice c01 and c11.
 template <class ImageGradients>
 SB_INLINE void pull_back_unscented(const GaussianLanes& g, const View& view, const Projected& o,
-                                   const ImageGradients& image, F (&out_p)[3], F (&out_a)[9],
-                                   F (&out_scale)[3]) {
+                                   const ImageGradients& image, F (&out_p)[3], F (&out_a)[9], F (&out_scale)[3],
+                                   MotionLanes* moved) {
   const Lens& lens = view.lens;
-  alignas(64) float to_p[3][W], to_a[9][W], to_scale[3][W];
+  alignas(64) float to_p[3][W], to_a[9][W], to_scale[3][W], to_motion[kMotionSums + 2][W];
   for (int half = 0; half < 2; ++half) {
-    const SigmaPoints s = sigma_points(view, g, o, half);
+    Reading readings[7];
+    MotionGradient motion{};
+    const SigmaPoints s = sigma_points(view, g, o, half, moved == nullptr ? nullptr : readings);
     const D mean[2] = {widen(image.mx, half), widen(image.my, half)};
     const D g00 = widen(image.g00, half), g01 = widen(image.g01, half), g11 = widen(image.g11, half);
     // d loss / d e of a point at e: weight x (mean + 2 G (e + excess x m)).
-    const auto of_point = [&](const Sight& point, D (&to)[3], D (&total)[2]) {
+    const auto of_point = [&](const Sight& point, int which, D (&to)[3], D (&total)[2]) {
       const D e0 = point.u[0] + lens.excess * s.mean[0], e1 = point.u[1] + lens.excess * s.mean[1];
       const D u0 = lens.weight * (mean[0] + 2.0 * (g00 * e0 + g01 * e1));
       const D u1 = lens.weight * (mean[1] + 2.0 * (g01 * e0 + g11 * e1));
@@ -343,13 +421,16 @@ SB_INLINE void pull_back_unscented(const GaussianLanes& g, const View& view, con
       for (int c = 0; c < 3; ++c) {
         to[c] = u0 * point.j[0][c] + u1 * point.j[1][c];
       }
+      if (moved != nullptr) {
+        pull_back_reading(view, readings[which], u0, u1, motion);
+      }
     };
     D total[2] = {wide(0.0), wide(0.0)};
     D p[3] = {wide(0.0), wide(0.0), widen(image.z, half)};
     for (int k = 0; k < 3; ++k) {
       D ahead[3], behind[3];
-      of_point(s.plus[k], ahead, total);
-      of_point(s.minus[k], behind, total);
+      of_point(s.plus[k], 1 + 2 * k, ahead, total);
+      of_point(s.minus[k], 2 + 2 * k, behind, total);
       D to = wide(0.0);
       const D scale = lens.spread * widen(g.scale[k], half);
       for (int c = 0; c < 3; ++c) {
@@ -363,6 +444,23 @@ SB_INLINE void pull_back_unscented(const GaussianLanes& g, const View& view, con
       p[c] += (mean[0] - total[0]) * s.center.j[0][c] + (mean[1] - total[1]) * s.center.j[1][c];
       narrow(p[c], half, to_p[c]);
     }
+    if (moved != nullptr) {
+      pull_back_reading(view, readings[0], mean[0] - total[0], mean[1] - total[1], motion);
+      for (int c = 0; c < 3; ++c) {
+        narrow(motion.turn[c], half, to_motion[c]);
+        narrow(motion.step[c], half, to_motion[3 + c]);
+        narrow(motion.pivot[c], half, to_motion[6 + c]);
+      }
+      narrow(motion.focal, half, to_motion[kMotionSums]);
+      narrow(motion.center, half, to_motion[kMotionSums + 1]);
+    }
+  }
+  if (moved != nullptr) {
+    for (int k = 0; k < kMotionSums; ++k) {
+      moved->motion[k] = load(to_motion[k]);
+    }
+    moved->focal = load(to_motion[kMotionSums]);
+    moved->center = load(to_motion[kMotionSums + 1]);
   }
   for (int c = 0; c < 3; ++c) {
     out_p[c] = load(to_p[c]);

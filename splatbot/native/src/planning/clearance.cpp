@@ -42,15 +42,10 @@ double least_seen(const Arm& arm, const CollisionField& field, std::span<const d
 double path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int rounds) {
   const auto joints = static_cast<std::size_t>(arm.joints());
   const std::size_t edges = path.size() / joints - 1;
-  const auto spheres = static_cast<std::size_t>(arm.spheres());
   ArmView larger = arm.view();
-  std::vector<float> radius(spheres);
-  larger.radius = radius.data();
   larger.pairs = 0;
   const auto certified = [&](double margin) {
-    for (std::size_t s = 0; s < spheres; ++s) {
-      radius[s] = std::nextafter(arm.view().radius[s] + static_cast<float>(margin), std::numeric_limits<float>::infinity());
-    }
+    larger.margin = std::nextafter(arm.view().margin + static_cast<float>(margin), std::numeric_limits<float>::infinity());
     for (std::size_t e = 0; e < edges; ++e) {
       ArmEdge edge;
       const double* from = path.data() + e * joints;

@@ -55,7 +55,7 @@ bool Connect::run(std::span<const double> start, Random& random, const Stop& sto
     if (step == Step::reached) {
       meeting_[grows] = reached;
       meeting_[1 - grows] = added_;
-      if (trees_[0].cost(meeting_[0]) + trees_[1].cost(meeting_[1]) < bound) {
+      if (cost() < bound) {
         return true;
       }
     }

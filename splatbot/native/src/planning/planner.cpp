@@ -35,24 +35,72 @@ void Planner::forget_best() {
   best_ = {{}, kInfinity, {}};
 }
 
-void Planner::publish(double seconds) {
+void Planner::publish(double seconds) { publish(star_->path(), star_->best(), seconds); }
+
+void Planner::publish(Configuration waypoints, double cost, double seconds) {
   const std::lock_guard lock(mutex_);
-  best_.waypoints = star_->path();
-  best_.cost = star_->best();
-  best_.history.push_back({seconds, best_.cost});
+  if (cost < best_.cost) {
+    best_.waypoints = std::move(waypoints);
+    best_.cost = cost;
+    best_.history.push_back({seconds, cost});
+  }
 }
 
 PlanEnd Planner::run(std::span<const double> start, std::span<const double> goals, const PlanLimits& limits) {
   const Stop stop(limits.seconds, &cancelled_);
   random_ = Random(limits.seed);
+  goals_.assign(goals.begin(), goals.end());
+  begin(start);
+  forget_best();
+  return search(limits, stop);
+}
+
+// A tree of the start alone.
+void Planner::begin(std::span<const double> start) {
   start_.assign(start.begin(), start.end());
-  sampler_ = std::make_unique<Sampler>(*space_, start, goals);
-  star_ = std::make_unique<Star>(*space_, *sampler_, start, kStarRange);
+  sampler_ = std::make_unique<Sampler>(*space_, start_, goals_);
+  star_ = std::make_unique<Star>(*space_, *sampler_, start_, kStarRange);
   connect_ = std::make_unique<Connect>(*space_, *sampler_, kConnectRange);
   edges_before_ = space_->edges();
   iterations_ = 0;
+}
+
+PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLimits& limits) {
+  const Stop stop(limits.seconds, &cancelled_);
+  random_ = Random(limits.seed);
+  start_.assign(start.begin(), start.end());
+  *sampler_ = Sampler(*space_, start_, goals_);
+  edges_before_ = space_->edges();
   forget_best();
+  // A new path is sooner found than the tree is asked.
+  std::uint64_t left = limits.iterations;
+  const bool met = connect_->run(start_, random_, stop, kInfinity, left);
+  iterations_ = limits.iterations - left;
+  if (met) {
+    publish(connect_->path(), connect_->cost(), stop.elapsed());
+  }
+  Configuration orphans;
+  star_->cut(added, stop, orphans);
+  if (!star_->start_from(start.data())) {
+    star_ = std::make_unique<Star>(*space_, *sampler_, start_, kStarRange);
+  }
+  if (met) {
+    star_->adopt(*connect_);
+  }
+  if (std::isfinite(star_->best())) {
+    publish(stop.elapsed());
+  }
+  join(orphans, stop);
   return search(limits, stop);
+}
+
+// Configurations that were in the tree: what still can be reached of them.
+void Planner::join(const Configuration& orphans, const Stop& stop) {
+  for (std::size_t i = 0; i < orphans.size() && !stop.now(); i += space_->size()) {
+    if (star_->grow(orphans.data() + i, stop)) {
+      publish(stop.elapsed());
+    }
+  }
 }
 
 // Until there is a path, and then until time is up.
@@ -66,8 +114,8 @@ PlanEnd Planner::search(const PlanLimits& limits, const Stop& stop) {
       publish(stop.elapsed());
     }
   }
-  const bool found = std::isfinite(star_->best());
-  if (found) {
+  const bool found = std::isfinite(best_.cost);
+  if (std::isfinite(star_->best())) {
     improve(limits, stop);
   }
   const bool cancelled = cancelled_.exchange(false);
@@ -131,6 +179,7 @@ bool Planner::near_best(double* q) {
     const double a = path[edge * dims + d], b = path[(edge + 1) * dims + d];
     q[d] = a + t * (b - a) + spread * random_.normal();
   }
+  space_->settle(q);
   return space_->contains(q);
 }
 

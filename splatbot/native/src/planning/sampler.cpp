@@ -91,6 +91,7 @@ bool Sampler::informed(Random& random, double bound, double* q) {
     for (std::size_t d = 0; d < dims; ++d) {
       q[d] += 0.5 * (start_[d] + goal(g)[d]);
     }
+    space_->settle(q);
     if (space_->contains(q)) {
       return true;
     }

@@ -14,7 +14,7 @@ constexpr double kGain = 1e-9;  // relative: what a cheaper way must save
 
 Star::Star(Space& space, Sampler& sampler, std::span<const double> start, double range)
     : space_(&space), sampler_(&sampler), range_(range), tree_(space), goal_nodes_(sampler.goals(), -1), best_(kInfinity), step_(space.size()) {
-  enter(start.data(), -1);
+  root_ = enter(start.data(), -1);
 }
 
 std::int32_t Star::enter(const double* q, std::int32_t parent) {
@@ -29,6 +29,11 @@ std::int32_t Star::enter(const double* q, std::int32_t parent) {
 
 // The node that is exactly there, or -1.
 std::int32_t Star::find(const double* q) {
+  for (std::size_t g = 0; g < goal_nodes_.size(); ++g) {
+    if (goal_nodes_[g] >= 0 && std::equal(q, q + space_->size(), sampler_->goal(g))) {
+      return goal_nodes_[g];
+    }
+  }
   const std::int32_t near = tree_.index().nearest(q);
   return near >= 0 && std::equal(q, q + space_->size(), tree_.at(near)) ? near : -1;
 }
@@ -57,7 +62,7 @@ Configuration Star::path() const {
 void Star::adopt(const Connect& connect) {
   const Tree& a = connect.from_start();
   const Tree& b = connect.from_goals();
-  std::vector<std::int32_t> renamed(a.size(), 0);  // the root is already there
+  std::vector<std::int32_t> renamed(a.size(), root_);  // the root is already there
   for (std::int32_t i = 1; i < static_cast<std::int32_t>(a.size()); ++i) {
     renamed[static_cast<std::size_t>(i)] = enter(a.at(i), renamed[static_cast<std::size_t>(a.parent(i))]);
   }
@@ -144,7 +149,7 @@ bool Star::grow(const double* q, const Stop& stop) {
 
 bool Star::insert(const Configuration& path) {
   const std::size_t dims = space_->size();
-  std::int32_t above = find(path.data());
+  std::int32_t above = root_;
   for (std::size_t i = dims; i < path.size(); i += dims) {
     const double* q = path.data() + i;
     std::int32_t node = find(q);
@@ -173,12 +178,86 @@ void Star::prune() {
       kept[static_cast<std::size_t>(up)] = 1;
     }
   }
-  kept[0] = 1;
+  kept[static_cast<std::size_t>(root_)] = 1;
+  drop(kept);
+}
+
+void Star::drop(const std::vector<std::uint8_t>& kept) {
   const std::vector<std::int32_t> renamed = tree_.keep(kept);
+  root_ = renamed[static_cast<std::size_t>(root_)];
   for (std::int32_t& node : goal_nodes_) {
     node = node >= 0 ? renamed[static_cast<std::size_t>(node)] : -1;
   }
   update();
+}
+
+bool Star::cut(Space& added, const Stop& stop, Configuration& orphans) {
+  const std::size_t n = tree_.size();
+  orphans.clear();
+  std::vector<std::uint8_t> free(n, 0), kept(n, 0);
+  if (std::isfinite(best_)) {
+    for (const std::int32_t node : tree_.branch(best_node_)) {
+      const std::int32_t up = tree_.parent(node);
+      free[static_cast<std::size_t>(node)] = up < 0 || added.free(tree_.at(up), tree_.at(node)) ? 1 : 2;
+    }
+  }
+  std::vector<std::int32_t> order{root_};
+  kept[static_cast<std::size_t>(root_)] = 1;
+  bool in_time = true;
+  for (std::size_t i = 0; i < order.size(); ++i) {  // parents before children
+    const std::int32_t up = order[i];
+    for (std::int32_t c = tree_.first_child(up); c >= 0; c = tree_.next_sibling(c)) {
+      const auto child = static_cast<std::size_t>(c);
+      if (kept[static_cast<std::size_t>(up)] != 0 && in_time) {
+        in_time = !stop.now();
+        kept[child] = free[child] == 1 || (free[child] == 0 && added.free(tree_.at(up), tree_.at(c))) ? 1 : 0;
+      }
+      if (kept[child] == 0) {
+        orphans.insert(orphans.end(), tree_.at(c), tree_.at(c) + space_->size());
+      }
+      order.push_back(c);
+    }
+  }
+  if (!in_time) {
+    std::fill(kept.begin(), kept.end(), 0);
+    kept[static_cast<std::size_t>(root_)] = 1;
+  }
+  drop(kept);
+  return in_time;
+}
+
+bool Star::start_from(const double* q) {
+  std::int32_t node = find(q);
+  if (node == root_) {
+    return true;
+  }
+  if (node < 0) {
+    // Between which two of the best path's waypoints? Else next to the root.
+    std::int32_t above = root_, below = -1;
+    if (std::isfinite(best_)) {
+      const std::vector<std::int32_t> way = tree_.branch(best_node_);
+      for (std::size_t i = 0; i + 1 < way.size(); ++i) {
+        const double* a = tree_.at(way[i]);
+        const double* b = tree_.at(way[i + 1]);
+        if (space_->distance(a, q) + space_->distance(q, b) < space_->distance(a, b) + 1e-6) {
+          above = way[i];
+          below = way[i + 1];
+          break;
+        }
+      }
+    }
+    if (!space_->free(tree_.at(above), q) || (below >= 0 && !space_->free(q, tree_.at(below)))) {
+      return false;
+    }
+    node = enter(q, above);
+    if (below >= 0) {
+      tree_.hang(below, node);
+    }
+  }
+  tree_.root(node);
+  root_ = node;
+  update();
+  return true;
 }
 
 }  // namespace splatbot::planning

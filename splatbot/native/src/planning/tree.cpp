@@ -34,12 +34,28 @@ std::int32_t Tree::add(const double* q, std::int32_t parent) {
 void Tree::hang(std::int32_t node, std::int32_t parent) {
   detach(node);
   attach(node, parent);
+  renew_costs(node);
+}
+
+void Tree::root(std::int32_t node) {
+  const std::vector<std::int32_t> nodes = branch(node);
+  for (std::size_t i = nodes.size(); i-- > 1;) {
+    detach(nodes[i]);
+  }
+  for (std::size_t i = nodes.size(); i-- > 1;) {
+    attach(nodes[i - 1], nodes[i]);
+  }
+  renew_costs(node);
+}
+
+// Of a node and all below it.
+void Tree::renew_costs(std::int32_t node) {
   stack_.assign(1, node);
   while (!stack_.empty()) {
     const std::int32_t n = stack_.back();
     stack_.pop_back();
     const std::int32_t above = parent_[of(n)];
-    cost_[of(n)] = cost(above) + space_->distance(at(above), at(n));
+    cost_[of(n)] = above < 0 ? 0.0 : cost(above) + space_->distance(at(above), at(n));
     for (std::int32_t c = child_[of(n)]; c >= 0; c = next_[of(c)]) {
       stack_.push_back(c);
     }

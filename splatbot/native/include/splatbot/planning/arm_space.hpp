@@ -15,6 +15,9 @@ class ArmSpace final : public Space {
   ArmSpace(const Arm& arm, std::shared_ptr<const CollisionField> field, std::span<const double> lower,
            std::span<const double> upper, float eps);
 
+  // Asks another field from now on.
+  void look_at(std::shared_ptr<const CollisionField> field) { field_ = std::move(field); }
+
  protected:
   bool check(const double* a, const double* b) override;
 

@@ -21,6 +21,7 @@ class Connect {
 
   // After a meeting: the waypoints (N, dims) from the start to a goal.
   Configuration path() const;
+  double cost() const { return trees_[0].cost(meeting_[0]) + trees_[1].cost(meeting_[1]); }
 
   const Tree& from_start() const noexcept { return trees_[0]; }
   const Tree& from_goals() const noexcept { return trees_[1]; }  // its roots are the goals, in their order

@@ -29,7 +29,7 @@ class Neighbours {
   std::span<const Neighbour> nearest(const double* q, std::size_t k);
 
  private:
-  void measure(const double* q);
+  std::size_t measure(const double* q);
   void grow();
 
   std::size_t dims_, size_ = 0, room_ = 0;

@@ -39,6 +39,11 @@ class Planner {
   // From the start to one of the goals (K, dims), all free. The tree is kept until the next call.
   PlanEnd run(std::span<const double> start, std::span<const double> goals, const PlanLimits& limits);
 
+  // The same after the space has changed: what `added` says is in the way now is cut off, the rest of the last run's tree
+  // is kept, and planning goes on from `start`, which is on the last best path, or from anywhere. Edges of the tree are
+  // asked of `added` alone.
+  PlanEnd rerun(std::span<const double> start, Space& added, const PlanLimits& limits);
+
   // The following may be called while run() is busy in another thread.
   BestPath best() const;
   void cancel() noexcept { cancelled_.store(true, std::memory_order_relaxed); }
@@ -54,10 +59,13 @@ class Planner {
   void shorten(const Configuration& path, int attempts, const Stop& stop);
   bool near_best(double* q);
   void publish(double seconds);
+  void publish(Configuration waypoints, double cost, double seconds);
   void forget_best();
+  void begin(std::span<const double> start);
+  void join(const Configuration& orphans, const Stop& stop);
 
   std::shared_ptr<Space> space_;
-  Configuration start_;
+  Configuration start_, goals_;
   std::unique_ptr<Sampler> sampler_;
   std::unique_ptr<Star> star_;
   std::unique_ptr<Connect> connect_;

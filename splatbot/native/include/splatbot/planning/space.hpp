@@ -26,6 +26,12 @@ class Space {
   const double* lower() const noexcept { return lower_.data(); }
   const double* upper() const noexcept { return upper_.data(); }
   bool contains(const double* q) const;
+  // Puts joints that cannot move where they are.
+  void settle(double* q) const {
+    for (std::size_t d = 0; d < lower_.size(); ++d) {
+      q[d] = lower_[d] == upper_[d] ? lower_[d] : q[d];
+    }
+  }
 
   // Euclidean.
   double distance(const double* a, const double* b) const {

@@ -30,6 +30,13 @@ class Star {
   // Enters a path (N, dims) of free edges from the start. True: the best path is shorter.
   bool insert(const Configuration& path);
 
+  // Cuts off what hangs on edges that `added` does not leave free; they are given as configurations (N, dims), those
+  // nearest to the root first. The best path's edges are asked first. False: time was up, and all but the root is cut off.
+  bool cut(Space& added, const Stop& stop, Configuration& orphans);
+
+  // The tree's root becomes q, on the best path or next to the root. False: q cannot be joined to the tree.
+  bool start_from(const double* q);
+
   // Leaves out what no path better than the best can pass through.
   void prune();
 
@@ -44,11 +51,13 @@ class Star {
   std::int32_t find(const double* q);
   void gather(const double* q);
   bool update();
+  void drop(const std::vector<std::uint8_t>& kept);
 
   Space* space_;
   Sampler* sampler_;
   double range_;
   Tree tree_;
+  std::int32_t root_ = -1;
   std::vector<std::int32_t> goal_nodes_;  // of each goal, -1: not in the tree
   double best_;
   std::int32_t best_node_ = -1;

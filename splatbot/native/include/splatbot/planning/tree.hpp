@@ -28,6 +28,8 @@ class Tree {
   std::int32_t add(const double* q, std::int32_t parent);
   // Hangs a node below another that is not beneath it; costs change all the way down.
   void hang(std::int32_t node, std::int32_t parent);
+  // Makes a node the root of its tree: the edges up to the old root are turned around.
+  void root(std::int32_t node);
   // From the root to the node.
   std::vector<std::int32_t> branch(std::int32_t node) const;
   // Leaves out the nodes not kept; every kept node's parent must be kept. Returns the new number of each, -1 for none.
@@ -37,6 +39,7 @@ class Tree {
  private:
   void attach(std::int32_t node, std::int32_t parent);
   void detach(std::int32_t node);
+  void renew_costs(std::int32_t node);
 
   const Space* space_;
   std::size_t dims_;

@@ -1,0 +1,116 @@
+"""What controllers without hardware share: the clock, what may be sent, stops and faults."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatbot.errors import ControllerError, InputError
+from splatbot.protocols import Array, Feedback, MotionState, TimedPath
+
+AT_START = 0.01  # [rad or m]; an arm farther than this from where a trajectory begins does not follow it
+FOLLOWING = 0.05  # [rad or m]; an arm farther than this from where it should be is at fault
+
+
+class SteppedController:
+    """A :class:`splatbot.protocols.Controller` whose motion a subclass makes.
+
+    Args:
+        position: (J,) where the arm is.
+        period: [s]
+        following: largest difference between where it is and should be, beyond which it faults and stands still.
+
+    Raises:
+        InputError: the period or ``following`` is not above 0.
+    """
+
+    def __init__(self, position: Array, *, period: float = 1e-3, following: float = FOLLOWING) -> None:
+        if not (0.0 < period < np.inf and following > 0.0):
+            raise InputError(f"is {period}.", field="period", hint="give seconds above 0, and a distance above 0")
+        self._period, self._following = period, following
+        self._position = np.array(position, dtype=np.float64)
+        self._velocity = np.zeros_like(self._position)
+        self._desired = self._position.copy()
+        self._trajectory: TimedPath | None = None
+        self._time = 0.0
+        self._state, self._fault = MotionState.IDLE, ""
+        self._stopping = False
+
+    @property
+    def period(self) -> float:
+        """Between two steps [s]."""
+        return self._period
+
+    @property
+    def position(self) -> Array:
+        """Where the arm is (J,)."""
+        return self._position.copy()
+
+    @property
+    def state(self) -> MotionState:
+        """What it is doing."""
+        return self._state
+
+    def send(self, trajectory: TimedPath) -> None:
+        """Begin to follow a trajectory.
+
+        Raises:
+            ControllerError: at fault, moving, or the trajectory begins elsewhere.
+        """
+        if self._state is MotionState.FAULT:
+            raise ControllerError(f"is at fault: {self._fault}.", field="controller", hint="reset it")
+        if self._state is MotionState.MOVING:
+            raise ControllerError("is moving.", field="controller", hint="stop it, or wait until it has arrived")
+        start = trajectory.reference(0.0)[0]
+        if start.shape != self._position.shape:
+            raise ControllerError(f"has {start.size} joints, not {self._position.size}.", field="trajectory")
+        off = float(np.abs(start - self._position).max())
+        if not off <= AT_START:
+            hint = "plan from where the arm is"
+            raise ControllerError(f"begins {off:.4f} from where the arm is.", field="trajectory", hint=hint)
+        self._trajectory, self._time, self._stopping = trajectory, 0.0, False
+        self._state = MotionState.MOVING
+
+    def step(self) -> Feedback:
+        """Let one period pass."""
+        if self._state is MotionState.MOVING and self._trajectory is not None:
+            if self._stopping:
+                self._rest(MotionState.STOPPED)
+            else:
+                self._follow(self._trajectory)
+        return Feedback(
+            self._time, self._position.copy(), self._velocity.copy(), self._desired.copy(), self._state, self._fault
+        )
+
+    def stop(self) -> None:
+        """At rest from the next step on."""
+        self._stopping = True
+
+    def fault(self, why: str) -> None:
+        """Stand still until :meth:`reset`, as after an emergency stop."""
+        self._rest(MotionState.FAULT)
+        self._fault = why
+
+    def reset(self) -> None:
+        """Clear a fault; the arm stays where it is."""
+        self._rest(MotionState.IDLE)
+        self._fault = ""
+
+    def _follow(self, trajectory: TimedPath) -> None:
+        self._time += self._period
+        self._desired, velocity = trajectory.reference(self._time)
+        position = self._moved(self._time, self._desired, velocity)
+        self._velocity = (position - self._position) / self._period
+        self._position = position
+        error = float(np.abs(self._position - self._desired).max())
+        if not error <= self._following:
+            self.fault(f"{error:.4f} from the trajectory at {self._time:.3f} s")
+        elif self._time >= trajectory.duration and error <= AT_START:
+            self._rest(MotionState.DONE)
+
+    def _rest(self, state: MotionState) -> None:
+        self._velocity = np.zeros_like(self._position)
+        self._state, self._stopping = state, False
+
+    def _moved(self, t: float, desired: Array, velocity: Array) -> Array:
+        """Where the arm is (J,) at time ``t`` [s]."""
+        raise NotImplementedError

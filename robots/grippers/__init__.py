@@ -1,0 +1,5 @@
+"""Grippers without hardware."""
+
+from splatbot.robots.grippers.fake import FakeGripper
+
+__all__ = ["FakeGripper"]

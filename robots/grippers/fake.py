@@ -1,0 +1,53 @@
+"""A gripper that opens and closes at once, around an object of a given width if there is one."""
+
+from __future__ import annotations
+
+from splatbot.errors import InputError
+
+
+class FakeGripper:
+    """A :class:`splatbot.protocols.Gripper`.
+
+    Args:
+        stroke: widest opening [m].
+        width: of what is between the fingers [m]; 0: nothing.
+
+    Raises:
+        InputError: the width does not fit between the fingers.
+    """
+
+    def __init__(self, stroke: float = 0.08, *, width: float = 0.0) -> None:
+        if not 0.0 <= width <= stroke:
+            raise InputError(f"is {width}.", field="width", hint=f"give 0..{stroke:g} m")
+        self._stroke, self.width = stroke, width
+        self._opening = self._wanted = stroke
+
+    @property
+    def stroke(self) -> float:
+        """Widest opening [m]."""
+        return self._stroke
+
+    def move(self, opening: float, *, force: float | None = None) -> None:
+        """Go to an opening [m], or as near as what is between the fingers lets them.
+
+        Raises:
+            InputError: the opening is out of range, or the force is not above 0.
+        """
+        if not 0.0 <= opening <= self._stroke:
+            raise InputError(f"is {opening}.", field="opening", hint=f"give 0..{self._stroke:g} m")
+        if force is not None and not force > 0.0:
+            raise InputError(f"is {force}.", field="force", hint="give newtons above 0")
+        self._wanted = opening
+        self._opening = max(opening, self.width)
+
+    def opening(self) -> float:
+        """Between the fingers now [m]."""
+        return self._opening
+
+    def holds(self) -> bool:
+        """Whether what is between the fingers keeps them apart."""
+        return self._opening > self._wanted
+
+    def stop(self) -> None:
+        """Stay."""
+        self._wanted = self._opening

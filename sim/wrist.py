@@ -1,0 +1,117 @@
+"""What a camera on an arm's wrist sees: a scene, and the arm itself in view, with its joints and exact poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.camera import Camera
+from splatbot.frame import Frame
+from splatbot.logs.base import LogBase
+from splatbot.logs.raycast import Moving, Scene, Surface
+from splatbot.logs.shapes import Mesh, lathe
+from splatbot.logs.textures import Texture
+from splatbot.protocols import Array
+from splatbot.robots.robot import RobotModel
+from splatbot.robots.shapes import Capsule
+from splatbot.trajectory import Trajectory
+
+# On a bracket of a Panda's last link, 28 cm from its axis and above the hand, turned 25 degrees towards the fingers.
+_TILT = np.radians(25.0)
+T_PANDA_CAMERA = np.array(
+    [
+        [0.0, -np.cos(_TILT), -np.sin(_TILT), 0.28],
+        [1.0, 0.0, 0.0, 0.0],
+        [0.0, -np.sin(_TILT), np.cos(_TILT), -0.12],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+class WristLog(LogBase):
+    """Frames from a camera on the last link of a moving arm; each tells the joints.
+
+    Args:
+        robot: of capsules, which are what is seen of it.
+        joints: (F, J) of each frame.
+        surfaces: of the scene, in its own frame.
+        T_scene_base: (4, 4) where the arm stands in it.
+        T_link_camera: (4, 4), the camera on the last link.
+        width: [px]
+        rate: frames a second.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        joints: Array,
+        surfaces: list[Surface],
+        *,
+        T_scene_base: Array,
+        T_link_camera: Array = T_PANDA_CAMERA,
+        width: int = 320,
+        rate: float = 30.0,
+    ) -> None:
+        self.name, self.uri = "wrist", "wrist"
+        height, f = width * 3 // 4, 0.7 * width
+        self.camera = Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
+        self.robot, self.joints, self.T_scene_base = robot, joints, T_scene_base
+        T = T_scene_base @ robot.fk(joints)
+        stamps = np.arange(len(joints)) / rate
+        self.ground_truth = Trajectory(stamps, T[:, -1] @ T_link_camera)
+        moving = {f"link {k}": Moving(found, _pose_of(stamps, T[:, k])) for k, found in _seen_links(robot).items()}
+        self.scene = Scene(surfaces, moving)
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def _decode(self, index: int) -> Frame:
+        stamp = float(self.ground_truth.stamps[index])
+        rgb, depth = self.scene.render(self.camera, self.ground_truth.T_world_camera[index], stamp)
+        return Frame(stamp, rgb, depth, self.camera, index, joints=self.joints[index].copy(), source=f"wrist#{index}")
+
+    def shows_robot(self, index: int) -> NDArray[np.bool_]:
+        """Pixels (H, W) of a frame in which the arm is seen."""
+        stamp = float(self.ground_truth.stamps[index])
+        return self.scene.moving_mask(self.camera, self.ground_truth.T_world_camera[index], stamp)
+
+
+def _pose_of(stamps: Array, poses: Array) -> Callable[[float], Array]:
+    return lambda t: np.asarray(poses[int(np.argmin(np.abs(stamps - t)))])
+
+
+def _seen_links(robot: RobotModel) -> dict[int, list[Surface]]:
+    """Capsules of each link that has any; the fingers open on the last one."""
+    found: dict[int, list[Surface]] = {}
+    for number, shape in enumerate(robot.shapes):
+        if isinstance(shape, Capsule):
+            texture = Texture((0.9, 0.9, 0.92), (0.35, 0.4, 0.5), 0.02, seed=number)
+            found.setdefault(shape.link, []).append(
+                Surface(capsule_mesh(shape.start, shape.end, shape.radius), texture)
+            )
+    if robot.gripper is not None:
+        opened = np.array([0.0, robot.gripper.stroke, 0.0])
+        for T in robot.gripper.T_link_finger:
+            for shape in robot.gripper.shapes:
+                if isinstance(shape, Capsule):
+                    ends = [T[:3, :3] @ (np.array(p) + opened) + T[:3, 3] for p in (shape.start, shape.end)]
+                    mesh = capsule_mesh(ends[0], ends[1], shape.radius)
+                    found.setdefault(len(robot), []).append(
+                        Surface(mesh, Texture((0.3, 0.3, 0.3), (0.7, 0.6, 0.2), 0.01))
+                    )
+    return found
+
+
+def capsule_mesh(start: ArrayLike, end: ArrayLike, radius: float) -> Mesh:
+    """A capsule between two points (3,) [m]."""
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    length = float(np.linalg.norm(b - a))
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 24)
+    profile = np.stack([radius * np.cos(turn), radius * np.sin(turn) + np.where(turn > 0, length, 0.0)], axis=1)
+    mesh = lathe(profile)
+    z = (b - a) / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
+    x /= np.linalg.norm(x)
+    return Mesh(mesh.vertices @ np.stack([x, np.cross(z, x), z]) + a, mesh.triangles)

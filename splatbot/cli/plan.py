@@ -1,0 +1,218 @@
+"""`splatbot plan`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splatbot.collision import GaussianCollisionField
+    from splatbot.planning import PlanResult, Trajectory
+    from splatbot.robots.robot import RobotModel
+
+_REACH = 1.0  # [m] around the base in which a margin is looked for
+Pose = tuple[float, float, float, float, float, float, float]
+
+
+def plan(
+    *,
+    map: Annotated[Path, tyro.conf.arg(metavar="MAP")],
+    start: Annotated[tuple[str, ...], tyro.conf.arg(metavar="Q ...")],
+    goal: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="Q ...")] = None,
+    goal_pose: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
+    robot: str = "panda",
+    base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
+    margin: Annotated[str, tyro.conf.arg(metavar="M|auto")] = "0",
+    n_sigma: float = 2.0,
+    budget_ms: float = 100.0,
+    seed: int = 0,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+) -> int:
+    """Plan an arm's way among the Gaussians of a map.
+
+    Writes the certified trajectory (trajectory.json as ROS JointTrajectory, trajectory.csv at 1 kHz), plan.json, a
+    picture plan.png and plan.html, in which arm and map can be turned and played.
+
+    Examples:
+        splatbot plan --map runs/latest --start home --goal 0.5 -0.3 0 -2.0 0 1.9 0.8
+        splatbot plan --map runs/latest --margin auto --start home --goal-pose 0.5 0.2 0.3 0 1 0 0
+        splatbot plan --map map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --start home --goal home
+
+    Args:
+        map: a map file, or a run folder.
+        start: joint values [rad or m], or "home".
+        goal: joint values, or "home".
+        goal_pose: in place of --goal, where the tool shall be, in the frame of the robot's base: position [m] and
+            quaternion.
+        robot: its name, as of `splatbot robot list`.
+        base: pose of the robot's base in the map; by default that of the scene.yaml beside the map (see
+            `splatbot info --fit-plane`).
+        margin: room [m] to keep from the map; "auto", for a run folder: the error of its surfaces within a metre of
+            the base, as its own depth images tell.
+        n_sigma: where the surface of a Gaussian is.
+        budget_ms: time to plan.
+        seed: of the search.
+        out: folder to write to; by default runs/plan.
+    """
+    from splatbot.errors import InputError
+
+    if (goal is None) == (goal_pose is None):
+        raise InputError("must be given, one of the two.", field="--goal, --goal-pose", hint="give joints or a pose")
+
+    from splatbot.atomic import atomic_write
+    from splatbot.collision import GaussianCollisionField
+    from splatbot.gaussians import GaussianModel
+    from splatbot.geometry import pose_from_quat
+    from splatbot.planning import GaussianRRTStar, PoseGoal, time_path
+    from splatbot.report.plan_page import plan_html, plan_png
+    from splatbot.robots.store import load_robot
+
+    arm = load_robot(robot)
+    file = map / "map.ply" if map.is_dir() else map
+    model = GaussianModel.load(file)
+    field = GaussianCollisionField(model, n_sigma)
+    T_world_base = _base(base, map)
+    planner = GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=_margin(margin, map, field, T_world_base))
+    wanted: Any = (
+        _joints(goal, arm, "--goal")
+        if goal is not None
+        else PoseGoal(T_world_base @ _checked_pose(goal_pose, "--goal-pose", pose_from_quat))
+    )
+    result = planner.plan(_joints(start, arm, "--start"), wanted, budget_ms=budget_ms, seed=seed)
+    path = result.unwrap()
+    trajectory = time_path(path, planner.arm, field)
+    folder = out if out is not None else Path("runs") / "plan"
+    folder.mkdir(parents=True, exist_ok=True)
+    title = f"{arm.name} in {map.resolve().name}"
+    texts = {
+        "plan.json": json.dumps(_summary(result, trajectory), indent=2),
+        "trajectory.json": trajectory.to_json(),
+        "trajectory.csv": trajectory.to_csv(),
+        "plan.html": plan_html(model, planner.arm, field, trajectory, title=title),
+    }
+    for name, text in texts.items():
+        with atomic_write(folder / name) as handle:
+            handle.write(text.encode())
+    with atomic_write(folder / "plan.png") as handle:
+        handle.write(plan_png(model, planner.arm, trajectory))
+    _print(result, trajectory, folder)
+    return 0
+
+
+def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
+    import numpy as np
+
+    from splatbot.errors import InputError
+
+    if words == ("home",):
+        return np.asarray(robot.home)
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise InputError(f"is {' '.join(words)}.", field=flag, hint='give numbers, or "home"') from error
+    if len(values) != len(robot) or not np.isfinite(values).all():
+        raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
+    return values
+
+
+def _checked_pose(pose: Pose | None, flag: str, pose_from_quat: Any) -> NDArray[np.float64]:
+    import numpy as np
+
+    from splatbot.errors import InputError
+
+    assert pose is not None
+    try:
+        return np.asarray(pose_from_quat(pose[:3], pose[3:]))
+    except ValueError as error:
+        raise InputError(f"{error}.", field=flag, hint="QW QX QY QZ of no rotation are 1 0 0 0") from error
+
+
+def _base(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
+    from splatbot.errors import InputError
+    from splatbot.geometry import pose_from_quat
+    from splatbot.workspace import find_workspace
+
+    if pose is not None:
+        return _checked_pose(pose, "--base", pose_from_quat)
+    known = find_workspace(map_)
+    if known is None or known.T_world_base is None:
+        hint = "give --base, or write a scene.yaml: splatbot info MAP --fit-plane estimates one"
+        raise InputError("is not known.", file=map_, field="base", hint=hint)
+    return known.T_world_base
+
+
+def _margin(text: str, map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
+    import math
+
+    from splatbot.errors import InputError
+
+    if text == "auto":
+        return _own_margin(map_, field, T_world_base)
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < math.inf:
+        raise InputError(f"is {text!r}.", field="--margin", hint='give metres, 0 or more, or "auto"')
+    return value
+
+
+def _own_margin(map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
+    """Of 99.9 % of what the run measured within a metre of the base, without what mapping leaves out."""
+    from splatbot.collision import surface_error
+    from splatbot.errors import InputError
+    from splatbot.logs import open_log
+    from splatbot.results.folder import RunFolder
+    from splatbot.tracking.prepare import valid_depth
+
+    if not map_.is_dir():
+        raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
+    run = RunFolder(map_)
+    source = run.load_metrics()["log"]
+    log = open_log(str(source["uri"]), camera=source.get("camera"))
+    poses = sorted(run.load_poses().items())
+    some = poses[:: max(1, len(poses) // 40)]
+    bounds = run.load_config().tracking
+    frames = ((log[index], T) for index, T in some)
+    views = ((valid_depth(frame.depth, bounds.min_depth, bounds.max_depth), frame.camera, T) for frame, T in frames)
+    return surface_error(field, views, around=[*T_world_base[:3, 3], _REACH]).share(0.999)
+
+
+def _summary(result: PlanResult, trajectory: Trajectory) -> dict[str, Any]:
+    assert result.path is not None
+    c = trajectory.certificate
+    return {
+        "status": result.status.name,
+        "code": int(result.status),
+        "cost_rad": result.path.cost,
+        "waypoints": result.path.waypoints.tolist(),
+        "history": result.history.tolist(),
+        "seconds": result.seconds,
+        "duration_s": trajectory.duration,
+        "certified": c.certified,
+        "clearance_m": c.clearance,
+        "margin_m": c.margin,
+        "map_version": c.map_version,
+    }
+
+
+def _print(result: PlanResult, trajectory: Trajectory, folder: Path) -> None:
+    from splatbot.cli.tables import print_table
+
+    assert result.path is not None
+    c = trajectory.certificate
+    rows = [
+        ("first path after", f"{1e3 * result.first_seconds:.2f} ms"),
+        ("length", f"{result.path.cost:.3f} rad, {len(result.path)} waypoints"),
+        ("duration", f"{trajectory.duration:.3f} s"),
+        ("certified", "yes" if c.certified else "NO"),
+        ("room all along", f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm"),
+        ("written to", str(folder)),
+    ]
+    print_table(rows, title="planned")

@@ -1,0 +1,123 @@
+"""The robot's own body in the picture: it moves with the camera or before it, and is no part of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.camera import Camera
+from splatbot.collision import RobotSpheres
+from splatbot.errors import InputError
+from splatbot.frame import Frame
+from splatbot.geometry import inverse, transform_points
+from splatbot.protocols import Array, RobotKinematics
+
+REACH = 0.02  # [m] around the robot that counts as the robot
+
+
+class SelfMask:
+    """Leaves out of frames what may show the robot: within ``reach`` of its spheres at the frame's joints.
+
+    A pixel is left out where its ray meets an enlarged sphere at or before the measured depth, or where nothing was
+    measured; or where the measured point lies in one. What is seen in front of the robot stays.
+
+    Args:
+        robot: joints, links and the spheres that cover them.
+        T_link_camera: (4, 4), the camera on the link that carries it.
+        link: that carries the camera; -1: the last one, 0: the base, for a camera that stands beside the robot.
+        opening: of the gripper [m]; None: as wide as it goes.
+        reach: [m]
+
+    Raises:
+        InputError: the camera's pose is not rigid, the link is not there, or reach is negative.
+    """
+
+    def __init__(
+        self,
+        robot: RobotKinematics,
+        T_link_camera: ArrayLike,
+        *,
+        link: int = -1,
+        opening: float | None = None,
+        reach: float = REACH,
+    ) -> None:
+        links = len(robot.chain) + 1
+        if not -links <= link < links:
+            raise InputError(f"is {link}.", field="link", hint=f"{robot.name} has links 0..{links - 1}")
+        if not 0.0 <= reach < np.inf:
+            raise InputError(f"is {reach}.", field="reach", hint="give metres, 0 or more")
+        T = np.asarray(T_link_camera, dtype=np.float64)
+        if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+            raise InputError(
+                "is no rigid pose.", field="T_link_camera", hint="give (4, 4) with an orthonormal rotation"
+            )
+        self._arm = RobotSpheres(robot, opening=opening)
+        self._T_link_camera, self._link, self._reach = T, link % links, reach
+        self._radii = self._arm.spheres.radii + reach
+
+    def __call__(self, frame: Frame) -> Frame:
+        """The frame with the robot left out of its mask.
+
+        Raises:
+            InputError: the frame tells no joints, or another number of them.
+        """
+        free = self.usable(frame)
+        return replace(frame, mask=free if frame.mask is None else frame.mask & free)
+
+    def usable(self, frame: Frame) -> NDArray[np.bool_]:
+        """Pixels (H, W) that do not show the robot.
+
+        Raises:
+            InputError: as for the whole.
+        """
+        joints = len(self._arm.robot.chain)
+        where = frame.source or f"frame {frame.index}"
+        if frame.joints is None or len(frame.joints) < joints:
+            told = "no" if frame.joints is None else str(len(frame.joints))
+            hint = f"record the joints of {self._arm.robot.name} with the frames, or map without its mask"
+            raise InputError(f"has {told} joints.", file=where, field="joints", hint=hint)
+        q = np.asarray(frame.joints[:joints], dtype=np.float64)  # a gripper's own may follow
+        T_base_camera = self._arm.forward(q)[0, self._link] @ self._T_link_camera
+        centers = transform_points(inverse(T_base_camera), self._arm.centers(q)[0])
+        hidden = np.zeros(frame.depth.shape, np.bool_)
+        for center, radius in zip(centers, self._radii, strict=True):
+            _hide(hidden, frame.depth, frame.camera, center, float(radius))
+        return ~hidden
+
+
+def _hide(hidden: NDArray[np.bool_], depth: NDArray[np.float32], camera: Camera, center: Array, radius: float) -> None:
+    """Mark the pixels whose ray meets a sphere (camera's frame) no farther than their depth, or ends in it."""
+    rows, columns = _window(camera, center, radius)
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        return
+    x = (np.arange(columns.start, columns.stop) - camera.cx) / camera.fx
+    y = (np.arange(rows.start, rows.stop)[:, None] - camera.cy) / camera.fy
+    z = depth[rows, columns].astype(np.float64)
+    # Along (x, y, 1) s: a s² - 2 b s + c = 0 on the sphere.
+    a, b, c = x * x + y * y + 1.0, x * center[0] + y * center[1] + center[2], float(center @ center) - radius**2
+    under = b * b - a * c
+    root = np.sqrt(np.maximum(under, 0.0))
+    near, far = (b - root) / a, (b + root) / a
+    measured = z > 0
+    inside = measured & (z >= near) & (z <= far)
+    before = (near > 0.0) & (~measured | (near <= z))
+    hidden[rows, columns] |= (under > 0.0) & (inside | before)
+
+
+def _window(camera: Camera, center: Array, radius: float) -> tuple[slice, slice]:
+    """The pixels that a sphere can cover: of the box around it; all of them if that reaches behind the camera."""
+    whole = slice(0, camera.height), slice(0, camera.width)
+    if center[2] + radius <= 0.0:
+        return slice(0, 0), slice(0, 0)
+    if center[2] - radius <= 1e-3:
+        return whole
+    nearest, farthest = center[2] - radius, center[2] + radius
+    found = []
+    for k, f, c, size in ((1, camera.fy, camera.cy, camera.height), (0, camera.fx, camera.cx, camera.width)):
+        low, high = center[k] - radius, center[k] + radius
+        first = f * (low / (nearest if low < 0 else farthest)) + c
+        last = f * (high / (nearest if high > 0 else farthest)) + c
+        found.append(slice(max(0, int(np.floor(first))), min(size, int(np.ceil(last)) + 1)))
+    return found[0], found[1]

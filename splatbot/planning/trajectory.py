@@ -1,0 +1,158 @@
+"""A path with its time: what a controller is given."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from splatbot.errors import InputError
+from splatbot.planning.problem import Certificate
+from splatbot.protocols import Array, KinematicChain
+
+# Rows: weights of four control points; columns: powers of u, 0..3.
+_CUBIC = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A uniform cubic B-spline in time, at rest at both ends.
+
+    Velocity, acceleration and jerk are bounded by the first, second and third differences of the control points, over
+    ``step``, its square and its cube: everywhere, not only where they are looked at (de Boor 1978, ch. X).
+
+    Args:
+        names: of the joints.
+        control: (M, J), M >= 4, control points [rad or m].
+        step: between knots [s].
+        certificate: what is known of the curve, not only of the path that it was made from.
+
+    Raises:
+        InputError: too few control points, a value that is not finite, or a step that is not above 0.
+    """
+
+    names: tuple[str, ...]
+    control: Array
+    step: float
+    certificate: Certificate
+
+    def __post_init__(self) -> None:
+        if self.control.ndim != 2 or len(self.control) < 4 or self.control.shape[1] != len(self.names):
+            raise InputError(f"are {self.control.shape}.", field="control", hint=f"give (M >= 4, {len(self.names)})")
+        if not np.isfinite(self.control).all() or not 0.0 < self.step < np.inf:
+            raise InputError("has values that are not finite.", field="trajectory", hint="give finite points and step")
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return (len(self.control) - 3) * self.step
+
+    @property
+    def start(self) -> Array:
+        """Where it begins (J,)."""
+        return self.at(0.0).position
+
+    @property
+    def end(self) -> Array:
+        """Where it ends (J,)."""
+        return self.at(self.duration).position
+
+    def at(self, t: ArrayLike) -> State:
+        """The state at times (...) [s]; before the start and after the end, at rest there."""
+        times = np.asarray(t, dtype=np.float64)
+        inside = (times >= 0.0) & (times <= self.duration)
+        x = np.clip(times, 0.0, self.duration) / self.step
+        span = np.minimum(x.astype(np.int64), len(self.control) - 4)
+        u = (x - span)[..., None]
+        points = self.control[span[..., None] + np.arange(4)]
+        columns = []
+        for order in range(4):
+            powers = np.zeros((*u.shape[:-1], 4))
+            for k in range(order, 4):
+                factor = float(np.prod(np.arange(k - order + 1, k + 1)))
+                powers[..., k] = factor * u[..., 0] ** (k - order)
+            weights = powers @ _CUBIC.T
+            value = np.einsum("...k,...kj->...j", weights, points) / self.step**order
+            columns.append(value if order == 0 else np.where(inside[..., None], value, 0.0))
+        return State(times, *columns)
+
+    def reference(self, t: float) -> tuple[Array, Array]:
+        """Position and velocity (J,) at a time [s], as controllers ask for it."""
+        state = self.at(t)
+        return state.position, state.velocity
+
+    def sampled(self, rate: float = 1000.0) -> State:
+        """States at a rate [Hz], the end included."""
+        if not 0.0 < rate < np.inf:
+            raise InputError(f"is {rate}.", field="rate", hint="give hertz above 0")
+        count = int(np.ceil(self.duration * rate - 1e-9))
+        return self.at(np.append(np.arange(count) / rate, self.duration))
+
+    def load(self, chain: KinematicChain) -> tuple[float, float, float]:
+        """The largest shares of the limits of velocity, acceleration and jerk that it uses anywhere; 1 is all."""
+        shares = []
+        for order, limit in ((1, chain.velocity), (2, chain.acceleration), (3, chain.jerk)):
+            most = np.abs(np.diff(self.control, n=order, axis=0)).max(axis=0) / self.step**order
+            shares.append(float((most / limit).max()))
+        return shares[0], shares[1], shares[2]
+
+    def slowed(self, factor: float) -> Trajectory:
+        """The same curve in ``factor`` times the time; the certificate stays, for it speaks of the curve alone."""
+        if not 0.0 < factor < np.inf:
+            raise InputError(f"is {factor}.", field="factor", hint="give a number above 0, 2 for half the speed")
+        return Trajectory(self.names, self.control, self.step * factor, self.certificate)
+
+    def to_ros(self, *, rate: float = 100.0, frame_id: str = "") -> dict[str, Any]:
+        """``trajectory_msgs/JointTrajectory`` as a dictionary, as rosbridge takes it."""
+        states = self.sampled(rate)
+        points = []
+        for i, t in enumerate(states.time):
+            nanoseconds = round(float(t) * 1e9)
+            points.append(
+                {
+                    "positions": states.position[i].tolist(),
+                    "velocities": states.velocity[i].tolist(),
+                    "accelerations": states.acceleration[i].tolist(),
+                    "effort": [],
+                    "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
+                }
+            )
+        header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
+        return {"header": header, "joint_names": list(self.names), "points": points}
+
+    def to_json(self, *, rate: float = 100.0) -> str:
+        """:meth:`to_ros` as text."""
+        return json.dumps(self.to_ros(rate=rate))
+
+    def to_csv(self, *, rate: float = 1000.0) -> str:
+        """Time, positions, velocities and accelerations, a line a sample."""
+        states = self.sampled(rate)
+        text = io.StringIO()
+        out = csv.writer(text, lineterminator="\n")
+        kinds = ("position", "velocity", "acceleration")
+        out.writerow(["time", *(f"{kind}.{name}" for kind in kinds for name in self.names)])
+        for row in np.c_[states.time, states.position, states.velocity, states.acceleration]:
+            out.writerow([f"{value:.9g}" for value in row])
+        return text.getvalue()
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where the joints are at some times, and how they move.
+
+    Args:
+        time: (...) [s].
+        position: (..., J) [rad or m].
+        velocity, acceleration, jerk: (..., J), per s, s² and s³.
+    """
+
+    time: Array
+    position: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array

@@ -1,0 +1,141 @@
+"""A planned trajectory among the Gaussians, as a picture and as a page that turns; nothing is fetched."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from importlib import resources
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse, transform_points
+from splatbot.planning import Trajectory
+from splatbot.protocols import Array
+from splatbot.rasterize.views import render_view, to_png
+
+_MOST_POINTS = 40_000
+_NEAR = 1.6  # [m] around the base that is shown
+_FRAMES = 80
+_SH0 = 0.28209479177387814  # of a colour's constant harmonic
+_GHOSTS = 5  # postures in the picture
+_EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # of the picture, from the base [m]
+
+
+def plan_html(
+    model: GaussianModel, arm: RobotSpheres, field: GaussianCollisionField, trajectory: Trajectory, *, title: str
+) -> str:
+    """The page: the map's Gaussians as points around the arm's spheres, with a slider for time.
+
+    Args:
+        model: the map.
+        arm: the robot, with its base's pose.
+        field: the map as the arm avoids it.
+        trajectory: what was planned.
+        title: above it.
+    """
+    times = np.linspace(0.0, trajectory.duration, _FRAMES)
+    q = trajectory.at(times).position
+    T_base_world = inverse(arm.T_world_base)  # the page's up is the base's z
+    points, colors = _nearby(model, T_base_world)
+    centers = transform_points(T_base_world, arm.centers(q).reshape(-1, 3))
+    last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])
+    tool = centers.reshape(_FRAMES, -1, 3)[:, last]
+    rooms = np.minimum(arm.clearance(field, q, cut=0.5).distance, 0.5)
+    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+    document = {
+        "points": _packed(points, np.float32),
+        "colors": _packed(colors, np.uint8),
+        "balls": _packed(centers, np.float32),
+        "radii": arm.spheres.radii.round(4).tolist(),
+        "tool": _packed(tool, np.float32),
+        "times": times.round(4).tolist(),
+        "rooms": rooms.round(4).tolist(),
+        "middle": middle.round(3).tolist(),
+        "distance": 2.2,
+        "size": 0.006,
+    }
+    c = trajectory.certificate
+    facts = (
+        f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, room all along at least "
+        f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm; map version {c.map_version}"
+    )
+    script = resources.files("splatbot.report").joinpath("plan_view.js").read_text(encoding="utf-8")
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>
+body {{ margin: 0; font: 14px system-ui, sans-serif; background: #16181d; color: #e8e8ea; }}
+header, footer {{ padding: 8px 14px; }}
+canvas {{ width: 100vw; height: calc(100vh - 92px); display: block; touch-action: none; }}
+footer {{ display: flex; gap: 12px; align-items: center; }} input {{ flex: 1; }}
+</style></head><body>
+<header><b>{html.escape(title)}</b> &nbsp; {html.escape(facts)}</header>
+<canvas id="view"></canvas>
+<footer><button id="play">play</button><input id="time" type="range" min="0" value="0"><span id="label"></span></footer>
+<script type="application/json" id="data">{json.dumps(document)}</script>
+<script>{script}</script>
+</body></html>
+"""
+
+
+def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *, width: int = 960) -> bytes:
+    """The map with the arm at the start (blue), at the end (orange) and between, rendered as Gaussians."""
+    times = np.linspace(0.0, trajectory.duration, _GHOSTS)
+    centers = arm.centers(trajectory.at(times).position)
+    share = np.linspace(0.0, 1.0, _GHOSTS)[:, None]
+    hues = (1 - share) * np.array([0.15, 0.45, 0.9]) + share * np.array([0.95, 0.5, 0.1])
+    ghosts = [
+        _balls(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35) for i in range(_GHOSTS)
+    ]
+    near = _within(model, inverse(arm.T_world_base))
+    import torch
+
+    scene = GaussianModel.concatenate([model.select(torch.from_numpy(near)), *ghosts])
+    camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
+    return to_png(
+        render_view(scene, camera, arm.T_world_base @ _look(_EYE, _TARGET), background=(0.09, 0.1, 0.12)), "rgb"
+    )
+
+
+def _look(eye: Array, target: Array) -> Array:
+    """The pose (4, 4) of a camera at an eye that looks at a target, in a frame whose z is up."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+    return T
+
+
+def _balls(centers: Array, radii: Array, color: Array, opacity: float) -> GaussianModel:
+    n = len(centers)
+    return GaussianModel.from_activated(
+        means=centers,
+        quats=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        scales=np.repeat(radii[:, None] / 2.2, 3, axis=1),
+        opacities=np.full(n, opacity),
+        colors=np.tile(color, (n, 1)),
+    )
+
+
+def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:
+    """Rows of the Gaussians around the base; all of them if there are none."""
+    at = transform_points(T_base_world, model.means.double().numpy())
+    rows = np.flatnonzero(np.abs(at).max(axis=1) < _NEAR)
+    return rows if len(rows) else np.arange(len(model))
+
+
+def _nearby(model: GaussianModel, T_base_world: Array) -> tuple[Array, NDArray[np.uint8]]:
+    """Means (P, 3) around the base, in its frame, and their colours (P, 3)."""
+    rows = _within(model, T_base_world)
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MOST_POINTS)).astype(np.int64)]
+    means = transform_points(T_base_world, model.means.double().numpy()[rows])
+    base = model.sh[:, 0].double().numpy()[rows]
+    return means, (255 * np.clip(0.5 + _SH0 * base, 0, 1)).astype(np.uint8)
+
+
+def _packed(values: NDArray[np.generic], kind: type) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()

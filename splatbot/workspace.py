@@ -1,0 +1,210 @@
+"""Where a robot works in a map: `scene.yaml` beside a map or in a log's folder, read, written and estimated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.atomic import atomic_write
+from splatbot.errors import FormatError, InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import pose_from_quat, rotation_to_quat, transform_points
+
+Array = NDArray[np.float64]
+
+NAME = "scene.yaml"
+_KEYS = ("T_world_base", "gravity", "support_plane", "workspace")
+_TRIALS = 400  # planes tried
+_THICK = 0.01  # [m] that a plane's points may be off it
+_UPRIGHT = 6  # power of the cosine of a plane's lean that its points are weighed by
+_AHEAD = 0.55  # [m] from a robot's base to what it works on
+_HEIGHT = 0.8  # [m] of the workspace over the plane
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """What a map alone does not say. World is the map's: its first camera, unless the map came from elsewhere.
+
+    Args:
+        T_world_base: (4, 4) pose of the robot's base, z up; None: not known.
+        gravity: (3,) unit vector downwards; None: not known.
+        support_plane: (4,) = (n, d): the surface that things stand on is n · p + d = 0, n a unit vector upwards; None.
+        box: (2, 3) corners of the space to work in [m], in the base's frame; None.
+
+    Raises:
+        InputError: a value is of another shape, not finite, no rigid pose, no direction, or an empty box.
+    """
+
+    T_world_base: Array | None = None
+    gravity: Array | None = None
+    support_plane: Array | None = None
+    box: Array | None = None
+
+    def __post_init__(self) -> None:
+        _check("T_world_base", self.T_world_base, (4, 4), "a pose")
+        _check("gravity", self.gravity, (3,), "three numbers")
+        _check("support_plane", self.support_plane, (4,), "a unit normal and an offset")
+        _check("workspace", self.box, (2, 3), "two corners")
+        for name, direction in (("gravity", self.gravity), ("support_plane", self.support_plane)):
+            if direction is not None and abs(float(np.linalg.norm(direction[:3])) - 1.0) > 1e-3:
+                raise InputError("is no unit vector.", field=name, hint="divide it by its length")
+        if self.box is not None and not (self.box[1] > self.box[0]).all():
+            raise InputError("is empty.", field="workspace", hint="give low corners below high ones")
+        T = self.T_world_base
+        if T is not None and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+            raise InputError("is no rigid pose.", field="T_world_base", hint="give a rotation and a translation")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Workspace:
+        """From a YAML file.
+
+        Raises:
+            FormatError: it cannot be read, or a field is unknown or makes no sense.
+        """
+        try:
+            found = yaml.safe_load(Path(path).read_text())
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise FormatError(f"cannot be read ({error}).", file=path, hint="write it as YAML") from error
+        if not isinstance(found, dict) or set(found) - set(_KEYS):
+            unknown = ", ".join(map(str, sorted(set(found) - set(_KEYS)))) if isinstance(found, dict) else "no mapping"
+            raise FormatError(f"holds {unknown}.", file=path, field="fields", hint=f"fields: {', '.join(_KEYS)}")
+        try:
+            return cls(_pose(found.get("T_world_base")), *(_array(found.get(key), key) for key in _KEYS[1:]))
+        except InputError as error:
+            raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
+
+    def save(self, path: str | Path) -> None:
+        """As YAML; what is not known is left out."""
+        document: dict[str, Any] = {}
+        if self.T_world_base is not None:
+            quat = rotation_to_quat(self.T_world_base[:3, :3])
+            document["T_world_base"] = {
+                "translation": _plain(self.T_world_base[:3, 3]), "quaternion_wxyz": _plain(quat, 9)
+            }  # fmt: skip
+        for key, value in zip(_KEYS[1:], (self.gravity, self.support_plane, self.box), strict=True):
+            if value is not None:
+                document[key] = _plain(value, 9)
+        with atomic_write(Path(path)) as file:
+            file.write(yaml.safe_dump(document, sort_keys=False, default_flow_style=None).encode())
+
+
+def find_workspace(*places: str | Path | None) -> Workspace | None:
+    """The first ``scene.yaml`` in a folder, or beside a file, of those named; None if there is none.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    for place in places:
+        if place is None:
+            continue
+        path = Path(place)
+        file = (path.parent if path.suffix and not path.is_dir() else path) / NAME
+        if file.is_file():
+            return Workspace.load(file)
+    return None
+
+
+def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), seed: int = 0) -> Workspace:
+    """The widest upward surface below the first camera by RANSAC (Fischler and Bolles 1981), a base and a box on it.
+
+    Of two planes the one that leans less from ``up`` counts for more. The base is proposed 55 cm from the middle of the
+    surface on the camera's side, x towards the middle. Both are estimates to be corrected by hand.
+
+    Args:
+        model: a map whose world is its first camera.
+        up: (3,) roughly upwards in it; -y is right for a camera that looks ahead, -z for one that looks straight down.
+        seed: of what is tried.
+
+    Raises:
+        InputError: fewer than 100 Gaussians, no direction, or no plane holds a twentieth of them.
+    """
+    points = model.means.double().numpy()
+    upward = np.asarray(up, dtype=np.float64)
+    if upward.shape != (3,) or not np.isfinite(upward).all() or not upward.any():
+        raise InputError(f"is {upward.tolist()}.", field="up", hint="give three numbers, as 0 -1 0")
+    upward = upward / np.linalg.norm(upward)
+    if len(points) < 100:
+        raise InputError(f"has {len(points)} Gaussians.", field="map", hint="map a log with a table or a floor in view")
+    rng = np.random.default_rng(seed)
+    some = points[rng.choice(len(points), min(len(points), 4000), replace=False)]
+    best, most, count = np.zeros(4), 0.0, 0
+    for trio in rng.integers(0, len(some), (_TRIALS, 3)):
+        a, b, c = some[trio]
+        plane = _through(np.cross(b - a, c - a), a, upward)
+        if plane is None or plane[3] <= 0.0:
+            continue
+        held = int((np.abs(some @ plane[:3] + plane[3]) < _THICK).sum())
+        weight = held * float(plane[:3] @ upward) ** _UPRIGHT
+        if weight > most:
+            best, most, count = plane, weight, held
+    if count < len(some) / 20:
+        raise InputError("has no upward surface.", field="map", hint="write scene.yaml by hand")
+    for _ in range(5):  # least squares on what it holds
+        on = points[np.abs(points @ best[:3] + best[3]) < _THICK]
+        middle = on.mean(axis=0)
+        refined = _through(np.linalg.svd(on - middle, full_matrices=False)[2][2], middle, upward)
+        best = best if refined is None else refined
+    return _around(best, points[np.abs(points @ best[:3] + best[3]) < _THICK])
+
+
+def _through(normal: Array, point: Array, up: Array) -> Array | None:
+    """The plane (4,) through a point, its normal turned upwards; None of three in a row."""
+    length = float(np.linalg.norm(normal))
+    if length < 1e-9:
+        return None
+    n = normal / length
+    n = -n if n @ up < 0 else n
+    return np.append(n, -float(n @ point))
+
+
+def _around(plane: Array, on: Array) -> Workspace:
+    up = plane[:3]
+    middle = np.median(on, axis=0)
+    middle = middle - (middle @ up + plane[3]) * up
+    forward = middle - (middle @ up) * up  # from below the first camera to the middle
+    length = float(np.linalg.norm(forward))
+    forward = forward / length if length > 1e-6 else np.linalg.svd(up[None])[2][1]
+    T = np.eye(4)
+    T[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
+    T[:3, 3] = middle - _AHEAD * forward
+    local = transform_points(np.linalg.inv(T), on)
+    low, high = np.percentile(local, [1, 99], axis=0)
+    box = np.array([[low[0], low[1], 0.0], [high[0], high[1], _HEIGHT]])
+    return Workspace(T, -up, plane, box)
+
+
+def _check(name: str, value: Array | None, shape: tuple[int, ...], what: str) -> None:
+    if value is not None and (value.shape != shape or not np.isfinite(value).all()):
+        raise InputError(f"is {value.shape}, or not finite.", field=name, hint=f"give {what}, {shape}")
+
+
+def _pose(value: Any) -> Array | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict) or set(value) != {"translation", "quaternion_wxyz"}:
+        raise InputError("is no pose.", field="T_world_base", hint="give translation and quaternion_wxyz")
+    translation, quat = _array(value["translation"], "translation"), _array(value["quaternion_wxyz"], "quaternion")
+    if translation is None or quat is None or translation.shape != (3,) or quat.shape != (4,):
+        raise InputError("makes no sense.", field="T_world_base", hint="give 3 and 4 numbers")
+    try:
+        return pose_from_quat(translation, quat)
+    except ValueError as error:
+        raise InputError(f"{error}.", field="quaternion_wxyz", hint="no rotation is 1 0 0 0") from error
+
+
+def _array(value: Any, name: str) -> Array | None:
+    if value is None:
+        return None
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"holds what is no number ({error}).", field=name, hint="give numbers") from error
+
+
+def _plain(values: Array, digits: int = 6) -> Any:
+    return np.round(values, digits).tolist()

@@ -1,0 +1,107 @@
+"""`splatbot plan`."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatbot.bench.tabletop import tabletop
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.robots.panda import panda
+from splatbot.workspace import Workspace
+from tests.unit.cli.conftest import RunCommand
+
+BASE = ("--base", 0, 0, 0, 1, 0, 0, 0)
+GOAL = (0.9, -0.3, 0.1, -2.0, 0.2, 1.8, 0.5)
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    path = tmp_path / "map.ply"
+    tabletop().gaussians(4000).save(path)
+    return path
+
+
+def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    answer = run("plan", "--map", map_file, *BASE, "--start", "home", "--goal", *GOAL, "--out", out)
+    assert answer.code == 0, answer.err
+    assert "certified" in answer.out
+    summary = json.loads((out / "plan.json").read_text())
+    assert summary["status"] == "SUCCESS"
+    assert summary["certified"]
+    message = json.loads((out / "trajectory.json").read_text())
+    np.testing.assert_allclose(message["points"][0]["positions"], panda().home, atol=1e-9)
+    np.testing.assert_allclose(message["points"][-1]["positions"], GOAL, atol=1e-9)
+    rows = list(csv.reader((out / "trajectory.csv").open()))
+    q = np.array([[float(x) for x in row[1:8]] for row in rows[1:]])
+    field = GaussianCollisionField(tabletop().gaussians(4000))
+    assert not RobotSpheres(panda()).check(field, q).in_collision.any()
+    picture = cv2.imread(str(out / "plan.png"))
+    assert picture is not None
+    assert picture.shape == (720, 960, 3)
+    assert picture.std() > 5
+    page = (out / "plan.html").read_text()
+    assert "http://" not in page
+    assert "https://" not in page
+    assert page.count("<script") == 2
+
+
+def test_the_base_is_taken_from_the_scene_beside_the_map_and_a_pose_is_reached(
+    run: RunCommand, map_file: Path, tmp_path: Path
+) -> None:
+    assert run("plan", "--map", map_file, "--start", "home", "--goal", *GOAL).code == 2
+    T = np.eye(4)
+    T[:3, 3] = [0.0, 0.0, 0.05]
+    Workspace(T_world_base=T).save(tmp_path / "scene.yaml")
+    tool = panda().tcp(np.array(GOAL))
+    from splatbot.geometry import rotation_to_quat
+
+    pose = [*tool[:3, 3], *rotation_to_quat(tool[:3, :3])]
+    out = tmp_path / "out"
+    answer = run(
+        "plan", "--map", map_file, "--start", "home", "--goal-pose", *pose, "--margin", 0.01, "--out", out,
+        "--budget-ms", 300,
+    )  # fmt: skip
+    assert answer.code == 0, answer.err
+    summary = json.loads((out / "plan.json").read_text())
+    np.testing.assert_allclose(panda().tcp(np.array(summary["waypoints"][-1])), tool, atol=1e-4)
+    assert summary["margin_m"] == 0.01
+
+
+def test_the_margin_of_a_run_is_what_its_depth_leaves_outside_of_the_ellipsoids(run_folder: Path) -> None:
+    from splatbot.cli.plan import _own_margin
+    from splatbot.gaussians import GaussianModel
+
+    model = GaussianModel.load(run_folder / "map.ply")
+    T = np.eye(4)
+    T[:3, 3] = np.median(model.means.numpy(), axis=0)
+    thin, thick = (_own_margin(run_folder, GaussianCollisionField(model, n), T) for n in (0.2, 3.0))
+    assert 0.0 <= thick < thin < 0.3
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--start", "home"), "--goal, --goal-pose"),
+        (("--start", "there", "--goal", "home"), "--start: is there"),
+        (("--start", 0.1, 0.2, "--goal", "home"), "--start: has 2 values"),
+        (("--start", "home", "--goal", "home", "--margin", "wide"), "--margin"),
+        (("--start", "home", "--goal", "home", "--margin", "auto"), "run folder"),
+        (("--start", "home", "--goal", *([9.0] * 7)), "goal: "),
+        (("--start", "home", "--goal-pose", 5, 0, 0, 1, 0, 0, 0), "goal: "),
+        (("--start", "home", "--goal", "home", "--robot", "nobody"), "robot"),
+    ],
+)
+def test_what_cannot_be_planned_is_said(
+    words: tuple[object, ...], message: str, run: RunCommand, map_file: Path
+) -> None:
+    answer = run("plan", "--map", map_file, *BASE, *words)
+    assert answer.code in (1, 2)
+    assert message in answer.err
+    assert "Traceback" not in answer.err

@@ -1,0 +1,102 @@
+"""scene.yaml: read, written, found, estimated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.errors import FormatError, InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import transform_points
+from splatbot.workspace import Workspace, find_workspace, fit_workspace
+
+
+def _table(seed: int = 0) -> tuple[GaussianModel, np.ndarray]:
+    """A table, a larger wall behind it and things on it, seen from 0.5 m above; and T_world_table."""
+    rng = np.random.default_rng(seed)
+    table = np.c_[rng.uniform(-0.6, 0.6, 3000), rng.uniform(-0.4, 0.4, 3000), rng.normal(0, 1e-3, 3000)]
+    wall = np.c_[rng.uniform(-2, 2, 6000), np.full(6000, 0.75), rng.uniform(-0.7, 1.5, 6000)]
+    things = rng.uniform([-0.2, -0.2, 0], [0.2, 0.2, 0.15], (1500, 3))
+    # The camera looks down by 40 degrees from 0.8 m before the table's middle and 0.6 m over it.
+    turn = np.radians(40.0)
+    T_table_world = np.eye(4)
+    T_table_world[:3, :3] = np.array([[1, 0, 0], [0, -np.sin(turn), np.cos(turn)], [0, -np.cos(turn), -np.sin(turn)]])
+    T_table_world[:3, 3] = [0.0, -0.8, 0.6]
+    T = np.linalg.inv(T_table_world)
+    points = transform_points(T, np.concatenate([table, wall, things]))
+    n = len(points)
+    model = GaussianModel.from_activated(
+        means=points, quats=np.tile([1.0, 0, 0, 0], (n, 1)), scales=np.full((n, 3), 0.01),
+        opacities=np.full(n, 0.9), colors=np.full((n, 3), 0.5),
+    )  # fmt: skip
+    return model, T
+
+
+def test_the_table_is_found_before_a_larger_wall_and_the_base_stands_on_it() -> None:
+    model, T = _table()
+    found = fit_workspace(model)
+    assert found.support_plane is not None
+    assert found.gravity is not None
+    assert found.T_world_base is not None
+    assert found.box is not None
+    up = T[:3, 2]
+    assert np.degrees(np.arccos(np.clip(found.support_plane[:3] @ up, -1, 1))) < 0.5
+    assert abs(found.support_plane[:3] @ T[:3, 3] + found.support_plane[3]) < 2e-3
+    np.testing.assert_allclose(found.gravity, -found.support_plane[:3])
+    base = np.linalg.inv(T) @ found.T_world_base  # in the table's frame
+    np.testing.assert_allclose(base[:3, 3], [0.0, -0.55, 0.0], atol=0.03)
+    np.testing.assert_allclose(base[:3, 0], [0.0, 1.0, 0.0], atol=0.03)
+    np.testing.assert_allclose(base[:3, 2], [0.0, 0.0, 1.0], atol=0.01)
+    np.testing.assert_allclose(found.box[:, 1], [-0.6, 0.6], atol=0.05)
+
+
+def test_what_is_written_is_read_and_found_beside_a_map(tmp_path: Path) -> None:
+    found = fit_workspace(_table()[0])
+    found.save(tmp_path / "scene.yaml")
+    again = find_workspace(None, tmp_path / "elsewhere" / "map.ply", tmp_path / "map.ply")
+    assert again is not None
+    for name in ("T_world_base", "gravity", "support_plane", "box"):
+        np.testing.assert_allclose(getattr(again, name), getattr(found, name), atol=1e-6)
+    assert find_workspace(tmp_path / "elsewhere") is None
+    Workspace(gravity=np.array([0.0, 0, -1])).save(tmp_path / "scene.yaml")
+    part = Workspace.load(tmp_path / "scene.yaml")
+    assert part.T_world_base is None
+    np.testing.assert_array_equal(part.gravity, [0, 0, -1])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[1, 2", "cannot be read"),
+        ("- 1\n", "no mapping"),
+        ("gravitation: [0, 0, 1]\n", "gravitation"),
+        ("gravity: [0, 0, 2]\n", "gravity: is no unit vector"),
+        ("gravity: [0, 0]\n", r"gravity: is \(2,\)"),
+        ("gravity: [a, b, c]\n", "gravity: holds what is no number"),
+        ("T_world_base: [1, 2, 3]\n", "T_world_base: is no pose"),
+        ("T_world_base: {translation: [0, 0, 0], quaternion_wxyz: [0, 0, 0, 0]}\n", "quaternion"),
+        ("workspace: [[0, 0, 0], [1, 0, 1]]\n", "workspace: is empty"),
+    ],
+)
+def test_a_damaged_file_is_named_with_its_field(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=message):
+        Workspace.load(path)
+
+
+def test_a_map_without_an_upward_surface_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    n = 3000
+    model = GaussianModel.from_activated(
+        means=rng.uniform(-1, 1, (n, 3)), quats=np.tile([1.0, 0, 0, 0], (n, 1)), scales=np.full((n, 3), 0.01),
+        opacities=np.full(n, 0.9), colors=np.full((n, 3), 0.5),
+    )  # fmt: skip
+    with pytest.raises(InputError, match="no upward surface"):
+        fit_workspace(model)
+    with pytest.raises(InputError, match="up"):
+        fit_workspace(model, up=(0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="Gaussians"):
+        fit_workspace(GaussianModel.empty())
