@@ -105,7 +105,10 @@ def timed(waypoints: Array, chain: KinematicChain) -> JointMotion:
 
 
 def arm_room(robot: RobotModel, table: Tabletop, q: Array, first: int = 1) -> Array:
-    """Signed distance (C,) [m] between the capsules of links from ``first`` on, gripper open, and the shapes, exact."""
+    """Distance (C,) [m] between the capsules of links from ``first`` on, gripper open, and the shapes; signed.
+
+    In closed form, at 13 points of each axis: at most a few millimetres above the exact one.
+    """
     T = robot.fk(q)
     found = []
     for link, shape in _capsules(robot):
