@@ -24,10 +24,10 @@ class Follower:
         assert world.robot is not None
         assert world.scene.robot is not None
         self._world, m = world, world.model
-        self.qpos, self._dofs, self._acts = robot_joints(m, world.robot)
+        self.qpos, self.dofs, self._acts = robot_joints(m, world.robot)
         self._stiffness = np.array(m.actuator_gainprm[self._acts, 0])
         damping = np.asarray(m.dof_damping).reshape(m.nv, -1)[:, 0]  # MuJoCo 4 has polynomials of the speed
-        self._damping = -np.array(m.actuator_biasprm[self._acts, 2]) + damping[self._dofs]
+        self._damping = -np.array(m.actuator_biasprm[self._acts, 2]) + damping[self.dofs]
         self._knows = world.scene.robot.motors.feedforward
         self._gripper = gripper_joints(m, world.robot) if world.robot.gripper is not None else None
         self._acceleration, self._torque = np.zeros(m.nv), np.zeros(m.nv)
@@ -43,9 +43,9 @@ class Follower:
         """Set the motors' commands for targets (J,)."""
         u = q + self._damping * velocity / self._stiffness
         if self._knows:
-            self._acceleration[self._dofs] = acceleration
+            self._acceleration[self.dofs] = acceleration
             mujoco.mj_mulM(self._world.model, data, self._torque, self._acceleration)
-            u = u + (self._torque + data.qfrc_bias)[self._dofs] / self._stiffness
+            u = u + (self._torque + data.qfrc_bias)[self.dofs] / self._stiffness
         data.ctrl[self._acts] = u
         if self._gripper is not None and opening is not None:
             data.ctrl[self._gripper[2]] = opening

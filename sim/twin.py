@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import time as clock
 from collections.abc import Callable
@@ -109,6 +110,7 @@ class _Log:
 
 # MuJoCo would write every warning into a file in the working directory; results carry what matters of them.
 mujoco.set_mju_user_warning(lambda text: None)
+atexit.register(mujoco.set_mju_user_warning, None)  # else it outlives the modules that it refers to
 
 
 class Twin:
@@ -173,6 +175,16 @@ class Twin:
             self.follower.settle_lag(self.data)
         mujoco.mj_forward(self.world.model, self.data)
 
+    def advance(self, time: float, q: Array, velocity: Array, acceleration: Array, opening: float | None) -> None:
+        """One control period that begins at ``time`` [s], at whose end the arm shall be at ``q`` (J,)."""
+        for hook in self.hooks:
+            hook.on_step(self.data, time)
+        if self.follower is not None:
+            for hook in self.hooks:
+                q = hook.on_targets(q)
+            self.follower.command(self.data, q, velocity, acceleration, opening)
+        mujoco.mj_step(self.world.model, self.data, self.substeps)
+
     def stop(self) -> None:
         """Ends the motion that another thread, or a callback, follows, within one control period."""
         self._stop = True
@@ -224,14 +236,7 @@ class Twin:
         for k in range(count):
             now = (k + 1) * period
             start = clock.perf_counter()
-            for hook in self.hooks:
-                hook.on_step(self.data, k * period)
-            if self.follower is not None:
-                target = q[k]
-                for hook in self.hooks:
-                    target = hook.on_targets(target)
-                self.follower.command(self.data, target, v[k], a[k], None if opening is None else float(opening[k]))
-            mujoco.mj_step(self.world.model, self.data, self.substeps)
+            self.advance(k * period, q[k], v[k], a[k], None if opening is None else float(opening[k]))
             log.physics += clock.perf_counter() - start
             if self._broken():
                 return k
@@ -289,7 +294,7 @@ class Twin:
             notes=self.world.notes,
         )
 
-    def _tracking(self, motion: JointMotion, log: _Log, done: int) -> Tracking:
+    def _tracking(self, motion: JointMotion, log: _Log, done: int) -> Tracking | None:
         assert self.world.robot is not None
         errors = np.array(log.errors)
         if not len(errors):

@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 
 from splatbot.errors import FormatError, InputError
+from splatbot.planning.problem import Certificate
+from splatbot.planning.trajectory import Trajectory
 from splatbot.robots.panda import panda
-from splatbot.sim.motion import hold, load_motion, minimum_jerk, motion_from_samples, motion_of
+from splatbot.sim.motion import (
+    hold,
+    load_motion,
+    minimum_jerk,
+    motion_from_samples,
+    motion_from_trajectory,
+    motion_of,
+)
 from splatbot.sim.scene import load_scene
 
 T = np.linspace(0.0, 2.0, 41)
@@ -91,3 +100,21 @@ def test_a_file_that_is_no_trajectory_of_the_robot_is_refused(text: str, tmp_pat
 def test_a_hold_needs_time() -> None:
     with pytest.raises(InputError, match="seconds"):
         hold(np.zeros(7), 0.0)
+
+
+def test_a_planners_trajectory_is_the_same_motion_directly_as_json_and_as_csv(tmp_path: Path) -> None:
+    ease = np.array([0.0, 0.0, 0.0, 0.1, 0.4, 0.7, 0.9, 1.0, 1.0, 1.0])[:, None]
+    control = panda().home + ease * np.linspace(-0.4, 0.5, 7)
+    certificate = Certificate(True, 1e-3, 0.05, 0.0, 1)
+    trajectory = Trajectory(panda().chain.names, control, 0.2, certificate)
+    (tmp_path / "a.json").write_text(trajectory.to_json(rate=500.0))
+    (tmp_path / "a.csv").write_text(trajectory.to_csv())
+    t = np.linspace(0.0, trajectory.duration, 333)
+    for motion in (
+        motion_from_trajectory(trajectory),
+        load_motion(tmp_path / "a.json", panda()),
+        load_motion(tmp_path / "a.csv", panda()),
+    ):
+        assert motion.duration == pytest.approx(trajectory.duration, abs=1e-6)
+        np.testing.assert_allclose(motion.at(t)[0], trajectory.at(t).position, atol=1e-6)
+        np.testing.assert_allclose(motion.at(t)[1], trajectory.at(t).velocity, atol=2e-4)

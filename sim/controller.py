@@ -1,0 +1,68 @@
+"""The twin as a controller: whatever drives a real arm drives the twin's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.protocols import Array, Feedback, MotionState, TimedPath
+from splatbot.robots.controllers.base import FOLLOWING, SteppedController
+from splatbot.sim.twin import Twin
+
+
+class TwinController(SteppedController):
+    """A :class:`splatbot.protocols.Controller` whose arm is in a twin; each step is one control period of physics.
+
+    Physics passes while the arm holds still, too. Told to stop, it holds where it is from the next step on.
+
+    Args:
+        twin: reset, or wherever its arm is.
+        following: largest difference between where the arm is and should be [rad or m], beyond which it faults.
+
+    Raises:
+        InputError: the twin has no robot.
+    """
+
+    def __init__(self, twin: Twin, *, following: float = FOLLOWING) -> None:
+        if twin.follower is None:
+            raise InputError("has no robot.", field=twin.scene.name, hint="give the scene a robot")
+        self.twin, self._follower = twin, twin.follower
+        self._clock = 0.0
+        super().__init__(self._measured(), period=1.0 / twin.rate, following=following)
+        self._hold = self._position.copy()
+
+    def send(self, trajectory: TimedPath) -> None:
+        """Begin to follow a trajectory; see :class:`SteppedController`."""
+        super().send(trajectory)
+        self._before = trajectory.reference(0.0)[1]
+
+    def step(self) -> Feedback:
+        """Let one period pass, whatever the arm does."""
+        if self._state is MotionState.MOVING and not self._stopping:
+            return super().step()
+        if self._state is MotionState.MOVING:
+            self._rest(MotionState.STOPPED)
+        still = np.zeros_like(self._hold)
+        self._advance(self._hold, still, still)
+        self._position = self._measured()
+        self._velocity = np.array(self.twin.data.qvel[self._follower.dofs])
+        return Feedback(
+            self._time, self._position.copy(), self._velocity.copy(), self._desired.copy(), self._state, self._fault
+        )
+
+    def _moved(self, t: float, desired: Array, velocity: Array) -> Array:
+        acceleration = (velocity - self._before) / self._period
+        self._before = velocity
+        self._advance(desired, velocity, acceleration)
+        return self._measured()
+
+    def _rest(self, state: MotionState) -> None:
+        super()._rest(state)
+        self._hold = self._desired.copy() if state is MotionState.DONE else self._measured()
+
+    def _advance(self, q: Array, velocity: Array, acceleration: Array) -> None:
+        self.twin.advance(self._clock, q, velocity, acceleration, None)
+        self._clock += self._period
+
+    def _measured(self) -> Array:
+        return np.array(self.twin.data.qpos[self._follower.qpos])

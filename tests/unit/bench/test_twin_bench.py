@@ -1,0 +1,60 @@
+"""The benchmark of the twin: its truth is MuJoCo's geometry, its motions keep to limits, pushed paths are seen."""
+
+from __future__ import annotations
+
+import itertools
+
+import mujoco
+import numpy as np
+
+from splatbot.bench.tabletop import tabletop
+from splatbot.bench.twin_paths import DEPTH, arm_room, push, timed, truth_scene, try_paths
+from splatbot.robots.panda import panda
+from splatbot.sim.twin import Twin
+
+
+def test_the_closed_form_room_is_that_between_mujocos_geoms(rng: np.random.Generator) -> None:
+    """Two computations that share no code; the first looks at 13 points of each axis, and so is a little above."""
+    table, twin = tabletop(), Twin(truth_scene(tabletop()))
+    world, data = twin.world, twin.data
+    arm = [g for g in range(world.model.ngeom) if world.of_robot[g] and world.owner[g] != "link0"]
+    rest = np.flatnonzero(~world.of_robot)
+    compared = 0
+    for q in panda().random(40, rng):
+        twin.reset(q)
+        theirs = min(mujoco.mj_geomDistance(world.model, data, a, b, 1.0, None) for a in arm for b in rest)
+        ours = float(arm_room(panda(), table, q[None])[0])
+        if 0.0 < theirs < 0.9:
+            compared += 1
+            assert -1e-6 < ours - theirs < 5e-3
+    assert compared > 5
+
+
+def test_a_timed_path_stays_on_its_edges_and_within_limits(rng: np.random.Generator) -> None:
+    chain = panda().chain
+    waypoints = panda().random(4, rng)
+    motion = timed(waypoints, chain)
+    assert (np.abs(motion.velocity) <= chain.velocity).all()
+    assert (np.abs(motion.acceleration) <= chain.acceleration).all()
+    for q in motion.position[::37]:
+        off = []
+        for a, b in itertools.pairwise(waypoints):
+            share = np.clip((q - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            off.append(float(np.linalg.norm(q - a - share * (b - a))))
+        assert min(off) < 1e-9
+
+
+def test_a_pushed_path_ends_a_centimetre_deep() -> None:
+    home = panda().home
+    into = push(np.stack([home, home + 0.2]), panda(), tabletop(), DEPTH)
+    assert into is not None
+    assert float(arm_room(panda(), tabletop(), into[-1:])[0]) <= -DEPTH
+    assert float(arm_room(panda(), tabletop(), into[:1])[0]) > 0
+
+
+def test_planned_paths_touch_nothing_and_pushed_ones_are_seen() -> None:
+    trials = try_paths(2, gaussians=6000, budget_ms=60.0, say=lambda text: None)
+    assert trials.planned == trials.certified == 2
+    assert trials.touched == 0
+    assert trials.least_room > 0
+    assert trials.seen == trials.pushed == 2
