@@ -40,9 +40,9 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     for index, T in sorted(poses.items()):
         frame = log[index]
         v, u = np.nonzero(np.isfinite(frame.depth) & (frame.depth > 0))
-        clouds.append(_lifted(frame.depth, u[::3], v[::3], frame.camera, T))
+        clouds.append(lifted(frame.depth, u[::3], v[::3], frame.camera, T))
         chosen = rng.integers(0, len(u), each)
-        surface = _lifted(frame.depth, u[chosen], v[chosen], frame.camera, T)
+        surface = lifted(frame.depth, u[chosen], v[chosen], frame.camera, T)
         free.append(T[:3, 3] + rng.uniform(0.1, 0.95, (each, 1)) * (surface - T[:3, 3]))
     cloud, queries = np.concatenate(clouds), np.concatenate(free)[:points]
     raw = _nearest(cloud, queries)
@@ -54,7 +54,8 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     _picture(field, log[min(poses)], poses[min(poses)], cloud, out / f"{name}-field.jpg")
 
 
-def _lifted(depth: NDArray[np.float32], u: NDArray[np.int64], v: NDArray[np.int64], camera: Camera, T: Array) -> Array:
+def lifted(depth: NDArray[np.float32], u: NDArray[np.int64], v: NDArray[np.int64], camera: Camera, T: Array) -> Array:
+    """Points (P, 3) [m, world] that pixels (u, v) show from ``T`` (4, 4)."""
     z = depth[v, u].astype(np.float64)
     return transform_points(T, np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1))
 

@@ -249,14 +249,15 @@ def mesh_of(scene: Tabletop) -> tuple[Array, Array]:
     """Vertices (V, 3) [m] and triangles (T, 3) of the shapes."""
     vertices, triangles, count = [], [], 0
     for solid in scene.solids:
-        mesh = _mesh(solid)
+        mesh = solid_mesh(solid)
         vertices.append(mesh.vertices)
         triangles.append(mesh.triangles.astype(np.int64) + count)
         count += len(mesh.vertices)
     return np.concatenate(vertices), np.concatenate(triangles)
 
 
-def _mesh(solid: object) -> Mesh:
+def solid_mesh(solid: object) -> Mesh:
+    """The triangles of a block, can or ball."""
     if isinstance(solid, Block):
         x, y, z = solid.center
         return box(solid.size).placed([x, y, z - solid.size[2] / 2], solid.yaw)

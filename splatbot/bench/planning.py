@@ -11,9 +11,13 @@ import numpy as np
 import torch
 
 from splatbot.bench.machine import describe_machine
+from splatbot.bench.planning_audit import audit
+from splatbot.bench.planning_log import map_film, shoot
+from splatbot.bench.planning_mapped import audit_mapped
 from splatbot.bench.planning_peers import run_peers
 from splatbot.bench.planning_plots import plot_cost
 from splatbot.bench.planning_problems import Problem, problems
+from splatbot.bench.planning_runs import plan_in_run
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.timing import threads
@@ -26,8 +30,7 @@ from splatbot.robots.panda import panda
 
 Say = Callable[[str], None]
 EXACT_TO = 0.01  # [m]; more true room than this is known from below alone
-STEP = 1 / 256  # [rad] between the configurations of a path that the truth is asked for
-FAST_MS = 28.0  # of the path that a change of the map meets
+FAST_MS = 28.0  # of the path that a change of the map meets, and of those on mapped logs
 REPAIR_MS = 9.0
 SOLVABLE_MS = 100.0  # in which a problem must be solved anew to count as one that can be
 
@@ -43,6 +46,8 @@ class PlanningPlan:
         budgets_ms: of the planner.
         peers: measure other planners and maps too.
         peers_ms: budgets of those that improve until time is up.
+        film: (frames, width [px]) of the noisy film that is mapped for :func:`run_mapped`.
+        run_problems: in each run's map.
         quick: tiny: whether it runs, not how well.
         say: told what goes on.
     """
@@ -53,6 +58,8 @@ class PlanningPlan:
     budgets_ms: tuple[float, ...] = (1.0, 3.0, 10.0, 28.0, 100.0, 1000.0)
     peers: bool = False
     peers_ms: tuple[float, ...] = (28.0, 100.0, 1000.0)
+    film: tuple[int, int] = (120, 320)
+    run_problems: int = 10
     quick: bool = False
     say: Say = field(default=lambda text: None)
 
@@ -64,7 +71,7 @@ class PlanningPlan:
     @classmethod
     def quick_plan(cls, *, peers: bool = False, say: Say = lambda text: None) -> PlanningPlan:
         """A run of seconds."""
-        return cls(5000, 3, 2, (3.0, 28.0), peers, (28.0,), True, say)
+        return cls(5000, 3, 2, (3.0, 28.0), peers, (28.0,), (24, 160), 2, True, say)
 
 
 def run_planning(plan: PlanningPlan, out: Path) -> Results:
@@ -93,6 +100,38 @@ def run_planning(plan: PlanningPlan, out: Path) -> Results:
     results.write_json(out / "planning.json")
     results.write_csv(out / "planning.csv")
     plot_cost(histories, theirs, out)
+    return results
+
+
+def run_mapped(plan: PlanningPlan, out: Path, *, noisy: bool, runs: Sequence[Path] = ()) -> Results:
+    """The problems on a map made of a noisy film (``noisy``), and problems in the maps of runs; one thread.
+
+    Writes planning-mapped.json (after each part) and planning-mapped.csv into ``out``.
+
+    Raises:
+        FormatError: a run is damaged.
+        LogError: the log of a run is gone.
+        InputError: there is nowhere to place an arm in a run's map.
+    """
+    plan.say("measuring the machine")
+    results = Results(describe_machine((1,), peak_ms=20.0 if plan.quick else 200.0))
+    out.mkdir(parents=True, exist_ok=True)
+    with threads(1):
+        if noisy:
+            scene = tabletop()
+            plan.say(f"filming and mapping {plan.film[0]} frames")
+            mapped = map_film(shoot(scene, *plan.film))
+            truth = Truth(scene, 0.1 if plan.quick else 0.02)
+            ideal = GaussianCollisionField(scene.gaussians(plan.gaussians))
+            wanted = problems(panda(), RobotSpheres(panda()), ideal, truth, plan.problems)
+            plan.say("planning on it")
+            audit_mapped(results, mapped, truth, wanted, seeds=plan.seeds, budget_ms=FAST_MS)
+            results.write_json(out / "planning-mapped.json")
+        for run in runs:
+            plan.say(f"planning in {run}")
+            plan_in_run(results, run, problems=plan.run_problems, budget_ms=FAST_MS)
+            results.write_json(out / "planning-mapped.json")
+    results.write_csv(out / "planning-mapped.csv")
     return results
 
 
@@ -156,21 +195,6 @@ def add_audit(
     if promised is not None:
         broken = int((rooms < np.minimum(promised, EXACT_TO)).sum())
         results.add(case, "nearer to the truth than promised", float(broken), f"of {len(paths)}", peer=peer)
-
-
-def audit(paths: Sequence[Array], arm: RobotSpheres, truth: Truth) -> tuple[Array, int]:
-    """Least true room (P,) [m] of each path's configurations every 1/256 rad, and how many paths touch themselves."""
-    rooms, own = [], 0
-    for path in paths:
-        steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        parts = [
-            a + np.linspace(0, 1, int(np.ceil(step / STEP)) + 1)[:, None] * (b - a)
-            for a, b, step in zip(path[:-1], path[1:], steps, strict=True)
-        ]
-        q = np.concatenate(parts)
-        rooms.append(float(truth.rooms(arm, q).min()))
-        own += bool(arm.check(None, q).in_collision.any())
-    return np.array(rooms), own
 
 
 def run_changes(plan: PlanningPlan, results: Results, model: GaussianModel, wanted: Sequence[Problem]) -> None:

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from splatbot.planning import PlanResult, Trajectory
     from splatbot.robots.robot import RobotModel
 
-_REACH = 1.0  # [m] around the base in which a margin is looked for
 Pose = tuple[float, float, float, float, float, float, float]
 
 
@@ -153,7 +152,11 @@ def _margin(text: str, map_: Path, field: GaussianCollisionField, T_world_base: 
     from splatbot.errors import InputError
 
     if text == "auto":
-        return _own_margin(map_, field, T_world_base)
+        if not map_.is_dir():
+            raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
+        from splatbot.results.margin import own_margin
+
+        return own_margin(map_, field, T_world_base)
     try:
         value = float(text)
     except ValueError:
@@ -161,27 +164,6 @@ def _margin(text: str, map_: Path, field: GaussianCollisionField, T_world_base: 
     if not 0.0 <= value < math.inf:
         raise InputError(f"is {text!r}.", field="--margin", hint='give metres, 0 or more, or "auto"')
     return value
-
-
-def _own_margin(map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
-    """Of 99.9 % of what the run measured within a metre of the base, without what mapping leaves out."""
-    from splatbot.collision import surface_error
-    from splatbot.errors import InputError
-    from splatbot.logs import open_log
-    from splatbot.results.folder import RunFolder
-    from splatbot.tracking.prepare import valid_depth
-
-    if not map_.is_dir():
-        raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
-    run = RunFolder(map_)
-    source = run.load_metrics()["log"]
-    log = open_log(str(source["uri"]), camera=source.get("camera"))
-    poses = sorted(run.load_poses().items())
-    some = poses[:: max(1, len(poses) // 40)]
-    bounds = run.load_config().tracking
-    frames = ((log[index], T) for index, T in some)
-    views = ((valid_depth(frame.depth, bounds.min_depth, bounds.max_depth), frame.camera, T) for frame, T in frames)
-    return surface_error(field, views, around=[*T_world_base[:3, 3], _REACH]).share(0.999)
 
 
 def _summary(result: PlanResult, trajectory: Trajectory) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.planning import PlanningPlan, audit, run_planning
+from splatbot.bench.planning import PlanningPlan, run_planning
+from splatbot.bench.planning_audit import audit
 from splatbot.bench.planning_peers import add_ratio
 from splatbot.bench.planning_problems import ROOM, problems
 from splatbot.bench.results import Results
