@@ -1,4 +1,4 @@
-"""The planner's table top, filmed all around with a noisy depth camera, and the map that is made of it."""
+"""The planner's table top, filmed in an arc with a noisy depth camera, and the map that is made of it."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from splatbot.trajectory import Trajectory
 NOISY = ("depth_noise", "depth_holes")
 TARGET, RADIUS = np.array([0.5, 0.1, 0.1]), 1.15  # [m]; of the camera's way around
 MIDDLE, SWING = 0.70, 0.15  # [m] height over the table top
+ARC = np.radians(75.0)  # to both sides of where the robot stands
+WHOLE = 120  # frames; fewer end on the way
 RATE = 30.0  # [Hz]
 _FLOOR = Surface(box([8.0, 8.0, 0.02]).placed([0.5, 0.0, -0.8]), Texture((0.60, 0.58, 0.55), (0.30, 0.30, 0.33), 0.30))
 _COLORS = ((0.80, 0.62, 0.42), (0.85, 0.85, 0.80), (0.20, 0.70, 0.35), (0.95, 0.55, 0.15), (0.15, 0.40, 0.60))
@@ -84,7 +86,10 @@ class FilmedMap:
 
 
 def shoot(scene: Tabletop, frames: int, width: int, seed: int = 0) -> Film:
-    """Once around the table, 55 to 85 cm over its top; the floor lies 80 cm below it. What faces down stays unseen."""
+    """From behind the robot 75 degrees to one side, to the other and back, 55 to 85 cm over the table, the floor below.
+
+    The robot is not there. What faces down or away from it stays unseen.
+    """
     solids = [
         Surface(solid_mesh(solid), Texture(_COLORS[i % 5], _COLORS[(i + 2) % 5], 0.04, seed=i))
         for i, solid in enumerate(scene.solids)
@@ -92,8 +97,7 @@ def shoot(scene: Tabletop, frames: int, width: int, seed: int = 0) -> Film:
     stage = Scene([_FLOOR, *solids])
     f, height = 525.0 * width / 640.0, width * 3 // 4
     camera = Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
-    share = np.arange(frames) / max(1, frames)
-    poses = np.array([_pose(s) for s in share])
+    poses = np.array([_pose(i / WHOLE) for i in range(frames)])
     stamps = np.arange(frames) / RATE
     effects = make_effects(NOISY, seed=seed).along(Trajectory(stamps, poses))
     shot = []
@@ -116,7 +120,7 @@ def map_film(film: Film) -> FilmedMap:
 
 def _pose(share: float) -> Array:
     """T_scene_camera (4, 4) after a share of the way."""
-    turn = np.pi + 2 * np.pi * share
+    turn = np.pi + ARC * np.sin(2 * np.pi * share)
     height = MIDDLE + SWING * np.cos(4 * np.pi * share)
     eye = [TARGET[0] + RADIUS * np.cos(turn), TARGET[1] + RADIUS * np.sin(turn), height]
     return look_at(np.array(eye), TARGET)
