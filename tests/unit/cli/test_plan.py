@@ -74,17 +74,6 @@ def test_the_base_is_taken_from_the_scene_beside_the_map_and_a_pose_is_reached(
     assert summary["margin_m"] == 0.01
 
 
-def test_the_margin_of_a_run_is_what_its_depth_leaves_outside_of_the_ellipsoids(run_folder: Path) -> None:
-    from splatbot.gaussians import GaussianModel
-    from splatbot.results.margin import own_margin
-
-    model = GaussianModel.load(run_folder / "map.ply")
-    T = np.eye(4)
-    T[:3, 3] = np.median(model.means.numpy(), axis=0)
-    thin, thick = (own_margin(run_folder, GaussianCollisionField(model, n), T) for n in (0.2, 3.0))
-    assert 0.0 <= thick < thin < 0.3
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -1,0 +1,46 @@
+"""`splatbot bench planning --run`: an arm in the map of a recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.bench.planning_runs import plan_in_run
+from splatbot.bench.results import Results
+from splatbot.cli import main
+from splatbot.errors import InputError
+from splatbot.workspace import Workspace
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of a small table."""
+    folder = tmp_path_factory.mktemp("run") / "table"
+    log = "synthetic:tabletop?frames=4&width=160&height=120"
+    assert main(["map", log, "--out", str(folder), "--quiet"]) == 0
+    return folder
+
+
+def test_problems_in_a_run_are_solved_certified_and_off_what_was_measured(recorded: Path, tmp_path: Path) -> None:
+    assert main(["bench", "planning", "--quick", "--run", str(recorded), "--out", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "planning-mapped.json").read_text())["rows"]
+    cases = sorted({row["case"] for row in rows})
+    assert len(cases) == 2
+    for case in cases:
+        found = {row["metric"]: row["value"] for row in rows if row["case"] == case}
+        assert found["solved"] == found["certified"] == found["problems found"] == 2
+        assert found["clearance promised beyond the margin, least"] >= 0
+        assert found["touch a measured point"] == 0 or "margin 0.0" in case
+
+
+def test_a_scene_without_a_place_to_work_at_is_named(recorded: Path) -> None:
+    file = recorded / "scene.yaml"
+    Workspace(T_world_base=np.eye(4)).save(file)
+    try:
+        with pytest.raises(InputError, match=r"scene\.yaml.*workspace"):
+            plan_in_run(Results({}), recorded, problems=1, budget_ms=10.0)
+    finally:
+        file.unlink()
