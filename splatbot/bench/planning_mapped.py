@@ -39,21 +39,42 @@ class Touches:
     seen: NDArray[np.bool_]
 
 
+def add_map(results: Results, mapped: FilmedMap) -> float:
+    """What the map is like; returns the margin [m] that it asks for itself."""
+    case = "mapped noisy log"
+    field = GaussianCollisionField(mapped.snapshot)
+    own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], REACH]).share(SHARE)
+    drift = mapped.drift()
+    results.add(case, "frames", float(len(drift)), "")
+    results.add(case, "lost", float(np.isnan(drift).sum()), f"of {len(drift)}")
+    results.add(case, "camera off, median", 1e3 * float(np.nanmedian(drift)), "mm")
+    results.add(case, "camera off, most", 1e3 * float(np.nanmax(drift)), "mm")
+    results.add(case, "Gaussians", float(len(field)), "")
+    results.add(case, f"surface error within {REACH:g} m, as its depth tells, {SHARE:.1%}", 1e3 * own, "mm")
+    return own
+
+
 def audit_mapped(
-    results: Results, mapped: FilmedMap, truth: Truth, wanted: Sequence[Problem], *, seeds: int, budget_ms: float
+    results: Results,
+    name: str,
+    mapped: FilmedMap,
+    truth: Truth,
+    wanted: Sequence[Problem],
+    own: float,
+    *,
+    seeds: int,
+    budget_ms: float,
 ) -> None:
-    """All problems with all seeds on the map, over margins from 0 to 2 cm and with the map's own.
+    """All problems with all seeds on the map, over margins from 0 to 2 cm and with the map's ``own`` [m].
 
     Costs are told beside those of margin 0, over the problems that both solved.
     """
     field = GaussianCollisionField(mapped.snapshot)
     base = mapped.T_map_scene
-    own = surface_error(field, mapped.views(), around=[*base[:3, 3], REACH]).share(SHARE)
-    _add_map(results, mapped, field, own)
     bare = RobotSpheres(panda())
     reference: Array | None = None
     for margin in sorted({*MARGINS, own}):
-        case = f"mapped noisy log, margin {1e3 * margin:.1f} mm" + (" (its own)" if margin == own else "")
+        case = f"{name}, margin {1e3 * margin:.1f} mm" + (" (its own)" if margin == own else "")
         planner = GaussianRRTStar(field, panda(), T_world_base=base, margin=margin)
         begin = time.perf_counter()
         runs = [
@@ -87,18 +108,6 @@ def touches(paths: Sequence[Array], arm: RobotSpheres, truth: Truth, film: Film)
             inside = centers[truth.scene.distance(centers) <= radii]
         seen.append(bool(film.seen(_closest(shapes, inside)).any()) if len(inside) else False)
     return Touches(np.array(rooms), np.array(seen, np.bool_))
-
-
-def _add_map(results: Results, mapped: FilmedMap, field: GaussianCollisionField, own: float) -> None:
-    """What the map is like: its size, its own idea of its error, and its true one."""
-    case = "mapped noisy log"
-    drift = mapped.drift()
-    results.add(case, "frames", float(len(drift)), "")
-    results.add(case, "lost", float(np.isnan(drift).sum()), f"of {len(drift)}")
-    results.add(case, "camera off, median", 1e3 * float(np.nanmedian(drift)), "mm")
-    results.add(case, "camera off, most", 1e3 * float(np.nanmax(drift)), "mm")
-    results.add(case, "Gaussians", float(len(field)), "")
-    results.add(case, f"surface error within {REACH:g} m, as its depth tells, {SHARE:.1%}", 1e3 * own, "mm")
 
 
 def _add_success(results: Results, case: str, runs: Sequence[PlanResult], mean_ms: float) -> None:

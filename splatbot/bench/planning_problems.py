@@ -25,15 +25,21 @@ class Problem:
 
 
 def problems(
-    robot: RobotModel, arm: RobotSpheres, field: GaussianCollisionField, truth: Truth, count: int, seed: int = 0
+    robot: RobotModel,
+    arm: RobotSpheres,
+    field: GaussianCollisionField,
+    truth: Truth,
+    count: int,
+    seed: int = 0,
+    room: float = ROOM,
 ) -> list[Problem]:
-    """``count`` pairs of free configurations between which the straight line in joint space collides."""
+    """``count`` pairs of configurations with ``room`` [m] between which the straight line in joint space collides."""
     rng = np.random.default_rng(seed)
     found: list[Problem] = []
     while len(found) < count:
         q = robot.random(20_000, rng)
         q = q[~arm.check(field, q).in_collision]
-        q = q[truth.rooms(arm, q) > ROOM]
+        q = q[truth.rooms(arm, q) > room]
         tool = robot.tcp(q)[:, :3, 3]
         above = tool[:, 2] > 0.0
         low = above & (tool[:, 2] < HAND) & (tool[:, 0] > 0.2) & (tool[:, 0] < 0.9) & (np.abs(tool[:, 1]) < 0.8)
