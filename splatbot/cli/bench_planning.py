@@ -77,6 +77,8 @@ def bench_planning(
 
 
 def _print(results: Results, folder: Path) -> None:
+    from dataclasses import replace
+
     from splatbot.cli.bench_tables import figure_table, metric_table, warn_if_busy, wide_console
 
     console = wide_console()
@@ -85,8 +87,9 @@ def _print(results: Results, folder: Path) -> None:
     warn_if_busy(console, machine)
     own = [row for row in results.rows if row.peer is None]
     if not any(row.case.startswith("budget") for row in own):
-        for case in dict.fromkeys(row.case.split(", margin")[0] for row in own):
-            console.print(metric_table(case, results.select(case)))
+        for name in dict.fromkeys(row.case.split(", margin")[0] for row in own):
+            group = [row for row in own if row.case.split(", margin")[0] == name]
+            console.print(metric_table(name, [replace(row, case=row.case.removeprefix(f"{name}, ")) for row in group]))
         console.print(f"written to {folder}")
         return
     console.print(metric_table("By time budget", [row for row in own if row.case.startswith("budget")]))
