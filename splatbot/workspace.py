@@ -22,7 +22,7 @@ _KEYS = ("T_world_base", "gravity", "support_plane", "workspace")
 _TRIALS = 400  # planes tried
 _THICK = 0.01  # [m] that a plane's points may be off it
 _UPRIGHT = 6  # power of the cosine of a plane's lean that its points are weighed by
-_AHEAD = 0.55  # [m] from a robot's base to what it works on
+AHEAD = 0.55  # [m] from a robot's base to what it works on
 _HEIGHT = 0.8  # [m] of the workspace over the plane
 
 
@@ -171,7 +171,7 @@ def _around(plane: Array, on: Array) -> Workspace:
     forward = forward / length if length > 1e-6 else np.linalg.svd(up[None])[2][1]
     T = np.eye(4)
     T[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
-    T[:3, 3] = middle - _AHEAD * forward
+    T[:3, 3] = middle - AHEAD * forward
     local = transform_points(np.linalg.inv(T), on)
     low, high = np.percentile(local, [1, 99], axis=0)
     box = np.array([[low[0], low[1], 0.0], [high[0], high[1], _HEIGHT]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from splatbot.bench.results import Results
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
+from splatbot.geometry import so3_exp
 from splatbot.logs import open_log
 from splatbot.planning import GaussianRRTStar, PlanResult
 from splatbot.protocols import Array
@@ -21,24 +23,28 @@ from splatbot.results.folder import RunFolder
 from splatbot.results.margin import own_margin
 from splatbot.robots.panda import panda
 from splatbot.tracking.prepare import valid_depth
-from splatbot.workspace import find_workspace, fit_workspace
+from splatbot.workspace import AHEAD, Workspace, find_workspace, fit_workspace
 
 _FRAMES = 40  # whose depth the paths are compared with, at least
 _EVERY = 5  # pixel of them
+_TURNS = (0, *(sign * angle for angle in range(30, 181, 30) for sign in (1, -1)))  # [deg]
+_TRIED, _FREE = 1000, 0.1  # configurations, and the share of them that must be free
+_BOX = ((0.2, -0.5, 0.0), (0.9, 0.5, 0.8))  # [m]
 _SPARSE = 8  # configurations of a path per one that is compared with depth: 1/32 rad
 
 
 def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float, seed: int = 0) -> None:
     """Seeded problems in a run's map, with margin 0 and with the map's own.
 
-    The base stands where the run's scene.yaml says, or where :func:`splatbot.workspace.fit_workspace` proposes.
+    The base stands where the run's scene.yaml says; without one, where :func:`splatbot.workspace.fit_workspace`
+    proposes, or as near to it around the same middle as leaves the arm free to move.
 
     Raises:
         InputError: there is no plane in the map, or its scene.yaml lacks the base or the workspace.
     """
     model = GaussianModel.load(run / "map.ply")
     field = GaussianCollisionField(model)
-    place = find_workspace(run) or fit_workspace(model)
+    place = find_workspace(run) or free_place(field, fit_workspace(model))
     if place.T_world_base is None or place.box is None:
         raise InputError(
             "is not known.",
@@ -57,6 +63,24 @@ def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float,
         runs = [planner.plan(p.start, p.goal, budget_ms=budget_ms, seed=k) for k, p in enumerate(wanted)]
         if runs:
             _add(results, case, runs, planner, measured)
+
+
+def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
+    """A proposed place (base known), turned about the middle of its surface until the arm can be in many postures.
+
+    A turned one has a box of its own: what lies in reach before the arm. None is: the place as it was.
+    """
+    T = place.T_world_base
+    assert T is not None
+    some = panda().random(_TRIED, np.random.default_rng(0))
+    for degrees in _TURNS:
+        turn = np.eye(4)
+        turn[:3, :3] = so3_exp([0.0, 0.0, np.radians(degrees)])
+        turn[:3, 3] = [AHEAD, 0.0, 0.0] - turn[:3, :3] @ [AHEAD, 0.0, 0.0]
+        arm = RobotSpheres(panda(), T_world_base=T @ turn)
+        if (~arm.check(field, some).in_collision).mean() > _FREE:
+            return place if degrees == 0 else replace(place, T_world_base=T @ turn, box=np.array(_BOX))
+    return place
 
 
 def _add(results: Results, case: str, runs: list[PlanResult], planner: GaussianRRTStar, measured: cKDTree) -> None:

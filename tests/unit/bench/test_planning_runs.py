@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.planning_runs import plan_in_run
+from splatbot.bench.planning_runs import free_place, plan_in_run
 from splatbot.bench.results import Results
 from splatbot.cli import main
+from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
-from splatbot.workspace import Workspace
+from splatbot.gaussians import GaussianModel
+from splatbot.workspace import AHEAD, Workspace
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +46,30 @@ def test_a_scene_without_a_place_to_work_at_is_named(recorded: Path) -> None:
             plan_in_run(Results({}), recorded, problems=1, budget_ms=10.0)
     finally:
         file.unlink()
+
+
+def test_a_base_that_stands_in_something_is_turned_about_the_middle_until_it_is_free() -> None:
+    place = Workspace(T_world_base=np.eye(4), box=np.array([[0.0, -1, 0], [1, 1, 1]]))
+    pile = _pile([0.0, 0.0, 0.3])
+    found = free_place(pile, place)
+    assert found.T_world_base is not None
+    assert found.box is not None
+    base, middle = found.T_world_base[:3, 3], np.array([AHEAD, 0.0, 0.0])
+    np.testing.assert_allclose(np.linalg.norm(base - middle), AHEAD, atol=1e-12)
+    np.testing.assert_allclose(found.T_world_base @ [AHEAD, 0, 0, 1], [*middle, 1], atol=1e-12)
+    assert np.linalg.norm(base) > 0.2
+    assert free_place(_pile([5.0, 5.0, 5.0]), place) is place
+
+
+def _pile(at: list[float]) -> GaussianCollisionField:
+    """Something of 20 cm where an arm's shoulder would be."""
+    points = np.asarray(at) + np.random.default_rng(0).uniform(-0.1, 0.1, (200, 3))
+    return GaussianCollisionField(
+        GaussianModel.from_activated(
+            means=points,
+            quats=np.tile([1.0, 0, 0, 0], (200, 1)),
+            scales=np.full((200, 3), 0.02),
+            opacities=np.full(200, 0.9),
+            colors=np.full((200, 3), 0.5),
+        )
+    )
