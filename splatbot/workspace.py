@@ -84,10 +84,12 @@ class Workspace:
             raise FormatError(f"holds {unknown}.", file=path, field="fields", hint=f"fields: {', '.join(_KEYS)}")
         try:
             return cls(
-                _pose(found, "T_world_base"),
-                *(_array(found.get(key), key) for key in _KEYS[1:4]),
-                _pose(found, "T_link_camera"),
-                found.get("camera_link", -1),
+                T_world_base=_pose(found, "T_world_base"),
+                gravity=_array(found.get("gravity"), "gravity"),
+                support_plane=_array(found.get("support_plane"), "support_plane"),
+                box=_array(found.get("workspace"), "workspace"),
+                T_link_camera=_pose(found, "T_link_camera"),
+                camera_link=found.get("camera_link", -1),
             )
         except InputError as error:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
