@@ -7,9 +7,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from splatbot.config import read_yaml
 from splatbot.errors import ConfigError
 from splatbot.sim.solids import Shape
 
@@ -253,14 +253,7 @@ def load_scene(name: str | Path) -> Scene:
             field="scene",
             hint=f"give a YAML file or one of {', '.join(scene_names())}",
         )
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror}).", file=path, hint="check the path") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"is not YAML: {error}.", file=path, hint="mend the line it names") from error
-    if not isinstance(values, dict):
-        raise ConfigError("is no mapping.", file=path, hint="begin with `name: ...`")
+    values = read_yaml(path)
     return make_scene({"name": path.stem, **values, "folder": path.parent}, file=path)
 
 

@@ -18,7 +18,7 @@ from splatbot.geometry import pose_from_quat, rotation_to_quat, transform_points
 Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
-_KEYS = ("T_world_base", "gravity", "support_plane", "workspace")
+_KEYS = ("T_world_base", "gravity", "support_plane", "workspace", "T_link_camera", "camera_link")
 _TRIALS = 400  # planes tried
 _THICK = 0.01  # [m] that a plane's points may be off it
 _UPRIGHT = 6  # power of the cosine of a plane's lean that its points are weighed by
@@ -35,6 +35,8 @@ class Workspace:
         gravity: (3,) unit vector downwards; None: not known.
         support_plane: (4,) = (n, d): the surface that things stand on is n · p + d = 0, n a unit vector upwards; None.
         box: (2, 3) corners of the space to work in [m], in the base's frame; None.
+        T_link_camera: (4, 4) where the camera is on the link that carries it; None: not known.
+        camera_link: that link; -1: the last one, 0: the base, for a camera that stands beside the robot.
 
     Raises:
         InputError: a value is of another shape, not finite, no rigid pose, no direction, or an empty box.
@@ -44,6 +46,8 @@ class Workspace:
     gravity: Array | None = None
     support_plane: Array | None = None
     box: Array | None = None
+    T_link_camera: Array | None = None
+    camera_link: int = -1
 
     def __post_init__(self) -> None:
         _check("T_world_base", self.T_world_base, (4, 4), "a pose")
@@ -55,9 +59,14 @@ class Workspace:
                 raise InputError("is no unit vector.", field=name, hint="divide it by its length")
         if self.box is not None and not (self.box[1] > self.box[0]).all():
             raise InputError("is empty.", field="workspace", hint="give low corners below high ones")
-        T = self.T_world_base
-        if T is not None and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
-            raise InputError("is no rigid pose.", field="T_world_base", hint="give a rotation and a translation")
+        _check("T_link_camera", self.T_link_camera, (4, 4), "a pose")
+        for name, T in (("T_world_base", self.T_world_base), ("T_link_camera", self.T_link_camera)):
+            if T is not None and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+                raise InputError("is no rigid pose.", field=name, hint="give a rotation and a translation")
+        if not isinstance(self.camera_link, int) or isinstance(self.camera_link, bool):
+            raise InputError(
+                f"is {self.camera_link!r}.", field="camera_link", hint="give a link's number, -1: the last"
+            )
 
     @classmethod
     def load(cls, path: str | Path) -> Workspace:
@@ -74,19 +83,27 @@ class Workspace:
             unknown = ", ".join(map(str, sorted(set(found) - set(_KEYS)))) if isinstance(found, dict) else "no mapping"
             raise FormatError(f"holds {unknown}.", file=path, field="fields", hint=f"fields: {', '.join(_KEYS)}")
         try:
-            return cls(_pose(found.get("T_world_base")), *(_array(found.get(key), key) for key in _KEYS[1:]))
+            return cls(
+                T_world_base=_pose(found, "T_world_base"),
+                gravity=_array(found.get("gravity"), "gravity"),
+                support_plane=_array(found.get("support_plane"), "support_plane"),
+                box=_array(found.get("workspace"), "workspace"),
+                T_link_camera=_pose(found, "T_link_camera"),
+                camera_link=found.get("camera_link", -1),
+            )
         except InputError as error:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
 
     def save(self, path: str | Path) -> None:
         """As YAML; what is not known is left out."""
         document: dict[str, Any] = {}
-        if self.T_world_base is not None:
-            quat = rotation_to_quat(self.T_world_base[:3, :3])
-            document["T_world_base"] = {
-                "translation": _plain(self.T_world_base[:3, 3]), "quaternion_wxyz": _plain(quat, 9)
-            }  # fmt: skip
-        for key, value in zip(_KEYS[1:], (self.gravity, self.support_plane, self.box), strict=True):
+        for key, T in (("T_world_base", self.T_world_base), ("T_link_camera", self.T_link_camera)):
+            if T is not None:
+                quat = rotation_to_quat(T[:3, :3])
+                document[key] = {"translation": _plain(T[:3, 3]), "quaternion_wxyz": _plain(quat, 9)}
+        if self.T_link_camera is not None:
+            document["camera_link"] = self.camera_link
+        for key, value in zip(_KEYS[1:4], (self.gravity, self.support_plane, self.box), strict=True):
             if value is not None:
                 document[key] = _plain(value, 9)
         with atomic_write(Path(path)) as file:
@@ -183,14 +200,15 @@ def _check(name: str, value: Array | None, shape: tuple[int, ...], what: str) ->
         raise InputError(f"is {value.shape}, or not finite.", field=name, hint=f"give {what}, {shape}")
 
 
-def _pose(value: Any) -> Array | None:
+def _pose(found: dict[str, Any], key: str) -> Array | None:
+    value = found.get(key)
     if value is None:
         return None
     if not isinstance(value, dict) or set(value) != {"translation", "quaternion_wxyz"}:
-        raise InputError("is no pose.", field="T_world_base", hint="give translation and quaternion_wxyz")
+        raise InputError("is no pose.", field=key, hint="give translation and quaternion_wxyz")
     translation, quat = _array(value["translation"], "translation"), _array(value["quaternion_wxyz"], "quaternion")
     if translation is None or quat is None or translation.shape != (3,) or quat.shape != (4,):
-        raise InputError("makes no sense.", field="T_world_base", hint="give 3 and 4 numbers")
+        raise InputError("makes no sense.", field=key, hint="give 3 and 4 numbers")
     try:
         return pose_from_quat(translation, quat)
     except ValueError as error:

@@ -34,6 +34,7 @@ def eval_run(
         ground_truth: TUM trajectory to compare with instead of the log's own.
         as_json: print JSON instead of a table.
     """
+    from splatbot.cli.robot_in_view import without_robot
     from splatbot.errors import FormatError
     from splatbot.logs import open_log
     from splatbot.results.folder import RunFolder
@@ -45,7 +46,7 @@ def eval_run(
     uri = log or source.get("uri")
     if uri is None:
         raise FormatError("does not say where the log is.", file=folder.metrics, field="log.uri", hint="give --log LOG")
-    recording = open_log(uri, camera=camera or source.get("camera"))
+    recording = without_robot(open_log(uri, camera=camera or source.get("camera")), source.get("robot"))
     reference = Trajectory.load(ground_truth) if ground_truth else None
     scores = rescore(folder, recording, reference)
     if as_json:

@@ -32,6 +32,7 @@ def map_log_command(
     save_every: Annotated[float, tyro.conf.arg(metavar="S")] = 30.0,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     localise: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     dump_config: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -49,6 +50,7 @@ def map_log_command(
         splatbot map "synthetic:tabletop?frames=40" --out runs/tabletop
         splatbot map --resume runs/desk
         splatbot map recordings/desk_again --localise runs/desk
+        splatbot map recordings/wrist --robot panda
         splatbot map --dump-config > mine.yaml
 
     Args:
@@ -68,6 +70,8 @@ def map_log_command(
             LOG only if the log has moved.
         localise: place the frames in the map of this run instead of building one; the first may be anywhere in it, and
             is not believed before the second agrees.
+        robot: leave this robot out of the frames: the log's joints.txt and the T_link_camera of its scene.yaml say
+            where it is in view.
         dump_config: print the configuration in force and leave.
         quiet: no progress and no summary, only errors.
     """
@@ -90,13 +94,15 @@ def map_log_command(
         raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
 
     from splatbot.cli.progress import progress_display
+    from splatbot.cli.robot_in_view import without_robot
     from splatbot.logs import open_log
     from splatbot.run import map_log
 
     saved = _saved_run(resume, localise)
     if resume is not None and saved is not None:
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
-    recording = open_log(log, camera=camera)
+        robot = robot or saved.place.robot
+    recording = without_robot(open_log(log, camera=camera), robot)
     folder = out if out is not None else Path("runs") / f"{_slug(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     with progress_display(quiet=quiet) as on_progress:
         result = map_log(
@@ -111,7 +117,7 @@ def map_log_command(
             save_every=save_every if save_every > 0 else None,
             resume=saved if resume is not None else None,
             localise=saved if localise is not None else None,
-            source={"camera": _lasting(camera) if camera else None},
+            source={"camera": _lasting(camera) if camera else None, "robot": robot},
         )
     if out is None:
         _link_latest(folder)

@@ -16,6 +16,7 @@ from splatbot.atomic import atomic_write
 from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import Log
+from splatbot.logs.joints import NAME as JOINTS
 from splatbot.trajectory import Trajectory
 
 Progress = Callable[[int], None]
@@ -31,7 +32,7 @@ def record(
     depth_scale: float = 5000.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics and poses; joints are not stored.
+    """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics, poses and, where told, joints.
 
     A frame is listed only once both of its images are on the disk, so what an interrupted recording leaves is a
     shorter log, not a broken one.
@@ -66,6 +67,9 @@ def record(
             elif frame.camera != camera:
                 raise LogError("the camera changed.", file=frame.source, field="camera", hint="record two logs")
             name = f"{number:06d}.png"
+            if frame.joints is not None:
+                with (out / JOINTS).open("a") as lines:
+                    lines.write(" ".join(repr(float(v)) for v in (frame.stamp, *frame.joints)) + "\n")
             _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
             _write_png(out / "depth" / name, _to_units(frame, depth_scale))
             # Depth first: a depth image without colour is harmless, the other way round is an error.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration, read_calibration
 from splatbot.logs.effects import read_account
 from splatbot.logs.index import Entry, associate, read_index
+from splatbot.logs.joints import find_joints
 from splatbot.logs.masks import find_masks
 from splatbot.logs.presets import PRESETS, find_calibration
 from splatbot.logs.rgbd import RgbdReader
@@ -41,6 +43,8 @@ class TumLog(LogBase):
     `mask.png` (for all frames) or `mask.txt` (lines `stamp path`, one mask for each frame) name pixels that may be used
     (white) and that must not be (black): the gripper in view, the robot's own arm.
 
+    `joints.txt` (lines `stamp q1 q2 ...`) tells the robot's joints, which are interpolated to each frame's stamp.
+
     Raises:
         LogError: a list is missing, empty or malformed, nothing can be associated, or `effects.json` is damaged.
         CameraError: there are no usable intrinsics.
@@ -61,6 +65,7 @@ class TumLog(LogBase):
         kept = [i for i in range(len(colors)) if i in pairs or missing == "error"]
         self._frames: list[tuple[Entry, Entry | None]] = [(colors[i], pairs.get(i)) for i in kept]
         self._masks = find_masks(self.folder)
+        self._joints = find_joints(self.folder)
         self._effects, blanks_depth = read_account(self.folder)
         self._reader = RgbdReader(self._calibration(camera), empty_depth=blanks_depth)
         self._report(len(colors), len(pairs))
@@ -98,7 +103,8 @@ class TumLog(LogBase):
         if depth is None:
             raise self._no_partner(color)
         mask = None if self._masks is None else self._masks.at(color.stamp)
-        return self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path, mask)
+        frame = self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path, mask)
+        return frame if self._joints is None else replace(frame, joints=self._joints.at(color.stamp))
 
     def _pair(self, colors: list[Entry]) -> dict[int, Entry]:
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))

@@ -128,7 +128,14 @@ def map_log(
 
         if save_every is not None and localise is None:
             checkpoint = Checkpoint(folder.path, save_every)
-            loop.saver = Saver(checkpoint, log, (source or {}).get("camera"), lambda: outcome().save_files(folder))
+            opened = source or {}
+            loop.saver = Saver(
+                checkpoint,
+                log,
+                opened.get("camera"),
+                lambda: outcome().save_files(folder),
+                robot=opened.get("robot"),
+            )
         loop.run(interrupts)
         if not loop.slam.results:
             raise loop.crash or loop.error or loop.first_bad or KeyboardInterrupt()

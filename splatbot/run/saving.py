@@ -20,16 +20,22 @@ class Saver:
 
     Args:
         checkpoint: where to, and how often.
-        log: that is read; ``camera`` is what it was opened with.
+        log: that is read; ``camera`` is what it was opened with, ``robot`` what was left out of its frames.
         write_results: writes the files that other programs read (map, trajectory, figures so far).
     """
 
     def __init__(
-        self, checkpoint: Checkpoint, log: Log, camera: str | None, write_results: Callable[[], None] | None = None
+        self,
+        checkpoint: Checkpoint,
+        log: Log,
+        camera: str | None,
+        write_results: Callable[[], None] | None = None,
+        *,
+        robot: str | None = None,
     ) -> None:
         self.checkpoint = checkpoint
         self.write_results = write_results
-        self._log, self._camera = log, camera
+        self._log, self._camera, self._robot = log, camera, robot
         self._last: Frame | None = None
         self._index: int | None = None
 
@@ -54,6 +60,7 @@ class Saver:
             last_index=self._index,
             last_stamp=float(self._last.stamp),
             last_checksum=checksum(self._last),
+            robot=self._robot,
         )
         self.checkpoint.save(loop.slam, loop_state(loop), place, loop.config)
 

@@ -52,6 +52,21 @@ def test_the_table_is_found_before_a_larger_wall_and_the_base_stands_on_it() -> 
     np.testing.assert_allclose(found.box[:, 1], [-0.6, 0.6], atol=0.05)
 
 
+def test_the_cameras_mount_is_kept_and_a_bad_one_refused(tmp_path: Path) -> None:
+    T = np.eye(4)
+    T[:3, 3] = [0.05, 0.0, 0.1]
+    Workspace(T_link_camera=T, camera_link=6).save(tmp_path / "scene.yaml")
+    again = Workspace.load(tmp_path / "scene.yaml")
+    assert again.camera_link == 6
+    assert again.T_link_camera is not None
+    np.testing.assert_allclose(again.T_link_camera, T, atol=1e-9)
+    (tmp_path / "scene.yaml").write_text("camera_link: hand\n")
+    with pytest.raises(FormatError, match="camera_link"):
+        Workspace.load(tmp_path / "scene.yaml")
+    with pytest.raises(InputError, match="T_link_camera"):
+        Workspace(T_link_camera=np.ones((4, 4)))
+
+
 def test_what_is_written_is_read_and_found_beside_a_map(tmp_path: Path) -> None:
     found = fit_workspace(_table()[0])
     found.save(tmp_path / "scene.yaml")

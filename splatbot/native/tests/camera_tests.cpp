@@ -115,7 +115,7 @@ Render render(const Cloud& cloud, const View& view) {
   r.quats.resize(g.quats.size());
   r.scales.resize(g.scales.size());
   r.opacities.resize(g.count);
-  r.camera.resize(16);
+  r.camera.resize(kCameraSums);
   const std::vector<float> grad(4 * pixels, 0.5F);
   Gradients out{};
   out.means = r.means;

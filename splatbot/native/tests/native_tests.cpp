@@ -167,7 +167,7 @@ Result render(const Scene& scene, const View& view, const RasterOptions& options
   r.covars.resize(g.covars.size());
   r.means2d.resize(2 * g.count);
   r.absolute2d.resize(2 * g.count);
-  r.camera.resize(16);
+  r.camera.resize(kCameraSums);
   r.contributions.resize(g.count);
   r.background.resize(background.size());
   const Gradients out = {.means = r.means,
@@ -268,7 +268,7 @@ std::vector<float> render_surfels(const Scene& scene, const View& view, const Su
   const auto distorted = some.first(distortion.size());
   std::vector<float> means(g.means.size()), quats(g.quats.size()), scales(g.scales.size()), opacities(g.count);
   std::vector<float> channels(g.colors.size()), means2d(2 * g.count);
-  std::vector<double> camera(16), behind(background.size());
+  std::vector<double> camera(kCameraSums), behind(background.size());
   const Gradients out = {.means = means,
                          .quats = quats,
                          .scales = scales,

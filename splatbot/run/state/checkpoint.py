@@ -35,6 +35,7 @@ class LogPlace:
 
     Args:
         name, uri, frames: of the log; ``camera`` is what it was opened with beside the uri.
+        robot: that was left out of its frames.
         next_index: the first frame that has not been processed.
         last_index, last_stamp, last_checksum: the last frame that has: position, time [s] and CRC-32 of its pixels;
             None before there is one.
@@ -48,6 +49,7 @@ class LogPlace:
     last_index: int | None = None
     last_stamp: float | None = None
     last_checksum: int | None = None
+    robot: str | None = None
 
     def check(self, log: Log) -> None:
         """That ``log`` begins with the frames that were processed.

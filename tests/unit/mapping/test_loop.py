@@ -116,7 +116,8 @@ def circuit(enabled: bool) -> tuple[Slam, list[Array]]:
     log = open_log(uri)
     truth = log.ground_truth
     assert truth is not None
-    slam = Slam(small_config(loops__enabled=enabled, mapping__refine_iterations=1))
+    # Depth as much believed as its noise allows: the wrong focal length then drifts by 11 cm, more than a loop is off.
+    slam = Slam(small_config(loops__enabled=enabled, mapping__refine_iterations=1, tracking__depth_doubt=1.0))
     for frame in log:
         camera = replace(frame.camera, fx=1.03 * frame.camera.fx, fy=1.03 * frame.camera.fy)
         slam.process(replace(frame, camera=camera))
@@ -138,7 +139,7 @@ def gap(slam: Slam, truth: list[Array]) -> float:
 def test_a_circuit_that_drifts_closes_without_a_gap() -> None:
     (open_, truth), (closed, _) = circuit(False), circuit(True)
     assert all(r.verdict == "ok" for r in closed.results)
-    assert gap(open_, truth) > 0.03
+    assert gap(open_, truth) > 0.08
     assert gap(closed, truth) < 0.6 * gap(open_, truth)
 
 

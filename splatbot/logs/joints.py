@@ -1,0 +1,68 @@
+"""Joint positions of a log in TUM layout: `joints.txt`, lines `stamp q1 q2 ...` [s, rad]."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import LogError
+
+NAME = "joints.txt"
+MAX_GAP = 0.1  # [s] between two lines, or to the first or the last: beyond, the joints are not known
+
+
+class JointRecord:
+    """Joint positions over time, linear in between.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        LogError: it cannot be read, a line is malformed or of another length, or the stamps do not increase.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise LogError(f"cannot be read ({error}).", file=path, hint="write lines `stamp q1 q2 ...`") from error
+        rows: list[list[float]] = []
+        for number, line in enumerate(lines, 1):
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
+            try:
+                row = [float(word) for word in line.split()]
+            except ValueError:
+                row = []
+            if len(row) < 2 or not np.isfinite(row).all() or (rows and len(row) != len(rows[0])):
+                what = f"{line.strip()[:80]!r} is malformed"
+                hint = "write `stamp q1 q2 ...` (seconds, radians), as many joints in every line"
+                raise LogError(f"{what}.", file=path, field=f"line {number}", hint=hint)
+            if rows and row[0] <= rows[-1][0]:
+                what = f"stamp {row[0]:.6f} is not after {rows[-1][0]:.6f}"
+                raise LogError(f"{what}.", file=path, field=f"line {number}", hint="sort the lines and drop doubles")
+            rows.append(row)
+        if not rows:
+            raise LogError("is empty.", file=path, hint="write lines `stamp q1 q2 ...`, or remove it")
+        table = np.array(rows)
+        self._stamps, self._joints = table[:, 0], table[:, 1:]
+
+    def at(self, stamp: float) -> NDArray[np.float64] | None:
+        """Positions (J,) [rad] then; None where the lines on either side, or the only one, are more than 0.1 s away."""
+        after = int(np.searchsorted(self._stamps, stamp))
+        beside = self._stamps[max(after - 1, 0) : after + 1]
+        apart = np.abs(beside - stamp)
+        if apart.min() > 0 and apart.max() > MAX_GAP:
+            return None
+        return np.array([np.interp(stamp, self._stamps, column) for column in self._joints.T])
+
+
+def find_joints(folder: Path) -> JointRecord | None:
+    """What a log's folder says of joints, None if nothing.
+
+    Raises:
+        LogError: `joints.txt` is damaged.
+    """
+    return JointRecord(folder / NAME) if (folder / NAME).exists() else None
