@@ -155,6 +155,9 @@ class MappingConfig(_Section):
     rate_opacities: float = Field(default=2e-2, ge=0, description="learning rate of opacity logits")
     rate_sh: float = Field(default=2e-2, ge=0, description="learning rate of colour coefficients")
     min_opacity: float = Field(default=0.05, ge=0, le=1, description="fainter Gaussians are pruned")
+    max_pixels: float = Field(
+        default=3.0, gt=0, description="standard deviations grow no larger in refinement [px of the keyframe]"
+    )
     max_scale: float = Field(default=0.5, gt=0, description="larger Gaussians are pruned [m]")
     look_every: float = Field(
         default=0.2, ge=0, description="between keyframes, a frame as old as this tells what has gone or moves [s]"

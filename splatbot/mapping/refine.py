@@ -97,7 +97,19 @@ class Refiner:
         visible = torch.zeros(len(model), dtype=torch.bool)
         visible[meta["visible_ids"][0]] = True
         self.adam.step(model, dict(zip(PARAMETERS, grads, strict=True)), visible)
+        self._keep_small(model, keyframe, visible)
         return float(loss.detach())
+
+    def _keep_small(self, model: GaussianModel, keyframe: Keyframe, visible: Tensor) -> None:
+        """No Gaussian in view grows beyond ``config.max_pixels`` of this keyframe, or it would reach into free space.
+
+        Colour alone does not see that: a needle before a plain wall changes no pixel.
+        """
+        rows = visible.nonzero()[:, 0]
+        viewmat = keyframe.viewmat[0].to(torch.float32)
+        z = model.means[rows] @ viewmat[2, :3] + viewmat[2, 3]
+        limit = (self.config.max_pixels * z / float(keyframe.K[0, 0, 0])).log()
+        model.log_scales[rows] = torch.minimum(model.log_scales[rows], limit[:, None])
 
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         observed = keyframe.rgb.float() / 255.0
