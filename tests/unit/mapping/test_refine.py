@@ -174,3 +174,17 @@ def test_the_latest_keyframe_comes_first_then_half_the_draws_from_the_window(
 def test_draws_are_those_of_the_seed(monkeypatch: pytest.MonkeyPatch, make_keyframe: MakeKeyframe) -> None:
     first, again, other = (drawn(30, monkeypatch, make_keyframe, seed) for seed in (1, 1, 2))
     assert first == again != other
+
+
+def test_a_needle_in_view_shrinks_to_what_a_keyframe_can_tell(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe()
+    model = disturbed(keyframe)
+    model.log_scales[:50, 0] = np.log(0.4)
+    refiner = refiner_for(model, mapping__max_pixels=3.0)
+    refiner.step(model, keyframe)
+    rows = torch.arange(50)
+    z = (keyframe.viewmat[0, 2, :3].double() @ model.means[rows].double().T) + keyframe.viewmat[0, 2, 3].double()
+    limit = 3.0 * z / float(keyframe.K[0, 0, 0])
+    seen = z > 0.1
+    assert int(seen.sum()) > 20
+    assert (model.scales[rows].double().amax(1)[seen] <= 1.001 * limit[seen]).all()
