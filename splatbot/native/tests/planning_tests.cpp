@@ -160,7 +160,7 @@ void check_others() {
     end = planner.run(start, std::span<const double>(goals).first(2), {.seconds = 60.0});
     done = true;
   });
-  while (planner.best().waypoints.empty() || planner.best().cost == 0.0) {
+  for (BestPath best = planner.best(); best.waypoints.empty() || best.cost == 0.0; best = planner.best()) {
     std::this_thread::yield();
   }
   while (!done) {
