@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 
@@ -60,13 +60,10 @@ class Slam:
 
     Args:
         config: None takes the defaults.
-        self_mask: called with each frame first, leaves the robot out of it
-            (:class:`splatbot.mapping.selfmask.SelfMask`).
     """
 
-    def __init__(self, config: Config | None = None, *, self_mask: Callable[[Frame], Frame] | None = None) -> None:
+    def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self._self_mask = self_mask
         self.results: list[FrameResult] = []
         self._tracker = Tracker(self.config.tracking)
         mapper = Mapper(self.config)
@@ -86,8 +83,6 @@ class Slam:
         """
         self._check_size(frame)
         start = time.perf_counter()
-        if self._self_mask is not None:
-            frame = self._self_mask(frame)
         if self._growing and self._mapper.has_loop:
             self._close_loops()
         prepared = prepare(frame, self.config.tracking)

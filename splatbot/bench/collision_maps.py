@@ -18,9 +18,9 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
-from splatbot.logs import open_log
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
+from splatbot.robots.in_view import reopen_log
 
 
 def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observations: int = 1) -> None:
@@ -31,7 +31,7 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     """
     folder = RunFolder(run)
     name = str(folder.load_metrics()["log"]["name"])
-    log = open_log(str(folder.load_metrics()["log"]["uri"]))
+    log = reopen_log(folder)
     poses = folder.load_poses()
     field = GaussianCollisionField(GaussianModel.load(run / "map.ply"), min_observations=min_observations)
     rng = np.random.default_rng(0)

@@ -16,13 +16,14 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import so3_exp
-from splatbot.logs import open_log
+from splatbot.logs import Log
 from splatbot.planning import GaussianRRTStar, PlanResult
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import own_margin
+from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
-from splatbot.tracking.prepare import valid_depth
+from splatbot.tracking.prepare import usable_depth
 from splatbot.workspace import AHEAD, Workspace, find_workspace, fit_workspace
 
 _FRAMES = 40  # whose depth the paths are compared with, at least
@@ -52,8 +53,10 @@ def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float,
             field="T_world_base, workspace",
             hint="give both, or no scene.yaml",
         )
-    own = own_margin(run, field, place.T_world_base)
-    measured = cKDTree(_measured(run))
+    folder = RunFolder(run)
+    log = reopen_log(folder)
+    own = own_margin(run, log, field, place.T_world_base)
+    measured = cKDTree(_measured(folder, log))
     for margin in (0.0, own):
         case = f"{run.resolve().name}, margin {1e3 * margin:.1f} mm"
         planner = GaussianRRTStar(field, panda(), T_world_base=place.T_world_base, margin=margin)
@@ -102,17 +105,14 @@ def _add(results: Results, case: str, runs: list[PlanResult], planner: GaussianR
     results.add(case, "deepest", 1e3 * max(0.0, -float(rooms.min())), "mm")
 
 
-def _measured(run: Path) -> Array:
+def _measured(folder: RunFolder, log: Log) -> Array:
     """Points (P, 3) [m, world] of the log's depth, without what mapping leaves out."""
-    folder = RunFolder(run)
-    source = folder.load_metrics()["log"]
-    log = open_log(str(source["uri"]), camera=source.get("camera"))
-    bounds = folder.load_config().tracking
+    config = folder.load_config().tracking
     poses = sorted(folder.load_poses().items())
     parts = []
     for index, T in poses[:: max(1, len(poses) // _FRAMES)]:
         frame = log[index]
-        depth = valid_depth(frame.depth, bounds.min_depth, bounds.max_depth)
+        depth = usable_depth(frame, config)
         v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
         parts.append(lifted(depth, u[::_EVERY], v[::_EVERY], frame.camera, T))
     return np.concatenate(parts)

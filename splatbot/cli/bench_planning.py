@@ -79,12 +79,10 @@ def bench_planning(
 def _print(results: Results, folder: Path) -> None:
     from dataclasses import replace
 
-    from splatbot.cli.bench_tables import figure_table, metric_table, warn_if_busy, wide_console
+    from splatbot.cli.bench_tables import figure_table, metric_table, tell_machine, wide_console
 
     console = wide_console()
-    machine = results.machine
-    console.print(f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}")
-    warn_if_busy(console, machine)
+    tell_machine(console, results.machine)
     own = [row for row in results.rows if row.peer is None]
     if not any(row.case.startswith("budget") for row in own):
         for name in dict.fromkeys(row.case.split(", margin")[0] for row in own):
@@ -97,5 +95,5 @@ def _print(results: Results, folder: Path) -> None:
     for title, part in (("Peers", False), ("Costs as parts of a peer's", True)):
         rows = [row for row in results.rows if row.peer is not None and ("against" in row.case) == part]
         if rows:
-            console.print(figure_table(title, rows, list(dict.fromkeys(row.metric for row in rows))))
+            console.print(figure_table(title, rows))
     console.print(f"written to {folder}")

@@ -67,15 +67,14 @@ def bench_raster(
 
 
 def _print(results: Results, folder: Path) -> None:
-    from splatbot.cli.bench_tables import figure_table, figure_text, warn_if_busy, wide_console
+    from splatbot.cli.bench_tables import figure_table, figure_text, tell_machine, wide_console
 
     console = wide_console()
     machine = results.machine
     peaks = ", ".join(
         f"{gflops:.0f} GFLOP/s on {n}" for n, gflops in machine["fma_peak_gflops"][machine["isa"]].items()
     )
-    console.print(f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}, peak {peaks} threads")
-    warn_if_busy(console, machine)
+    tell_machine(console, machine, f"peak {peaks} threads")
     prefixes = ("effect", "sweep", "growth")
     own = [r for r in results.rows if r.peer is None and not r.case.startswith(prefixes)]
     console.print(figure_table("Milliseconds, least (median)", own, (*_TIMES, "state memory", "peak memory", *_SHARES)))

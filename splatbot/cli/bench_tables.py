@@ -24,19 +24,23 @@ def say_progress(text: str) -> None:
     Console(stderr=True).print(f"[dim]{text} ...[/dim]", highlight=False)
 
 
-def warn_if_busy(console: Console, machine: Mapping[str, Any]) -> None:
-    """Other programs took time: say what that makes of the figures."""
+def tell_machine(console: Console, machine: Mapping[str, Any], *more: str) -> None:
+    """What measured, and whether other programs took its time, which makes the figures upper bounds."""
+    console.print(", ".join((f"{machine['cpu']}, {machine['cpus']} CPUs, kernels {machine['isa']}", *more)))
     load = machine["load_1min"]
     if load is not None and load > 0.5:
         console.print(f"[yellow]the machine was busy (load {load}): times are upper bounds[/yellow]")
 
 
-def figure_table(title: str, rows: Iterable[Row], metrics: Sequence[str]) -> Table:
-    """A line per case and peer, a column per metric; a case without figures shows why."""
+def figure_table(title: str, rows: Iterable[Row], metrics: Sequence[str] | None = None) -> Table:
+    """A line per case and peer, a column per metric, of all if none are named; a case without figures shows why."""
     table = Table(title=title)
     grouped: dict[str, dict[str, Row]] = {}
+    found_metrics: dict[str, None] = {}
     for row in rows:
         grouped.setdefault(f"{row.case}: {row.peer}" if row.peer else row.case, {})[row.metric] = row
+        found_metrics[row.metric] = None
+    metrics = list(found_metrics) if metrics is None else metrics
     table.add_column("case")
     for metric in metrics:
         table.add_column(metric, justify="right")

@@ -87,12 +87,10 @@ def _print(results: Results, folder: Path) -> None:
     from splatbot.bench.stress import AFTER, DEGRADED, RECOVERY, SILENT, STRESS, VIEWS, WORST
     from splatbot.bench.stress import LOST as STRESS_LOST
     from splatbot.bench.tracking import ATE, FRAME_MS, LOST, PERCENTILES, RESIDENT, RPE, RPE_ROT, TRACKED
-    from splatbot.cli.bench_tables import figure_table, warn_if_busy, wide_console
+    from splatbot.cli.bench_tables import figure_table, tell_machine, wide_console
 
     console = wide_console()
-    machine = results.machine
-    console.print(f"{machine['cpu']}, {machine['cpus']} CPUs")
-    warn_if_busy(console, machine)
+    tell_machine(console, results.machine)
     metrics = (ATE, RPE, RPE_ROT, TRACKED, LOST, *(f"p{p}" for p in PERCENTILES), FRAME_MS, RESIDENT)
     hard = results.select(STRESS)
     if not hard or len(results.rows) > len(hard):

@@ -38,7 +38,7 @@ def bench_twin(
         raise InputError(f"is {paths}.", field="--paths", hint="give a positive number")
 
     from splatbot.bench.twin import TwinPlan, run_twin
-    from splatbot.cli.bench_tables import say_progress, warn_if_busy, wide_console
+    from splatbot.cli.bench_tables import say_progress, tell_machine, wide_console
 
     folder = out if out is not None else Path("runs") / "bench-twin"
     plan = TwinPlan(paths=paths, scenes=tuple(scene), say=say_progress)
@@ -48,8 +48,7 @@ def bench_twin(
     if json is not None:
         results.write_json(json)
     console = wide_console()
-    console.print(f"{results.machine['cpu']}, {results.machine['cpus']} CPUs")
-    warn_if_busy(console, results.machine)
+    tell_machine(console, results.machine)
     from rich.table import Table
 
     table = Table("case", "metric", "figure", "")

@@ -34,19 +34,13 @@ def eval_run(
         ground_truth: TUM trajectory to compare with instead of the log's own.
         as_json: print JSON instead of a table.
     """
-    from splatbot.cli.robot_in_view import without_robot
-    from splatbot.errors import FormatError
-    from splatbot.logs import open_log
     from splatbot.results.folder import RunFolder
     from splatbot.results.rescore import rescore
+    from splatbot.robots.in_view import reopen_log
     from splatbot.trajectory import Trajectory
 
     folder = RunFolder(run)
-    source = folder.load_metrics().get("log", {})
-    uri = log or source.get("uri")
-    if uri is None:
-        raise FormatError("does not say where the log is.", file=folder.metrics, field="log.uri", hint="give --log LOG")
-    recording = without_robot(open_log(uri, camera=camera or source.get("camera")), source.get("robot"))
+    recording = reopen_log(folder, uri=log, camera=camera)
     reference = Trajectory.load(ground_truth) if ground_truth else None
     scores = rescore(folder, recording, reference)
     if as_json:

@@ -94,8 +94,8 @@ def map_log_command(
         raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
 
     from splatbot.cli.progress import progress_display
-    from splatbot.cli.robot_in_view import without_robot
     from splatbot.logs import open_log
+    from splatbot.robots.in_view import without_robot
     from splatbot.run import map_log
 
     saved = _saved_run(resume, localise)

@@ -154,9 +154,11 @@ def _margin(text: str, map_: Path, field: GaussianCollisionField, T_world_base: 
     if text == "auto":
         if not map_.is_dir():
             raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
+        from splatbot.results.folder import RunFolder
         from splatbot.results.margin import own_margin
+        from splatbot.robots.in_view import reopen_log
 
-        return own_margin(map_, field, T_world_base)
+        return own_margin(map_, reopen_log(RunFolder(map_)), field, T_world_base)
     try:
         value = float(text)
     except ValueError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
@@ -17,7 +17,7 @@ from splatbot.config import MappingConfig, TrackingConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse
 from splatbot.tracking.features import Features
-from splatbot.tracking.prepare import Level, halve, valid_depth
+from splatbot.tracking.prepare import Level, halve, usable_depth
 from splatbot.tracking.reference import Reference
 from splatbot.tracking.tracker import pose_distance
 
@@ -69,13 +69,7 @@ def mapping_images(
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.float32]]:
     """Camera, colour and valid, unmasked depth of a frame, halved until at most ``config.max_width`` wide."""
     rgb = frame.rgb
-    level = Level(
-        np.zeros(frame.depth.shape, np.float32),
-        valid_depth(frame.depth, tracking.min_depth, tracking.max_depth),
-        frame.camera,
-    )
-    if frame.mask is not None:
-        level = replace(level, depth=np.where(frame.mask, level.depth, np.float32(0)))
+    level = Level(np.zeros(frame.depth.shape, np.float32), usable_depth(frame, tracking), frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
         width, height = level.camera.width, level.camera.height

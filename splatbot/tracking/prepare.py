@@ -53,9 +53,7 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
     """
     started = time.perf_counter()
-    depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
-    if frame.mask is not None:
-        depth = np.where(frame.mask, depth, np.float32(0))
+    depth = usable_depth(frame, config)
     gray = np.multiply(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.float32(1 / 255), dtype=np.float32)
     if frame.mask is not None:
         gray[~frame.mask] = np.nan  # and so is all that is smoothed or interpolated from it
@@ -76,6 +74,12 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
     a single missing row of neighbours, as registration leaves in upsampled depth, does not count against a pixel.
     """
     return np.asarray(_native.valid_depth(np.ascontiguousarray(depth), near, far, _FLYING_STEP))
+
+
+def usable_depth(frame: Frame, config: TrackingConfig) -> Image:
+    """Depth (H, W) [m] of a frame with 0 where it is implausible (see :func:`valid_depth`) or masked."""
+    depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
+    return depth if frame.mask is None else np.where(frame.mask, depth, np.float32(0))
 
 
 def valid_share(prepared: PreparedFrame) -> float:

@@ -15,6 +15,7 @@ from splatbot.mapping.selfmask import SelfMask
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.robots.shapes import Capsule
+from splatbot.run.masked import MaskedLog
 from splatbot.sim.wrist import T_PANDA_CAMERA, WristLog
 from splatbot.slam import Slam
 
@@ -70,8 +71,8 @@ def test_the_hand_is_in_view_and_every_pixel_of_it_is_left_out(log: WristLog) ->
 def test_with_the_mask_no_gaussian_is_near_the_swept_arm_and_without_it_many_are(log: WristLog) -> None:
     near, blocked = [], []
     for self_mask in (SelfMask(panda(), T_PANDA_CAMERA), None):
-        slam = Slam(self_mask=self_mask)
-        for frame in log:
+        slam = Slam()
+        for frame in log if self_mask is None else MaskedLog(log, self_mask):
             slam.process(frame)
         slam.finish()
         model = slam.snapshot().model

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,12 @@ import pytest
 from splatbot.cli import main
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import FormatError
+from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
+from splatbot.results.folder import RunFolder
 from splatbot.results.margin import own_margin
+from splatbot.robots.in_view import reopen_log
+from splatbot.run.masked import MaskedLog
 from splatbot.workspace import fit_workspace
 
 
@@ -21,11 +27,34 @@ def test_the_margin_of_a_run_is_what_its_depth_leaves_outside_of_the_ellipsoids(
     model = GaussianModel.load(run / "map.ply")
     T = fit_workspace(model).T_world_base
     assert T is not None
-    thin, thick = (own_margin(run, GaussianCollisionField(model, n), T) for n in (0.2, 3.0))
+    thin, thick = (own_margin(run, reopen_log(RunFolder(run)), GaussianCollisionField(model, n), T) for n in (0.2, 3.0))
     assert 0.0 <= thick < thin < 0.3
 
 
 def test_a_folder_that_holds_no_run_has_none(tmp_path: Path) -> None:
     field = GaussianCollisionField(GaussianModel.empty())
     with pytest.raises(FormatError, match="metrics"):
-        own_margin(tmp_path, field, np.eye(4))
+        own_margin(tmp_path, reopen_log(RunFolder(tmp_path)), field, np.eye(4))
+
+
+def test_what_the_run_left_out_does_not_count(tmp_path: Path) -> None:
+    run = tmp_path / "table"
+    assert main(["map", "synthetic:tabletop?frames=2&width=160&height=120", "--out", str(run), "--quiet"]) == 0
+    model = GaussianModel.load(run / "map.ply")
+    T = fit_workspace(model).T_world_base
+    assert T is not None
+    field, log = GaussianCollisionField(model), reopen_log(RunFolder(run))
+
+    def with_an_arm_in_view(frame: Frame, *, masked: bool) -> Frame:
+        depth, mask = frame.depth.copy(), np.ones(frame.depth.shape, np.bool_)
+        depth[:, 60:100] *= 0.75
+        mask[:, 60:100] = not masked
+        return replace(frame, depth=depth, mask=mask)
+
+    clean = own_margin(run, log, field, T)
+    seen, left_out = (
+        own_margin(run, MaskedLog(log, partial(with_an_arm_in_view, masked=masked)), field, T)
+        for masked in (False, True)
+    )
+    assert seen > clean + 0.02
+    assert left_out <= clean + 0.005
