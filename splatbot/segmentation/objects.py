@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -13,12 +14,15 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
-from splatbot.segmentation.plane import Support, find_support
+from splatbot.segmentation.plane import NEAR, Support, find_support
 
 OPAQUE = 0.3  # fainter Gaussians are no surface
-ABOVE = 0.008  # [m] over the support: lower is its own noise
+LOWEST, ABOVE = 0.002, 0.008  # [m] over the support; lower is its own noise, of which it has this much at most
 FEWEST, LARGEST = 40, 0.35  # Gaussians of an object; [m] across
 _APART = 0.012  # [m] between Gaussians of one object
+_LEDGE = 0.15  # [m] across, from where on a thing may be a support of others
+_SHARE, _PLANES, _DEEPEST = 0.1, 3, 2  # of its points that its plane has; planes looked at; supports on supports
+_OVER = 0.7  # of what is above a plane that is over it
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +118,11 @@ def segment(
     if not len(used):
         raise InputError(f"has nothing between {low.tolist()} and {high.tolist()}.", field="map", hint="see scene.yaml")
     support = find_support(points[used])
+    above = used if support is None else used[_above(support, points[used])]
     labels = np.full(len(model), -1, np.int32)
     objects: list[MapObject] = []
-    above = used if support is None else used[(support.height(points[used]) > ABOVE) & ~support.inside]
     colors = model.colors.detach().double().numpy()
-    for part in clusters(points[above], apart=apart):
-        rows = above[part]
-        if len(rows) < FEWEST or np.ptp(points[rows], axis=0).max() > LARGEST:
-            continue
+    for rows in sorted(_things(points, above, apart, _DEEPEST), key=lambda rows: (-len(rows), int(rows[0]))):
         labels[rows] = len(objects)
         objects.append(_described(len(objects), rows, points[rows], colors[rows], T))
     named = _with_names(tuple(objects), points, T, names)
@@ -129,9 +130,57 @@ def segment(
     return MapScene(model, T, support, named, labels, version)
 
 
-def _described(number: int, rows: NDArray[np.int64], points: Array, colors: Array, T: Array) -> MapObject:
-    import cv2
+def _things(points: Array, used: NDArray[np.int64], apart: float, deeper: int) -> list[NDArray[np.int64]]:
+    """Rows of what hangs together; what stands together on a support of its own, as a stool or a shelf, apart."""
+    found: list[NDArray[np.int64]] = []
+    for part in clusters(points[used], apart=apart):
+        rows = used[part]
+        wide = float(np.ptp(points[rows], axis=0).max())
+        ledge = _ledge(points[rows]) if deeper and wide > _LEDGE else None
+        if ledge is not None:
+            on = rows[_above(ledge, points[rows])]
+            found += _things(points, on, apart, deeper - 1)
+        elif len(rows) >= FEWEST and wide <= LARGEST:
+            found.append(rows)
+    return found
 
+
+def _ledge(points: Array) -> Support | None:
+    """The lowest of the level planes that hold most points (P, 3), if something stands on it."""
+    left, best = np.ones(len(points), np.bool_), None
+    for _ in range(_PLANES):
+        plane = find_support(points[left])
+        if plane is None or plane.inside.sum() < _SHARE * len(points):
+            break
+        if (best is None or plane.offset < best.offset) and _holds(plane, points):
+            best = plane
+        left[np.flatnonzero(left)[plane.inside]] = False
+    if best is None:
+        return None
+    away = best.height(points)
+    return Support(best.normal, best.offset, best.error, np.abs(away) < NEAR)
+
+
+def _holds(plane: Support, points: Array) -> bool:
+    """Whether what is above the plane is over it, as on a shelf, and not beside it."""
+    away = plane.height(points)
+    on = points[away > ABOVE][:, :2].astype(np.float32)
+    if len(on) < FEWEST:
+        return False
+    hull = cv2.convexHull(points[np.abs(away) < NEAR][:, :2].astype(np.float32))
+    some = on[:: max(1, len(on) // 200)]
+    over = [cv2.pointPolygonTest(hull, (float(x), float(y)), False) >= 0 for x, y in some]
+    return float(np.mean(over)) > _OVER
+
+
+def _above(support: Support, points: Array) -> NDArray[np.bool_]:
+    """Which points (P, 3) are higher than the support's own noise."""
+    height = support.height(points)
+    noise = 1.48 * float(np.median(np.abs(height[np.abs(height) < NEAR])))
+    return np.asarray(height > np.clip(3.0 * noise, LOWEST, ABOVE))
+
+
+def _described(number: int, rows: NDArray[np.int64], points: Array, colors: Array, T: Array) -> MapObject:
     (x, y), sides, _ = cv2.minAreaRect(points[:, :2].astype(np.float32))
     low, high = np.percentile(points[:, 2], [1, 99])
     size = np.array([max(sides), min(sides), high - low])
