@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
+from splatbot.segmentation.parts import cut_at_steps, nearest_of, region
 from splatbot.segmentation.plane import NEAR, Support, find_support
 
 OPAQUE = 0.3  # fainter Gaussians are no surface
@@ -21,7 +23,9 @@ LOWEST, ABOVE = 0.002, 0.008  # [m] over the support; lower is its own noise, of
 FEWEST, LARGEST = 40, 0.35  # Gaussians of an object; [m] across
 _APART = 0.012  # [m] between Gaussians of one object
 _LEDGE = 0.15  # [m] across, from where on a thing may be a support of others
-_SHARE, _PLANES, _DEEPEST = 0.1, 3, 2  # of its points that its plane has; planes looked at; supports on supports
+_SHARE, _PLANES, _DEEPEST = 0.1, 3, 1  # of its points that its plane has; planes looked at; supports on supports
+_AROUND = 0.05  # [m] around what was pointed at that is looked at
+_STRAY = 0.006  # [m] around an object within which faint Gaussians are its own
 _OVER = 0.7  # of what is above a plane that is over it
 
 
@@ -81,7 +85,33 @@ class MapScene:
     support: Support | None
     objects: tuple[MapObject, ...]
     labels: NDArray[np.int32] = field(repr=False)
+    names: tuple[NamedPlace, ...] = ()
     map_version: int = 0
+
+    @cached_property
+    def points(self) -> Array:
+        """Means (N, 3) of all Gaussians in the base's frame [m]."""
+        return transform_points(inverse(self.T_world_base), self.model.means.detach().double().numpy())
+
+    @cached_property
+    def solid(self) -> NDArray[np.bool_]:
+        """Which Gaussians (N,) are a surface that was measured."""
+        return solid_rows(self.model)
+
+    def grown(self, seeds: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Rows of the faces that lie mostly in the rows ``seeds``, without the support; for what is no object."""
+        if not len(seeds):
+            return seeds
+        near = self.points[seeds]
+        low, high = np.percentile(near, [2, 98], axis=0) + np.array([[-_AROUND], [_AROUND]])
+        rows = np.flatnonzero(self.solid & ((self.points > low) & (self.points < high)).all(axis=1))
+        if self.support is not None:
+            rows = rows[above_support(self.support, self.points[rows])]
+        if len(rows) < FEWEST:
+            return rows[:0]
+        chosen = np.zeros(len(self.model), np.bool_)
+        chosen[seeds] = True
+        return rows[region(self.points[rows], chosen[rows], fewest=FEWEST)]
 
     @property
     def up(self) -> Array:
@@ -89,11 +119,17 @@ class MapScene:
         return np.asarray(self.T_world_base[:3, 2])
 
 
+def solid_rows(model: GaussianModel) -> NDArray[np.bool_]:
+    """Which Gaussians (N,) are a surface that was measured."""
+    return np.asarray((model.opacities.detach().numpy() >= OPAQUE) & (model.observations.numpy() >= 1))
+
+
 def segment(
     source: GaussianModel | Snapshot,
     T_world_base: ArrayLike,
     *,
     box: ArrayLike | None = None,
+    plane: ArrayLike | None = None,
     names: Sequence[NamedPlace] = (),
     apart: float = _APART,
 ) -> MapScene:
@@ -103,6 +139,7 @@ def segment(
         source: the map.
         T_world_base: (4, 4), a frame whose z is up.
         box: (2, 3) corners of the space that is looked at, in that frame [m]; None: 2 m around.
+        plane: (4,) = (n, d), the support where it is known: n · p + d = 0 [world]; None: it is looked for.
         names: what a scene file calls things.
         apart: objects have more than this between their Gaussians [m].
 
@@ -113,21 +150,31 @@ def segment(
     T = np.asarray(T_world_base, dtype=np.float64)
     points = transform_points(inverse(T), model.means.detach().double().numpy())
     low, high = np.array([[-2.0] * 3, [2.0] * 3]) if box is None else np.asarray(box, dtype=np.float64)
-    solid = (model.opacities.detach().numpy() >= OPAQUE) & (model.observations.numpy() >= 1)
-    used = np.flatnonzero(solid & ((points >= low - ABOVE) & (points <= high)).all(axis=1))
+    used = np.flatnonzero(solid_rows(model) & ((points >= low - ABOVE) & (points <= high)).all(axis=1))
     if not len(used):
         raise InputError(f"has nothing between {low.tolist()} and {high.tolist()}.", field="map", hint="see scene.yaml")
-    support = find_support(points[used])
-    above = used if support is None else used[_above(support, points[used])]
+    support = find_support(points[used]) if plane is None else _known(plane, T, points[used])
+    above = used if support is None else used[above_support(support, points[used])]
     labels = np.full(len(model), -1, np.int32)
     objects: list[MapObject] = []
     colors = model.colors.detach().double().numpy()
     for rows in sorted(_things(points, above, apart, _DEEPEST), key=lambda rows: (-len(rows), int(rows[0]))):
         labels[rows] = len(objects)
         objects.append(_described(len(objects), rows, points[rows], colors[rows], T))
+    objects = _with_faint(objects, labels, points, used)
     named = _with_names(tuple(objects), points, T, names)
     version = source.map_version if isinstance(source, Snapshot) else 0
-    return MapScene(model, T, support, named, labels, version)
+    return MapScene(model, T, support, named, labels, tuple(names), version)
+
+
+def _known(plane: ArrayLike, T_world_base: Array, points: Array) -> Support:
+    """A plane of the world in the base's frame."""
+    values = np.asarray(plane, dtype=np.float64)
+    normal = T_world_base[:3, :3].T @ values[:3]
+    offset = -float(values[3] + values[:3] @ T_world_base[:3, 3])
+    away = points @ normal - offset
+    inside = np.abs(away) < NEAR
+    return Support(normal, offset, float(np.sqrt(np.mean(away[inside] ** 2))) if inside.any() else 0.0, inside)
 
 
 def _things(points: Array, used: NDArray[np.int64], apart: float, deeper: int) -> list[NDArray[np.int64]]:
@@ -138,10 +185,10 @@ def _things(points: Array, used: NDArray[np.int64], apart: float, deeper: int) -
         wide = float(np.ptp(points[rows], axis=0).max())
         ledge = _ledge(points[rows]) if deeper and wide > _LEDGE else None
         if ledge is not None:
-            on = rows[_above(ledge, points[rows])]
+            on = rows[above_support(ledge, points[rows])]
             found += _things(points, on, apart, deeper - 1)
         elif len(rows) >= FEWEST and wide <= LARGEST:
-            found.append(rows)
+            found += [rows[some] for some in cut_at_steps(points[rows], fewest=FEWEST)]
     return found
 
 
@@ -173,11 +220,29 @@ def _holds(plane: Support, points: Array) -> bool:
     return float(np.mean(over)) > _OVER
 
 
-def _above(support: Support, points: Array) -> NDArray[np.bool_]:
+def above_support(support: Support, points: Array) -> NDArray[np.bool_]:
     """Which points (P, 3) are higher than the support's own noise."""
     height = support.height(points)
     noise = 1.48 * float(np.median(np.abs(height[np.abs(height) < NEAR])))
     return np.asarray(height > np.clip(3.0 * noise, LOWEST, ABOVE))
+
+
+def _with_faint(
+    objects: list[MapObject], labels: NDArray[np.int32], points: Array, used: NDArray[np.int64]
+) -> list[MapObject]:
+    """Objects with the faint and stray Gaussians that lie within 6 mm of them: they are no obstacles of their own."""
+    if not objects:
+        return objects
+    own = np.flatnonzero(labels >= 0)
+    low, high = points[own].min(axis=0) - _STRAY, points[own].max(axis=0) + _STRAY
+    solid = np.zeros(len(points), np.bool_)
+    solid[used] = True
+    faint = np.flatnonzero(~solid & ((points > low) & (points < high)).all(axis=1))
+    if len(faint):
+        nearest, square = nearest_of(points[own], points[faint])
+        near = square < _STRAY**2
+        labels[faint[near]] = labels[own[nearest[near]]]
+    return [replace(o, rows=np.flatnonzero(labels == o.number)) for o in objects]
 
 
 def _described(number: int, rows: NDArray[np.int64], points: Array, colors: Array, T: Array) -> MapObject:
@@ -198,6 +263,5 @@ def _with_names(
         away = [float(np.linalg.norm(points[o.rows] - at, axis=1).min()) for o in objects]
         if away and min(away) < 0.05:
             k = int(np.argmin(away))
-            o = objects[k]
-            found[k] = MapObject(o.number, o.rows, o.center, o.size, o.color, place.name, place.aliases)
+            found[k] = replace(objects[k], name=place.name, aliases=place.aliases)
     return tuple(found)
