@@ -11,10 +11,9 @@ from splatbot.grasping.antipodal import Pairs
 from splatbot.grasping.surface import Surface
 from splatbot.protocols import Array, HandShape
 
-FLUSH = 0.004  # [m] that anything under the pads may stand out beyond the contact
+FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
 SLACK = 0.005  # [m] between each pad and the target as the hand comes
 OPENINGS = 0.005  # [m] that openings are rounded up to
-_SIGMA = 2.0  # standard deviations at which a Gaussian of the target is solid
 _CHUNK, _SAMPLE = 256, 250  # hands at once; points for a first look
 _TOUCH = 0.003  # [m] between a pad and what it presses
 _LOOK = 0.03  # [m] of room beyond which more is no better
@@ -98,7 +97,9 @@ def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: floa
     return free
 
 
-def beside_target(hands: Hands, pairs: Pairs, surface: Surface, hand: HandShape, *, retreat: float) -> Hands:
+def beside_target(
+    hands: Hands, pairs: Pairs, surface: Surface, hand: HandShape, *, retreat: float, n_sigma: float
+) -> Hands:
     """The hands with their opening, and their room to the target on a straight way of ``retreat`` [m].
 
     Each Gaussian is the box around its ellipsoid along the hand's axes, which is no smaller. Under the pads it asks for
@@ -106,8 +107,7 @@ def beside_target(hands: Hands, pairs: Pairs, surface: Surface, hand: HandShape,
     """
     center = surface.center
     p, n = (surface.points - center).astype(np.float32), surface.normals.astype(np.float32)
-    flat, wide = (_SIGMA * surface.thickness).astype(np.float32), (_SIGMA * surface.spread).astype(np.float32)
-    wide = np.minimum(wide, 0.01)
+    flat, wide = (n_sigma * surface.thickness).astype(np.float32), (n_sigma * surface.spread).astype(np.float32)
     out = [np.empty(len(hands)) for _ in range(4)]
     half = (pairs.width[hands.pair] / 2).astype(np.float32)
     for k in range(0, len(hands), _CHUNK):

@@ -80,7 +80,7 @@ class GraspSampler:
         make_reach: gives, for the map without the target and the whole map, who says whether the arm gets there; by
             default :class:`splatbot.grasping.reach.ArmReach`.
         observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known; None: nowhere is.
-        n_sigma: where the surface of a Gaussian is for collisions.
+        n_sigma: where the surface of a Gaussian is; less than for planning, as the hand has to come near.
         margin: room to keep from the map [m].
 
     Raises:
@@ -95,7 +95,7 @@ class GraspSampler:
         hand_only: bool = False,
         make_reach: MakeReach | None = None,
         observers: Array | None = None,
-        n_sigma: float = 2.0,
+        n_sigma: float = 1.0,
         margin: float = 0.0,
     ) -> None:
         if observers is not None and observers.shape != (len(scene.model), 3):
@@ -194,7 +194,9 @@ class _Search:
         """Those that the target lets come, with their scores but for the map."""
         hands = self._promising(hands)
         if len(hands):
-            hands = beside_target(hands, self.pairs, self.surface, self.s.hand, retreat=self.o.pregrasp)
+            hands = beside_target(
+                hands, self.pairs, self.surface, self.s.hand, retreat=self.o.pregrasp, n_sigma=self.s.n_sigma
+            )
         uneven = hands.stands_out > FLUSH
         free = ~uneven & (hands.room > 0.0)
         self.log.drop("hands have something that stands out under a pad", uneven.sum())

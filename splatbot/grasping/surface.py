@@ -16,12 +16,15 @@ from splatbot.segmentation import MapScene
 
 MOST = 2500  # points that are looked at
 _SMOOTH = 0.006  # [m] over which normals are averaged
+_LONELY = 0.25  # of the usual crowd around a point; those with less are strays
 _CELL = 0.002  # [m] of the picture of a face
 _DISC = 0.004  # [m] that a Gaussian covers of it at most
 _STEP = 0.006  # [m] from where on a difference in height is an edge
 _FACING, _TURNED = 0.7, 0.1  # cosines between a direction and the normals of what faces it, and of what it still sees
+_TURNED_AWAY = 0.7  # below it a normal is of another face
 _FEW = 20  # points that are no face
-_BEHIND = 0.04  # [m] that sides reach behind a face that does not stand on anything
+_BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
+_SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
 _SEEN = 0.006  # [m] around seen points of a side within which none is added
 _ROWS = 0.003  # [m] between added points
 
@@ -77,11 +80,10 @@ def target_surface(
         outward = np.where(known[:, None], observers[chosen] - points, outward)
     normals = shortest_axes(model).detach().double().numpy()
     normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
-    normals = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
-    seen = Surface(
-        points, normals, scales[:, 0], scales[:, 2], np.ones(len(points), np.bool_), _doubts(model, scales), center
-    )
-    return _completed(scene, seen)
+    normals, kept = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
+    doubt = _doubts(model, scales)
+    columns = (x[kept] for x in (points, normals, scales[:, 0], scales[:, 2], np.ones(len(points), np.bool_), doubt))
+    return _completed(scene, Surface(*columns, center))
 
 
 def _index(rows: NDArray[np.int64]):  # type: ignore[no-untyped-def]
@@ -106,33 +108,33 @@ def _middle(scene: MapScene, points: Array) -> Array:
     return transform_points(scene.T_world_base, (low + high) / 2)
 
 
-def _smoothed(points: Array, normals: Array, flatness: Array) -> Array:
-    """Normals averaged with those of neighbours on the same side; round Gaussians have little to say."""
+def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Normals averaged with those of neighbours on the same side, and which points are no strays (M,).
+
+    Round Gaussians have little to say.
+    """
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
     weight = np.maximum(square[:, None] + square[None] - 2 * (p @ p.T), 0.0)
     np.exp(weight * (-0.5 / _SMOOTH**2), out=weight)
+    crowd = weight.sum(axis=1)
     weight *= n @ n.T > 0.3
     weight *= np.maximum(flatness, 0.05).astype(np.float32)
     mean = (weight @ n).astype(np.float64)
-    return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    return mean, np.asarray(crowd > _LONELY * np.median(crowd))
 
 
 def _completed(scene: MapScene, seen: Surface) -> Surface:
     """With the sides that go down from its top to the support, and back from the face that was seen in front."""
     up = scene.up
     parts = [_sides(seen, up, _floor(scene, seen, up))]
-    level = np.abs(seen.normals @ up) < 0.5
-    if level.sum() > 0.2 * len(seen):
-        front = seen.normals[level].mean(axis=0)
-        front -= (front @ up) * up
-        if np.linalg.norm(front) > 0.3:  # seen from one side alone
-            front /= np.linalg.norm(front)
-            facing = seen.points[seen.normals @ front > _FACING] @ front
-            if len(facing) > _FEW:
-                parts.append(_sides(seen, front, float(np.percentile(facing, 95)) - _BEHIND))
+    for face in _faces(seen.normals, up):
+        parts.append(_sides(seen, face, _back(seen, face, up), closed=True))
     points, normals = (np.concatenate([part[k] for part in parts]) for k in range(2))
-    n = len(points)
+    thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
+    thin = thin[:: 1 + len(thin) // MOST]
+    points, normals, n = points[thin], normals[thin], len(thin)
     if n == 0:
         return seen
     wide = np.full(n, _ROWS / 2)
@@ -147,6 +149,25 @@ def _completed(scene: MapScene, seen: Surface) -> Surface:
     )
 
 
+def _faces(normals: Array, up: Array) -> list[Array]:
+    """Level directions that many normals (M, 3) have, 45 degrees apart, unless the opposite side was seen as well."""
+    left = normals[np.abs(normals @ up) < 0.5]
+    left = left - np.outer(left @ up, up)
+    left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
+    few = max(_FEW, 0.05 * len(normals))
+    found: list[Array] = []
+    while len(left) >= few and len(found) < 4:
+        close = left @ left[:: max(1, len(left) // 100)].T > 0.9
+        best = int(close.sum(axis=0).argmax())
+        if close[:, best].sum() < few:
+            break
+        face = left[close[:, best]].mean(axis=0)
+        face /= np.linalg.norm(face)
+        found.append(face)
+        left = left[left @ face < _TURNED_AWAY]
+    return [face for face in found if not any(face @ other < -_FACING for other in found)]
+
+
 def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
     """Height along ``up`` [m, world] where the target stands."""
     low = float(np.percentile(seen.points @ up, 1))
@@ -157,8 +178,21 @@ def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
     return low - under if 0.0 <= under < 0.03 else low - 0.01
 
 
-def _sides(seen: Surface, direction: Array, floor: float) -> tuple[Array, Array]:
-    """Points and normals (K, 3) of the sides behind the edges of what faces ``direction``, where none was seen."""
+def _back(seen: Surface, face: Array, up: Array) -> float:
+    """Where along ``face`` [m, world] the target ends behind: as deep as other sides show, or as it is narrow."""
+    along = seen.points @ face
+    near = float(np.percentile(along[seen.normals @ face > _FACING], 95))
+    shown = near - float(np.percentile(along, 2))
+    across = seen.points @ np.stack([up, np.cross(up, face)], axis=1)
+    narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
+    return near - (shown if shown > _SHOWN else min(narrow, 2 * _BEHIND))
+
+
+def _sides(seen: Surface, direction: Array, floor: float, *, closed: bool = False) -> tuple[Array, Array]:
+    """Points and normals (K, 3) of the sides behind the edges of what faces ``direction``, where none was seen.
+
+    ``closed``: and of the back, at ``floor``.
+    """
     none = np.zeros((0, 3)), np.zeros((0, 3))
     facing = seen.normals @ direction > _TURNED
     if facing.sum() < _FEW:
@@ -179,6 +213,11 @@ def _sides(seen: Surface, direction: Array, floor: float) -> tuple[Array, Array]
     plane = low + (at + 0.5) * _CELL + out * (_CELL / 2)
     points = np.c_[np.repeat(plane, count, axis=0), np.concatenate(rows)] @ across
     normals = np.repeat(np.c_[out, np.zeros(len(out))] @ across, count, axis=0)
+    if closed:
+        cells = np.argwhere(np.isfinite(heights) & (heights > floor + _STEP) & ~np.isfinite(below))[::2]
+        back = np.c_[low + (cells + 0.5) * _CELL, np.full(len(cells), floor)] @ across
+        points = np.concatenate([points, back])
+        normals = np.concatenate([normals, np.tile(-direction, (len(back), 1))])
     new = _far_from(points, seen.points[seen.normals @ direction < _FACING])
     return points[new], normals[new]
 

@@ -16,7 +16,7 @@ _PARALLEL = 0.8  # cosine between normals of one face
 _STEP = 0.006  # [m] along their normal that neighbours of one face are apart at most
 _MEET = 5  # pairs of neighbours of two faces that meet
 _MOSTLY = 0.5  # share of a face that is pointed at
-_LEAST = 0.04  # share of the points that a part must have to be a thing of its own
+_LEAST = 0.02  # share of the points that a part must have to be a thing of its own
 
 
 @dataclass(frozen=True, eq=False)
