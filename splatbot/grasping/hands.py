@@ -12,7 +12,7 @@ from splatbot.grasping.surface import Surface
 from splatbot.protocols import Array, HandShape
 
 FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
-SLACK = 0.005  # [m] between each pad and the target as the hand comes
+SLACK = 0.003  # [m] between each pad and the target as the hand comes
 OPENINGS = 0.005  # [m] that openings are rounded up to
 _CHUNK, _SAMPLE = 256, 250  # hands at once; points for a first look
 _TOUCH = 0.003  # [m] between a pad and what it presses
@@ -106,19 +106,18 @@ def beside_target(
     a wider opening; beside a finger, behind its tip, or where the palm is, it is in the way.
     """
     center = surface.center
-    p, n = (surface.points - center).astype(np.float32), surface.normals.astype(np.float32)
-    flat, wide = (n_sigma * surface.thickness).astype(np.float32), (n_sigma * surface.spread).astype(np.float32)
+    p = (surface.points - center).astype(np.float32)
+    axes = [np.ascontiguousarray((n_sigma * surface.half[:, :, i]).astype(np.float32).T) for i in range(3)]
     out = [np.empty(len(hands)) for _ in range(4)]
     half = (pairs.width[hands.pair] / 2).astype(np.float32)
     for k in range(0, len(hands), _CHUNK):
         T = hands.T[k : k + _CHUNK]
-        axes, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - center).astype(np.float32)
+        R, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - center).astype(np.float32)
         local, reach = [], []
         for i in range(3):
-            u = np.ascontiguousarray(axes[:, :, i])
+            u = np.ascontiguousarray(R[:, :, i])
             local.append(u @ p.T - np.einsum("ij,ij->i", u, at)[:, None])
-            c = (u @ n.T) ** 2
-            reach.append(np.sqrt(c * flat**2 + (1 - c) * wide**2))
+            reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)))
         for into, values in zip(out, _measured(local, reach, half[k : k + _CHUNK, None], hand, retreat), strict=True):
             into[k : k + _CHUNK] = values
     opening, room, stands_out, held = out

@@ -21,7 +21,7 @@ from splatbot.grasping.affordance import (
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapScene
-from splatbot.segmentation.objects import FEWEST, LARGEST, above_support
+from splatbot.segmentation.objects import FEWEST, LARGEST
 from splatbot.segmentation.parts import find_faces
 
 NEAR = 0.02  # [m] around a point within which an object's Gaussian must be
@@ -103,8 +103,7 @@ def _face_at(scene: MapScene, point: Array) -> NDArray[np.int64]:
     """The Gaussians around a point, if they are a face of their own, as that of a book in a shelf."""
     local = transform_points(inverse(scene.T_world_base), point)
     rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < LARGEST / 2).all(axis=1))
-    if scene.support is not None:
-        rows = rows[above_support(scene.support, scene.points[rows])]
+    rows = rows[scene.labels[rows] >= -1]
     if len(rows) < FEWEST:
         return rows[:0]
     faces = find_faces(scene.points[rows], fewest=FEWEST)

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, place_hands
+from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ArmReach, Reach, hand_of
 from splatbot.grasping.score import arm_terms, best_apart, hand_terms, totals
@@ -81,6 +83,8 @@ class GraspSampler:
             default :class:`splatbot.grasping.reach.ArmReach`.
         observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known; None: nowhere is.
         n_sigma: where the surface of a Gaussian is; less than for planning, as the hand has to come near.
+        min_observations: Gaussians that fewer keyframes support are air; see
+            :class:`splatbot.collision.GaussianCollisionField`.
         margin: room to keep from the map [m].
 
     Raises:
@@ -96,6 +100,7 @@ class GraspSampler:
         make_reach: MakeReach | None = None,
         observers: Array | None = None,
         n_sigma: float = 1.0,
+        min_observations: int = 1,
         margin: float = 0.0,
     ) -> None:
         if observers is not None and observers.shape != (len(scene.model), 3):
@@ -105,7 +110,8 @@ class GraspSampler:
         self.scene, self.robot, self.observers = scene, robot, observers
         self.hand = hand_of(robot)
         self.margin, self.n_sigma = margin, n_sigma
-        self.field = GaussianCollisionField(scene.model, n_sigma)
+        self.min_observations = min_observations
+        self.field = self.collision_field(scene.model)
         self._make_reach = None if hand_only else make_reach or self._arm_reach
 
     def sample(self, target: Target, options: GraspOptions | None = None) -> GraspResult:
@@ -117,6 +123,10 @@ class GraspSampler:
         if not len(target.rows):
             raise InputError("has no Gaussians.", field=target.label, hint="name another target")
         return _Search(self, target, options or GraspOptions()).run()
+
+    def collision_field(self, model: GaussianModel) -> GaussianCollisionField:
+        """A part of the map as the hand and the arm avoid it."""
+        return GaussianCollisionField(model, self.n_sigma, min_observations=self.min_observations)
 
     def reach(self, around: GaussianCollisionField) -> Reach | None:
         """Who says whether the arm gets there in the map without the target; None: nobody is asked."""
@@ -300,13 +310,9 @@ class _Search:
 
     def _split(self) -> tuple[GaussianCollisionField, GaussianCollisionField]:
         """The map without the target, and the target alone."""
-        model = self.s.scene.model
-        own = torch.zeros(len(model), dtype=torch.bool)
-        own[torch.from_numpy(self.target.rows)] = True
-        return (
-            GaussianCollisionField(model.select(~own), self.s.n_sigma),
-            GaussianCollisionField(model.select(own), self.s.n_sigma),
-        )
+        own = self.s.scene.model.select(torch.from_numpy(self.target.rows))
+        around = around_target(self.s.scene, self.target.rows)
+        return self.s.collision_field(around), self.s.collision_field(own)
 
     def _notes(self, found: PairSearch) -> tuple[str, ...]:
         notes = []

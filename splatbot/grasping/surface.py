@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
-from splatbot.gaussians.shape import shortest_axes
+from splatbot.gaussians.shape import rotations, shortest_axes
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation import MapScene
+from splatbot.segmentation.parts import nearest_of
 
 MOST = 2500  # points that are looked at
 _SMOOTH = 0.006  # [m] over which normals are averaged
 _LONELY = 0.25  # of the usual crowd around a point; those with less are strays
 _CELL = 0.002  # [m] of the picture of a face
-_DISC = 0.004  # [m] that a Gaussian covers of it at most
+_DISC, _OVERHANG = 0.004, 0.5  # [m] that a Gaussian covers of it at most; standard deviations
 _STEP = 0.006  # [m] from where on a difference in height is an edge
 _FACING, _TURNED = 0.7, 0.1  # cosines between a direction and the normals of what faces it, and of what it still sees
 _TURNED_AWAY = 0.7  # below it a normal is of another face
@@ -36,8 +37,8 @@ class Surface:
     Args:
         points: (M, 3) [m, world].
         normals: (M, 3) unit, outwards.
-        thickness: (M,) standard deviation along the normal [m]; 0 of what is implied.
-        spread: (M,) largest standard deviation across it [m].
+        half: (M, 3, 3) principal axes as columns, each as long as its standard deviation [m]; 0 of what is implied.
+        spread: (M,) the largest of them [m]; of what is implied, half of the distance between its points.
         seen: (M,) whether it was measured; the others are implied.
         doubt: (M,) standard deviation of where the point is along its normal [m].
         center: (3,) middle of its box [m, world].
@@ -45,7 +46,7 @@ class Surface:
 
     points: Array
     normals: Array
-    thickness: Array
+    half: Array
     spread: Array
     seen: NDArray[np.bool_]
     doubt: Array
@@ -82,7 +83,8 @@ def target_surface(
     normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
     normals, kept = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
     doubt = _doubts(model, scales)
-    columns = (x[kept] for x in (points, normals, scales[:, 0], scales[:, 2], np.ones(len(points), np.bool_), doubt))
+    half = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
+    columns = (x[kept] for x in (points, normals, half, scales[:, 2], np.ones(len(points), np.bool_), doubt))
     return _completed(scene, Surface(*columns, center))
 
 
@@ -102,9 +104,9 @@ def _middle(scene: MapScene, points: Array) -> Array:
     """Half way between the highest point and what the target stands on."""
     local = transform_points(inverse(scene.T_world_base), points)
     low, high = np.percentile(local, [1, 99], axis=0)
-    if scene.support is not None and (low[2] + high[2]) / 2 > scene.support.offset:
-        gap = float(np.median(scene.support.height(local)) - np.ptp(local[:, 2]))
-        low[2] -= np.clip(gap, 0.0, 0.03)
+    support = scene.under(local)
+    if support is not None:
+        low[2] -= np.clip(float(np.percentile(support.height(local), 1)), 0.0, 0.03)
     return transform_points(scene.T_world_base, (low + high) / 2)
 
 
@@ -141,7 +143,7 @@ def _completed(scene: MapScene, seen: Surface) -> Surface:
     return Surface(
         np.concatenate([seen.points, points]),
         np.concatenate([seen.normals, normals]),
-        np.concatenate([seen.thickness, np.zeros(n)]),
+        np.concatenate([seen.half, np.zeros((n, 3, 3))]),
         np.concatenate([seen.spread, wide]),
         np.concatenate([seen.seen, np.zeros(n, np.bool_)]),
         np.concatenate([seen.doubt, wide]),
@@ -171,10 +173,11 @@ def _faces(normals: Array, up: Array) -> list[Array]:
 def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
     """Height along ``up`` [m, world] where the target stands."""
     low = float(np.percentile(seen.points @ up, 1))
-    if scene.support is None:
-        return low - _BEHIND
     local = transform_points(inverse(scene.T_world_base), seen.points)
-    under = float(scene.support.height(local).min())
+    support = scene.under(local)
+    if support is None:
+        return low - _BEHIND
+    under = float(np.percentile(support.height(local), 1))
     return low - under if 0.0 <= under < 0.03 else low - 0.01
 
 
@@ -218,7 +221,7 @@ def _sides(seen: Surface, direction: Array, floor: float, *, closed: bool = Fals
         back = np.c_[low + (cells + 0.5) * _CELL, np.full(len(cells), floor)] @ across
         points = np.concatenate([points, back])
         normals = np.concatenate([normals, np.tile(-direction, (len(back), 1))])
-    new = _far_from(points, seen.points[seen.normals @ direction < _FACING])
+    new = _unseen(points, normals, seen)
     return points[new], normals[new]
 
 
@@ -245,7 +248,7 @@ def _picture(
     if not len(flat):
         return picture, low
     at = np.floor((flat[:, :2] - low) / _CELL).astype(int)
-    reach = np.full(len(flat), _DISC) if spread is None else np.minimum(spread, _DISC)
+    reach = np.full(len(flat), _DISC) if spread is None else np.minimum(_OVERHANG * spread, _DISC)
     radius = int(_DISC / _CELL)
     for i in range(-radius, radius + 1):
         for j in range(-radius, radius + 1):
@@ -285,12 +288,13 @@ def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
     return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)
 
 
-def _far_from(points: Array, others: Array) -> NDArray[np.bool_]:
-    """Whether each of points (P, 3) has none of the others within 6 mm."""
-    if not len(others) or not len(points):
-        return np.ones(len(points), np.bool_)
-    size = _SEEN
-    near: set[tuple[int, ...]] = set()
-    for offset in np.ndindex(3, 3, 3):
-        near.update(map(tuple, (np.floor(others / size).astype(int) + offset - 1).tolist()))
-    return np.array([tuple(cell) not in near for cell in np.floor(points / size).astype(int).tolist()])
+def _unseen(points: Array, normals: Array, seen: Surface) -> NDArray[np.bool_]:
+    """Whether nothing that was seen within 6 mm of each of points (P, 3) faces the same way (P,)."""
+    new = np.ones(len(points), np.bool_)
+    for way in (*np.eye(3), *-np.eye(3)):
+        asked, known = normals @ way > 0.5, seen.normals @ way > 0.3
+        if asked.any() and known.any():
+            nearest, square = nearest_of(seen.points[known], points[asked])
+            alike = np.einsum("ij,ij->i", seen.normals[known][nearest], normals[asked]) > 0.5
+            new[np.flatnonzero(asked)[alike & (square < _SEEN**2)]] = False
+    return new

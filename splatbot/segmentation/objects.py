@@ -76,7 +76,8 @@ class MapScene:
         T_world_base: (4, 4), a frame whose z is up; the robot's base, where there is one.
         support: in that frame; None: there is no level plane.
         objects: on it.
-        labels: (N,) int32 of the map's Gaussians: the number of its object, -1 for none.
+        labels: (N,) int32 of the map's Gaussians: the number of its object, -1 for none, -2 - k: of the k-th support.
+        supports: the support, and further ones that stand on it or beside it, as the seat of a stool.
         map_version: of the map.
     """
 
@@ -85,6 +86,7 @@ class MapScene:
     support: Support | None
     objects: tuple[MapObject, ...]
     labels: NDArray[np.int32] = field(repr=False)
+    supports: tuple[Support, ...] = ()
     names: tuple[NamedPlace, ...] = ()
     map_version: int = 0
 
@@ -98,6 +100,12 @@ class MapScene:
         """Which Gaussians (N,) are a surface that was measured."""
         return solid_rows(self.model)
 
+    def under(self, points: Array) -> Support | None:
+        """The highest support that is not above points (P, 3) of the base's frame [m]; None: there is none."""
+        low = np.percentile(points, 5, axis=0)
+        below = [s for s in self.supports if s.height(low[None])[0] > -NEAR]
+        return min(below, key=lambda s: float(s.height(low[None])[0])) if below else None
+
     def grown(self, seeds: NDArray[np.int64]) -> NDArray[np.int64]:
         """Rows of the faces that lie mostly in the rows ``seeds``, without the support; for what is no object."""
         if not len(seeds):
@@ -105,8 +113,7 @@ class MapScene:
         near = self.points[seeds]
         low, high = np.percentile(near, [2, 98], axis=0) + np.array([[-_AROUND], [_AROUND]])
         rows = np.flatnonzero(self.solid & ((self.points > low) & (self.points < high)).all(axis=1))
-        if self.support is not None:
-            rows = rows[above_support(self.support, self.points[rows])]
+        rows = rows[self.labels[rows] >= -1]
         if len(rows) < FEWEST:
             return rows[:0]
         chosen = np.zeros(len(self.model), np.bool_)
@@ -156,15 +163,20 @@ def segment(
     support = find_support(points[used]) if plane is None else _known(plane, T, points[used])
     above = used if support is None else used[above_support(support, points[used])]
     labels = np.full(len(model), -1, np.int32)
+    if support is not None:
+        labels[used[np.abs(support.height(points[used])) < NEAR]] = -2
+    supports = [] if support is None else [support]
     objects: list[MapObject] = []
     colors = model.colors.detach().double().numpy()
-    for rows in sorted(_things(points, above, apart, _DEEPEST), key=lambda rows: (-len(rows), int(rows[0]))):
+    for rows in sorted(
+        _things(points, above, apart, _DEEPEST, labels, supports), key=lambda rows: (-len(rows), int(rows[0]))
+    ):
         labels[rows] = len(objects)
         objects.append(_described(len(objects), rows, points[rows], colors[rows], T))
     objects = _with_faint(objects, labels, points, used)
     named = _with_names(tuple(objects), points, T, names)
     version = source.map_version if isinstance(source, Snapshot) else 0
-    return MapScene(model, T, support, named, labels, tuple(names), version)
+    return MapScene(model, T, support, named, labels, tuple(supports), tuple(names), version)
 
 
 def _known(plane: ArrayLike, T_world_base: Array, points: Array) -> Support:
@@ -177,7 +189,14 @@ def _known(plane: ArrayLike, T_world_base: Array, points: Array) -> Support:
     return Support(normal, offset, float(np.sqrt(np.mean(away[inside] ** 2))) if inside.any() else 0.0, inside)
 
 
-def _things(points: Array, used: NDArray[np.int64], apart: float, deeper: int) -> list[NDArray[np.int64]]:
+def _things(
+    points: Array,
+    used: NDArray[np.int64],
+    apart: float,
+    deeper: int,
+    labels: NDArray[np.int32],
+    supports: list[Support],
+) -> list[NDArray[np.int64]]:
     """Rows of what hangs together; what stands together on a support of its own, as a stool or a shelf, apart."""
     found: list[NDArray[np.int64]] = []
     for part in clusters(points[used], apart=apart):
@@ -186,7 +205,9 @@ def _things(points: Array, used: NDArray[np.int64], apart: float, deeper: int) -
         ledge = _ledge(points[rows]) if deeper and wide > _LEDGE else None
         if ledge is not None:
             on = rows[above_support(ledge, points[rows])]
-            found += _things(points, on, apart, deeper - 1)
+            supports.append(replace(ledge, inside=np.zeros(0, np.bool_)))
+            labels[rows[np.abs(ledge.height(points[rows])) < NEAR]] = -1 - len(supports)
+            found += _things(points, on, apart, deeper - 1, labels, supports)
         elif len(rows) >= FEWEST and wide <= LARGEST:
             found += [rows[some] for some in cut_at_steps(points[rows], fewest=FEWEST)]
     return found
