@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.errors import InputError
-from splatbot.geometry import transform_points
+from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import (
     AffordanceError,
     BoxHint,
@@ -21,9 +21,12 @@ from splatbot.grasping.affordance import (
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapScene
+from splatbot.segmentation.objects import FEWEST, LARGEST
+from splatbot.segmentation.parts import find_faces
 
 NEAR = 0.02  # [m] around a point within which an object's Gaussian must be
-_CLEAR = 0.6  # share of a mask's points that one object must have
+_CLEAR = 0.6  # share of a mask's objects that one must have
+_UNSEGMENTED = "it is no object of its own: what was marked of its faces is taken for it"
 
 
 class PlaceAffordance:
@@ -74,64 +77,79 @@ def point_at(scene: MapScene, view: View, u: float, v: float) -> Array:
     return transform_points(view.T_world_camera, z * ray)
 
 
-def at_point(scene: MapScene, point: Array, *, backend: str = "place") -> Target:
-    """The object whose Gaussian is nearest to a point (3,) [m, world].
+def at_point(scene: MapScene, point: Array, *, backend: str = "place", label: str = "") -> Target:
+    """The object whose Gaussian is nearest to a point (3,) [m, world], or the face of what was not segmented there.
 
     Raises:
-        AffordanceError: no object is within 2 cm; what is there is said.
+        AffordanceError: nothing is within 2 cm but what things stand on; what is there is said.
     """
     means = scene.model.means.detach().double().numpy()
     away = [float(np.linalg.norm(means[o.rows] - point, axis=1).min()) for o in scene.objects]
-    if not away or min(away) > NEAR:
-        where = ", ".join(f"{x:.3f}" for x in point)
-        nearest = f"; the nearest object is {100 * min(away):.1f} cm away" if away else "; there are no objects"
-        raise AffordanceError(f"at ({where}) there is no object{nearest}.", field="target", hint="point at an object")
+    if away and min(away) <= NEAR:
+        k = int(np.argmin(away))
+        found = scene.objects[k]
+        others = [a for i, a in enumerate(away) if i != k]
+        score = 1.0 if not others else float(np.clip((min(others) - away[k]) / NEAR, 0.0, 1.0))
+        return Target(found.rows, point, label or found.name or f"object {k}", backend, score, (), k)
+    rows = _face_at(scene, point)
+    if len(rows):
+        return Target(rows, point, label or "face", backend, 0.5, (_UNSEGMENTED,))
+    where = ", ".join(f"{x:.3f}" for x in point)
+    nearest = f"; the nearest object is {100 * min(away):.1f} cm away" if away else "; there are no objects"
+    raise AffordanceError(f"at ({where}) there is no object{nearest}.", field="target", hint="point at an object")
+
+
+def _face_at(scene: MapScene, point: Array) -> NDArray[np.int64]:
+    """The Gaussians around a point, if they are a face of their own, as that of a book in a shelf."""
+    local = transform_points(inverse(scene.T_world_base), point)
+    rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < LARGEST / 2).all(axis=1))
+    rows = rows[scene.labels[rows] >= -1]
+    if len(rows) < FEWEST:
+        return rows[:0]
+    faces = find_faces(scene.points[rows], fewest=FEWEST)
+    away = np.linalg.norm(scene.points[rows] - local, axis=1)
     k = int(np.argmin(away))
-    found = scene.objects[k]
-    others = sorted(a for i, a in enumerate(away) if i != k)
-    score = 1.0 if not others else float(np.clip((others[0] - away[k]) / NEAR, 0.0, 1.0))
-    return Target(found.rows, point, found.name or f"object {k}", backend, score, (), k)
+    own = rows[faces.owner == faces.owner[k]]
+    if away[k] > NEAR or faces.owner[k] < 0 or np.ptp(scene.points[own], axis=0).max() > 0.9 * LARGEST:
+        return rows[:0]
+    return own
 
 
 def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_]) -> Target:
     c = view.camera
     if mask.shape != (c.height, c.width) or mask.dtype != np.bool_:
         raise InputError(f"is {mask.dtype} {mask.shape}.", field="mask", hint=f"give ({c.height}, {c.width}) booleans")
-    depth = render_view(scene.model, c, view.T_world_camera, "depth")
-    v, u = np.nonzero(mask & (depth > 0))
-    if not len(u):
+    seeds = _visible(scene, view, mask)
+    if not len(seeds):
         raise AffordanceError("shows nothing of the map.", field="mask", hint="mark a thing in the picture")
-    pick = np.linspace(0, len(u) - 1, min(len(u), 2000)).astype(np.int64)
-    u, v = u[pick], v[pick]
-    z = depth[v, u].astype(np.float64)
-    points = transform_points(view.T_world_camera, np.stack([(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z], axis=1))
-    votes = _votes(scene, points)
-    if not votes.any():
-        raise AffordanceError("shows no object, only what they stand on.", field="mask", hint="mark a thing")
+    votes = np.bincount(scene.labels[seeds] + 1, minlength=len(scene.objects) + 1)[1:]
+    share = votes / len(seeds)
+    if not len(votes) or share.sum() < _CLEAR / 2:
+        rows = scene.grown(seeds)
+        if not len(rows):
+            raise AffordanceError("shows no object, only what they stand on.", field="mask", hint="mark a thing")
+        return Target(rows, None, "what was marked", "place", 0.5, (_UNSEGMENTED,))
     k = int(np.argmax(votes))
-    share = float(votes[k] / votes.sum())
-    if share < _CLEAR:
+    if votes[k] < _CLEAR * votes.sum():
         names = tuple(o.name or f"object {o.number}" for o in scene.objects if votes[o.number] > 0.2 * votes.sum())
         raise AffordanceError(
             f"shows {len(names)} objects about equally.", field="mask", hint="mark one of them", candidates=names
         )
     found = scene.objects[k]
-    return Target(found.rows, None, found.name or f"object {k}", "place", share, (), k)
+    return Target(found.rows, None, found.name or f"object {k}", "place", float(votes[k] / votes.sum()), (), k)
 
 
-def _votes(scene: MapScene, points: Array) -> Array:
-    """How many of the points (P, 3) are at each object (K,)."""
-    rows = np.flatnonzero(scene.labels >= 0)
-    votes = np.zeros(len(scene.objects))
-    if not len(rows):
-        return votes
-    means = scene.model.means.detach().double().numpy()[rows]
-    for k in range(0, len(points), 256):
-        away = np.linalg.norm(points[k : k + 256, None] - means[None], axis=2)
-        nearest = away.argmin(axis=1)
-        near = away[np.arange(len(nearest)), nearest] <= NEAR
-        votes += np.bincount(scene.labels[rows[nearest[near]]], minlength=len(votes))
-    return votes
+def _visible(scene: MapScene, view: View, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rows of the solid Gaussians that show in the marked pixels."""
+    c = view.camera
+    depth = render_view(scene.model, c, view.T_world_camera, "depth")
+    rows = np.flatnonzero(scene.solid)
+    at = transform_points(inverse(view.T_world_camera), scene.model.means.detach().double().numpy()[rows])
+    rows, at = rows[at[:, 2] > 0.01], at[at[:, 2] > 0.01]
+    u, v = np.rint(c.project(at)).astype(np.int64).T
+    inside = (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height)
+    rows, at, u, v = rows[inside], at[inside], u[inside], v[inside]
+    return rows[mask[v, u] & (np.abs(depth[v, u] - at[:, 2]) < NEAR)]
 
 
 def _rectangle(hint: BoxHint) -> NDArray[np.bool_]:
