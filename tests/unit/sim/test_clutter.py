@@ -11,9 +11,9 @@ import pytest
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
 from splatbot.errors import ConfigError, InputError
 from splatbot.gaussians import GaussianModel
+from splatbot.segmentation import find_support
 from splatbot.sim.clutter import MapParts, map_parts
 from splatbot.sim.maps.ellipsoids import merge
-from splatbot.sim.maps.plane import find_support
 from splatbot.sim.scene import Clutter, make_scene
 from splatbot.sim.twin import Twin
 
