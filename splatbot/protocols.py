@@ -211,8 +211,12 @@ class Gripper(Protocol):
         """Widest opening [m]."""
         ...
 
-    def move(self, opening: float, *, force: float | None = None) -> None:
-        """Go towards an opening [m], with at most a force [N]."""
+    def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
+        """Go towards an opening [m], with at most a force [N] and a speed [m/s] of the opening."""
+        ...
+
+    def moving(self) -> bool:
+        """Whether the fingers are still on their way."""
         ...
 
     def opening(self) -> float:

@@ -30,6 +30,7 @@ COMMANDS = {
     ),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
+    "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),
     "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
     "sim2real": _Command(
         "splatbot.cli.sim2real", "sim2real", "Say how far the twin is from a recorded log, and from a held-out twin."
