@@ -67,6 +67,12 @@ class ControllerError(SplatbotError):
     code = -4
 
 
+class DeviceError(SplatbotError):
+    """A device is gone or does not answer."""
+
+    http_status = 503
+
+
 class MapNotFoundError(SplatbotError):
     """No map of that name."""
 
