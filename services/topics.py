@@ -7,6 +7,7 @@
 | ``maps/{id}/result`` | :class:`splatbot.slam.FrameResult`: odometry, verdict, keyframe, stage timings |
 | ``maps/{id}/trajectory`` | :class:`splatbot.trajectory.Trajectory`: all poses so far, at each published state |
 | ``maps/{id}/plan`` | :class:`splatbot.planning.RobotTrajectory`: the latest planned motion |
+| ``jobs/{id}`` | :class:`splatbot.services.jobs.Job`: each change of a job |
 | ``robot/{name}/joints`` | :class:`JointState`: the robot's latest joints |
 """
 
@@ -50,3 +51,8 @@ def map_topic(map_id: str, kind: str) -> str:
 def robot_topic(robot: str, kind: str) -> str:
     """The topic of a robot, e.g. ``robot_topic("panda", JOINTS)``."""
     return f"robot/{robot}/{kind}"
+
+
+def job_topic(job_id: str) -> str:
+    """The topic of a job."""
+    return f"jobs/{job_id}"
