@@ -24,6 +24,7 @@ COMMANDS = {
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
     "info": _Command("splatbot.cli.info", "info", "Say what is in a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
+    "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
     "plan": _Command(
         "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
