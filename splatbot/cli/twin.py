@@ -50,8 +50,8 @@ def twin(
         trajectory: ROS JointTrajectory as JSON, or CSV; by default the moves of the scene's task.
         json: file for the whole result.
         video: MP4 of what the scene's camera sees.
-        force: physics that is on whatever the scene calls for; once for each.
-        forbid: physics that is off.
+        force: physics, or an effect of the camera's sensor, that is on whatever the scene calls for; once for each.
+        forbid: what is off.
         timestep: longest step of physics [s]: accuracy for time.
         seed: of where movable objects stand, within millimetres, and of the camera's noise; 0: where the scene says.
         no_costs: do not measure what each effect cost (a run for each).
@@ -75,7 +75,7 @@ def twin(
     with _film(video, it.world, seed) as film, _progress(quiet) as show:
         result = it.follow(motion, progress=show, watch=film)
         sensor = film.report() if film is not None else []
-    entries = ledger(it, result, motion, costs=not no_costs)
+    entries = ledger(it, result, motion, costs=not no_costs, sensor=sensor)
     if json is not None:
         _write(json, result, entries, sensor)
     if not quiet:
@@ -183,7 +183,8 @@ def _print(result: TwinResult, entries: list[Entry], video: Path | None) -> None
     table = Table("effect", "on", "why", "ms", "us a step")
     for entry in entries:
         cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
-        table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
+        if entry.on or entry.observable or entry.by != "scene":  # not each of the many that no sensor names
+            table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
     console.print(table)
     if video is not None:
         console.print(f"written to {video}")
@@ -192,7 +193,9 @@ def _print(result: TwinResult, entries: list[Entry], video: Path | None) -> None
 def _print_lists() -> None:
     from splatbot.cli.tables import print_table
     from splatbot.sim.effects.physics import PHYSICS, physics_effect
+    from splatbot.sim.effects.registry import EFFECTS, effect_class
     from splatbot.sim.scene import load_scene, scene_names
 
     print_table([(name, load_scene(name).about) for name in scene_names()], title="scenes")
     print_table([(name, physics_effect(name).cost) for name in PHYSICS], title="physics, and what it costs")
+    print_table([(name, effect_class(name).cost) for name in EFFECTS], title="the camera's sensor, and what it costs")
