@@ -13,15 +13,13 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_to_rotation
 from splatbot.protocols import Array
+from splatbot.segmentation import Fit, Support, clusters, find_support, fit
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge
-from splatbot.sim.maps.fits import Fit, fit
-from splatbot.sim.maps.plane import Support, find_support
 from splatbot.sim.scene import Clutter, Scene, SceneObject
 from splatbot.sim.solids import rotation_of
 
 _OPAQUE = 0.3  # fainter Gaussians are no surface
 _ABOVE = 0.008  # [m] over the table: lower is the table's own noise
-_TOGETHER = 0.025  # [m] between Gaussians of one object
 _FEWEST, _LARGEST = 40, 0.35  # Gaussians of an object; [m] across
 
 
@@ -128,7 +126,7 @@ def _add_objects(
     notes: list[str],
 ) -> None:
     above = np.flatnonzero((support.height(points) > _ABOVE) & ~support.inside)
-    for rows in _clusters(points[above]):
+    for rows in clusters(points[above]):
         cluster = points[above[rows]]
         if len(cluster) < _FEWEST or np.ptp(cluster, axis=0).max() > _LARGEST:
             continue
@@ -143,15 +141,3 @@ def _add_objects(
             f"{name}: {len(cluster)} Gaussians, {1e3 * found.error:.1f} mm from its surface "
             f"(95 %: {1e3 * found.worst:.1f} mm)"
         )
-
-
-def _clusters(points: Array) -> list[np.ndarray]:
-    """Rows of points (P, 3) that hang together, largest first (DBSCAN)."""
-    import open3d as o3d
-
-    if not len(points):
-        return []
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    label = np.asarray(cloud.cluster_dbscan(eps=_TOGETHER, min_points=5))
-    found = [np.flatnonzero(label == k) for k in range(int(label.max()) + 1)]
-    return sorted(found, key=lambda rows: (-len(rows), int(rows[0])))

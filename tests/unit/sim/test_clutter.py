@@ -15,9 +15,9 @@ from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
 from splatbot.errors import ConfigError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.robots.panda import panda
+from splatbot.segmentation import find_support
 from splatbot.sim.clutter import MapParts, map_parts
 from splatbot.sim.maps.ellipsoids import merge
-from splatbot.sim.maps.plane import find_support
 from splatbot.sim.motion import hold
 from splatbot.sim.scene import Clutter, make_scene
 from splatbot.sim.twin import Twin

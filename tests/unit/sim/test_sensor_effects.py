@@ -155,7 +155,7 @@ def test_a_sideways_motion_shears_by_its_speed_times_the_readout() -> None:
     read = RollingShutter(readout=0.05).along(path).apply(frame_at(rgb=edge, index=10), RNG)
     edges = [int(np.argmax(read.rgb[line, :, 0] > 100)) for line in (0, 74, 149)]
     assert edges == pytest.approx([110, 100, 90], abs=1)
-    np.testing.assert_allclose(read.depth[read.depth > 0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(read.depth[read.depth > 0], 1.0, atol=1e-4)
 
 
 def test_a_late_frame_keeps_its_images_and_is_stamped_when_it_arrives() -> None:
