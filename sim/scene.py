@@ -166,6 +166,9 @@ class Clutter(Section):
     ellipsoids: int = Field(default=2000, ge=0, le=20_000, description="at most so many: accuracy for time")
     at: Vec3 = Field(default=(0.0, 0.0, 0.0), description="of the map's origin [m]")
     rpy: Vec3 = Field(default=(0.0, 0.0, 0.0), description="of the map's axes: roll, pitch, yaw [rad]")
+    support: tuple[float, float, float, float] | None = Field(
+        default=None, description="n, d of the plane n · p + d = 0 that things stand on, n upwards; None: it is found"
+    )
     movable: bool = Field(default=False, description="whether fitted objects may be moved")
     objects: bool = Field(default=True, description="clusters above the table become primitives or hulls")
     harmonics: int = Field(default=0, ge=0, exclude=True, description="degree of its colours; known once it is read")

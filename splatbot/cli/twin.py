@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def twin(
     scene: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None,
-    map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    map: Annotated[Path | None, tyro.conf.arg(metavar="RUN|FILE")] = None,
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -41,12 +41,13 @@ def twin(
         splatbot twin --list
         splatbot twin --scene mug_hanging --video mug.mp4
         splatbot twin --scene wiping --forbid backlash --json result.json
-        splatbot twin --map runs/latest/map.ply --trajectory plan.json
+        splatbot twin --map runs/latest --trajectory runs/plan/trajectory.json
         splatbot twin --scene my_scene.yaml --seed 3
 
     Args:
         scene: a shipped scene (--list) or a YAML file.
-        map: a Gaussian map in the robot's frame (z up, base at the origin): table, objects, clutter are fitted.
+        map: a run's folder or a Gaussian map: table, objects, clutter are fitted. The scene.yaml beside it says where
+            the robot stands; a file without one is in the robot's frame (z up, base at the origin).
         trajectory: ROS JointTrajectory as JSON, or CSV; by default the moves of the scene's task.
         json: file for the whole result.
         video: MP4 of what the scene's camera sees.
@@ -85,6 +86,7 @@ def twin(
 
 def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
     from splatbot.errors import InputError
+    from splatbot.sim.maps.placed import placed_scene
     from splatbot.sim.scene import load_scene, make_scene
 
     if (name is None) == (map is None):
@@ -93,7 +95,7 @@ def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
         )
     values: dict[str, Any] = {}
     if map is not None:
-        values = {"name": map.stem, "map": {"file": str(map.resolve())}}
+        values = placed_scene(map)
     else:
         assert name is not None
         found = load_scene(name)
