@@ -13,7 +13,7 @@ from splatbot.protocols import Array, HandShape
 
 FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
 SLACK = 0.003  # [m] between each pad and the target as the hand comes
-OPENINGS = 0.005  # [m] that openings are rounded up to
+OPENINGS = 0.002  # [m] that openings are rounded up to
 _CHUNK, _SAMPLE = 256, 250  # hands at once; points for a first look
 _TOUCH = 0.003  # [m] between a pad and what it presses
 _LOOK = 0.03  # [m] of room beyond which more is no better
@@ -138,9 +138,8 @@ def _measured(
     dz = z - reach[2] - hand.tip  # gap ahead of the tips
     under = (np.abs(x) < hand.width / 2) & (z < hand.tip) & (z > -hand.palm)
     stands_out = np.where(under & (side < half + 0.02), side - half, -np.inf).max(axis=1)
-    fresh = np.clip(stands_out, 0.0, FLUSH)
-    thick = np.where(under & (side < half[:, :1] + FLUSH), reach[1], 0.0).max(axis=1)
-    opening = 2 * (half[:, 0] + fresh + np.minimum(thick, SLACK)) + 2 * SLACK
+    solid = np.where(under & (side < half + FLUSH), side + np.minimum(reach[1], FLUSH), half).max(axis=1)
+    opening = 2 * (np.maximum(solid, half[:, 0]) + SLACK)
     opening = np.minimum(np.ceil(opening / OPENINGS) * OPENINGS, hand.stroke)
     inner = opening[:, None] / 2
     dy = np.maximum(inner - (side + reach[1]), (side - reach[1]) - inner - hand.thickness)

@@ -132,7 +132,8 @@ def _completed(scene: MapScene, seen: Surface) -> Surface:
     up = scene.up
     parts = [_sides(seen, up, _floor(scene, seen, up))]
     for face in _faces(seen.normals, up):
-        parts.append(_sides(seen, face, _back(seen, face, up), closed=True))
+        back, mirrored = _back(seen, face, up)
+        parts.append(_sides(seen, face, back, closed=True, mirrored=mirrored))
     points, normals = (np.concatenate([part[k] for part in parts]) for k in range(2))
     thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
     thin = thin[:: 1 + len(thin) // MOST]
@@ -181,20 +182,29 @@ def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
     return low - under if 0.0 <= under < 0.03 else low - 0.01
 
 
-def _back(seen: Surface, face: Array, up: Array) -> float:
-    """Where along ``face`` [m, world] the target ends behind: as deep as other sides show, or as it is narrow."""
+def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
+    """Where along ``face`` [m, world] the target ends behind, and whether its back is the mirror image of its front.
+
+    A flat front is that of a box, as deep as its other sides show; a round one turns away half way to its back. Where
+    nothing of either was seen, a thing is taken to be as deep as it is narrow.
+    """
     along = seen.points @ face
-    near = float(np.percentile(along[seen.normals @ face > _FACING], 95))
-    shown = near - float(np.percentile(along, 2))
+    facing = along[seen.normals @ face > _FACING]
+    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 2))
+    if near - far > _SHOWN:
+        flat = float((near - facing < _SHOWN).mean()) > 0.7
+        return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
     across = seen.points @ np.stack([up, np.cross(up, face)], axis=1)
     narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
-    return near - (shown if shown > _SHOWN else min(narrow, 2 * _BEHIND))
+    return near - min(narrow, 2 * _BEHIND), False
 
 
-def _sides(seen: Surface, direction: Array, floor: float, *, closed: bool = False) -> tuple[Array, Array]:
+def _sides(
+    seen: Surface, direction: Array, floor: float, *, closed: bool = False, mirrored: bool = False
+) -> tuple[Array, Array]:
     """Points and normals (K, 3) of the sides behind the edges of what faces ``direction``, where none was seen.
 
-    ``closed``: and of the back, at ``floor``.
+    ``closed``: and of the back, at ``floor``, or mirrored at the middle between it and the top.
     """
     none = np.zeros((0, 3)), np.zeros((0, 3))
     facing = seen.normals @ direction > _TURNED
@@ -218,7 +228,9 @@ def _sides(seen: Surface, direction: Array, floor: float, *, closed: bool = Fals
     normals = np.repeat(np.c_[out, np.zeros(len(out))] @ across, count, axis=0)
     if closed:
         cells = np.argwhere(np.isfinite(heights) & (heights > floor + _STEP) & ~np.isfinite(below))[::2]
-        back = np.c_[low + (cells + 0.5) * _CELL, np.full(len(cells), floor)] @ across
+        top = heights[cells[:, 0], cells[:, 1]]
+        depth = np.maximum(floor + np.percentile(top, 95) - top, floor) if mirrored and len(cells) else floor
+        back = np.c_[low + (cells + 0.5) * _CELL, np.broadcast_to(depth, len(cells))] @ across
         points = np.concatenate([points, back])
         normals = np.concatenate([normals, np.tile(-direction, (len(back), 1))])
     new = _unseen(points, normals, seen)

@@ -1,8 +1,19 @@
 """What a map is made of: a support and the things on it."""
 
 from splatbot.segmentation.clusters import clusters
-from splatbot.segmentation.fits import Fit, fit
-from splatbot.segmentation.objects import MapObject, MapScene, segment
+from splatbot.segmentation.fits import Fit, fit, primitive_fits
+from splatbot.segmentation.objects import MapObject, MapScene, NamedPlace, segment
 from splatbot.segmentation.plane import Support, find_support
 
-__all__ = ["Fit", "MapObject", "MapScene", "Support", "clusters", "find_support", "fit", "segment"]
+__all__ = [
+    "Fit",
+    "MapObject",
+    "MapScene",
+    "NamedPlace",
+    "Support",
+    "clusters",
+    "find_support",
+    "fit",
+    "primitive_fits",
+    "segment",
+]
