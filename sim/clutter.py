@@ -28,12 +28,14 @@ class MapParts:
     """What a map became.
 
     Args:
+        model: the map, in its own frame.
         objects: table and fitted objects, as a scene has them.
         ellipsoids: the rest.
         notes: each with its geometric error against the map, in words.
         labels: (N,) of the map's Gaussians: -2 left out, -1 ellipsoids, 0 the table, k the k-th fitted object.
     """
 
+    model: GaussianModel
     objects: tuple[SceneObject, ...]
     ellipsoids: Ellipsoids
     notes: tuple[str, ...]
@@ -81,18 +83,19 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
         f"clutter: {len(left)} Gaussians as {len(rest.centers)} ellipsoids, "
         f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm)"
     )
-    return MapParts(tuple(objects), rest, tuple(notes), labels)
+    return MapParts(model, tuple(objects), rest, tuple(notes), labels)
 
 
 def load_parts(scene: Scene) -> tuple[Scene, MapParts | None]:
-    """The scene with the objects of its map, and the map's parts; without a map, the scene itself."""
+    """The scene with its map's objects and degree of colours, and the map's parts; without a map, the scene itself."""
     if scene.map is None:
         return scene, None
     path = Path(scene.map.file)
     model = GaussianModel.load(path if path.is_absolute() else scene.folder / path)
     base = np.asarray(scene.robot.at if scene.robot is not None else (0.0, 0.0, 0.0), dtype=np.float64)
     parts = map_parts(model, scene.map, base)
-    return scene.model_copy(update={"objects": (*scene.objects, *parts.objects)}), parts
+    read = scene.map.model_copy(update={"harmonics": model.sh_degree})
+    return scene.model_copy(update={"objects": (*scene.objects, *parts.objects), "map": read}), parts
 
 
 def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:

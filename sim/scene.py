@@ -168,6 +168,7 @@ class Clutter(Section):
     rpy: Vec3 = Field(default=(0.0, 0.0, 0.0), description="of the map's axes: roll, pitch, yaw [rad]")
     movable: bool = Field(default=False, description="whether fitted objects may be moved")
     objects: bool = Field(default=True, description="clusters above the table become primitives or hulls")
+    harmonics: int = Field(default=0, ge=0, exclude=True, description="degree of its colours; known once it is read")
 
 
 class Choice(Section):

@@ -1,13 +1,17 @@
-"""What the core asks of a robot: kinematics, spheres that stand for its links, a controller, a gripper."""
+"""What the core asks of a robot: kinematics, spheres for its links, a controller, a gripper, a camera."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from splatbot.frame import Frame
 
 Array = NDArray[np.float64]
 
@@ -211,8 +215,12 @@ class Gripper(Protocol):
         """Widest opening [m]."""
         ...
 
-    def move(self, opening: float, *, force: float | None = None) -> None:
-        """Go towards an opening [m], with at most a force [N]."""
+    def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
+        """Go towards an opening [m], with at most a force [N] and a speed [m/s] of the opening."""
+        ...
+
+    def moving(self) -> bool:
+        """Whether the fingers are still on their way."""
         ...
 
     def opening(self) -> float:
@@ -225,4 +233,31 @@ class Gripper(Protocol):
 
     def stop(self) -> None:
         """Stay where they are."""
+        ...
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """A camera that runs by itself: frames come at their times and are lost when nobody takes them."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        ...
+
+    @property
+    def uri(self) -> str:
+        """What it is opened by."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The frames from now on.
+
+        Raises:
+            DeviceError: the device is gone.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the stream."""
         ...

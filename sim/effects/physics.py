@@ -25,6 +25,7 @@ PHYSICS = (
     "fluid_drag",
     "moving_obstacles",
     "lighting",
+    "view_color",
     "sleep",
 )
 """The names, in the order in which they are built; each is a module of this package."""

@@ -15,7 +15,9 @@ import numpy as np
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
+from splatbot.bench.twin_composite import exact_map, filmed_map
 from splatbot.bench.twin_paths import DEPTH, try_paths
+from splatbot.errors import NativeError
 from splatbot.protocols import Array
 from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.panda import panda
@@ -38,6 +40,7 @@ class TwinPlan:
         gaussians: of the map that is planned in.
         timesteps: to compare with one ten times finer than the finest [s].
         scenes: whose effects are measured; empty for all that are shipped.
+        poses: of the composite pictures.
         quick: tiny, to see whether it runs.
         say: told what goes on.
     """
@@ -48,6 +51,7 @@ class TwinPlan:
     gaussians: int = 50_000
     timesteps: tuple[float, ...] = (0.0005, 0.001, 0.002, 0.004, 0.008)
     scenes: tuple[str, ...] = ()
+    poses: int = 20
     quick: bool = False
     say: Say = field(default=lambda text: None)
 
@@ -59,6 +63,7 @@ def run_twin(plan: TwinPlan, folder: Path | None = None) -> Results:
     _effects(results, plan)
     _time_steps(results, plan)
     _paths(results, plan)
+    _composites(results, plan)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         results.write_json(folder / "twin.json")
@@ -178,3 +183,24 @@ def _paths(results: Results, plan: TwinPlan) -> None:
     results.add(case, f"pushed {1e3 * DEPTH:g} mm in", trials.pushed, "")
     results.add(case, "seen as contact", trials.seen, "", note="of those pushed")
     results.add(case, "faster than real time", trials.real_time, "x")
+
+
+def _composites(results: Results, plan: TwinPlan) -> None:
+    plan.say("composite pictures")
+    try:
+        exact = exact_map(
+            plan.poses, plan.gaussians if plan.quick else 4 * plan.gaussians, width=160 if plan.quick else 640
+        )
+        filmed = filmed_map(plan.poses, 10 if plan.quick else 120, width=160 if plan.quick else 320)
+    except NativeError as error:
+        results.add("composite picture", "overlap", None, "", note=str(error))
+        return
+    for case, found in (("composite picture, exact map", exact), ("composite picture, map of a noisy film", filmed)):
+        results.add(case, "least overlap", float(found.overlap.min()), "", note="IoU of the robot's pixels")
+        results.add(case, "median overlap", float(np.median(found.overlap)), "", note=f"{len(found.overlap)} poses")
+        results.add(case, "farthest wrong pixel", float(found.astray.max()), "px", note="from the robot's outline")
+    lost = float((filmed.plain_db - filmed.composite_db).max())
+    results.add(
+        "composite picture, map of a noisy film", "PSNR", float(filmed.plain_db.mean()), "dB", note="the map alone"
+    )
+    results.add("composite picture, map of a noisy film", "PSNR lost, most", lost, "dB", note="where the robot is not")

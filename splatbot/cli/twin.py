@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+
+from splatbot.cli.drawing import draw_offscreen
 
 if TYPE_CHECKING:
     from splatbot.sim.ledger import Entry
@@ -57,8 +58,8 @@ def twin(
         list_: print the scenes and the physics and leave.
         quiet: print only errors.
     """
-    if video is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # before anything imports mujoco
+    if video is not None:
+        draw_offscreen()
     if list_:
         _print_lists()
         return 0
