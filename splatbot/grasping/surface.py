@@ -26,6 +26,7 @@ _TURNED_AWAY = 0.7  # below it a normal is of another face
 _FEW = 20  # points that are no face
 _BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
 _SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
+_TUBE = 0.003  # [m] around a line within which it meets a point
 _SEEN = 0.006  # [m] around seen points of a side within which none is added
 _ROWS = 0.003  # [m] between added points
 
@@ -137,7 +138,9 @@ def _completed(scene: MapScene, seen: Surface) -> Surface:
     points, normals = (np.concatenate([part[k] for part in parts]) for k in range(2))
     thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
     thin = thin[:: 1 + len(thin) // MOST]
-    points, normals, n = points[thin], normals[thin], len(thin)
+    points, normals = points[thin], normals[thin]
+    outer = ~_inside(points, normals, np.concatenate([seen.points, points]), np.concatenate([seen.normals, normals]))
+    points, normals, n = points[outer], normals[outer], int(outer.sum())
     if n == 0:
         return seen
     wide = np.full(n, _ROWS / 2)
@@ -159,7 +162,7 @@ def _faces(normals: Array, up: Array) -> list[Array]:
     left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
     few = max(_FEW, 0.05 * len(normals))
     found: list[Array] = []
-    while len(left) >= few and len(found) < 4:
+    while len(left) >= few and len(found) < 8:
         close = left @ left[:: max(1, len(left) // 100)].T > 0.9
         best = int(close.sum(axis=0).argmax())
         if close[:, best].sum() < few:
@@ -300,13 +303,32 @@ def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
     return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)
 
 
+def _inside(points: Array, normals: Array, others: Array, other_normals: Array) -> NDArray[np.bool_]:
+    """Whether what points (P, 3) face first is another surface from behind (P,): they are within the target."""
+    middle = others.mean(axis=0)
+    p, q = (points - middle).astype(np.float32), (others - middle).astype(np.float32)
+    n, m = normals.astype(np.float32), other_normals.astype(np.float32)
+    found = np.zeros(len(p), np.bool_)
+    square = (q**2).sum(axis=1)
+    for k in range(0, len(p), 256):
+        a, d = p[k : k + 256], n[k : k + 256]
+        ahead = d @ q.T - np.einsum("ij,ij->i", a, d)[:, None]
+        aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ q.T) + square - ahead**2
+        ahead[(ahead < _SEEN) | (aside > _TUBE**2)] = np.inf
+        first = ahead.argmin(axis=1)
+        hit = np.isfinite(ahead[np.arange(len(a)), first])
+        found[k : k + 256] = hit & (np.einsum("ij,ij->i", m[first], d) > 0.3)
+    return found
+
+
 def _unseen(points: Array, normals: Array, seen: Surface) -> NDArray[np.bool_]:
     """Whether nothing that was seen within 6 mm of each of points (P, 3) faces the same way (P,)."""
     new = np.ones(len(points), np.bool_)
+    reach = max(_SEEN, 3.0 * float(np.median(seen.spread)))
     for way in (*np.eye(3), *-np.eye(3)):
         asked, known = normals @ way > 0.5, seen.normals @ way > 0.3
         if asked.any() and known.any():
             nearest, square = nearest_of(seen.points[known], points[asked])
             alike = np.einsum("ij,ij->i", seen.normals[known][nearest], normals[asked]) > 0.5
-            new[np.flatnonzero(asked)[alike & (square < _SEEN**2)]] = False
+            new[np.flatnonzero(asked)[alike & (square < reach**2)]] = False
     return new
