@@ -8,6 +8,8 @@ from typing import Any
 from splatbot.frame import Frame
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.inlets import RosInlets
+from splatbot.services.ros.moveit import MoveItServices
+from splatbot.services.ros.nvblox import NvbloxServices
 from splatbot.services.ros.outlets import RosOutlets
 from splatbot.services.ros.rosapi import RosApi
 from splatbot.services.store import MapStore
@@ -27,6 +29,8 @@ class RosNode:
     ) -> None:
         self.graph = RosGraph()
         RosApi(self.graph)
+        MoveItServices(self.graph, store, robot=robot)
+        NvbloxServices(self.graph, store)
         self._outlets = RosOutlets(store.bus, self.graph)
         self._inlets = RosInlets(self.graph, store.bus, robot=robot, on_frame=on_frame)
 
