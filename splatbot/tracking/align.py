@@ -110,13 +110,13 @@ def align(
 
     Dense residuals are correlated between neighbouring pixels (blur, rolling shutter, depth registered a moment
     earlier), so they count ``config.dense_weight`` each, against reprojected features (``features`` with the
-    ``camera`` of their pixels), which count one. More pixels measure the same better; they bring no more that is
-    independent, so together they weigh as 4800 do. Beside colour, depth is taken for ``config.depth_doubt`` times as
-    uncertain as its pixels' noise.
+    ``camera`` of their pixels), which count one over their variance [px²]. More pixels measure the same better; they
+    bring no more that is independent, so together they weigh as 4800 do. Beside colour, depth is taken for
+    ``config.depth_doubt`` times as uncertain as its pixels' noise.
     """
     matches = None
     if features is not None and camera is not None:
-        matches = (features.points, features.pixels, _intrinsics(camera))
+        matches = (features.points, features.pixels, features.sigmas, _intrinsics(camera))
     T_camera_world, information, curvature, spread, cells, *_ = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
