@@ -1,4 +1,4 @@
-"""A keyframe's exposure against the map's, taken out before its colours are fused."""
+"""A keyframe's exposure against the map's: where it jumps, it is taken out before colours are fused."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ _SOLID = 0.9  # alpha from which on the map shows colour
 _AGREES = 0.05  # depths that differ by less are of the same surface [share of depth]
 _CLIPPED = (2, 253)  # values beyond these say only that there was as little, or as much
 _STEPS, _SCALE = 10, 0.02  # of the robust fit; residuals of this size still count half
-_NOTICED = 0.04  # smaller differences [0..1] are the map's own errors: taken out each time they would add up
+# Smaller differences [0..1] stay. Automatic exposure makes up to 0.16 from keyframe to keyframe of recorded logs: there
+# the map shows each place as it looked, and taken out each time, the map's own errors would add up.
+_JUMP = 0.2
 
 
 @dataclass(frozen=True)
@@ -31,9 +33,9 @@ class Exposure:
     offset: float = 0.0
 
     @property
-    def is_noticed(self) -> bool:
-        """Whether some grey between black and white differs by more than the map may be wrong."""
-        return max(abs(self.offset), abs(self.gain + self.offset - 1.0)) > _NOTICED
+    def is_jump(self) -> bool:
+        """Whether black or white differs by more than automatic exposure makes of it between keyframes."""
+        return max(abs(self.offset), abs(self.gain + self.offset - 1.0)) > _JUMP
 
 
 def exposure_of(rgb: Tensor, depth: Tensor, view: View) -> Exposure:
@@ -60,12 +62,12 @@ def exposure_of(rgb: Tensor, depth: Tensor, view: View) -> Exposure:
 
 
 def in_exposure_of_map(rgb: Tensor, depth: Tensor, view: View) -> Tensor:
-    """The image (H, W, 3) uint8 as it would be in the map's exposure; itself where no difference is noticed.
+    """The image (H, W, 3) uint8 as it would be in the map's exposure; itself where they differ by no jump.
 
     What was clipped is as bright, or as dark, as the map has it, if the map goes further.
     """
     exposure = exposure_of(rgb, depth, view)
-    if not exposure.is_noticed:
+    if not exposure.is_jump:
         return rgb
     seen = rgb.numpy()
     corrected = (seen / 255.0 - exposure.offset) / exposure.gain

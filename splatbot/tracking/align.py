@@ -30,6 +30,7 @@ class Alignment:
         curvature: (6, 6) of the robust cost at the pose: less than the information by what outlying residuals lack.
         spread: (6, 6) sum of g gᵀ over the cells of the image, g the gradient of the residuals in one cell.
         cells: how many cells have residuals.
+        focal: focal length [px] of the finest level that it used.
     """
 
     T_world_camera: Array
@@ -37,6 +38,7 @@ class Alignment:
     curvature: Array
     spread: Array
     cells: int
+    focal: float
 
     def at(self, T_world_camera: Array) -> Alignment:
         """The same numbers at another pose."""
@@ -129,7 +131,7 @@ def align(
         finest,
         config.dense_share if photometric else 0.0,
     )
-    return Alignment(inverse(T_camera_world), information, curvature, spread, cells)
+    return Alignment(inverse(T_camera_world), information, curvature, spread, cells, levels[finest].camera.fx)
 
 
 def _level_arrays(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float, float, float]]:
