@@ -147,14 +147,6 @@ Shape = Annotated[
 ]
 
 
-def rpy_of(R: Array) -> Vec3:
-    """Roll, pitch and yaw [rad] of a rotation (3, 3); the inverse of :func:`rotation_of`."""
-    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
-    if np.hypot(R[0, 0], R[1, 0]) < 1e-9:  # straight up or down: roll and yaw turn about the same axis
-        return 0.0, float(pitch), float(np.arctan2(-R[0, 1], R[1, 1]))
-    return float(np.arctan2(R[2, 1], R[2, 2])), float(pitch), float(np.arctan2(R[1, 0], R[0, 0]))
-
-
 def rotation_of(rpy: Vec3) -> Array:
     """Rotation (3, 3) Rz(yaw) Ry(pitch) Rx(roll)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
