@@ -11,7 +11,7 @@ _FINEST = 0.01  # [m] between spheres
 _COARSER = 1.25
 
 
-def covering_spheres(points: Array, reach: Array, *, most: int = 40) -> Array:
+def covering_spheres(points: Array, reach: Array, *, most: int = 100) -> Array:
     """At most so many spheres (A, 4), (x, y, z, radius) [m], that cover balls around points.
 
     Points are gathered in cubes of a grid, which is made coarser until there are few enough; each sphere is around the

@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import GripperError, InputError, SplatbotError
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.hands import OPENINGS
 from splatbot.grasping.held import covering_spheres
@@ -84,7 +87,7 @@ class PickOptions:
     """
 
     lift: float = 0.15
-    free: float = 0.02
+    free: float = 0.03
     force: float | None = None
     speed: float = 0.5
     slow: float = 0.3
@@ -193,7 +196,6 @@ class _Way:
 
     grasp: Grasp
     opening: float
-    around: GaussianCollisionField
     open_arm: RobotSpheres
     closed_arm: RobotSpheres
     loaded_arm: RobotSpheres
@@ -284,11 +286,12 @@ class _Pick:
     def _way(self, found: GraspResult) -> _Way:
         """Of the best grasp that has one."""
         self.stage = PickStage.PLAN
-        around = self.s.collision_field(around_target(self.s.scene, self.target.rows))
+        around = around_target(self.s.scene, self.target.rows)
+        self._around, self._beside = self.s.collision_field(around), self._without_strays(around)
         start = self.controller.step().position
         why: list[str] = []
         for k, grasp in enumerate(found.grasps[: self.o.tries]):
-            way = self._way_of(grasp, start, around)
+            way = self._way_of(grasp, start)
             if isinstance(way, _Way):
                 room = min(path.certificate.clearance for path in (way.there, way.approach, way.lift))
                 self._done(f"grasp {k + 1}, {grasp.approach}; {1e3 * room:.1f} mm of room all the way")
@@ -296,7 +299,7 @@ class _Pick:
             why.append(f"grasp {k + 1}: {way}")
         raise _EndedError(PickOutcome.NO_WAY, "; ".join(why))
 
-    def _way_of(self, grasp: Grasp, start: Array, around: GaussianCollisionField) -> _Way | str:
+    def _way_of(self, grasp: Grasp, start: Array) -> _Way | str:
         """All of it, or what is in the way."""
         if grasp.q is None or grasp.q_pregrasp is None:
             return "no posture is known"
@@ -307,31 +310,21 @@ class _Pick:
         plan = planner.plan(start, JointGoal(grasp.q_pregrasp), budget_ms=self.o.budget_ms, seed=self.o.seed)
         if plan.path is None:
             return plan.reason.rstrip(".")
-        approach = straight_line(planner.arm, around, grasp.q_pregrasp, grasp.T_world_tcp)
+        approach = straight_line(planner.arm, self._around, grasp.q_pregrasp, grasp.T_world_tcp)
         if not approach or approach.path is None:
             return f"its approach is blocked: {approach.reason.rstrip('.')}"
         q = approach.path.waypoints[-1]
         closed = self._arm(grasp.width)
         attached = self._attached(closed, q)
         loaded = self._arm(grasp.width, attached)
-        free = self._up(closed, around, q, self.o.free)
+        free = self._up(closed, self._beside, q, self.o.free)
         if not free or free.path is None:
             return f"it cannot be lifted: {free.reason.rstrip('.')}"
-        lift = self._up(loaded, around, free.path.waypoints[-1], self.o.lift - self.o.free)
+        lift = self._up(loaded, self._beside, free.path.waypoints[-1], self.o.lift - self.o.free)
         if not lift or lift.path is None:
             return f"it cannot be lifted: {lift.reason.rstrip('.')}"
         return _Way(
-            grasp,
-            opening,
-            around,
-            planner.arm,
-            closed,
-            loaded,
-            attached,
-            plan.path,
-            approach.path,
-            free.path,
-            lift.path,
+            grasp, opening, planner.arm, closed, loaded, attached, plan.path, approach.path, free.path, lift.path
         )
 
     def _execute(self, way: _Way) -> None:
@@ -340,10 +333,10 @@ class _Pick:
         self._settle()
         self._done(f"{1e3 * self.gripper.opening():.0f} mm")
         self._follow(PickStage.MOVE, way.there, way.open_arm, self.s.field, 1.0)
-        self._follow(PickStage.APPROACH, way.approach, way.open_arm, way.around, self.o.slow)
+        self._follow(PickStage.APPROACH, way.approach, way.open_arm, self._around, self.o.slow)
         self._close(way)
-        self._follow(PickStage.LIFT, way.free, way.closed_arm, way.around, self.o.slow)
-        self._follow(PickStage.LIFT, way.lift, way.loaded_arm, way.around, self.o.slow)
+        self._follow(PickStage.LIFT, way.free, way.closed_arm, self._beside, self.o.slow)
+        self._follow(PickStage.LIFT, way.lift, way.loaded_arm, self._beside, self.o.slow)
         self._check()
         if self.o.carry_to is not None:
             self._carry(way)
@@ -372,7 +365,7 @@ class _Pick:
         assert self.o.carry_to is not None
         assert self.q is not None
         planner = GaussianRRTStar(
-            way.around,
+            self._beside,
             self.s.robot,
             T_world_base=self.p._T,
             opening=way.grasp.width,
@@ -382,7 +375,7 @@ class _Pick:
         plan = planner.plan(self.q, self.o.carry_to, budget_ms=self.o.budget_ms, seed=self.o.seed)
         if plan.path is None:
             raise _EndedError(PickOutcome.NO_WAY, plan.reason)
-        self._follow(PickStage.CARRY, plan.path, planner.arm, way.around, self.o.slow)
+        self._follow(PickStage.CARRY, plan.path, planner.arm, self._beside, self.o.slow)
         if not self.gripper.holds():
             self.attached = None
             raise _EndedError(PickOutcome.LOST, "nothing is between the fingers any more")
@@ -425,12 +418,21 @@ class _Pick:
             self.s.robot, T_world_base=self.p._T, opening=opening, attached=attached, margin=self.s.margin
         )
 
+    def _without_strays(self, around: GaussianModel) -> GaussianCollisionField:
+        """What is around the target, less what is within it: its own strays, which segmentation has left out."""
+        surface = target_surface(self.s.scene, self.target.rows, observers=self.s.observers)
+        reach = np.where(surface.seen, 0.0, surface.spread) + _N_SIGMA * surface.doubt
+        self._object = covering_spheres(surface.points, reach)
+        means = around.means.detach().double().numpy()
+        away = np.full(len(means), np.inf)
+        for sphere in self._object:
+            away = np.minimum(away, np.linalg.norm(means - sphere[:3], axis=1) - sphere[3])
+        return self.s.collision_field(around.select(torch.from_numpy(away > 0.0)))
+
     def _attached(self, arm: RobotSpheres, q: Array) -> Array:
         """The object (A, 4) in the frame of the last link, the arm being at the grasp ``q`` (J,)."""
-        surface = target_surface(self.s.scene, self.target.rows, observers=self.s.observers)
-        T = np.linalg.inv(arm.forward(q[None])[0, -1])
-        points = surface.points @ T[:3, :3].T + T[:3, 3]
-        return covering_spheres(points, np.where(surface.seen, 0.0, surface.spread) + _N_SIGMA * surface.doubt)
+        T_link_world = inverse(arm.forward(q[None])[0, -1])
+        return np.c_[transform_points(T_link_world, self._object[:, :3]), self._object[:, 3]]
 
     def _up(self, arm: RobotSpheres, around: GaussianCollisionField, q: Array, by: float) -> StraightResult:
         tool = np.asarray(self.s.robot.T_link_tcp, dtype=np.float64)  # type: ignore[attr-defined]
