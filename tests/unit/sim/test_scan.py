@@ -28,7 +28,7 @@ def twin(*sensor: str) -> Twin:
     return Twin(make_scene({"name": "scanned", "objects": objects, "camera": camera}))
 
 
-def off(points: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def off(points: np.ndarray) -> np.ndarray:
     """Distance [m] of points from the nearest surface."""
     table = points[:, 2]
     return np.abs(np.min([BOX.distance(points), BALL.distance(points), table], axis=0))
@@ -67,4 +67,4 @@ def test_what_makes_no_sense_is_refused() -> None:
         scan(Twin(make_scene({"name": "bare", "objects": [{"name": "table", "shapes": [{"kind": "plane"}]}]})))
     for wrong in ({"views": 0}, {"width": 8}, {"spacing": 0.0}):
         with pytest.raises(InputError, match="out of range"):
-            scan(twin(), **wrong)  # type: ignore[arg-type]
+            scan(twin(), **wrong)
