@@ -66,11 +66,11 @@ class TrackingConfig(_Section):
         description="weight of a dense residual against a feature's: neighbours are correlated",
     )
     dense_share: float = Field(
-        default=0.3,
+        default=1.0,
         ge=0,
         le=1,
         description="dense residuals and features are weighed by the spread that they show in each frame, the dense "
-        "with this share: they err together across the image too; 0: by dense_weight alone",
+        "with this share, for they may err together across the image too; 0: by dense_weight alone",
     )
     features: Literal["always", "needed"] = Field(
         default="always", description="match ORB features on every frame, or only when motion or residual is large"
