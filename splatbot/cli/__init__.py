@@ -29,6 +29,7 @@ COMMANDS = {
     "plan": _Command(
         "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
     ),
+    "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked thing in a map."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
     "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),

@@ -11,6 +11,7 @@ from splatbot.grasping.surface import Surface
 from splatbot.protocols import Array
 
 PAD = 0.006  # [m] around a contact that its plane is fitted to
+_IMPLIED = 0.1  # weight of implied points beside seen ones
 _LEAST = 3e-4  # [m] between two sides
 _LEAN = 0.25  # [rad] that closing directions are varied by
 _ROUNDS = 3
@@ -167,12 +168,13 @@ def _plane(surface: Surface, at: Array, out: Array) -> tuple[Array, Array, Array
     """Where lines through ``at`` (C, 3) along ``out`` (C, 3) cross the plane of the Gaussians around, its normal,
     the share of them that was seen, and their doubt; a line that meets none keeps its place and is of no use."""
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
+    trust = np.where(surface.seen, 1.0, _IMPLIED).astype(np.float32)
     values = np.c_[surface.points, surface.normals, surface.seen, surface.doubt]
     total = np.zeros((len(at), values.shape[1] + 1))
     for k in range(0, len(at), _CHUNK):
         a, o = at[k : k + _CHUNK].astype(np.float32), out[k : k + _CHUNK].astype(np.float32)
         square = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + (p**2).sum(axis=1)[None]
-        weight = np.exp(np.minimum(-0.5 / PAD**2 * square, 0.0)) * (o @ n.T > 0.3)
+        weight = trust * np.exp(np.minimum(-0.5 / PAD**2 * square, 0.0)) * (o @ n.T > 0.3)
         weight[square > (2.5 * PAD) ** 2] = 0.0
         total[k : k + _CHUNK] = np.c_[weight @ values.astype(np.float32), weight.sum(axis=1)]
     count = np.maximum(total[:, -1:], 1e-9)
@@ -180,7 +182,7 @@ def _plane(surface: Surface, at: Array, out: Array) -> tuple[Array, Array, Array
     normal = mean[:, 3:6] / np.maximum(np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True), 1e-12)
     tilt = np.einsum("ij,ij->i", normal, out)
     ahead = np.einsum("ij,ij->i", mean[:, :3] - at, normal) / np.maximum(tilt, 0.2)
-    empty = total[:, -1] < 0.2
+    empty = total[:, -1] < _IMPLIED
     ahead = np.where(empty, 0.0, np.clip(ahead, -2 * PAD, 2 * PAD))
     normal = np.where(empty[:, None], -out, normal)
     return at + ahead[:, None] * out, normal, mean[:, 6], mean[:, 7]

@@ -13,8 +13,9 @@ from splatbot.protocols import Array, HandShape
 
 FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
 SLACK = 0.003  # [m] between each pad and the target as the hand comes
-OPENINGS = 0.005  # [m] that openings are rounded up to
+OPENINGS = 0.002  # [m] that openings are rounded up to
 _CHUNK, _SAMPLE = 256, 250  # hands at once; points for a first look
+_GIVE = 0.003  # [m] that implied sides are off by and do not stop a hand
 _TOUCH = 0.003  # [m] between a pad and what it presses
 _LOOK = 0.03  # [m] of room beyond which more is no better
 
@@ -108,6 +109,7 @@ def beside_target(
     center = surface.center
     p = (surface.points - center).astype(np.float32)
     axes = [np.ascontiguousarray((n_sigma * surface.half[:, :, i]).astype(np.float32).T) for i in range(3)]
+    give = np.where(surface.seen, 0.0, _GIVE).astype(np.float32)
     out = [np.empty(len(hands)) for _ in range(4)]
     half = (pairs.width[hands.pair] / 2).astype(np.float32)
     for k in range(0, len(hands), _CHUNK):
@@ -117,7 +119,7 @@ def beside_target(
         for i in range(3):
             u = np.ascontiguousarray(R[:, :, i])
             local.append(u @ p.T - np.einsum("ij,ij->i", u, at)[:, None])
-            reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)))
+            reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)) - give)
         for into, values in zip(out, _measured(local, reach, half[k : k + _CHUNK, None], hand, retreat), strict=True):
             into[k : k + _CHUNK] = values
     opening, room, stands_out, held = out
@@ -138,10 +140,9 @@ def _measured(
     dz = z - reach[2] - hand.tip  # gap ahead of the tips
     under = (np.abs(x) < hand.width / 2) & (z < hand.tip) & (z > -hand.palm)
     stands_out = np.where(under & (side < half + 0.02), side - half, -np.inf).max(axis=1)
-    fresh = np.clip(stands_out, 0.0, FLUSH)
-    thick = np.where(under & (side < half[:, :1] + FLUSH), reach[1], 0.0).max(axis=1)
-    opening = 2 * (half[:, 0] + fresh + np.minimum(thick, SLACK)) + 2 * SLACK
-    opening = np.minimum(np.ceil(opening / OPENINGS) * OPENINGS, hand.stroke)
+    solid = np.where(under & (side < half + FLUSH), side + np.minimum(reach[1], FLUSH), half).max(axis=1)
+    opening = 2 * (np.maximum(solid, half[:, 0]) + SLACK)
+    opening = np.minimum(np.ceil(opening.astype(np.float64) / OPENINGS) * OPENINGS, hand.stroke)
     inner = opening[:, None] / 2
     dy = np.maximum(inner - (side + reach[1]), (side - reach[1]) - inner - hand.thickness)
     finger = np.maximum(np.maximum(dx, dz), np.maximum(dy, -hand.palm - retreat - z - reach[2]))

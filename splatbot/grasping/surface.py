@@ -26,6 +26,7 @@ _TURNED_AWAY = 0.7  # below it a normal is of another face
 _FEW = 20  # points that are no face
 _BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
 _SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
+_TUBE = 0.003  # [m] around a line within which it meets a point
 _SEEN = 0.006  # [m] around seen points of a side within which none is added
 _ROWS = 0.003  # [m] between added points
 
@@ -132,11 +133,14 @@ def _completed(scene: MapScene, seen: Surface) -> Surface:
     up = scene.up
     parts = [_sides(seen, up, _floor(scene, seen, up))]
     for face in _faces(seen.normals, up):
-        parts.append(_sides(seen, face, _back(seen, face, up), closed=True))
+        back, mirrored = _back(seen, face, up)
+        parts.append(_sides(seen, face, back, closed=True, mirrored=mirrored))
     points, normals = (np.concatenate([part[k] for part in parts]) for k in range(2))
     thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
     thin = thin[:: 1 + len(thin) // MOST]
-    points, normals, n = points[thin], normals[thin], len(thin)
+    points, normals = points[thin], normals[thin]
+    outer = ~_inside(points, normals, np.concatenate([seen.points, points]), np.concatenate([seen.normals, normals]))
+    points, normals, n = points[outer], normals[outer], int(outer.sum())
     if n == 0:
         return seen
     wide = np.full(n, _ROWS / 2)
@@ -158,7 +162,7 @@ def _faces(normals: Array, up: Array) -> list[Array]:
     left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
     few = max(_FEW, 0.05 * len(normals))
     found: list[Array] = []
-    while len(left) >= few and len(found) < 4:
+    while len(left) >= few and len(found) < 8:
         close = left @ left[:: max(1, len(left) // 100)].T > 0.9
         best = int(close.sum(axis=0).argmax())
         if close[:, best].sum() < few:
@@ -181,20 +185,29 @@ def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
     return low - under if 0.0 <= under < 0.03 else low - 0.01
 
 
-def _back(seen: Surface, face: Array, up: Array) -> float:
-    """Where along ``face`` [m, world] the target ends behind: as deep as other sides show, or as it is narrow."""
+def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
+    """Where along ``face`` [m, world] the target ends behind, and whether its back is the mirror image of its front.
+
+    A flat front is that of a box, as deep as its other sides show; a round one turns away half way to its back. Where
+    nothing of either was seen, a thing is taken to be as deep as it is narrow.
+    """
     along = seen.points @ face
-    near = float(np.percentile(along[seen.normals @ face > _FACING], 95))
-    shown = near - float(np.percentile(along, 2))
+    facing = along[seen.normals @ face > _FACING]
+    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 2))
+    if near - far > _SHOWN:
+        flat = float((near - facing < _SHOWN).mean()) > 0.7
+        return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
     across = seen.points @ np.stack([up, np.cross(up, face)], axis=1)
     narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
-    return near - (shown if shown > _SHOWN else min(narrow, 2 * _BEHIND))
+    return near - min(narrow, 2 * _BEHIND), False
 
 
-def _sides(seen: Surface, direction: Array, floor: float, *, closed: bool = False) -> tuple[Array, Array]:
+def _sides(
+    seen: Surface, direction: Array, floor: float, *, closed: bool = False, mirrored: bool = False
+) -> tuple[Array, Array]:
     """Points and normals (K, 3) of the sides behind the edges of what faces ``direction``, where none was seen.
 
-    ``closed``: and of the back, at ``floor``.
+    ``closed``: and of the back, at ``floor``, or mirrored at the middle between it and the top.
     """
     none = np.zeros((0, 3)), np.zeros((0, 3))
     facing = seen.normals @ direction > _TURNED
@@ -218,7 +231,9 @@ def _sides(seen: Surface, direction: Array, floor: float, *, closed: bool = Fals
     normals = np.repeat(np.c_[out, np.zeros(len(out))] @ across, count, axis=0)
     if closed:
         cells = np.argwhere(np.isfinite(heights) & (heights > floor + _STEP) & ~np.isfinite(below))[::2]
-        back = np.c_[low + (cells + 0.5) * _CELL, np.full(len(cells), floor)] @ across
+        top = heights[cells[:, 0], cells[:, 1]]
+        depth = np.maximum(floor + np.percentile(top, 95) - top, floor) if mirrored and len(cells) else floor
+        back = np.c_[low + (cells + 0.5) * _CELL, np.broadcast_to(depth, len(cells))] @ across
         points = np.concatenate([points, back])
         normals = np.concatenate([normals, np.tile(-direction, (len(back), 1))])
     new = _unseen(points, normals, seen)
@@ -288,13 +303,32 @@ def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
     return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)
 
 
+def _inside(points: Array, normals: Array, others: Array, other_normals: Array) -> NDArray[np.bool_]:
+    """Whether what points (P, 3) face first is another surface from behind (P,): they are within the target."""
+    middle = others.mean(axis=0)
+    p, q = (points - middle).astype(np.float32), (others - middle).astype(np.float32)
+    n, m = normals.astype(np.float32), other_normals.astype(np.float32)
+    found = np.zeros(len(p), np.bool_)
+    square = (q**2).sum(axis=1)
+    for k in range(0, len(p), 256):
+        a, d = p[k : k + 256], n[k : k + 256]
+        ahead = d @ q.T - np.einsum("ij,ij->i", a, d)[:, None]
+        aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ q.T) + square - ahead**2
+        ahead[(ahead < _SEEN) | (aside > _TUBE**2)] = np.inf
+        first = ahead.argmin(axis=1)
+        hit = np.isfinite(ahead[np.arange(len(a)), first])
+        found[k : k + 256] = hit & (np.einsum("ij,ij->i", m[first], d) > 0.3)
+    return found
+
+
 def _unseen(points: Array, normals: Array, seen: Surface) -> NDArray[np.bool_]:
     """Whether nothing that was seen within 6 mm of each of points (P, 3) faces the same way (P,)."""
     new = np.ones(len(points), np.bool_)
+    reach = max(_SEEN, 3.0 * float(np.median(seen.spread)))
     for way in (*np.eye(3), *-np.eye(3)):
         asked, known = normals @ way > 0.5, seen.normals @ way > 0.3
         if asked.any() and known.any():
             nearest, square = nearest_of(seen.points[known], points[asked])
             alike = np.einsum("ij,ij->i", seen.normals[known][nearest], normals[asked]) > 0.5
-            new[np.flatnonzero(asked)[alike & (square < _SEEN**2)]] = False
+            new[np.flatnonzero(asked)[alike & (square < reach**2)]] = False
     return new

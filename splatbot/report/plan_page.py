@@ -12,6 +12,7 @@ from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import Trajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view, to_png
+from splatbot.report.balls import balls
 from splatbot.report.moving_page import bytes_of, moving_page, packed, thinned
 
 _MOST_POINTS = 40_000
@@ -69,7 +70,7 @@ def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *,
     share = np.linspace(0.0, 1.0, _GHOSTS)[:, None]
     hues = (1 - share) * np.array([0.15, 0.45, 0.9]) + share * np.array([0.95, 0.5, 0.1])
     ghosts = [
-        _balls(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35) for i in range(_GHOSTS)
+        balls(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35) for i in range(_GHOSTS)
     ]
     near = _within(model, inverse(arm.T_world_base))
     import torch
@@ -78,17 +79,6 @@ def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *,
     camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
     return to_png(
         render_view(scene, camera, arm.T_world_base @ look_at(_EYE, _TARGET), background=(0.09, 0.1, 0.12)), "rgb"
-    )
-
-
-def _balls(centers: Array, radii: Array, color: Array, opacity: float) -> GaussianModel:
-    n = len(centers)
-    return GaussianModel.from_activated(
-        means=centers,
-        quats=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-        scales=np.repeat(radii[:, None] / 2.2, 3, axis=1),
-        opacities=np.full(n, opacity),
-        colors=np.tile(color, (n, 1)),
     )
 
 

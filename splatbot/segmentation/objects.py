@@ -17,6 +17,7 @@ from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.parts import cut_at_steps, nearest_of, region
 from splatbot.segmentation.plane import NEAR, Support, find_support
+from splatbot.workspace import NamedPlace
 
 OPAQUE = 0.3  # fainter Gaussians are no surface
 LOWEST, ABOVE = 0.002, 0.008  # [m] over the support; lower is its own noise, of which it has this much at most
@@ -49,21 +50,6 @@ class MapObject:
     size: Array
     color: Array
     name: str = ""
-    aliases: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class NamedPlace:
-    """What a scene file calls the object at a place.
-
-    Args:
-        name: of the object.
-        at: (3,) a point in or on it [m, world].
-        aliases: other names.
-    """
-
-    name: str
-    at: Array
     aliases: tuple[str, ...] = ()
 
 

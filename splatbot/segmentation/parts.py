@@ -13,6 +13,7 @@ from splatbot.protocols import Array
 _REACH, _MOST = 0.012, 24  # [m] and how many neighbours
 _COHERENT = 0.9  # length of the mean normal around a point that lies in a face
 _PARALLEL = 0.8  # cosine between normals of one face
+_LEVEL = 0.8  # of a normal along z
 _STEP = 0.006  # [m] along their normal that neighbours of one face are apart at most
 _MEET = 5  # pairs of neighbours of two faces that meet
 _MOSTLY = 0.5  # share of a face that is pointed at
@@ -74,7 +75,8 @@ def find_faces(points: Array, *, fewest: int) -> Faces:
 def cut_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
     """Rows of points (P, 3) [m], largest first, in parts that meet at steps only; one part if they do not fall apart.
 
-    Faces that meet at an angle are of one thing; those that meet at a step between parallel ones are not.
+    Faces that meet at an angle are of one thing, unless one rises from the other as from what it stands on; those that
+    meet at a step between parallel ones are not. z is up.
     """
     if len(points) < 2 * fewest:
         return [np.arange(len(points))]
@@ -84,12 +86,23 @@ def cut_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
     group = {face: face for face in faces.numbers}
     for i, a in enumerate(faces.numbers):
         for b in faces.numbers[i + 1 :]:
-            if abs(faces.axis(a) @ faces.axis(b)) < _PARALLEL and faces.touch(a, b):
+            if abs(faces.axis(a) @ faces.axis(b)) < _PARALLEL and faces.touch(a, b) and _under(points, faces, a, b):
                 old, new = group[b], group[a]
                 group = {face: new if root == old else root for face, root in group.items()}
     roots = sorted(set(group.values()))
     parts = [np.flatnonzero(np.isin(faces.owner, [f for f in group if group[f] == root])) for root in roots]
     return sorted(parts, key=lambda rows: (-len(rows), int(rows[0])))
+
+
+def _under(points: Array, faces: Faces, a: int, b: int) -> bool:
+    """Whether a level face of two is the upper one: a side that rises above a top is of another thing."""
+    up = [abs(float(faces.axis(k)[2])) for k in (a, b)]
+    if max(up) < _LEVEL:
+        return True
+    top, side = (a, b) if up[0] >= up[1] else (b, a)
+    n = faces.axis(top)
+    own, other = points[faces.owner == top], points[faces.owner == side]
+    return float(np.median((other - own.mean(axis=0)) @ (n * np.sign(n[2])))) < _STEP
 
 
 def region(points: Array, seeds: NDArray[np.bool_], *, fewest: int) -> NDArray[np.int64]:
