@@ -19,7 +19,8 @@ from splatbot.sim.world import OBJECT
 
 NEAR = 0.03  # [m] from the goal that counts as there
 _UPRIGHT = float(np.cos(0.5))  # a thing that leans more has tipped over
-_FINGER = 0.0125  # [m], radius of the fingers
+_TIP = 0.01  # [m] that the fingers' tips are ahead of the tool's frame
+_TILT = np.pi / 4  # of the tool from straight down, forwards: the fingers, not the hand, meet the thing
 _LOWEST = 0.03  # [m] of the tool over the table
 _RUN = 0.05  # [m] before contact
 _OVER = 0.25  # [m] over the table that the tool comes from
@@ -65,16 +66,24 @@ class Push:
         """See :class:`splatbot.sim.compare.trials.Task`."""
         return self.map_twin, self.held_out(case)
 
-    def succeeded(self, case: PushCase, twin: Twin, result: TwinResult) -> bool:
-        """Whether the thing is where it should be, and upright."""
+    def failure(self, case: PushCase, twin: Twin, result: TwinResult) -> str:
+        """That the thing tipped over, or how far it is from where it should be."""
         name = case.true if twin is not self.map_twin else case.believed.name if case.believed is not None else ""
         things = {thing.name: thing for thing in twin.world.scene.movable}
-        if name not in things or result.stopped is not None:
-            return False
+        if name not in things:
+            return "the map lacks it"
+        if result.stopped is not None:
+            return "; ".join(result.warnings) or "stopped"
         body = twin.data.body(OBJECT + name)
-        goal = np.asarray(things[name].at)[:2] + case.distance * case.direction
-        upright = float(np.asarray(body.xmat)[8]) >= _UPRIGHT
-        return bool(upright and np.linalg.norm(np.asarray(body.xpos)[:2] - goal) <= NEAR)
+        if float(np.asarray(body.xmat)[8]) < _UPRIGHT:
+            return "tipped over"
+        went = np.asarray(body.xpos)[:2] - np.asarray(things[name].at)[:2]
+        off = went - case.distance * case.direction
+        if np.linalg.norm(off) <= NEAR:
+            return ""
+        along = float(off @ case.direction)
+        aside = float(np.linalg.norm(off - along * case.direction))
+        return f"{1e3 * abs(along):.0f} mm {'beyond' if along > 0 else 'short'}, {1e3 * aside:.0f} mm aside"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +112,13 @@ class Pusher:
         back, tall = extents(case.believed, d)
         middle = np.asarray(case.believed.at) * [1, 1, 0] + self.aside * np.array([-d[1], d[0], 0.0])
         z = np.array([0.0, 0.0, max(_LOWEST, self.height * tall)])
-        begin, end = middle - (back + _FINGER + _RUN) * d + z, middle + (case.distance - back - _FINGER) * d + z
+        begin, end = middle - (back + _TIP + _RUN) * d + z, middle + (case.distance - back - _TIP) * d + z
         above = np.array([begin[0], begin[1], _OVER])
-        return self._motion(above, begin, end, float(np.arctan2(d[1], d[0])))
+        z_tool = np.sin(_TILT) * d - np.array([0.0, 0.0, np.cos(_TILT)])
+        y_tool = np.array([-d[1], d[0], 0.0])
+        return self._motion(above, begin, end, np.stack([np.cross(y_tool, z_tool), y_tool, z_tool], axis=1))
 
-    def _motion(self, above: Array, begin: Array, end: Array, yaw: float) -> Attempt | None:
-        R = rotation_of((np.pi, 0.0, yaw))
+    def _motion(self, above: Array, begin: Array, end: Array, R: Array) -> Attempt | None:
         first = self._reach(R, above, self.robot.home, seeds=32)
         if first is None:
             return None

@@ -11,6 +11,7 @@ import numpy as np
 from splatbot.protocols import Array
 
 _PLAIN = 1.3  # a hull is taken only where every primitive's error is this many times larger
+_FOOT = 0.3  # of a hull's height whose points stand on the floor
 _TRIM = 1.0  # [%] of the points that may stick out of a box or cylinder on each side
 
 
@@ -40,7 +41,7 @@ def fit(points: Array, floor: float) -> Fit:
     high = float(np.percentile(points[:, 2], 100 - _TRIM))
     fits = [_box(points, low, high), _cylinder(points, low, high), _ball(points)]
     best = min(fits, key=lambda f: f.error)
-    hull = _hull(points)
+    hull = _hull(points, low, high)
     return hull if best.error > _PLAIN * max(hull.error, 2e-3) else best
 
 
@@ -83,10 +84,12 @@ def _ball(points: Array) -> Fit:
     return _fit({"kind": "sphere", "radius": radius}, x[:3], np.linalg.norm(points - x[:3], axis=1) - radius)
 
 
-def _hull(points: Array) -> Fit:
+def _hull(points: Array, low: float, high: float) -> Fit:
+    """Down to ``low``, as the others are: clusters begin where the table's noise ends, and would fall and tip."""
     import open3d as o3d
 
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    foot = points[points[:, 2] < low + _FOOT * (high - low)] * [1.0, 1.0, 0.0] + [0.0, 0.0, low]
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.concatenate([points, foot])))
     mesh, _ = cloud.compute_convex_hull()
     middle = points.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
