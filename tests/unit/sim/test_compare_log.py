@@ -141,7 +141,7 @@ def test_overlap_is_intersection_over_union_where_it_counts() -> None:
 
 def _tools(count: int, spacing: float) -> tuple[Array, Trajectory]:
     q = panda().home + np.linspace(0.0, 0.4, count)[:, None] * np.array([1.0, 0.3, 0, 0.5, 0, -0.4, 0.2])
-    return q, Trajectory(spacing * np.arange(count), panda().tcp(q))
+    return q, Trajectory(spacing * np.arange(count, dtype=np.float64), panda().tcp(q))
 
 
 def test_tool_poses_are_done_again_by_ik_to_a_tenth_of_a_millimetre() -> None:
