@@ -135,7 +135,7 @@ def compare_log(
     by_arm = {i: T for i in known if (T := record.camera_at(stamps[i], robot)) is not None}
     base = base_in_map(by_arm, tracked, record.source) if by_arm else _told_base(record, model)
     poses = by_arm or {i: np.asarray(inverse(base.T_world_base) @ T) for i, T in tracked.items() if i < len(log)}
-    around = surroundings(model, run.map, base.T_world_base, robot)
+    around = surroundings(model, run.map, base.T_world_base, robot, record.workspace.support_plane)
     chosen = _spread(sorted(poses), frames)
     notes = [] if around.support is not None else ["no level plane within the arm's reach: nothing stands on anything"]
     views: list[ViewAgreement] = []
