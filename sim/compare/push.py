@@ -25,6 +25,7 @@ _LOWEST = 0.03  # [m] of the tool over the table
 _RUN = 0.05  # [m] before contact
 _OVER = 0.25  # [m] over the table that the tool comes from
 _APPROACH, _DOWN, _REST = 2.0, 1.0, 0.5  # [s]
+_POSTURES = 8  # above the thing that are tried
 _RATE = 50.0  # [Hz] of the samples; between them a motion is a cubic
 
 
@@ -115,38 +116,47 @@ class Pusher:
         begin, end = middle - (back + _TIP + _RUN) * d + z, middle + (case.distance - back - _TIP) * d + z
         above = np.array([begin[0], begin[1], _OVER])
         z_tool = np.sin(_TILT) * d - np.array([0.0, 0.0, np.cos(_TILT)])
-        y_tool = np.array([-d[1], d[0], 0.0])
+        y_tool = np.array([d[1], -d[0], 0.0])  # as at home: the other way round the wrist is near its limits
         return self._motion(above, begin, end, np.stack([np.cross(y_tool, z_tool), y_tool, z_tool], axis=1))
 
     def _motion(self, above: Array, begin: Array, end: Array, R: Array) -> Attempt | None:
-        first = self._reach(R, above, self.robot.home, seeds=32)
-        if first is None:
-            return None
+        """The first of several postures above the thing from which the whole way is within the joints' limits."""
         stretch = max(float(np.linalg.norm(end - begin)) / self.speed, 2 / _RATE)
-        lines = [(above, begin, _DOWN), (begin, end, stretch), (end, end, _REST)]
-        t = np.arange(0.0, _APPROACH, 1 / _RATE)
-        q = list(minimum_jerk(t, np.array([0.0, _APPROACH]), np.stack([self.robot.home, first]), 0))
-        times, now, at = list(t), _APPROACH, first
-        for a, b, seconds in lines:
-            local = np.linspace(0.0, seconds, max(3, round(seconds * _RATE)), endpoint=False)
-            for moment, place in zip(
-                local, minimum_jerk(local, np.array([0.0, seconds]), np.stack([a, b]), 0), strict=True
-            ):
-                found = self._reach(R, place, at, seeds=1)
-                if found is None:
-                    return None
-                at = found
-                times.append(now + float(moment))
-                q.append(at)
-            now += seconds
-        motion = motion_from_samples(times, np.array(q))
-        return Attempt(replace(motion, opening=np.zeros(len(times))))
+        times, places = _way([(above, begin, _DOWN), (begin, end, stretch), (end, end, _REST)])
+        for first in solve_ik(self.robot, _pose(R, above), near=self.robot.home).q[:_POSTURES]:
+            q = self._along(first, places, R)
+            if q is not None:
+                t = np.arange(0.0, _APPROACH, 1 / _RATE)
+                approach = minimum_jerk(t, np.array([0.0, _APPROACH]), np.stack([self.robot.home, first]), 0)
+                motion = motion_from_samples(np.append(t, _APPROACH + times), np.concatenate([approach, q]))
+                return Attempt(replace(motion, opening=np.zeros(len(motion.time))))
+        return None
 
-    def _reach(self, R: Array, at: Array, near: Array, *, seeds: int) -> Array | None:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, at
-        found = solve_ik(self.robot, T, near=near, seeds=seeds).q
-        return found[0] if len(found) else None
+    def _along(self, first: Array, places: Array, R: Array) -> Array | None:
+        found = [first]
+        for place in places:
+            nearest = solve_ik(self.robot, _pose(R, place), near=found[-1], seeds=1).q
+            if not len(nearest):
+                return None
+            found.append(nearest[0])
+        return np.array(found[1:])
+
+
+def _way(lines: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array]:
+    """Times (N,) [s] and places (N, 3) on lines (from, to, seconds), at rest at the end of each."""
+    times, places, now = [], [], 0.0
+    for a, b, seconds in lines:
+        t = np.linspace(0.0, seconds, max(3, round(seconds * _RATE)), endpoint=False)
+        times.append(now + t)
+        places.append(minimum_jerk(t, np.array([0.0, seconds]), np.stack([a, b]), 0))
+        now += seconds
+    return np.concatenate(times), np.concatenate(places)
+
+
+def _pose(R: Array, at: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, at
+    return T
 
 
 def push_policies(robot: RobotModel) -> tuple[Pusher, ...]:
