@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from splatbot.sim.compare.views import TwinViews
+from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand
 
 pytest.importorskip("mujoco")
@@ -31,9 +34,7 @@ def test_a_log_without_an_arm_is_compared_at_tracked_poses(
     run: RunCommand, log_folder: Path, run_folder: Path, tmp_path: Path
 ) -> None:
     """Of a scene in which nothing stands on anything, and whose log tells neither tool nor joints."""
-    (log_folder / "scene.yaml").write_text(
-        "T_world_base: {translation: [0, 0, 0], quaternion_wxyz: [1, 0, 0, 0]}\n", encoding="utf-8"
-    )
+    Workspace(np.eye(4)).save(log_folder / "scene.yaml")
     answer = run("sim2real", log_folder, "--map", run_folder, "--frames", "3", "--out", tmp_path / "out")
     assert answer.code == 0, answer.err
     found = json.loads((tmp_path / "out" / "sim2real.json").read_text())
@@ -50,8 +51,7 @@ def test_a_log_without_an_arm_is_compared_at_tracked_poses(
 def test_a_stop_between_frames_keeps_what_was_compared(
     run: RunCommand, log_folder: Path, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from splatbot.sim.compare.views import TwinViews
-
+    Workspace(np.eye(4)).save(log_folder / "scene.yaml")
     compare, seen = TwinViews.compare, []
 
     def stopped(self, *args, **kwargs):  # type: ignore[no-untyped-def]
