@@ -52,7 +52,8 @@ def test_a_stop_between_frames_keeps_what_was_compared(
     run: RunCommand, log_folder: Path, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Workspace(np.eye(4)).save(log_folder / "scene.yaml")
-    compare, seen = TwinViews.compare, []
+    compare = TwinViews.compare
+    seen: list[int] = []
 
     def stopped(self, *args, **kwargs):  # type: ignore[no-untyped-def]
         if len(seen) == 2:

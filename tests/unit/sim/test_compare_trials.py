@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,7 +90,7 @@ def test_without_a_spread_the_held_out_twin_is_the_twin() -> None:
 
 
 @pytest.mark.parametrize(("change", "least"), [({"gain": 0.6}, 2e-4), ({"lag": 0.02}, 5e-3), ({"latency": 0.02}, 5e-3)])
-def test_each_kind_of_bad_drive_costs_tracking(change: dict[str, float], least: float) -> None:
+def test_each_kind_of_bad_drive_costs_tracking(change: dict[str, Any], least: float) -> None:
     scene = make_scene({"name": "bare"})
     exact = draw(EXACT, 0)
     good, bad = (HeldOutTwin(scene, physics).follow(_swing()) for physics in (exact, replace(exact, **change)))
