@@ -32,6 +32,7 @@ COMMANDS = {
     "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked thing in a map."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
+    "pick": _Command("splatbot.cli.pick", "pick", "Pick a named thing in the twin: look, grasp, plan, lift, check."),
     "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),
     "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
     "sim2real": _Command(
