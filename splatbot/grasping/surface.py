@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
@@ -58,6 +59,12 @@ class Surface:
     def __len__(self) -> int:
         return len(self.points)
 
+    def select(self, chosen: NDArray[np.int64]) -> Surface:
+        """The points that are named, about the same centre."""
+        columns = (self.points, self.normals, self.half, self.spread)
+        points, normals, half, spread = (column[chosen] for column in columns)
+        return Surface(points, normals, half, spread, self.seen[chosen], self.doubt[chosen], self.center)
+
 
 def target_surface(
     scene: MapScene, rows: NDArray[np.int64], *, observers: Array | None = None, seed: int = 0
@@ -74,30 +81,23 @@ def target_surface(
     """
     rng = np.random.default_rng(seed)
     chosen = rows if len(rows) <= MOST else np.sort(rng.choice(rows, MOST, replace=False))
-    model = scene.model.select(_index(chosen))
+    model = scene.model.select(torch.from_numpy(chosen))
     points = model.means.detach().double().numpy()
     scales = np.sort(model.scales.detach().double().numpy(), axis=1)
     center = _middle(scene, points)
     outward = points - center
     if observers is not None:
-        known = np.isfinite(observers[chosen]).all(axis=1)
-        outward = np.where(known[:, None], observers[chosen] - points, outward)
+        outward = np.where(np.isfinite(observers[chosen]), observers[chosen] - points, outward)
     normals = shortest_axes(model).detach().double().numpy()
     normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
     normals, areas = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
     doubt = _doubts(model, scales)
     half = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
-    kept = areas < _LONELY * np.median(areas)
+    kept = np.flatnonzero(areas < _LONELY * np.median(areas))
     apart = np.sqrt(areas)
     spread = np.where(apart > 2 * scales[:, 2], 1.2 * apart, scales[:, 2])  # where only some of many are looked at
-    columns = (x[kept] for x in (points, normals, half, spread, np.ones(len(points), np.bool_), doubt))
-    return _completed(scene, Surface(*columns, center), areas[kept])
-
-
-def _index(rows: NDArray[np.int64]):  # type: ignore[no-untyped-def]
-    import torch
-
-    return torch.from_numpy(rows)
+    seen = Surface(points, normals, half, spread, np.ones(len(points), np.bool_), doubt, center)
+    return _completed(scene, seen.select(kept), areas[kept])
 
 
 def _doubts(model: GaussianModel, scales: Array) -> Array:
