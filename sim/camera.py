@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,15 @@ from splatbot.frame import Frame
 from splatbot.protocols import Array
 from splatbot.sim.bodies_view import BodiesView
 from splatbot.sim.effects.registry import make_effects
+from splatbot.sim.effects.sensors import sensor_specs
 from splatbot.sim.map_view import MapView
 from splatbot.sim.scene import CameraSection
 from splatbot.sim.view import View, composite
-from splatbot.sim.world import World
+from splatbot.sim.world import World, robot_joints
 from splatbot.trajectory import Trajectory
 
 _REACH = 20.0  # [m] that depth cameras see
+_PROMPT = 1e-9  # [s] by which a frame may be late and yet on time
 
 
 class TwinCamera:
@@ -43,7 +46,9 @@ class TwinCamera:
         self.T_world_camera = pose_of(section)
         still = Trajectory(np.zeros(1), self.T_world_camera[None])
         why = f"sensor of the scene {world.scene.name}"
-        self.effects = make_effects(section.sensor, seed=seed, why=why).along(still)
+        self.effects = make_effects(sensor_specs(world.scene), seed=seed, why=why).along(still)
+        self._underway: list[Frame] = []
+        self._qpos = robot_joints(world.model, world.robot)[0] if world.robot is not None else None
         self._map = MapView(world, self.camera) if splats and world.parts is not None else None
         self._bodies = BodiesView(world, self.camera, map_too=self._map is None)
 
@@ -54,10 +59,19 @@ class TwinCamera:
         return bodies if self._map is None else composite(bodies, self._map.view(data, T))
 
     def frame(self, data: Any, index: int, stamp: float) -> Frame | None:
-        """What the camera sees now; None if the sensor loses the frame."""
+        """The newest frame that arrives at ``stamp`` [s], with the joints (J,) of that moment; None if none does.
+
+        Without latency that is what the camera sees now, or nothing if the sensor loses it.
+        """
         seen = self.view(data)
         frame = Frame(stamp, seen.rgb(), seen.measured(_REACH), self.camera, index, source=f"twin#{index}")
-        return next(iter(self.effects.over([frame])), None)
+        self._underway.extend(self.effects.over([frame]))
+        arrived = [late for late in self._underway if late.stamp <= stamp + _PROMPT]
+        self._underway = [late for late in self._underway if late.stamp > stamp + _PROMPT]
+        return replace(arrived[-1], joints=self._joints(data)) if arrived else None
+
+    def _joints(self, data: Any) -> Array | None:
+        return None if self._qpos is None else np.array(data.qpos[self._qpos])
 
     def report(self) -> list[dict[str, Any]]:
         """The account of the sensor's effects."""

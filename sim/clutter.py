@@ -13,7 +13,7 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_to_rotation
 from splatbot.protocols import Array
-from splatbot.segmentation import Fit, Support, clusters, find_support, fit
+from splatbot.segmentation import Fit, Support, clusters, find_support, fit, given_support
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge
 from splatbot.sim.scene import Clutter, Scene, SceneObject
 from splatbot.sim.solids import rotation_of
@@ -67,7 +67,7 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     labels[used] = -1
     objects: list[SceneObject] = []
     notes: list[str] = []
-    support = find_support(points)
+    support = find_support(points) if clutter.support is None else _given(points, clutter.support)
     if support is not None:
         labels[used[support.inside]] = 0
         objects.append(_table(support))
@@ -106,6 +106,13 @@ def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
         geom.condim, geom.rgba = 1, [0.6, 0.6, 0.65, 1.0]
         geoms.append(geom)
     return geoms
+
+
+def _given(points: Array, plane: tuple[float, float, float, float]) -> Support:
+    length = float(np.linalg.norm(plane[:3]))
+    if length < 1e-6 or plane[2] <= 0:
+        raise InputError(f"is {list(plane)}.", field="map.support", hint="give n, d with n upwards")
+    return given_support(points, np.array(plane[:3]) / length, -plane[3] / length)
 
 
 def _table(support: Support) -> SceneObject:

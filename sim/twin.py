@@ -15,7 +15,8 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.effects.physics import Decision, Hook
+from splatbot.sim.effects.decisions import Decision
+from splatbot.sim.effects.physics import Hook
 from splatbot.sim.following import Follower, targets_of
 from splatbot.sim.motion import JointMotion, home_of, motion_of
 from splatbot.sim.scene import Scene

@@ -16,7 +16,8 @@ from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot
 from splatbot.sim.clutter import MapParts, add_ellipsoids, load_parts
-from splatbot.sim.effects.physics import Decision, Hook, effects_for, physics_effect
+from splatbot.sim.effects.decisions import Decision
+from splatbot.sim.effects.physics import PHYSICS, Hook, effects_for, physics_effect
 from splatbot.sim.scene import CameraSection, Scene, SceneObject
 from splatbot.sim.solids import quat_of
 
@@ -80,7 +81,7 @@ class World:
 
     @property
     def on(self) -> tuple[str, ...]:
-        """The physics that is on."""
+        """The effects that are on."""
         return tuple(d.name for d in self.decisions if d.on)
 
     @property
@@ -110,7 +111,7 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
         for geom in (*draft.map_geoms, *stand_ins):
             geom.group = MAP_GROUP
     decisions = effects_for(scene)
-    on = [physics_effect(d.name) for d in decisions if d.on]
+    on = [physics_effect(d.name) for d in decisions if d.on and d.name in PHYSICS]
     for effect in on:
         effect.build(draft)
     draft.spec.option.timestep = scene.timestep if timestep is None else timestep

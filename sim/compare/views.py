@@ -18,7 +18,7 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.rasterize.views import colorize, render_view
 from splatbot.robots.robot import RobotModel
-from splatbot.segmentation.plane import Support, find_support
+from splatbot.segmentation import Support, find_support
 from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.solids import rpy_of
 from splatbot.sim.world import World, build_world

@@ -21,7 +21,7 @@ def bench_twin(
 
     What a step costs with and without a map's clutter, awake and asleep; what each effect costs, alone and together;
     error against the time step; planned paths among the true shapes, and paths pushed into an obstacle; the picture of
-    a robot among Gaussians against that of the true shapes.
+    a robot among Gaussians against that of the true shapes. Exit code 1: a figure is out of its bounds.
 
     Examples:
         splatbot bench twin
@@ -42,6 +42,7 @@ def bench_twin(
 
     draw_offscreen()
     from splatbot.bench.twin import TwinPlan, run_twin
+    from splatbot.bench.twin_bounds import broken_bounds
     from splatbot.cli.bench_tables import say_progress, tell_machine, wide_console
 
     folder = out if out is not None else Path("runs") / "bench-twin"
@@ -61,4 +62,7 @@ def bench_twin(
         table.add_row(row.case, row.metric, figure, row.note or "")
     console.print(table)
     console.print(f"written to {folder}")
-    return 0
+    broken = broken_bounds(results) if not quick else []
+    for text in broken:
+        console.print(f"[red]{text}[/red]")
+    return 1 if broken else 0

@@ -96,7 +96,7 @@ def build(name: str, values: Mapping[str, Any] | None = None, /, **fields: Any) 
 
 def to_plain(message: Message) -> dict[str, Any]:
     """The message as nested dictionaries; numeric arrays stay numpy arrays."""
-    return {name: _plain(getattr(message, name)) for name in (f.name for f in dataclasses.fields(message))}
+    return {name: _plain(getattr(message, name)) for name, _ in typestore().fielddefs[type_of(message)][1]}
 
 
 def _plain(value: Any) -> Any:

@@ -3,7 +3,7 @@
 from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.fits import Fit, fit, primitive_fits
 from splatbot.segmentation.objects import MapObject, MapScene, segment
-from splatbot.segmentation.plane import Support, find_support
+from splatbot.segmentation.plane import Support, find_support, given_support
 
 __all__ = [
     "Fit",
@@ -13,6 +13,7 @@ __all__ = [
     "clusters",
     "find_support",
     "fit",
+    "given_support",
     "primitive_fits",
     "segment",
 ]

@@ -91,6 +91,54 @@ for shift in (0.0, 0.15):
 """
 
 
+_IDEAL = """
+from splatbot.sim.effects.registry import EFFECTS, effect_class
+from splatbot.sim.scene import load_scene, make_scene
+from splatbot.sim.twin import Twin
+from splatbot.sim.camera import TwinCamera
+calls = []
+for name in EFFECTS:
+    kind = effect_class(name)
+    def watched(self, frame, rng, really=kind.apply, name=name):
+        calls.append(name)
+        return really(self, frame, rng)
+    kind.apply = watched
+camera = {"at": [1.5, -0.5, 0.9], "look_at": [0.5, 0.2, 0.4], "width": 64, "height": 48}
+for sensor, scene in (([], {}), (["color_noise"], {"effects": {"force": ["exposure"], "forbid": ["color_noise"]}})):
+    twin = Twin(make_scene({"name": "x", "camera": camera | {"sensor": sensor}, **scene}))
+    eye = TwinCamera(twin.world)
+    for i in range(3):
+        eye.frame(twin.data, i, 0.1 * i)
+    eye.close()
+    on = [d.name for d in twin.world.decisions if d.on]
+    print(sorted(calls), [(row["name"], row["frames"]) for row in eye.report()], on)
+    calls.clear()
+"""
+
+_LATE = """
+import numpy as np
+from splatbot.sim.scene import make_scene
+from splatbot.sim.twin import Twin
+from splatbot.sim.camera import TwinCamera
+camera = {"at": [1.5, -0.5, 0.9], "look_at": [0.4, 0.0, 0.4], "width": 64, "height": 48}
+twins = [Twin(make_scene({"name": "x", "camera": camera | {"sensor": s}})) for s in ([], ["latency:delay=0.15"])]
+prompt, late = (TwinCamera(twin.world) for twin in twins)
+home = np.array(twins[0].world.robot.home)
+taken = []
+for i in range(5):
+    q = home + 0.1 * i
+    for twin in twins:
+        twin.reset(q)
+    taken.append(prompt.frame(twins[0].data, i, 0.1 * i))
+    frame = late.frame(twins[1].data, i, 0.1 * i)
+    if frame is None:
+        print(i, None)
+    else:
+        old = (frame.rgb == taken[i - 2].rgb).all()
+        print(i, frame.index, f"{frame.stamp:.2f}", bool(old), bool(np.allclose(frame.joints, q)))
+"""
+
+
 def _run(sensor: str) -> str:
     return run_drawing(_DEPTH % sensor)[0]
 
@@ -105,6 +153,19 @@ def test_the_sensors_effects_are_on_the_account_and_change_the_depth() -> None:
     noisy, _, *names = _run('["depth_noise:strength=5"]').split()
     assert "".join(names) == "['depth_noise']"
     assert noisy != ideal
+
+
+def test_what_nobody_asked_the_sensor_for_is_never_called() -> None:
+    ideal, chosen = run_drawing(_IDEAL)
+    assert ideal == "[] [] []"
+    assert chosen == "['exposure', 'exposure', 'exposure'] [('exposure', 3)] ['exposure']"
+
+
+def test_a_late_frame_shows_the_past_with_the_joints_of_the_present() -> None:
+    """Taken every 0.1 s and 0.15 s on the way: each is handed over at the second call after its own."""
+    lines = run_drawing(_LATE)
+    assert lines[:2] == ["0 None", "1 None"]
+    assert lines[2:] == [f"{i} {i - 2} {0.1 * (i - 2) + 0.15:.2f} True True" for i in (2, 3, 4)]
 
 
 def test_any_pinhole_anywhere_shows_a_ball_where_it_projects_to() -> None:
