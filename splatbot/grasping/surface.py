@@ -17,6 +17,7 @@ from splatbot.segmentation import MapScene
 from splatbot.segmentation.parts import nearest_of
 
 MOST = 1800  # points that are looked at
+_OFTEN = 0.2  # of the keyframes that the best Gaussians are supported by
 _SMOOTH = 0.006  # [m] over which normals are averaged
 _LONELY = 4.0  # times the usual area of a point; those with more are strays
 _WITHIN = 0.45  # winding number, from where on a point is within what was seen
@@ -80,6 +81,8 @@ def target_surface(
         seed: of which Gaussians are kept where there are more than 1800.
     """
     rng = np.random.default_rng(seed)
+    seen_by = scene.model.observations.numpy()[rows]  # what few keyframes saw is often smeared beyond an edge
+    rows = rows[seen_by >= _OFTEN * np.percentile(seen_by, 90)] if len(rows) else rows
     chosen = rows if len(rows) <= MOST else np.sort(rng.choice(rows, MOST, replace=False))
     model = scene.model.select(torch.from_numpy(chosen))
     points = model.means.detach().double().numpy()
@@ -200,7 +203,7 @@ def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
     """
     along = seen.points @ face
     facing = along[seen.normals @ face > _FACING]
-    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 2))
+    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 5))
     if near - far > _SHOWN:
         flat = float((near - facing < _SHOWN).mean()) > 0.7
         return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
