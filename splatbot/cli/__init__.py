@@ -59,6 +59,11 @@ COMMANDS = {
         "bench_planning",
         "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
     ),
+    "bench grasping": _Command(
+        "splatbot.cli.bench_grasping",
+        "bench_grasping",
+        "Measure grasping: candidates a second, time to a ranked list, contacts against exact shapes.",
+    ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 
