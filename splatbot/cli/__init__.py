@@ -52,6 +52,11 @@ COMMANDS = {
         "bench_planning",
         "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
     ),
+    "bench service": _Command(
+        "splatbot.cli.bench_service",
+        "bench_service",
+        "Measure the service: frames mapped and questions answered at once, and what HTTP costs.",
+    ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 
