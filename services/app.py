@@ -15,6 +15,7 @@ from splatbot.services.guard import Guard
 from splatbot.services.limits import BodyLimit
 from splatbot.services.problems import install_problem_handlers
 from splatbot.services.requests import HEADER, RequestLog
+from splatbot.services.ros.node import RosNode
 from splatbot.services.routes import (
     collisions,
     distance,
@@ -24,6 +25,7 @@ from splatbot.services.routes import (
     maps,
     plans,
     render,
+    ros,
     trajectories,
     trials,
     views,
@@ -40,15 +42,19 @@ camera axes OpenCV's (x right, y down, z forward). Every answer names the `map_v
 def create_app(runtime: Runtime) -> FastAPI:
     """The service on ``runtime``, which begins with the application and ends with it."""
     settings = runtime.settings
+    node = RosNode(runtime.store, on_frame=runtime.take)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(runtime.start)
+        node.start()
         yield
+        node.stop()
         await run_in_threadpool(runtime.close)
 
     app = FastAPI(title="splatbot", version=splatbot.__version__, description=_DESCRIPTION, lifespan=lifespan)
     app.state.runtime = runtime
+    app.state.ros = node
     # The last one added is the first to see a request.
     uploads = {"/upload": settings.max_upload_bytes}
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, larger=uploads)
@@ -62,7 +68,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     install_problem_handlers(app)
     describe_bodies(app)
     for group in (
-        health, maps, frames, distance, collisions, render, views, plans, trajectories, trials, jobs
+        health, maps, frames, distance, collisions, render, views, plans, trajectories, trials, jobs, ros
     ):  # fmt: skip
         app.include_router(group.router)
     return app

@@ -179,7 +179,7 @@ class Arms:
     def _tell(self, arm: Arm, handle: JobHandle, feedback: Feedback, duration: float) -> None:
         names = arm.robot.chain.names
         joints = JointState(time.time(), names, feedback.position, np.asarray(feedback.velocity))
-        self._bus.publish(robot_topic(arm.name, JOINTS), joints)
+        self._bus.publish(robot_topic(arm.robot.name, JOINTS), joints)
         self._bus.publish(motion_topic(handle.id), feedback)
         if not handle.cancelled.is_set():
             handle.tell(feedback.time / duration if duration > 0 else 1.0)

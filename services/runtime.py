@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
+from contextlib import suppress
 
 from splatbot.config import Config
 from splatbot.errors import ConfigError, SplatbotError
@@ -17,7 +18,7 @@ from splatbot.services.metrics import Metrics
 from splatbot.services.plans import Plans
 from splatbot.services.pushed import PushedFrames, StreamEndedError
 from splatbot.services.settings import ServiceSettings
-from splatbot.services.store import MapStore, ServedMap
+from splatbot.services.store import MapExistsError, MapStore, ServedMap
 from splatbot.workspace import Workspace
 
 _log = logging.getLogger(__name__)
@@ -106,6 +107,17 @@ class Runtime:
             hint = 'create a map for frames: POST /v1/maps {"id": ...}'
             raise StreamEndedError(f"map {map_id!r} is not made of pushed frames.", hint=hint)
         return frames
+
+    def take(self, frame: Frame, map_id: str = "ros") -> None:
+        """Map a frame that was published, not pushed into a map: the first one makes the map.
+
+        Raises:
+            BusyError: as many frames wait as may; this one is dropped.
+            InputError: the frame does not fit those before, or the map is made of something else.
+        """
+        with suppress(MapExistsError):
+            self.open_stream(map_id)
+        self.stream(map_id).push(frame)
 
     def remove(self, map_id: str) -> None:
         """End the map's making, serve it no longer, and delete what was saved of it.
