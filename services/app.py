@@ -20,6 +20,7 @@ from splatbot.services.routes import (
     collisions,
     distance,
     frames,
+    grasps,
     health,
     jobs,
     maps,
@@ -68,7 +69,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     install_problem_handlers(app)
     describe_bodies(app)
     for group in (
-        health, maps, frames, distance, collisions, render, views, plans, trajectories, trials, jobs, ros
+        health, maps, frames, distance, collisions, render, views, plans, grasps, trajectories, trials, jobs, ros
     ):  # fmt: skip
         app.include_router(group.router)
     return app

@@ -182,6 +182,44 @@ class PlanRequest(Request):
         return self
 
 
+class PictureHint(Request):
+    """A place in a picture: a pixel, or the corners of a rectangle."""
+
+    camera: CameraIn
+    pose: Pose = Field(description="T_world_camera")
+    pixel: tuple[float, float] | None = Field(None, description="(u, v) [px]")
+    box: Vector4 | None = Field(None, description="(u0, v0, u1, v1) [px]")
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.pixel is None) == (self.box is None):
+            raise ValueError("give one of pixel and box")
+        return self
+
+
+class GraspsRequest(Request):
+    """A thing to be grasped: named, pointed at in the world, or in a picture."""
+
+    target: str | None = Field(None, max_length=200, description='words, as "largest box" or "red cup"')
+    point: Vector3 | None = Field(None, description="on or in the thing, world frame [m]")
+    picture: PictureHint | None = None
+    robot: str = "panda"
+    base: Pose | None = Field(None, description="T_world_base, z up; by default what the map knows")
+    hand_only: bool = Field(False, description="leave the arm out")
+    approach: Literal["any", "top", "side"] = "any"
+    friction: Annotated[float, Field(gt=0, le=2)] = 0.5
+    samples: Annotated[int, Field(ge=10, le=5000)] = Field(400, description="places tried: the knob of time")
+    wanted: Annotated[int, Field(ge=1, le=100)] = 10
+    margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+
+    @model_validator(mode="after")
+    def _one_hint(self) -> Self:
+        if sum(hint is not None for hint in (self.target, self.point, self.picture)) != 1:
+            raise ValueError("give one of target, point and picture")
+        return self
+
+
 class TrajectoryRequest(Request):
     """A planned motion to be followed."""
 

@@ -229,6 +229,10 @@ class Client:
         """A certified motion; see POST /v1/maps/{map_id}/plans for what may be asked. No motion is an error."""
         return self._json("POST", f"/v1/maps/{quote(map_id, safe='')}/plans", asked)
 
+    def grasps(self, map_id: str, **asked: Any) -> dict[str, Any]:
+        """Ranked grasps of a thing; see POST /v1/maps/{map_id}/grasps for how it is named. No grasp is an error."""
+        return self._json("POST", f"/v1/maps/{quote(map_id, safe='')}/grasps", asked)
+
     def ik(self, pose: Mapping[str, Any], **more: Any) -> NDArray[np.float64]:
         """Configurations (K, J) that bring the tool to a pose."""
         found: NDArray[np.float64] = self._packed("POST", "/v1/ik", {"pose": dict(pose), **more})["q"]

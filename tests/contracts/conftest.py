@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import uvicorn
 from fastapi import FastAPI
+from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.services.app import create_app
@@ -69,6 +70,40 @@ def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
         colors=np.tile([1.0, 0.2, 0.1], (n, 1)),
     )
     return Snapshot(model, version)
+
+
+def table_with_box() -> Snapshot:
+    """A table top at z = 0, z up, and a box of 4 x 6 x 8 cm on it at (0.5, 0, 0)."""
+    size = np.array([0.04, 0.06, 0.08])
+    grids = [_sheet(np.array([0.5, 0.0, 0.0]), 2, np.array([0.6, 0.8]), 0.02)]
+    for axis in range(3):
+        for side in (-1, 1):
+            center = np.array([0.5, 0.0, 0.04])
+            center[axis] += side * size[axis] / 2
+            grids.append(_sheet(center, axis, np.delete(size, axis), 0.005))
+    means, scales = (np.concatenate(parts) for parts in zip(*grids, strict=True))
+    n, table = len(means), len(grids[0][0])
+    colors = np.where(np.arange(n)[:, None] < table, [0.5, 0.5, 0.5], [0.9, 0.1, 0.1])
+    model = GaussianModel.from_activated(
+        means=means, quats=np.tile([1.0, 0, 0, 0], (n, 1)), scales=scales, opacities=np.full(n, 0.95), colors=colors
+    )
+    model.observations += 9
+    return Snapshot(model, 1)
+
+
+def _sheet(
+    center: NDArray[np.float64], axis: int, size: NDArray[np.float64], step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres and scales of flat Gaussians on a rectangle across an axis."""
+    a, b = (np.arange(-s / 2 + step / 2, s / 2, step) for s in size)
+    u, v = (g.ravel() for g in np.meshgrid(a, b))
+    means = np.tile(center, (len(u), 1))
+    others = [k for k in range(3) if k != axis]
+    means[:, others[0]] += u
+    means[:, others[1]] += v
+    scales = np.full((len(u), 3), step / 2)
+    scales[:, axis] = 0.0003
+    return means, scales
 
 
 @pytest.fixture

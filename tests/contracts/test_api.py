@@ -23,7 +23,7 @@ from splatbot.robots.panda import panda
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.trajectory import Trajectory
-from tests.contracts.conftest import Service, running, wall
+from tests.contracts.conftest import Service, running, table_with_box, wall
 
 LOG = "synthetic:tabletop?frames=6&width=160&height=120&arc=4"
 BASE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
@@ -35,6 +35,7 @@ def api() -> Iterator[Service]:
     store = MapStore()
     path = Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
     store.add("default", source="wall.ply", state="static", snapshot=wall(), trajectory=path)
+    store.add("table", source="a table", state="static", snapshot=table_with_box())
     with running(ServiceSettings(), store) as service:
         yield service
 
@@ -55,11 +56,13 @@ def test_every_documented_example_is_answered_as_documented(api: Service) -> Non
             if where.endswith("/frames"):
                 api.client.post("/v1/maps", json={"id": "frames"})
                 where = "/v1/maps/frames/frames"
+            if where.endswith("/grasps"):
+                where = "/v1/maps/table/grasps"
             body = example | ({"plan": plan} if "plan" in example else {})
             response = api.client.post(where, json=body)
             assert response.status_code in (200, 201, 202), f"{path}, {name}: {response.text}"
             asked += 1
-    assert asked >= 14
+    assert asked >= 16
 
 
 def _examples(operation: dict[str, Any]) -> dict[str, Any]:
@@ -165,6 +168,16 @@ def test_a_plan_into_the_wall_is_a_problem_with_moveit_s_code(robot: Client) -> 
     with pytest.raises(ServiceError) as caught:
         robot.plan("default", goal_pose=far, base=BASE)
     assert (caught.value.status, caught.value.code) == (422, -31)
+
+
+def test_grasps_of_a_box_are_as_wide_as_it_is_and_one_that_is_not_there_is_a_problem(robot: Client) -> None:
+    found = robot.grasps("table", target="box", base={})
+    best = found["grasps"][0]
+    assert best["width_m"] == pytest.approx(0.04, abs=0.005) or best["width_m"] == pytest.approx(0.06, abs=0.005)
+    assert best["q"] is not None
+    with pytest.raises(ServiceError) as caught:
+        robot.grasps("table", target="blue cup", base={})
+    assert caught.value.status == 422
 
 
 def test_ik_reaches_the_pose(robot: Client) -> None:
