@@ -45,6 +45,6 @@ def distance(request: Request, served: Served, settings: Settings, asked: _Body)
         "n_sigma": asked.n_sigma,
         "distance": found.distance,
         "index": found.index,
-        "inside": np.asarray(found.distance <= asked.n_sigma),
+        "inside": found.distance.astype(np.float64) <= asked.n_sigma,
     }
     return answer(request, body, array="distance")
