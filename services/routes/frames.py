@@ -135,15 +135,13 @@ def _frame(asked: FrameRequest, max_pixels: int) -> Frame:
     joints = None if asked.joints is None else np.array(asked.joints, dtype=np.float64)
     if joints is not None and not np.isfinite(joints).all():
         raise InputError("has values that are not finite.", field="joints", hint="give radians and metres")
-    source = "the pushed frame"
-    return Frame(
-        asked.stamp, np.ascontiguousarray(rgb), np.ascontiguousarray(depth), camera, joints=joints, source=source
-    )
+    rgb, depth = np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
+    return Frame(asked.stamp, rgb, depth, camera, joints=joints, source="the pushed frame")
 
 
 def _decoded(value: Any, field: str, flags: int, max_pixels: int) -> NDArray[Any]:
     if isinstance(value, np.ndarray):
-        return value
+        return np.require(value, requirements="CW")  # arrays of a body are read-only
     data = checked_picture(value, max_pixels, field)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

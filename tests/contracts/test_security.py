@@ -63,7 +63,7 @@ def test_each_key_opens_in_either_header(locked: Service, key: str, header: str)
     "headers",
     [
         {},
-        {"Authorization": "Bearer "},
+        {"Authorization": "Bearer x"},
         {"Authorization": f"Basic {KEYS[0]}"},
         {"Authorization": f"Bearer {KEYS[0]}x"},
         {"X-API-Key": hash_key(KEYS[0])},
