@@ -64,6 +64,11 @@ COMMANDS = {
         "bench_grasping",
         "Measure grasping: candidates a second, time to a ranked list, contacts against exact shapes.",
     ),
+    "bench service": _Command(
+        "splatbot.cli.bench_service",
+        "bench_service",
+        "Measure the service: frames mapped and questions answered at once, and what HTTP costs.",
+    ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 

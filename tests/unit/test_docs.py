@@ -10,7 +10,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"]
 DOCUMENTS += [
-    f"docs/{name}.md" for name in ("stability", "simulate", "bench", "mapping", "planning", "twin", "sim2real")
+    f"docs/{name}.md"
+    for name in ("stability", "simulate", "bench", "mapping", "planning", "twin", "sim2real", "service")
 ]
 
 
