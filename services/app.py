@@ -9,11 +9,15 @@ from fastapi import FastAPI
 
 import splatbot
 from splatbot.services.limits import BodyLimit
+from splatbot.services.live import LiveMapping
 from splatbot.services.problems import install_problem_handlers
+from splatbot.services.pushed import PushedFrames
+from splatbot.services.ros.client_frames import ClientFrames
 from splatbot.services.ros.node import RosNode
 from splatbot.services.routes import distance, health, maps, render, ros
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
+from splatbot.slam import Slam
 
 _DESCRIPTION = """
 Questions about maps of 3D Gaussians. Lengths are metres in the map's world frame, quaternions are wxyz, camera axes are
@@ -24,7 +28,7 @@ OpenCV's (x right, y down, z forward). Every answer names the `map_version` it w
 
 def create_app(settings: ServiceSettings, store: MapStore) -> FastAPI:
     """The service on the maps of ``store``, which others may go on writing to."""
-    node = RosNode(store)
+    node = RosNode(store, on_frame=ClientFrames(lambda map_id: _open_stream(store, map_id)))
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -41,3 +45,10 @@ def create_app(settings: ServiceSettings, store: MapStore) -> FastAPI:
     for group in (health, maps, distance, render, ros):
         app.include_router(group.router)
     return app
+
+
+def _open_stream(store: MapStore, map_id: str) -> PushedFrames:
+    frames = PushedFrames()
+    store.add(map_id, source="pushed frames", state="mapping", awaited=False)
+    LiveMapping(store, map_id, frames, Slam(), on_result=frames.answer).start()
+    return frames

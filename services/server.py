@@ -33,7 +33,7 @@ def run_service(
         create_app(settings, store),
         log_level="info",
         timeout_graceful_shutdown=settings.shutdown_s,
-        ws_max_size=settings.max_message_bytes,
+        ws_max_size=settings.ws_max_bytes,
     )
     # After its graceful end uvicorn raises the signal again for whoever else listens: here it has done its work.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}

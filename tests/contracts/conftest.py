@@ -13,9 +13,11 @@ import pytest
 import uvicorn
 
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.geometry import pose_from_quat
 from splatbot.services.app import create_app
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
+from splatbot.workspace import Workspace
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,10 @@ class Service:
 
     client: httpx.Client
     store: MapStore
+
+    def ws(self, path: str) -> str:
+        """The address of a WebSocket."""
+        return f"ws://127.0.0.1:{self.client.base_url.port}{path}"
 
 
 def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
@@ -44,9 +50,16 @@ def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
 def service() -> Iterator[Service]:
     """The service on the map "wall", with small limits."""
     store = MapStore()
-    store.add("wall", source="wall.ply", state="static", snapshot=wall())
-    settings = ServiceSettings(max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480)
-    config = uvicorn.Config(create_app(settings, store), host="127.0.0.1", port=0, log_level="warning")
+    behind = Workspace(T_world_base=pose_from_quat((0.0, 0.5, -1.0), (0.7071068, 0.7071068, 0.0, 0.0)))
+    store.add("wall", source="wall.ply", state="static", snapshot=wall(), workspace=behind)
+    settings = ServiceSettings(max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480, ws_max_bytes=2_000_000)
+    config = uvicorn.Config(
+        create_app(settings, store),
+        host="127.0.0.1",
+        port=0,
+        log_level="warning",
+        ws_max_size=settings.ws_max_bytes,
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
