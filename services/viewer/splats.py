@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
-from splatbot.gaussians.shape import covariances, shortest_axes
+from splatbot.gaussians.shape import covariances
+from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
+from splatbot.rasterize.views import facing_normals
 
 Coloring = Literal["rgb", "depth", "normal", "uncertainty"]
 COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
@@ -54,8 +56,8 @@ def pieces(
 
     Args:
         model: the map.
-        coloring: what colours tell: the map's own, depth seen by a camera, the direction of the thinnest axis, or how
-            little a Gaussian's place is known.
+        coloring: what colours tell: the map's own; depth seen by a camera, red near and blue far; the direction of the
+            surface, light blue where it faces that camera; or how little a Gaussian's place is known, red for least.
         T_world_camera: (4, 4) of that camera; None: the world's origin.
     """
     if not len(model):
@@ -87,13 +89,14 @@ def colors(model: GaussianModel, coloring: Coloring, *, T_world_camera: Array | 
     with torch.no_grad():
         if coloring == "rgb":
             return model.colors.clamp(0, 1).numpy().astype(np.float32)
-        if coloring == "normal":
-            return (0.5 + 0.5 * shortest_axes(model).numpy()).astype(np.float32)
         if coloring == "uncertainty":
             return _turbo(model.uncertainty.numpy())
+        T_camera_world = np.eye(4) if T_world_camera is None else inverse(T_world_camera)
+        if coloring == "normal":
+            normals = facing_normals(model, T_camera_world).numpy()
+            return (0.5 + 0.5 * normals * np.array([1, -1, -1])).astype(np.float32)
         if coloring == "depth":
-            T = np.eye(4) if T_world_camera is None else T_world_camera
-            return _turbo((model.means.numpy() - T[:3, 3]) @ T[:3, 2])
+            return _turbo(-transform_points(T_camera_world, model.means.numpy())[:, 2])
     raise InputError(f"is {coloring!r}.", field="coloring", hint=f"use {', '.join(COLORINGS)}")
 
 

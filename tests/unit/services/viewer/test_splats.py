@@ -74,14 +74,14 @@ def test_every_colouring_gives_colours(coloring: str, rng: np.random.Generator) 
     assert rgb.std(0).min() > 0.01
 
 
-def test_depth_is_red_far_from_the_camera_and_blue_near(rng: np.random.Generator) -> None:
+def test_depth_is_red_near_the_camera_and_blue_far_from_it(rng: np.random.Generator) -> None:
     model = _model(rng, 500)
     T = look_at(np.array([0.0, -5.0, 0.1]), np.zeros(3))
     rgb = colors(model, "depth", T_world_camera=T)
     depth = model.means.numpy()[:, 1]
     near, far = rgb[np.argmin(depth)], rgb[np.argmax(depth)]
-    assert near[2] > near[0]
-    assert far[0] > far[2]
+    assert near[0] > near[2]
+    assert far[2] > far[0]
 
 
 def test_nothing_is_drawn_of_nothing_and_an_unknown_colouring_is_refused() -> None:
