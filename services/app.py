@@ -6,16 +6,16 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
+from starlette.concurrency import run_in_threadpool
 
 import splatbot
 from splatbot.services.limits import BodyLimit
 from splatbot.services.live import LiveMapping
 from splatbot.services.problems import install_problem_handlers
 from splatbot.services.pushed import PushedFrames
-from splatbot.services.ros.client_frames import ClientFrames
-from splatbot.services.ros.node import RosNode
 from splatbot.services.routes import distance, health, maps, render, ros
 from splatbot.services.settings import ServiceSettings
+from splatbot.services.sides import Sides
 from splatbot.services.store import MapStore
 from splatbot.slam import Slam
 
@@ -28,16 +28,16 @@ OpenCV's (x right, y down, z forward). Every answer names the `map_version` it w
 
 def create_app(settings: ServiceSettings, store: MapStore) -> FastAPI:
     """The service on the maps of ``store``, which others may go on writing to."""
-    node = RosNode(store, on_frame=ClientFrames(lambda map_id: _open_stream(store, map_id)))
+    sides = Sides(settings, store, lambda map_id: _open_stream(store, map_id))
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        node.start()
+        await run_in_threadpool(sides.start)
         yield
-        node.stop()
+        await run_in_threadpool(sides.stop)
 
     app = FastAPI(title="splatbot", version=splatbot.__version__, description=_DESCRIPTION, lifespan=lifespan)
-    app.state.ros = node
+    app.state.ros = sides.ros
     app.state.settings = settings
     app.state.store = store
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)

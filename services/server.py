@@ -26,8 +26,10 @@ def run_service(
     Raises:
         InputError: the address cannot be listened on.
     """
-    listener = _listen(settings.host, settings.port)
-    host, port = listener.getsockname()[:2]
+    listeners = [_listen(settings.host, settings.port)]
+    if settings.ros_port is not None:
+        listeners.append(_listen(settings.host, settings.ros_port))
+    host, port = listeners[0].getsockname()[:2]
     on_start(f"http://{'[' + host + ']' if ':' in host else host}:{port}")
     config = uvicorn.Config(
         create_app(settings, store),
@@ -38,7 +40,7 @@ def run_service(
     # After its graceful end uvicorn raises the signal again for whoever else listens: here it has done its work.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        uvicorn.Server(config).run(sockets=[listener])
+        uvicorn.Server(config).run(sockets=listeners)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

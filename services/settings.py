@@ -25,6 +25,9 @@ class ServiceSettings(BaseSettings):
 
     host: str = Field("127.0.0.1", description="address to listen on; 0.0.0.0 for every interface")
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
+    ros_port: int | None = Field(None, ge=0, le=65535, description="a port for roslib clients too (9090 is theirs)")
+    viewer_port: int | None = Field(None, ge=0, le=65535, description="port of the viewer, on this machine alone")
+    record: Path | None = Field(None, description="an MCAP file that every topic is recorded into")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")
     max_body_bytes: int = Field(16 * 2**20, ge=1024, description="size of a request's body [bytes]")
     ws_max_bytes: int = Field(16 * 2**20, ge=1024, description="size of a WebSocket message [bytes]")
