@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 from pathlib import Path
 
@@ -18,7 +19,7 @@ LOG = "synthetic:tabletop?frames=12&width=160&height=120"
 def test_a_camera_that_is_unplugged_leaves_its_map_odometry_and_a_recording_that_is_a_log(tmp_path: Path) -> None:
     camera = f"replay:{LOG}&speed=0.5&unplug=9"
     options = "--record", str(tmp_path / "all.mcap"), "--ros-port", "0", "--viewer-port", "0"
-    with serving("--camera", camera, *options) as (_, client):
+    with serving("--camera", camera, *options) as (process, client):
         url = f"ws://127.0.0.1:{client.base_url.port}/rosbridge"
         with connect(url, max_size=None) as socket:
             socket.send(json.dumps({"op": "subscribe", "topic": "/odom"}))
@@ -30,6 +31,8 @@ def test_a_camera_that_is_unplugged_leaves_its_map_odometry_and_a_recording_that
             time.sleep(0.1)
         assert (described["state"], described["detail"]) == ("failed", "is gone.")
         assert described["gaussians"] > 500
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
     recorded, original = open_log(tmp_path / "all.mcap"), open_log(LOG)
     assert len(recorded) == 9
     for a, b in zip(original, recorded, strict=False):
