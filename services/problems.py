@@ -37,6 +37,12 @@ class ProblemResponse(JSONResponse):
     media_type = MEDIA_TYPE
 
 
+class NotReadyError(SplatbotError):
+    """The service does not answer now."""
+
+    http_status = 503
+
+
 class BusyError(SplatbotError):
     """The service has as much to do as it can; the same request may do later."""
 

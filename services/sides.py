@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-from splatbot.services.pushed import PushedFrames
-from splatbot.services.ros.client_frames import ClientFrames
+from splatbot.frame import Frame
 from splatbot.services.ros.node import RosNode
 from splatbot.services.ros.recorder import McapRecorder
 from splatbot.services.settings import ServiceSettings
@@ -19,14 +19,14 @@ class Sides:
     Args:
         settings: which of them there are.
         store: the maps.
-        open_stream: makes a map of frames that are pushed, see :class:`ClientFrames`.
+        on_frame: called with each frame that ROS clients publish.
 
     Raises:
         InputError: the viewer's port is taken.
     """
 
-    def __init__(self, settings: ServiceSettings, store: MapStore, open_stream: Callable[[str], PushedFrames]) -> None:
-        self.ros = RosNode(store, on_frame=ClientFrames(open_stream))
+    def __init__(self, settings: ServiceSettings, store: MapStore, *, on_frame: Callable[[Frame], Any]) -> None:
+        self.ros = RosNode(store, on_frame=on_frame)
         self._record = settings.record
         self._recorder: McapRecorder | None = None
         # The viewer knows no keys: whoever is elsewhere comes through a tunnel.

@@ -85,6 +85,46 @@ class RobotKinematics(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class HandShape:
+    """Two fingers with flat pads that close on each other, as boxes in the tool's frame.
+
+    The hand comes along the tool's z and closes along its y; the tool's origin is between the pads.
+
+    Args:
+        stroke: widest opening between the pads [m].
+        width: of a finger along x [m].
+        thickness: of a finger along y, outwards from its pad [m].
+        tip: how far the fingers reach beyond the origin along z [m].
+        palm: how far behind the origin the palm is [m].
+        palm_size: of the palm along x and y [m].
+        force: between the fingers [N].
+    """
+
+    stroke: float
+    width: float
+    thickness: float
+    tip: float
+    palm: float
+    palm_size: tuple[float, float]
+    force: float = 70.0
+
+
+@runtime_checkable
+class HasHand(Protocol):
+    """A robot that can take hold of things."""
+
+    @property
+    def hand(self) -> HandShape | None:
+        """Its fingers; None: it has none."""
+        ...
+
+    @property
+    def T_link_tcp(self) -> Array:
+        """(4, 4), the tool's frame on the last link."""
+        ...
+
+
 class MotionState(StrEnum):
     """What a controller is doing."""
 
@@ -175,8 +215,12 @@ class Gripper(Protocol):
         """Widest opening [m]."""
         ...
 
-    def move(self, opening: float, *, force: float | None = None) -> None:
-        """Go towards an opening [m], with at most a force [N]."""
+    def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
+        """Go towards an opening [m], with at most a force [N] and a speed [m/s] of the opening."""
+        ...
+
+    def moving(self) -> bool:
+        """Whether the fingers are still on their way."""
         ...
 
     def opening(self) -> float:

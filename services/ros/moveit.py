@@ -15,7 +15,7 @@ from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal, time_path
 from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
-from splatbot.robots.store import load_robot
+from splatbot.services.arms import known_robot
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.requests import entries, entry, joints, number, pose, vector
@@ -132,7 +132,7 @@ class MoveItServices:
         if known is None:
             hint = "keep a scene.yaml beside the map: splatbot info MAP --fit-plane estimates one"
             raise FrameError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
-        return served, load_robot(self._name), known
+        return served, known_robot(self._name), known
 
     def _in_base(self, args: Any, path: str) -> bool:
         frame = str(entry(args, path) or MAP_FRAME).strip("/")

@@ -17,7 +17,7 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.planning import Trajectory as RobotTrajectory
 from splatbot.protocols import Array
-from splatbot.robots.store import load_robot
+from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.topics import FRAME, PLAN, RESULT, STATE, TRAJECTORY, JointState
@@ -190,7 +190,7 @@ class Viewer:
             self._scene.show_way(served.trajectory, self._camera)
         base = served.workspace.T_world_base if served.workspace is not None else None
         if base is not None and self._arm is None:
-            robot = load_robot(self._robot_name)
+            robot = known_robot(self._robot_name)
             self._arm = RobotSpheres(robot, T_world_base=base)
             self._scene.show_robot(self._arm, np.asarray(robot.home), served.field)
 

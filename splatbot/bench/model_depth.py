@@ -47,10 +47,9 @@ def biases(uri: str, config: Config) -> dict[str, dict[str, Bias]]:
     exact = SyntheticLog(uri.split("&effects=")[0].split("?effects=")[0])
     mapper, poses = Mapper(config), log.ground_truth.T_world_camera
     T_first_world = inverse(poses[0])
-    nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
     keyframes = list(range(0, len(log), _EVERY))
     for i in keyframes:
-        mapper.insert(prepare(log[i], config.tracking), T_first_world @ poses[i], nothing)
+        mapper.insert(prepare(log[i], config.tracking), T_first_world @ poses[i], Features.none())
     views = {"keyframes": keyframes, "between": [i + _EVERY // 2 for i in keyframes[:-1]]}
     found: dict[str, dict[str, list[Bias]]] = {}
     for kind, indices in views.items():

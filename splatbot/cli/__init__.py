@@ -30,9 +30,14 @@ COMMANDS = {
     "plan": _Command(
         "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
     ),
+    "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked thing in a map."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
+    "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),
     "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
+    "sim2real": _Command(
+        "splatbot.cli.sim2real", "sim2real", "Say how far the twin is from a recorded log, and from a held-out twin."
+    ),
     "bench twin": _Command(
         "splatbot.cli.bench_twin", "bench_twin", "Measure the twin: cost of each effect, error against the time step."
     ),
@@ -53,6 +58,11 @@ COMMANDS = {
         "splatbot.cli.bench_planning",
         "bench_planning",
         "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
+    ),
+    "bench service": _Command(
+        "splatbot.cli.bench_service",
+        "bench_service",
+        "Measure the service: frames mapped and questions answered at once, and what HTTP costs.",
     ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }

@@ -16,6 +16,7 @@ from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, weigh
+from splatbot.mapping.exposure import in_exposure_of_map
 from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
 from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images, resized
 from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
@@ -190,7 +191,8 @@ class Mapper:
         self._weigh(depths, camera, T_world_camera)
         self._prune()
         view = view_of(self.model, camera, T_world_camera)
-        colors, stamp = torch.from_numpy(np.ascontiguousarray(rgb)), prepared.frame.stamp
+        colors = in_exposure_of_map(torch.from_numpy(np.ascontiguousarray(rgb)), depths, view)
+        stamp = prepared.frame.stamp
         self._movers.find(view, colors, depths, camera, T_world_camera, self.keyframes, stamp)
         bare = (depths > 0) & (view.alpha < self.config.mapping.new_alpha)
         self._revealed = float(bare.float().mean()) > _REVEALED
@@ -200,6 +202,7 @@ class Mapper:
         """Bring a keyframe's evidence and its new surfaces into the map; it calls for refinement."""
         self._weigh(keyframe.depth, keyframe.camera, keyframe.T_world_camera)
         view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
+        keyframe.rgb = in_exposure_of_map(keyframe.rgb, keyframe.depth, view)
         self._leave_out_what_moves(keyframe, view)
         self._add(keyframe, view)
         self._prune()

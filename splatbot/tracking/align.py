@@ -30,6 +30,7 @@ class Alignment:
         curvature: (6, 6) of the robust cost at the pose: less than the information by what outlying residuals lack.
         spread: (6, 6) sum of g gᵀ over the cells of the image, g the gradient of the residuals in one cell.
         cells: how many cells have residuals.
+        focal: focal length [px] of the finest level that it used.
     """
 
     T_world_camera: Array
@@ -37,6 +38,7 @@ class Alignment:
     curvature: Array
     spread: Array
     cells: int
+    focal: float
 
     def at(self, T_world_camera: Array) -> Alignment:
         """The same numbers at another pose."""
@@ -110,13 +112,13 @@ def align(
 
     Dense residuals are correlated between neighbouring pixels (blur, rolling shutter, depth registered a moment
     earlier), so they count ``config.dense_weight`` each, against reprojected features (``features`` with the
-    ``camera`` of their pixels), which count one. More pixels measure the same better; they bring no more that is
-    independent, so together they weigh as 4800 do. Beside colour, depth is taken for ``config.depth_doubt`` times as
-    uncertain as its pixels' noise.
+    ``camera`` of their pixels), which count one over their variance [px²]. More pixels measure the same better; they
+    bring no more that is independent, so together they weigh as 4800 do. Beside colour, depth is taken for
+    ``config.depth_doubt`` times as uncertain as its pixels' noise.
     """
     matches = None
     if features is not None and camera is not None:
-        matches = (features.points, features.pixels, _intrinsics(camera))
+        matches = (features.points, features.pixels, features.sigmas, _intrinsics(camera))
     T_camera_world, information, curvature, spread, cells, *_ = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
@@ -129,7 +131,7 @@ def align(
         finest,
         config.dense_share if photometric else 0.0,
     )
-    return Alignment(inverse(T_camera_world), information, curvature, spread, cells)
+    return Alignment(inverse(T_camera_world), information, curvature, spread, cells, levels[finest].camera.fx)
 
 
 def _level_arrays(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float, float, float]]:

@@ -20,6 +20,7 @@ Index = NDArray[np.intp]
 # Minimal trust in a pose from features: fewer inliers than this, or a smaller share, happens by chance.
 MIN_INLIERS = 20
 _MAX_REPROJECTION = 3.0  # [px]
+_SCALE_FACTOR = 1.2  # from one level of ORB's pyramid to the next
 _MATCH_RATIO = 0.8  # Lowe's ratio test
 _MIN_SPREAD = 0.05  # standard deviation of matched pixels across their narrowest direction [image width]
 _PATCH = 31  # [px] that an ORB descriptor looks at on the finest level
@@ -34,11 +35,18 @@ class Features:
         pixels: (N, 2).
         descriptors: (N, 32) uint8.
         points: (N, 3) [m] in the camera frame, NaN where there is no depth.
+        scales: (N,) size [px] of a pixel of the pyramid's level that each was found on: it is placed that much worse.
     """
 
     pixels: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
     points: Array
+    scales: NDArray[np.float32]
+
+    @classmethod
+    def none(cls) -> Features:
+        """Those of an image without any."""
+        return cls(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)), np.zeros(0, np.float32))
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -46,11 +54,19 @@ class Features:
 
 @dataclass(frozen=True)
 class FeaturePose:
-    """T_world_camera (4, 4) from features, and the matches that agree with it: points (M, 3) [m] and pixels (M, 2)."""
+    """T_world_camera (4, 4) from features, and the matches that agree with it.
+
+    Args:
+        points: (M, 3) [m], world frame.
+        pixels: (M, 2).
+        sigmas: (M,) of the pixels [px].
+        matches: how many there were.
+    """
 
     T_world_camera: Array
     points: Array
     pixels: Array
+    sigmas: Array
     matches: int
 
 
@@ -66,15 +82,18 @@ def detect(
     if mask is not None:
         gray[~mask] = 128  # coarse levels of ORB's pyramid reach further than the margin: let them see nothing there
         usable = cv2.erode(mask.astype(np.uint8), np.ones((_PATCH, _PATCH), np.uint8))
-    keypoints, descriptors = cv2.ORB.create(nfeatures=n_features, fastThreshold=10).detectAndCompute(gray, usable)
+    orb = cv2.ORB.create(nfeatures=n_features, scaleFactor=_SCALE_FACTOR, fastThreshold=10)
+    keypoints, descriptors = orb.detectAndCompute(gray, usable)
     if descriptors is None:
-        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
-    pixels = np.array([k.pt for k in keypoints], dtype=np.float32)
+        return Features.none()
+    scales = np.float32(_SCALE_FACTOR) ** np.array([k.octave for k in keypoints], dtype=np.float32)
+    # OpenCV scales a level's coordinates about the corner pixel's centre, the level itself is scaled about its corner.
+    pixels = np.array([k.pt for k in keypoints], dtype=np.float32) + 0.5 * (scales[:, None] - 1)
     z = np.asarray(_native.depth_around(depth, pixels))
     rays = np.stack(
         [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(z))], 1
     )
-    return Features(pixels, np.asarray(descriptors, dtype=np.uint8), rays * z[:, None])
+    return Features(pixels, np.asarray(descriptors, dtype=np.uint8), rays * z[:, None], scales)
 
 
 @dataclass(frozen=True)
@@ -98,7 +117,7 @@ def match_pose(
     repeatable. None when too few matches agree. Near to an expectation, also None when those that do pile up at the
     edge of the search, or in one corner of the image: it was wrong, and what was found is a choice that agrees with it.
     """
-    pixels, points = [], []
+    pixels, points, sigmas = [], [], []
     for features, T_world_keyframe in keyframes:
         anchored = np.flatnonzero(np.isfinite(features.points[:, 2]))
         world = transform_points(T_world_keyframe, features.points[anchored])
@@ -112,9 +131,15 @@ def match_pose(
         query, train = _match(current, features.descriptors[anchored], places, radius)
         pixels.append(current.pixels[query])
         points.append(world[train])
+        sigmas.append(np.maximum(current.scales[query], features.scales[anchored[train]]))
     if not pixels:
         return None
-    found = _pose_from_matches(np.concatenate(pixels).astype(np.float64), np.concatenate(points), camera)
+    found = _pose_from_matches(
+        np.concatenate(pixels).astype(np.float64),
+        np.concatenate(points),
+        np.concatenate(sigmas).astype(np.float64),
+        camera,
+    )
     if found is None or expected is None:
         return found
     return found if _is_believable(found, camera, expected) else None
@@ -139,8 +164,8 @@ def _match(
     return found[train].astype(np.intp), train
 
 
-def _pose_from_matches(image: Array, world: Array, camera: Camera) -> FeaturePose | None:
-    """PnP of pixels (M, 2) and points (M, 3)."""
+def _pose_from_matches(image: Array, world: Array, sigmas: Array, camera: Camera) -> FeaturePose | None:
+    """PnP of pixels (M, 2), σ (M,), and points (M, 3)."""
     if len(image) < MIN_INLIERS:
         return None
     found, r, t, inliers = cv2.solvePnPRansac(
@@ -162,4 +187,4 @@ def _pose_from_matches(image: Array, world: Array, camera: Camera) -> FeaturePos
     T_camera_world[:3, 3] = t[:, 0]
     if not np.isfinite(T_camera_world).all():
         return None
-    return FeaturePose(inverse(T_camera_world), world[agree], image[agree], len(image))
+    return FeaturePose(inverse(T_camera_world), world[agree], image[agree], sigmas[agree], len(image))

@@ -60,11 +60,15 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     level = Level(gray, depth, frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
-    smooth = np.asarray(cv2.GaussianBlur(level.gray, (0, 0), 0.7), dtype=np.float32)
-    levels = [Level(smooth, level.depth, level.camera)]
+    levels = [Level(smoothed(level.gray), level.depth, level.camera)]
     while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
         levels.append(halve(levels[-1]))
     return PreparedFrame(frame, depth, tuple(levels), started)
+
+
+def smoothed(gray: Image) -> Image:
+    """Grey (H, W) without the finest of its noise, as alignment takes it."""
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.7), dtype=np.float32)
 
 
 def valid_depth(depth: Image, near: float, far: float) -> Image:

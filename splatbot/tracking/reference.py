@@ -34,12 +34,18 @@ def make_reference(levels: tuple[Level, ...], T_world_camera: NDArray[np.float64
 
 
 def sample_level(level: Level, n_pixels: int) -> ReferencePoints:
-    """Pixels on smooth surface: half of them the strongest gradient of each tile, half on a regular grid.
-
-    Edges carry the photometric information, the grid the geometric; a pixel needs a normal, which keeps both off
-    occlusion boundaries, where colour belongs to one surface and depth to another.
-    """
+    """About ``n_pixels`` pixels of a level, see :func:`sampled_pixels`."""
     normals = normals_of(level.depth, level.camera)
+    chosen = sampled_pixels(level, normals, n_pixels)
+    return ReferencePoints(level.camera.backproject(level.depth)[chosen], normals[chosen], level.gray[chosen])
+
+
+def sampled_pixels(level: Level, normals: Image, n_pixels: int) -> NDArray[np.bool_]:
+    """Pixels (H, W) on smooth surface: half of them the strongest gradient of each tile, half on a regular grid.
+
+    Edges carry the photometric information, the grid the geometric; a pixel needs a normal (H, W, 3), which keeps both
+    off occlusion boundaries, where colour belongs to one surface and depth to another.
+    """
     good = ((normals**2).sum(-1) > 0.25) & np.isfinite(level.gray)
     gx = cv2.Scharr(level.gray, cv2.CV_32F, 1, 0)
     gy = cv2.Scharr(level.gray, cv2.CV_32F, 0, 1)
@@ -55,4 +61,4 @@ def sample_level(level: Level, n_pixels: int) -> ReferencePoints:
     chosen = np.zeros_like(good)
     chosen[v[flat.max(-1) >= 0], u[flat.max(-1) >= 0]] = True
     chosen[tile // 2 :: tile, tile // 2 :: tile] |= good[tile // 2 :: tile, tile // 2 :: tile]
-    return ReferencePoints(level.camera.backproject(level.depth)[chosen], normals[chosen], level.gray[chosen])
+    return chosen

@@ -5,16 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import httpx
 import numpy as np
 import pytest
 import uvicorn
+from fastapi import FastAPI
 
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import pose_from_quat
 from splatbot.services.app import create_app
+from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
@@ -22,14 +25,42 @@ from splatbot.workspace import Workspace
 
 @dataclass(frozen=True)
 class Service:
-    """A running service: what a client sees of it, and its store."""
+    """A running service: what a client sees of it, and its parts."""
 
     client: httpx.Client
-    store: MapStore
+    runtime: Runtime
+    app: FastAPI
+    url: str
+
+    @property
+    def store(self) -> MapStore:
+        """Its maps."""
+        return self.runtime.store
 
     def ws(self, path: str) -> str:
         """The address of a WebSocket."""
         return f"ws://127.0.0.1:{self.client.base_url.port}{path}"
+
+
+@contextmanager
+def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterator[Service]:
+    """A real server on a real socket, until the block ends."""
+    runtime = Runtime(settings, store)
+    app = create_app(runtime)
+    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws_max_size=settings.max_message_bytes)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive(), "the server did not start"
+        time.sleep(0.01)
+    url = f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    with httpx.Client(base_url=url, timeout=60) as client:
+        yield Service(client, runtime, app, url)
+    runtime.drain()
+    server.should_exit = True
+    thread.join(20)
+    assert not thread.is_alive(), "the server did not end"
 
 
 def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
@@ -50,24 +81,8 @@ def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
 def service() -> Iterator[Service]:
     """The service on the map "wall", with small limits."""
     store = MapStore()
-    behind = Workspace(T_world_base=pose_from_quat((0.0, 0.5, -1.0), (0.7071068, 0.7071068, 0.0, 0.0)))
-    store.add("wall", source="wall.ply", state="static", snapshot=wall(), workspace=behind)
-    settings = ServiceSettings(max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480, ws_max_bytes=2_000_000)
-    config = uvicorn.Config(
-        create_app(settings, store),
-        host="127.0.0.1",
-        port=0,
-        log_level="warning",
-        ws_max_size=settings.ws_max_bytes,
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive(), "the server did not start"
-        time.sleep(0.01)
-    port = server.servers[0].sockets[0].getsockname()[1]
-    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
-        yield Service(client, store)
-    server.should_exit = True
-    thread.join(10)
+    beside = Workspace(T_world_base=pose_from_quat((0.0, 0.5, -1.0), (0.7071068, 0.7071068, 0.0, 0.0)))
+    store.add("wall", source="wall.ply", state="static", snapshot=wall(), workspace=beside)
+    limits = {"max_points": 1000, "max_body_bytes": 200_000, "max_pixels": 640 * 480, "max_message_bytes": 2_000_000}
+    with running(ServiceSettings(**limits), store) as it:
+        yield it

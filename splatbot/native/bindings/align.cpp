@@ -55,7 +55,8 @@ splatbot::AlignPoints points_of(const Rows3& points, const Rows3& normals, const
 using LevelArrays = std::tuple<Image, Image, Intrinsics>;
 using PointArrays = std::tuple<Rows3, Rows3, Vector>;
 using ReferenceArrays = std::pair<Pose, std::vector<PointArrays>>;
-using MatchArrays = std::tuple<Points, Pixels, Intrinsics>;
+using Sigmas = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using MatchArrays = std::tuple<Points, Pixels, Sigmas, Intrinsics>;
 using Information = nb::ndarray<const double, nb::shape<6, 6>, nb::c_contig, nb::device::cpu>;
 using PriorArrays = std::pair<Pose, Information>;
 
@@ -110,9 +111,10 @@ void define_align(nb::module_& m) {
         }
         splatbot::AlignMatches match;
         if (matches) {
-          const auto& [points, pixels, k] = *matches;
-          if (points.shape(0) != pixels.shape(0)) throw nb::value_error("points and pixels differ in length");
-          match = {.fx = k[0], .fy = k[1], .cx = k[2], .cy = k[3], .points = span_of(points), .pixels = span_of(pixels)};
+          const auto& [points, pixels, sigmas, k] = *matches;
+          if (points.shape(0) != pixels.shape(0) || points.shape(0) != sigmas.size())
+            throw nb::value_error("points, pixels, sigmas differ in length");
+          match = {.fx = k[0], .fy = k[1], .cx = k[2], .cy = k[3], .points = span_of(points), .pixels = span_of(pixels), .sigmas = span_of(sigmas)};
         }
         splatbot::AlignPrior known_before;
         if (prior) {
@@ -133,6 +135,6 @@ void define_align(nb::module_& m) {
       "levels"_a, "references"_a, "matches"_a.none(), "prior"_a.none(), "T_camera_world"_a.noconvert(), "settings"_a, "dense_weight"_a,
       "iterations"_a, "finest"_a, "dense_share"_a,
       "Gauss-Newton over the levels (gray, depth, (fx, fy, cx, cy)), fine to coarse, against references (T_world_reference, "
-      "[(points, normals, gray)] per level) matches (points, pixels, (fx, fy, cx, cy)) and a prior (T_camera_world, information (6, 6)). Returns "
+      "[(points, normals, gray)] per level) matches (points, pixels, sigmas, (fx, fy, cx, cy)) and a prior (T_camera_world, information (6, 6)). Returns "
       "(T_camera_world, H (6, 6), curvature (6, 6), spread (6, 6), cells, dense_weight, match_weight).");
 }

@@ -298,7 +298,7 @@ class DenseTerm {
   Mat6 H_{};
 };
 
-// Reprojection residuals, σ = 1 px, Student-t weights: calls take(index, w, Ju, Jv, ru, rv) for each match in view.
+// Reprojection residuals over their σ, Student-t weights: calls take(index, w, Ju, Jv, ru, rv) for each match in view.
 template <typename Take>
 void for_matches(const AlignMatches& m, std::span<const double, 16> T, Take take) {
   for (std::size_t i = 0; i < m.points.size() / 3; ++i) {
@@ -308,9 +308,10 @@ void for_matches(const AlignMatches& m, std::span<const double, 16> T, Take take
     const double z = T[8] * p[0] + T[9] * p[1] + T[10] * p[2] + T[11];
     if (!(z > 1e-3)) continue;
     const double iz = 1.0 / z;
-    const double ru = m.fx * x * iz + m.cx - pixel[0], rv = m.fy * y * iz + m.cy - pixel[1];
+    const double fx = m.fx / m.sigmas[i], fy = m.fy / m.sigmas[i];
+    const double ru = fx * x * iz + (m.cx - pixel[0]) / m.sigmas[i], rv = fy * y * iz + (m.cy - pixel[1]) / m.sigmas[i];
     const double w = 5.0 / (4.0 + ru * ru + rv * rv);
-    const double ux = m.fx * iz, uz = -m.fx * x * iz * iz, vy = m.fy * iz, vz = -m.fy * y * iz * iz;
+    const double ux = fx * iz, uz = -fx * x * iz * iz, vy = fy * iz, vz = -fy * y * iz * iz;
     const Vec6 Ju = {ux, 0.0, uz, uz * y, ux * z - uz * x, -ux * y};
     const Vec6 Jv = {0.0, vy, vz, vz * y - vy * z, -vz * x, vy * x};
     take(i, w, Ju, Jv, ru, rv);

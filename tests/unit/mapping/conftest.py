@@ -27,7 +27,7 @@ def keyframe_of(frame: Frame, T_world_camera: Array, number: int = 0) -> Keyfram
         rgb=torch.from_numpy(frame.rgb),
         depth=torch.from_numpy(frame.depth),
         T_world_camera=T_world_camera,
-        features=Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3))),
+        features=Features.none(),
         reference=Reference(T_world_camera, ()),
     )
 

@@ -19,9 +19,8 @@ from tests.rgbd import CAMERA, Array, small_config, tabletop
 
 
 def keyframe(number: int, T_world_camera: Array) -> Keyframe:
-    nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
     reference = Reference(T_world_camera, ())
-    return Keyframe(number, CAMERA, torch.zeros(1), torch.zeros(1), T_world_camera, nothing, reference)
+    return Keyframe(number, CAMERA, torch.zeros(1), torch.zeros(1), T_world_camera, Features.none(), reference)
 
 
 def test_the_most_redundant_keyframe_goes_first() -> None:

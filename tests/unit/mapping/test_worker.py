@@ -22,7 +22,7 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import prepare
 from tests.rgbd import Array, small_config, tabletop, wall_frame
 
-NO_FEATURES = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)))
+NO_FEATURES = Features.none()
 
 
 def at(x: float) -> Array:

@@ -188,7 +188,9 @@ def test_feature_equations_equal_finite_differences_of_reprojection(rng: np.rand
     points = rng.uniform([-0.4, -0.3, 0.7], [0.4, 0.3, 2.0], (60, 3))
     T_camera_world = se3_exp([0.02, 0.01, -0.03, 0.05, -0.02, 0.04])
     pixels = CAMERA.project(transform_points(T_camera_world, points)) + rng.normal(0, 2.0, (60, 2))
-    features = FeaturePose(np.eye(4), np.vstack([points, [[0, 0, -1.0]]]), np.vstack([pixels, [[80, 60]]]), 61)
+    sigmas = rng.uniform(1.0, 3.5, 61)
+    behind = np.vstack([points, [[0, 0, -1.0]]])
+    features = FeaturePose(np.eye(4), behind, np.vstack([pixels, [[80, 60]]]), sigmas, 61)
     blank = np.zeros((120, 160), np.float32)
     found = align(
         [Level(blank, blank, CAMERA)],
@@ -204,7 +206,7 @@ def test_feature_equations_equal_finite_differences_of_reprojection(rng: np.rand
 
     def reprojection(twist: Array) -> Array:
         q = transform_points(se3_exp(twist) @ T_camera_world, points)
-        return np.asarray((CAMERA.project(q) - pixels).ravel())
+        return np.asarray(((CAMERA.project(q) - pixels) / sigmas[:60, None]).ravel())
 
     J, r = jacobian(reprojection, np.zeros(6)), reprojection(np.zeros(6))
     w = np.repeat((NU + 1) / (NU + (r.reshape(-1, 2) ** 2).sum(1)), 2)

@@ -21,7 +21,7 @@ SURE = np.diag([1e-6] * 3 + [1e-6] * 3)  # 1 mm, 0.06°
 
 
 def pose(twist: list[float]) -> Judged:
-    found = Alignment(se3_exp(twist), np.eye(6), np.eye(6), np.eye(6), 48)
+    found = Alignment(se3_exp(twist), np.eye(6), np.eye(6), np.eye(6), 48, 525.0)
     return Judged(Candidate("direct", found, []), Health(1, 1, 1, 0.5, 1), "ok", (), None, np.eye(6))
 
 

@@ -63,7 +63,7 @@ def test_the_covariance_is_symmetric_positive_and_grows_as_pixels_go() -> None:
 
 
 def test_without_any_information_the_covariance_is_large_and_finite_and_of_nan_it_is_nan() -> None:
-    nothing = Alignment(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 0)
+    nothing = Alignment(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 0, 525.0)
     covariance = alignment_covariance(nothing)
     assert np.linalg.eigvalsh(covariance)[0] >= 100.0
     assert np.isfinite(covariance).all()

@@ -62,6 +62,7 @@ struct AlignMatches {
   double fx = 1, fy = 1, cx = 0, cy = 0;
   std::span<const double> points;  // (M, 3) [m]
   std::span<const double> pixels;  // (M, 2)
+  std::span<const double> sigmas;  // (M,) [px]
 };
 
 // What is known of the pose besides: where it should be, and the information of the twist (t, ω) that left-multiplies it.
@@ -72,7 +73,7 @@ struct AlignPrior {
 
 struct AlignPlan {
   AlignSettings settings;
-  double dense_weight = 1.0;  // of a dense residual against a match's, whose σ is 1 px: neighbours are correlated
+  double dense_weight = 1.0;  // of a dense residual against a match's: neighbours are correlated
   int iterations = 5;         // per level, at most
   std::size_t finest = 0;     // level to end on
   // On the last level both kinds are weighed by the spread that they show; the dense ones with this share of it, since

@@ -16,6 +16,7 @@ namespace {
 constexpr std::size_t kLooks = 8;  // configurations of each edge, for an upper bound
 constexpr float kEps = 2e-4F;      // [m]
 constexpr double kNearly = 0.9;    // of the room seen: what is tried first
+constexpr int kAtLeast = 2;        // rounds, unless the first one shows some room
 
 // The least room of configurations along the path.
 double least_seen(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut) {
@@ -67,7 +68,7 @@ double path_clearance(const Arm& arm, const CollisionField& field, std::span<con
   double longest = 0.0;
   for (int i = 0; i < rounds && high > 0.0; ++i) {
     const double begin = stop.elapsed();
-    if (begin + longest >= seconds) {
+    if ((low > 0.0 || i >= kAtLeast) && begin + longest >= seconds) {
       break;
     }
     (certified(middle) ? low : high) = middle;

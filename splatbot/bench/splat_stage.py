@@ -1,0 +1,166 @@
+"""Poses from the alpha blend itself against the direct stage's: `python -m splatbot.bench.splat_stage [URI ...]`.
+
+Each frame of a synthetic log is tracked and mapped as always; then its pose is sought once more from there, by
+Gauss-Newton on pixels of the map's own rendering (colour, depth, and their derivatives with respect to the pose through
+the blend, by differences). Nothing of it goes back into the map: both poses are of the same frames in the same map.
+
+What a native stage would cost is bounded from below by what it cannot do without: per step, the map projected, and
+blended once at the pixels in question; derivatives and sums are not counted.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatbot.bench.timing import threads
+from splatbot.config import Config, load_config
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse, se3_exp, se3_log
+from splatbot.logs.synthetic import SyntheticLog
+from splatbot.mapping.fusion import view_of
+from splatbot.rasterize import rasterize_pixels
+from splatbot.slam import Slam
+from splatbot.tracking.prepare import Level, PreparedFrame, normals_of, prepare, smoothed
+from splatbot.tracking.reference import sampled_pixels
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+URIS = (
+    "synthetic:tabletop?trajectory=arm&frames=30&seed=1&effects=depth_noise;motion_blur",
+    "synthetic:room?trajectory=handheld&frames=40&seed=3&effects=motion_blur;depth_noise",
+    "synthetic:room?trajectory=loop&frames=30&rate=8&seed=4&effects=depth_noise",
+    "synthetic:corridor?trajectory=forward&frames=30&seed=6&effects=depth_noise",
+    "synthetic:wall_soft?frames=30&seed=8&effects=depth_noise",
+)
+STEPS = ((1, 2), (0, 3))  # levels of the pyramid, and Gauss-Newton steps on each
+_DIFFERENCE = 2e-4  # [m] and [rad]: a tenth of a pixel
+_SOLID = 0.9  # least alpha of a pixel that counts
+_NU = 4.0  # of the Student-t weights, as in the direct stage
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Grey, depth [m] and alpha of the map at chosen pixels (N,)."""
+
+    gray: Array
+    depth: Array
+    alpha: Array
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Errors of the translation, RMS over the frames [m], and milliseconds of a frame."""
+
+    frames: int
+    direct_m: float
+    splat_m: float
+    direct_ms: float
+    splat_least_ms: float
+
+
+def compare(uri: str, config: Config) -> Comparison:
+    """Direct poses and splat poses of a log's frames, each in the map as it was when the frame came."""
+    log = SyntheticLog(uri)
+    truth = log.ground_truth.T_world_camera
+    slam, errors, ms = Slam(config), [], []
+    for index in range(len(log)):
+        frame = log[index]
+        model = slam.snapshot().model
+        result = slam.process(frame)
+        if index == 0 or result.T_world_camera is None:
+            continue
+        prepared = prepare(frame, config.tracking)
+        T, least_ms = align_to_map(model, prepared, result.T_world_camera, config)
+        T_true = inverse(truth[0]) @ truth[index]
+        errors.append([_off(T_true, result.T_world_camera), _off(T_true, T)])
+        ms.append([result.stage_ms["direct"], least_ms])
+    direct_m, splat_m = np.sqrt(np.mean(np.square(errors), axis=0))
+    return Comparison(len(errors), float(direct_m), float(splat_m), *(float(t) for t in np.median(ms, axis=0)))
+
+
+def align_to_map(
+    model: GaussianModel, prepared: PreparedFrame, T_world_camera: Array, config: Config
+) -> tuple[Array, float]:
+    """T_world_camera (4, 4) that the map's rendering explains best from a start, and the least it can cost [ms]."""
+    T_camera_world, least_ms = inverse(T_world_camera), 0.0
+    for index, steps in STEPS:
+        level = prepared.levels[index]
+        pixels = sampled_pixels(level, normals_of(level.depth, level.camera), config.tracking.n_pixels)
+        exposure = np.array([1.0, 0.0])
+        for _ in range(steps):
+            least_ms += _least_ms(model, level, pixels, T_camera_world)
+            shown = _render(model, level, pixels, T_camera_world)
+            moved = [_render(model, level, pixels, se3_exp(_DIFFERENCE * axis) @ T_camera_world) for axis in np.eye(6)]
+            step = _solve(level, pixels, shown, moved, exposure, config)
+            T_camera_world = se3_exp(step[:6]) @ T_camera_world
+            exposure += step[6:]
+    return inverse(T_camera_world), least_ms
+
+
+def _render(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> Rendered:
+    view = view_of(model, level.camera, inverse(T_camera_world))
+    gray = smoothed((view.rgb @ torch.tensor([0.299, 0.587, 0.114])).numpy())
+    return Rendered(*(image[pixels].astype(np.float64) for image in (gray, view.depth.numpy(), view.alpha.numpy())))
+
+
+def _least_ms(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> float:
+    """Milliseconds of the map's Gaussians projected, and blended where a chosen pixel lies."""
+    arguments = model.means, model.quats, model.scales, model.opacities, model.colors
+    camera, at = level.camera, torch.from_numpy(np.argwhere(pixels)[:, ::-1].copy())
+    viewmat, K = torch.from_numpy(T_camera_world)[None], torch.from_numpy(camera.K_corner)[None]
+    start = time.perf_counter()
+    rasterize_pixels(*arguments, viewmat, K, camera.width, camera.height, at, render_mode="RGB+ED", depth_mode="plane")
+    return 1e3 * (time.perf_counter() - start)
+
+
+def _solve(
+    level: Level,
+    pixels: Mask,
+    shown: Rendered,
+    moved: Sequence[Rendered],
+    exposure: Array,
+    config: Config,
+) -> Array:
+    """The step (8,): twist (t, ω) that left-multiplies T_camera_world, gain and offset."""
+    c = config.tracking
+    depth = level.depth[pixels].astype(np.float64)
+    sigma_depth = c.depth_doubt * (c.sigma_depth_floor + c.sigma_depth_quad * depth**2)
+    r_gray = (exposure[0] * shown.gray + exposure[1] - level.gray[pixels]) / c.sigma_gray
+    r_depth = (shown.depth - depth) / sigma_depth
+    J_gray = np.stack([exposure[0] * (m.gray - shown.gray) / _DIFFERENCE for m in moved], 1) / c.sigma_gray
+    J_depth = np.stack([(m.depth - shown.depth) / _DIFFERENCE for m in moved], 1) / sigma_depth[:, None]
+    solid = shown.alpha > _SOLID
+    near = solid & (depth > 0) & (np.abs(shown.depth - depth) < c.gate)
+    of_exposure = np.stack([shown.gray, np.ones_like(depth)], 1) / c.sigma_gray
+    J = np.concatenate([np.hstack([J_gray, of_exposure])[solid], np.hstack([J_depth, 0 * of_exposure])[near]])
+    r = np.concatenate([r_gray[solid], r_depth[near]])
+    weight = (_NU + 1) / (_NU + r**2)
+    H = (J * weight[:, None]).T @ J
+    H += np.diag([*[1e-5 * np.trace(H[:6, :6]) / 6] * 6, 1e2, 1e2])
+    return np.linalg.solve(H, -(J * weight[:, None]).T @ r)
+
+
+def _off(T_true: Array, T: Array) -> float:
+    return float(np.linalg.norm(se3_log(inverse(T) @ T_true)[:3]))
+
+
+def main(argv: Sequence[str]) -> None:
+    """Print the comparison for addresses of synthetic logs, by default five."""
+    print("errors of the translation, RMS over the frames, and the median time of a frame")
+    with threads(1):
+        for uri in argv or URIS:
+            found = compare(uri, load_config(environ={}))
+            direct = f"direct {1e3 * found.direct_m:.2f} mm, {found.direct_ms:.1f} ms"
+            print(f"{uri}\n    {direct}; splat {1e3 * found.splat_m:.2f} mm, over {found.splat_least_ms:.0f} ms")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
