@@ -42,7 +42,7 @@ camera axes OpenCV's (x right, y down, z forward). Every answer names the `map_v
 def create_app(runtime: Runtime) -> FastAPI:
     """The service on ``runtime``, which begins with the application and ends with it."""
     settings = runtime.settings
-    sides = Sides(settings, runtime.store, on_frame=runtime.take)
+    sides = Sides(settings, runtime.store, runtime.arms, on_frame=runtime.take)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:

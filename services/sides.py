@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from splatbot.frame import Frame
+from splatbot.services.arms import Arms
 from splatbot.services.ros.node import RosNode
 from splatbot.services.ros.recorder import McapRecorder
 from splatbot.services.settings import ServiceSettings
@@ -19,14 +20,17 @@ class Sides:
     Args:
         settings: which of them there are.
         store: the maps.
+        arms: what follows the motions that ROS clients send.
         on_frame: called with each frame that ROS clients publish.
 
     Raises:
         InputError: the viewer's port is taken.
     """
 
-    def __init__(self, settings: ServiceSettings, store: MapStore, *, on_frame: Callable[[Frame], Any]) -> None:
-        self.ros = RosNode(store, on_frame=on_frame)
+    def __init__(
+        self, settings: ServiceSettings, store: MapStore, arms: Arms, *, on_frame: Callable[[Frame], Any]
+    ) -> None:
+        self.ros = RosNode(store, arms=arms, on_frame=on_frame)
         self._record = settings.record
         self._recorder: McapRecorder | None = None
         # The viewer knows no keys: whoever is elsewhere comes through a tunnel.

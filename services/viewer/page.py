@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import viser
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
 from splatbot.planning import Trajectory as RobotTrajectory
 from splatbot.robots.store import load_robot
-from splatbot.services.viewer.scene import MapScene
+from splatbot.services.viewer.scene import MapScene, close_server, open_server
 from splatbot.services.viewer.splats import Coloring
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
@@ -34,7 +33,7 @@ def map_page(
         robot: its name.
         plan: a motion of it.
     """
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server = open_server("127.0.0.1", 0)
     try:
         scene = MapScene(server)
         scene.look_at_all(model)
@@ -49,4 +48,4 @@ def map_page(
                 scene.show_plan(arm, plan)
         return scene.html()
     finally:
-        server.stop()
+        close_server(server)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import rotation_to_quat
 from splatbot.planning import Trajectory as RobotTrajectory
@@ -24,6 +27,25 @@ _FRUSTUM = 0.04  # [m]
 _ROOM = 0.1  # [m] of clearance and more is green
 _GREY, _BLUE, _AMBER = (150, 150, 150), (40, 120, 255), (255, 170, 0)
 _PATH_POINTS = 60
+
+
+def open_server(host: str, port: int) -> viser.ViserServer:
+    """viser's server, at the next free port where ``port`` is taken; without its banner.
+
+    Raises:
+        InputError: the address cannot be listened on.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            return viser.ViserServer(host=host, port=port, label="splatbot", verbose=False)
+    except OSError as error:
+        raise InputError(f"cannot listen on {host} port {port}.", field="viewer_port", hint="give another") from error
+
+
+def close_server(server: viser.ViserServer) -> None:
+    """End it, without a word."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 class MapScene:

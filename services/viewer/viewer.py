@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import viser
 
 from splatbot.camera import Camera
 from splatbot.collision import RobotSpheres
-from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.planning import Trajectory as RobotTrajectory
 from splatbot.protocols import Array
@@ -21,7 +19,7 @@ from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.topics import FRAME, PLAN, RESULT, STATE, TRAJECTORY, JointState
-from splatbot.services.viewer.scene import MapScene
+from splatbot.services.viewer.scene import MapScene, close_server, open_server
 from splatbot.services.viewer.splats import COLORINGS, Coloring
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
@@ -49,12 +47,12 @@ class Viewer:
 
     Args:
         store: the maps; ``map_id`` is shown, or the first one there is.
-        host, port: where the page is served; port 0 takes a free one.
+        host, port: where the page is served, at the next free port where that one is taken; 0 takes any.
         robot: the arm that is shown where its base is known.
         map_id: None: the first.
 
     Raises:
-        InputError: the port cannot be listened on.
+        InputError: the host cannot be listened on.
     """
 
     def __init__(
@@ -67,12 +65,8 @@ class Viewer:
         map_id: str | None = None,
     ) -> None:
         self._store, self._map_id, self._robot_name = store, map_id, robot
-        try:
-            self.server = viser.ViserServer(host=host, port=port, label="splatbot", verbose=False)
-        except OSError as error:
-            hint = "give another port"
-            raise InputError(f"cannot listen on {host} port {port}.", field="viewer_port", hint=hint) from error
-        self.port = self.server.get_port()
+        self.server = open_server(host, port)
+        self._host, self.port = host, self.server.get_port()
         self._scene = MapScene(self.server)
         self._news, self._lock = _News(), threading.Lock()
         self._served: ServedMap | None = None
@@ -92,6 +86,7 @@ class Viewer:
         """Begin."""
         for thread in self._threads:
             thread.start()
+        _log.info("the viewer is at http://%s:%d", self._host, self.port)
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """End, and close the page's connections."""
@@ -100,7 +95,7 @@ class Viewer:
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout_s)
-        self.server.stop()
+        close_server(self.server)
 
     def html(self) -> str:
         """What is shown now as one page that needs nothing else."""

@@ -20,7 +20,7 @@ from splatbot.robots.store import load_robot
 from splatbot.services.store import MapStore
 from splatbot.services.topics import PLAN, RESULT, map_topic
 from splatbot.services.viewer.page import map_page
-from splatbot.services.viewer.scene import MapScene
+from splatbot.services.viewer.scene import MapScene, close_server, open_server
 from splatbot.services.viewer.viewer import Viewer
 from splatbot.slam import FrameResult
 from splatbot.workspace import Workspace
@@ -28,7 +28,7 @@ from tests.browser.chromium import Chromium
 
 pytestmark = pytest.mark.long
 
-WIDTH, HEIGHT, FOV = 640, 480, 50.0
+WIDTH, HEIGHT, FOV = 1100, 480, 50.0  # the panel covers the right 330
 EYE, TARGET = np.array([1.6, -1.2, 1.0]), np.array([0.3, 0.0, 0.4])
 BASE = pose_from_quat((0.0, 0.0, 0.0), (1, 0, 0, 0))
 
@@ -38,15 +38,15 @@ def _camera() -> Camera:
     return Camera(f, f, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, WIDTH, HEIGHT)
 
 
-def _wall() -> GaussianModel:
-    """A wall behind the robot, its left half red, its right half blue, 2 m wide; opaque."""
+def _wall(axes: tuple[int, int, int] = (0, 1, 2)) -> GaussianModel:
+    """A wall behind the robot, across the first of the axes, one half red, the other blue, 2 m wide; opaque."""
     y, z = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 81), np.linspace(-0.4, 1.4, 73)))
     n = len(y)
     red, blue = np.array([0.9, 0.1, 0.1]), np.array([0.1, 0.2, 0.9])
     return GaussianModel.from_activated(
-        means=np.stack([np.full(n, -0.6), y, z], -1),
+        means=np.stack([np.full(n, -0.6), y, z], -1)[:, axes],
         quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        scales=np.tile([0.002, 0.02, 0.02], (n, 1)),
+        scales=np.tile([0.002, 0.02, 0.02], (n, 1))[:, axes],
         opacities=np.full(n, 0.99),
         colors=np.where(y[:, None] < 0, red, blue),
     )
@@ -99,7 +99,7 @@ def test_the_viewer_draws_the_splats_as_the_rasterizer_does_and_the_robot_and_it
         time.sleep(1.5)
         viewer._scene.look(EYE, TARGET, fov_deg=FOV)
         browser.open(f"http://127.0.0.1:{viewer.port}")
-        left, right = np.array([-0.6, -0.7, 0.2]), np.array([-0.6, 0.75, 1.1])
+        left, right = np.array([-0.6, -0.7, 0.2]), np.array([-0.6, 0.55, 0.2])
         image = _shot(browser, left, np.array([230.0, 26, 26]))
         expected = render_view(model, _camera(), look_at(EYE, TARGET), "rgb")
         for point in (left, right):
@@ -123,7 +123,7 @@ def test_the_viewer_draws_the_splats_as_the_rasterizer_does_and_the_robot_and_it
 
 
 def test_the_page_needs_nothing_else_and_shows_the_same_colours(browser: Chromium, tmp_path: Path) -> None:
-    model = _wall()
+    model = _wall((1, 2, 0))  # across the world's z axis, along which a map is looked at
     page = map_page(model, workspace=Workspace(T_world_base=BASE))
     assert "<script src=" not in page
     (tmp_path / "page.html").write_text(page)
@@ -133,15 +133,13 @@ def test_the_page_needs_nothing_else_and_shows_the_same_colours(browser: Chromiu
         image = browser.screenshot().reshape(-1, 3).astype(int)
         red = ((image[:, 0] > 190) & (image[:, 1] < 80) & (image[:, 2] < 80)).mean()
         blue = ((image[:, 2] > 190) & (image[:, 0] < 80) & (image[:, 1] < 100)).mean()
-        if red > 0.02 and blue > 0.02:
+        if red > 0.05 and blue > 0.05:
             return
     raise AssertionError(f"red on {red:.1%}, blue on {blue:.1%} of the page")
 
 
 def test_a_scene_sends_again_only_what_has_changed() -> None:
-    import viser
-
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server = open_server("127.0.0.1", 0)
     try:
         scene, model = MapScene(server), _wall()
         everything = scene.show_map(model)
@@ -152,4 +150,4 @@ def test_a_scene_sends_again_only_what_has_changed() -> None:
         assert scene.show_map(moved) == 1
         assert scene.show_map(model.select(model.means[:, 1] < 0)) < everything
     finally:
-        server.stop()
+        close_server(server)
