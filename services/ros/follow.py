@@ -20,7 +20,7 @@ from splatbot.services.bus import Message as News
 from splatbot.services.jobs import ENDED, Job
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import waypoints_of
-from splatbot.services.ros.moveit import main_map
+from splatbot.services.ros.moveit import robot_place
 from splatbot.services.ros.waypoints import Waypoints
 from splatbot.services.store import MapStore
 
@@ -109,11 +109,7 @@ class FollowJointTrajectory:
         q = given[:, [names.index(name) for name in robot.chain.names]]
         if not robot.within_limits(q, 1e-6).all():
             raise InputError("leave the joints' limits.", field="points", hint="plan within them")
-        served = main_map(self._store)
-        base = served.workspace.T_world_base if served.workspace is not None else None
-        if base is None:
-            hint = "keep a scene.yaml beside the map"
-            raise InputError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
+        served, _, base = robot_place(self._store, robot.name)
         arm = RobotSpheres(robot, T_world_base=base)
         ends = (q[:-1], q[1:]) if len(q) > 1 else (q, q)
         edges = arm.certify(served.field, np.ascontiguousarray(ends[0]), np.ascontiguousarray(ends[1]))

@@ -9,6 +9,7 @@ from splatbot.frame import Frame
 from splatbot.services.arms import Arms
 from splatbot.services.ros.follow import FollowJointTrajectory
 from splatbot.services.ros.graph import RosGraph
+from splatbot.services.ros.grasping import GraspServices
 from splatbot.services.ros.inlets import RosInlets
 from splatbot.services.ros.moveit import MoveItServices
 from splatbot.services.ros.nvblox import NvbloxServices
@@ -39,6 +40,7 @@ class RosNode:
         RosApi(self.graph)
         MoveItServices(self.graph, store, robot=robot)
         NvbloxServices(self.graph, store)
+        GraspServices(self.graph, store, robot=robot)
         self._follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
         self._outlets = RosOutlets(store.bus, self.graph)
         self._inlets = RosInlets(self.graph, store.bus, robot=robot, on_frame=on_frame)
