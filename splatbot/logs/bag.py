@@ -148,8 +148,9 @@ class BagLog(LogBase):
 
     def _recorded_camera(self) -> Camera:
         topic = self._given.get("info") or self._info_topic()
-        for message in self._all(topic):
-            return self._checked(topic, lambda m=message: camera_of(m))  # type: ignore[misc]
+        first = next(iter(self._all(topic)), None)
+        if first is not None:
+            return self._checked(topic, lambda: camera_of(first))
         raise LogError("holds no message.", file=self.path, field=topic, hint="give --camera FILE")
 
     def _info_topic(self) -> str:

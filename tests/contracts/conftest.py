@@ -83,6 +83,8 @@ def service() -> Iterator[Service]:
     store = MapStore()
     beside = Workspace(T_world_base=pose_from_quat((0.0, 0.5, -1.0), (0.7071068, 0.7071068, 0.0, 0.0)))
     store.add("wall", source="wall.ply", state="static", snapshot=wall(), workspace=beside)
-    limits = {"max_points": 1000, "max_body_bytes": 200_000, "max_pixels": 640 * 480, "max_message_bytes": 2_000_000}
-    with running(ServiceSettings(**limits), store) as it:
+    settings = ServiceSettings(
+        max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480, max_message_bytes=2_000_000
+    )
+    with running(settings, store) as it:
         yield it
