@@ -105,10 +105,9 @@ class BagLog(LogBase):
         """The poses of /ground_truth/pose, T_world_camera; None where there are none."""
         if TRUTH not in self._reader.topics:
             return None
-        rows = [
-            self._checked(TRUTH, lambda m=m: (seconds_of(m.header.stamp), pose_of(m.pose))) for m in self._all(TRUTH)
-        ]
-        return Trajectory(np.array([stamp for stamp, _ in rows]), np.stack([T for _, T in rows]))
+        messages = list(self._all(TRUTH))
+        poses = self._checked(TRUTH, lambda: np.stack([pose_of(m.pose) for m in messages]))
+        return Trajectory(np.array([seconds_of(m.header.stamp) for m in messages]), poses)
 
     def __len__(self) -> int:
         return len(self._pairs)
