@@ -26,6 +26,7 @@ COMMANDS = {
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "view": _Command("splatbot.cli.view", "view", "Show a map in a web browser, or write it as one HTML page."),
     "plan": _Command(
         "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
     ),
