@@ -96,8 +96,9 @@ def _arm_shapes() -> list[Capsule]:
 
 
 def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
-    start, end = (T_link_hand @ np.array([0.0, y, 0.04, 1.0]) for y in (-0.06, 0.06))
-    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.04)]
+    """Around the hand's body of 63 x 204 x 66 mm, round at its ends."""
+    start, end = (T_link_hand @ np.array([0.0, y, 0.0345, 1.0]) for y in (-0.0705, 0.0705))
+    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.0315)]
 
 
 def _dh(a: float, d: float, alpha: float) -> Array:

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError
-from splatbot.protocols import Array, KinematicChain, LinkSpheres
+from splatbot.geometry import inverse, transform_points
+from splatbot.protocols import Array, HandShape, KinematicChain, LinkSpheres
 from splatbot.robots.cover import cover
 from splatbot.robots.joints import Joint
 from splatbot.robots.shapes import Shape
 
 SLACK = 0.008  # [m] that generated spheres may reach beyond the collision geometry
+_SPACING = 2e-3  # [m] between points of the shapes that the hand is measured by
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +159,29 @@ class RobotModel:
         fingers = np.full(2 * len(self._finger_spheres), len(self), np.int32)
         return LinkSpheres(
             np.concatenate([self._link_spheres.link, fingers]), np.concatenate(centers), np.concatenate(radii)
+        )
+
+    @cached_property
+    def hand(self) -> HandShape | None:
+        """The gripper as boxes around its shapes; None without one. Its fingers must open along the tool's y."""
+        if self.gripper is None or not self.gripper.shapes:
+            return None
+        T_tcp_link = inverse(self.T_link_tcp)
+        T_tcp_finger = T_tcp_link @ self.gripper.T_link_finger[0]
+        finger = np.concatenate([shape.surface(_SPACING) for shape in self.gripper.shapes])
+        finger = transform_points(T_tcp_finger, finger) * [1.0, np.sign(T_tcp_finger[1, 1]), 1.0]
+        own = [shape.surface(_SPACING) for shape in self.shapes if shape.link == len(self)]
+        body = transform_points(T_tcp_link, np.concatenate(own)) if own else np.zeros((0, 3))
+        palm = body[body[:, 2] > finger[:, 2].min()]  # what stands beside the fingers or between them
+        front = palm if len(palm) else finger[finger[:, 2] == finger[:, 2].min()]
+        return HandShape(
+            stroke=2 * self.gripper.stroke,
+            width=float(2 * np.abs(finger[:, 0]).max()),
+            thickness=float(np.ptp(finger[:, 1])),
+            tip=float(finger[:, 2].max()),
+            palm=float(-front[:, 2].max()),
+            palm_size=(float(2 * np.abs(front[:, 0]).max()), float(2 * np.abs(front[:, 1]).max())),
+            force=self.gripper.force,
         )
 
     @cached_property

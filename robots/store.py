@@ -15,8 +15,10 @@ from splatbot.protocols import LinkSpheres
 from splatbot.robots.joints import Joint
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import Inertial, RobotModel
+from splatbot.robots.wide_hand import panda_2f140
 
 _FORMAT = "splatbot robot 1"
+_BUILT_IN = {"panda": panda, "panda-2f140": panda_2f140}
 
 
 def robots_folder() -> Path:
@@ -30,7 +32,7 @@ def robot_names() -> list[str]:
     """All robots there are."""
     folder = robots_folder()
     added = sorted(path.stem for path in folder.glob("*.json")) if folder.is_dir() else []
-    return ["panda", *(name for name in added if name != "panda")]
+    return [*_BUILT_IN, *(name for name in added if name not in _BUILT_IN)]
 
 
 def load_robot(name: str | Path) -> RobotModel:
@@ -40,8 +42,8 @@ def load_robot(name: str | Path) -> RobotModel:
         InputError: there is none of that name.
         FormatError: its file is damaged.
     """
-    if str(name) == "panda":
-        return panda()
+    if str(name) in _BUILT_IN:
+        return _BUILT_IN[str(name)]()
     path = Path(name) if str(name).endswith(".json") else robots_folder() / f"{name}.json"
     if not path.is_file():
         raise InputError(

@@ -37,6 +37,12 @@ class ProblemResponse(JSONResponse):
     media_type = MEDIA_TYPE
 
 
+class BusyError(SplatbotError):
+    """The service has as much to do as it can; the same request may do later."""
+
+    http_status = 503
+
+
 def problem(
     status: int,
     detail: str,

@@ -30,7 +30,10 @@ def run_service(
     host, port = listener.getsockname()[:2]
     on_start(f"http://{'[' + host + ']' if ':' in host else host}:{port}")
     config = uvicorn.Config(
-        create_app(settings, store), log_level="info", timeout_graceful_shutdown=settings.shutdown_s
+        create_app(settings, store),
+        log_level="info",
+        timeout_graceful_shutdown=settings.shutdown_s,
+        ws_max_size=settings.max_message_bytes,
     )
     # After its graceful end uvicorn raises the signal again for whoever else listens: here it has done its work.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}

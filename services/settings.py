@@ -27,6 +27,7 @@ class ServiceSettings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")
     max_body_bytes: int = Field(16 * 2**20, ge=1024, description="size of a request's body [bytes]")
+    max_message_bytes: int = Field(32 * 2**20, ge=1024, description="size of one WebSocket message [bytes]")
     max_pixels: int = Field(2_100_000, ge=1, description="pixels of one rendered view")
     shutdown_s: int = Field(10, ge=0, description="how long running requests may take to end after SIGTERM [s]")
 

@@ -8,9 +8,20 @@ from functools import cached_property
 from typing import Literal
 
 from splatbot.collision import GaussianCollisionField
-from splatbot.errors import MapNotFoundError
+from splatbot.errors import InputError, MapNotFoundError
 from splatbot.gaussians import Snapshot
+from splatbot.services.bus import Bus
 from splatbot.services.problems import MapNotReadyError
+from splatbot.services.topics import STATE, TRAJECTORY, map_topic
+from splatbot.trajectory import Trajectory
+from splatbot.workspace import Workspace
+
+
+class MapExistsError(InputError):
+    """A map of that name is served already."""
+
+    http_status = 409
+
 
 # "static": from a file; the others: being mapped from a log, which ended, or broke (what was mapped is still served).
 State = Literal["static", "mapping", "ended", "failed"]
@@ -26,6 +37,9 @@ class ServedMap:
         state: how it came about, and whether it is still growing.
         detail: why it failed.
         snapshot: None before the first state is published.
+        trajectory: of the camera, as far as ``snapshot`` knows it; None where there was none.
+        workspace: where the robot stands in it, where that is known.
+        awaited: the service counts as ready only once this map has a state.
     """
 
     id: str
@@ -33,6 +47,9 @@ class ServedMap:
     state: State
     detail: str | None = None
     snapshot: Snapshot | None = None
+    trajectory: Trajectory | None = None
+    workspace: Workspace | None = None
+    awaited: bool = True
 
     @property
     def map_version(self) -> int:
@@ -62,24 +79,41 @@ class ServedMap:
 
 
 class MapStore:
-    """Maps by id. Writers swap whole states, readers keep the one they took: nobody waits for a computation."""
+    """Maps by id. Writers swap whole states, readers keep the one they took: nobody waits for a computation.
 
-    def __init__(self) -> None:
+    Args:
+        bus: told of each new state; None makes one.
+    """
+
+    def __init__(self, bus: Bus | None = None) -> None:
+        self.bus = bus or Bus()
         self._lock = threading.Lock()
         self._maps: dict[str, ServedMap] = {}
 
-    def add(self, map_id: str, *, source: str, state: State, snapshot: Snapshot | None = None) -> None:
+    def add(
+        self,
+        map_id: str,
+        *,
+        source: str,
+        state: State,
+        snapshot: Snapshot | None = None,
+        trajectory: Trajectory | None = None,
+        workspace: Workspace | None = None,
+        awaited: bool = True,
+    ) -> ServedMap:
         """Serve a map under a new name.
 
         Raises:
-            ValueError: the name is taken.
+            MapExistsError: the name is taken.
         """
         with self._lock:
             if map_id in self._maps:
-                raise ValueError(f"map {map_id!r} exists")
-            self._maps[map_id] = ServedMap(map_id, source, state, snapshot=snapshot)
+                raise MapExistsError(f"map {map_id!r} exists.", field="id", hint="delete it, or choose another id")
+            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited)
+            self._put(served)
+        return served
 
-    def publish(self, map_id: str, snapshot: Snapshot) -> None:
+    def publish(self, map_id: str, snapshot: Snapshot, trajectory: Trajectory | None = None) -> None:
         """Let ``snapshot`` be the map's latest state; one that is not newer is ignored, so versions only grow.
 
         Raises:
@@ -87,8 +121,11 @@ class MapStore:
         """
         with self._lock:
             current = self._find(map_id)
-            if current.snapshot is None or snapshot.map_version > current.map_version:
-                self._maps[map_id] = replace(current, snapshot=snapshot)
+            if current.snapshot is not None and snapshot.map_version <= current.map_version:
+                return
+            self._put(replace(current, snapshot=snapshot, trajectory=trajectory or current.trajectory))
+            if trajectory is not None:
+                self.bus.publish(map_topic(map_id, TRAJECTORY), trajectory)
 
     def set_state(self, map_id: str, state: State, detail: str | None = None) -> None:
         """Tell how the map's making goes.
@@ -97,7 +134,18 @@ class MapStore:
             MapNotFoundError: no map of that name.
         """
         with self._lock:
-            self._maps[map_id] = replace(self._find(map_id), state=state, detail=detail)
+            self._put(replace(self._find(map_id), state=state, detail=detail))
+
+    def remove(self, map_id: str) -> None:
+        """Serve a map no longer; who holds a state of it keeps that.
+
+        Raises:
+            MapNotFoundError: no map of that name.
+        """
+        with self._lock:
+            self._find(map_id)
+            del self._maps[map_id]
+            self.bus.forget(map_topic(map_id, ""))
 
     def get(self, map_id: str) -> ServedMap:
         """The map's latest state.
@@ -112,6 +160,10 @@ class MapStore:
         """All maps at their latest states, in the order in which they were added."""
         with self._lock:
             return tuple(self._maps.values())
+
+    def _put(self, served: ServedMap) -> None:
+        self._maps[served.id] = served
+        self.bus.publish(map_topic(served.id, STATE), served)
 
     def _find(self, map_id: str) -> ServedMap:
         if map_id not in self._maps:

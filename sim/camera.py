@@ -1,19 +1,27 @@
-"""The twin's camera: MuJoCo's images and depth as a robot's camera would give them, through its sensor effects."""
+"""The twin's camera: bodies by MuJoCo, a map by its Gaussians, the nearer in front, and what a sensor does to that."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from splatbot.camera import Camera
-from splatbot.errors import InputError, NativeError
+from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.protocols import Array
+from splatbot.sim.bodies_view import BodiesView
 from splatbot.sim.effects.registry import make_effects
+from splatbot.sim.effects.sensors import sensor_specs
+from splatbot.sim.map_view import MapView
 from splatbot.sim.scene import CameraSection
-from splatbot.sim.world import CAMERA, World
+from splatbot.sim.view import View, composite
+from splatbot.sim.world import World, robot_joints
+from splatbot.trajectory import Trajectory
+
+_REACH = 20.0  # [m] that depth cameras see
+_PROMPT = 1e-9  # [s] by which a frame may be late and yet on time
 
 
 class TwinCamera:
@@ -22,36 +30,48 @@ class TwinCamera:
     Args:
         world: a compiled scene with a camera.
         seed: of the sensor's noise.
+        splats: show the scene's map, if it has one, as Gaussians, not as the shapes that physics takes it for.
+        camera: a pinhole in place of the scene's.
 
     Raises:
         InputError: the scene has no camera, or its sensor names an unknown effect.
         NativeError: nothing can be drawn on this machine.
     """
 
-    def __init__(self, world: World, *, seed: int = 0) -> None:
+    def __init__(self, world: World, *, seed: int = 0, splats: bool = True, camera: Camera | None = None) -> None:
         if world.scene.camera is None:
             raise InputError("has no camera.", field=world.scene.name, hint="add `camera: {at: ..., look_at: ...}`")
         section: CameraSection = world.scene.camera
-        self.camera = intrinsics(section)
-        self.effects = make_effects(section.sensor, seed=seed, why=f"sensor of the scene {world.scene.name}")
-        try:
-            self._renderer = mujoco.Renderer(world.model, section.height, section.width)
-        except Exception as error:  # EGL, OSMesa and GLFW each fail with their own kinds
-            raise NativeError(
-                f"MuJoCo cannot draw here: {error}.", field="camera", hint="install libegl1 and set MUJOCO_GL=egl"
-            ) from error
+        self.camera = intrinsics(section) if camera is None else camera
+        self.T_world_camera = pose_of(section)
+        still = Trajectory(np.zeros(1), self.T_world_camera[None])
+        why = f"sensor of the scene {world.scene.name}"
+        self.effects = make_effects(sensor_specs(world.scene), seed=seed, why=why).along(still)
+        self._underway: list[Frame] = []
+        self._qpos = robot_joints(world.model, world.robot)[0] if world.robot is not None else None
+        self._map = MapView(world, self.camera) if splats and world.parts is not None else None
+        self._bodies = BodiesView(world, self.camera, map_too=self._map is None)
+
+    def view(self, data: Any, T_world_camera: Array | None = None) -> View:
+        """What an ideal camera would see now, from the scene's place or from another pose (4, 4)."""
+        T = self.T_world_camera if T_world_camera is None else T_world_camera
+        bodies = self._bodies.view(data, T)
+        return bodies if self._map is None else composite(bodies, self._map.view(data, T))
 
     def frame(self, data: Any, index: int, stamp: float) -> Frame | None:
-        """What the camera sees now; None if the sensor loses the frame."""
-        self._renderer.disable_depth_rendering()
-        self._renderer.update_scene(data, CAMERA)
-        rgb = self._renderer.render().copy()
-        self._renderer.enable_depth_rendering()
-        self._renderer.update_scene(data, CAMERA)
-        depth = self._renderer.render().astype(np.float32)
-        depth[depth > 20.0] = 0.0  # the sky, and what no depth camera reaches
-        frame = Frame(stamp, rgb, depth, self.camera, index, source=f"twin#{index}")
-        return next(iter(self.effects.over([frame])), None)
+        """The newest frame that arrives at ``stamp`` [s], with the joints (J,) of that moment; None if none does.
+
+        Without latency that is what the camera sees now, or nothing if the sensor loses it.
+        """
+        seen = self.view(data)
+        frame = Frame(stamp, seen.rgb(), seen.measured(_REACH), self.camera, index, source=f"twin#{index}")
+        self._underway.extend(self.effects.over([frame]))
+        arrived = [late for late in self._underway if late.stamp <= stamp + _PROMPT]
+        self._underway = [late for late in self._underway if late.stamp > stamp + _PROMPT]
+        return replace(arrived[-1], joints=self._joints(data)) if arrived else None
+
+    def _joints(self, data: Any) -> Array | None:
+        return None if self._qpos is None else np.array(data.qpos[self._qpos])
 
     def report(self) -> list[dict[str, Any]]:
         """The account of the sensor's effects."""
@@ -59,7 +79,7 @@ class TwinCamera:
 
     def close(self) -> None:
         """Give the drawing context back."""
-        self._renderer.close()
+        self._bodies.close()
 
 
 def intrinsics(section: CameraSection) -> Camera:

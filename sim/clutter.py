@@ -13,15 +13,13 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_to_rotation
 from splatbot.protocols import Array
+from splatbot.segmentation import Fit, Support, clusters, find_support, fit, given_support
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge
-from splatbot.sim.maps.fits import Fit, fit
-from splatbot.sim.maps.plane import Support, find_support
 from splatbot.sim.scene import Clutter, Scene, SceneObject
 from splatbot.sim.solids import rotation_of
 
 _OPAQUE = 0.3  # fainter Gaussians are no surface
 _ABOVE = 0.008  # [m] over the table: lower is the table's own noise
-_TOGETHER = 0.025  # [m] between Gaussians of one object
 _FEWEST, _LARGEST = 40, 0.35  # Gaussians of an object; [m] across
 
 
@@ -30,12 +28,14 @@ class MapParts:
     """What a map became.
 
     Args:
+        model: the map, in its own frame.
         objects: table and fitted objects, as a scene has them.
         ellipsoids: the rest.
         notes: each with its geometric error against the map, in words.
         labels: (N,) of the map's Gaussians: -2 left out, -1 ellipsoids, 0 the table, k the k-th fitted object.
     """
 
+    model: GaussianModel
     objects: tuple[SceneObject, ...]
     ellipsoids: Ellipsoids
     notes: tuple[str, ...]
@@ -67,7 +67,7 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     labels[used] = -1
     objects: list[SceneObject] = []
     notes: list[str] = []
-    support = find_support(points)
+    support = find_support(points) if clutter.support is None else _given(points, clutter.support)
     if support is not None:
         labels[used[support.inside]] = 0
         objects.append(_table(support))
@@ -83,18 +83,19 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
         f"clutter: {len(left)} Gaussians as {len(rest.centers)} ellipsoids, "
         f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm)"
     )
-    return MapParts(tuple(objects), rest, tuple(notes), labels)
+    return MapParts(model, tuple(objects), rest, tuple(notes), labels)
 
 
 def load_parts(scene: Scene) -> tuple[Scene, MapParts | None]:
-    """The scene with the objects of its map, and the map's parts; without a map, the scene itself."""
+    """The scene with its map's objects and degree of colours, and the map's parts; without a map, the scene itself."""
     if scene.map is None:
         return scene, None
     path = Path(scene.map.file)
     model = GaussianModel.load(path if path.is_absolute() else scene.folder / path)
     base = np.asarray(scene.robot.at if scene.robot is not None else (0.0, 0.0, 0.0), dtype=np.float64)
     parts = map_parts(model, scene.map, base)
-    return scene.model_copy(update={"objects": (*scene.objects, *parts.objects)}), parts
+    read = scene.map.model_copy(update={"harmonics": model.sh_degree})
+    return scene.model_copy(update={"objects": (*scene.objects, *parts.objects), "map": read}), parts
 
 
 def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
@@ -105,6 +106,13 @@ def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
         geom.condim, geom.rgba = 1, [0.6, 0.6, 0.65, 1.0]
         geoms.append(geom)
     return geoms
+
+
+def _given(points: Array, plane: tuple[float, float, float, float]) -> Support:
+    length = float(np.linalg.norm(plane[:3]))
+    if length < 1e-6 or plane[2] <= 0:
+        raise InputError(f"is {list(plane)}.", field="map.support", hint="give n, d with n upwards")
+    return given_support(points, np.array(plane[:3]) / length, -plane[3] / length)
 
 
 def _table(support: Support) -> SceneObject:
@@ -125,7 +133,7 @@ def _add_objects(
     notes: list[str],
 ) -> None:
     above = np.flatnonzero((support.height(points) > _ABOVE) & ~support.inside)
-    for rows in _clusters(points[above]):
+    for rows in clusters(points[above]):
         cluster = points[above[rows]]
         if len(cluster) < _FEWEST or np.ptp(cluster, axis=0).max() > _LARGEST:
             continue
@@ -140,15 +148,3 @@ def _add_objects(
             f"{name}: {len(cluster)} Gaussians, {1e3 * found.error:.1f} mm from its surface "
             f"(95 %: {1e3 * found.worst:.1f} mm)"
         )
-
-
-def _clusters(points: Array) -> list[np.ndarray]:
-    """Rows of points (P, 3) that hang together, largest first (DBSCAN)."""
-    import open3d as o3d
-
-    if not len(points):
-        return []
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    label = np.asarray(cloud.cluster_dbscan(eps=_TOGETHER, min_points=5))
-    found = [np.flatnonzero(label == k) for k in range(int(label.max()) + 1)]
-    return sorted(found, key=lambda rows: (-len(rows), int(rows[0])))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from splatbot.sim.effects.physics import physics_effect
+from splatbot.sim.effects.physics import PHYSICS, physics_effect
+from splatbot.sim.effects.registry import effect_class
 from splatbot.sim.motion import JointMotion
 from splatbot.sim.twin import Twin, TwinResult
 
@@ -18,9 +21,9 @@ class Entry:
         on: whether it was.
         why: or why not.
         by: the scene's content, or `forced`, `forbidden`.
-        observable: the figure that changes without it.
-        ms: how much longer physics took with it than without it [ms]; None if it was off, or was not measured.
-            Below 0 it saved time.
+        observable: what changes without it: a figure, or something of the frames; empty for what the sensor leaves out.
+        ms: how much longer physics took with it than without it [ms], below 0 if it saved time; of the sensor, how
+            long it took; None if it was off, or was not measured.
         us_per_step: the same for a step [us].
     """
 
@@ -33,23 +36,42 @@ class Entry:
     us_per_step: float | None
 
 
-def ledger(twin: Twin, result: TwinResult, motion: JointMotion | None = None, *, costs: bool = True) -> list[Entry]:
-    """An entry for every effect; each that is on is measured by running the motion again without it.
+def ledger(
+    twin: Twin,
+    result: TwinResult,
+    motion: JointMotion | None = None,
+    *,
+    costs: bool = True,
+    sensor: Sequence[Mapping[str, Any]] = (),
+) -> list[Entry]:
+    """An entry for every effect; physics that is on is measured by running the motion again without it.
 
     Args:
         twin: that ran.
         result: of that run.
         motion: that it followed.
-        costs: whether to measure; takes a run for each effect that is on.
+        costs: whether to measure; takes a run for each physics effect that is on.
+        sensor: the account of the camera that looked on, see :meth:`TwinCamera.report`.
     """
+    drawn = {row["name"]: (row["ms_per_frame"] or 0.0) * row["frames"] for row in sensor}
     base = twin.follow(motion).physics_seconds if costs else 0.0  # again: the run itself may have been watched
     found = []
     for decision in result.decisions:
-        ms = _cost(twin, result, motion, decision.name, base) if costs and decision.on else None
+        physical = decision.name in PHYSICS
+        if physical:
+            ms = _cost(twin, result, motion, decision.name, base) if costs and decision.on else None
+        else:
+            ms = drawn.get(decision.name)
         each = None if ms is None else 1e3 * ms / max(1, result.steps)
-        observable = physics_effect(decision.name).observable
+        observable = _observable(decision.name) if physical or decision.on else ""
         found.append(Entry(decision.name, decision.on, decision.why, decision.by, observable, ms, each))
     return found
+
+
+def _observable(name: str) -> str:
+    if name in PHYSICS:
+        return physics_effect(name).observable
+    return str(effect_class(name).observable)
 
 
 def _cost(twin: Twin, result: TwinResult, motion: JointMotion | None, name: str, base: float) -> float:

@@ -166,12 +166,16 @@ class Clutter(Section):
     ellipsoids: int = Field(default=2000, ge=0, le=20_000, description="at most so many: accuracy for time")
     at: Vec3 = Field(default=(0.0, 0.0, 0.0), description="of the map's origin [m]")
     rpy: Vec3 = Field(default=(0.0, 0.0, 0.0), description="of the map's axes: roll, pitch, yaw [rad]")
+    support: tuple[float, float, float, float] | None = Field(
+        default=None, description="n, d of the plane n · p + d = 0 that things stand on, n upwards; None: it is found"
+    )
     movable: bool = Field(default=False, description="whether fitted objects may be moved")
     objects: bool = Field(default=True, description="clusters above the table become primitives or hulls")
+    harmonics: int = Field(default=0, ge=0, exclude=True, description="degree of its colours; known once it is read")
 
 
 class Choice(Section):
-    """Physics that is on or off whatever the scene calls for."""
+    """Physics and sensor effects that are on or off whatever the scene calls for."""
 
     force: tuple[str, ...] = ()
     forbid: tuple[str, ...] = ()
@@ -203,10 +207,12 @@ class Scene(Section):
         if self.task.moves and self.robot is None:
             raise ValueError("task: moves need a robot")
         from splatbot.sim.effects.physics import PHYSICS
+        from splatbot.sim.effects.registry import EFFECTS
 
         for name in (*self.effects.force, *self.effects.forbid):
-            if name not in PHYSICS:
-                raise ValueError(f"effects: there is no {name!r}; physics: {', '.join(PHYSICS)}")
+            if name not in (*PHYSICS, *EFFECTS):
+                known = f"physics: {', '.join(PHYSICS)}; of the camera's sensor: {', '.join(EFFECTS)}"
+                raise ValueError(f"effects: there is no {name!r}; {known}")
         both = set(self.effects.force) & set(self.effects.forbid)
         if both:
             raise ValueError(f"effects: {min(both)!r} is forced and forbidden")
@@ -228,7 +234,7 @@ class Scene(Section):
         return tuple(thing for thing in self.objects if thing.path)
 
     def with_effects(self, *, force: Sequence[str] = (), forbid: Sequence[str] = ()) -> Scene:
-        """The scene with more physics forced on or off; the latest word counts."""
+        """The scene with more effects forced on or off; the latest word counts."""
         forced = [n for n in (*self.effects.force, *force) if n not in forbid]
         forbidden = [n for n in (*self.effects.forbid, *forbid) if n not in force]
         values = self.model_dump() | {"effects": {"force": forced, "forbid": forbidden}, "folder": self.folder}

@@ -162,3 +162,15 @@ def rotation_of(rpy: Vec3) -> Array:
 def quat_of(rpy: Vec3) -> list[float]:
     """Quaternion wxyz of roll, pitch, yaw [rad]."""
     return [float(v) for v in rotation_to_quat(rotation_of(rpy))]
+
+
+def rpy_of(R: Array) -> Vec3:
+    """Roll, pitch, yaw [rad] of a rotation (3, 3): the other way round of :func:`rotation_of`.
+
+    Where the pitch is ±90 degrees, roll and yaw turn about one axis, and the roll is 0.
+    """
+    across = float(np.hypot(R[0, 0], R[1, 0]))
+    pitch = float(np.arctan2(-R[2, 0], across))
+    if across < 1e-9:
+        return 0.0, pitch, float(np.arctan2(-R[0, 1], R[1, 1]))
+    return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))

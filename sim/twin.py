@@ -15,7 +15,8 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.effects.physics import Decision, Hook
+from splatbot.sim.effects.decisions import Decision
+from splatbot.sim.effects.physics import Hook
 from splatbot.sim.following import Follower, targets_of
 from splatbot.sim.motion import JointMotion, home_of, motion_of
 from splatbot.sim.scene import Scene
@@ -145,6 +146,7 @@ class Twin:
         # A controller slower than physics takes several steps; one that is faster shortens them.
         self.substeps = max(1, int(np.ceil(1.0 / (self.rate * longest) - 1e-9)))
         self.timestep = 1.0 / (self.rate * self.substeps)
+        self._asked_rate = self.rate
         if timestep is not None and timestep > 1.0 / self.rate:
             self.rate, self.substeps, self.timestep = 1.0 / timestep, 1, timestep
         self.world: World = build_world(scene, robot=robot, timestep=self.timestep)
@@ -271,6 +273,7 @@ class Twin:
             "light": float(np.sum(self.world.model.light_diffuse))
             + float(self.world.model.vis.headlight.diffuse.sum()),
             "asleep": log.things.asleep,
+            "harmonics": float(self.world.harmonics),
         }
         return TwinResult(
             scene=self.scene.name,
@@ -318,6 +321,11 @@ class Twin:
             found.append(f"physics became unstable and was stopped: take steps below {1e3 * self.timestep:g} ms")
         if self.timestep > _SOFT_CONTACTS and "contact" in self.world.on:
             found.append(f"steps of {1e3 * self.timestep:g} ms: contacts give way; 2 ms are right")
+        if self.rate < self._asked_rate:
+            found.append(
+                f"steps of {1e3 * self.timestep:g} ms: the controller runs at {self.rate:g} Hz, "
+                f"not at {self._asked_rate:g}"
+            )
         deepest = max((touch.depth for touch in log.touches.found), default=0.0)
         if deepest > _DEEP:
             found.append(f"contacts overlap by {1e3 * deepest:.1f} mm: forces are rough")

@@ -15,14 +15,16 @@ from splatbot.geometry import rotation_to_quat
 from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot
-from splatbot.sim.clutter import add_ellipsoids, load_parts
-from splatbot.sim.effects.physics import Decision, Hook, effects_for, physics_effect
+from splatbot.sim.clutter import MapParts, add_ellipsoids, load_parts
+from splatbot.sim.effects.decisions import Decision
+from splatbot.sim.effects.physics import PHYSICS, Hook, effects_for, physics_effect
 from splatbot.sim.scene import CameraSection, Scene, SceneObject
 from splatbot.sim.solids import quat_of
 
 OBJECT = "object/"
 CAMERA = "camera"
 MAP = "map"
+MAP_GROUP = 2  # of geoms that stand for the map's Gaussians, which may be drawn instead
 _MOVABLE_MASS = 0.2  # [kg]
 
 
@@ -61,7 +63,8 @@ class World:
         owner: (G,) what each geom belongs to: a link, a finger, an object, or the map.
         of_robot: (G,) whether it is the robot's.
         mounted: parts of the arm that stand in something fixed at home, as (link, object): they are let.
-        notes: what the map became, in words.
+        parts: what the map became; None without one.
+        notes: on that, in words.
     """
 
     scene: Scene
@@ -73,12 +76,18 @@ class World:
     owner: tuple[str, ...]
     of_robot: NDArray[np.bool_]
     mounted: tuple[tuple[str, str], ...] = ()
+    parts: MapParts | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def on(self) -> tuple[str, ...]:
-        """The physics that is on."""
+        """The effects that are on."""
         return tuple(d.name for d in self.decisions if d.on)
+
+    @property
+    def harmonics(self) -> int:
+        """Degree to which a camera evaluates the colours of the map."""
+        return self.parts.model.sh_degree if self.parts is not None and "view_color" in self.on else 0
 
 
 def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: float | None = None) -> World:
@@ -97,9 +106,12 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
     draft = _draft(scene, robot)
     if parts is not None and len(parts.ellipsoids.centers):
         draft.map_geoms = add_ellipsoids(draft.spec, parts.ellipsoids)
-    notes = parts.notes if parts is not None else ()
+    if parts is not None:
+        stand_ins = [geom for thing in parts.objects for geom in draft.bodies[thing.name].geoms]
+        for geom in (*draft.map_geoms, *stand_ins):
+            geom.group = MAP_GROUP
     decisions = effects_for(scene)
-    on = [physics_effect(d.name) for d in decisions if d.on]
+    on = [physics_effect(d.name) for d in decisions if d.on and d.name in PHYSICS]
     for effect in on:
         effect.build(draft)
     draft.spec.option.timestep = scene.timestep if timestep is None else timestep
@@ -112,8 +124,13 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
     owner, of_robot = _owners(model)
     return World(
         scene, draft.robot, draft.spec, model, decisions, tuple(h for h in hooks if h is not None), owner, of_robot,
-        mounted, notes,
+        mounted, parts, _notes(parts, mounted),
     )  # fmt: skip
+
+
+def _notes(parts: MapParts | None, mounted: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
+    lets = tuple(f"{link} stands in {other} at home: contacts of the two are left out" for link, other in mounted)
+    return (parts.notes if parts is not None else ()) + lets
 
 
 def _draft(scene: Scene, robot: RobotModel | None) -> Draft:

@@ -127,7 +127,7 @@ class MappingConfig(_Section):
     max_width: int = Field(default=640, ge=64, description="width of the images that are fused [px]")
     stride: int = Field(default=3, ge=1, description="one new Gaussian per so many pixels each way: accuracy for time")
     footprint: float = Field(default=1.0, gt=0, description="size of a new Gaussian over the grid's half spacing")
-    thickness: float = Field(default=0.2, gt=0, le=1, description="thickness of a new Gaussian over its size")
+    thickness: float = Field(default=0.2, gt=0, le=1, description="thickness of a Gaussian over its size, at most")
     new_opacity: float = Field(default=0.8, gt=0, lt=1, description="opacity of a new Gaussian")
     new_alpha: float = Field(default=0.6, ge=0, le=1, description="pixels covered less than this are unexplained")
     new_depth: float = Field(default=0.04, gt=0, description="depths that differ by this share are different surfaces")
@@ -142,7 +142,7 @@ class MappingConfig(_Section):
     refine_iterations: int = Field(default=15, ge=0, description="optimiser steps per keyframe: accuracy for time")
     final_iterations: int = Field(default=300, ge=0, description="optimiser steps once the log has ended")
     window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")
-    depth_weight: float = Field(default=8.0, ge=0, description="weight of relative depth against colour")
+    depth_weight: float = Field(default=4.0, ge=0, description="weight of relative depth against colour")
     dssim_weight: float = Field(
         default=0.0,
         ge=0,
@@ -156,7 +156,7 @@ class MappingConfig(_Section):
     rate_sh: float = Field(default=2e-2, ge=0, description="learning rate of colour coefficients")
     min_opacity: float = Field(default=0.05, ge=0, le=1, description="fainter Gaussians are pruned")
     max_pixels: float = Field(
-        default=3.0, gt=0, description="standard deviations grow no larger in refinement [px of the keyframe]"
+        default=6.0, gt=0, description="standard deviations grow no larger in refinement [px of the keyframe]"
     )
     max_scale: float = Field(default=0.5, gt=0, description="larger Gaussians are pruned [m]")
     look_every: float = Field(

@@ -67,6 +67,16 @@ class ControllerError(SplatbotError):
     code = -4
 
 
+class GripperError(ControllerError):
+    """A gripper does not do what it is asked; it was told to stand still as far as it could be told anything."""
+
+
+class DeviceError(SplatbotError):
+    """A device is gone or does not answer."""
+
+    http_status = 503
+
+
 class MapNotFoundError(SplatbotError):
     """No map of that name."""
 

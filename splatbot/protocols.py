@@ -1,13 +1,17 @@
-"""What the core asks of a robot: kinematics, spheres that stand for its links, a controller, a gripper."""
+"""What the core asks of a robot: kinematics, spheres for its links, a controller, a gripper, a camera."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from splatbot.frame import Frame
 
 Array = NDArray[np.float64]
 
@@ -78,6 +82,46 @@ class RobotKinematics(Protocol):
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
         """The spheres with the gripper opened by ``opening`` [m]; None: as wide as it goes."""
+        ...
+
+
+@dataclass(frozen=True)
+class HandShape:
+    """Two fingers with flat pads that close on each other, as boxes in the tool's frame.
+
+    The hand comes along the tool's z and closes along its y; the tool's origin is between the pads.
+
+    Args:
+        stroke: widest opening between the pads [m].
+        width: of a finger along x [m].
+        thickness: of a finger along y, outwards from its pad [m].
+        tip: how far the fingers reach beyond the origin along z [m].
+        palm: how far behind the origin the palm is [m].
+        palm_size: of the palm along x and y [m].
+        force: between the fingers [N].
+    """
+
+    stroke: float
+    width: float
+    thickness: float
+    tip: float
+    palm: float
+    palm_size: tuple[float, float]
+    force: float = 70.0
+
+
+@runtime_checkable
+class HasHand(Protocol):
+    """A robot that can take hold of things."""
+
+    @property
+    def hand(self) -> HandShape | None:
+        """Its fingers; None: it has none."""
+        ...
+
+    @property
+    def T_link_tcp(self) -> Array:
+        """(4, 4), the tool's frame on the last link."""
         ...
 
 
@@ -171,8 +215,12 @@ class Gripper(Protocol):
         """Widest opening [m]."""
         ...
 
-    def move(self, opening: float, *, force: float | None = None) -> None:
-        """Go towards an opening [m], with at most a force [N]."""
+    def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
+        """Go towards an opening [m], with at most a force [N] and a speed [m/s] of the opening."""
+        ...
+
+    def moving(self) -> bool:
+        """Whether the fingers are still on their way."""
         ...
 
     def opening(self) -> float:
@@ -185,4 +233,31 @@ class Gripper(Protocol):
 
     def stop(self) -> None:
         """Stay where they are."""
+        ...
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """A camera that runs by itself: frames come at their times and are lost when nobody takes them."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        ...
+
+    @property
+    def uri(self) -> str:
+        """What it is opened by."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The frames from now on.
+
+        Raises:
+            DeviceError: the device is gone.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the stream."""
         ...

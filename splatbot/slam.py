@@ -22,6 +22,7 @@ from splatbot.mapping.worker import MappingWorker
 from splatbot.tracking.health import Verdict
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from splatbot.tracking.tracker import PoseEstimate, Tracker
+from splatbot.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,13 @@ class Slam:
     def keyframes(self) -> Sequence[Keyframe]:
         """What frames are tracked against."""
         return self._mapper.keyframes
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses of the frames that were tracked, as they are known now."""
+        poses = [(r.stamp, r.T_world_camera) for r in self.results if r.T_world_camera is not None]
+        stamps = np.array([stamp for stamp, _ in poses], dtype=np.float64)
+        return Trajectory(stamps, np.array([T for _, T in poses], dtype=np.float64).reshape(-1, 4, 4))
 
     def snapshot(self) -> Snapshot:
         """The map as it is now, immutable."""

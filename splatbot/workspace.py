@@ -18,12 +18,27 @@ from splatbot.geometry import pose_from_quat, rotation_to_quat, transform_points
 Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
-_KEYS = ("T_world_base", "gravity", "support_plane", "workspace", "T_link_camera", "camera_link")
+_KEYS = ("T_world_base", "gravity", "support_plane", "workspace", "T_link_camera", "camera_link", "objects")
 _TRIALS = 400  # planes tried
 _THICK = 0.01  # [m] that a plane's points may be off it
 _UPRIGHT = 6  # power of the cosine of a plane's lean that its points are weighed by
 AHEAD = 0.55  # [m] from a robot's base to what it works on
 _HEIGHT = 0.8  # [m] of the workspace over the plane
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPlace:
+    """What things at a place are called.
+
+    Args:
+        name: of the thing.
+        at: (3,) a point in or on it [m, world].
+        aliases: other names.
+    """
+
+    name: str
+    at: Array
+    aliases: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +52,7 @@ class Workspace:
         box: (2, 3) corners of the space to work in [m], in the base's frame; None.
         T_link_camera: (4, 4) where the camera is on the link that carries it; None: not known.
         camera_link: that link; -1: the last one, 0: the base, for a camera that stands beside the robot.
+        objects: names of things, for whoever asks for them by name.
 
     Raises:
         InputError: a value is of another shape, not finite, no rigid pose, no direction, or an empty box.
@@ -48,6 +64,7 @@ class Workspace:
     box: Array | None = None
     T_link_camera: Array | None = None
     camera_link: int = -1
+    objects: tuple[NamedPlace, ...] = ()
 
     def __post_init__(self) -> None:
         _check("T_world_base", self.T_world_base, (4, 4), "a pose")
@@ -90,6 +107,7 @@ class Workspace:
                 box=_array(found.get("workspace"), "workspace"),
                 T_link_camera=_pose(found, "T_link_camera"),
                 camera_link=found.get("camera_link", -1),
+                objects=_places(found.get("objects")),
             )
         except InputError as error:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
@@ -106,6 +124,11 @@ class Workspace:
         for key, value in zip(_KEYS[1:4], (self.gravity, self.support_plane, self.box), strict=True):
             if value is not None:
                 document[key] = _plain(value, 9)
+        if self.objects:
+            document["objects"] = [
+                {"name": o.name, "at": _plain(o.at)} | ({"aliases": list(o.aliases)} if o.aliases else {})
+                for o in self.objects
+            ]
         with atomic_write(Path(path)) as file:
             file.write(yaml.safe_dump(document, sort_keys=False, default_flow_style=None).encode())
 
@@ -213,6 +236,24 @@ def _pose(found: dict[str, Any], key: str) -> Array | None:
         return pose_from_quat(translation, quat)
     except ValueError as error:
         raise InputError(f"{error}.", field="quaternion_wxyz", hint="no rotation is 1 0 0 0") from error
+
+
+def _places(value: Any) -> tuple[NamedPlace, ...]:
+    if value is None:
+        return ()
+    hint = "list things as - {name: cup, at: [x, y, z], aliases: [mug]}"
+    if not isinstance(value, list) or not all(isinstance(thing, dict) for thing in value):
+        raise InputError("is no list of things.", field="objects", hint=hint)
+    found = []
+    for thing in value:
+        at, aliases = _array(thing.get("at"), "objects: at"), thing.get("aliases", [])
+        words = [thing.get("name"), *(aliases if isinstance(aliases, list) else [None])]
+        if set(thing) - {"name", "at", "aliases"} or not all(isinstance(word, str) and word for word in words):
+            raise InputError(f"has {thing}.", field="objects", hint=hint)
+        if at is None or at.shape != (3,) or not np.isfinite(at).all():
+            raise InputError(f"{thing['name']} is nowhere.", field="objects", hint=hint)
+        found.append(NamedPlace(thing["name"], at, tuple(words[1:])))
+    return tuple(found)
 
 
 def _array(value: Any, name: str) -> Array | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from splatbot.errors import InputError
+from splatbot.robots.grippers.checks import check_move
 
 
 class FakeGripper:
@@ -27,18 +28,19 @@ class FakeGripper:
         """Widest opening [m]."""
         return self._stroke
 
-    def move(self, opening: float, *, force: float | None = None) -> None:
+    def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
         """Go to an opening [m], or as near as what is between the fingers lets them.
 
         Raises:
-            InputError: the opening is out of range, or the force is not above 0.
+            InputError: a value is out of range.
         """
-        if not 0.0 <= opening <= self._stroke:
-            raise InputError(f"is {opening}.", field="opening", hint=f"give 0..{self._stroke:g} m")
-        if force is not None and not force > 0.0:
-            raise InputError(f"is {force}.", field="force", hint="give newtons above 0")
+        check_move(self._stroke, opening, force, speed)
         self._wanted = opening
         self._opening = max(opening, self.width)
+
+    def moving(self) -> bool:
+        """Never: they are there at once."""
+        return False
 
     def opening(self) -> float:
         """Between the fingers now [m]."""

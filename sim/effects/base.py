@@ -6,19 +6,29 @@ import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.trajectory import Trajectory
+
+Observable = Literal["colors", "depth", "stamps", "arrivals"]
+"""What of a stream of frames an effect changes."""
 
 # Fields of an effect's dataclass that no user sets: what it is called, who asked for it, how the camera moved.
 _NO_SETTINGS = ("name", "why", "path")
 
 
 class Effect(Protocol):
-    """Something that a real sensor does to an ideal frame; a frozen dataclass whose fields are its settings."""
+    """Something that a real sensor does to an ideal frame; a frozen dataclass whose fields are its settings.
+
+    ``cost`` says what it computes for a frame; ``observable`` what of the frames changes with it.
+    """
+
+    cost: ClassVar[str]
+    observable: ClassVar[Observable]
 
     @property
     def name(self) -> str:
@@ -119,6 +129,18 @@ class Effects:
 
     def _generator(self, effect: int, index: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, index, *self._streams[effect]])
+
+
+def check_span(at: int, until: int) -> None:
+    """Frames ``at`` up to ``until``, or for ever if that is 0.
+
+    Raises:
+        InputError: there are none.
+    """
+    if at < 0:
+        raise InputError(f"is {at}.", field="at", hint="give a frame number >= 0")
+    if until and until <= at:
+        raise InputError(f"is {until}.", field="until", hint=f"give a frame after {at}, or 0 for never")
 
 
 def settings(effect: Effect | type) -> dict[str, Any]:

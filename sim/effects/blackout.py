@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
+from splatbot.sim.effects.base import Observable
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Blackout:
     depth: str = "lost"
     why: str = "asked for"
     name: str = "blackout"
+    cost: ClassVar[str] = "nothing"
+    observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
         for name in ("at", "n"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
+from splatbot.sim.effects.base import Observable
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class DepthHoles:
     size: float = 40.0
     why: str = "asked for"
     name: str = "depth_holes"
+    cost: ClassVar[str] = "smooth noise, and a partial sort of the pixels"
+    observable: ClassVar[Observable] = "depth"
 
     def __post_init__(self) -> None:
         if not 0 <= self.share < 1:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
+from splatbot.sim.effects.base import Observable, check_span
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class Exposure:
     drift: float = 0.0
     why: str = "asked for"
     name: str = "exposure"
+    cost: ClassVar[str] = "a table look-up"
+    observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.step) and self.step >= 0):
@@ -43,10 +47,7 @@ class Exposure:
         for name in ("offset", "drift"):
             if not np.isfinite(getattr(self, name)):
                 raise InputError(f"is {getattr(self, name)}.", field=name, hint="give a finite number")
-        if self.at < 0:
-            raise InputError(f"is {self.at}.", field="at", hint="give a frame number >= 0")
-        if self.until and self.until <= self.at:
-            raise InputError(f"is {self.until}.", field="until", hint=f"give a frame after {self.at}, or 0 for never")
+        check_span(self.at, self.until)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """The frame in its new brightness."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
+from splatbot.sim.effects.base import Observable
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,8 @@ class FrameDrops:
     burst: int = 1
     why: str = "asked for"
     name: str = "frame_drops"
+    cost: ClassVar[str] = "a random number for a frame"
+    observable: ClassVar[Observable] = "arrivals"
 
     def __post_init__(self) -> None:
         if not 0 <= self.rate < 1:

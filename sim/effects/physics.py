@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from splatbot.protocols import Array
+from splatbot.sim.effects.decisions import Decision, decide
+from splatbot.sim.effects.sensors import sensor_effects_for
 
 if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
@@ -25,6 +26,7 @@ PHYSICS = (
     "fluid_drag",
     "moving_obstacles",
     "lighting",
+    "view_color",
     "sleep",
 )
 """The names, in the order in which they are built; each is a module of this package."""
@@ -71,16 +73,6 @@ class PhysicsEffect:
         return None
 
 
-@dataclass(frozen=True)
-class Decision:
-    """Whether an effect is on, why, and who said so: the scene's content, or `forced`, `forbidden`."""
-
-    name: str
-    on: bool
-    why: str
-    by: str = "scene"
-
-
 @cache
 def physics_effect(name: str) -> PhysicsEffect:
     """The effect of a name of :data:`PHYSICS`; its module is imported now."""
@@ -89,18 +81,10 @@ def physics_effect(name: str) -> PhysicsEffect:
 
 
 def effects_for(scene: Scene) -> tuple[Decision, ...]:
-    """A decision on every physics effect, in the order of :data:`PHYSICS`."""
-    return tuple(_decide(name, scene) for name in PHYSICS)
-
-
-def _decide(name: str, scene: Scene) -> Decision:
-    effect = physics_effect(name)
-    why = effect.called_for(scene)
-    if name in scene.effects.forbid:
-        return Decision(name, False, f"forbidden by the scene; {why or effect.not_called_for(scene)}", "forbidden")
-    if name in scene.effects.force and not why:
-        return Decision(name, True, f"forced by the scene; {effect.not_called_for(scene)}", "forced")
-    return Decision(name, bool(why), why or effect.not_called_for(scene))
+    """A decision on every effect: physics in the order of :data:`PHYSICS`, then the camera's sensor."""
+    physics = (physics_effect(name) for name in PHYSICS)
+    decided = (decide(e.name, scene, e.called_for(scene), e.not_called_for(scene)) for e in physics)
+    return (*decided, *sensor_effects_for(scene))
 
 
 def names_of(things: Any, most: int = 3) -> str:

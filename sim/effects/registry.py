@@ -11,11 +11,17 @@ from splatbot.sim.effects.base import Effect, Effects, settings
 
 _CLASSES = {
     "motion_blur": ("splatbot.sim.effects.motion_blur", "MotionBlur"),
+    "rolling_shutter": ("splatbot.sim.effects.rolling_shutter", "RollingShutter"),
+    "lens_distortion": ("splatbot.sim.effects.lens_distortion", "LensDistortion"),
     "exposure": ("splatbot.sim.effects.exposure", "Exposure"),
+    "white_balance": ("splatbot.sim.effects.white_balance", "WhiteBalance"),
+    "color_noise": ("splatbot.sim.effects.color_noise", "ColorNoise"),
     "depth_noise": ("splatbot.sim.effects.depth_noise", "DepthNoise"),
+    "stereo_holes": ("splatbot.sim.effects.stereo_holes", "StereoHoles"),
     "depth_holes": ("splatbot.sim.effects.depth_holes", "DepthHoles"),
     "blackout": ("splatbot.sim.effects.blackout", "Blackout"),
     "frame_drops": ("splatbot.sim.effects.frame_drops", "FrameDrops"),
+    "latency": ("splatbot.sim.effects.latency", "Latency"),
 }
 
 EFFECTS = tuple(_CLASSES)

@@ -15,7 +15,10 @@ import numpy as np
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
+from splatbot.bench.twin_bounds import FILMED, FORCED
+from splatbot.bench.twin_composite import exact_map, filmed_map
 from splatbot.bench.twin_paths import DEPTH, try_paths
+from splatbot.errors import NativeError
 from splatbot.protocols import Array
 from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.panda import panda
@@ -38,6 +41,7 @@ class TwinPlan:
         gaussians: of the map that is planned in.
         timesteps: to compare with one ten times finer than the finest [s].
         scenes: whose effects are measured; empty for all that are shipped.
+        poses: of the composite pictures.
         quick: tiny, to see whether it runs.
         say: told what goes on.
     """
@@ -48,6 +52,7 @@ class TwinPlan:
     gaussians: int = 50_000
     timesteps: tuple[float, ...] = (0.0005, 0.001, 0.002, 0.004, 0.008)
     scenes: tuple[str, ...] = ()
+    poses: int = 20
     quick: bool = False
     say: Say = field(default=lambda text: None)
 
@@ -59,6 +64,7 @@ def run_twin(plan: TwinPlan, folder: Path | None = None) -> Results:
     _effects(results, plan)
     _time_steps(results, plan)
     _paths(results, plan)
+    _composites(results, plan)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         results.write_json(folder / "twin.json")
@@ -74,17 +80,18 @@ def _step_costs(results: Results, plan: TwinPlan) -> None:
     mujoco.mj_resetDataKeyframe(model, data, 0)
     empty = Twin(load_scene("empty"))
     empty.world.model.opt.timestep = _STEP
-    bare, ours = (float("inf"),) * 2
+    forced = Twin(load_scene("empty").with_effects(force=("contact", "fluid_drag")))
+    forced.world.model.opt.timestep = _STEP
+    bare, ours, more = (float("inf"),) * 3
     for _ in range(3):  # in turns: a busy moment must not hit one alone
         bare = min(bare, step_us(model, data, plan.steps))
         ours = min(ours, step_us(empty.world.model, empty.data, plan.steps))
+        more = min(more, step_us(forced.world.model, forced.data, plan.steps))
     results.add("robot alone", "step", bare, "us", note="mj_step of its MJCF")
     results.add("empty scene", "step", ours, "us")
     results.add("empty scene", "over the robot alone", ours / bare, "x")
-    forced = Twin(load_scene("empty").with_effects(force=("contact", "fluid_drag")))
-    forced.world.model.opt.timestep = _STEP
-    cost = step_us(forced.world.model, forced.data, plan.steps)
-    results.add("empty scene, contact and drag forced on", "step", cost, "us")
+    results.add(FORCED, "step", more, "us")
+    results.add(FORCED, "over none forced", more / ours, "x")
     for name, ellipsoids in (("2,000 map geoms, robot, 4 objects", 2000), ("500 map geoms, robot, 4 objects", 500)):
         with TemporaryDirectory() as temporary:
             scene = cluttered(ellipsoids, 2000 if plan.quick else plan.gaussians, Path(temporary))
@@ -178,3 +185,22 @@ def _paths(results: Results, plan: TwinPlan) -> None:
     results.add(case, f"pushed {1e3 * DEPTH:g} mm in", trials.pushed, "")
     results.add(case, "seen as contact", trials.seen, "", note="of those pushed")
     results.add(case, "faster than real time", trials.real_time, "x")
+
+
+def _composites(results: Results, plan: TwinPlan) -> None:
+    plan.say("composite pictures")
+    try:
+        exact = exact_map(
+            plan.poses, plan.gaussians if plan.quick else 4 * plan.gaussians, width=160 if plan.quick else 640
+        )
+        filmed = filmed_map(plan.poses, 10 if plan.quick else 120, width=160 if plan.quick else 320)
+    except NativeError as error:
+        results.add("composite picture", "overlap", None, "", note=str(error))
+        return
+    for case, found in (("composite picture, exact map", exact), (FILMED, filmed)):
+        results.add(case, "least overlap", float(found.overlap.min()), "", note="IoU of the robot's pixels")
+        results.add(case, "median overlap", float(np.median(found.overlap)), "", note=f"{len(found.overlap)} poses")
+        results.add(case, "farthest wrong pixel", float(found.astray.max()), "px", note="from the robot's outline")
+    lost = float((filmed.plain_db - filmed.composite_db).max())
+    results.add(FILMED, "PSNR", float(filmed.plain_db.mean()), "dB", note="the map alone")
+    results.add(FILMED, "PSNR lost, most", lost, "dB", note="where the robot is not")

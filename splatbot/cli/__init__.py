@@ -24,13 +24,19 @@ COMMANDS = {
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
     "info": _Command("splatbot.cli.info", "info", "Say what is in a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
+    "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
     "plan": _Command(
         "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
     ),
+    "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked thing in a map."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
+    "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),
     "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
+    "sim2real": _Command(
+        "splatbot.cli.sim2real", "sim2real", "Say how far the twin is from a recorded log, and from a held-out twin."
+    ),
     "bench twin": _Command(
         "splatbot.cli.bench_twin", "bench_twin", "Measure the twin: cost of each effect, error against the time step."
     ),

@@ -54,7 +54,8 @@ def map_log_command(
         splatbot map --dump-config > mine.yaml
 
     Args:
-        log: a folder in TUM or Replica layout, or synthetic:SCENE?... (see splatbot simulate --list).
+        log: a folder in TUM or Replica layout, a recording of ROS topics (.mcap, rosbag2 folder, .bag), or
+            synthetic:SCENE?... (see splatbot simulate --list).
         out: folder to write; by default runs/NAME-TIME, with a link runs/latest.
         config: YAML file; environment variables (SPLATBOT_MAPPING__MAX_GAUSSIANS=...) and then --set override it.
         overrides: one key of the configuration, as in mapping.max_gaussians=50000.

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_of
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.collision import GaussianCollisionField
     from splatbot.planning import PlanResult, Trajectory
     from splatbot.robots.robot import RobotModel
-
-Pose = tuple[float, float, float, float, float, float, float]
 
 
 def plan(
@@ -67,7 +66,6 @@ def plan(
     from splatbot.atomic import atomic_write
     from splatbot.collision import GaussianCollisionField
     from splatbot.gaussians import GaussianModel
-    from splatbot.geometry import pose_from_quat
     from splatbot.planning import GaussianRRTStar, PoseGoal, time_path
     from splatbot.report.plan_page import plan_html, plan_png
     from splatbot.robots.store import load_robot
@@ -76,12 +74,12 @@ def plan(
     file = map / "map.ply" if map.is_dir() else map
     model = GaussianModel.load(file)
     field = GaussianCollisionField(model, n_sigma)
-    T_world_base = _base(base, map)
-    planner = GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=_margin(margin, map, field, T_world_base))
+    T_world_base = base_pose(base, map)
+    planner = GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=margin_of(margin, map, field, T_world_base))
     wanted: Any = (
-        _joints(goal, arm, "--goal")
-        if goal is not None
-        else PoseGoal(T_world_base @ _checked_pose(goal_pose, "--goal-pose", pose_from_quat))
+        PoseGoal(T_world_base @ checked_pose(goal_pose, "--goal-pose"))
+        if goal_pose is not None
+        else _joints(goal or (), arm, "--goal")
     )
     result = planner.plan(_joints(start, arm, "--start"), wanted, budget_ms=budget_ms, seed=seed)
     path = result.unwrap()
@@ -118,54 +116,6 @@ def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.
     if len(values) != len(robot) or not np.isfinite(values).all():
         raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
     return values
-
-
-def _checked_pose(pose: Pose | None, flag: str, pose_from_quat: Any) -> NDArray[np.float64]:
-    import numpy as np
-
-    from splatbot.errors import InputError
-
-    assert pose is not None
-    try:
-        return np.asarray(pose_from_quat(pose[:3], pose[3:]))
-    except ValueError as error:
-        raise InputError(f"{error}.", field=flag, hint="QW QX QY QZ of no rotation are 1 0 0 0") from error
-
-
-def _base(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
-    from splatbot.errors import InputError
-    from splatbot.geometry import pose_from_quat
-    from splatbot.workspace import find_workspace
-
-    if pose is not None:
-        return _checked_pose(pose, "--base", pose_from_quat)
-    known = find_workspace(map_)
-    if known is None or known.T_world_base is None:
-        hint = "give --base, or write a scene.yaml: splatbot info MAP --fit-plane estimates one"
-        raise InputError("is not known.", file=map_, field="base", hint=hint)
-    return known.T_world_base
-
-
-def _margin(text: str, map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
-    import math
-
-    from splatbot.errors import InputError
-
-    if text == "auto":
-        if not map_.is_dir():
-            raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
-        from splatbot.results.folder import RunFolder
-        from splatbot.results.margin import own_margin
-        from splatbot.robots.in_view import reopen_log
-
-        return own_margin(map_, reopen_log(RunFolder(map_)), field, T_world_base)
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value < math.inf:
-        raise InputError(f"is {text!r}.", field="--margin", hint='give metres, 0 or more, or "auto"')
-    return value
 
 
 def _summary(result: PlanResult, trajectory: Trajectory) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,18 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from splatbot.cli.drawing import draw_offscreen
+
 if TYPE_CHECKING:
     from splatbot.sim.ledger import Entry
+    from splatbot.sim.recording import Recording
     from splatbot.sim.scene import Scene
     from splatbot.sim.twin import TwinResult
 
 
 def twin(
     scene: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None,
-    map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    map: Annotated[Path | None, tyro.conf.arg(metavar="RUN|FILE")] = None,
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    html: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     force: Annotated[tuple[str, ...], tyro.conf.arg(metavar="EFFECT"), tyro.conf.UseAppendAction] = (),
     forbid: Annotated[tuple[str, ...], tyro.conf.arg(metavar="EFFECT"), tyro.conf.UseAppendAction] = (),
     timestep: Annotated[float | None, tyro.conf.arg(metavar="S")] = None,
@@ -38,32 +41,35 @@ def twin(
 
     Examples:
         splatbot twin --list
-        splatbot twin --scene mug_hanging --video mug.mp4
+        splatbot twin --scene mug_hanging --video mug.mp4 --html mug.html
         splatbot twin --scene wiping --forbid backlash --json result.json
-        splatbot twin --map runs/latest/map.ply --trajectory plan.json
+        splatbot twin --map runs/latest --trajectory runs/plan/trajectory.json
         splatbot twin --scene my_scene.yaml --seed 3
 
     Args:
         scene: a shipped scene (--list) or a YAML file.
-        map: a Gaussian map in the robot's frame (z up, base at the origin): table, objects, clutter are fitted.
+        map: a run's folder or a Gaussian map: table, objects, clutter are fitted. The scene.yaml beside it says where
+            the robot stands; a file without one is in the robot's frame (z up, base at the origin).
         trajectory: ROS JointTrajectory as JSON, or CSV; by default the moves of the scene's task.
         json: file for the whole result.
         video: MP4 of what the scene's camera sees.
-        force: physics that is on whatever the scene calls for; once for each.
-        forbid: physics that is off.
+        html: page on which the run is turned, played, stepped and scrubbed.
+        force: physics, or an effect of the camera's sensor, that is on whatever the scene calls for; once for each.
+        forbid: what is off.
         timestep: longest step of physics [s]: accuracy for time.
         seed: of where movable objects stand, within millimetres, and of the camera's noise; 0: where the scene says.
         no_costs: do not measure what each effect cost (a run for each).
         list_: print the scenes and the physics and leave.
         quiet: print only errors.
     """
-    if video is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # before anything imports mujoco
+    if video is not None:
+        draw_offscreen()
     if list_:
         _print_lists()
         return 0
     from splatbot.sim.ledger import ledger
     from splatbot.sim.motion import load_motion
+    from splatbot.sim.recording import Recording
     from splatbot.sim.twin import Twin
 
     chosen = _scene(scene, map, with_camera=video is not None).with_effects(force=force, forbid=forbid)
@@ -72,18 +78,22 @@ def twin(
     if trajectory is not None and it.world.robot is not None:
         motion = load_motion(trajectory, it.world.robot)
     with _film(video, it.world, seed) as film, _progress(quiet) as show:
-        result = it.follow(motion, progress=show, watch=film)
+        recording = Recording(it.world) if html is not None else None
+        result = it.follow(motion, progress=show, watch=_watchers(film, recording))
         sensor = film.report() if film is not None else []
-    entries = ledger(it, result, motion, costs=not no_costs)
+    entries = ledger(it, result, motion, costs=not no_costs, sensor=sensor)
     if json is not None:
         _write(json, result, entries, sensor)
+    if html is not None and recording is not None:
+        _write_page(html, recording, result)
     if not quiet:
-        _print(result, entries, video)
+        _print(result, entries, [path for path in (video, html) if path is not None])
     return 1 if _harm(chosen, result) else 0
 
 
 def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
     from splatbot.errors import InputError
+    from splatbot.sim.maps.placed import placed_scene
     from splatbot.sim.scene import load_scene, make_scene
 
     if (name is None) == (map is None):
@@ -92,7 +102,7 @@ def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
         )
     values: dict[str, Any] = {}
     if map is not None:
-        values = {"name": map.stem, "map": {"file": str(map.resolve())}}
+        values = placed_scene(map)
     else:
         assert name is not None
         found = load_scene(name)
@@ -125,6 +135,26 @@ def _film(path: Path | None, world: Any, seed: int) -> Iterator[Any]:
         video.close()
 
 
+def _watchers(*watchers: Callable[[Any, float], None] | None) -> Callable[[Any, float], None] | None:
+    there = [watch for watch in watchers if watch is not None]
+    if not there:
+        return None
+
+    def watch_all(data: Any, time: float) -> None:
+        for watch in there:
+            watch(data, time)
+
+    return watch_all
+
+
+def _write_page(path: Path, recording: Recording, result: TwinResult) -> None:
+    from splatbot.atomic import atomic_write
+    from splatbot.sim.page import twin_html
+
+    with atomic_write(path) as file:
+        file.write(twin_html(recording, result).encode())
+
+
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Callable[[float], None] | None]:
     if quiet or not sys.stderr.isatty():
@@ -151,7 +181,7 @@ def _write(path: Path, result: TwinResult, entries: list[Entry], sensor: list[di
         file.write(text.dumps(values, indent=1).encode() + b"\n")
 
 
-def _print(result: TwinResult, entries: list[Entry], video: Path | None) -> None:
+def _print(result: TwinResult, entries: list[Entry], written: list[Path]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -182,16 +212,19 @@ def _print(result: TwinResult, entries: list[Entry], video: Path | None) -> None
     table = Table("effect", "on", "why", "ms", "us a step")
     for entry in entries:
         cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
-        table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
+        if entry.on or entry.observable or entry.by != "scene":  # not each of the many that no sensor names
+            table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
     console.print(table)
-    if video is not None:
-        console.print(f"written to {video}")
+    for path in written:
+        console.print(f"written to {path}")
 
 
 def _print_lists() -> None:
     from splatbot.cli.tables import print_table
     from splatbot.sim.effects.physics import PHYSICS, physics_effect
+    from splatbot.sim.effects.registry import EFFECTS, effect_class
     from splatbot.sim.scene import load_scene, scene_names
 
     print_table([(name, load_scene(name).about) for name in scene_names()], title="scenes")
     print_table([(name, physics_effect(name).cost) for name in PHYSICS], title="physics, and what it costs")
+    print_table([(name, effect_class(name).cost) for name in EFFECTS], title="the camera's sensor, and what it costs")

@@ -14,7 +14,8 @@ from splatbot.logs.tum import Missing, TumLog
 __all__ = ["Calibration", "Log", "open_log", "record"]
 
 _LOOKED_FOR = (
-    "looked for rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica); `synthetic:tabletop` needs no files"
+    "looked for rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2); "
+    "`synthetic:tabletop` needs no files"
 )
 
 
@@ -22,8 +23,10 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
     """Open the log that ``uri`` names; frames are decoded only when read.
 
     Args:
-        uri: a folder in TUM or Replica layout, or `synthetic:SCENE?trajectory=NAME&frames=N&effects=SPEC;SPEC&...`
-            with the keys of :class:`splatbot.logs.synthetic.Options`.
+        uri: a folder in TUM or Replica layout, a recording of ROS topics (`.mcap`, rosbag2 folder, `.bag`; where it has
+            several cameras `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`), or
+            `synthetic:SCENE?trajectory=NAME&frames=N&effects=SPEC;SPEC&...` with the keys of
+            :class:`splatbot.logs.synthetic.Options`.
         camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration, instead of the log's own.
         missing: what a colour image without depth means in a TUM log, see :class:`splatbot.logs.tum.TumLog`.
 
@@ -33,6 +36,8 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
     """
     if str(uri).startswith("synthetic:"):
         return _open_synthetic(str(uri), camera)
+    if _is_bag(Path(str(uri).partition("?")[0])):
+        return _open_bag(str(uri), camera)
     folder = Path(uri)
     if not folder.is_dir():
         what = "is a file, logs are folders" if folder.exists() else "does not exist"
@@ -50,3 +55,14 @@ def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:
     if camera is not None:
         raise LogError("a synthetic log has its own camera.", file=uri, field="camera", hint="leave --camera out")
     return SyntheticLog(uri)
+
+
+def _is_bag(path: Path) -> bool:
+    return path.suffix in (".mcap", ".bag") or (path.is_dir() and (path / "metadata.yaml").exists())
+
+
+def _open_bag(uri: str, camera: str | Path | Calibration | None) -> Log:
+    from splatbot.logs.bag import BagLog, split_query  # rosbags builds its message classes when imported
+
+    path, topics = split_query(uri)
+    return BagLog(path, camera=camera, topics=topics)

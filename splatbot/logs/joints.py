@@ -51,12 +51,19 @@ class JointRecord:
 
     def at(self, stamp: float) -> NDArray[np.float64] | None:
         """Positions (J,) [rad] then; None where the lines on either side, or the only one, are more than 0.1 s away."""
-        after = int(np.searchsorted(self._stamps, stamp))
-        beside = self._stamps[max(after - 1, 0) : after + 1]
-        apart = np.abs(beside - stamp)
-        if apart.min() > 0 and apart.max() > MAX_GAP:
-            return None
-        return np.array([np.interp(stamp, self._stamps, column) for column in self._joints.T])
+        return interpolate_joints(self._stamps, self._joints, stamp)
+
+
+def interpolate_joints(
+    stamps: NDArray[np.float64], joints: NDArray[np.float64], stamp: float
+) -> NDArray[np.float64] | None:
+    """Positions (J,) at a time of a record (N,) [s], (N, J) [rad], linear in between; see :meth:`JointRecord.at`."""
+    after = int(np.searchsorted(stamps, stamp))
+    beside = stamps[max(after - 1, 0) : after + 1]
+    apart = np.abs(beside - stamp)
+    if apart.min() > 0 and apart.max() > MAX_GAP:
+        return None
+    return np.array([np.interp(stamp, stamps, column) for column in joints.T])
 
 
 def find_joints(folder: Path) -> JointRecord | None:

@@ -15,8 +15,8 @@ from splatbot.config import MappingConfig
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, rotation_to_quat
 from splatbot.mapping.keyframes import Keyframe
+from splatbot.mapping.normals import fitted_normals
 from splatbot.rasterize import rasterization
-from splatbot.tracking.prepare import normals_of
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> G
     """One flat Gaussian for each chosen pixel on a grid of ``config.stride`` pixels.
 
     Its disc covers the grid's footprint on the surface: σ = 0.5 stride · z / f across, stretched by the slant (at most
-    3) along it, ``config.thickness`` of that through it. A pixel without a normal faces the camera.
+    3) along it, ``config.thickness`` of that through it. A pixel that fits no plane faces the camera.
     """
     s = config.stride
     grid = torch.zeros_like(where)
@@ -107,7 +107,8 @@ def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> G
     camera = keyframe.camera
     depth = keyframe.depth.numpy()
     points = camera.backproject(depth)[chosen].astype(np.float64)
-    normals = normals_of(depth, camera)[chosen].astype(np.float64)
+    rows, columns = np.nonzero(chosen)
+    normals = fitted_normals(depth, camera, rows, columns, reach=2 * s)
     toward = -points / np.linalg.norm(points, axis=1, keepdims=True)
     normals = np.where((normals**2).sum(1, keepdims=True) > 0.25, normals, toward)
     cosine = np.abs((normals * toward).sum(1)).clip(1 / 3, 1.0)

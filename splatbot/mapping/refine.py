@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -97,19 +98,22 @@ class Refiner:
         visible = torch.zeros(len(model), dtype=torch.bool)
         visible[meta["visible_ids"][0]] = True
         self.adam.step(model, dict(zip(PARAMETERS, grads, strict=True)), visible)
-        self._keep_small(model, keyframe, visible)
+        self._keep_flat(model, keyframe, visible)
         return float(loss.detach())
 
-    def _keep_small(self, model: GaussianModel, keyframe: Keyframe, visible: Tensor) -> None:
-        """No Gaussian in view grows beyond ``config.max_pixels`` of this keyframe, or it would reach into free space.
+    def _keep_flat(self, model: GaussianModel, keyframe: Keyframe, visible: Tensor) -> None:
+        """Gaussians in view stay discs: thin, and no larger than ``config.max_pixels`` of this keyframe.
 
-        Colour alone does not see that: a needle before a plain wall changes no pixel.
+        Pictures do not ask for it: a needle before a plain wall changes no pixel, and a blob shows what its disc does.
+        But both reach into free space, and the normal of a blob is any.
         """
         rows = visible.nonzero()[:, 0]
         viewmat = keyframe.viewmat[0].to(torch.float32)
         z = model.means[rows] @ viewmat[2, :3] + viewmat[2, 3]
         limit = (self.config.max_pixels * z / float(keyframe.K[0, 0, 0])).log()
-        model.log_scales[rows] = torch.minimum(model.log_scales[rows], limit[:, None])
+        sizes, axes = torch.minimum(model.log_scales[rows], limit[:, None]).sort(1)
+        sizes[:, 0] = torch.minimum(sizes[:, 0], sizes[:, 1] + math.log(self.config.thickness))
+        model.log_scales[rows] = torch.empty_like(sizes).scatter_(1, axes, sizes)
 
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         observed = keyframe.rgb.float() / 255.0

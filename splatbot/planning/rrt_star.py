@@ -150,7 +150,7 @@ class GaussianRRTStar:
         before = time.perf_counter() - begin
         left = _for_search(budget_ms, before)
         end = self._native.run(q, goals.q, left, 2**62 if iterations is None else iterations, seed, 0.0)
-        return self._result(end, q, goals.q, before, begin)
+        return self._result(end, q, goals.q, before, begin, begin + 1e-3 * budget_ms)
 
     def solve(
         self, problem: PlanningProblem, *, budget_ms: float = 28.0, seed: int = 0, iterations: int | None = None
@@ -207,14 +207,14 @@ class GaussianRRTStar:
         spent = time.perf_counter() - begin
         left = _for_search(budget_ms, spent)
         end = self._native.rerun(q, field.native, added.native, self.arm.without_pairs.native, left, 2**62, seed)
-        return self._result(end, q, goals.q, spent, begin)
+        return self._result(end, q, goals.q, spent, begin, begin + 1e-3 * budget_ms)
 
     def room_to(self, field: GaussianCollisionField, waypoints: Array, cut: float, eps: float) -> float | None:
         """Room [m] along a path (N, J) to a field alone, the arm itself left out, up to ``cut``; None: not free."""
         arm = self.arm.without_pairs
         if arm.certify(field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
             return None
-        return float(path_clearance(arm.native, field.native, waypoints, max(cut, eps), _CLEARANCE_ROUNDS))
+        return float(path_clearance(arm.native, field.native, waypoints, max(cut, eps), _CLEARANCE_ROUNDS, np.inf))
 
     def cancel(self) -> None:
         """Ends the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""
@@ -237,12 +237,18 @@ class GaussianRRTStar:
         with self._searching:
             return int(self._native.bytes)
 
-    def certificate(self, waypoints: Array) -> Certificate:
-        """What can be promised of a path (N, J): whether all its edges are free, and the room along it."""
+    def certificate(self, waypoints: Array, until: float = np.inf) -> Certificate:
+        """What can be promised of a path (N, J): whether all its edges are free, and the room along it.
+
+        The room is a lower bound, within a few percent unless ``until`` (of ``time.perf_counter``) comes before.
+        """
         # The trees' edges were checked in the direction they grew; rounding may make a difference to the other one.
         for eps in (self._eps, self._eps / 4):
             if not self.arm.certify(self.field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
-                room = path_clearance(self.arm.native, self.field.native, waypoints, CLEARANCE_CUT, _CLEARANCE_ROUNDS)
+                left = until - time.perf_counter()
+                room = path_clearance(
+                    self.arm.native, self.field.native, waypoints, CLEARANCE_CUT, _CLEARANCE_ROUNDS, left
+                )
                 return Certificate(True, eps, room, self.margin, self.field.map_version)
         return Certificate(False, self._eps, 0.0, self.margin, self.field.map_version)
 
@@ -278,7 +284,7 @@ class GaussianRRTStar:
         if eps != self._eps:
             self._eps, self._native = eps, self._planner(eps)
 
-    def _result(self, end: int, start: Array, goals: Array, before: float, begin: float) -> PlanResult:
+    def _result(self, end: int, start: Array, goals: Array, before: float, begin: float, until: float) -> PlanResult:
         status = _ENDS[end]
         if status is not None:
             cause = blocked_line(self.arm, self.field, start, goals[0], self._eps)
@@ -288,7 +294,7 @@ class GaussianRRTStar:
         if len(waypoints) == 1:
             waypoints = np.repeat(waypoints, 2, axis=0)
         history[:, 0] += before
-        path = Path(waypoints, float(cost), self.certificate(waypoints))
+        path = Path(waypoints, float(cost), self.certificate(waypoints, until))
         if not path.certificate.certified:
             return self._failure(PlanStatus.PLANNING_FAILED, None, "the path found is not certified.", begin)
         return self._answer(PlanStatus.SUCCESS, path, history, None, "", begin)

@@ -51,10 +51,7 @@ def render_view(
         CameraError: the camera has distortion.
     """
     T_camera_world = inverse(_rigid(T_world_camera))
-    if camera.distortion:
-        raise CameraError(
-            "is set, and views are pinhole.", field="distortion", hint="pass the camera with distortion=()"
-        )
+    _check_pinhole(camera)
     if mode == "rgb":
         rgb, alpha = _splat(model, None, camera, T_camera_world, "RGB")
         rgb += (1.0 - alpha[..., None]) * np.asarray(background, dtype=np.float32)
@@ -70,6 +67,27 @@ def render_view(
     if mode == "alpha":
         return _splat(model, None, camera, T_camera_world, "RGB")[1]
     raise InputError(f"is {mode!r}.", field="mode", hint=f"one of {', '.join(MODES)}")
+
+
+def render_rgbd(
+    model: GaussianModel, camera: Camera, T_world_camera: ArrayLike, *, sh_degree: int | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Colour times opacity (H, W, 3), opacity (H, W) and depth (H, W) [m] of a map, in one pass and unfiltered.
+
+    Args:
+        model: the map.
+        camera: intrinsics and size; without distortion.
+        T_world_camera: (4, 4) rigid.
+        sh_degree: of the harmonics that are evaluated; None: all that the map has.
+
+    Raises:
+        InputError: the pose is not a rigid transform.
+        CameraError: the camera has distortion.
+    """
+    T_camera_world = inverse(_rigid(T_world_camera))
+    _check_pinhole(camera)
+    images, alpha = _splat(model, None, camera, T_camera_world, "RGB+ED", sh_degree)
+    return np.ascontiguousarray(images[..., :3]), alpha, images[..., 3]
 
 
 def facing_normals(model: GaussianModel, T_camera_world: ArrayLike) -> Tensor:
@@ -156,7 +174,8 @@ def _splat(
     features: Tensor | None,
     camera: Camera,
     T_camera_world: NDArray[np.float64],
-    render_mode: Literal["RGB", "ED"],
+    render_mode: Literal["RGB", "ED", "RGB+ED"],
+    sh_degree: int | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Blended features (H, W, C), None: the model's colours; and opacity (H, W)."""
     with torch.no_grad():
@@ -166,7 +185,7 @@ def _splat(
             scales=model.scales,
             opacities=model.opacities,
             colors=model.sh if features is None else features.contiguous(),
-            sh_degree=model.sh_degree if features is None else None,
+            sh_degree=(model.sh_degree if sh_degree is None else sh_degree) if features is None else None,
             viewmats=torch.as_tensor(T_camera_world, dtype=torch.float64)[None],
             Ks=torch.as_tensor(camera.K_corner, dtype=torch.float64)[None],
             width=camera.width,
@@ -175,6 +194,13 @@ def _splat(
             depth_mode="plane",  # blended centres of a slanted surface lie in front of it
         )
     return images[0].numpy(), alphas[0, ..., 0].numpy()
+
+
+def _check_pinhole(camera: Camera) -> None:
+    if camera.distortion:
+        raise CameraError(
+            "is set, and views are pinhole.", field="distortion", hint="pass the camera with distortion=()"
+        )
 
 
 def _rigid(T: ArrayLike) -> NDArray[np.float64]:

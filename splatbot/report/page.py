@@ -5,15 +5,15 @@ from __future__ import annotations
 import html
 import platform
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from importlib import metadata, resources
+from collections.abc import Mapping, Sequence
+from importlib import metadata
 from typing import Any
 
 from splatbot.config import Config
 from splatbot.rasterize.views import depth_limits
 from splatbot.report.figures import error_plot, gaussians_plot, stages_plot, trajectory_plot
 from splatbot.report.images import colour_png, depth_png, difference_png
-from splatbot.report.theme import data_uri
+from splatbot.report.parts import details, document, image, note, pictures, section, table, tiles
 from splatbot.results.folder import FrameRow
 from splatbot.results.scoring import ShownView, TrajectoryScore, ViewScores
 from splatbot.results.units import count, decibels, megabytes, metres, milliseconds, percent
@@ -46,26 +46,18 @@ def report_html(
     parts = [
         _banner(metrics),
         _tiles(metrics),
-        _section("Trajectory", _image(trajectory_plot(trajectory, track), "trajectory"), _no_reference(track)),
-        _section("Error over time", _image(error_plot(rows, track), "position error over time")),
-        _section("Frames in doubt", _doubts(rows)),
-        _section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
-        _section(
-            "Time per frame", _image(stages_plot(rows), "milliseconds per stage"), _stages(metrics), _pace(metrics)
-        ),
-        _section("Map", _image(gaussians_plot(rows), "Gaussians over frames")),
-        _section("Simulated sensor effects", _effects(metrics["effects"])),
-        _details("Configuration", f"<pre>{html.escape(config.to_yaml())}</pre>"),
-        _details("Versions", _table(("", ""), _versions())),
+        section("Trajectory", image(trajectory_plot(trajectory, track), "trajectory"), _no_reference(track)),
+        section("Error over time", image(error_plot(rows, track), "position error over time")),
+        section("Frames in doubt", _doubts(rows)),
+        section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
+        section("Time per frame", image(stages_plot(rows), "milliseconds per stage"), _stages(metrics), _pace(metrics)),
+        section("Map", image(gaussians_plot(rows), "Gaussians over frames")),
+        section("Simulated sensor effects", _effects(metrics["effects"])),
+        details("Configuration", f"<pre>{html.escape(config.to_yaml())}</pre>"),
+        details("Versions", table(("", ""), _versions())),
     ]
-    css = resources.files("splatbot.report").joinpath("style.css").read_text(encoding="utf-8")
-    source = html.escape(str(metrics["log"].get("uri", name)))
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)} · splatbot</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>\n{css}</style></head>\n'
-        f'<body><main>\n<h1>{html.escape(name)}</h1>\n<p class="sub">{source}</p>\n'
-        f"{''.join(parts)}</main></body></html>\n"
-    )
+    source = str(metrics["log"].get("uri", name))
+    return document(name, source, parts)
 
 
 def _banner(metrics: Mapping[str, Any]) -> str:
@@ -81,7 +73,7 @@ def _banner(metrics: Mapping[str, Any]) -> str:
 
 def _tiles(metrics: Mapping[str, Any]) -> str:
     ms = metrics["ms_per_frame"]
-    tiles = [
+    figures = [
         (f"{metrics['tracked']}/{metrics['frames']}", "frames tracked"),
         (metres(metrics["ate_rmse_m"]), "ATE RMSE"),
         (metres(metrics["rpe_trans_rmse_m"]), "RPE per frame"),
@@ -91,19 +83,18 @@ def _tiles(metrics: Mapping[str, Any]) -> str:
         (count(metrics["gaussians"]), f"Gaussians, {megabytes(metrics['map_bytes'])}"),
         (megabytes(metrics["peak_rss_bytes"]), "peak memory"),
     ]
-    cells = "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in tiles)
-    return f'<div class="tiles">{cells}</div>\n'
+    return tiles(figures)
 
 
 def _no_reference(track: TrajectoryScore | None) -> str:
     if track is not None:
-        return _note("The estimate is aligned to the reference by a rigid motion (no scale); the dot is the start.")
-    return _note("No reference poses: there is no trajectory error to show. The dot is the start.")
+        return note("The estimate is aligned to the reference by a rigid motion (no scale); the dot is the start.")
+    return note("No reference poses: there is no trajectory error to show. The dot is the start.")
 
 
 def _doubts(rows: Sequence[FrameRow]) -> str:
     doubts = Counter((row.verdict, reason) for row in rows if row.verdict != "ok" for reason in row.reasons or ("",))
-    return _table(("verdict and reason", "frames"), [(f"{v}: {r}", str(n)) for (v, r), n in doubts.most_common(12)])
+    return table(("verdict and reason", "frames"), [(f"{v}: {r}", str(n)) for (v, r), n in doubts.most_common(12)])
 
 
 def _view(view: ShownView) -> str:
@@ -115,16 +106,13 @@ def _view(view: ShownView) -> str:
         (depth_png(view.depth, span), f"sensor depth, {span[0]:.2f} to {span[1]:.2f} m"),
         (depth_png(view.rendered_depth, span), f"map depth, off by {metres(view.score.depth_median_m)}"),
     ]
-    figures = "".join(
-        f"<figure>{_image(data, text)}<figcaption>{html.escape(text)}</figcaption></figure>" for data, text in images
-    )
-    return f'<div class="view">{figures}</div>\n'
+    return pictures(images)
 
 
 def _views_note(metrics: Mapping[str, Any], views: ViewScores) -> str:
     if not views.scores:
-        return _note("No held-out view was scored.")
-    return _note(
+        return note("No held-out view was scored.")
+    return note(
         f"Mean over {len(views.scores)} frames that were tracked but never mapped: PSNR "
         f"{decibels(metrics['psnr_holdout_db'])} over whole images, depth L1 {metres(metrics['depth_l1_m'])} where "
         f"both have depth; the map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
@@ -135,13 +123,13 @@ def _stages(metrics: Mapping[str, Any]) -> str:
     rows = [("frame", metrics["ms_per_frame"], metrics["frames"])]
     rows += [(name, values, values["frames"]) for name, values in metrics["stages"].items()]
     cells = [(name, *(milliseconds(v[p]) for p in ("p50", "p95", "p99")), str(n)) for name, v, n in rows]
-    return _table(("stage", "p50", "p95", "p99", "frames"), cells)
+    return table(("stage", "p50", "p95", "p99", "frames"), cells)
 
 
 def _pace(metrics: Mapping[str, Any]) -> str:
     if metrics["paced"] is None:
         return ""
-    return _note(
+    return note(
         f"Frames came {metrics['paced']}: {metrics['late']} were not done when the next one arrived, "
         f"{metrics['dropped']} were dropped because a newer one had arrived."
     )
@@ -149,7 +137,7 @@ def _pace(metrics: Mapping[str, Any]) -> str:
 
 def _effects(effects: Sequence[Mapping[str, Any]]) -> str:
     cells = [(e["name"], e["why"], milliseconds(e["ms_per_frame"]), str(e["frames"])) for e in effects]
-    return _table(("effect", "why", "per frame", "frames"), cells)
+    return table(("effect", "why", "per frame", "frames"), cells)
 
 
 def _versions() -> list[tuple[str, str]]:
@@ -160,28 +148,3 @@ def _versions() -> list[tuple[str, str]]:
         except metadata.PackageNotFoundError:  # as when run from a checkout that is not installed
             found.append((package, "not installed"))
     return found
-
-
-def _section(title: str, *parts: str) -> str:
-    body = "".join(parts)
-    return f"<section><h2>{title}</h2>\n{body}</section>\n" if body else ""
-
-
-def _details(title: str, body: str) -> str:
-    return f"<section><details><summary>{title}</summary>{body}</details></section>\n"
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{text}</p>'
-
-
-def _image(data: bytes | None, text: str) -> str:
-    return f'<img alt="{html.escape(text)}" src="{data_uri(data)}">' if data is not None else ""
-
-
-def _table(head: Iterable[str], rows: Sequence[Iterable[str]]) -> str:
-    if not rows:
-        return ""
-    lines = ["".join(f"<th>{html.escape(cell)}</th>" for cell in head)]
-    lines += ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
-    return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import json
-from importlib import resources
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,11 +12,12 @@ from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import Trajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view, to_png
+from splatbot.report.balls import balls
+from splatbot.report.moving_page import bytes_of, moving_page, packed, thinned
 
 _MOST_POINTS = 40_000
 _NEAR = 1.6  # [m] around the base that is shown
 _FRAMES = 80
-_SH0 = 0.28209479177387814  # of a colour's constant harmonic
 _GHOSTS = 5  # postures in the picture
 _EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # of the picture, from the base [m]
 
@@ -48,11 +44,11 @@ def plan_html(
     rooms = np.minimum(arm.clearance(field, q, cut=0.5).distance, 0.5)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     document = {
-        "points": _packed(points, np.float32),
-        "colors": _packed(colors, np.uint8),
-        "balls": _packed(centers, np.float32),
+        "points": packed(points, np.float32),
+        "colors": packed(colors, np.uint8),
+        "balls": packed(centers, np.float32),
         "radii": arm.spheres.radii.round(4).tolist(),
-        "tool": _packed(tool, np.float32),
+        "tool": packed(tool, np.float32),
         "times": times.round(4).tolist(),
         "rooms": rooms.round(4).tolist(),
         "middle": middle.round(3).tolist(),
@@ -64,21 +60,7 @@ def plan_html(
         f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, room all along at least "
         f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm; map version {c.map_version}"
     )
-    script = resources.files("splatbot.report").joinpath("plan_view.js").read_text(encoding="utf-8")
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>
-body {{ margin: 0; font: 14px system-ui, sans-serif; background: #16181d; color: #e8e8ea; }}
-header, footer {{ padding: 8px 14px; }}
-canvas {{ width: 100vw; height: calc(100vh - 92px); display: block; touch-action: none; }}
-footer {{ display: flex; gap: 12px; align-items: center; }} input {{ flex: 1; }}
-</style></head><body>
-<header><b>{html.escape(title)}</b> &nbsp; {html.escape(facts)}</header>
-<canvas id="view"></canvas>
-<footer><button id="play">play</button><input id="time" type="range" min="0" value="0"><span id="label"></span></footer>
-<script type="application/json" id="data">{json.dumps(document)}</script>
-<script>{script}</script>
-</body></html>
-"""
+    return moving_page(title, facts, document, "plan_view.js")
 
 
 def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *, width: int = 960) -> bytes:
@@ -88,7 +70,7 @@ def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *,
     share = np.linspace(0.0, 1.0, _GHOSTS)[:, None]
     hues = (1 - share) * np.array([0.15, 0.45, 0.9]) + share * np.array([0.95, 0.5, 0.1])
     ghosts = [
-        _balls(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35) for i in range(_GHOSTS)
+        balls(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35) for i in range(_GHOSTS)
     ]
     near = _within(model, inverse(arm.T_world_base))
     import torch
@@ -97,17 +79,6 @@ def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *,
     camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
     return to_png(
         render_view(scene, camera, arm.T_world_base @ look_at(_EYE, _TARGET), background=(0.09, 0.1, 0.12)), "rgb"
-    )
-
-
-def _balls(centers: Array, radii: Array, color: Array, opacity: float) -> GaussianModel:
-    n = len(centers)
-    return GaussianModel.from_activated(
-        means=centers,
-        quats=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-        scales=np.repeat(radii[:, None] / 2.2, 3, axis=1),
-        opacities=np.full(n, opacity),
-        colors=np.tile(color, (n, 1)),
     )
 
 
@@ -121,11 +92,6 @@ def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:
 def _nearby(model: GaussianModel, T_base_world: Array) -> tuple[Array, NDArray[np.uint8]]:
     """Means (P, 3) around the base, in its frame, and their colours (P, 3)."""
     rows = _within(model, T_base_world)
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MOST_POINTS)).astype(np.int64)]
+    rows = rows[thinned(len(rows), _MOST_POINTS)]
     means = transform_points(T_base_world, model.means.double().numpy()[rows])
-    base = model.sh[:, 0].double().numpy()[rows]
-    return means, (255 * np.clip(0.5 + _SH0 * base, 0, 1)).astype(np.uint8)
-
-
-def _packed(values: NDArray[np.generic], kind: type) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
+    return means, bytes_of(model.colors.double().numpy()[rows])

@@ -122,8 +122,8 @@ def map_log(
                 model=loop.slam.snapshot().model,
                 rows=loop.rows(),
                 costs=cost_metrics(loop.rows()),
-                trajectory=loop.trajectory(),
-                track=score_trajectory(loop.trajectory(), truth, loop.covariances()),
+                trajectory=loop.slam.trajectory,
+                track=score_trajectory(loop.slam.trajectory, truth, loop.covariances()),
             )
 
         if save_every is not None and localise is None:

@@ -19,7 +19,6 @@ from splatbot.run.interrupts import Interrupts
 from splatbot.run.pacing import Arrival, FrameSource
 from splatbot.run.progress import Phase, Progress
 from splatbot.slam import FrameResult, Slam
-from splatbot.trajectory import Trajectory
 
 _DROPPED = "a newer frame had arrived"
 
@@ -185,9 +184,3 @@ class FrameLoop:
         if any(covariance is None for covariance in tracked):
             return None
         return np.array(tracked, dtype=np.float64).reshape(-1, 6, 6)
-
-    def trajectory(self) -> Trajectory:
-        """The tracked poses."""
-        poses = [(r.stamp, r.T_world_camera) for r in self.slam.results if r.T_world_camera is not None]
-        stamps = np.array([stamp for stamp, _ in poses], dtype=np.float64)
-        return Trajectory(stamps, np.array([T for _, T in poses], dtype=np.float64).reshape(-1, 4, 4))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from splatbot.cli import main
 from splatbot.logs import open_log
 from splatbot.run import map_log
 
@@ -32,6 +34,27 @@ def test_every_frame_is_tracked_within_the_bound(
     assert metrics["ate_rmse_m"] <= ate_m
     assert (tmp_path / name / "report.html").exists()
     check_views(name, metrics)
+    if name == "arm_wrist_48":
+        check_twin(data_root / name, tmp_path)
+
+
+def check_twin(log: Path, folder: Path) -> None:
+    """The recording whose arm told its tool's poses, against the twin of its map."""
+    words = ["sim2real", str(log), "--map", str(folder / log.name), "--frames", "6", "--out", str(folder / "twin")]
+    assert main([*words, "--quiet"]) == 0
+    found = json.loads((folder / "twin" / "sim2real.json").read_text())
+    summary = found["summary"]
+    assert found["kind"] == "sim-to-real"
+    assert found["poses"].startswith("ee_poses.txt")
+    assert summary["base_residual_m"] <= 0.002
+    assert summary["all"]["frames"] == 6
+    assert summary["all"]["psnr_db"] >= 22.0
+    assert summary["all"]["depth_median_m"] <= 0.005
+    assert summary["all"]["iou"] >= 0.9
+    assert found["replay"]["source"] == "joints by IK, not recorded"
+    assert found["replay"]["reached"] == 48
+    assert summary["replay_most_m"] <= 0.001
+    assert "sim-to-sim" not in (folder / "twin" / "sim2real.html").read_text()
 
 
 def check_views(name: str, metrics: dict[str, Any]) -> None:

@@ -129,15 +129,16 @@ void define_planning(nb::module_& m) {
       "starts"_a.noconvert(), "most"_a, "Joint values (N, J) and what they miss the targets (N, 3, 4) by (N, 2) [m, rad]");
   m.def(
       "path_clearance",
-      [](const Arm& arm, const CollisionField& field, Configurations path, double cut, int rounds) {
+      [](const Arm& arm, const CollisionField& field, Configurations path, double cut, int rounds,
+         double seconds) {
         if (path.shape(1) != static_cast<std::size_t>(arm.joints()) || path.shape(0) < 2) {
           throw nb::value_error("the path has another number of joints, or is no path");
         }
         const nb::gil_scoped_release release;
-        return splatbot::planning::path_clearance(arm, field, span_of(path), cut, rounds);
+        return splatbot::planning::path_clearance(arm, field, span_of(path), cut, rounds, seconds);
       },
-      "arm"_a, "field"_a, "path"_a.noconvert(), "cut"_a, "rounds"_a,
-      "A lower bound [m] of the room along a path (N, J)");
+      "arm"_a, "field"_a, "path"_a.noconvert(), "cut"_a, "rounds"_a, "seconds"_a,
+      "A lower bound [m] of the room along a path (N, J), made better while there is time");
   nb::class_<ArmPlanner>(m, "ArmPlanner", "RRT* for an arm in a field; one run at a time")
       .def(
           "__init__",

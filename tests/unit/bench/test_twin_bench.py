@@ -7,7 +7,9 @@ import itertools
 import mujoco
 import numpy as np
 
+from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
+from splatbot.bench.twin_bounds import FORCED, broken_bounds
 from splatbot.bench.twin_paths import DEPTH, arm_room, push, timed, truth_scene, try_paths
 from splatbot.robots.panda import panda
 from splatbot.sim.twin import Twin
@@ -58,3 +60,11 @@ def test_planned_paths_touch_nothing_and_pushed_ones_are_seen() -> None:
     assert trials.touched == 0
     assert trials.least_room > 0
     assert trials.seen == trials.pushed == 2
+
+
+def test_a_figure_out_of_its_bounds_is_named_and_one_that_is_missing_is_not() -> None:
+    results = Results({})
+    results.add("empty scene", "over the robot alone", 0.9, "x")
+    assert broken_bounds(results) == []
+    results.add(FORCED, "over none forced", 1.01, "x")
+    assert broken_bounds(results) == [f"{FORCED}: over none forced is 1.01, not in 1.2..inf"]

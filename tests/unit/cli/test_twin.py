@@ -13,6 +13,7 @@ import pytest
 from splatbot.bench.tabletop import tabletop
 from splatbot.robots.panda import panda
 from splatbot.sim.effects.physics import PHYSICS
+from splatbot.sim.effects.registry import EFFECTS
 from tests.unit.cli.conftest import RunCommand
 
 pytest.importorskip("mujoco")
@@ -25,7 +26,7 @@ def test_the_result_holds_tracking_touches_and_the_ledger_with_costs(run: RunCom
     assert {touch["other"] for touch in values["touches"]} >= {"board"}
     assert values["tracking"]["tcp"] > 1e-3
     effects = {entry["name"]: entry for entry in values["effects"]}
-    assert list(effects) == list(PHYSICS)
+    assert list(effects) == [*PHYSICS, *EFFECTS]
     assert effects["backlash"]["by"] == "forbidden"
     assert effects["backlash"]["ms"] is None
     assert all(isinstance(entry["ms"], float) for entry in effects.values() if entry["on"])

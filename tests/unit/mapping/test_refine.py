@@ -188,3 +188,14 @@ def test_a_needle_in_view_shrinks_to_what_a_keyframe_can_tell(make_keyframe: Mak
     seen = z > 0.1
     assert int(seen.sum()) > 20
     assert (model.scales[rows].double().amax(1)[seen] <= 1.001 * limit[seen]).all()
+
+
+def test_a_blob_becomes_a_disc_of_the_same_extent(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe()
+    model = disturbed(keyframe)
+    model.log_scales[:] = np.log(0.004)
+    refiner_for(model, mapping__rate_scales=0.0).step(model, keyframe)
+    sizes = model.scales.double().sort(1).values
+    changed = sizes[:, 0] < 0.0039
+    assert float(changed.double().mean()) > 0.9
+    np.testing.assert_allclose(sizes[changed].numpy(), [[0.2 * 0.004, 0.004, 0.004]] * int(changed.sum()), rtol=1e-4)

@@ -16,7 +16,9 @@ from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.services.live import LiveMapping
 from splatbot.services.store import MapStore
+from splatbot.services.topics import FRAME, RESULT, STATE, TRAJECTORY, map_topic
 from splatbot.slam import FrameResult
+from splatbot.trajectory import Trajectory
 
 CAMERA = Camera(10, 10, 1.5, 1.5, 4, 4)
 
@@ -70,6 +72,10 @@ class _Mapper:
 
     def close(self) -> None:
         self.closed = True
+
+    @property
+    def trajectory(self) -> Trajectory:
+        return Trajectory(np.arange(self.frames, dtype=np.float64), np.tile(np.eye(4), (self.frames, 1, 1)))
 
     def snapshot(self) -> Snapshot:
         model = GaussianModel.empty()
@@ -127,3 +133,30 @@ def test_stopping_ends_after_the_frame_in_work() -> None:
     mapping.stop(timeout_s=10)
     assert mapping.wait(0)
     assert store.get("live").map_version <= 1
+
+
+def test_the_bus_is_told_of_every_frame_result_state_and_trajectory() -> None:
+    log = _Log()
+    log.hold.clear()
+    store, mapping = _follow(log)
+    with store.bus.subscribe(map_topic("live", "*"), capacity=1000, latched=False) as reader:
+        log.hold.set()
+        assert mapping.wait(10)
+        messages = []
+        while (message := reader.get(0)) is not None:
+            messages.append(message)
+    by_kind = {kind: [m.value for m in messages if m.topic == map_topic("live", kind)] for kind in (FRAME, RESULT)}
+    assert [f.index for f in by_kind[FRAME]] == [r.index for r in by_kind[RESULT]] == list(range(10))
+    versions = [m.value.map_version for m in messages if m.topic == map_topic("live", STATE)]
+    assert versions == [1, 2, 3, 4, 5, 6, 6]
+    assert len([m for m in messages if m.topic == map_topic("live", TRAJECTORY)][-1].value.stamps) == 10
+
+
+def test_a_map_that_is_deleted_while_it_is_mapped_ends_its_mapping() -> None:
+    log = _Log()
+    log.hold.clear()
+    store, mapping = _follow(log)
+    store.remove("live")
+    log.hold.set()
+    assert mapping.wait(10)
+    assert store.list() == ()

@@ -10,7 +10,7 @@ import torch
 from splatbot.errors import MapNotFoundError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.services.problems import MapNotReadyError
-from splatbot.services.store import MapStore
+from splatbot.services.store import MapExistsError, MapStore
 
 
 def _snapshot(version: int, x: float = 0.0) -> Snapshot:
@@ -74,7 +74,7 @@ def test_an_unknown_map_is_named_with_the_known_ones() -> None:
 
 def test_a_name_is_given_once() -> None:
     store = _store()
-    with pytest.raises(ValueError, match="desk"):
+    with pytest.raises(MapExistsError, match="desk"):
         store.add("desk", source="another", state="static")
 
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
 from splatbot.errors import ConfigError, InputError
 from splatbot.gaussians import GaussianModel
+from splatbot.robots.panda import panda
+from splatbot.segmentation import find_support
 from splatbot.sim.clutter import MapParts, map_parts
 from splatbot.sim.maps.ellipsoids import merge
-from splatbot.sim.maps.plane import find_support
+from splatbot.sim.motion import hold
 from splatbot.sim.scene import Clutter, make_scene
 from splatbot.sim.twin import Twin
 
@@ -93,7 +98,8 @@ def test_a_scene_of_a_map_runs_and_the_arm_touches_its_wall(tmp_path: Path) -> N
     )
     result = Twin(scene).follow(until_touch=True)
     assert result.near.room < 0.12
-    assert len(result.notes) == 5
+    assert len(result.notes) == 6
+    assert result.notes[-1] == "link1 stands in map-table at home: contacts of the two are left out"
 
 
 def test_a_part_of_the_map_without_gaussians_is_an_error() -> None:
@@ -117,3 +123,23 @@ def _first_axes(quats: np.ndarray) -> np.ndarray:
     from splatbot.geometry import quat_to_rotation
 
     return quat_to_rotation(quats)[:, :, 0]
+
+
+@pytest.mark.parametrize(("degree", "camera", "on"), [(2, True, True), (2, False, False), (0, True, False)])
+def test_harmonics_are_evaluated_only_where_a_camera_sees_some(
+    tmp_path: Path, degree: int, camera: bool, on: bool
+) -> None:
+    model = scanned()
+    coefficients = torch.zeros(len(model), (degree + 1) ** 2, 3)
+    coefficients[:, :1] = model.sh
+    replace(model, sh=coefficients).save(tmp_path / "scan.ply")
+    values: dict[str, Any] = {"name": "scan", "map": {"file": str(tmp_path / "scan.ply")}}
+    if camera:
+        values["camera"] = {"at": [1.5, -0.5, 0.9], "look_at": [0.5, 0.0, 0.2]}
+    scenes = [make_scene(values).with_effects(forbid=forbidden) for forbidden in ((), ("view_color",))]
+    results = [Twin(scene).follow(hold(panda().home, 0.02)) for scene in scenes]
+    assert results[0].figures["harmonics"] == (degree if on else 0)
+    assert results[1].figures["harmonics"] == 0
+    (decision,) = (d for d in results[0].decisions if d.name == "view_color")
+    assert decision.on == on
+    assert decision.why

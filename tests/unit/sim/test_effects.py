@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatbot.camera import Camera
 from splatbot.errors import InputError
+from splatbot.frame import Frame
 from splatbot.sim.effects.base import Effects
-from splatbot.sim.effects.depth_noise import DepthNoise
-from tests.unit.sim.frames import frame_at
+from splatbot.sim.effects.depth_noise import DepthNoise, tilts
+from tests.unit.sim.frames import CAMERA, frame_at
 
 
 @pytest.mark.parametrize("z", [0.4, 1.0, 2.5])
@@ -21,6 +23,26 @@ def test_noise_has_the_published_deviation_and_no_bias(z: float) -> None:
     n = noisy.size
     assert noisy.mean() == pytest.approx(z, abs=5 * sigma / np.sqrt(n))
     assert noisy.std() == pytest.approx(sigma, rel=5 / np.sqrt(2 * n))
+
+
+@pytest.mark.parametrize("z", [0.5, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize("tilt", [0, 30, 50, 65, 75, 80])
+def test_noise_of_a_tilted_wall_is_that_of_the_published_fit_within_a_tenth(z: float, tilt: int) -> None:
+    """Nguyen, Izadi, Lovell 2012, eq. 3; a lens so long that the wall has one depth and one angle."""
+    camera = Camera(60_000.0, 60_000.0, 99.5, 74.5, 200, 150)
+    wall = z / (1.0 - np.tan(np.radians(tilt)) * (np.arange(200) - 99.5) / 60_000.0)
+    depth = np.repeat(wall[None].astype(np.float32), 150, axis=0)
+    frame = Frame(0.0, np.zeros((150, 200, 3), np.uint8), depth, camera)
+    noise = DepthNoise(step=0, edge_loss=0).apply(frame, np.random.default_rng(1)).depth.astype(np.float64) - depth
+    theta = np.radians(tilt)
+    published = 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(z) * theta**2 / (np.pi / 2 - theta) ** 2
+    assert noise.std() == pytest.approx(published, rel=0.1)
+    assert abs(noise.mean()) < 5 * published / np.sqrt(noise.size)
+
+
+def test_an_edge_does_not_pass_for_a_steep_wall() -> None:
+    z = np.where(np.arange(200) < 100, 1.0, 1.5)[None, :].repeat(150, axis=0)
+    assert tilts(CAMERA, z.astype(np.float32))[75, 95:105].max() < np.radians(5)
 
 
 def test_depth_comes_in_steps() -> None:

@@ -11,7 +11,8 @@ from splatbot.geometry import se3_exp
 from splatbot.logs import open_log
 from splatbot.logs.synthetic import SyntheticLog
 from splatbot.logs.trajectories import Shooting, make_path
-from splatbot.sim.effects.motion_blur import MotionBlur, pose_at
+from splatbot.sim.effects.motion_blur import MotionBlur
+from splatbot.sim.effects.warping import pose_at
 from splatbot.trajectory import Trajectory
 from tests.unit.sim.frames import frame_at
 

@@ -123,3 +123,11 @@ def test_the_first_link_may_stand_in_what_the_robot_stands_on() -> None:
     assert twin.world.mounted == ()
     on_plane = Twin(load_scene("tabletop_clutter"))
     assert on_plane.world.mounted == (("link1", "table"),)
+
+
+def test_steps_longer_than_the_controllers_period_slow_it_and_that_is_said() -> None:
+    motion = hold(panda().home, 0.1)
+    slow = Twin(_scene(), timestep=0.004).follow(motion)
+    assert slow.rate == pytest.approx(250.0)
+    assert any("the controller runs at 250 Hz, not at 1000" in text for text in slow.warnings)
+    assert Twin(_scene(), timestep=0.0005).follow(motion).warnings == ()

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "splatbot/kernels.hpp"
+#include "splatbot/planning/space.hpp"
 
 namespace splatbot::planning {
 
@@ -14,6 +15,8 @@ namespace {
 
 constexpr std::size_t kLooks = 8;  // configurations of each edge, for an upper bound
 constexpr float kEps = 2e-4F;      // [m]
+constexpr double kNearly = 0.9;    // of the room seen: what is tried first
+constexpr int kAtLeast = 2;        // rounds, unless the first one shows some room
 
 // The least room of configurations along the path.
 double least_seen(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut) {
@@ -39,7 +42,9 @@ double least_seen(const Arm& arm, const CollisionField& field, std::span<const d
 
 }  // namespace
 
-double path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int rounds) {
+double path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int rounds,
+                      double seconds) {
+  const Stop stop(seconds, nullptr);
   const auto joints = static_cast<std::size_t>(arm.joints());
   const std::size_t edges = path.size() / joints - 1;
   ArmView larger = arm.view();
@@ -56,13 +61,19 @@ double path_clearance(const Arm& arm, const CollisionField& field, std::span<con
     }
     return true;
   };
-  double low = 0.0, high = least_seen(arm, field, path, cut);
+  double low = 0.0, high = least_seen(arm, field, path, cut), middle = kNearly * high;
   if (high >= cut && certified(cut)) {
     return cut;
   }
+  double longest = 0.0;
   for (int i = 0; i < rounds && high > 0.0; ++i) {
-    const double middle = 0.5 * (low + high);
+    const double begin = stop.elapsed();
+    if ((low > 0.0 || i >= kAtLeast) && begin + longest >= seconds) {
+      break;
+    }
     (certified(middle) ? low : high) = middle;
+    middle = 0.5 * (low + high);
+    longest = std::max(longest, stop.elapsed() - begin);
   }
   return low;
 }

@@ -36,12 +36,16 @@ def fit(points: Array, floor: float) -> Fit:
 
     Tried are an upright box, an upright cylinder, a ball and, where they all fail, the convex hull.
     """
-    low = min(floor, float(points[:, 2].min())) if floor > points[:, 2].min() - 0.03 else float(points[:, 2].min())
-    high = float(np.percentile(points[:, 2], 100 - _TRIM))
-    fits = [_box(points, low, high), _cylinder(points, low, high), _ball(points)]
-    best = min(fits, key=lambda f: f.error)
+    best = min(primitive_fits(points, floor), key=lambda f: f.error)
     hull = _hull(points)
     return hull if best.error > _PLAIN * max(hull.error, 2e-3) else best
+
+
+def primitive_fits(points: Array, floor: float) -> list[Fit]:
+    """An upright box, an upright cylinder and a ball for points (P, 3) [m] that stand on the height ``floor``."""
+    low = min(floor, float(points[:, 2].min())) if floor > points[:, 2].min() - 0.03 else float(points[:, 2].min())
+    high = float(np.percentile(points[:, 2], 100 - _TRIM))
+    return [_box(points, low, high), _cylinder(points, low, high), _ball(points)]
 
 
 def _box(points: Array, low: float, high: float) -> Fit:

@@ -36,6 +36,13 @@ class Support:
         return np.asarray(points @ self.normal - self.offset)
 
 
+def given_support(points: Array, normal: Array, offset: float) -> Support:
+    """A plane normal · p = offset that is known, with those of the points (P, 3) [m] that are on it."""
+    away = points @ normal - offset
+    inside = np.abs(away) < NEAR
+    return Support(normal, offset, float(np.sqrt(np.mean(away[inside] ** 2))) if inside.any() else 0.0, inside)
+
+
 def find_support(points: Array, *, seed: int = 0) -> Support | None:
     """The level plane with most of the points (P, 3) [m, z up]; None if none has 5 % of them.
 
@@ -68,6 +75,4 @@ def _refined(points: Array, normal: Array, offset: float) -> Support:
         normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
         normal = normal * np.sign(normal[2])
         offset = float(middle @ normal)
-    away = points @ normal - offset
-    inside = np.abs(away) < NEAR
-    return Support(normal, offset, float(np.sqrt(np.mean(away[inside] ** 2))), inside)
+    return given_support(points, normal, offset)

@@ -1,0 +1,169 @@
+"""A recording that behaves as a camera: frames at their times, lost when nobody takes them, and a device's faults."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from splatbot.camera import Camera
+from splatbot.errors import DeviceError, InputError
+from splatbot.frame import Frame
+from splatbot.logs import Log, open_log
+
+PREFIX = "replay:"
+_QUEUE = 4  # frames that a driver holds for a slow reader, as depthai's queues do
+_END = object()
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How a recording is played; the faults count frames from 0 at the first.
+
+    Args:
+        speed: 2 plays twice as fast; stamps stay the recording's.
+        loop: begin anew at the end; stamps go on increasing.
+        stall: the frame before which nothing comes for ``stall_s``; -1: never.
+        stall_s: how long [s].
+        drop: the share of frames that the device loses, 0 to 1.
+        corrupt: the share of frames whose transfer breaks off: the lower half is noise.
+        unplug: the frame instead of which the device is gone; -1: never.
+        fault_seed: of which frames are lost and broken.
+    """
+
+    speed: float = 1.0
+    loop: bool = False
+    stall: int = -1
+    stall_s: float = 1.0
+    drop: float = 0.0
+    corrupt: float = 0.0
+    unplug: int = -1
+    fault_seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("speed", 1e-3, 1e3), ("stall_s", 0, 3600), ("drop", 0, 1), ("corrupt", 0, 1)):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"is {value}.", field=f"replay {name}", hint=f"give a number in {low:g}..{high:g}")
+
+
+class ReplayCamera:
+    """A log as a live camera. Who reads too slowly loses the oldest frames, which ``dropped`` counts.
+
+    Iterating starts a thread that reads the log and delivers each frame at its time; a log that itself is too slow
+    delivers late. The frames end with the log, or by :meth:`close`.
+
+    Args:
+        log: any log.
+        options: how it is played.
+
+    Raises:
+        DeviceError: when iterating: the device was unplugged.
+        LogError: when iterating: a frame cannot be read.
+    """
+
+    def __init__(self, log: Log, options: ReplayOptions | None = None) -> None:
+        self.options = options or ReplayOptions()
+        self.name = log.name
+        self.uri = PREFIX + log.uri
+        self.camera: Camera = log.camera
+        self.dropped = 0
+        self._log = log
+        self._queue: deque[Frame | BaseException | object] = deque()
+        self._changed = threading.Condition()
+        self._closed = threading.Event()
+        self._rng = np.random.default_rng(self.options.fault_seed)
+
+    @classmethod
+    def from_uri(cls, uri: str) -> ReplayCamera:
+        """The camera of `replay:LOG?speed=2&loop=1&...`; options that are not of replay are the log's own.
+
+        Raises:
+            InputError: an option is no number or out of range.
+            LogError: the log cannot be opened.
+        """
+        log, _, query = uri.removeprefix(PREFIX).partition("?")
+        kinds = {f.name: type(f.default) for f in fields(ReplayOptions)}
+        pairs = [pair for pair in query.split("&") if pair]
+        values = {}
+        for key, _, text in (pair.partition("=") for pair in pairs if pair.partition("=")[0] in kinds):
+            try:
+                values[key] = bool(int(text)) if kinds[key] is bool else kinds[key](text)
+            except ValueError as error:
+                raise InputError(f"is {text!r}.", field=f"replay {key}", hint="give a number") from error
+        own = "&".join(pair for pair in pairs if pair.partition("=")[0] not in kinds)
+        return cls(open_log(log + (f"?{own}" if own else "")), ReplayOptions(**values))
+
+    def close(self) -> None:
+        """End the stream; who waits for a frame gets none."""
+        self._closed.set()
+        with self._changed:
+            self._changed.notify_all()
+
+    def __iter__(self) -> Iterator[Frame]:
+        threading.Thread(target=self._run, name=f"camera-{self.name}", daemon=True).start()
+        try:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._queue or self._closed.is_set())
+                    taken = _END if self._closed.is_set() else self._queue.popleft()
+                if taken is _END:
+                    return
+                if isinstance(taken, BaseException):
+                    raise taken
+                assert isinstance(taken, Frame)
+                yield taken
+        finally:
+            self.close()
+
+    def _run(self) -> None:
+        try:
+            for number, frame in self._frames():
+                if number == self.options.unplug:
+                    raise DeviceError("is gone.", file=self.uri, field="camera", hint="plug it in and start again")
+                if self._rng.random() >= self.options.drop:
+                    self._deliver(self._damaged(frame) if self._rng.random() < self.options.corrupt else frame)
+                if self._closed.is_set():
+                    return
+            self._deliver(_END)
+        except Exception as error:
+            self._deliver(error)
+
+    def _frames(self) -> Iterator[tuple[int, Frame]]:
+        """Frames at their times, numbered over all rounds, until the camera is closed."""
+        number, offset, late = 0, 0.0, 0.0
+        begun: tuple[float, float] | None = None
+        while True:
+            period = last = 0.0
+            for frame in self._log:
+                stamp = frame.stamp + offset
+                begun = begun or (time.monotonic(), stamp)
+                late += self.options.stall_s if number == self.options.stall else 0.0
+                due = begun[0] + (stamp - begun[1]) / self.options.speed + late
+                if self._closed.wait(max(due - time.monotonic(), 0.0)):
+                    return
+                yield number, replace(frame, stamp=stamp, index=number)
+                period, last = (frame.stamp - last if last else 0.0), frame.stamp
+                number += 1
+            if not self.options.loop:
+                return
+            offset += last - self._log.read(0).stamp + (period or 1.0)
+
+    def _deliver(self, item: Frame | BaseException | object) -> None:
+        with self._changed:
+            if len(self._queue) >= _QUEUE and isinstance(item, Frame):
+                self._queue.popleft()
+                self.dropped += 1
+            self._queue.append(item)
+            self._changed.notify_all()
+
+    def _damaged(self, frame: Frame) -> Frame:
+        """The frame as a transfer that broke off leaves it."""
+        rgb, depth, half = frame.rgb.copy(), frame.depth.copy(), frame.rgb.shape[0] // 2
+        rgb[half:] = self._rng.integers(0, 256, rgb[half:].shape, dtype=np.uint8)
+        depth[half:] = self._rng.uniform(0, 10, depth[half:].shape)
+        return replace(frame, rgb=rgb, depth=depth)

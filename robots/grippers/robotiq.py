@@ -1,0 +1,322 @@
+"""Robotiq's 2F-85 and 2F-140 over Modbus RTU: activated, moved, asked, and at rest where anything goes wrong."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from types import TracebackType
+
+from splatbot.errors import GripperError, InputError
+from splatbot.robots.grippers.checks import check_move
+from splatbot.robots.grippers.modbus import LineError, ModbusClient, open_line
+from splatbot.robots.grippers.registers import (
+    COMMAND,
+    NO_COMMUNICATION,
+    REGISTERS,
+    STATUS,
+    Activation,
+    Command,
+    Fingers,
+    Status,
+)
+
+_POLL = 0.01  # [s] between questions
+_ECHO = 0.5  # [s] in which the gripper must tell the position that it was told
+_log = logging.getLogger(__name__)
+
+
+class FaultError(GripperError):
+    """The gripper reports a fault; ``status`` has it."""
+
+    def __init__(self, status: Status, *, field: str) -> None:
+        self.status = status
+        super().__init__(f"reports fault {status.fault:#04x}: {status.fault_text}.", field=field, hint="activate it")
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a gripper can do (data sheets); values between the ends are taken as linear in the registers.
+
+    Args:
+        stroke: widest opening [m].
+        force: least and largest [N].
+        speed: least and largest, of the opening [m/s].
+        open_at, closed_at: gPO at the ends of the stroke; :meth:`RobotiqGripper.calibrate` measures a gripper's own.
+    """
+
+    stroke: float
+    force: tuple[float, float]
+    speed: tuple[float, float]
+    open_at: int = 13
+    closed_at: int = 230
+
+    def opening(self, position: int) -> float:
+        """[m] at gPO."""
+        share = (self.closed_at - position) / (self.closed_at - self.open_at)
+        return self.stroke * min(max(share, 0.0), 1.0)
+
+    def position(self, opening: float) -> int:
+        """rPR of an opening [m]; the ends are asked for in full."""
+        if opening <= 0.0:
+            return 255
+        if opening >= self.stroke:
+            return 0
+        return round(self.closed_at - opening / self.stroke * (self.closed_at - self.open_at))
+
+
+MODELS = {
+    "2f-85": Model(0.085, (20.0, 235.0), (0.02, 0.15)),
+    "2f-140": Model(0.140, (10.0, 125.0), (0.03, 0.25)),
+}
+
+
+class RobotiqGripper:
+    """A :class:`splatbot.protocols.Gripper` on a serial port.
+
+    Whatever goes wrong (no answer, a wrong checksum again and again, a port that is gone, a fault) is a
+    :class:`splatbot.errors.GripperError`; the gripper is then told once to stand still, and takes no move until it is
+    activated again. No call lasts longer than its time-outs.
+
+    Args:
+        port: as "/dev/ttyUSB0".
+        model: "2f-85" or "2f-140".
+        device: its Modbus number.
+        timeout: for the first and for the other bytes of an answer [s].
+        retries: of an exchange.
+
+    Raises:
+        InputError: the model is unknown.
+        LineError: the port cannot be opened.
+    """
+
+    def __init__(
+        self, port: str, model: str = "2f-85", *, device: int = 9, timeout: float = 0.1, retries: int = 4
+    ) -> None:
+        if model not in MODELS:
+            raise InputError(f"is {model!r}.", field="model", hint=f"models: {', '.join(MODELS)}")
+        if not 0.0 < timeout <= 10.0 or not 0 <= retries <= 100:
+            raise InputError(f"are {timeout}, {retries}.", field="timeout, retries", hint="give seconds, and a number")
+        self.model = MODELS[model]
+        self._port, self._device, self._timeout, self._retries = port, device, timeout, retries
+        self._unsafe = "it is not activated"
+        self._told: Command | None = None
+        self._client: ModbusClient | None = self._opened()
+
+    def __enter__(self) -> RobotiqGripper:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def stroke(self) -> float:
+        """Widest opening [m]."""
+        return self.model.stroke
+
+    @property
+    def unsafe(self) -> str:
+        """Why it takes no move; empty if it does."""
+        return self._unsafe
+
+    @property
+    def repeated(self) -> int:
+        """How many exchanges were tried again since the port was opened."""
+        return self._client.repeated if self._client is not None else 0
+
+    def activate(self, *, again: bool = False, patience: float = 10.0) -> None:
+        """Clear faults and activate: the fingers close and open once. Opens the port again if it was lost.
+
+        A gripper that is active and at no fault is left as it is, with what it holds, unless ``again``.
+
+        Raises:
+            GripperError: it does not become ready within ``patience`` [s].
+        """
+        with self._secured():
+            if self._client is None:
+                self._client = self._opened()
+            self._told, self._unsafe = None, "it is not activated"
+            status = self._read()
+            if again or status.fault not in (0, NO_COMMUNICATION) or status.activation is not Activation.DONE:
+                self._write(Command(activate=False, go=False))
+                self._until(lambda s: not s.activated, patience, "does not reset", read=self._read)
+                self._write(Command(go=False))
+                self._until(lambda s: s.activation is Activation.DONE, patience, "is not ready")
+            self._unsafe = ""
+
+    def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
+        """Go towards an opening [m], with at most a force [N] and a speed [m/s].
+
+        By default as fast as it can, with a quarter of its force (the 2F-85: 74 N).
+
+        Values beyond its own least and most are taken as those; fingers that meet something stop and hold it.
+
+        Raises:
+            InputError: a value is out of range.
+            GripperError: it must be activated first, or cannot be told.
+        """
+        check_move(self.stroke, opening, force, speed)
+        if self._unsafe:
+            raise GripperError(f"takes no move: {self._unsafe}.", field=self._port, hint="activate it")
+        with self._secured():
+            self._told = Command(
+                position=self.model.position(opening),
+                speed=_register(speed, *self.model.speed, default=255),
+                force=_register(force, *self.model.force, default=64),
+            )
+            self._write(self._told)
+
+    def status(self) -> Status:
+        """All that it tells, once it tells of what it was told last.
+
+        Raises:
+            FaultError: it reports a fault.
+            GripperError: it does not answer.
+        """
+        with self._secured():
+            return self._status()
+
+    def moving(self) -> bool:
+        """Whether the fingers are still on their way."""
+        status = self.status()
+        return status.going and status.fingers is Fingers.MOVING
+
+    def opening(self) -> float:
+        """Between the fingers now [m]."""
+        return self.model.opening(self.status().position)
+
+    def holds(self) -> bool:
+        """Whether something stopped the fingers, and still does; not known, so False, after :meth:`stop`."""
+        status = self.status()
+        return status.going and status.fingers in (Fingers.STOPPED_CLOSING, Fingers.STOPPED_OPENING)
+
+    def wait(self, seconds: float = 5.0) -> None:
+        """Until the fingers rest.
+
+        Raises:
+            GripperError: they do not within that time [s]; they are then told to.
+        """
+        with self._secured():
+            self._until(lambda s: not (s.going and s.fingers is Fingers.MOVING), seconds, "still moves")
+
+    def stop(self) -> None:
+        """Stay where they are; what is held stays held.
+
+        Raises:
+            GripperError: it cannot be told.
+        """
+        with self._secured():
+            self._told = replace(self._told or Command(), go=False)
+            self._write(self._told)
+
+    def release(self, *, opens: bool = True) -> None:
+        """Let go slowly, whatever else it was told (automatic release); it must be activated afterwards.
+
+        Raises:
+            GripperError: it cannot be told.
+        """
+        with self._secured():
+            self._unsafe = "it was told to release"
+            self._write(Command(release=True, release_opens=opens))
+
+    def calibrate(self, *, patience: float = 10.0) -> Model:
+        """Close and open all the way, with nothing between the fingers, and take where they end as the stroke's ends.
+
+        Raises:
+            GripperError: they end where no gripper of this kind does.
+        """
+        ends = []
+        for opening in (0.0, self.stroke):
+            self.move(opening)
+            self.wait(patience)
+            ends.append(self.status().position)
+        closed, opened = ends
+        if not opened + 128 <= closed:
+            hint = "take away what is between the fingers"
+            raise GripperError(f"closes at {closed} and opens at {opened}.", field=self._port, hint=hint)
+        self.model = replace(self.model, open_at=opened, closed_at=closed)
+        return self.model
+
+    def close(self) -> None:
+        """Give the port back. The fingers keep what they hold."""
+        if self._client is not None:
+            self._client.close()
+        self._client, self._unsafe = None, "its port is closed"
+
+    def _opened(self) -> ModbusClient:
+        return ModbusClient(open_line(self._port, timeout=self._timeout), self._device, retries=self._retries)
+
+    @property
+    def _asked(self) -> ModbusClient:
+        if self._client is None:
+            raise LineError(f"is not open: {self._unsafe}.", file=self._port, hint="activate the gripper")
+        return self._client
+
+    def _write(self, command: Command) -> None:
+        self._asked.write(COMMAND, command.to_bytes())
+
+    def _status(self) -> Status:
+        """As :meth:`status`. A status from before the last command would tell of other fingers: its echo says so."""
+        until = time.monotonic() + _ECHO
+        while True:
+            status = self._read()
+            if status.fault == NO_COMMUNICATION:
+                _log.info("nothing was said to %s for a second", self._port)
+            elif status.fault:
+                raise FaultError(status, field=self._port)
+            if self._told is None or (status.requested, status.going) == (self._told.position, self._told.go):
+                return status
+            if time.monotonic() > until:
+                hint = "check that nothing else commands it; activate it"
+                raise GripperError("does not tell what it was told.", field=self._port, hint=hint)
+            time.sleep(_POLL)
+
+    def _read(self) -> Status:
+        return Status.from_bytes(self._asked.read(STATUS, REGISTERS))
+
+    def _until(
+        self,
+        holds: Callable[[Status], bool],
+        seconds: float,
+        what: str,
+        read: Callable[[], Status] | None = None,
+    ) -> None:
+        until = time.monotonic() + seconds
+        while not holds((read or self._status)()):
+            if time.monotonic() > until:
+                raise GripperError(
+                    f"{what} after {seconds:g} s.", field=self._port, hint="check its power; activate it"
+                )
+            time.sleep(_POLL)
+
+    @contextmanager
+    def _secured(self) -> Iterator[None]:
+        """After an error nothing moves: it is told once to stand still, and moves are refused."""
+        try:
+            yield
+        except GripperError as error:
+            self._unsafe = self._unsafe or error.message.rstrip(".")
+            _log.warning("%s", error)
+            self._stand_still(lost=isinstance(error, LineError))
+            raise
+
+    def _stand_still(self, *, lost: bool) -> None:
+        if self._client is None:
+            return
+        if not lost:
+            try:
+                self._client.write(COMMAND, replace(self._told or Command(), go=False).to_bytes(), retries=0)
+            except LineError:
+                lost = True
+            except GripperError as error:
+                _log.warning("it may still move: %s", error)
+        if lost:
+            self._client.close()
+            self._client = None
+
+
+def _register(value: float | None, least: float, most: float, *, default: int) -> int:
+    """0..255 between the least and the most."""
+    return default if value is None else round(255 * min(max((value - least) / (most - least), 0.0), 1.0))

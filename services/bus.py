@@ -1,0 +1,196 @@
+"""News inside the process: the latest value of each topic, and bounded queues that never make a writer wait."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from types import TracebackType
+from typing import Any, Self
+
+
+@dataclass(frozen=True)
+class Message:
+    """One value of one topic.
+
+    Args:
+        topic: e.g. "maps/default/result"; :mod:`splatbot.services.topics` lists them.
+        value: immutable, whoever holds it.
+        number: of this topic's messages, from 1; a gap tells a reader that it has missed some.
+        time: when it was published, Unix time [s].
+    """
+
+    topic: str
+    value: Any = field(repr=False)
+    number: int
+    time: float
+
+
+class Subscription:
+    """What a reader has yet to read, oldest first; when full, the oldest message makes room and is counted.
+
+    Read from a thread (:meth:`get`, iteration) or from asyncio (:meth:`receive`, ``async for``); closing ends both.
+    """
+
+    def __init__(self, bus: Bus, patterns: tuple[str, ...], capacity: int) -> None:
+        self._bus = bus
+        self._patterns = patterns
+        self._queue: deque[Message] = deque(maxlen=capacity)
+        self._changed = threading.Condition()
+        self._waiting: list[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = []
+        self._closed = False
+        self._dropped: dict[str, int] = {}
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How many messages of each topic had to make room."""
+        with self._changed:
+            return dict(self._dropped)
+
+    def wants(self, topic: str) -> bool:
+        """Whether a topic is subscribed to."""
+        return any(fnmatchcase(topic, pattern) for pattern in self._patterns)
+
+    def get(self, timeout_s: float | None = None) -> Message | None:
+        """The next message; None once closed or after ``timeout_s`` [s]. Blocks the calling thread."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._queue or self._closed, timeout_s)
+            return self._take()
+
+    async def receive(self) -> Message | None:
+        """The next message; None once closed. Waits without blocking the event loop."""
+        while True:
+            news = asyncio.Event()
+            waiter = asyncio.get_running_loop(), news
+            with self._changed:
+                if self._queue or self._closed:
+                    return self._take()
+                self._waiting.append(waiter)
+            try:
+                await news.wait()
+            finally:
+                with self._changed:
+                    if waiter in self._waiting:
+                        self._waiting.remove(waiter)
+
+    def close(self) -> None:
+        """Leave the bus; whoever waits gets None."""
+        self._bus._leave(self)
+        with self._changed:
+            self._closed = True
+            self._queue.clear()
+            self._wake()
+
+    def __iter__(self) -> Iterator[Message]:
+        while (message := self.get()) is not None:
+            yield message
+
+    async def __aiter__(self) -> AsyncIterator[Message]:
+        while (message := await self.receive()) is not None:
+            yield message
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _offer(self, message: Message) -> str | None:
+        """Queue a message; the topic of the one that made room for it."""
+        with self._changed:
+            lost = self._queue[0].topic if len(self._queue) == self._queue.maxlen else None
+            if lost is not None:
+                self._dropped[lost] = self._dropped.get(lost, 0) + 1
+            self._queue.append(message)
+            self._wake()
+        return lost
+
+    def _take(self) -> Message | None:
+        return self._queue.popleft() if self._queue else None
+
+    def _wake(self) -> None:
+        self._changed.notify_all()
+        for loop, news in self._waiting:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(news.set)
+        self._waiting.clear()
+
+
+class Bus:
+    """Topics of one process. Publishing takes microseconds whoever reads, however slowly."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._latest: dict[str, Message] = {}
+        self._numbers: dict[str, int] = {}
+        self._readers: list[Subscription] = []
+        self._dropped: dict[str, int] = {}
+
+    def publish(self, topic: str, value: Any) -> None:
+        """Let ``value`` be the topic's latest, and queue it for the topic's readers."""
+        with self._lock:
+            number = self._numbers[topic] = self._numbers.get(topic, 0) + 1
+            message = self._latest[topic] = Message(topic, value, number, time.time())
+            for reader in self._readers:
+                if reader.wants(topic) and (lost := reader._offer(message)) is not None:
+                    self._dropped[lost] = self._dropped.get(lost, 0) + 1
+
+    def latest(self, topic: str) -> Message | None:
+        """The topic's latest message; None when there was none."""
+        with self._lock:
+            return self._latest.get(topic)
+
+    def topics(self) -> tuple[str, ...]:
+        """Topics that have a latest message, in the order of their first."""
+        with self._lock:
+            return tuple(self._latest)
+
+    def subscribe(self, *patterns: str, capacity: int = 16, latched: bool = True) -> Subscription:
+        """Read the topics that match any of the patterns (as of a shell: "maps/*/result"), those to come as well.
+
+        Args:
+            capacity: messages that may wait.
+            latched: begin with the latest message of each topic.
+
+        Raises:
+            ValueError: the capacity is less than 1.
+        """
+        if capacity < 1:
+            raise ValueError(f"capacity is {capacity}, must be at least 1")
+        reader = Subscription(self, patterns, capacity)
+        with self._lock:
+            if latched:
+                for message in self._latest.values():
+                    if reader.wants(message.topic):
+                        reader._offer(message)
+            self._readers.append(reader)
+        return reader
+
+    def forget(self, prefix: str) -> None:
+        """Drop the latest messages of all topics that begin with ``prefix``."""
+        with self._lock:
+            for topic in [topic for topic in self._latest if topic.startswith(prefix)]:
+                del self._latest[topic], self._numbers[topic]
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How many messages of each topic readers were too slow for, since the start."""
+        with self._lock:
+            return dict(self._dropped)
+
+    @property
+    def readers(self) -> int:
+        """How many subscriptions are open."""
+        with self._lock:
+            return len(self._readers)
+
+    def _leave(self, reader: Subscription) -> None:
+        with self._lock:
+            if reader in self._readers:
+                self._readers.remove(reader)

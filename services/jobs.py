@@ -1,0 +1,232 @@
+"""Work that outlasts a request: queued, run one after the other, watched, cancelled."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+from uuid import uuid4
+
+from splatbot.errors import InputError, SplatbotError
+from splatbot.services.bus import Bus
+from splatbot.services.problems import BusyError
+from splatbot.services.topics import job_topic
+
+_log = logging.getLogger(__name__)
+
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+ENDED: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
+
+_KEPT = 200  # ended jobs that can still be asked about
+
+
+class JobNotFoundError(InputError):
+    """No job of that id, or it ended long ago."""
+
+    http_status = 404
+
+
+class IdempotencyError(InputError):
+    """A key has been used for another request."""
+
+    http_status = 409
+
+
+class JobCancelled(Exception):  # noqa: N818 (no error: somebody wanted it)
+    """Ends the work of a job that is no longer wanted."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work at one moment.
+
+    Args:
+        id: its name in URLs.
+        kind: what is done, e.g. "map".
+        state: where it stands; the last three are for ever.
+        progress: 0..1.
+        detail: what is being done, or why it failed.
+        result: what came of it.
+        created, started, ended: Unix time [s].
+    """
+
+    id: str
+    kind: str
+    state: JobState = "queued"
+    progress: float = 0.0
+    detail: str | None = None
+    result: dict[str, Any] | None = field(default=None, repr=False)
+    created: float = field(default_factory=time.time)
+    started: float | None = None
+    ended: float | None = None
+
+
+class JobHandle:
+    """What the work of a job knows of it."""
+
+    def __init__(self, jobs: Jobs, job_id: str) -> None:
+        self._jobs = jobs
+        self.id = job_id
+        self.cancelled = threading.Event()
+
+    def tell(self, progress: float, detail: str | None = None) -> None:
+        """Say how far it is (0..1), and what is being done.
+
+        Raises:
+            JobCancelled: nobody wants it any more.
+        """
+        if self.cancelled.is_set():
+            raise JobCancelled
+        self._jobs._change(self.id, progress=min(max(progress, 0.0), 1.0), detail=detail)
+
+
+Work = Callable[[JobHandle], dict[str, Any]]
+
+
+class Jobs:
+    """A queue of jobs and the threads that work on it; every change of a job goes to the bus (``jobs/{id}``).
+
+    Args:
+        bus: told of each change.
+        workers: jobs that run at once.
+        capacity: jobs that may wait.
+    """
+
+    def __init__(self, bus: Bus, *, workers: int = 1, capacity: int = 16) -> None:
+        self._bus = bus
+        self._capacity = capacity
+        self._lock = threading.Lock()
+        self._jobs: dict[str, Job] = {}
+        self._handles: dict[str, JobHandle] = {}
+        self._keys: dict[str, tuple[str, str]] = {}
+        self._waiting: queue.Queue[tuple[JobHandle, Work] | None] = queue.Queue()
+        self._closed = False
+        self._threads = [threading.Thread(target=self._run, name=f"job-{i}", daemon=True) for i in range(workers)]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, kind: str, work: Work, *, key: str | None = None, request: str = "") -> tuple[Job, bool]:
+        """Queue work; the job and whether it is new.
+
+        Args:
+            kind: what is done.
+            work: runs in a thread and returns the result; its SplatbotErrors become the job's detail.
+            key: of the request (Idempotency-Key): asked again with it, the same job is returned.
+            request: what the key stands for; another request under the same key is refused.
+
+        Raises:
+            BusyError: as many jobs wait as may, or the service is about to stop.
+            IdempotencyError: the key belongs to another request.
+        """
+        with self._lock:
+            if key is not None and key in self._keys:
+                job_id, before = self._keys[key]
+                if before != request:
+                    hint = "use a new key for a new request"
+                    raise IdempotencyError("was used for another request.", field="Idempotency-Key", hint=hint)
+                return self._jobs[job_id], False
+            waiting = sum(job.state == "queued" for job in self._jobs.values())
+            if self._closed or waiting >= self._capacity:
+                why = "the service is stopping" if self._closed else f"{waiting} jobs wait"
+                raise BusyError(f"{why}.", hint="try again later")
+            job = Job(uuid4().hex[:16], kind)
+            handle = JobHandle(self, job.id)
+            self._jobs[job.id], self._handles[job.id] = job, handle
+            if key is not None:
+                self._keys[key] = job.id, request
+            self._tell(job)
+            self._waiting.put((handle, work))
+            self._forget_old()
+        return job, True
+
+    def get(self, job_id: str) -> Job:
+        """The job as it stands.
+
+        Raises:
+            JobNotFoundError: there is none of that id.
+        """
+        with self._lock:
+            return self._find(job_id)
+
+    def list(self) -> tuple[Job, ...]:
+        """All jobs, the oldest first."""
+        with self._lock:
+            return tuple(self._jobs.values())
+
+    def cancel(self, job_id: str) -> Job:
+        """Ask a job to end: one that waits ends now, one that runs when its work looks. One that has ended stays so.
+
+        Raises:
+            JobNotFoundError: there is none of that id.
+        """
+        with self._lock:
+            job = self._find(job_id)
+            self._handles[job_id].cancelled.set()
+            if job.state == "queued":
+                job = self._put(replace(job, state="cancelled", ended=time.time()))
+        return job
+
+    def close(self, timeout_s: float) -> None:
+        """Take no more, cancel all, and wait for those that run up to ``timeout_s`` [s]."""
+        with self._lock:
+            self._closed = True
+            running = list(self._jobs.values())
+        for job in running:
+            if job.state not in ENDED:
+                self.cancel(job.id)
+        for _ in self._threads:
+            self._waiting.put(None)
+        deadline = time.monotonic() + timeout_s
+        for thread in self._threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _run(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            self._work(*item)
+
+    def _work(self, handle: JobHandle, work: Work) -> None:
+        with self._lock:
+            job = self._jobs[handle.id]
+            if job.state != "queued":
+                return
+            self._put(replace(job, state="running", started=time.time()))
+        try:
+            result = work(handle)
+            self._change(handle.id, state="succeeded", progress=1.0, detail=None, result=result, ended=time.time())
+        except JobCancelled:
+            self._change(handle.id, state="cancelled", ended=time.time())
+        except SplatbotError as error:
+            told = f"{error.field}: {error.message}" if error.field else error.message
+            self._change(handle.id, state="failed", detail=told, ended=time.time())
+        except Exception:
+            _log.exception("job %s failed", handle.id)
+            told = "unexpected error; the service's log says more"
+            self._change(handle.id, state="failed", detail=told, ended=time.time())
+
+    def _change(self, job_id: str, **changes: Any) -> None:
+        with self._lock:
+            self._put(replace(self._jobs[job_id], **changes))
+
+    def _put(self, job: Job) -> Job:
+        self._jobs[job.id] = job
+        self._tell(job)
+        return job
+
+    def _tell(self, job: Job) -> None:
+        self._bus.publish(job_topic(job.id), job)
+
+    def _find(self, job_id: str) -> Job:
+        if job_id not in self._jobs:
+            raise JobNotFoundError(f"No job {job_id[:40]!r}.", hint="GET /v1/jobs lists them")
+        return self._jobs[job_id]
+
+    def _forget_old(self) -> None:
+        ended = [job.id for job in self._jobs.values() if job.state in ENDED]
+        for job_id in ended[: max(0, len(ended) - _KEPT)]:
+            del self._jobs[job_id], self._handles[job_id]
+            self._bus.forget(job_topic(job_id))
+            self._keys = {key: value for key, value in self._keys.items() if value[0] != job_id}

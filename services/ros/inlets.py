@@ -1,0 +1,120 @@
+"""Frames and joints that clients publish as ROS messages."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from splatbot.camera import Camera
+from splatbot.errors import SplatbotError
+from splatbot.frame import Frame
+from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
+from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of
+from splatbot.logs.tum import MAX_DIFFERENCE
+from splatbot.logs.undistort import Undistorter
+from splatbot.services.bus import Bus
+from splatbot.services.ros.graph import RosGraph
+from splatbot.services.ros.messages import joints_of
+from splatbot.services.ros.outlets import FROM_ROS
+from splatbot.services.ros.wire import RosMessage
+from splatbot.services.topics import JOINTS as ROBOT_JOINTS
+from splatbot.services.topics import robot_topic
+
+_WAITING = 16
+
+_log = logging.getLogger(__name__)
+
+
+class RosInlets:
+    """A thread that makes frames of the images that clients publish, and tells the bus of their joint states.
+
+    A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. What cannot
+    be used is logged, and so told on /rosout.
+
+    Args:
+        graph: where clients publish.
+        bus: told of joints.
+        robot: whose joints /joint_states are.
+        on_frame: called with each frame; None: nobody maps them, images are only passed on to other clients.
+    """
+
+    def __init__(
+        self, graph: RosGraph, bus: Bus, *, robot: str = "panda", on_frame: Callable[[Frame], Any] | None = None
+    ) -> None:
+        self._bus, self._robot, self._on_frame = bus, robot, on_frame
+        self._pairs = FramePairs()
+        self._news = graph.subscribe(COLOR, DEPTH, INFO, JOINTS, capacity=_WAITING)
+        self._thread = threading.Thread(target=self._run, name="ros-inlets", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """End."""
+        self._news.close()
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        for news in self._news:
+            value: RosMessage = news.value
+            if value.client == 0:
+                continue
+            try:
+                self._take(news.topic, value)
+            except SplatbotError as error:
+                _log.warning("%s from a client: %s", news.topic, error)
+            except Exception:  # one odd message must not end the others
+                _log.exception("%s from a client could not be used", news.topic)
+
+    def _take(self, topic: str, value: RosMessage) -> None:
+        if topic == JOINTS:
+            self._bus.publish(robot_topic(self._robot, ROBOT_JOINTS), joints_of(value.message))
+        elif self._on_frame is not None and (frame := self._pairs.add(topic, value.message)) is not None:
+            self._on_frame(frame)
+
+
+class FramePairs:
+    """Colour and depth images as they come, paired by time."""
+
+    def __init__(self) -> None:
+        self._camera: Camera | None = None
+        self._undistort: Undistorter | None = None
+        self._waiting: dict[str, OrderedDict[float, Any]] = {COLOR: OrderedDict(), DEPTH: OrderedDict()}
+        self._count = 0
+
+    def add(self, topic: str, message: Any) -> Frame | None:
+        """The frame that an image completes, if it does.
+
+        Raises:
+            InputError: the image or the intrinsics make no sense, or do not belong together.
+        """
+        if topic == INFO:
+            camera = camera_of(message)
+            if self._undistort is None or camera != self._camera:
+                self._undistort = Undistorter(camera) if camera.distortion else None
+            self._camera = camera
+            return None
+        stamp, other = seconds_of(message.header.stamp), self._waiting[DEPTH if topic == COLOR else COLOR]
+        nearest = min(other, key=lambda known: abs(known - stamp), default=None)
+        if self._camera is None or nearest is None or abs(nearest - stamp) > MAX_DIFFERENCE:
+            self._waiting[topic][stamp] = message
+            while len(self._waiting[topic]) > _WAITING:
+                self._waiting[topic].popitem(last=False)
+            return None
+        partner = other.pop(nearest)
+        color, depth = (message, partner) if topic == COLOR else (partner, message)
+        return self._frame(seconds_of(color.header.stamp), color, depth)
+
+    def _frame(self, stamp: float, color: Any, depth: Any) -> Frame:
+        assert self._camera is not None
+        rgb, z = color_of(color), depth_of(depth)
+        camera = self._camera
+        if self._undistort is not None and rgb.shape[:2] == z.shape == (camera.height, camera.width):
+            rgb, z, camera = self._undistort.color(rgb), self._undistort.depth(z), self._undistort.camera
+        self._count += 1
+        return Frame(stamp, rgb, z, camera, self._count - 1, source=FROM_ROS)

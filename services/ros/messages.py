@@ -1,0 +1,208 @@
+"""What the service knows as ROS messages: the map, the camera's way, the robot, plans.
+
+Frames: "map" is the map's world, "camera" the camera's optical frame (x right, y down, z forward).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.logs.ros_frames import header, joint_state_message, pose_message, time_of
+from splatbot.logs.ros_types import Message, build
+from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.services.topics import JointState
+from splatbot.slam import FrameResult
+from splatbot.trajectory import Trajectory
+
+MAP_FRAME, CAMERA_FRAME = "map", "camera"
+
+_FLOAT32 = 7  # of sensor_msgs/PointField
+_SPLAT_FIELDS = ("opacity", "scale_x", "scale_y", "scale_z", "rot_x", "rot_y", "rot_z", "rot_w")
+_SPHERE, _LINE_STRIP = 2, 4  # of visualization_msgs/Marker
+
+
+def point_cloud_message(model: GaussianModel, stamp: float, *, splats: bool = True) -> Message:
+    """sensor_msgs/PointCloud2 of N Gaussians in the map frame: x y z rgb, one float32 each.
+
+    Args:
+        splats: add opacity, scales [m] and the rotation (xyzw): the whole Gaussian but for higher harmonics.
+    """
+    names = ["x", "y", "z", "rgb", *(_SPLAT_FIELDS if splats else ())]
+    table = np.zeros((len(model), len(names)), np.float32)
+    with torch.no_grad():
+        table[:, :3] = model.means.numpy()
+        table[:, 3] = _packed(model.colors.numpy())
+        if splats:
+            table[:, 4] = model.opacities.numpy()
+            table[:, 5:8] = model.scales.numpy()
+            table[:, 8:] = torch.nn.functional.normalize(model.quats, dim=1).numpy()[:, [1, 2, 3, 0]]
+    return build(
+        "sensor_msgs/msg/PointCloud2",
+        header=header(stamp, MAP_FRAME),
+        height=1,
+        width=len(table),
+        fields=[{"name": n, "offset": 4 * i, "datatype": _FLOAT32, "count": 1} for i, n in enumerate(names)],
+        point_step=4 * len(names),
+        row_step=table.nbytes,
+        data=table.reshape(-1).view(np.uint8),
+        is_dense=True,
+    )
+
+
+def points_of(message: Message) -> dict[str, NDArray[np.float32]]:
+    """The float32 fields (N,) of a PointCloud2 by name; "rgb" is (N, 3) in 0..1.
+
+    Raises:
+        InputError: a field is of another type, or the data are cut short.
+    """
+    count, step = int(message.width) * int(message.height), int(message.point_step)
+    data = np.asarray(message.data, np.uint8)
+    if any(f.datatype != _FLOAT32 or f.offset + 4 > step for f in message.fields) or data.size < count * step:
+        raise InputError("has fields of another type, or too few bytes.", field="data", hint="send FLOAT32 fields")
+    table = data[: count * step].reshape(count, step)
+    found = {
+        f.name: np.ascontiguousarray(table[:, f.offset : f.offset + 4]).view(np.float32)[:, 0] for f in message.fields
+    }
+    if "rgb" in found:
+        packed = found["rgb"].view(np.uint32)
+        found["rgb"] = np.stack([(packed >> shift & 255) / np.float32(255) for shift in (16, 8, 0)], -1)
+    return found
+
+
+def odometry_message(result: FrameResult) -> Message:
+    """nav_msgs/Odometry of a tracked frame's camera in the map frame, with the pose's covariance.
+
+    Raises:
+        ValueError: the frame was lost.
+    """
+    if result.T_world_camera is None:
+        raise ValueError(f"frame {result.index} was lost")
+    covariance = np.zeros((6, 6))
+    if result.covariance is not None:  # ROS wants fixed axes of the header's frame
+        turn = np.kron(np.eye(2), result.T_world_camera[:3, :3])
+        covariance = turn @ result.covariance @ turn.T
+    return build(
+        "nav_msgs/msg/Odometry",
+        header=header(result.stamp, MAP_FRAME),
+        child_frame_id=CAMERA_FRAME,
+        pose={"pose": pose_message(result.T_world_camera), "covariance": covariance.ravel()},
+    )
+
+
+def transform_message(stamp: float, T_parent_child: ArrayLike, parent: str, child: str) -> Message:
+    """tf2_msgs/TFMessage of one transform (4, 4)."""
+    pose = pose_message(T_parent_child)
+    transform = {"translation": {a: getattr(pose.position, a) for a in "xyz"}, "rotation": pose.orientation}
+    stamped = {"header": header(stamp, parent), "child_frame_id": child, "transform": transform}
+    return build("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+def path_message(trajectory: Trajectory) -> Message:
+    """nav_msgs/Path of the camera in the map frame."""
+    stamp = float(trajectory.stamps[-1]) if len(trajectory) else 0.0
+    poses = [
+        {"header": header(float(t), MAP_FRAME), "pose": pose_message(T)}
+        for t, T in zip(trajectory.stamps, trajectory.T_world_camera, strict=True)
+    ]
+    return build("nav_msgs/msg/Path", header=header(stamp, MAP_FRAME), poses=poses)
+
+
+def joints_message(state: JointState) -> Message:
+    """sensor_msgs/JointState."""
+    message = joint_state_message(state.stamp, state.position, state.names)
+    if state.velocity is not None:
+        message.velocity = np.asarray(state.velocity, np.float64)
+    return message
+
+
+def joints_of(message: Message) -> JointState:
+    """The joints that a sensor_msgs/JointState tells.
+
+    Raises:
+        InputError: there are more or fewer positions than names, or one is not finite.
+    """
+    q = np.asarray(message.position, np.float64)
+    if len(q) != len(message.name) or not len(q) or not np.isfinite(q).all():
+        raise InputError(f"has {len(q)} values.", field="position", hint="give one finite number for each name")
+    velocity = np.asarray(message.velocity, np.float64)
+    seconds = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+    return JointState(seconds, tuple(message.name), q, velocity if len(velocity) == len(q) else None)
+
+
+def joint_trajectory_message(trajectory: RobotTrajectory, *, frame_id: str = "") -> Message:
+    """trajectory_msgs/JointTrajectory, a point every 10 ms."""
+    return build("trajectory_msgs/msg/JointTrajectory", trajectory.to_ros(frame_id=frame_id))
+
+
+def waypoints_of(message: Message) -> tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]:
+    """Names, times (N,) [s] and positions (N, J) of a JointTrajectory.
+
+    Raises:
+        InputError: it has no points, sizes differ, a value is not finite or the times do not increase.
+    """
+    times = np.array([p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points])
+    sizes = {len(p.positions) for p in message.points}
+    if sizes != {len(message.joint_names)} or not message.joint_names:
+        hint = f"give {len(message.joint_names)} values in each point"
+        raise InputError(f"have {sorted(sizes)} positions.", field="points", hint=hint)
+    positions = np.stack([p.positions for p in message.points])
+    if not np.isfinite(positions).all() or (np.diff(times) <= 0).any() or times[0] < 0:
+        raise InputError("are not finite, or not in order.", field="points", hint="let time_from_start increase")
+    return tuple(message.joint_names), times, positions
+
+
+def camera_way_message(trajectory: Trajectory) -> Message:
+    """visualization_msgs/MarkerArray: the camera's way as a line in the map frame."""
+    points = [dict(zip("xyz", p, strict=True)) for p in trajectory.positions.tolist()]
+    return _markers([_marker("camera", 0, _LINE_STRIP, 0.005, (0.1, 0.8, 1.0), points=points)], trajectory)
+
+
+def spheres_message(stamp: float, centers: ArrayLike, radii: ArrayLike, colors: ArrayLike) -> Message:
+    """visualization_msgs/MarkerArray of S spheres in the map frame: (S, 3) [m], (S,) [m], RGB (S, 3) 0..1."""
+    at, r, rgb = (np.asarray(a, np.float64) for a in (centers, radii, colors))
+    markers = []
+    for i in range(len(at)):
+        marker = _marker("robot", i, _SPHERE, 2 * float(r[i]), rgb[i].tolist())
+        marker["pose"] = {"position": dict(zip("xyz", at[i].tolist(), strict=True)), "orientation": {"w": 1.0}}
+        marker["header"] = header(stamp, MAP_FRAME)
+        markers.append(marker)
+    return build("visualization_msgs/msg/MarkerArray", markers=markers)
+
+
+def _markers(markers: Sequence[dict[str, Any]], trajectory: Trajectory) -> Message:
+    stamp = float(trajectory.stamps[-1]) if len(trajectory) else 0.0
+    for marker in markers:
+        marker["header"] = header(stamp, MAP_FRAME)
+    return build("visualization_msgs/msg/MarkerArray", markers=list(markers))
+
+
+def _marker(
+    ns: str, number: int, kind: int, width: float, color: Sequence[float], *, points: Sequence[Any] = ()
+) -> dict[str, Any]:
+    return {
+        "ns": ns,
+        "id": number,
+        "type": kind,
+        "pose": {"orientation": {"w": 1.0}},
+        "scale": {"x": width, "y": width, "z": width},
+        "color": {"r": color[0], "g": color[1], "b": color[2], "a": 1.0},
+        "points": list(points),
+    }
+
+
+def _packed(colors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """RGB (N, 3) in 0..1 as the bytes 0x00RRGGBB of a float, which RViz and PCL expect."""
+    r, g, b = (np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint32)).T
+    return ((r << 16) | (g << 8) | b).view(np.float32)
+
+
+def log_message(level: int, name: str, text: str, stamp: float) -> Message:
+    """rcl_interfaces/Log; ``level`` as of Python's logging, which ROS 2 shares."""
+    return build("rcl_interfaces/msg/Log", stamp=time_of(stamp), level=min(level, 50), name=name, msg=text)

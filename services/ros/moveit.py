@@ -1,0 +1,210 @@
+"""Planning, inverse kinematics and state checks as MoveIt's services (moveit_msgs) name them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.collision import RobotSpheres
+from splatbot.errors import InputError, MapNotFoundError, SplatbotError
+from splatbot.geometry import inverse
+from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal, time_path
+from splatbot.robots.ik import solve_ik
+from splatbot.robots.robot import RobotModel
+from splatbot.robots.store import load_robot
+from splatbot.services.ros.graph import RosGraph, Service
+from splatbot.services.ros.messages import MAP_FRAME
+from splatbot.services.ros.requests import entries, entry, joints, number, pose, vector
+from splatbot.services.store import MapStore, ServedMap
+from splatbot.services.topics import PLAN, map_topic
+
+PLAN_SERVICE, IK_SERVICE, VALIDITY_SERVICE = "/plan_kinematic_path", "/compute_ik", "/check_state_validity"
+
+# Of moveit_msgs/MoveItErrorCodes; the planner's own are PlanStatus.
+_FRAME_TRANSFORM_FAILURE, _INVALID_GOAL = -21, -16
+_BUDGET_MS, _LONGEST_MS = 200.0, 10_000.0
+_RATE = 100.0  # points of an answer's trajectory per second
+
+
+class MoveItServices:
+    """GetMotionPlan, GetPositionIK and GetStateValidity on the maps of a store.
+
+    Poses are in the frame "map" (or "world", or none named) or in the robot's base (`base_link`, the first link). What
+    fails is told by ``error_code``, with the reason as its ``message``.
+
+    Args:
+        graph: is told of the services.
+        store: the maps; the one called "default", or else the first, is asked.
+        robot: the arm.
+    """
+
+    def __init__(self, graph: RosGraph, store: MapStore, *, robot: str = "panda") -> None:
+        self._store, self._name = store, robot
+        for name, kind, call in (
+            (PLAN_SERVICE, "GetMotionPlan", self.plan),
+            (IK_SERVICE, "GetPositionIK", self.ik),
+            (VALIDITY_SERVICE, "GetStateValidity", self.validity),
+        ):
+            graph.serve(name, Service(f"moveit_msgs/srv/{kind}", call))
+
+    def plan(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        """moveit_msgs/GetMotionPlan; joint goals, or a position and orientation constraint of the tool."""
+        begin = time.perf_counter()
+        answer: dict[str, Any] = {"group_name": self._name, "trajectory_start": {}, "trajectory": {}}
+
+        def work() -> dict[str, Any]:
+            request = entry(args, "motion_plan_request")
+            served, robot, base = self._place()
+            start = joints(request, "start_state.joint_state", robot)
+            goal = self._goal(request, robot, base)
+            budget = min(1e3 * number(request, "allowed_planning_time") or _BUDGET_MS, _LONGEST_MS)
+            planner = GaussianRRTStar(served.field, robot, T_world_base=base)
+            path = planner.plan(start, goal, budget_ms=budget).unwrap()
+            speed = number(request, "max_velocity_scaling_factor") or 1.0
+            trajectory = time_path(path, planner.arm, served.field, velocity_scale=speed)
+            self._store.bus.publish(map_topic(served.id, PLAN), trajectory)
+            return {
+                "trajectory_start": {"joint_state": {"name": list(robot.chain.names), "position": start}},
+                "trajectory": {"joint_trajectory": trajectory.to_ros(rate=_RATE)},
+            }
+
+        told = answer | _coded(work)
+        return {"motion_plan_response": told | {"planning_time": time.perf_counter() - begin}}
+
+    def ik(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        """moveit_msgs/GetPositionIK: the posture nearest to the seed that brings the tool there."""
+
+        def work() -> dict[str, Any]:
+            request = entry(args, "ik_request")
+            served, robot, base = self._place()
+            near = joints(request, "robot_state.joint_state", robot)
+            wanted = pose(request, "pose_stamped.pose")
+            if not self._in_base(request, "pose_stamped.header.frame_id"):
+                wanted = inverse(base) @ wanted
+            arm = RobotSpheres(robot, T_world_base=base)
+
+            def free(q: NDArray[np.float64]) -> NDArray[np.bool_]:
+                return ~arm.check(served.field, q).in_collision
+
+            avoid = bool(entry(request, "avoid_collisions"))
+            found = solve_ik(robot, wanted, near=near, free=free if avoid else None)
+            if not len(found.q):
+                return _code(PlanStatus.NO_IK_SOLUTION, f"{found.reached} of {found.tried} tries reached it, none free")
+            return {"solution": {"joint_state": {"name": list(robot.chain.names), "position": found.q[0]}}}
+
+        return {"solution": {}} | _coded(work)
+
+    def validity(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        """moveit_msgs/GetStateValidity; the contact is the one of least clearance.
+
+        Raises:
+            SplatbotError: the request makes no sense, or there is no map: this service has no error code.
+        """
+        served, robot, base = self._place()
+        q = joints(args, "robot_state.joint_state", robot)[None]
+        arm = RobotSpheres(robot, T_world_base=base)
+        verdict, room = arm.check(served.field, q), arm.clearance(served.field, q)
+        contacts = []
+        if verdict.in_collision[0]:
+            other = int(verdict.other[0])
+            contacts.append(
+                {
+                    "contact_body_1": f"link{int(verdict.link[0])}",
+                    "body_type_1": 0,
+                    "contact_body_2": f"link{other}" if other >= 0 else "map",
+                    "body_type_2": 0 if other >= 0 else 1,
+                    "depth": max(-float(room.distance[0]), 0.0),
+                }
+            )
+        inside = bool(robot.within_limits(q)[0])
+        limits = [] if inside else [{"result": False, "distance": 0.0}]
+        valid = inside and not verdict.in_collision[0]
+        return {"valid": valid, "contacts": contacts, "cost_sources": [], "constraint_result": limits}
+
+    def _place(self) -> tuple[ServedMap, RobotModel, NDArray[np.float64]]:
+        """The map that is asked, the arm, and where it stands."""
+        served = main_map(self._store)
+        known = served.workspace.T_world_base if served.workspace is not None else None
+        if known is None:
+            hint = "keep a scene.yaml beside the map: splatbot info MAP --fit-plane estimates one"
+            raise FrameError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
+        return served, load_robot(self._name), known
+
+    def _in_base(self, args: Any, path: str) -> bool:
+        frame = str(entry(args, path) or MAP_FRAME).strip("/")
+        if frame in (MAP_FRAME, "world"):
+            return False
+        if frame in ("base_link", f"{self._name}_link0"):
+            return True
+        hint = f"use {MAP_FRAME}, world, base_link or {self._name}_link0"
+        raise FrameError(f"{frame[:40]!r} is unknown.", field=path, hint=hint)
+
+    def _goal(self, request: Any, robot: RobotModel, base: NDArray[np.float64]) -> JointGoal | PoseGoal:
+        goals = entries(request, "goal_constraints")
+        if not goals:
+            raise InputError("are missing.", field="goal_constraints", hint="give joint_constraints, or a pose")
+        if entries(goals[0], "joint_constraints"):
+            return JointGoal(np.stack([_joint_goal(goal, robot) for goal in goals]))
+        return self._pose_goal(goals[0], base)
+
+    def _pose_goal(self, goal: Any, base: NDArray[np.float64]) -> PoseGoal:
+        at, turn = (next(iter(entries(goal, f"{kind}_constraints")), None) for kind in ("position", "orientation"))
+        region = next(iter(entries(at, "constraint_region.primitive_poses")), None)
+        if region is None:
+            raise InputError("has no region.", field="position_constraints", hint="give a primitive and its pose")
+        size = entry(next(iter(entries(at, "constraint_region.primitives")), None), "dimensions") or [0.0]
+        centre = vector(region, "position") + vector(at, "target_point_offset")
+        if turn is None:
+            T, tolerance = pose({"p": {"position": {}, "orientation": {"w": 1.0}}}, "p"), np.full(3, np.pi)
+        else:
+            T = pose({"p": {"orientation": entry(turn, "orientation")}}, "p")
+            tolerance = np.array([number(turn, f"absolute_{axis}_axis_tolerance") for axis in "xyz"])
+        T[:3, 3] = centre
+        if self._in_base(at, "header.frame_id"):
+            T = base @ T
+        half = np.resize(np.asarray(size, np.float64), 3) * (0.5 if len(size) == 3 else 1.0)  # a box's edges; a radius
+        return PoseGoal(T, position=half, angle=tolerance)
+
+
+class FrameError(InputError):
+    """A frame is unknown (FRAME_TRANSFORM_FAILURE)."""
+
+    code = _FRAME_TRANSFORM_FAILURE
+
+
+def main_map(store: MapStore) -> ServedMap:
+    """The map that ROS' unqualified names mean: "default", or else the first.
+
+    Raises:
+        MapNotFoundError: there is none.
+    """
+    maps = store.list()
+    if not maps:
+        raise MapNotFoundError("there is no map.", hint="start the service with one")
+    return next((served for served in maps if served.id == "default"), maps[0])
+
+
+def _joint_goal(goal: Any, robot: RobotModel) -> NDArray[np.float64]:
+    named = {str(entry(c, "joint_name")): number(c, "position") for c in entries(goal, "joint_constraints")}
+    missing = [name for name in robot.chain.names if name not in named]
+    if missing:
+        hint = "constrain every joint"
+        raise InputError(f"lack {', '.join(missing)}.", field="joint_constraints", hint=hint)
+    return np.array([named[name] for name in robot.chain.names])
+
+
+def _coded(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What ``work`` gives with a success code, or the code and reason of its error."""
+    try:
+        return _code(PlanStatus.SUCCESS, "") | work()
+    except SplatbotError as error:
+        code = _INVALID_GOAL if type(error) is InputError else error.code
+        return _code(code, str(error))
+
+
+def _code(value: int, message: str) -> dict[str, Any]:
+    return {"error_code": {"val": int(value), "message": message, "source": "splatbot"}}

@@ -1,0 +1,45 @@
+"""All of the service's ROS side, started and stopped with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from splatbot.frame import Frame
+from splatbot.services.ros.graph import RosGraph
+from splatbot.services.ros.inlets import RosInlets
+from splatbot.services.ros.moveit import MoveItServices
+from splatbot.services.ros.nvblox import NvbloxServices
+from splatbot.services.ros.outlets import RosOutlets
+from splatbot.services.ros.rosapi import RosApi
+from splatbot.services.store import MapStore
+
+
+class RosNode:
+    """Topics and services of a store's maps.
+
+    Args:
+        store: the maps, and the bus that tells of them.
+        robot: whose joints /joint_states are, and which plans are made for where a request names none.
+        on_frame: called with each frame that clients publish; None: nobody maps them.
+    """
+
+    def __init__(
+        self, store: MapStore, *, robot: str = "panda", on_frame: Callable[[Frame], Any] | None = None
+    ) -> None:
+        self.graph = RosGraph()
+        RosApi(self.graph)
+        MoveItServices(self.graph, store, robot=robot)
+        NvbloxServices(self.graph, store)
+        self._outlets = RosOutlets(store.bus, self.graph)
+        self._inlets = RosInlets(self.graph, store.bus, robot=robot, on_frame=on_frame)
+
+    def start(self) -> None:
+        """Begin."""
+        self._outlets.start()
+        self._inlets.start()
+
+    def stop(self) -> None:
+        """End."""
+        self._outlets.stop()
+        self._inlets.stop()

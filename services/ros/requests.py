@@ -1,0 +1,98 @@
+"""Reading the nested requests of ROS services, where anything may be missing or of another type."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import InputError
+from splatbot.geometry import pose_from_quat
+from splatbot.robots.robot import RobotModel
+
+
+def entry(args: Any, path: str) -> Any:
+    """``args.a.b.c`` of a dotted path; None where it is not given."""
+    for key in path.split("."):
+        if not isinstance(args, Mapping):
+            return None
+        args = args.get(key)
+    return args
+
+
+def entries(args: Any, path: str) -> Sequence[Any]:
+    """The list at a dotted path, empty where it is not given.
+
+    Raises:
+        InputError: there is something else.
+    """
+    found = entry(args, path)
+    if found is None:
+        return ()
+    if not isinstance(found, list):
+        raise InputError("is no list.", field=path, hint="give a list")
+    return found
+
+
+def number(args: Any, path: str, default: float = 0.0) -> float:
+    """The number at a dotted path.
+
+    Raises:
+        InputError: it is no finite number.
+    """
+    value = entry(args, path)
+    if value is None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise InputError(f"is {str(value)[:40]!r}.", field=path, hint="give a number")
+    return float(value)
+
+
+def seconds(args: Any, path: str) -> float:
+    """A builtin_interfaces/Duration [s]; 0 where it is not given."""
+    return number(args, f"{path}.sec", number(args, f"{path}.secs")) + 1e-9 * number(
+        args, f"{path}.nanosec", number(args, f"{path}.nsecs")
+    )
+
+
+def vector(args: Any, path: str) -> NDArray[np.float64]:
+    """A geometry_msgs/Point or Vector3 (3,) [m].
+
+    Raises:
+        InputError: a coordinate is no finite number.
+    """
+    return np.array([number(args, f"{path}.{axis}") for axis in "xyz"])
+
+
+def pose(args: Any, path: str) -> NDArray[np.float64]:
+    """A geometry_msgs/Pose (4, 4) [m].
+
+    Raises:
+        InputError: it is missing, or its quaternion is zero.
+    """
+    if entry(args, path) is None:
+        raise InputError("is missing.", field=path, hint="give position and orientation")
+    xyzw = [number(args, f"{path}.orientation.{axis}") for axis in "xyzw"]
+    try:
+        return pose_from_quat(vector(args, f"{path}.position"), [xyzw[3], *xyzw[:3]])
+    except ValueError as error:
+        raise InputError(f"{error}.", field=f"{path}.orientation", hint="w = 1 is no rotation") from error
+
+
+def joints(args: Any, path: str, robot: RobotModel) -> NDArray[np.float64]:
+    """The configuration (J,) of a sensor_msgs/JointState, its joints in any order; home where it is empty.
+
+    Raises:
+        InputError: a joint of the robot is missing, or a value is no finite number.
+    """
+    names, values = list(entries(args, f"{path}.name")), entries(args, f"{path}.position")
+    if not names and not values:
+        return np.asarray(robot.home, np.float64)
+    named = dict(zip(map(str, names), values, strict=False))
+    missing = [name for name in robot.chain.names if name not in named]
+    if missing or len(names) != len(values):
+        hint = f"name {', '.join(robot.chain.names)}, each with its position"
+        raise InputError(f"lacks {', '.join(missing) or 'positions'}.", field=path, hint=hint)
+    return np.array([number(named, name) for name in robot.chain.names])

@@ -1,0 +1,105 @@
+"""/rosapi: what clients ask of topics, services and types before they use them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+
+from splatbot.logs.ros_types import definition, full_name, typestore
+from splatbot.services.ros.graph import RosGraph, Service, resolve
+
+NODE = "/splatbot"
+
+
+class RosApi:
+    """The services of /rosapi on a graph.
+
+    Args:
+        graph: is told of them.
+    """
+
+    def __init__(self, graph: RosGraph) -> None:
+        self._graph = graph
+        calls = {
+            "topics": ("Topics", self._topics),
+            "topics_and_raw_types": ("TopicsAndRawTypes", self._topics_and_raw_types),
+            "topic_type": ("TopicType", self._topic_type),
+            "topics_for_type": ("TopicsForType", self._topics_for_type),
+            "services": ("Services", self._services),
+            "service_type": ("ServiceType", self._service_type),
+            "services_for_type": ("ServicesForType", self._services_for_type),
+            "nodes": ("Nodes", lambda _: {"nodes": [NODE]}),
+            "publishers": ("Publishers", lambda _: {"publishers": [NODE]}),
+            "subscribers": ("Subscribers", lambda _: {"subscribers": [NODE]}),
+            "get_time": ("GetTime", self._get_time),
+            "get_ros_version": ("GetROSVersion", lambda _: {"version": 2, "distro": "jazzy"}),
+            "message_details": ("MessageDetails", self._message_details),
+        }
+        for name, (kind, call) in calls.items():
+            graph.serve(f"/rosapi/{name}", Service(f"rosapi_msgs/srv/{kind}", call))
+
+    def _topics(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        topics = self._graph.topics
+        return {"topics": list(topics), "types": list(topics.values())}
+
+    def _topics_and_raw_types(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        topics = self._graph.topics
+        texts = [definition(kind) for kind in topics.values()]
+        return {"topics": list(topics), "types": list(topics.values()), "typedefs_full_text": texts}
+
+    def _topic_type(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        return {"type": self._graph.topics.get(resolve(args.get("topic")), "")}
+
+    def _topics_for_type(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        kind = full_name(str(args.get("type", "")))
+        return {"topics": [topic for topic, known in self._graph.topics.items() if known == kind]}
+
+    def _services(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        return {"services": list(self._graph.services)}
+
+    def _service_type(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        found = self._graph.services.get(resolve(args.get("service")))
+        return {"type": found.type if found else ""}
+
+    def _services_for_type(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        return {"services": [name for name, s in self._graph.services.items() if s.type == args.get("type")]}
+
+    @staticmethod
+    def _get_time(_: Mapping[str, Any]) -> dict[str, Any]:
+        sec, nanosec = divmod(time.time_ns(), 10**9)
+        # Clients of ROS 1 read secs and nsecs, those of ROS 2 sec and nanosec.
+        return {"time": {"sec": sec, "nanosec": nanosec, "secs": sec, "nsecs": nanosec}}
+
+    @staticmethod
+    def _message_details(args: Mapping[str, Any]) -> dict[str, Any]:
+        todo, done = [full_name(str(args.get("type", "")))], {}
+        while todo:
+            kind = todo.pop(0)
+            done[kind] = _type_definition(kind)
+            todo += [t for t in done[kind]["fieldtypes"] if t in typestore().fielddefs and t not in done]
+        return {"typedefs": list(done.values())}
+
+
+def _type_definition(kind: str) -> dict[str, Any]:
+    """rosapi_msgs/TypeDef: array lengths are -1 for none, 0 for any."""
+    constants, fields = typestore().fielddefs[kind]
+    names, types, lengths = [], [], []
+    for name, (node, what) in fields:
+        length = -1
+        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (node, what), length = what  # of a sequence 0
+        names.append(name)
+        types.append(what if node is Nodetype.NAME else what[0])
+        lengths.append(length)
+    return {
+        "type": kind,
+        "fieldnames": names,
+        "fieldtypes": types,
+        "fieldarraylen": lengths,
+        "examples": ["" for _ in names],
+        "constnames": [name for name, _, _ in constants],
+        "constvalues": [str(value) for _, _, value in constants],
+    }

@@ -1,0 +1,237 @@
+"""One rosbridge client: what it may ask, and what it is answered. Knows nothing of WebSockets."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import itertools
+import json
+import logging
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+from splatbot.errors import InputError, SplatbotError
+from splatbot.logs.ros_types import build, full_name
+from splatbot.services.ros.graph import RosGraph, Service, resolve
+from splatbot.services.ros.rosbridge.packing import (
+    Fragments,
+    check_compression,
+    check_fragment_size,
+    pack,
+    split,
+    unpack_png,
+)
+from splatbot.services.ros.rosbridge.subscriptions import Send, Subscriptions
+
+_LEVELS = ("none", "error", "warning", "info")
+_CALLS = 16  # services that one client may have called without an answer
+_ANSWER_S = 60.0  # [s] that a client may take to serve a call
+_numbers = itertools.count(1)
+
+_log = logging.getLogger(__name__)
+
+
+class RosbridgeSession:
+    """Operations of one client.
+
+    What cannot be done is answered by a `status` of level error (which a client turns off by `set_level` none), a call
+    by a `service_response` whose result is false. Nothing is compressed or sent in fragments unless asked for.
+
+    Args:
+        graph: topics and services.
+        send: takes text or bytes for the client; one at a time, and may wait.
+        most_bytes: of one message.
+    """
+
+    def __init__(self, graph: RosGraph, send: Send, *, most_bytes: int) -> None:
+        self.number = next(_numbers)
+        self._graph, self._most_bytes = graph, most_bytes
+        self._to_client = send
+        self._sending = asyncio.Lock()
+        self._subscriptions = Subscriptions(graph, self._send)
+        self._fragments = Fragments(most_bytes)
+        self._advertised: dict[str, str] = {}
+        self._served: set[str] = set()
+        self._calls: set[asyncio.Task[None]] = set()
+        self._answers: dict[str, asyncio.Future[dict[str, Any]]] = {}
+        self._level = _LEVELS.index("error")
+        self._operations: dict[str, Callable[[dict[str, Any]], Awaitable[None] | None]] = {
+            "advertise": self._advertise,
+            "unadvertise": self._unadvertise,
+            "publish": self._publish,
+            "subscribe": self._subscriptions.add,
+            "unsubscribe": self._subscriptions.remove,
+            "call_service": self._call_service,
+            "advertise_service": self._advertise_service,
+            "unadvertise_service": self._unadvertise_service,
+            "service_response": self._service_response,
+            "fragment": self._fragment,
+            "png": self._png,
+            "set_level": self._set_level,
+            "status": lambda _: None,
+            "auth": lambda _: None,  # keys are looked at when the connection is made
+        }
+
+    async def receive(self, text: str | bytes) -> None:
+        """Do what a client's message asks; never raises for what it holds."""
+        operation: dict[str, Any] = {}
+        try:
+            operation = self._parse(text)
+            done = self._operation(operation.get("op"))(operation)
+            if inspect.isawaitable(done):
+                await done
+        except SplatbotError as error:
+            await self._status("error", str(error), operation.get("id"))
+        except Exception:
+            if not isinstance(text, str):
+                text = repr(text[:80])
+            _log.exception("a rosbridge operation failed: %.200s", text)
+            await self._status("error", "the service failed on this message; its log says why", operation.get("id"))
+
+    async def close(self) -> None:
+        """Forget the client."""
+        await self._subscriptions.close()
+        for name in self._served:
+            self._graph.withdraw(name, self.number)
+        for answer in list(self._answers.values()):
+            if not answer.done():
+                answer.set_result({"result": False, "values": "its server has gone"})
+        for call in list(self._calls):
+            call.cancel()
+
+    def _parse(self, text: str | bytes) -> dict[str, Any]:
+        if isinstance(text, bytes):
+            raise InputError("is binary.", field="message", hint="send JSON as text")
+        if len(text) > self._most_bytes:
+            raise InputError(f"has more than {self._most_bytes} bytes.", field="message", hint="send less at once")
+        try:
+            values = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError("is no JSON.", field="message", hint='send {"op": ...}') from error
+        if not isinstance(values, dict):
+            raise InputError("is no JSON object.", field="message", hint='send {"op": ...}')
+        return values
+
+    def _operation(self, name: Any) -> Callable[[dict[str, Any]], Awaitable[None] | None]:
+        if not isinstance(name, str) or name not in self._operations:
+            known = ", ".join(self._operations)
+            raise InputError("asks for nothing that is known.", field="op", hint=f"the operations are {known}")
+        return self._operations[name]
+
+    async def _send(self, data: str | bytes) -> None:
+        async with self._sending:
+            await self._to_client(data)
+
+    async def _status(self, level: str, text: str, name: Any) -> None:
+        if _LEVELS.index(level) <= self._level:
+            told = {"op": "status", "level": level, "msg": text} | ({} if name is None else {"id": str(name)[:256]})
+            await self._send(json.dumps(told))
+
+    def _set_level(self, operation: dict[str, Any]) -> None:
+        if operation.get("level") not in _LEVELS:
+            raise InputError("is unknown.", field="level", hint=f"use {', '.join(_LEVELS)}")
+        self._level = _LEVELS.index(operation["level"])
+
+    def _advertise(self, operation: dict[str, Any]) -> None:
+        kind = full_name(str(operation.get("type", "")))
+        self._advertised[self._graph.advertise(operation.get("topic"), kind)] = kind  # type: ignore[arg-type]
+
+    def _unadvertise(self, operation: dict[str, Any]) -> None:
+        self._advertised.pop(resolve(operation.get("topic")), None)
+
+    def _publish(self, operation: dict[str, Any]) -> None:
+        topic = resolve(operation.get("topic"))
+        kind = self._advertised.get(topic) or self._graph.topics.get(topic)
+        if kind is None:
+            raise InputError(f"{topic} is of no known type.", field="topic", hint="advertise it first")
+        values = operation.get("msg", {})
+        if not isinstance(values, Mapping):
+            raise InputError("is no object.", field="msg", hint=f"give the fields of {kind}")
+        message = build(kind, values)
+        self._graph.publish(topic, message, latched=bool(operation.get("latch")), client=self.number)
+
+    async def _fragment(self, operation: dict[str, Any]) -> None:
+        if (whole := self._fragments.add(operation)) is not None:
+            await self.receive(whole)
+
+    async def _png(self, operation: dict[str, Any]) -> None:
+        text = await asyncio.to_thread(unpack_png, operation.get("data"), self._most_bytes)
+        if '"png"' in text[:16]:  # one image in another, for ever
+            raise InputError("holds another.", field="png", hint="pack once")
+        await self.receive(text.rstrip("\n"))
+
+    async def _call_service(self, operation: dict[str, Any]) -> None:
+        if len(self._calls) >= _CALLS:
+            await self._respond(operation, f"{_CALLS} calls have no answer yet", result=False)
+            return
+        task = asyncio.get_running_loop().create_task(self._call(operation))
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
+
+    async def _call(self, operation: dict[str, Any]) -> None:
+        try:
+            check_compression(operation.get("compression") or "none")
+            check_fragment_size(operation.get("fragment_size"))
+            name, args = str(operation.get("service")), operation.get("args") or {}
+            if not isinstance(args, Mapping):
+                raise InputError("is no object.", field="args", hint="name the request's fields")
+            service = self._graph.service(name)
+            if inspect.iscoroutinefunction(service.call):
+                values = await service.call(args)
+            else:
+                values = await asyncio.to_thread(service.call, args)
+        except SplatbotError as error:
+            await self._respond(operation, str(error), result=False)
+        except Exception:
+            _log.exception("service %.80s failed", operation.get("service"))
+            await self._respond(operation, "the service failed on this request; its log says why", result=False)
+        else:
+            await self._respond(operation, values, result=True)
+
+    async def _respond(self, operation: dict[str, Any], values: Any, *, result: bool) -> None:
+        answer = {"op": "service_response", "service": operation.get("service"), "values": values, "result": result}
+        if operation.get("id") is not None:
+            answer["id"] = operation["id"]
+        try:
+            compression = check_compression(operation.get("compression") or "none")
+            size = check_fragment_size(operation.get("fragment_size"))
+        except InputError:
+            compression, size = "none", None
+        packed = await asyncio.to_thread(pack, answer, compression)
+        for part in [packed] if isinstance(packed, bytes) else split(packed, size, str(operation.get("id"))):
+            await self._send(part)
+
+    def _advertise_service(self, operation: dict[str, Any]) -> None:
+        name = resolve(operation.get("service"))
+
+        async def relay(args: Mapping[str, Any]) -> dict[str, Any]:
+            return await self._ask_client(name, args)
+
+        self._graph.serve(name, Service(str(operation.get("type", "")), relay, self.number))
+        self._served.add(name)
+
+    def _unadvertise_service(self, operation: dict[str, Any]) -> None:
+        name = resolve(operation.get("service"))
+        self._graph.withdraw(name, self.number)
+        self._served.discard(name)
+
+    async def _ask_client(self, name: str, args: Mapping[str, Any]) -> dict[str, Any]:
+        ticket = f"{name}:{next(_numbers)}"
+        answer = self._answers[ticket] = asyncio.get_running_loop().create_future()
+        call = {"op": "call_service", "id": ticket, "service": name, "args": dict(args)}
+        try:
+            await self._send(pack(call, "none"))
+            done = await asyncio.wait_for(answer, _ANSWER_S)
+        except TimeoutError as error:
+            raise InputError(f"{name}: its server does not answer.", field="service", hint="try again") from error
+        finally:
+            self._answers.pop(ticket, None)
+        if not done.get("result", True):
+            raise InputError(f"{name}: {str(done.get('values'))[:400]}", field="service")
+        values = done.get("values")
+        return values if isinstance(values, dict) else {}
+
+    def _service_response(self, operation: dict[str, Any]) -> None:
+        answer = self._answers.get(str(operation.get("id")))
+        if answer is not None and not answer.done():
+            answer.set_result(operation)

@@ -1,0 +1,58 @@
+"""Names of the bus's topics and what their values are.
+
+| topic | value |
+|---|---|
+| ``maps/{id}/state`` | :class:`splatbot.services.store.ServedMap`: each published state or change of ``state`` |
+| ``maps/{id}/frame`` | :class:`splatbot.frame.Frame`: what the mapper was given |
+| ``maps/{id}/result`` | :class:`splatbot.slam.FrameResult`: odometry, verdict, keyframe, stage timings |
+| ``maps/{id}/trajectory`` | :class:`splatbot.trajectory.Trajectory`: all poses so far, at each published state |
+| ``maps/{id}/plan`` | :class:`splatbot.planning.RobotTrajectory`: the latest planned motion |
+| ``jobs/{id}`` | :class:`splatbot.services.jobs.Job`: each change of a job |
+| ``robot/{name}/joints`` | :class:`JointState`: the robot's latest joints |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+STATE = "state"
+FRAME = "frame"
+RESULT = "result"
+TRAJECTORY = "trajectory"
+PLAN = "plan"
+JOINTS = "joints"
+
+
+@dataclass(frozen=True, eq=False)
+class JointState:
+    """Joints of an arm at a time.
+
+    Args:
+        stamp: [s].
+        names: of the joints.
+        position: (J,) [rad or m].
+        velocity: (J,) per s; None when unknown.
+    """
+
+    stamp: float
+    names: tuple[str, ...]
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64] | None = None
+
+
+def map_topic(map_id: str, kind: str) -> str:
+    """The topic of a map, e.g. ``map_topic("default", RESULT)``; "*" as id makes a pattern for every map."""
+    return f"maps/{map_id}/{kind}"
+
+
+def robot_topic(robot: str, kind: str) -> str:
+    """The topic of a robot, e.g. ``robot_topic("panda", JOINTS)``."""
+    return f"robot/{robot}/{kind}"
+
+
+def job_topic(job_id: str) -> str:
+    """The topic of a job."""
+    return f"jobs/{job_id}"

@@ -1,0 +1,206 @@
+"""Sim-to-real: a recorded log against the twin that is built from its map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse
+from splatbot.logs import Log
+from splatbot.results.folder import RunFolder
+from splatbot.results.metrics import without_nan
+from splatbot.robots.robot import RobotModel
+from splatbot.sim.compare.recorded import ArmRecord, BaseInMap, base_in_map, pose_gap, read_arm
+from splatbot.sim.compare.replay import Replay, find_knots, replay
+from splatbot.sim.compare.views import SeenView, Surroundings, TwinViews, ViewAgreement, surroundings
+from splatbot.sim.twin import Twin
+from splatbot.workspace import fit_workspace
+
+KIND = "sim-to-real"
+_SHOWN = 3  # frames whose images are kept
+
+Tell = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class LogComparison:
+    """A log against its twin.
+
+    Args:
+        log, map: their names.
+        robot: the twin's arm.
+        frames: of the log, and how many of them were compared.
+        poses: where the camera's poses come from, in words.
+        base: of the arm in the map.
+        support: height of what things stand on over the base [m], and its RMS error [m]; None: no level plane in reach.
+        views: one for each frame that was compared.
+        shown: images of a few, by frame.
+        replay: of the arm's motion; None where the log tells of none, or it was interrupted before.
+        notes: where not to trust it.
+        interrupted: whether somebody stopped it: then this is what was done until then.
+    """
+
+    log: str
+    map: str
+    robot: str
+    frames: int
+    poses: str
+    base: BaseInMap
+    support: tuple[float, float] | None
+    views: tuple[ViewAgreement, ...]
+    shown: Mapping[int, SeenView]
+    replay: Replay | None
+    notes: tuple[str, ...]
+    interrupted: bool
+
+    def summary(self) -> dict[str, Any]:
+        """Means over the frames, and over the held-out ones among them; None where there is nothing to average."""
+        names = [name for name in asdict(self.views[0]) if name not in ("index", "held_out")] if self.views else []
+        parts = {"all": self.views, "held_out": [view for view in self.views if view.held_out]}
+        found: dict[str, Any] = {
+            part: {"frames": len(views), **{name: _mean([getattr(view, name) for view in views]) for name in names}}
+            for part, views in parts.items()
+        }
+        residuals = self.base.residuals
+        found["base_residual_m"] = float(np.sqrt(np.mean(residuals[:, 0] ** 2))) if len(residuals) else None
+        found["base_residual_rad"] = float(np.sqrt(np.mean(residuals[:, 1] ** 2))) if len(residuals) else None
+        if self.replay is not None and self.replay.errors:
+            away = np.array([(error.position_m, error.angle_rad) for error in self.replay.errors])
+            found["replay_mean_m"], found["replay_mean_rad"] = away.mean(axis=0).tolist()
+            found["replay_most_m"], found["replay_most_rad"] = away.max(axis=0).tolist()
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON takes it, images left out."""
+        base = {"T_world_base": self.base.T_world_base.tolist(), "source": self.base.source}
+        return without_nan(
+            {
+                "kind": KIND,
+                "log": self.log,
+                "map": self.map,
+                "robot": self.robot,
+                "frames": self.frames,
+                "poses": self.poses,
+                "base": base,
+                "support": None if self.support is None else {"height_m": self.support[0], "rms_m": self.support[1]},
+                "summary": self.summary(),
+                "views": [asdict(view) for view in self.views],
+                "replay": None if self.replay is None else asdict(self.replay),
+                "notes": list(self.notes),
+                "interrupted": self.interrupted,
+            }
+        )
+
+
+def compare_log(
+    log: Log,
+    run: RunFolder,
+    robot: RobotModel,
+    *,
+    frames: int = 0,
+    tell: Tell = lambda what, share: None,
+) -> LogComparison:
+    """A log against the twin of its map: images at recorded poses, and the arm's motion done again.
+
+    The camera's poses are those that the arm tells (tool poses and mount, or joints and mount); without them those that
+    were tracked, and the base is that of the log's scene.yaml, or proposed from the map. Ctrl-C ends it early with what
+    was done.
+
+    Args:
+        log: the recording, with what the run left out masked.
+        run: what mapped it.
+        robot: the twin's arm.
+        frames: how many to compare, evenly spaced; 0: all.
+        tell: told what goes on, and the share of it that is done.
+
+    Raises:
+        InputError: log and run have no frame in common.
+        FormatError: a file of the run or of the log is damaged.
+        LogError: a frame cannot be read.
+    """
+    record, tracked = read_arm(log.uri), run.load_poses()
+    model = GaussianModel.load(run.map)
+    held_out = {row.index for row in run.load_frames() if row.held_out}
+    stamps = _stamps(log, run)
+    known = sorted(index for index in stamps if index < len(log))
+    if not known or not tracked:
+        raise InputError(
+            f"has no tracked frame in common with {log.name}.", file=run.path, hint="give the run that mapped this log"
+        )
+    by_arm = {i: T for i in known if (T := record.camera_at(stamps[i], robot)) is not None}
+    base = base_in_map(by_arm, tracked, record.source) if by_arm else _told_base(record, model)
+    poses = by_arm or {i: np.asarray(inverse(base.T_world_base) @ T) for i, T in tracked.items() if i < len(log)}
+    around = surroundings(model, run.map, base.T_world_base, robot)
+    chosen = _spread(sorted(poses), frames)
+    notes = [] if around.support is not None else ["no level plane within the arm's reach: nothing stands on anything"]
+    views: list[ViewAgreement] = []
+    shown: dict[int, SeenView] = {}
+    done: Replay | None = None
+    interrupted = False
+    try:
+        looker = TwinViews(around)
+        notes += looker.world.notes
+        keep = set(_spread(chosen, _SHOWN))
+        for k, index in enumerate(chosen):
+            gap = pose_gap(base.T_world_base @ poses[index], tracked[index]) if index in tracked else None
+            view, seen = looker.compare(log[index], poses[index], held_out=index in held_out, gap=gap)
+            views.append(view)
+            if index in keep:
+                shown[index] = seen
+            tell("frames", (k + 1) / len(chosen))
+        tell("the arm's motion", 0.0)
+        done = _replay(record, [stamps.get(i, np.nan) for i in range(len(log))], around, robot)
+        tell("the arm's motion", 1.0)
+    except KeyboardInterrupt:
+        interrupted = True
+    return LogComparison(
+        log=log.name,
+        map=run.path.resolve().name,
+        robot=robot.name,
+        frames=len(log),
+        poses=record.source if by_arm else "as tracked: the log does not tell the arm's",
+        base=base,
+        support=None if around.support is None else (around.support.offset, around.support.error),
+        views=tuple(views),
+        shown=shown,
+        replay=done,
+        notes=tuple(notes),
+        interrupted=interrupted,
+    )
+
+
+def _replay(record: ArmRecord, stamps: Sequence[float], around: Surroundings, robot: RobotModel) -> Replay | None:
+    knots = find_knots(record, stamps, robot)
+    return None if knots is None else replay(knots, Twin(around.scene(robot.name), robot=robot))
+
+
+def _told_base(record: ArmRecord, model: GaussianModel) -> BaseInMap:
+    if record.workspace.T_world_base is not None:
+        T, source = record.workspace.T_world_base, "scene.yaml of the log"
+    else:
+        proposed = fit_workspace(model).T_world_base
+        assert proposed is not None
+        T, source = proposed, "proposed from the map: the log does not tell the arm's poses"
+    return BaseInMap(T, np.zeros((0, 2)), (), source)
+
+
+def _stamps(log: Log, run: RunFolder) -> dict[int, float]:
+    """Stamps [s] of the frames that the run read, by their position in the log."""
+    return {row.index: row.stamp for row in run.load_frames() if row.stamp is not None}
+
+
+def _spread(items: Sequence[int], count: int) -> list[int]:
+    """``count`` of them, evenly spaced, both ends among them; all for 0."""
+    if count <= 0 or count >= len(items):
+        return list(items)
+    return [items[round(k)] for k in np.linspace(0, len(items) - 1, count)]
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

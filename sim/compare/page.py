@@ -1,0 +1,153 @@
+"""A comparison as one self-contained HTML page: sim-to-real of a log, sim-to-sim of a held-out twin."""
+
+from __future__ import annotations
+
+import html
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.rasterize.views import depth_limits
+from splatbot.report.images import colour_png, depth_png, difference_png
+from splatbot.report.parts import document, image, note, pictures, section, table, tiles
+from splatbot.results.units import NONE, count, decibels, metres, number, percent
+from splatbot.sim.compare.log_twin import KIND, LogComparison
+from splatbot.sim.compare.plots import frames_plot, replay_plot
+from splatbot.sim.compare.views import SeenView, ViewAgreement
+
+_GAIN = 3.0  # of difference images
+
+
+def log_rows(found: LogComparison) -> list[tuple[str, str]]:
+    """The figures of a sim-to-real comparison as names and values."""
+    s = found.summary()
+    rows = [
+        ("camera poses", found.poses),
+        ("base in the map", found.base.source + _residual(s)),
+        ("support", "none within reach" if found.support is None else _support(*found.support)),
+    ]
+    for part, name in (("all", "frames"), ("held_out", "held-out frames")):
+        v = s[part]
+        if not v["frames"]:
+            continue
+        rows += [
+            (name, f"{v['frames']} of {found.frames}"),
+            ("  PSNR", decibels(v["psnr_db"])),
+            (
+                "  depth L1, whole image",
+                f"{metres(v['depth_l1_m'])}, median {metres(v['depth_median_m'])}, covers {percent(v['coverage'])}",
+            ),
+            ("  depth L1, part simulated", f"{metres(v['part_l1_m'])}; shapes {metres(v['physics_l1_m'])}"),
+            ("  silhouette IoU", f"{number(v['iou'], 3)}; shapes {number(v['physics_iou'], 3)}"),
+        ]
+    return [*rows, *_replay_rows(found, s)]
+
+
+def log_section(found: LogComparison) -> list[str]:
+    """The parts of a page on a log."""
+    rows = log_rows(found)
+    stop = '<section class="banner warn"><b>Interrupted</b>; this is what was compared until then.</section>\n'
+    replayed = found.replay
+    return [
+        stop if found.interrupted else "",
+        tiles(_tiles(found)),
+        section(
+            f"{KIND}: {html.escape(found.log)} against the twin of {html.escape(found.map)}", table(("", ""), rows)
+        ),
+        section(
+            "Side by side", *(_view(view, found.shown[view.index]) for view in found.views if view.index in found.shown)
+        ),
+        section("Over the frames", image(frames_plot(found.views), "figures over the frames"), _rings()),
+        section(
+            "The arm's motion, done again",
+            image(replay_plot(replayed), "tool error over the frames"),
+            note(html.escape("; ".join((replayed.source, *replayed.notes)))),
+        )
+        if replayed is not None
+        else "",
+        section("What the map became", *(note(html.escape(text)) for text in found.notes)),
+    ]
+
+
+def log_html(found: LogComparison) -> str:
+    """The page of a sim-to-real comparison."""
+    return document(f"{found.log}: {KIND}", f"twin of {found.map}, arm {found.robot}", log_section(found))
+
+
+def _tiles(found: LogComparison) -> list[tuple[str, str]]:
+    s = found.summary()
+    v = s["all"]
+    return [
+        (count(v["frames"]), "frames"),
+        (decibels(v.get("psnr_db")), "PSNR"),
+        (metres(v.get("part_l1_m")), "depth L1, part simulated"),
+        (metres(v.get("physics_l1_m")), "depth L1 of the shapes"),
+        (number(v.get("iou"), 3), "silhouette IoU"),
+        (metres(s.get("replay_most_m")), "tool off at most"),
+    ]
+
+
+def _view(view: ViewAgreement, seen: SeenView) -> str:
+    span = depth_limits(seen.depth)
+    images = [
+        (colour_png(seen.rgb), f"frame {view.index}, recorded{' (held out)' if view.held_out else ''}"),
+        (colour_png(seen.twin_rgb), f"twin, {decibels(view.psnr_db)}"),
+        (difference_png(seen.rgb, seen.twin_rgb, gain=_GAIN), f"difference, times {_GAIN:g}"),
+        (depth_png(seen.depth, span), f"recorded depth, {span[0]:.2f} to {span[1]:.2f} m"),
+        (depth_png(seen.twin_depth, span), f"twin's depth, off by {metres(view.depth_median_m)} (median)"),
+        (
+            depth_png(_as_large(seen.shape_depth, seen.depth), span),
+            f"shapes of physics, off by {metres(view.physics_l1_m)}",
+        ),
+    ]
+    if seen.stands is not None and seen.twin_stands is not None:
+        text = f"what stands up: both white, only recorded red, only twin blue; IoU {number(view.iou, 3)}"
+        images.append((colour_png(silhouettes(seen.stands, seen.twin_stands)), text))
+    return pictures(images)
+
+
+def silhouettes(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Two masks (H, W) as a picture (H, W, 3): both white, only the first red, only the second blue."""
+    picture = np.zeros((*a.shape, 3), np.uint8)
+    picture[a & b], picture[a & ~b], picture[b & ~a] = (235, 235, 235), (217, 81, 95), (63, 134, 208)
+    return picture
+
+
+def _as_large(small: NDArray[np.float32], like: NDArray[np.float32]) -> NDArray[np.float32]:
+    size = (like.shape[1], like.shape[0])
+    return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
+
+
+def _rings() -> str:
+    return note(
+        "Rings: frames that were kept out of the map. Depth is compared in the part of the scene that is simulated."
+    )
+
+
+def _residual(summary: dict[str, float | None]) -> str:
+    away, turn = summary["base_residual_m"], summary["base_residual_rad"]
+    if away is None or turn is None:
+        return ""
+    return f"; the arm's and the tracked camera differ by {metres(away)} and {np.degrees(turn):.2f} deg RMS"
+
+
+def _support(height: float, error: float) -> str:
+    return f"{metres(height)} over the base, {metres(error)} RMS"
+
+
+def _replay_rows(found: LogComparison, summary: dict[str, float | None]) -> list[tuple[str, str]]:
+    if found.replay is None:
+        return [("action replay", "none: the log tells neither joints nor tool poses")]
+    rows = [("action replay", f"{found.replay.source}: {found.replay.reached} of {found.replay.poses} poses")]
+    if found.replay.errors:
+        rows += [(f"  tool off, {what}", _gap(summary, what)) for what in ("mean", "most")]
+    touched = ", ".join(f"{touch.part} and {touch.other}" for touch in found.replay.touches)
+    return [*rows, ("  touched", touched or "nothing"), ("  least room", metres(found.replay.room) or NONE)]
+
+
+def _gap(summary: dict[str, float | None], what: str) -> str:
+    away, turn = summary[f"replay_{what}_m"], summary[f"replay_{what}_rad"]
+    assert away is not None
+    assert turn is not None
+    return f"{1e3 * away:.3f} mm, {np.degrees(turn):.4f} deg"

@@ -1,0 +1,162 @@
+"""What a log tells of the arm that was there: tool poses, joints, and its camera's poses in the frame of its base."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from splatbot.errors import FormatError, InputError
+from splatbot.geometry import inverse, so3_log, transform_points
+from splatbot.logs.calibration import read_object
+from splatbot.logs.joints import JointRecord, find_joints
+from splatbot.protocols import Array
+from splatbot.robots.robot import RobotModel
+from splatbot.trajectory import Trajectory
+from splatbot.workspace import Workspace, find_workspace
+
+TOOL_POSES = "ee_poses.txt"
+_MOUNT = "ee_T_camera"
+_INTRINSICS = "intrinsics.json"
+_NEAR = 0.01  # [s] that a pose's stamp may be off its frame's
+
+
+@dataclass(frozen=True, eq=False)
+class ArmRecord:
+    """What is in a log's folder beside its images.
+
+    Args:
+        tool: T_base_tool at their own stamps; None: not recorded.
+        T_tool_camera: (4, 4), the camera on the tool; None: not known.
+        joints: over time; None: not recorded.
+        workspace: ``scene.yaml`` of the log, or an empty one.
+    """
+
+    tool: Trajectory | None = None
+    T_tool_camera: Array | None = None
+    joints: JointRecord | None = None
+    workspace: Workspace = field(default_factory=Workspace)
+
+    def tool_at(self, stamp: float) -> Array | None:
+        """T_base_tool (4, 4) as recorded within 10 ms of a stamp [s]."""
+        if self.tool is None or not len(self.tool):
+            return None
+        k = int(np.argmin(np.abs(self.tool.stamps - stamp)))
+        return self.tool.T_world_camera[k] if abs(float(self.tool.stamps[k]) - stamp) <= _NEAR else None
+
+    def camera_at(self, stamp: float, robot: RobotModel) -> Array | None:
+        """T_base_camera (4, 4) then, by the tool's pose or else by the joints; None where the log does not tell."""
+        T_base_tool = self.tool_at(stamp)
+        if T_base_tool is not None and self.T_tool_camera is not None:
+            return np.asarray(T_base_tool @ self.T_tool_camera)
+        q, mount = self.joints_at(stamp, robot), self.workspace.T_link_camera
+        if q is None or mount is None:
+            return None
+        return np.asarray(robot.fk(q)[self.workspace.camera_link] @ mount)
+
+    def joints_at(self, stamp: float, robot: RobotModel) -> Array | None:
+        """Joints (J,) then; None where they are not known.
+
+        Raises:
+            InputError: they are those of an arm with another number of joints.
+        """
+        q = None if self.joints is None else self.joints.at(stamp)
+        if q is not None and len(q) != len(robot):
+            raise InputError(
+                f"has {len(q)} joints, {robot.name} has {len(robot)}.", field="joints.txt", hint="name the arm: --robot"
+            )
+        return q
+
+    @property
+    def source(self) -> str:
+        """Where camera poses come from, in words; empty if they are not told."""
+        if self.tool is not None and self.T_tool_camera is not None:
+            return f"{TOOL_POSES} and {_MOUNT} of {_INTRINSICS}"
+        if self.joints is not None and self.workspace.T_link_camera is not None:
+            return "joints.txt and T_link_camera of scene.yaml"
+        return ""
+
+
+def read_arm(folder: str | Path) -> ArmRecord:
+    """What a log's folder tells of an arm; of a log that is no folder, nothing.
+
+    Raises:
+        FormatError: a file is damaged.
+        LogError: `joints.txt` is.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        return ArmRecord()
+    tool = Trajectory.load(place / TOOL_POSES) if (place / TOOL_POSES).exists() else None
+    return ArmRecord(tool, _mount(place / _INTRINSICS), find_joints(place), find_workspace(place) or Workspace())
+
+
+@dataclass(frozen=True, eq=False)
+class BaseInMap:
+    """Where the arm's base is in a map.
+
+    Args:
+        T_world_base: (4, 4).
+        residuals: (F, 2) by frame, of the camera's pose by the arm against that by tracking [m, rad]; empty where the
+            base is not known by poses.
+        frames: (F,) of the log.
+        source: how it is known, in words.
+    """
+
+    T_world_base: Array
+    residuals: Array
+    frames: tuple[int, ...]
+    source: str
+
+
+def base_in_map(T_base_camera: Mapping[int, Array], T_world_camera: Mapping[int, Array], source: str) -> BaseInMap:
+    """The base from one camera's poses in both frames: mean rotation (chordal L2; Hartley et al. 2013), mean place.
+
+    Args:
+        T_base_camera: (4, 4) by frame of the log, as the arm has it.
+        T_world_camera: (4, 4) by frame, as tracked.
+        source: of the first, in words.
+
+    Raises:
+        InputError: no frame has both.
+    """
+    frames = sorted(set(T_base_camera) & set(T_world_camera))
+    if not frames:
+        raise InputError(
+            f"has no frame in common with the arm's poses ({len(T_world_camera)} tracked, {len(T_base_camera)} told).",
+            field="map",
+            hint="give the run that mapped this log",
+        )
+    theirs, ours = (np.array([poses[i] for i in frames]) for poses in (T_base_camera, T_world_camera))
+    U, _, Vt = np.linalg.svd((ours[:, :3, :3] @ theirs[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    T[:3, 3] = (ours[:, :3, 3] - theirs[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
+    away = np.linalg.norm(transform_points(T, theirs[:, :3, 3]) - ours[:, :3, 3], axis=1)
+    turn = [pose_gap(T @ a, b)[1] for a, b in zip(theirs, ours, strict=True)]
+    return BaseInMap(T, np.stack([away, turn], axis=1), tuple(frames), source)
+
+
+def pose_gap(a: Array, b: Array) -> tuple[float, float]:
+    """How far two poses (4, 4) are apart [m, rad]."""
+    turn = so3_log(inverse(a)[:3, :3] @ b[:3, :3])
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(np.linalg.norm(turn))
+
+
+def _mount(path: Path) -> Array | None:
+    """``ee_T_camera`` of a log's intrinsics."""
+    if not path.exists():
+        return None
+    value = read_object(path).get(_MOUNT)
+    if value is None:
+        return None
+    hint = "write four rows of four numbers: a rotation, and metres in the last column"
+    try:
+        T = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"is no matrix ({error}).", file=path, field=_MOUNT, hint=hint) from error
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-4:
+        raise FormatError("is no rigid pose.", file=path, field=_MOUNT, hint=hint)
+    return T

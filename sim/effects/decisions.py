@@ -1,0 +1,28 @@
+"""Whether an effect is on, why, and who said so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from splatbot.sim.scene import Scene
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Whether an effect is on, why, and who said so: the scene's content, or `forced`, `forbidden`."""
+
+    name: str
+    on: bool
+    why: str
+    by: str = "scene"
+
+
+def decide(name: str, scene: Scene, called_for: str, not_called_for: str) -> Decision:
+    """What becomes of an effect that the scene calls for, or does not (empty), each with its reason."""
+    if name in scene.effects.forbid:
+        return Decision(name, False, f"forbidden by the scene; {called_for or not_called_for}", "forbidden")
+    if name in scene.effects.force and not called_for:
+        return Decision(name, True, f"forced by the scene; {not_called_for}", "forced")
+    return Decision(name, bool(called_for), called_for or not_called_for)

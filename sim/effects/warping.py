@@ -1,0 +1,72 @@
+"""Where a camera that moves sees things a moment earlier or later."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.errors import InputError
+from splatbot.geometry import Array, inverse, se3_exp, se3_log
+from splatbot.trajectory import Trajectory
+
+_SURFACE = 0.02  # share of its depth by which neighbours of one surface differ
+
+
+def motion_during(path: Trajectory | None, stamp: float, seconds: float, *, effect: str) -> list[Array]:
+    """T_now_then (4, 4) half of ``seconds`` before and after ``stamp`` [s].
+
+    Raises:
+        InputError: the path is not known.
+    """
+    if path is None:
+        raise InputError("does not know how the camera moves.", field=effect, hint="give it the path: along()")
+    now = inverse(pose_at(path, stamp))
+    return [now @ pose_at(path, stamp + side * seconds / 2) for side in (-1, 1)]
+
+
+def pose_at(path: Trajectory, t: float) -> Array:
+    """T_world_camera (4, 4) at ``t`` [s]: constant twist between neighbours, and on beyond the ends."""
+    if len(path) == 1:
+        return path.T_world_camera[0]
+    i = int(np.clip(np.searchsorted(path.stamps, t, "right") - 1, 0, len(path) - 2))
+    a, b = path.T_world_camera[i], path.T_world_camera[i + 1]
+    share = (t - path.stamps[i]) / (path.stamps[i + 1] - path.stamps[i])
+    return np.asarray(a @ se3_exp(share * se3_log(inverse(a) @ b)))
+
+
+def flow(camera: Camera, depth: NDArray[np.float32], T_now_then: Array) -> NDArray[np.float32]:
+    """How far (H, W, 2) [px] from a pixel of the view then lies, in the view now, what it shows."""
+    rays = camera.backproject(np.ones_like(depth))
+    R, t = T_now_then[:3, :3].astype(np.float32), T_now_then[:3, 3].astype(np.float32)
+    nearness = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    # x/z of R·ray·depth + t, divided by the depth so that infinitely far is a number
+    x, y, z = (R[k, 0] * rays[..., 0] + R[k, 1] * rays[..., 1] + R[k, 2] + t[k] * nearness for k in range(3))
+    z = np.maximum(z, np.float32(1e-3))  # what would be behind the camera goes out of the image
+    u = (x / z - rays[..., 0]) * np.float32(camera.fx)
+    v = (y / z - rays[..., 1]) * np.float32(camera.fy)
+    return np.stack([u, v], axis=-1)
+
+
+def grid(height: int, width: int) -> NDArray[np.float32]:
+    """Each pixel's own place (H, W, 2)."""
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+
+
+def color_at(rgb: NDArray[np.uint8], at: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Colours (H, W, 3) at places (H, W, 2) [px], between pixels; the border's outside."""
+    found = cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found, dtype=np.uint8)
+
+
+def depth_at(depth: NDArray[np.float32], at: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth (H, W) [m] at places (H, W, 2) [px]: between pixels of one surface, the nearest's at an edge; 0 outside."""
+    nearest, between = (_remapped(depth, at, how) for how in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
+    whole = _remapped((depth > 0).astype(np.float32), at, cv2.INTER_LINEAR) > 0.999
+    return np.where(whole & (np.abs(between - nearest) <= _SURFACE * nearest), between, nearest)
+
+
+def _remapped(image: NDArray[np.float32], at: NDArray[np.float32], how: int) -> NDArray[np.float32]:
+    found = cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(found, dtype=np.float32)

@@ -1,0 +1,48 @@
+"""A scene of a map whose `scene.yaml` says where the robot stands in it, what is down and where the table is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from splatbot.errors import InputError
+from splatbot.geometry import inverse
+from splatbot.protocols import Array
+from splatbot.sim.solids import rpy_of
+from splatbot.workspace import Workspace, find_workspace
+
+_G = 9.81  # [m/s²]
+_MAP = "map.ply"
+
+
+def placed_scene(place: Path) -> dict[str, Any]:
+    """What :func:`splatbot.sim.scene.make_scene` takes: the map, in the frame of the robot's base.
+
+    Args:
+        place: a run's folder, or a map file; without a `scene.yaml` beside it, a file's own frame is the base's.
+
+    Raises:
+        InputError: it is a folder without a map, or a run that does not say where the robot stands.
+        FormatError: the `scene.yaml` is damaged.
+    """
+    file = place / _MAP if place.is_dir() else place
+    if place.is_dir() and not file.is_file():
+        raise InputError(f"holds no {_MAP}.", file=place, field="--map", hint="give a map file, or the folder of a run")
+    known = find_workspace(file)
+    values: dict[str, Any] = {"name": place.resolve().stem, "map": {"file": str(file.resolve())}}
+    if known is None or known.T_world_base is None:
+        if place.is_dir():
+            hint = "write a scene.yaml: splatbot info RUN --fit-plane estimates one"
+            raise InputError("does not say where the robot stands.", file=place, field="T_world_base", hint=hint)
+        return values
+    return values | _placed(values["map"], known, inverse(known.T_world_base))
+
+
+def _placed(clutter: dict[str, Any], known: Workspace, T_base_world: Array) -> dict[str, Any]:
+    R, t = T_base_world[:3, :3], T_base_world[:3, 3]
+    clutter |= {"at": t.tolist(), "rpy": rpy_of(R)}
+    if known.support_plane is not None:  # n · p + d = 0, in the base's frame
+        normal = R @ known.support_plane[:3]
+        clutter["support"] = [*normal.tolist(), float(known.support_plane[3] - normal @ t)]
+    gravity = {} if known.gravity is None else {"gravity": (_G * (R @ known.gravity)).tolist()}
+    return {"map": clutter, **gravity}

@@ -1,0 +1,59 @@
+"""Pictures with depth, and one in front of the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.rasterize.views import MIN_ALPHA
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera sees of a part of the world; behind it is nothing.
+
+    Args:
+        color: (H, W, 3) RGB in 0..1, times ``alpha``.
+        alpha: (H, W) share of the pixel that is covered.
+        depth: (H, W) along the optical axis [m]; infinite where nothing is seen.
+        bodies: (H, W) share of the pixel that shows bodies of the simulation, not the map.
+    """
+
+    color: Image
+    alpha: Image
+    depth: Image
+    bodies: Image
+
+    def rgb(self) -> NDArray[np.uint8]:
+        """(H, W, 3) over black."""
+        return np.rint(255.0 * self.color.clip(0.0, 1.0)).astype(np.uint8)
+
+    def measured(self, reach: float) -> Image:
+        """Depth (H, W) [m] as a frame has it: 0 where the pixel is mostly empty, or beyond ``reach`` [m]."""
+        seen = (self.alpha >= MIN_ALPHA) & (self.depth <= reach)
+        return np.where(seen, self.depth, np.float32(0))
+
+
+def composite(a: View, b: View) -> View:
+    """Both, in each pixel the nearer over the farther (Porter and Duff 1984): soft edges stay soft."""
+    first = a.depth <= b.depth
+
+    def pick(x: Image, y: Image) -> tuple[Image, Image]:
+        choice = first[..., None] if x.ndim == 3 else first
+        return np.where(choice, x, y), np.where(choice, y, x)
+
+    alpha, under = pick(a.alpha, b.alpha)
+    rest = 1.0 - alpha
+    color, color_under = pick(a.color, b.color)
+    bodies, bodies_under = pick(a.bodies, b.bodies)
+    depth, depth_under = pick(a.depth, b.depth)
+    return View(
+        color + rest[..., None] * color_under,
+        alpha + rest * under,
+        np.where((alpha >= MIN_ALPHA) | (under < MIN_ALPHA), depth, depth_under),
+        bodies + rest * bodies_under,
+    )

@@ -1,0 +1,27 @@
+"""What the figures of `splatbot bench twin` must keep to."""
+
+from __future__ import annotations
+
+from splatbot.bench.results import Results
+
+FORCED = "empty scene, contact and drag forced on"
+FILMED = "composite picture, map of a noisy film"
+
+# Case, metric, least and largest.
+_BOUNDS: tuple[tuple[str, str, float, float], ...] = (
+    ("empty scene", "over the robot alone", 0.0, 1.3),
+    (FORCED, "over none forced", 1.2, float("inf")),  # physics that cannot apply is not free
+    ("planned paths among the true shapes", "touched", 0.0, 0.0),
+    (FILMED, "least overlap", 0.98, 1.0),
+    (FILMED, "PSNR lost, most", float("-inf"), 0.1),
+)
+
+
+def broken_bounds(results: Results) -> list[str]:
+    """A sentence on each figure that is out of its bounds; figures that were not measured are let."""
+    found = []
+    for case, metric, least, largest in _BOUNDS:
+        value = results.find(case, metric)
+        if value is not None and not least <= value <= largest:
+            found.append(f"{case}: {metric} is {value:.3g}, not in {least:g}..{largest:g}")
+    return found

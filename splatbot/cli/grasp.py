@@ -1,0 +1,285 @@
+"""`splatbot grasp`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from splatbot.cli.placing import Pose, base_pose, margin_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splatbot.grasping.affordance import Hint, View
+    from splatbot.grasping.types import Grasp, GraspResult
+    from splatbot.segmentation import MapScene
+
+
+def grasp(
+    *,
+    map: Annotated[Path, tyro.conf.arg(metavar="MAP")],
+    target: str | None = None,
+    pixel: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="U V")] = None,
+    point: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
+    box: Annotated[tuple[float, float, float, float] | None, tyro.conf.arg(metavar="U0 V0 U1 V1")] = None,
+    mask: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
+    tag: int | None = None,
+    index: Annotated[int, tyro.conf.arg(metavar="I")] = 0,
+    robot: str = "panda",
+    base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
+    hand_only: bool = False,
+    approach: Literal["any", "top", "side"] = "any",
+    friction: float = 0.5,
+    samples: int = 400,
+    wanted: int = 10,
+    pregrasp: float = 0.10,
+    margin: Annotated[str, tyro.conf.arg(metavar="M|auto")] = "0",
+    n_sigma: float = 1.0,
+    min_observations: int = 1,
+    seed: int = 0,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+) -> int:
+    """Find grasps of one thing in a map, best first, with each term of their scores.
+
+    The thing is named, or pointed at in one of the run's pictures, or in the world. Words are rules on names of the
+    scene.yaml, colours, shapes, sizes and places; what fits two things is refused. Writes grasp.json and a picture
+    grasp.png.
+
+    Examples:
+        splatbot grasp --map runs/latest --target "largest box"
+        splatbot grasp --map runs/latest --target "red cup" --approach top
+        splatbot grasp --map runs/latest --pixel 320 210 --index 12
+        splatbot grasp --map map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --point 0.1 0.2 0.6 --hand-only
+
+    Args:
+        map: a run folder, or a map file.
+        target: words.
+        pixel: of a picture of the run.
+        point: on or in the thing, in the map's frame [m].
+        box: corners of a rectangle in a picture of the run [px].
+        mask: a picture of the same size, not black where the thing is.
+        tag: number of an AprilTag 36h11 on the thing.
+        index: which picture of the run, from 0.
+        robot: its name, as of `splatbot robot list`.
+        base: pose of the robot's base in the map; by default that of the scene.yaml beside the map (see
+            `splatbot info --fit-plane`).
+        hand_only: leave the arm out: where the hand could be, not whether the arm gets there.
+        approach: where the hand may come from.
+        friction: coefficient between pads and thing.
+        samples: places on the surface that are tried: the knob of time.
+        wanted: how many grasps.
+        pregrasp: length of the straight approach [m].
+        margin: room [m] that hand and arm keep from the rest of the map; "auto" as in `splatbot plan`.
+        n_sigma: where the surface of a Gaussian is; less than for planning, as the hand has to come near.
+        min_observations: Gaussians that fewer keyframes support are air.
+        seed: of the search.
+        out: folder to write to; by default runs/grasp.
+    """
+    from splatbot.errors import InputError
+
+    places = {"--target": target, "--pixel": pixel, "--point": point, "--box": box, "--mask": mask, "--tag": tag}
+    given = [flag for flag, value in places.items() if value is not None]
+    if len(given) != 1:
+        raise InputError(f"are {len(given)}.", field=", ".join(places), hint="give one of them")
+
+    from splatbot.atomic import atomic_write
+    from splatbot.grasping.affordance import find_target
+    from splatbot.grasping.options import GraspOptions
+    from splatbot.grasping.places import PlaceAffordance
+    from splatbot.grasping.sampler import GraspSampler
+    from splatbot.grasping.tags import TagAffordance
+    from splatbot.grasping.words import WordAffordance
+    from splatbot.report.grasp_view import grasp_png
+    from splatbot.robots.store import load_robot
+
+    options = GraspOptions(
+        friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
+    )
+    arm = load_robot(robot)
+    scene = _scene(map, base)
+    hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
+    found = find_target(hint, scene, [WordAffordance(), PlaceAffordance(), TagAffordance()])
+    sampler = GraspSampler(
+        scene,
+        arm,
+        hand_only=hand_only,
+        observers=_observers(map, scene),
+        n_sigma=n_sigma,
+        min_observations=min_observations,
+    )
+    sampler.margin = margin_of(margin, map, sampler.field, scene.T_world_base)
+    result = sampler.sample(found, options)
+    folder = out if out is not None else Path("runs") / "grasp"
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(folder / "grasp.json") as handle:
+        handle.write(json.dumps(summary(result), indent=2).encode())
+    shown = result.grasps[0] if result.grasps else result.best_rejected
+    if shown is not None:
+        with atomic_write(folder / "grasp.png") as handle:
+            handle.write(grasp_png(scene, found.rows, arm, shown))
+    result.unwrap()
+    _print(result, folder)
+    return 0
+
+
+def summary(result: GraspResult) -> dict[str, Any]:
+    """A result as JSON has it; lengths in metres, poses as position and quaternion wxyz."""
+    return {
+        "target": {
+            "label": result.target.label,
+            "backend": result.target.backend,
+            "score": result.target.score,
+            "gaussians": len(result.target.rows),
+            "notes": list(result.target.notes),
+        },
+        "grasps": [_grasp_summary(grasp) for grasp in result.grasps],
+        "best_rejected": _grasp_summary(result.best_rejected) if result.best_rejected is not None else None,
+        "rejected": dict(result.rejected),
+        "candidates": result.candidates,
+        "notes": list(result.notes),
+        "seconds": dict(result.seconds),
+        "map_version": result.map_version,
+    }
+
+
+def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
+    from splatbot.geometry import rotation_to_quat
+
+    def pose(T: NDArray[np.float64]) -> dict[str, Any]:
+        return {"position": T[:3, 3].tolist(), "quaternion_wxyz": rotation_to_quat(T[:3, :3]).tolist()}
+
+    return {
+        "T_world_tcp": pose(grasp.T_world_tcp),
+        "T_world_pregrasp": pose(grasp.T_world_pregrasp),
+        "width_m": grasp.width,
+        "opening_m": grasp.opening,
+        "contacts": grasp.contacts.tolist(),
+        "normals": grasp.normals.tolist(),
+        "approach": grasp.approach,
+        "terms": dict(grasp.terms),
+        "total": grasp.total,
+        "room_m": grasp.room,
+        "q": grasp.q.tolist() if grasp.q is not None else None,
+        "q_pregrasp": grasp.q_pregrasp.tolist() if grasp.q_pregrasp is not None else None,
+        "approach_path": grasp.approach_path.tolist() if grasp.approach_path is not None else None,
+        "rejected": grasp.rejected,
+    }
+
+
+def _scene(map_: Path, base: Pose | None) -> MapScene:
+    from splatbot.gaussians import GaussianModel
+    from splatbot.segmentation import segment
+    from splatbot.workspace import find_workspace
+
+    known = find_workspace(map_)
+    model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
+    T = base_pose(base, map_)
+    own = known is not None and base is None  # box and plane belong to the base of the file
+    return segment(
+        model,
+        T,
+        box=known.box if own and known is not None else None,
+        plane=known.support_plane if own and known is not None else None,
+        names=known.objects if known is not None else (),
+    )
+
+
+def _observers(map_: Path, scene: MapScene) -> NDArray[np.float64] | None:
+    if not (map_ / "frames.jsonl").is_file():
+        return None
+    from splatbot.results.folder import RunFolder
+    from splatbot.results.observers import observers
+
+    return observers(RunFolder(map_), scene.model)
+
+
+def _hint(
+    map_: Path,
+    index: int,
+    *,
+    target: str | None,
+    pixel: tuple[float, float] | None,
+    point: tuple[float, float, float] | None,
+    box: tuple[float, float, float, float] | None,
+    mask: Path | None,
+    tag: int | None,
+) -> Hint:
+    import numpy as np
+
+    from splatbot.grasping.affordance import BoxHint, MaskHint, NameHint, PixelHint, PointHint, TagHint
+
+    if target is not None:
+        return NameHint(target)
+    if point is not None:
+        return PointHint(np.array(point))
+    view = _view(map_, index)
+    if pixel is not None:
+        return PixelHint(*pixel, view)
+    if box is not None:
+        return BoxHint(*box, view)
+    if mask is not None:
+        return MaskHint(_read_mask(mask), view)
+    assert tag is not None
+    return TagHint(tag, (view,))
+
+
+def _read_mask(path: Path) -> NDArray[np.bool_]:
+    import cv2
+    import numpy as np
+
+    from splatbot.errors import InputError
+
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if picture is None:
+        raise InputError("cannot be read.", file=path, field="--mask", hint="give a PNG as large as the picture")
+    return np.asarray(picture.reshape(*picture.shape[:2], -1).any(axis=2))
+
+
+def _view(map_: Path, index: int) -> View:
+    from dataclasses import replace
+
+    from splatbot.errors import InputError
+    from splatbot.grasping.affordance import View
+    from splatbot.results.folder import RunFolder
+    from splatbot.robots.in_view import reopen_log
+
+    if not map_.is_dir():
+        raise InputError("has no pictures.", file=map_, hint="give the folder of a run, or --target or --point")
+    run = RunFolder(map_)
+    poses = run.load_poses()
+    log = reopen_log(run)
+    if index not in poses:
+        raise InputError(
+            f"is {index}, which has no pose.", field="--index", hint=f"one of {min(poses)}..{max(poses)} that has"
+        )
+    return View(replace(log.camera, distortion=()), poses[index], log[index].rgb)
+
+
+def _print(result: GraspResult, folder: Path) -> None:
+    from rich.table import Table
+
+    from splatbot.cli.bench_tables import wide_console
+    from splatbot.cli.tables import print_table
+
+    target = result.target
+    seconds = sum(result.seconds.values())
+    rows = [
+        ("target", f"{target.label}, {len(target.rows)} Gaussians, by {target.backend} ({target.score:.2f})"),
+        ("candidates", f"{result.candidates} hands in {1e3 * seconds:.0f} ms"),
+        *(("note", note) for note in (*target.notes, *result.notes)),
+        ("written to", str(folder)),
+    ]
+    print_table(rows, title="grasps")
+    terms = list(result.grasps[0].terms)
+    table = Table()
+    for name in ("", "total", "approach", "width", "opens", "room", *terms):
+        table.add_column(name, justify="left" if name == "approach" else "right")
+    for k, g in enumerate(result.grasps):
+        lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.room))
+        table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *(f"{g.terms[name]:.2f}" for name in terms))
+    wide_console().print(table)
+    print("width, opens and room in mm; the terms are 1 at best")

@@ -1,0 +1,76 @@
+"""What commands that place a robot in a map have in common: poses, its base, its margin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splatbot.collision import GaussianCollisionField
+
+Pose = tuple[float, float, float, float, float, float, float]
+
+
+def checked_pose(pose: Pose, flag: str) -> NDArray[np.float64]:
+    """A pose (4, 4) of position and quaternion wxyz.
+
+    Raises:
+        InputError: the quaternion is no rotation.
+    """
+    import numpy as np
+
+    from splatbot.errors import InputError
+    from splatbot.geometry import pose_from_quat
+
+    try:
+        return np.asarray(pose_from_quat(pose[:3], pose[3:]))
+    except ValueError as error:
+        raise InputError(f"{error}.", field=flag, hint="QW QX QY QZ of no rotation are 1 0 0 0") from error
+
+
+def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
+    """T_world_base (4, 4): as given, or that of the scene.yaml beside the map.
+
+    Raises:
+        InputError: it is not known.
+    """
+    from splatbot.errors import InputError
+    from splatbot.workspace import find_workspace
+
+    if pose is not None:
+        return checked_pose(pose, "--base")
+    known = find_workspace(map_)
+    if known is None or known.T_world_base is None:
+        hint = "give --base, or write a scene.yaml: splatbot info MAP --fit-plane estimates one"
+        raise InputError("is not known.", file=map_, field="base", hint=hint)
+    return known.T_world_base
+
+
+def margin_of(text: str, map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
+    """Metres, or "auto": those that the run itself calls for.
+
+    Raises:
+        InputError: it is neither, or the map is no run folder.
+    """
+    import math
+
+    from splatbot.errors import InputError
+
+    if text == "auto":
+        if not map_.is_dir():
+            raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
+        from splatbot.results.folder import RunFolder
+        from splatbot.results.margin import own_margin
+        from splatbot.robots.in_view import reopen_log
+
+        return own_margin(map_, reopen_log(RunFolder(map_)), field, T_world_base)
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < math.inf:
+        raise InputError(f"is {text!r}.", field="--margin", hint='give metres, 0 or more, or "auto"')
+    return value

@@ -1,0 +1,36 @@
+"""`splatbot record`: a log as one MCAP file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def record(
+    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
+    /,
+    *,
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")],
+    camera: str | None = None,
+) -> None:
+    """Write a log as one MCAP file of ROS 2 messages, which Foxglove, ROS tools and splatbot itself read.
+
+    Nothing is rounded: mapping the file gives the trajectory that mapping the log gives.
+
+    Examples:
+        splatbot record recordings/desk --out desk.mcap
+        splatbot map desk.mcap
+
+    Args:
+        log: whatever `splatbot map` takes.
+        out: the file to write; must not exist.
+        camera: intrinsics instead of the log's own, as for `splatbot map`.
+    """
+    from splatbot.logs import open_log
+    from splatbot.logs.mcap import record_mcap
+
+    source = open_log(log, camera=camera)
+    record_mcap(source, out)
+    print(f"{out}: {len(source)} frames, {out.stat().st_size / 1e6:.1f} MB")

@@ -1,0 +1,328 @@
+"""Grasps of a target among Gaussians: sampled, tested, scored and ranked."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatbot.collision import GaussianCollisionField
+from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.grasping.affordance import Target
+from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
+from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, place_hands
+from splatbot.grasping.obstacles import around_target
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.reach import ArmReach, Reach, hand_of
+from splatbot.grasping.score import arm_terms, best_apart, hand_terms, totals
+from splatbot.grasping.surface import target_surface
+from splatbot.grasping.sweep import swept_room, touches
+from splatbot.grasping.types import Grasp, GraspResult
+from splatbot.planning.cartesian import along
+from splatbot.protocols import Array, RobotKinematics
+from splatbot.segmentation import MapScene
+
+_HANDS = 3000  # whose room beside the target is looked at
+_TRIED = 400  # hands whose room in the map is looked at
+_ASKED = 60  # of them that an arm is asked for
+_TOP, _LOWEST = np.cos(np.radians(40.0)), -0.26  # cosine between the approach and down: from the top; the least of all
+_LEVEL = 0.5  # of a side approach, at most
+
+_IN_TARGET = "hands are in the target on their way"
+
+MakeReach = Callable[[GaussianCollisionField, GaussianCollisionField], Reach]
+
+
+@dataclass(eq=False)
+class _Log:
+    """What was rejected and why, the best of it, and seconds by stage."""
+
+    rejected: dict[str, int] = field(default_factory=dict)
+    best: Grasp | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    began: float = field(default_factory=time.perf_counter)
+
+    def drop(self, reason: str, count: int) -> None:
+        self.rejected[reason] = self.rejected.get(reason, 0) + int(count)
+
+    def stage(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name], self.began = now - self.began, now
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """Hands with their room [m] and the terms of their scores, each (K,)."""
+
+    hands: Hands
+    room: Array
+    terms: Mapping[str, Array]
+
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> _Scored:
+        terms = {name: values[chosen] for name, values in self.terms.items()}
+        return _Scored(self.hands.select(chosen), self.room[chosen], terms)
+
+    @property
+    def totals(self) -> Array:
+        return totals(self.terms)
+
+
+class GraspSampler:
+    """Grasps of targets in one state of the map.
+
+    Args:
+        scene: the map and what is in it; its base is the robot's.
+        robot: with fingers.
+        hand_only: leave the arm out, and look at the hand alone.
+        make_reach: gives, for the map without the target and the whole map, who says whether the arm gets there; by
+            default :class:`splatbot.grasping.reach.ArmReach`.
+        observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known; None: nowhere is.
+        n_sigma: where the surface of a Gaussian is; less than for planning, as the hand has to come near.
+        min_observations: Gaussians that fewer keyframes support are air; see
+            :class:`splatbot.collision.GaussianCollisionField`.
+        margin: room to keep from the map [m].
+
+    Raises:
+        InputError: the robot has no fingers, or an argument makes no sense.
+    """
+
+    def __init__(
+        self,
+        scene: MapScene,
+        robot: RobotKinematics,
+        *,
+        hand_only: bool = False,
+        make_reach: MakeReach | None = None,
+        observers: Array | None = None,
+        n_sigma: float = 1.0,
+        min_observations: int = 1,
+        margin: float = 0.0,
+    ) -> None:
+        if observers is not None and observers.shape != (len(scene.model), 3):
+            raise InputError(f"is {observers.shape}.", field="observers", hint=f"give ({len(scene.model)}, 3)")
+        if not 0.0 <= margin < np.inf:
+            raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
+        self.scene, self.robot, self.observers = scene, robot, observers
+        self.hand = hand_of(robot)
+        self.margin, self.n_sigma = margin, n_sigma
+        self.min_observations = min_observations
+        self.field = self.collision_field(scene.model)
+        self._make_reach = None if hand_only else make_reach or self._arm_reach
+
+    def sample(self, target: Target, options: GraspOptions | None = None) -> GraspResult:
+        """Ranked grasps of a target; without any, what the candidates fell to.
+
+        Raises:
+            InputError: the target has no Gaussians.
+        """
+        if not len(target.rows):
+            raise InputError("has no Gaussians.", field=target.label, hint="name another target")
+        return _Search(self, target, options or GraspOptions()).run()
+
+    def collision_field(self, model: GaussianModel) -> GaussianCollisionField:
+        """A part of the map as the hand and the arm avoid it."""
+        return GaussianCollisionField(model, self.n_sigma, min_observations=self.min_observations)
+
+    def reach(self, around: GaussianCollisionField) -> Reach | None:
+        """Who says whether the arm gets there in the map without the target; None: nobody is asked."""
+        return None if self._make_reach is None else self._make_reach(around, self.field)
+
+    def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> Reach:
+        return ArmReach(self.robot, self.scene.T_world_base, around, whole, margin=self.margin)
+
+
+class _Search:
+    """One search: the steps, each of which leaves fewer hands."""
+
+    def __init__(self, sampler: GraspSampler, target: Target, options: GraspOptions) -> None:
+        self.s, self.target, self.o = sampler, target, options
+        self.log = _Log()
+
+    def run(self) -> GraspResult:
+        self.surface = target_surface(self.s.scene, self.target.rows, observers=self.s.observers, seed=self.o.seed)
+        self.log.stage("surface")
+        found = self._contacts()
+        self.log.stage("contacts")
+        hands = self._placed()
+        scored = self._beside_target(hands)
+        self.log.stage("hands")
+        around, own = self._split()
+        self.log.stage("fields")
+        scored = self._in_map(scored, around)
+        self.log.stage("map")
+        grasps = self._reached(scored, around, own)
+        self.log.stage("reach")
+        return GraspResult(
+            self.target,
+            grasps,
+            self.log.rejected,
+            None if grasps else self.log.best,
+            len(hands),
+            self.log.seconds,
+            self.s.scene.map_version,
+            self._notes(found),
+        )
+
+    def _contacts(self) -> PairSearch:
+        found = antipodal_pairs(
+            self.surface,
+            stroke=self.s.hand.stroke,
+            friction=self.o.friction,
+            samples=self.o.samples,
+            seed=self.o.seed,
+            near=self.target.point,
+        )
+        self.log.drop("closing directions meet nothing on the other side", found.alone)
+        self.log.drop("pairs of contacts are farther apart than the hand opens", found.too_wide)
+        self.log.drop("pairs of contacts are outside of the friction cone", found.slipping)
+        self.pairs: Pairs = found.pairs
+        return found
+
+    def _placed(self) -> Hands:
+        up, o = self.s.scene.up, self.o
+        lowest = _TOP if o.approach == "top" else _LOWEST
+        hands = place_hands(self.pairs, self.s.hand, rolls=o.rolls, depths=o.depths, up=up, lowest=lowest)
+        return hands.select(np.abs(hands.T[:, :3, 2] @ up) < _LEVEL) if o.approach == "side" else hands
+
+    def _promising(self, hands: Hands) -> Hands:
+        """At most 3000, those whose palm has room, of the best pairs."""
+        free = clear_palm(hands, self.surface, self.s.hand, retreat=self.o.pregrasp)
+        self.log.drop(_IN_TARGET, (~free).sum())
+        hands = hands.select(free)
+        aside = np.linalg.norm(self.pairs.contacts.mean(axis=1) - self.surface.center, axis=1)
+        good = (self.pairs.closure + self.pairs.seen - aside / 0.1)[hands.pair]
+        best = np.sort(np.argsort(-good, kind="stable")[:_HANDS])
+        self.log.drop("hands are of worse contacts than others", len(hands) - len(best))
+        return hands.select(best)
+
+    def _beside_target(self, hands: Hands) -> _Scored:
+        """Those that the target lets come, with their scores but for the map."""
+        hands = self._promising(hands)
+        if len(hands):
+            hands = beside_target(
+                hands, self.pairs, self.surface, self.s.hand, retreat=self.o.pregrasp, n_sigma=self.s.n_sigma
+            )
+        uneven = hands.stands_out > FLUSH
+        free = ~uneven & (hands.room > 0.0)
+        self.log.drop("hands have something that stands out under a pad", uneven.sum())
+        self.log.drop(_IN_TARGET, (~uneven & ~free).sum())
+        scored = self._scored(hands, hands.room)
+        if len(hands) and not free.any():
+            worst = np.where(uneven, -hands.stands_out - 1.0, hands.room)
+            k = int(np.argmax(worst))
+            why = (
+                f"has something under a pad that stands out {1e3 * hands.stands_out[k]:.0f} mm"
+                if uneven[k]
+                else f"is {-1e3 * hands.room[k]:.1f} mm deep in the target"
+            )
+            self.log.best = self._grasp(scored, k, rejected=why)
+        return scored.select(free)
+
+    def _in_map(self, scored: _Scored, around: GaussianCollisionField) -> _Scored:
+        """The best of them, those that are free of the rest of the map on their whole way."""
+        best = best_apart(scored.hands, scored.totals, most=_TRIED)
+        self.log.drop("hands are like a better one", len(scored.hands) - len(best))
+        tried = scored.select(best)
+        room = swept_room(self.s.robot, tried.hands, around, retreat=self.o.pregrasp) - self.s.margin
+        tried = self._scored(tried.hands, room)
+        free = room > 0.0
+        self.log.drop("hands touch what is around the target", (~free).sum())
+        if len(free) and not free.any():
+            k = int(np.argmax(room))
+            why = f"is {-1e3 * room[k]:.1f} mm deep in what is around the target"
+            self.log.best = self._grasp(tried, k, rejected=why)
+        return tried.select(free)
+
+    def _reached(
+        self, scored: _Scored, around: GaussianCollisionField, own: GaussianCollisionField
+    ) -> tuple[Grasp, ...]:
+        """Those of the best that do not touch the target's own ellipsoids and that the arm reaches, best first."""
+        reach = self.s.reach(around)
+        order = np.argsort(-scored.totals, kind="stable")[:_ASKED] if len(scored.hands) else np.zeros(0, np.int64)
+        inside = touches(own, scored.hands.select(order), self.s.hand, retreat=self.o.pregrasp)
+        self.log.drop("hands touch the target's ellipsoids", inside.sum())
+        found: list[Grasp] = []
+        for k, hit in zip(order.tolist(), inside.tolist(), strict=True):
+            if len(found) == self.o.wanted:
+                break
+            grasp = self._grasp(scored, k, rejected="touches the target's ellipsoids" if hit else "")
+            if not hit and reach is not None:
+                grasp = self._with_arm(grasp, reach)
+            if not grasp.rejected:
+                found.append(grasp)
+            elif self.log.best is None:
+                self.log.best = grasp
+        return tuple(sorted(found, key=lambda g: -g.total))
+
+    def _with_arm(self, grasp: Grasp, reach: Reach) -> Grasp:
+        reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening)
+        if reached.q is None or reached.path is None:
+            self.log.drop(f"hands: {reached.kind}", 1)
+            return replace(grasp, rejected=reached.why)
+        terms = dict(grasp.terms) | arm_terms(reached)
+        total = float(totals({name: np.array([value]) for name, value in terms.items()})[0])
+        return replace(
+            grasp, terms=terms, total=total, q=reached.q, q_pregrasp=reached.path[0], approach_path=reached.path
+        )
+
+    def _scored(self, hands: Hands, room: Array) -> _Scored:
+        terms = hand_terms(
+            hands,
+            self.pairs,
+            self.surface,
+            self.s.hand,
+            room,
+            up=self.s.scene.up,
+            near=self.target.point,
+        )
+        return _Scored(hands, room, terms)
+
+    def _grasp(self, scored: _Scored, k: int, *, rejected: str = "") -> Grasp:
+        T, pair = scored.hands.T[k], int(scored.hands.pair[k])
+        return Grasp(
+            T_world_tcp=T,
+            width=float(self.pairs.width[pair]),
+            opening=float(scored.hands.opening[k]),
+            contacts=self.pairs.contacts[pair],
+            normals=self.pairs.normals[pair],
+            approach=self._approach(T),
+            terms={name: float(values[k]) for name, values in scored.terms.items()},
+            total=float(scored.totals[k]),
+            room=float(scored.room[k]),
+            T_world_pregrasp=along(T, -self.o.pregrasp),
+            rejected=rejected,
+        )
+
+    def _approach(self, T: Array) -> str:
+        z = T[:3, 2]
+        if -(z @ self.s.scene.up) >= _TOP:
+            return "top"
+        if abs(z @ self.s.scene.up) >= _LEVEL:
+            return "free"
+        ahead = T[:3, 3] - self.s.scene.T_world_base[:3, 3]
+        ahead = ahead - (ahead @ self.s.scene.up) * self.s.scene.up
+        return "front" if z @ ahead >= _TOP * np.linalg.norm(ahead) else "side"
+
+    def _split(self) -> tuple[GaussianCollisionField, GaussianCollisionField]:
+        """The map without the target, and the target alone."""
+        own = self.s.scene.model.select(torch.from_numpy(self.target.rows))
+        around = around_target(self.s.scene, self.target.rows)
+        return self.s.collision_field(around), self.s.collision_field(own)
+
+    def _notes(self, found: PairSearch) -> tuple[str, ...]:
+        notes = []
+        implied = float(1.0 - self.surface.seen.mean())
+        if implied > 0.05:
+            notes.append(f"{implied:.0%} of its surface was not seen and is implied.")
+        if np.isfinite(found.narrowest):
+            stroke = self.s.hand.stroke
+            notes.append(
+                f"The narrowest of its sides that are too wide are {1e3 * found.narrowest:.0f} mm apart, and the hand "
+                f"opens {1e3 * stroke:.0f} mm."
+            )
+        return tuple(notes)

@@ -1,0 +1,334 @@
+"""The surface of a target, as oriented points: its Gaussians, and the sides that nobody saw but its top implies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.gaussians import GaussianModel
+from splatbot.gaussians.shape import rotations, shortest_axes
+from splatbot.geometry import inverse, transform_points
+from splatbot.protocols import Array
+from splatbot.segmentation import MapScene
+from splatbot.segmentation.parts import nearest_of
+
+MOST = 2500  # points that are looked at
+_SMOOTH = 0.006  # [m] over which normals are averaged
+_LONELY = 0.25  # of the usual crowd around a point; those with less are strays
+_CELL = 0.002  # [m] of the picture of a face
+_DISC, _OVERHANG = 0.004, 0.5  # [m] that a Gaussian covers of it at most; standard deviations
+_STEP = 0.006  # [m] from where on a difference in height is an edge
+_FACING, _TURNED = 0.7, 0.1  # cosines between a direction and the normals of what faces it, and of what it still sees
+_TURNED_AWAY = 0.7  # below it a normal is of another face
+_FEW = 20  # points that are no face
+_BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
+_SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
+_TUBE = 0.003  # [m] around a line within which it meets a point
+_SEEN = 0.006  # [m] around seen points of a side within which none is added
+_ROWS = 0.003  # [m] between added points
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """M oriented points on a target.
+
+    Args:
+        points: (M, 3) [m, world].
+        normals: (M, 3) unit, outwards.
+        half: (M, 3, 3) principal axes as columns, each as long as its standard deviation [m]; 0 of what is implied.
+        spread: (M,) the largest of them [m]; of what is implied, half of the distance between its points.
+        seen: (M,) whether it was measured; the others are implied.
+        doubt: (M,) standard deviation of where the point is along its normal [m].
+        center: (3,) middle of its box [m, world].
+    """
+
+    points: Array
+    normals: Array
+    half: Array
+    spread: Array
+    seen: NDArray[np.bool_]
+    doubt: Array
+    center: Array
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def target_surface(
+    scene: MapScene, rows: NDArray[np.int64], *, observers: Array | None = None, seed: int = 0
+) -> Surface:
+    """The surface of the Gaussians ``rows`` (M,) of a scene.
+
+    Normals are the Gaussians' flat axes, averaged over 6 mm, turned to who saw them, or else away from the middle.
+
+    Args:
+        scene: the map.
+        rows: of the target.
+        observers: (N, 3) where each Gaussian of the map was seen from [m, world], NaN where that is not known.
+        seed: of which Gaussians are kept where there are more than 2500.
+    """
+    rng = np.random.default_rng(seed)
+    chosen = rows if len(rows) <= MOST else np.sort(rng.choice(rows, MOST, replace=False))
+    model = scene.model.select(_index(chosen))
+    points = model.means.detach().double().numpy()
+    scales = np.sort(model.scales.detach().double().numpy(), axis=1)
+    center = _middle(scene, points)
+    outward = points - center
+    if observers is not None:
+        known = np.isfinite(observers[chosen]).all(axis=1)
+        outward = np.where(known[:, None], observers[chosen] - points, outward)
+    normals = shortest_axes(model).detach().double().numpy()
+    normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
+    normals, kept = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
+    doubt = _doubts(model, scales)
+    half = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
+    columns = (x[kept] for x in (points, normals, half, scales[:, 2], np.ones(len(points), np.bool_), doubt))
+    return _completed(scene, Surface(*columns, center))
+
+
+def _index(rows: NDArray[np.int64]):  # type: ignore[no-untyped-def]
+    import torch
+
+    return torch.from_numpy(rows)
+
+
+def _doubts(model: GaussianModel, scales: Array) -> Array:
+    """By the depth fused into them, or of a map from elsewhere their thickness."""
+    fused = model.uncertainty.detach().double().numpy()
+    return np.where(fused > 0, fused, scales[:, 0])
+
+
+def _middle(scene: MapScene, points: Array) -> Array:
+    """Half way between the highest point and what the target stands on."""
+    local = transform_points(inverse(scene.T_world_base), points)
+    low, high = np.percentile(local, [1, 99], axis=0)
+    support = scene.under(local)
+    if support is not None:
+        low[2] -= np.clip(float(np.percentile(support.height(local), 1)), 0.0, 0.03)
+    return transform_points(scene.T_world_base, (low + high) / 2)
+
+
+def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Normals averaged with those of neighbours on the same side, and which points are no strays (M,).
+
+    Round Gaussians have little to say.
+    """
+    p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
+    square = (p**2).sum(axis=1)
+    weight = np.maximum(square[:, None] + square[None] - 2 * (p @ p.T), 0.0)
+    np.exp(weight * (-0.5 / _SMOOTH**2), out=weight)
+    crowd = weight.sum(axis=1)
+    weight *= n @ n.T > 0.3
+    weight *= np.maximum(flatness, 0.05).astype(np.float32)
+    mean = (weight @ n).astype(np.float64)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    return mean, np.asarray(crowd > _LONELY * np.median(crowd))
+
+
+def _completed(scene: MapScene, seen: Surface) -> Surface:
+    """With the sides that go down from its top to the support, and back from the face that was seen in front."""
+    up = scene.up
+    parts = [_sides(seen, up, _floor(scene, seen, up))]
+    for face in _faces(seen.normals, up):
+        back, mirrored = _back(seen, face, up)
+        parts.append(_sides(seen, face, back, closed=True, mirrored=mirrored))
+    points, normals = (np.concatenate([part[k] for part in parts]) for k in range(2))
+    thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
+    thin = thin[:: 1 + len(thin) // MOST]
+    points, normals = points[thin], normals[thin]
+    outer = ~_inside(points, normals, np.concatenate([seen.points, points]), np.concatenate([seen.normals, normals]))
+    points, normals, n = points[outer], normals[outer], int(outer.sum())
+    if n == 0:
+        return seen
+    wide = np.full(n, _ROWS / 2)
+    return Surface(
+        np.concatenate([seen.points, points]),
+        np.concatenate([seen.normals, normals]),
+        np.concatenate([seen.half, np.zeros((n, 3, 3))]),
+        np.concatenate([seen.spread, wide]),
+        np.concatenate([seen.seen, np.zeros(n, np.bool_)]),
+        np.concatenate([seen.doubt, wide]),
+        seen.center,
+    )
+
+
+def _faces(normals: Array, up: Array) -> list[Array]:
+    """Level directions that many normals (M, 3) have, 45 degrees apart, unless the opposite side was seen as well."""
+    left = normals[np.abs(normals @ up) < 0.5]
+    left = left - np.outer(left @ up, up)
+    left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
+    few = max(_FEW, 0.05 * len(normals))
+    found: list[Array] = []
+    while len(left) >= few and len(found) < 8:
+        close = left @ left[:: max(1, len(left) // 100)].T > 0.9
+        best = int(close.sum(axis=0).argmax())
+        if close[:, best].sum() < few:
+            break
+        face = left[close[:, best]].mean(axis=0)
+        face /= np.linalg.norm(face)
+        found.append(face)
+        left = left[left @ face < _TURNED_AWAY]
+    return [face for face in found if not any(face @ other < -_FACING for other in found)]
+
+
+def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
+    """Height along ``up`` [m, world] where the target stands."""
+    low = float(np.percentile(seen.points @ up, 1))
+    local = transform_points(inverse(scene.T_world_base), seen.points)
+    support = scene.under(local)
+    if support is None:
+        return low - _BEHIND
+    under = float(np.percentile(support.height(local), 1))
+    return low - under if 0.0 <= under < 0.03 else low - 0.01
+
+
+def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
+    """Where along ``face`` [m, world] the target ends behind, and whether its back is the mirror image of its front.
+
+    A flat front is that of a box, as deep as its other sides show; a round one turns away half way to its back. Where
+    nothing of either was seen, a thing is taken to be as deep as it is narrow.
+    """
+    along = seen.points @ face
+    facing = along[seen.normals @ face > _FACING]
+    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 2))
+    if near - far > _SHOWN:
+        flat = float((near - facing < _SHOWN).mean()) > 0.7
+        return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
+    across = seen.points @ np.stack([up, np.cross(up, face)], axis=1)
+    narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
+    return near - min(narrow, 2 * _BEHIND), False
+
+
+def _sides(
+    seen: Surface, direction: Array, floor: float, *, closed: bool = False, mirrored: bool = False
+) -> tuple[Array, Array]:
+    """Points and normals (K, 3) of the sides behind the edges of what faces ``direction``, where none was seen.
+
+    ``closed``: and of the back, at ``floor``, or mirrored at the middle between it and the top.
+    """
+    none = np.zeros((0, 3)), np.zeros((0, 3))
+    facing = seen.normals @ direction > _TURNED
+    if facing.sum() < _FEW:
+        return none
+    across = _frame(direction)
+    flat = seen.points @ across.T  # the last is the height
+    heights, low = _picture(flat[facing], seen.spread[facing])
+    below, _ = _picture(flat[seen.normals @ direction < -_FACING], None, like=(heights.shape, low))
+    edges = _edges(heights)
+    if not len(edges[0]):
+        return none
+    at, out, top, beyond = edges
+    foot = np.maximum(floor, np.maximum(beyond, below[at[:, 0], at[:, 1]]))
+    rows = [np.arange(h - _ROWS / 2, f, -_ROWS) for h, f in zip(top, foot, strict=True)]
+    count = np.array([len(row) for row in rows])
+    if not count.sum():
+        return none
+    plane = low + (at + 0.5) * _CELL + out * (_CELL / 2)
+    points = np.c_[np.repeat(plane, count, axis=0), np.concatenate(rows)] @ across
+    normals = np.repeat(np.c_[out, np.zeros(len(out))] @ across, count, axis=0)
+    if closed:
+        cells = np.argwhere(np.isfinite(heights) & (heights > floor + _STEP) & ~np.isfinite(below))[::2]
+        top = heights[cells[:, 0], cells[:, 1]]
+        depth = np.maximum(floor + np.percentile(top, 95) - top, floor) if mirrored and len(cells) else floor
+        back = np.c_[low + (cells + 0.5) * _CELL, np.broadcast_to(depth, len(cells))] @ across
+        points = np.concatenate([points, back])
+        normals = np.concatenate([normals, np.tile(-direction, (len(back), 1))])
+    new = _unseen(points, normals, seen)
+    return points[new], normals[new]
+
+
+def _frame(direction: Array) -> Array:
+    """(3, 3) rows: two unit vectors across the direction, and itself."""
+    side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.cross(direction, side), direction])
+
+
+def _picture(
+    flat: Array, spread: Array | None, *, like: tuple[tuple[int, ...], Array] | None = None
+) -> tuple[Array, Array]:
+    """Greatest height in each cell [m], -inf where there is none, and the low corner (2,) [m].
+
+    ``flat`` (P, 3) are coordinates across and along; each point covers a disc.
+    """
+    if like is None:
+        low = flat[:, :2].min(axis=0) - 3 * _CELL - _DISC
+        shape = tuple(np.ceil((flat[:, :2].max(axis=0) + 3 * _CELL + _DISC - low) / _CELL).astype(int) + 1)
+    else:
+        shape, low = like
+    picture = np.full(shape, -np.inf)
+    if not len(flat):
+        return picture, low
+    at = np.floor((flat[:, :2] - low) / _CELL).astype(int)
+    reach = np.full(len(flat), _DISC) if spread is None else np.minimum(_OVERHANG * spread, _DISC)
+    radius = int(_DISC / _CELL)
+    for i in range(-radius, radius + 1):
+        for j in range(-radius, radius + 1):
+            covers = np.hypot(i, j) * _CELL <= reach
+            cell = at[covers] + [i, j]
+            inside = ((cell >= 0) & (cell < shape)).all(axis=1)
+            np.maximum.at(picture, tuple(cell[inside].T), flat[covers, 2][inside])
+    return picture, low
+
+
+def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    """Cells (E, 2) at which a face ends, the way out (E, 2), its height there (E,) and that beyond (E,)."""
+    known = np.isfinite(heights).astype(np.uint8)
+    closed = cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    filled = np.where(np.isfinite(heights), heights, -np.inf)
+    holes = (closed == 1) & (known == 0)
+    if holes.any():
+        spread = cv2.dilate(np.where(np.isfinite(filled), filled, -1e9), np.ones((5, 5), np.uint8))
+        filled = np.where(holes, spread, filled)
+    found, outs, tops, beyonds = [], [], [], []
+    padded = np.pad(filled, 1, constant_values=-np.inf)
+    blurred = cv2.GaussianBlur(closed.astype(np.float64), (0, 0), 2.0)
+    slope = np.stack(np.gradient(blurred), axis=-1)
+    for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        beyond = padded[1 + i : padded.shape[0] - 1 + i, 1 + j : padded.shape[1] - 1 + j]
+        with np.errstate(invalid="ignore"):
+            edge = np.isfinite(filled) & (filled > -1e8) & ((filled - beyond > _STEP) | ~np.isfinite(beyond))
+        cells = np.argwhere(edge)
+        way = -slope[cells[:, 0], cells[:, 1]]
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        way = np.where(length > 1e-3, way / np.maximum(length, 1e-12), [[i, j]])
+        good = way @ [i, j] > 0.3
+        found.append(cells[good])
+        outs.append(way[good])
+        tops.append(filled[edge][good])
+        beyonds.append(beyond[edge][good])
+    return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)
+
+
+def _inside(points: Array, normals: Array, others: Array, other_normals: Array) -> NDArray[np.bool_]:
+    """Whether what points (P, 3) face first is another surface from behind (P,): they are within the target."""
+    middle = others.mean(axis=0)
+    p, q = (points - middle).astype(np.float32), (others - middle).astype(np.float32)
+    n, m = normals.astype(np.float32), other_normals.astype(np.float32)
+    found = np.zeros(len(p), np.bool_)
+    square = (q**2).sum(axis=1)
+    for k in range(0, len(p), 256):
+        a, d = p[k : k + 256], n[k : k + 256]
+        ahead = d @ q.T - np.einsum("ij,ij->i", a, d)[:, None]
+        aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ q.T) + square - ahead**2
+        ahead[(ahead < _SEEN) | (aside > _TUBE**2)] = np.inf
+        first = ahead.argmin(axis=1)
+        hit = np.isfinite(ahead[np.arange(len(a)), first])
+        found[k : k + 256] = hit & (np.einsum("ij,ij->i", m[first], d) > 0.3)
+    return found
+
+
+def _unseen(points: Array, normals: Array, seen: Surface) -> NDArray[np.bool_]:
+    """Whether nothing that was seen within 6 mm of each of points (P, 3) faces the same way (P,)."""
+    new = np.ones(len(points), np.bool_)
+    reach = max(_SEEN, 3.0 * float(np.median(seen.spread)))
+    for way in (*np.eye(3), *-np.eye(3)):
+        asked, known = normals @ way > 0.5, seen.normals @ way > 0.3
+        if asked.any() and known.any():
+            nearest, square = nearest_of(seen.points[known], points[asked])
+            alike = np.einsum("ij,ij->i", seen.normals[known][nearest], normals[asked]) > 0.5
+            new[np.flatnonzero(asked)[alike & (square < reach**2)]] = False
+    return new

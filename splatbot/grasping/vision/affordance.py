@@ -1,0 +1,161 @@
+"""A named object found by a vision-language model, believed only as far as the map bears it out."""
+
+from __future__ import annotations
+
+import re
+import secrets
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.grasping.affordance import Affordance, AffordanceError, Hint, NameHint, Target, View
+from splatbot.grasping.places import at_point, point_at
+from splatbot.grasping.vision.answers import Answer, question_for, read_answers
+from splatbot.grasping.vision.models import Picture, VisionError, VisionModel
+from splatbot.grasping.vision.views import empty_picture, picture_of, scene_views
+from splatbot.protocols import Array
+from splatbot.segmentation import MapScene
+
+LEAST_CONFIDENCE = 0.5
+_NAME = re.compile(r"[\w ,.'()/-]{1,80}")  # letters, digits and what names are written with: no quotes, no lines
+_ALONE = 0.5  # of the score where there is only one picture to agree with
+
+
+class VisionAffordance:
+    """A :class:`splatbot.grasping.affordance.Affordance` that shows the map to a model.
+
+    It is asked where the object is in several pictures and in one more, from which all objects were taken away. Each
+    answer must be a pixel of its picture, with the map's surface there, on a segmented object. The target is the
+    object that more than half of all answers and at least two pictures point at; an answer for the empty picture, or
+    rules that name another object, discredit them all. What a model says is never more than a hint: a model that lies
+    consistently about two objects which rules cannot tell apart is not found out.
+
+    Args:
+        model: that is asked.
+        views: that it sees; None: cameras around the objects, as the map renders.
+        rules: another backend, whose answer, where it has one, must be the same object; None: none.
+        attempts: at an answer that can be read.
+
+    Raises:
+        InputError: ``attempts`` is not above 0, or there are no views.
+    """
+
+    def __init__(
+        self,
+        model: VisionModel,
+        *,
+        views: Sequence[View] | None = None,
+        rules: Affordance | None = None,
+        attempts: int = 2,
+    ) -> None:
+        if attempts < 1 or (views is not None and not views):
+            raise InputError("must be above 0, and views be there.", field="attempts, views", hint="give 1 or more")
+        self.model, self.rules, self._attempts = model, rules, attempts
+        self._views = None if views is None else tuple(views)
+
+    @property
+    def name(self) -> str:
+        """As results tell it."""
+        return self.model.name
+
+    def understands(self, hint: Hint) -> bool:
+        """Names."""
+        return isinstance(hint, NameHint)
+
+    def locate(self, hint: Hint, scene: MapScene) -> Target:
+        """See :class:`splatbot.grasping.affordance.Affordance`.
+
+        Raises:
+            VisionError: the model does not answer, or not what was asked.
+            AffordanceError: what it answers is not borne out by the map.
+        """
+        if not isinstance(hint, NameHint):
+            raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a name")
+        name = _checked_name(hint.text)
+        if not scene.objects:
+            raise AffordanceError("there are no objects.", field="target", hint="map a scene with objects")
+        views = self._views or scene_views(scene)
+        pictures = [picture_of(scene, view) for view in views]
+        empty = secrets.randbelow(len(views) + 1)
+        pictures.insert(empty, empty_picture(scene, views[0]))
+        answers = self._asked(name, pictures)
+        if any(answer.view == empty for answer in answers):
+            raise VisionError(f"sees {name!r} in a picture without objects.", field=self.name, hint="use another model")
+        seen = [a.model_copy(update={"view": a.view - (a.view > empty)}) for a in answers]
+        return self._judged(name, scene, views, seen)
+
+    def _asked(self, name: str, pictures: Sequence[Picture]) -> list[Answer]:
+        complaint = ""
+        for left in reversed(range(self._attempts)):
+            try:
+                return read_answers(self.model.ask(question_for(name, pictures, complaint)), pictures)
+            except VisionError as error:
+                if not (error.again and left):
+                    raise
+                complaint = error.message
+        raise AssertionError("the last attempt returns or raises")
+
+    def _judged(self, name: str, scene: MapScene, views: Sequence[View], answers: list[Answer]) -> Target:
+        if not answers:
+            raise AffordanceError(f"sees no {name!r}.", field=self.name, hint="say it in other words, or point at it")
+        notes: list[str] = []
+        votes: dict[int, list[tuple[Answer, Array]]] = {}
+        for answer in answers:
+            text = f"picture {answer.view} ({answer.u:g}, {answer.v:g}), {answer.confidence:.2f}: "
+            try:
+                point = point_at(scene, views[answer.view], answer.u, answer.v)
+                number = at_point(scene, point).number
+                votes.setdefault(number, []).append((answer, point))
+                notes.append(f"{text}object {number}")
+            except (AffordanceError, InputError) as error:
+                notes.append(f"{text}{error.message}")
+        winner = max(votes, key=lambda number: len(votes[number]), default=-1)
+        won = votes.get(winner, [])
+        if len(won) < min(2, len(views)) or 2 * len(won) <= len(answers):
+            raise AffordanceError(
+                f"points at no one object: {'; '.join(notes)}.",
+                field=self.name,
+                hint="say it in other words, or point at it",
+                candidates=tuple(_called(scene, number) for number in votes),
+            )
+        sure = float(np.mean([answer.confidence for answer, _ in won]))
+        if sure < LEAST_CONFIDENCE:
+            raise AffordanceError(f"is not sure ({sure:.2f}) of {name!r}.", field=self.name, hint="point at it")
+        self._agrees(name, scene, winner)
+        score = sure * (len(won) / len(views) if len(views) > 1 else _ALONE)
+        point = np.mean([at for _, at in won], axis=0)
+        return Target(scene.objects[winner].rows, point, _called(scene, winner), self.name, score, tuple(notes), winner)
+
+    def _agrees(self, name: str, scene: MapScene, number: int) -> None:
+        """Rules that know the name must mean the same object."""
+        if self.rules is None:
+            return
+        try:
+            known = self.rules.locate(NameHint(name), scene).number
+        except AffordanceError:
+            return
+        if known not in (-1, number):
+            both = (_called(scene, number), _called(scene, known))
+            raise AffordanceError(
+                f"says that {name!r} is {both[0]}, but {self.rules.name} says {both[1]}.",
+                field=self.name,
+                hint="point at it",
+                candidates=both,
+            )
+
+
+def _called(scene: MapScene, number: int) -> str:
+    return scene.objects[number].name or f"object {number}"
+
+
+def _checked_name(text: str) -> str:
+    """A name is words; text that could be read as more is not passed on."""
+    name = " ".join(text.split(" "))
+    if not _NAME.fullmatch(name) or not name.strip():
+        raise AffordanceError(
+            f"is no name: {text[:40]!r}.",
+            field="target",
+            hint="give up to 80 letters, digits, spaces and , . ' ( ) / -",
+        )
+    return name.strip()

@@ -1,0 +1,285 @@
+"""Recordings of ROS topics: a bare `.mcap`, a rosbag2 folder or a ROS 1 `.bag`, through rosbags."""
+
+from __future__ import annotations
+
+import struct
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+
+from splatbot.camera import Camera
+from splatbot.errors import InputError, LogError
+from splatbot.frame import Frame
+from splatbot.logs.base import LogBase
+from splatbot.logs.calibration import Calibration
+from splatbot.logs.index import associate
+from splatbot.logs.joints import interpolate_joints
+from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS, MASK, TRUTH
+from splatbot.logs.presets import find_calibration
+from splatbot.logs.ros_frames import (
+    COLOR_ENCODINGS,
+    DEPTH_ENCODINGS,
+    camera_of,
+    color_of,
+    depth_of,
+    mask_of,
+    pose_of,
+    seconds_of,
+)
+from splatbot.logs.ros_types import Message, typestore
+from splatbot.logs.tum import MAX_DIFFERENCE
+from splatbot.logs.undistort import Undistorter
+from splatbot.trajectory import Trajectory
+
+KEYS = ("color", "depth", "info", "joints")
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A message: its own stamp [s], when it was received [ns], and which of those received just then."""
+
+    stamp: float
+    received: int
+    nth: int
+
+
+class BagLog(LogBase):
+    """RGB-D frames of a recording of ROS topics; depth is paired with the colour image nearest in time.
+
+    Colour images without depth within 0.02 s are left out and counted in ``unpaired``. Joints are read from
+    /joint_states, masks (white: may be used) from /camera/mask/image_raw and reference poses from /ground_truth/pose,
+    where those topics are recorded. Frames are decoded when they are read; the file stays open. One thread may read.
+
+    Args:
+        path: the file or folder.
+        camera: intrinsics instead of the recorded CameraInfo.
+        topics: `color`, `depth`, `info`, `joints`: the topics to read where the recording has several.
+
+    Raises:
+        LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired.
+        CameraError: there are no usable intrinsics.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        camera: str | Path | Calibration | None = None,
+        topics: dict[str, str] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self._given = dict(topics or {})
+        self.uri = str(path) + ("?" + "&".join(f"{k}={v}" for k, v in self._given.items()) if self._given else "")
+        self.name = self.path.stem
+        self._reader = self._open()
+        self._color, self._depth = self._image_topics()
+        self._index = self._scan()
+        self._pairs = self._pair()
+        self.unpaired = len(self._index[self._color]) - len(self._pairs)
+        found = find_calibration(camera).camera if camera is not None else self._recorded_camera()
+        self._undistort = Undistorter(found) if found.distortion else None
+        self._camera = self._undistort.camera if self._undistort else found
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the delivered frames: undistorted."""
+        return self._camera
+
+    @property
+    def stamps(self) -> list[float]:
+        """Times of the frames [s]."""
+        return [color.stamp for color, _ in self._pairs]
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of /ground_truth/pose, T_world_camera; None where there are none."""
+        if TRUTH not in self._reader.topics:
+            return None
+        rows = [
+            self._checked(TRUTH, lambda m=m: (seconds_of(m.header.stamp), pose_of(m.pose))) for m in self._all(TRUTH)
+        ]
+        return Trajectory(np.array([stamp for stamp, _ in rows]), np.stack([T for _, T in rows]))
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def _decode(self, index: int) -> Frame:
+        color, depth = self._pairs[index]
+        rgb = self._checked(self._color, lambda: color_of(self._read(self._color, color)))
+        z = self._checked(self._depth, lambda: depth_of(self._read(self._depth, depth)))
+        mask = self._mask(color.stamp)
+        where = f"{self.path} {self._color} {index}"
+        if rgb.shape[:2] != z.shape:
+            hint = "record depth registered to colour: aligned_depth_to_color, depth_registered"
+            raise LogError(f"depth is {z.shape}, colour {rgb.shape[:2]} (rows, columns).", file=where, hint=hint)
+        if self._undistort:
+            rgb, z = self._undistort.color(rgb), self._undistort.depth(z)
+            mask = None if mask is None else self._undistort.mask(mask)
+        joints = None if self._joints is None else interpolate_joints(*self._joints, color.stamp)
+        try:
+            return Frame(color.stamp, rgb, z, self._camera, index, joints=joints, mask=mask, source=where)
+        except InputError as error:
+            raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error
+
+    @cached_property
+    def _joints(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Stamps (N,) [s] and positions (N, J) [rad] of the joint states that name as many joints as the first."""
+        topic = self._given.get("joints", JOINTS)
+        if topic not in self._reader.topics:
+            return None
+        rows = {seconds_of(m.header.stamp): np.asarray(m.position, np.float64) for m in self._all(topic)}
+        size = len(next(iter(rows.values()), ()))
+        kept = sorted((stamp, row) for stamp, row in rows.items() if len(row) == size and size)
+        return (np.array([s for s, _ in kept]), np.stack([q for _, q in kept])) if kept else None
+
+    def _mask(self, stamp: float) -> NDArray[np.bool_] | None:
+        entry = next((e for e in self._index.get(MASK, ()) if e.stamp == stamp), None)
+        return None if entry is None else self._checked(MASK, lambda: mask_of(self._read(MASK, entry)))
+
+    def _recorded_camera(self) -> Camera:
+        topic = self._given.get("info") or self._info_topic()
+        for message in self._all(topic):
+            return self._checked(topic, lambda m=message: camera_of(m))  # type: ignore[misc]
+        raise LogError("holds no message.", file=self.path, field=topic, hint="give --camera FILE")
+
+    def _info_topic(self) -> str:
+        beside = f"{self._color.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
+        known = [c.topic for c in self._reader.connections if c.msgtype == "sensor_msgs/msg/CameraInfo"]
+        for topic in (beside, INFO, *(known if len(set(known)) == 1 else ())):
+            if topic in known:
+                return topic
+        raise LogError(
+            f"holds no {beside}.", file=self.path, field="camera", hint="name it (?info=TOPIC) or give --camera FILE"
+        )
+
+    def _open(self) -> AnyReader:
+        if not self.path.exists():
+            raise LogError("does not exist.", file=self.path, field="log", hint="check the path")
+        try:
+            reader = AnyReader([self.path], default_typestore=typestore())
+            reader.open()
+        except Exception as error:  # whatever damaged bytes make of the reader
+            raise self._damaged(error) from error
+        return reader
+
+    def _image_topics(self) -> tuple[str, str]:
+        kinds: dict[str, list[str]] = {"color": [], "depth": []}
+        for connection in (c for c in self._reader.connections if c.msgtype in _IMAGES and c.msgcount):
+            kind = self._kind(connection)
+            if kind and connection.topic not in kinds[kind]:
+                kinds[kind].append(connection.topic)
+        color = self._choose("color", kinds["color"], (COLOR,))
+        depth = self._choose("depth", kinds["depth"], (DEPTH, "aligned_depth_to_color", "depth_registered"))
+        return color, depth
+
+    def _kind(self, connection: Connection) -> str | None:
+        if connection.msgtype == _IMAGES[1]:
+            return "depth" if "depth" in connection.topic.lower() else "color"
+        encoding = str(next(iter(self._all(connection.topic))).encoding)
+        return "color" if encoding in COLOR_ENCODINGS else "depth" if encoding in DEPTH_ENCODINGS else None
+
+    def _choose(self, key: str, topics: list[str], preferred: Iterable[str]) -> str:
+        given = self._given.get(key)
+        if given is not None and given in self._reader.topics:
+            return given
+        known = ", ".join(sorted(self._reader.topics)) or "none"
+        if given is not None:
+            raise LogError(f"holds no topic {given}.", file=self.path, field=key, hint=f"its topics are {known}")
+        fitting = [topics, *([t for t in topics if name in t] for name in preferred)]
+        for some in fitting:
+            if len(some) == 1:
+                return some[0]
+        what = f"several {key} topics ({', '.join(topics)})" if topics else f"no {key} images (topics: {known})"
+        raise LogError(f"holds {what}.", file=self.path, field=key, hint=f"name one: {self.path.name}?{key}=TOPIC")
+
+    def _scan(self) -> dict[str, list[_Entry]]:
+        """The images by topic, in the order of their stamps, from their headers alone."""
+        wanted = [c for c in self._reader.connections if c.topic in (self._color, self._depth, MASK)]
+        found: dict[str, list[_Entry]] = defaultdict(list)
+        seen: dict[tuple[str, int], int] = defaultdict(int)
+        try:
+            for connection, received, raw in self._reader.messages(wanted):
+                key = connection.topic, received
+                found[connection.topic].append(_Entry(self._stamp(raw), received, seen[key]))
+                seen[key] += 1
+        except Exception as error:
+            raise self._damaged(error) from error
+        return {topic: sorted(entries, key=lambda e: e.stamp) for topic, entries in found.items()}
+
+    def _stamp(self, raw: bytes) -> float:
+        if not self._reader.is2:
+            _seq, sec, nanosec = struct.unpack_from("<III", raw)
+        else:
+            sec, nanosec = struct.unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
+        return float((sec * 10**9 + nanosec) / 10**9)
+
+    def _pair(self) -> list[tuple[_Entry, _Entry]]:
+        colors, depths = self._index[self._color], self._index[self._depth]
+        a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, depths))
+        pairs = [(colors[i], depths[j]) for i, j in associate(a, b, MAX_DIFFERENCE)]
+        if not pairs:
+            raise LogError(
+                f"no stamp of {self._depth} is within {MAX_DIFFERENCE} s of one of {self._color}.",
+                file=self.path,
+                field="stamps",
+                hint="record both with the same clock",
+            )
+        return pairs
+
+    def _read(self, topic: str, entry: _Entry) -> Message:
+        of_topic = [c for c in self._reader.connections if c.topic == topic]
+        for nth, (connection, _, raw) in enumerate(
+            self._reader.messages(of_topic, start=entry.received, stop=entry.received + 1)
+        ):
+            if nth == entry.nth:
+                return self._reader.deserialize(raw, connection.msgtype)
+        raise LogError("a message is gone.", file=self.path, field=topic, hint="do not change a log while it is read")
+
+    def _all(self, topic: str) -> Iterable[Message]:
+        """The messages of a topic, in the order in which they were received."""
+        of_topic = [c for c in self._reader.connections if c.topic == topic]
+        try:
+            for connection, _, raw in self._reader.messages(of_topic):
+                yield self._reader.deserialize(raw, connection.msgtype)
+        except Exception as error:
+            raise self._damaged(error) from error
+
+    def _checked(self, topic: str, read: Callable[[], _T]) -> _T:
+        """What ``read`` makes of a message; its errors name the file and the topic."""
+        try:
+            return read()
+        except LogError:
+            raise
+        except InputError as error:
+            field = f"{topic} {error.field}" if error.field else topic
+            raise type(error)(error.message, file=self.path, field=field, hint=error.hint) from error
+        except Exception as error:
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> LogError:
+        hint = "copy the recording again, or mend it (`mcap recover`, `rosbag reindex`)"
+        return LogError(f"cannot be read ({type(error).__name__}: {error}).", file=self.path, field="log", hint=hint)
+
+
+def split_query(uri: str) -> tuple[Path, dict[str, str]]:
+    """The path and the topics of `FILE?color=TOPIC&depth=TOPIC`.
+
+    Raises:
+        LogError: a key is unknown.
+    """
+    path, _, query = uri.partition("?")
+    given: dict[str, Any] = dict(pair.partition("=")[::2] for pair in query.split("&") if pair)
+    for key in given:
+        if key not in KEYS:
+            raise LogError(f"has no option {key!r}.", file=path, field="log", hint=f"the options are {', '.join(KEYS)}")
+    return Path(path), given

@@ -1,0 +1,101 @@
+"""Write messages of any topics into one MCAP file (CDR and ros2msg, as ROS 2 and Foxglove read it)."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from splatbot.errors import LogError
+from splatbot.logs.base import Log
+from splatbot.logs.record import Progress
+from splatbot.logs.ros_frames import camera_info_message, image_message, joint_state_message, pose_stamped_message
+from splatbot.logs.ros_types import Message, to_cdr, type_of, typestore
+
+COLOR, DEPTH, INFO = "/camera/color/image_raw", "/camera/depth/image_raw", "/camera/color/camera_info"
+MASK, JOINTS, TRUTH = "/camera/mask/image_raw", "/joint_states", "/ground_truth/pose"
+
+
+class McapFile:
+    """A recording that is being written; it bears its name only once it is whole.
+
+    Until then the messages are in a folder `.NAME.partial` beside it, which a crash leaves behind.
+
+    Raises:
+        LogError: the file exists, or its folder cannot be written to.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._partial = self.path.with_name(f".{self.path.name}.partial")
+        if self.path.exists():
+            raise LogError("exists already.", file=self.path, hint="choose another name")
+        self._topics: dict[tuple[str, str], Any] = {}
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(self._partial, ignore_errors=True)
+            self._writer = Writer(self._partial, version=9, storage_plugin=StoragePlugin.MCAP)
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            self._writer.open()
+        except OSError as error:
+            raise LogError(f"cannot be written ({error.strerror}).", file=self.path, hint="check the folder") from error
+
+    def write(self, topic: str, message: Message, nanoseconds: int) -> None:
+        """Add a message that was received at a time [ns].
+
+        Raises:
+            OSError: the disk is full, or gone.
+        """
+        name = type_of(message)
+        if (topic, name) not in self._topics:
+            self._topics[topic, name] = self._writer.add_connection(topic, name, typestore=typestore())
+        self._writer.write(self._topics[topic, name], nanoseconds, to_cdr(message))
+
+    def close(self) -> None:
+        """Write the index and give the file its name."""
+        self._writer.close()
+        (made,) = self._partial.glob("*.mcap")
+        made.replace(self.path)
+        shutil.rmtree(self._partial)
+
+    def __enter__(self) -> McapFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, _error: object, _trace: TracebackType | None) -> None:
+        self.close()
+
+
+def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None) -> Path:
+    """Write a log's frames, intrinsics, joints, masks and reference poses; what is read back is equal, bit for bit.
+
+    Depth is 32FC1 [m], so nothing is rounded. Stamps are kept to the nanosecond.
+
+    Args:
+        progress: called with the number of frames written so far.
+
+    Raises:
+        LogError: the file exists, or a frame of the log cannot be read.
+    """
+    truth = log.ground_truth
+    with McapFile(path) as out:
+        for stamp, T in [] if truth is None else zip(truth.stamps.tolist(), truth.T_world_camera, strict=True):
+            out.write(TRUTH, pose_stamped_message(stamp, T, "world"), _nanoseconds(stamp))
+        for number, frame in enumerate(log, 1):
+            at = _nanoseconds(frame.stamp)
+            out.write(INFO, camera_info_message(frame.stamp, frame.camera), at)
+            out.write(COLOR, image_message(frame.stamp, frame.rgb), at)
+            out.write(DEPTH, image_message(frame.stamp, frame.depth), at)
+            if frame.mask is not None:
+                out.write(MASK, image_message(frame.stamp, frame.mask), at)
+            if frame.joints is not None:
+                out.write(JOINTS, joint_state_message(frame.stamp, frame.joints), at)
+            if progress is not None:
+                progress(number)
+    return out.path
+
+
+def _nanoseconds(stamp: float) -> int:
+    return round(stamp * 1e9)

@@ -1,0 +1,221 @@
+"""A frame's parts as ROS messages, and back: images, intrinsics, joints, poses. Only messages have quaternions xyzw."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.camera import Camera
+from splatbot.errors import CameraError, InputError
+from splatbot.geometry import pose_from_quat, rotation_to_quat
+from splatbot.logs.ros_types import Message, build
+
+COLOR_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8")
+DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+_MILLIMETRES = 1000.0  # of 16UC1 and mono16 (REP 118)
+_COMPRESSED_DEPTH_HEADER = 12  # bytes before the PNG: format and two quantisation parameters, used by 32FC1 alone
+_NANO = 10**9
+
+
+def time_of(seconds: float) -> Message:
+    """builtin_interfaces/Time of a stamp [s], to the nanosecond."""
+    sec, nanosec = divmod(round(float(seconds) * _NANO), _NANO)
+    return build("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+
+def seconds_of(time: Message) -> float:
+    """Stamp [s] of a builtin_interfaces/Time or Duration; the float nearest to its nanoseconds."""
+    return (int(time.sec) * _NANO + int(time.nanosec)) / _NANO
+
+
+def header(stamp: float, frame_id: str) -> Message:
+    """std_msgs/Header at a time [s]."""
+    return build("std_msgs/msg/Header", stamp=time_of(stamp), frame_id=frame_id)
+
+
+def image_message(stamp: float, image: NDArray[Any], frame_id: str = "camera") -> Message:
+    """sensor_msgs/Image of colour (H, W, 3) uint8, depth (H, W) float32 [m] or a mask (H, W) bool.
+
+    They become rgb8, 32FC1 and mono8 (255 where true).
+    """
+    if image.dtype == np.bool_:
+        image = image.astype(np.uint8) * 255
+    encoding = {(np.dtype("uint8"), 3): "rgb8", (np.dtype("float32"), 2): "32FC1", (np.dtype("uint8"), 2): "mono8"}
+    return build(
+        "sensor_msgs/msg/Image",
+        header=header(stamp, frame_id),
+        height=image.shape[0],
+        width=image.shape[1],
+        encoding=encoding[image.dtype, image.ndim],
+        step=image.shape[1] * image.itemsize * (3 if image.ndim == 3 else 1),
+        data=np.ascontiguousarray(image).reshape(-1).view(np.uint8),
+    )
+
+
+def color_of(message: Message) -> NDArray[np.uint8]:
+    """RGB (H, W, 3) of a sensor_msgs/Image or CompressedImage.
+
+    Raises:
+        InputError: it is of another encoding, cut short or damaged.
+    """
+    if hasattr(message, "format"):
+        return np.ascontiguousarray(_decode(message, message.data, cv2.IMREAD_COLOR)[..., ::-1])
+    channels = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}
+    if message.encoding not in channels:
+        raise _encoding(message, COLOR_ENCODINGS)
+    pixels = _pixels(message, np.dtype(np.uint8), len(message.encoding) - 1)
+    return np.ascontiguousarray(pixels[..., channels[message.encoding]])
+
+
+def depth_of(message: Message) -> NDArray[np.float32]:
+    """Depth (H, W) [m], 0 where missing, of a sensor_msgs/Image or CompressedImage; 16 bits are millimetres.
+
+    Raises:
+        InputError: it is of another encoding, cut short or damaged.
+    """
+    if hasattr(message, "format"):
+        return _compressed_depth(message)
+    if message.encoding not in DEPTH_ENCODINGS:
+        raise _encoding(message, DEPTH_ENCODINGS)
+    dtype = np.dtype(np.float32 if message.encoding == "32FC1" else np.uint16)
+    depth = _pixels(message, dtype, 1)[..., 0]
+    return _metres(depth)
+
+
+def mask_of(message: Message) -> NDArray[np.bool_]:
+    """Mask (H, W), True where a mono8 image is not black.
+
+    Raises:
+        InputError: it is of another encoding or cut short.
+    """
+    if message.encoding not in ("mono8", "8UC1"):
+        raise _encoding(message, ("mono8", "8UC1"))
+    return np.asarray(_pixels(message, np.dtype(np.uint8), 1)[..., 0] > 0)
+
+
+def camera_info_message(stamp: float, camera: Camera, frame_id: str = "camera") -> Message:
+    """sensor_msgs/CameraInfo of an undistorted camera."""
+    k = camera.K
+    return build(
+        "sensor_msgs/msg/CameraInfo",
+        header=header(stamp, frame_id),
+        height=camera.height,
+        width=camera.width,
+        distortion_model="plumb_bob",
+        d=np.zeros(5),
+        k=k.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([k, np.zeros((3, 1))]).ravel(),
+    )
+
+
+def camera_of(message: Message) -> Camera:
+    """The camera of a sensor_msgs/CameraInfo (of ROS 1 or 2), distorted as it says.
+
+    Raises:
+        CameraError: a value makes no sense, or the distortion is of another model.
+    """
+    k, d = (np.asarray(getattr(message, a, getattr(message, a.upper(), None)), np.float64) for a in ("k", "d"))
+    model = message.distortion_model or "plumb_bob"
+    if model not in ("plumb_bob", "rational_polynomial") and d.any():
+        hint = "undistort the images, or use plumb_bob or rational_polynomial"
+        raise CameraError(f"is {model!r}.", field="distortion_model", hint=hint)
+    distortion = tuple(d.tolist()) if d.any() else ()
+    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
+    return Camera(fx, fy, cx, cy, int(message.width), int(message.height), distortion)
+
+
+def joint_state_message(stamp: float, positions: ArrayLike, names: tuple[str, ...] = ()) -> Message:
+    """sensor_msgs/JointState of positions (J,) [rad or m]; unnamed joints are joint1, joint2, ..."""
+    q = np.asarray(positions, np.float64)
+    names = names or tuple(f"joint{i + 1}" for i in range(len(q)))
+    return build("sensor_msgs/msg/JointState", header=header(stamp, ""), name=list(names), position=q)
+
+
+def pose_message(T: ArrayLike) -> Message:
+    """geometry_msgs/Pose of a transform (4, 4)."""
+    M = np.asarray(T, np.float64)
+    w, *xyz = rotation_to_quat(M[:3, :3]).tolist()
+    named = dict(zip("xyz", xyz, strict=True))
+    return build("geometry_msgs/msg/Pose", position=_xyz(M[:3, 3]), orientation=named | {"w": w})
+
+
+def pose_stamped_message(stamp: float, T: ArrayLike, frame_id: str) -> Message:
+    """geometry_msgs/PoseStamped of a transform (4, 4) into ``frame_id``."""
+    return build("geometry_msgs/msg/PoseStamped", header=header(stamp, frame_id), pose=pose_message(T))
+
+
+def pose_of(message: Message) -> NDArray[np.float64]:
+    """Transform (4, 4) of a geometry_msgs/Pose or Transform.
+
+    Raises:
+        InputError: the quaternion is zero or a value is not finite.
+    """
+    at = getattr(message, "position", None) or message.translation
+    q = getattr(message, "orientation", None) or message.rotation
+    try:
+        T = pose_from_quat((at.x, at.y, at.z), (q.w, q.x, q.y, q.z))
+    except ValueError as error:
+        raise InputError(f"{error}.", field="orientation", hint="use w = 1 for no rotation") from error
+    if not np.isfinite(T).all():
+        raise InputError("is not finite.", field="position", hint="give metres")
+    return T
+
+
+def _xyz(values: ArrayLike) -> dict[str, float]:
+    return dict(zip("xyz", np.asarray(values, np.float64).tolist(), strict=True))
+
+
+def _pixels(message: Message, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+    """Pixels (H, W, channels) of an Image, rows padded or not, of either byte order."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row = width * channels * dtype.itemsize
+    data = np.asarray(message.data, np.uint8)
+    step = step or row
+    if height <= 0 or width <= 0 or step < row or data.size < step * (height - 1) + row:
+        raise InputError(
+            f"has {data.size} bytes of data for {width}x{height} {message.encoding} and a step of {step}.",
+            field="data",
+            hint="send height * step bytes",
+        )
+    padded = np.zeros(height * step, np.uint8)
+    padded[: min(data.size, padded.size)] = data[: padded.size]
+    pixels = np.ascontiguousarray(padded.reshape(height, step)[:, :row]).view(dtype.newbyteorder("<"))
+    if message.is_bigendian and dtype.itemsize > 1:
+        pixels = pixels.byteswap()
+    return np.asarray(pixels, dtype).reshape(height, width, channels)
+
+
+def _metres(depth: NDArray[Any]) -> NDArray[np.float32]:
+    if depth.dtype == np.uint16:
+        return depth.astype(np.float32) / np.float32(_MILLIMETRES)
+    return np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _compressed_depth(message: Message) -> NDArray[np.float32]:
+    data = np.asarray(message.data, np.uint8)
+    if "compressedDepth" in message.format:
+        if message.format.startswith("32FC1"):
+            raise InputError("is quantised 32FC1.", field="format", hint="record 16UC1, or raw images")
+        data = data[_COMPRESSED_DEPTH_HEADER:]
+    image = _decode(message, data, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError(f"is {image.dtype} {image.shape}.", field="data", hint="compress depth as 16-bit PNG")
+    return _metres(image)
+
+
+def _decode(message: Message, data: NDArray[np.uint8], flags: int) -> NDArray[Any]:
+    try:
+        image = cv2.imdecode(np.ascontiguousarray(data), flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"is no {message.format} image that can be decoded.", field="data", hint="send it again")
+    return image
+
+
+def _encoding(message: Message, known: tuple[str, ...]) -> InputError:
+    return InputError(f"is {message.encoding!r}.", field="encoding", hint=f"send {', '.join(known)}")

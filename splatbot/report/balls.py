@@ -1,0 +1,20 @@
+"""Balls as Gaussians, to draw robots and contacts into a map."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatbot.gaussians import GaussianModel
+from splatbot.protocols import Array
+
+
+def balls(centers: Array, radii: Array, color: Array, opacity: float) -> GaussianModel:
+    """Round Gaussians at ``centers`` (N, 3) that look as large as ``radii`` (N,) [m], of one colour (3,) in 0..1."""
+    n = len(centers)
+    return GaussianModel.from_activated(
+        means=centers,
+        quats=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        scales=np.repeat(radii[:, None] / 2.2, 3, axis=1),
+        opacities=np.full(n, opacity),
+        colors=np.tile(color, (n, 1)),
+    )

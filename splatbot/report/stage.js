@@ -1,0 +1,90 @@
+// Points on a canvas, drawn far to near, and time: drag turns, wheel zooms, the slider scrubs; buttons, space and arrow
+// keys play and step; #t=1.5 at the end of the address begins there. A page's own script, run before, gives
+// scene(put, at), which puts points and balls of moment `at`, and caption(at).
+"use strict";
+const canvas = document.getElementById("view"), slider = document.getElementById("time"), label = document.getElementById("label");
+const pen = canvas.getContext("2d"), steps = data.times.length, button = document.getElementById("play");
+let yaw = 3.6, pitch = 0.5, distance = data.distance, playing = false;
+slider.max = steps - 1;
+
+function basis() {  // camera axes in the world of z up
+  const c = Math.cos(pitch), s = Math.sin(pitch), a = Math.cos(yaw), b = Math.sin(yaw);
+  return [[-b, a, 0], [s * a, s * b, -c], [-c * a, -c * b, -s]];
+}
+
+function draw() {
+  const w = (canvas.width = canvas.clientWidth), h = (canvas.height = canvas.clientHeight), f = 0.9 * Math.min(w, h);
+  const [x, y, z] = basis(), m = data.middle, at = Number(slider.value);
+  const shown = [];
+  const put = (px, py, pz, radius, r, g, b) => {
+    const d = [px - m[0], py - m[1], pz - m[2]];
+    const depth = distance + d[0] * z[0] + d[1] * z[1] + d[2] * z[2];
+    if (depth < 0.05) return;
+    const u = w / 2 + (f * (d[0] * x[0] + d[1] * x[1] + d[2] * x[2])) / depth;
+    const v = h / 2 + (f * (d[0] * y[0] + d[1] * y[1] + d[2] * y[2])) / depth;
+    const size = (f * radius) / depth;
+    if (u > -size && v > -size && u < w + size && v < h + size) shown.push([depth, u, v, size, r, g, b]);
+  };
+  scene(put, at);
+  shown.sort((a, b) => b[0] - a[0]);
+  pen.fillStyle = "#16181d";
+  pen.fillRect(0, 0, w, h);
+  for (const [, u, v, size, r, g, b] of shown) {
+    pen.fillStyle = `rgb(${r},${g},${b})`;
+    if (size < 3) {
+      const side = Math.max(1, 2 * size);
+      pen.fillRect(u - side / 2, v - side / 2, side, side);
+    } else {
+      pen.beginPath();
+      pen.arc(u, v, size, 0, 2 * Math.PI);
+      pen.fill();
+      pen.strokeStyle = "rgba(0,0,0,0.35)";
+      pen.stroke();
+    }
+  }
+  label.textContent = `${data.times[at].toFixed(2)} s of ${data.times[steps - 1].toFixed(2)} s, ${caption(at)}`;
+}
+
+function go(at) {
+  slider.value = ((at % steps) + steps) % steps;
+  draw();
+}
+
+function play(on) {
+  playing = on;
+  button.textContent = playing ? "pause" : "play";
+}
+
+function step(by) {
+  play(false);
+  go(Number(slider.value) + by);
+}
+
+let held = null;
+canvas.addEventListener("pointerdown", (e) => { held = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
+canvas.addEventListener("pointerup", () => { held = null; });
+canvas.addEventListener("pointermove", (e) => {
+  if (!held) return;
+  yaw -= 0.01 * (e.clientX - held[0]);
+  pitch = Math.max(-1.5, Math.min(1.5, pitch + 0.01 * (e.clientY - held[1])));
+  held = [e.clientX, e.clientY];
+  draw();
+});
+canvas.addEventListener("wheel", (e) => { e.preventDefault(); distance *= Math.exp(0.001 * e.deltaY); draw(); }, { passive: false });
+slider.addEventListener("input", draw);
+button.addEventListener("click", () => play(!playing));
+document.getElementById("back").addEventListener("click", () => step(-1));
+document.getElementById("on").addEventListener("click", () => step(1));
+window.addEventListener("keydown", (e) => {
+  if (e.target === slider && e.key !== " ") return;  // it moves by itself
+  if (e.key === " ") play(!playing);
+  else if (e.key === "ArrowLeft") step(-1);
+  else if (e.key === "ArrowRight") step(1);
+  else return;
+  e.preventDefault();
+});
+setInterval(() => { if (playing) go(Number(slider.value) + 1); }, Math.max(30, (1000 * data.times[steps - 1]) / Math.max(1, steps - 1)));
+window.addEventListener("resize", draw);
+const begin = /#t=([0-9.]+)/.exec(location.hash);
+const first = begin ? data.times.findIndex((t) => t >= Number(begin[1]) - 1e-9) : 0;
+go(first < 0 ? steps - 1 : first);

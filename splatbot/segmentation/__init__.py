@@ -1,0 +1,19 @@
+"""What a map is made of: a support and the things on it."""
+
+from splatbot.segmentation.clusters import clusters
+from splatbot.segmentation.fits import Fit, fit, primitive_fits
+from splatbot.segmentation.objects import MapObject, MapScene, segment
+from splatbot.segmentation.plane import Support, find_support, given_support
+
+__all__ = [
+    "Fit",
+    "MapObject",
+    "MapScene",
+    "Support",
+    "clusters",
+    "find_support",
+    "fit",
+    "given_support",
+    "primitive_fits",
+    "segment",
+]

@@ -1,0 +1,1 @@
+"""Drivers against devices that are not there but speak their bytes."""

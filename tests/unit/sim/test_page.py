@@ -1,0 +1,154 @@
+"""A run as a page: what it holds is what happened, and a browser plays, steps and scrubs it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from splatbot.bench.tabletop import Block, Tabletop
+from splatbot.sim.page import surface_points, twin_html
+from splatbot.sim.recording import RATE, Recording
+from splatbot.sim.scene import load_scene, make_scene
+from splatbot.sim.twin import Twin, TwinResult
+
+_SHAPES: list[dict[str, Any]] = [
+    {"kind": "box", "size": [0.1, 0.2, 0.3]},
+    {"kind": "sphere", "radius": 0.1},
+    {"kind": "cylinder", "radius": 0.05, "height": 0.3},
+    {"kind": "capsule", "radius": 0.05, "height": 0.3},
+    {"kind": "ellipsoid", "axes": [0.1, 0.05, 0.2]},
+]
+
+
+@cache
+def recorded(scene: str = "mug_hanging") -> tuple[Recording, TwinResult]:
+    twin = Twin(load_scene(scene))
+    recording = Recording(twin.world)
+    return recording, twin.follow(watch=recording)
+
+
+def document(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    values: dict[str, Any] = json.loads(found.group(1))
+    return values
+
+
+def unpacked(text: str, kind: type) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+@pytest.mark.parametrize("shape", _SHAPES, ids=lambda shape: str(shape["kind"]))
+def test_points_of_a_shape_are_where_a_ray_from_outside_hits_it(shape: dict[str, Any]) -> None:
+    model = Twin(
+        make_scene({"name": "x", "robot": None, "objects": [{"name": "thing", "shapes": [shape]}]})
+    ).world.model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    points, hit = surface_points(model, 0, 200), np.zeros(1, np.int32)
+    assert len(points) == 200
+    for point in points:
+        out = point / np.linalg.norm(point)
+        far = mujoco.mj_ray(model, data, 2.0 * out, -out, None, 1, -1, hit)
+        assert 2.0 - far == pytest.approx(float(np.linalg.norm(point)), abs=1e-6)
+
+
+def test_the_recording_has_the_places_touches_and_room_of_the_run() -> None:
+    recording, result = recorded()
+    assert len(recording.times) == pytest.approx(RATE * result.duration, abs=1)
+    seen: list[np.ndarray] = []
+    twin = Twin(load_scene("mug_hanging"))
+    twin.follow(watch=lambda data, time: seen.append(data.xpos.copy()) if time in recording.times else None)
+    np.testing.assert_array_equal(recording.poses[..., 3], np.array(seen))
+    assert min(recording.rooms) == pytest.approx(result.near.room, abs=1e-3)
+    touching = [t for t, found in zip(recording.times, recording.touches, strict=True) if found]
+    first, last = min(touch.first for touch in result.touches), max(touch.last for touch in result.touches)
+    assert first <= touching[0] <= first + 2 / RATE + 0.2  # at first fainter than is shown
+    assert touching[-1] <= last
+    assert max(force for found in recording.touches for *_, force in found) <= max(t.force for t in result.touches)
+
+
+def test_the_pages_bodies_are_where_mujocos_geoms_are() -> None:
+    recording, result = recorded()
+    values = document(twin_html(recording, result))
+    model = recording.world.model
+    own, body = unpacked(values["own"], np.float32).reshape(-1, 3), unpacked(values["body"], np.uint16)
+    poses = unpacked(values["poses"], np.float32).reshape(len(values["times"]), model.nbody, 3, 4)
+    mug = int(model.body("object/mug").id)
+    at = poses[-1, mug]
+    shown = own[body == mug] @ at[:, :3].T + at[:, 3]
+    assert len(shown) > 100
+    assert np.linalg.norm(shown - recording.poses[-1, mug, :, 3], axis=1).max() < 0.15
+    assert values["touches"][-1]
+    assert {number for number in body if recording.world.of_robot[model.body_geomadr[number]]}
+
+
+def test_a_map_is_shown_by_its_gaussians_less_those_that_move(tmp_path: Path) -> None:
+    table, carton = Block((0.6, 0.0, -0.02), (0.8, 1.0, 0.04)), Block((0.5, 0.15, 0.06), (0.10, 0.07, 0.12))
+    Tabletop((table, carton)).gaussians(8000).save(tmp_path / "map.ply")
+    shown, file = {}, str(tmp_path / "map.ply")
+    for movable in (False, True):
+        twin = Twin(make_scene({"name": "x", "map": {"file": file, "movable": movable, "support": [0, 0, 1, 0]}}))
+        recording = Recording(twin.world)
+        values = document(twin_html(recording, twin.follow(watch=recording)))
+        points = unpacked(values["points"], np.float32).reshape(-1, 3)
+        on_top = (np.abs(points - [0.5, 0.15, 0.12]) < [0.05, 0.035, 0.003]).all(axis=1)
+        shown[movable] = int(on_top.sum())
+    assert shown[False] > 20
+    assert shown[True] == 0
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> str:
+    found = shutil.which("chromium") or shutil.which("google-chrome")
+    if found is None:
+        pytest.skip("no Chromium here")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("address", "clicks", "time"),
+    [
+        ("", "", 0.0),
+        ("#t=2.5", "", 2.5),
+        ("#t=99", "", 4.0),
+        ("#t=1", 'press("on"); press("on"); press("back");', 1.0 + 1 / RATE),
+        ("", 'press("back");', 4.0),
+        ("", 'const s = document.getElementById("time"); s.value = 60; s.dispatchEvent(new Event("input"));', 2.0),
+    ],
+    ids=["begins", "address", "beyond the end", "steps", "a step back from the start", "scrubs"],
+)
+def test_a_browser_shows_the_moment_that_it_is_told(
+    browser: str, tmp_path: Path, address: str, clicks: str, time: float
+) -> None:
+    text = _label(browser, tmp_path, address, clicks)
+    assert float(text.split()[0]) == pytest.approx(time, abs=1.5 / RATE)
+    assert "of 4.00 s, room" in text
+
+
+def test_a_browser_plays_until_it_is_stopped(browser: str, tmp_path: Path) -> None:
+    playing = 'press("play"); setTimeout(() => press("play"), 600);'
+    assert 0.1 < float(_label(browser, tmp_path, "", playing).split()[0]) < 3.5
+
+
+def _label(browser: str, folder: Path, address: str, clicks: str) -> str:
+    """What is written beside the slider after some clicks."""
+    page = twin_html(*recorded())
+    press = f"const press = (id) => document.getElementById(id).click(); {clicks}"
+    (folder / "run.html").write_text(page.replace("</body>", f"<script>{press}</script></body>"))
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}",
+               "--virtual-time-budget=3000", "--dump-dom", f"file://{folder / 'run.html'}{address}"]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    found = re.search(r'<span id="label">([^<]*)', done.stdout)
+    assert found is not None, done.stderr[-2000:]
+    return found.group(1)
