@@ -277,6 +277,6 @@ def test_spheres_of_a_held_object_cover_it_and_are_few() -> None:
 def test_options_that_make_no_sense_are_refused() -> None:
     for wrong in ({"lift": 0.0}, {"free": 0.3}, {"speed": 0.0}, {"tries": 0}, {"force": -1.0}, {"budget_ms": 0.0}):
         with pytest.raises(InputError, match="options"):
-            PickOptions(**wrong)  # type: ignore[arg-type]
+            PickOptions(**wrong)
     with pytest.raises(InputError, match="gripper"):
         Picker(sampler(), FakeController(panda().home), FakeGripper(stroke=0.05))
