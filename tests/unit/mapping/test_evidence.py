@@ -11,7 +11,16 @@ import torch
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.geometry import inverse, quat_multiply, se3_exp, transform_points
-from splatbot.mapping.evidence import DepthNoise, Evidence, count, first_uncertainty, fuse_depth, fuse_normals, stable, weigh
+from splatbot.mapping.evidence import (
+    DepthNoise,
+    Evidence,
+    count,
+    first_uncertainty,
+    fuse_depth,
+    fuse_normals,
+    stable,
+    weigh,
+)
 from splatbot.mapping.keyframes import Keyframe
 from tests.rgbd import CAMERA, Array
 from tests.unit.mapping.conftest import MakeKeyframe
