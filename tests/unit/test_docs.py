@@ -9,7 +9,9 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"]
-DOCUMENTS += [f"docs/{name}.md" for name in ("stability", "simulate", "bench", "mapping", "planning", "grasping", "twin")]
+DOCUMENTS += [
+    f"docs/{name}.md" for name in ("stability", "simulate", "bench", "mapping", "planning", "grasping", "twin")
+]
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
