@@ -15,6 +15,9 @@ from splatbot.robots.shapes import Box, Capsule, Shape
 
 DAMPING = 1.0  # [Nm s/rad] of arm joints; an estimate
 FINGER_MASS = 0.015  # [kg]
+FINGER_DRIVE = (
+    0.5  # [kg] of the drive as a finger feels it, an estimate; contacts of a bare finger's 15 g would be jelly
+)
 FINGER_GAIN = 2000.0  # [N/m] of the fingers' position servo, capped by the gripper's force
 
 
@@ -101,7 +104,14 @@ def _add_gripper(
     for name, T in zip(names, gripper.T_link_finger, strict=True):
         body = ElementTree.SubElement(hand, "body", {"name": name, **_pose(T)})
         ElementTree.SubElement(
-            body, "joint", name=name, type="slide", axis="0 1 0", range=_text([0.0, gripper.stroke]), damping="10"
+            body,
+            "joint",
+            name=name,
+            type="slide",
+            axis="0 1 0",
+            range=_text([0.0, gripper.stroke]),
+            damping="10",
+            armature=_text([FINGER_DRIVE]),
         )
         inertia = _text([FINGER_MASS / 6 * 4e-4] * 3)
         ElementTree.SubElement(body, "inertial", pos="0 0.01 0.02", mass=_text([FINGER_MASS]), diaginertia=inertia)

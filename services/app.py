@@ -15,7 +15,6 @@ from splatbot.services.guard import Guard
 from splatbot.services.limits import BodyLimit
 from splatbot.services.problems import install_problem_handlers
 from splatbot.services.requests import HEADER, RequestLog
-from splatbot.services.ros.node import RosNode
 from splatbot.services.routes import (
     collisions,
     distance,
@@ -32,6 +31,7 @@ from splatbot.services.routes import (
     views,
 )
 from splatbot.services.runtime import Runtime
+from splatbot.services.sides import Sides
 
 _DESCRIPTION = """
 Questions about maps of 3D Gaussians. Lengths are metres in the map's world frame, angles radians, quaternions wxyz,
@@ -43,19 +43,19 @@ camera axes OpenCV's (x right, y down, z forward). Every answer names the `map_v
 def create_app(runtime: Runtime) -> FastAPI:
     """The service on ``runtime``, which begins with the application and ends with it."""
     settings = runtime.settings
-    node = RosNode(runtime.store, on_frame=runtime.take)
+    sides = Sides(settings, runtime.store, runtime.arms, on_frame=runtime.take)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(runtime.start)
-        node.start()
+        await run_in_threadpool(sides.start)
         yield
-        node.stop()
+        await run_in_threadpool(sides.stop)
         await run_in_threadpool(runtime.close)
 
     app = FastAPI(title="splatbot", version=splatbot.__version__, description=_DESCRIPTION, lifespan=lifespan)
     app.state.runtime = runtime
-    app.state.ros = node
+    app.state.ros = sides.ros
     # The last one added is the first to see a request.
     uploads = {"/upload": settings.max_upload_bytes}
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, larger=uploads)

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from splatbot.errors import ControllerError, InputError
-from splatbot.planning import Trajectory
-from splatbot.protocols import Controller, Feedback, MotionState
+from splatbot.protocols import Controller, Feedback, MotionState, TimedPath
 from splatbot.robots.controllers import FakeController
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot, robot_names
@@ -124,7 +123,7 @@ class Arms:
             arm.ready()
             return arm
 
-    def send(self, name: str, trajectory: Trajectory, *, key: str | None = None, request: str = "") -> Job:
+    def send(self, name: str, trajectory: TimedPath, *, key: str | None = None, request: str = "") -> Job:
         """Let an arm follow a trajectory; the motion is a job: done, faulted ("failed"), or stopped ("cancelled").
 
         Raises:
@@ -148,7 +147,7 @@ class Arms:
         """Stop every motion."""
         self.motions.close(timeout_s)
 
-    def _follow(self, arm: Arm, trajectory: Trajectory, handle: JobHandle) -> dict[str, Any]:
+    def _follow(self, arm: Arm, trajectory: TimedPath, handle: JobHandle) -> dict[str, Any]:
         controller = arm.ready()
         told, largest = 0.0, 0.0
         begin, steps = time.perf_counter(), 0

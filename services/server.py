@@ -38,8 +38,10 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
     """
     settings = runtime.settings
     check_exposure(settings)
-    listener = _listen(settings.host, settings.port)
-    host, port = listener.getsockname()[:2]
+    listeners = [_listen(settings.host, settings.port)]
+    if settings.ros_port is not None:
+        listeners.append(_listen(settings.host, settings.ros_port))
+    host, port = listeners[0].getsockname()[:2]
     scheme = "https" if settings.tls_cert is not None else "http"
     on_start(f"{scheme}://{'[' + host + ']' if ':' in host else host}:{port}")
     config = uvicorn.Config(
@@ -55,7 +57,7 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
     # After its graceful end uvicorn raises the signal again for whoever else listens: here it has done its work.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        _Server(config, runtime).run(sockets=[listener])
+        _Server(config, runtime).run(sockets=listeners)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

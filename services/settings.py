@@ -30,6 +30,9 @@ class ServiceSettings(BaseSettings):
 
     host: str = Field("127.0.0.1", description="address to listen on; 0.0.0.0 for every interface")
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
+    ros_port: int | None = Field(None, ge=0, le=65535, description="a port for roslib clients too (9090 is theirs)")
+    viewer_port: int | None = Field(None, ge=0, le=65535, description="port of the viewer, on this machine alone")
+    record: Path | None = Field(None, description="an MCAP file that every topic is recorded into")
     api_keys: Words = Field((), description="hashes that `splatbot serve --new-key` prints; needed beyond loopback")
     tls_cert: Path | None = Field(None, description="certificate chain (PEM); with tls_key the service speaks HTTPS")
     tls_key: Path | None = Field(None, description="its private key (PEM)")

@@ -7,13 +7,15 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.protocols import Array, Feedback, MotionState, TimedPath
 from splatbot.robots.controllers.base import FOLLOWING, SteppedController
+from splatbot.sim.gripper import TwinGripper
 from splatbot.sim.twin import Twin
 
 
 class TwinController(SteppedController):
     """A :class:`splatbot.protocols.Controller` whose arm is in a twin; each step is one control period of physics.
 
-    Physics passes while the arm holds still, too. Told to stop, it holds where it is from the next step on.
+    Physics passes while the arm holds still, too. Told to stop, it holds where it is from the next step on. ``gripper``
+    are its fingers, None without any.
 
     Args:
         twin: reset, or wherever its arm is.
@@ -27,6 +29,8 @@ class TwinController(SteppedController):
         if twin.follower is None:
             raise InputError("has no robot.", field=twin.scene.name, hint="give the scene a robot")
         self.twin, self._follower = twin, twin.follower
+        has_fingers = twin.world.robot is not None and twin.world.robot.gripper is not None
+        self.gripper = TwinGripper(twin) if has_fingers else None
         self._clock = 0.0
         super().__init__(self._measured(), period=1.0 / twin.rate, following=following)
         self._hold = self._position.copy()
@@ -61,7 +65,8 @@ class TwinController(SteppedController):
         self._hold = self._desired.copy() if state is MotionState.DONE else self._measured()
 
     def _advance(self, q: Array, velocity: Array, acceleration: Array) -> None:
-        self.twin.advance(self._clock, q, velocity, acceleration, None)
+        opening = None if self.gripper is None else self.gripper.command(self._period)
+        self.twin.advance(self._clock, q, velocity, acceleration, opening)
         self._clock += self._period
 
     def _measured(self) -> Array:

@@ -141,7 +141,7 @@ def _frame(asked: FrameRequest, max_pixels: int) -> Frame:
 
 def _decoded(value: Any, field: str, flags: int, max_pixels: int) -> NDArray[Any]:
     if isinstance(value, np.ndarray):
-        return np.require(value, requirements=("C", "W"))  # arrays of a body are read-only
+        return np.require(value, requirements=["C", "W"])  # arrays of a body are read-only
     data = checked_picture(value, max_pixels, field)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

@@ -26,12 +26,14 @@ COMMANDS = {
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "view": _Command("splatbot.cli.view", "view", "Show a map in a web browser, or write it as one HTML page."),
     "plan": _Command(
         "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
     ),
     "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked thing in a map."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
+    "pick": _Command("splatbot.cli.pick", "pick", "Pick a named thing in the twin: look, grasp, plan, lift, check."),
     "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),
     "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
     "sim2real": _Command(
@@ -57,6 +59,11 @@ COMMANDS = {
         "splatbot.cli.bench_planning",
         "bench_planning",
         "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
+    ),
+    "bench grasping": _Command(
+        "splatbot.cli.bench_grasping",
+        "bench_grasping",
+        "Measure grasping: candidates a second, time to a ranked list, contacts against exact shapes.",
     ),
     "bench service": _Command(
         "splatbot.cli.bench_service",

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from splatbot.logs import Log
+    from splatbot.protocols import FrameSource
     from splatbot.services.runtime import Runtime
 
 MAP_ID = "default"
@@ -19,6 +21,9 @@ def serve(
     camera: str | None = None,
     host: str | None = None,
     port: int | None = None,
+    ros_port: int | None = None,
+    viewer_port: int | None = None,
+    record: Path | None = None,
     config: Path | None = None,
     service_config: Path | None = None,
     new_key: bool = False,
@@ -28,6 +33,7 @@ def serve(
     Examples:
         splatbot serve --map runs/demo/map.ply
         splatbot serve --log recordings/desk --port 8080
+        splatbot serve --camera "replay:recordings/desk?loop=1" --viewer-port 8001 --ros-port 9090
         SPLATBOT_LOG_ROOTS=recordings splatbot serve --data maps
         splatbot serve --new-key
         curl localhost:8000/v1/maps/default/distance -H 'content-type: application/json' -d '{"points": [[0, 0, 1]]}'
@@ -39,9 +45,14 @@ def serve(
         map: a map file, or a run folder that holds map.ply.
         log: a log that is mapped while the service runs; the answers follow the map's latest state.
         data: folder that maps made by clients are kept in and served from again, or SPLATBOT_DATA_DIR.
-        camera: intrinsics of the log, instead of its own (as for `splatbot map`).
+        camera: a camera that is mapped while the service runs (replay:LOG plays a recording in real time); or, with
+            --log, intrinsics instead of the log's own.
         host: address to listen on (default 127.0.0.1; 0.0.0.0 for every interface, which needs keys), or SPLATBOT_HOST.
         port: port to listen on (default 8000; 0 takes a free one), or SPLATBOT_PORT.
+        ros_port: one more port, for roslib clients that want a port of their own (usually 9090); rosbridge is at
+            /rosbridge of --port in any case, Foxglove at /foxglove.
+        viewer_port: show the map in the browser at this port, on this machine alone.
+        record: record every topic into this MCAP file; what was mapped can be mapped again from it.
         config: YAML file with the configuration of mapping.
         service_config: YAML file with the service's address, keys and limits.
         new_key: print a new API key and its hash for SPLATBOT_API_KEYS, and leave.
@@ -51,22 +62,29 @@ def serve(
     if new_key:
         return _print_new_key()
     from splatbot.config import load_config
+    from splatbot.logs import open_log
+    from splatbot.robots.cameras import is_camera, open_camera
     from splatbot.services.requests import configure_logging
     from splatbot.services.runtime import Runtime, check_exposure
     from splatbot.services.server import run_service
     from splatbot.services.settings import load_settings
 
-    settings = load_settings(service_config, host=host, port=port, data_dir=data)
+    given = {"host": host, "port": port, "ros_port": ros_port, "viewer_port": viewer_port, "record": record}
+    settings = load_settings(service_config, data_dir=data, **given)
     configure_logging(as_json=settings.log_json)
-    if (map is None) == (log is None) and (map is not None or settings.data_dir is None):
+    device = camera if camera is not None and is_camera(camera) else None
+    sources = sum(source is not None for source in (map, log, device))
+    if sources > 1 or (sources == 0 and settings.data_dir is None):
         hint = "e.g. --map runs/demo/map.ply; or --data DIR, for maps that clients make"
-        raise InputError("give either a map or a log.", field="--map, --log", hint=hint)
+        raise InputError("give a map, a log or a camera.", field="--map, --log, --camera", hint=hint)
     check_exposure(settings)
     runtime = Runtime(settings, config=load_config(config))
     if map is not None:
         _add_map(runtime, map)
+    elif device is not None:
+        _follow(runtime, open_camera(device))
     elif log is not None:
-        _follow_log(runtime, log, camera)
+        _follow(runtime, open_log(log, camera=camera))
     try:
         run_service(runtime, on_start=_announce)
     finally:
@@ -83,13 +101,13 @@ def _add_map(runtime: Runtime, map_: Path) -> None:
     runtime.store.add(MAP_ID, source=path.name, state="static", snapshot=snapshot, workspace=find_workspace(path))
 
 
-def _follow_log(runtime: Runtime, uri: str, camera: str | None) -> None:
-    from splatbot.logs import open_log
+def _follow(runtime: Runtime, source: Log | FrameSource) -> None:
+    from splatbot.robots.cameras.replay import PREFIX
     from splatbot.services.mapping import workspace_of
     from splatbot.slam import Slam
 
-    source = open_log(uri, camera=camera)
-    runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace_of(source.uri, None))
+    workspace = workspace_of(source.uri.removeprefix(PREFIX), None)
+    runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace)
     runtime.follow(MAP_ID, source, Slam(runtime.config))
 
 

@@ -77,11 +77,11 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     T[..., :3, 0], T[..., :3, 1], T[..., :3, 2] = np.cross(yy, zz), yy, zz
     T[..., :3, 3] = pairs.contacts.mean(axis=1)[:, None, None] - zz * places[None, None, :, None]
     pair = np.broadcast_to(np.arange(len(pairs))[:, None, None], shape).ravel()
-    T = T.reshape(-1, 4, 4)
-    steep = -(T[:, :3, 2] @ up) >= lowest
-    T, pair = T[steep], pair[steep]
-    zero = np.zeros(len(T))
-    return Hands(T, pair, pairs.width[pair] + 2 * SLACK, zero, zero.copy(), zero.copy())
+    poses = T.reshape(-1, 4, 4)
+    steep = -(poses[:, :3, 2] @ up) >= lowest
+    poses, pair = poses[steep], pair[steep]
+    zero = np.zeros(len(poses))
+    return Hands(poses, pair, pairs.width[pair] + 2 * SLACK, zero, zero.copy(), zero.copy())
 
 
 def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
@@ -156,7 +156,7 @@ def _measured(
 
 
 def _held(
-    x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], half: Array, hand: HandShape
+    x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], half: NDArray[np.float32], hand: HandShape
 ) -> Array:
     """Of four by four parts of each pad, the share that has the surface under it, of the lesser pad."""
     column = np.floor((x / hand.width + 0.5) * 4)

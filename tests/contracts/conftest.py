@@ -16,10 +16,12 @@ from fastapi import FastAPI
 from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.geometry import pose_from_quat
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
+from splatbot.workspace import Workspace
 
 
 @dataclass(frozen=True)
@@ -36,13 +38,17 @@ class Service:
         """Its maps."""
         return self.runtime.store
 
+    def ws(self, path: str) -> str:
+        """The address of a WebSocket."""
+        return f"ws://127.0.0.1:{self.client.base_url.port}{path}"
+
 
 @contextmanager
 def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterator[Service]:
     """A real server on a real socket, until the block ends."""
     runtime = Runtime(settings, store)
     app = create_app(runtime)
-    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning")
+    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws_max_size=settings.max_message_bytes)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
@@ -110,6 +116,10 @@ def _sheet(
 def service() -> Iterator[Service]:
     """The service on the map "wall", with small limits."""
     store = MapStore()
-    store.add("wall", source="wall.ply", state="static", snapshot=wall())
-    with running(ServiceSettings(max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480), store) as it:
+    beside = Workspace(T_world_base=pose_from_quat((0.0, 0.5, -1.0), (0.7071068, 0.7071068, 0.0, 0.0)))
+    store.add("wall", source="wall.ply", state="static", snapshot=wall(), workspace=beside)
+    settings = ServiceSettings(
+        max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480, max_message_bytes=2_000_000
+    )
+    with running(settings, store) as it:
         yield it

@@ -109,6 +109,19 @@ def test_a_thing_that_the_map_lacks_costs_overlap_and_depth(tmp_path: Path) -> N
         assert getattr(less, name) > getattr(whole, name) + 0.001
 
 
+def test_a_plane_that_the_log_names_counts_in_the_maps_frame(tmp_path: Path) -> None:
+    sought = around(tmp_path, TABLE, *THINGS)
+    up = T_MAP_BASE[:3, 2]
+    named = np.append(up, -float(up @ T_MAP_BASE[:3, 3]) - 0.02)  # 2 cm over the table
+    given = surroundings(sought.model, tmp_path / "map.ply", T_MAP_BASE, panda(), named)
+    assert sought.support is not None
+    assert given.support is not None
+    assert sought.support.offset == pytest.approx(0.0, abs=2e-3)
+    assert given.support.offset == pytest.approx(0.02)
+    table = next(thing for thing in TwinViews(given).world.scene.objects if thing.name == "map-table")
+    assert table.at[2] == pytest.approx(0.02)
+
+
 def test_masked_pixels_do_not_count(tmp_path: Path) -> None:
     views = TwinViews(around(tmp_path, TABLE, *THINGS))
     mask = np.ones((120, 160), np.bool_)
@@ -146,7 +159,7 @@ def _tools(count: int, spacing: float) -> tuple[Array, Trajectory]:
 
 def test_tool_poses_are_done_again_by_ik_to_a_tenth_of_a_millimetre() -> None:
     _, tool = _tools(4, 1.0)
-    knots = find_knots(ArmRecord(tool), list(tool.stamps), panda())
+    knots = find_knots(ArmRecord(tool), [*tool.stamps, np.nan], panda())  # the last frame could not be read
     assert knots is not None
     found = replay(knots, Twin(make_scene({"name": "bare"})))
     assert (found.source, found.poses, found.reached, found.slower) == (BY_IK, 4, 4, 1.0)

@@ -1,0 +1,137 @@
+"""A scene is looked at from around with a depth camera: what a robot knows of it before it acts."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from splatbot.camera import Camera
+from splatbot.errors import InputError
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import look_at, rotation_to_quat, transform_points
+from splatbot.protocols import Array
+from splatbot.sim.effects.registry import make_effects
+from splatbot.sim.motion import base_of
+from splatbot.sim.twin import Twin
+from splatbot.tracking.prepare import normals_of
+
+SPACING = 4e-3  # [m] between discs
+_AWAY = 0.65  # [m] of the camera from the middle of the objects
+_STEEP = (np.radians(60.0), np.radians(30.0))  # over the support, in turns
+_FARTHEST = 3.0  # [m] that the camera measures
+_SIGMA = 0.55  # of a disc across, in spacings
+_THICK = 1e-3  # [m]
+_STAND = 0.2  # [m] around the robot's foot that is its stand, and not mapped
+_GRAZING = 0.2  # least cosine between a surface's normal and the ray; flatter ones are measured badly
+
+
+def scan(twin: Twin, *, views: int = 8, width: int = 320, spacing: float = SPACING, seed: int = 0) -> GaussianModel:
+    """Discs on what the twin holds now, in its world's frame, where a depth camera at exact poses measured them.
+
+    Depth is cast against the twin's shapes, through the sensor effects of the scene's camera if it has one; the arm and
+    its stand are masked out. Colours are those of the shapes, without light. Nothing is tracked or refined: each disc
+    is the mean of what was measured in a cell of a grid.
+
+    Args:
+        twin: as it is.
+        views: around the middle of its movable objects.
+        width: of a picture [px]; 3/4 as high.
+        spacing: of the grid [m]: accuracy for time.
+        seed: of the sensor's noise.
+
+    Raises:
+        InputError: the scene has nothing but planes, or an argument is out of range.
+    """
+    if views < 1 or width < 32 or not 1e-3 <= spacing <= 0.1:
+        raise InputError("is out of range.", field="scan", hint="give 1 view or more, 32 pixels, 0.001..0.1 m")
+    camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (3 * width // 4 - 1) / 2, width, 3 * width // 4)
+    section = twin.scene.camera
+    effects = make_effects(section.sensor if section is not None else (), seed=seed, why="sensor of the scan")
+    middle = _middle(twin)
+    poses = [_pose(middle, k, views) for k in range(views)]
+    mujoco.mj_forward(twin.world.model, twin.data)
+    frames = [_frame(twin, camera, T, k) for k, T in enumerate(poses)]
+    points, normals, colors = (np.concatenate(c) for c in zip(*(
+        _measured(frame, poses[frame.index]) for frame in effects.over(frames)), strict=True))  # fmt: skip
+    base = base_of(twin.scene)
+    away = np.linalg.norm((points - base[:3, 3])[:, :2], axis=1) > _STAND
+    points, normals, colors = _averaged(points[away], normals[away], colors[away], spacing)
+    return GaussianModel.from_activated(
+        means=points,
+        quats=rotation_to_quat(_upright(normals)),
+        scales=np.tile([_SIGMA * spacing, _SIGMA * spacing, _THICK], (len(points), 1)),
+        opacities=np.full(len(points), 0.9),
+        colors=colors,
+    )
+
+
+def _middle(twin: Twin) -> Array:
+    things = [thing for thing in twin.scene.objects if all(shape.kind != "plane" for shape in thing.shapes)]
+    things = [thing for thing in things if thing.movable] or things
+    if not things:
+        raise InputError("has nothing to look at.", field=twin.scene.name, hint="give it objects")
+    at = np.array([twin.data.body(f"object/{thing.name}").xpos for thing in things])
+    return np.asarray((at.min(axis=0) + at.max(axis=0)) / 2)
+
+
+def _pose(middle: Array, k: int, views: int) -> Array:
+    turn, steep = 2 * np.pi * (k + 0.5) / views, _STEEP[k % len(_STEEP)]
+    side = np.array([np.cos(turn) * np.cos(steep), np.sin(turn) * np.cos(steep), np.sin(steep)])
+    return look_at(middle + _AWAY * side, middle)
+
+
+def _frame(twin: Twin, camera: Camera, T_world_camera: Array, index: int) -> Frame:
+    """Depth along the optical axis and colours; the arm is 0 in both."""
+    model = twin.world.model
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    world = np.ascontiguousarray(
+        rays.reshape(-1, 3) @ T_world_camera[:3, :3].T
+    )  # 1 m along the axis: distance is depth
+    geoms, depth = np.full(len(world), -1, np.int32), np.zeros(len(world))
+    origin = np.ascontiguousarray(T_world_camera[:3, 3])
+    mujoco.mj_multiRay(model, twin.data, origin, world.ravel(), None, 1, -1, geoms, depth, None, len(world), _FARTHEST)
+    hit = (geoms >= 0) & (depth > 0) & (depth <= _FARTHEST) & ~twin.world.of_robot[geoms]
+    rgb = np.where(hit[:, None], 255.0 * np.asarray(model.geom_rgba)[geoms, :3], 0.0)
+    shape = (camera.height, camera.width)
+    return Frame(
+        float(index),
+        rgb.reshape(*shape, 3).astype(np.uint8),
+        np.where(hit, depth, 0.0).reshape(shape).astype(np.float32),
+        camera,
+        index,
+        source=f"scan of {twin.scene.name} #{index}",
+    )
+
+
+def _measured(frame: Frame, T_world_camera: Array) -> tuple[Array, Array, Array]:
+    """Points (P, 3) [m], their normals (P, 3), in the world, and colours (P, 3), where a normal is known."""
+    normals = normals_of(frame.depth, frame.camera).astype(np.float64)
+    points = frame.camera.backproject(frame.depth).astype(np.float64)
+    rays = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
+    good = (frame.depth > 0) & (-(normals * rays).sum(axis=-1) > _GRAZING)
+    R = T_world_camera[:3, :3]
+    return transform_points(T_world_camera, points[good]), normals[good] @ R.T, frame.rgb[good] / 255.0
+
+
+def _averaged(points: Array, normals: Array, colors: Array, spacing: float) -> tuple[Array, Array, Array]:
+    """Means over cells of a grid."""
+    cells = np.floor(points / spacing).astype(np.int64)
+    group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)[1:]
+    means = []
+    for values in (points, normals, colors):
+        total = np.zeros((len(count), 3))
+        np.add.at(total, group.reshape(-1), values)
+        means.append(total / count[:, None])
+    length = np.linalg.norm(means[1], axis=1, keepdims=True)
+    kept = length[:, 0] > 0.3  # below, both sides of something thin are in the cell
+    return means[0][kept], (means[1] / np.maximum(length, 1e-9))[kept], means[2][kept]
+
+
+def _upright(normals: Array) -> Array:
+    """Rotations (P, 3, 3) whose z axes are normals (P, 3)."""
+    other = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    x = np.cross(other, normals)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(normals, x), normals], axis=-1)

@@ -1,0 +1,282 @@
+"""Picking in the twin, and with arms and fingers that fail: held and lifted, or a typed outcome and at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
+from splatbot.collision import RobotSpheres
+from splatbot.errors import GripperError, InputError
+from splatbot.grasping.affordance import Target
+from splatbot.grasping.held import covering_spheres
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.pick import Picker, PickError, PickOptions, PickOutcome, PickResult, PickStage
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.types import GraspResult
+from splatbot.planning import GaussianRRTStar
+from splatbot.protocols import Gripper, MotionState
+from splatbot.robots.controllers import FakeController
+from splatbot.robots.grippers import FakeGripper, FakeRobotiq, RobotiqGripper
+from splatbot.robots.panda import panda
+from splatbot.segmentation import MapScene, segment
+from splatbot.sim.controller import TwinController
+from splatbot.sim.scene import make_scene
+from splatbot.sim.twin import Twin
+
+pytest.importorskip("mujoco")
+
+TABLE = Block((0.55, 0.0, -0.02), (0.6, 0.9, 0.04))
+CARTON = Block((0.50, 0.05, 0.05), (0.10, 0.06, 0.10), 0.4)
+CAN = Can((0.50, -0.20, 0.0), 0.03, 0.12)
+BALL = Ball((0.60, 0.27, 0.03), 0.03)
+OPTIONS = PickOptions(speed=1.0, grasp=GraspOptions(samples=200, wanted=5))
+NAMES = {"carton": CARTON.center, "can": (0.50, -0.20, 0.06), "ball": BALL.center}
+
+
+@cache
+def scene() -> MapScene:
+    found = segment(Tabletop((TABLE, CARTON, CAN, BALL)).gaussians(20_000), np.eye(4))
+    assert len(found.objects) == 3
+    return found
+
+
+@cache
+def sampler() -> GraspSampler:
+    return GraspSampler(scene(), panda())
+
+
+def target(name: str) -> Target:
+    away = [np.linalg.norm(o.center - np.array(NAMES[name])) for o in scene().objects]
+    k = int(np.argmin(away))
+    return Target(scene().objects[k].rows, None, name, "test", 1.0, (), k)
+
+
+@cache
+def grasps(name: str) -> GraspResult:
+    return sampler().sample(target(name), OPTIONS.grasp)
+
+
+def twin() -> Twin:
+    things: list[dict[str, Any]] = [
+        {"name": "table", "shapes": [{"kind": "plane"}]},
+        {"name": "carton", "shapes": [{"kind": "box", "size": list(CARTON.size)}], "at": list(CARTON.center),
+         "rpy": [0, 0, CARTON.yaw], "movable": True, "mass": 0.3},
+        {"name": "can", "shapes": [{"kind": "cylinder", "radius": CAN.radius, "height": CAN.height}],
+         "at": [*CAN.foot[:2], CAN.height / 2], "movable": True, "mass": 0.3},
+        {"name": "ball", "shapes": [{"kind": "sphere", "radius": BALL.radius}], "at": list(BALL.center),
+         "movable": True, "mass": 0.1},
+    ]  # fmt: skip
+    return Twin(make_scene({"name": "pick", "objects": things, "task": {"kind": "grasp"}}))
+
+
+def height(of: Twin, name: str) -> float:
+    return float(of.data.body(f"object/{name}").xpos[2])
+
+
+@pytest.mark.parametrize("name", list(NAMES))
+def test_in_the_twin_it_is_lifted_and_carried_and_stays_in_the_hand(name: str) -> None:
+    world = twin()
+    controller = TwinController(world)
+    assert controller.gripper is not None
+    before = height(world, name)
+    others = {other: height(world, other) for other in NAMES if other != name}
+    result = Picker(sampler(), controller, controller.gripper, options=OPTIONS).pick(target(name), grasps=grasps(name))
+    assert result, result.reason
+    assert result.unwrap() is result.grasp
+    assert [step.stage for step in result.steps] == [
+        PickStage.GRASP, PickStage.PLAN, PickStage.OPEN, PickStage.MOVE, PickStage.APPROACH, PickStage.CLOSE,
+        PickStage.LIFT, PickStage.LIFT, PickStage.CHECK,
+    ]  # fmt: skip
+    assert height(world, name) - before == pytest.approx(OPTIONS.lift, abs=0.01)
+    assert {other: height(world, other) for other in others} == pytest.approx(others, abs=2e-3)
+    assert result.opening == pytest.approx(result.unwrap().width, abs=6e-3)
+    # What is attached is where the object is: planning takes it along from here.
+    assert result.attached is not None
+    assert result.q is not None
+    held = RobotSpheres(panda(), attached=result.attached).centers(result.q[None])[0, -len(result.attached) :]
+    assert np.linalg.norm(held.mean(axis=0) - world.data.body(f"object/{name}").xpos) < 0.03
+    for _ in range(300):
+        controller.step()
+    assert controller.gripper.holds()
+
+
+def test_what_is_held_is_carried_around_what_is_in_the_way() -> None:
+    world = twin()
+    controller = TwinController(world)
+    assert controller.gripper is not None
+    options = PickOptions(speed=1.0, grasp=OPTIONS.grasp, carry_to=tuple(panda().home), budget_ms=500.0)
+    result = Picker(sampler(), controller, controller.gripper, options=options).pick(
+        target("can"), grasps=grasps("can")
+    )
+    assert result, result.reason
+    assert result.steps[-1].stage is PickStage.CARRY
+    np.testing.assert_allclose(controller.position, panda().home, atol=0.01)
+    assert height(world, "can") > 0.2
+    # Planning minds the object: a goal at which it alone would be in the table is refused.
+    assert result.attached is not None
+    longer = result.attached.copy()
+    longer[:, 2] += 0.5
+    planner = GaussianRRTStar(sampler().field, panda(), attached=longer)
+    assert planner.plan(panda().home, panda().home + 1e-3).path is None
+
+
+class Scripted:
+    """Fingers that do as a test wants."""
+
+    def __init__(self, inner: Gripper, *, fails: str = "", at: int = 0, then: Callable[[], None] | None = None) -> None:
+        self.inner, self.fails, self.at, self.calls, self.then = inner, fails, at, 0, then
+        self.stroke = inner.stroke
+
+    def _count(self, name: str) -> None:
+        if name == self.fails:
+            self.calls += 1
+            if self.calls > self.at:
+                raise GripperError("is gone.", field="port")
+
+    def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
+        self._count("move")
+        self.inner.move(opening, force=force, speed=speed)
+
+    def moving(self) -> bool:
+        self._count("moving")
+        return self.inner.moving()
+
+    def opening(self) -> float:
+        return self.inner.opening()
+
+    def holds(self) -> bool:
+        self._count("holds")
+        return self.inner.holds()
+
+    def stop(self) -> None:
+        self.inner.stop()
+
+
+def with_fake(gripper: Gripper, *, stop: Callable[[], bool] | None = None, lag: float = 0.0) -> PickResult:
+    controller = FakeController(panda().home, lag=lag, period=4e-3)
+    result = Picker(sampler(), controller, gripper, options=OPTIONS, stop=stop).pick(
+        target("can"), grasps=grasps("can")
+    )
+    at = controller.position
+    for _ in range(20):
+        assert controller.step().state is not MotionState.MOVING
+    np.testing.assert_array_equal(controller.position, at)
+    return result
+
+
+def test_with_fingers_that_work_every_stage_is_done() -> None:
+    gripper = FakeGripper(width=0.06)
+    result = with_fake(gripper)
+    assert result.outcome is PickOutcome.PICKED
+    assert result.opening == 0.06
+
+
+def test_fingers_that_close_on_nothing_open_again() -> None:
+    gripper = FakeGripper(width=0.0)
+    result = with_fake(gripper)
+    assert (result.outcome, result.stage) == (PickOutcome.NOTHING_HELD, PickStage.CLOSE)
+    assert gripper.opening() > 0.06
+    with pytest.raises(PickError, match="nothing held") as caught:
+        result.unwrap()
+    assert caught.value.result is result
+    assert caught.value.code == -4
+
+
+def test_an_object_that_slips_out_on_the_way_up_is_lost() -> None:
+    gripper = FakeGripper(width=0.06)
+    asked = 0
+
+    class Slips(Scripted):
+        def holds(self) -> bool:
+            nonlocal asked
+            asked += 1
+            return asked == 1
+
+    result = with_fake(Slips(gripper))
+    assert (result.outcome, result.stage) == (PickOutcome.LOST, PickStage.CHECK)
+    assert result.attached is None
+
+
+@pytest.mark.parametrize(
+    ("fails", "at", "stage"),
+    [("move", 0, PickStage.OPEN), ("move", 1, PickStage.CLOSE), ("moving", 1, PickStage.CLOSE),
+     ("holds", 1, PickStage.CHECK)],
+)  # fmt: skip
+def test_a_gripper_that_fails_ends_the_pick_where_it_is(fails: str, at: int, stage: PickStage) -> None:
+    result = with_fake(Scripted(FakeGripper(width=0.06), fails=fails, at=at))
+    assert (result.outcome, result.stage) == (PickOutcome.GRIPPER_FAILED, stage)
+    assert isinstance(result.error, GripperError)
+
+
+def test_an_arm_that_cannot_follow_is_not_followed() -> None:
+    result = with_fake(FakeGripper(width=0.06), lag=0.5)
+    assert (result.outcome, result.stage) == (PickOutcome.NOT_FOLLOWED, PickStage.MOVE)
+    assert "from the trajectory" in result.reason
+
+
+@pytest.mark.parametrize("after", [0, 60, 400])
+def test_told_to_stop_it_stops_and_says_so(after: int) -> None:
+    asked = 0
+
+    def stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > after
+
+    result = with_fake(FakeGripper(width=0.06), stop=stop)
+    assert result.outcome is PickOutcome.STOPPED
+    assert result.steps[-1].note == "it was told to stop"
+
+
+def test_with_a_gripper_on_a_serial_port() -> None:
+    with FakeRobotiq(width=0.06, hurry=20.0) as device, RobotiqGripper(device.port, timeout=0.1) as gripper:
+        gripper.activate()
+        result = with_fake(gripper)
+        assert result, result.reason
+        assert result.opening == pytest.approx(0.06, abs=1e-3)
+    with FakeRobotiq(width=0.06, hurry=20.0) as device, RobotiqGripper(device.port, timeout=0.1) as gripper:
+        gripper.activate()
+        device.fault = 0x0E
+        result = with_fake(gripper)
+        assert (result.outcome, result.stage) == (PickOutcome.GRIPPER_FAILED, PickStage.OPEN)
+
+
+def test_a_target_without_a_way_moves_nothing() -> None:
+    """A roof over everything: hands would fit under it, but no arm gets there from home."""
+    walls = (Block((0.30, 0.0, 0.30), (0.02, 1.6, 0.9)), Block((0.5, 0.0, 0.45), (0.5, 1.6, 0.02)))
+    closed = segment(Tabletop((TABLE, CAN, *walls)).gaussians(30_000), np.eye(4))
+    can = min(closed.objects, key=lambda o: float(np.linalg.norm(o.center - np.array(NAMES["can"]))))
+    gripper = FakeGripper(width=0.06)
+    controller = FakeController(panda().home)
+    at = controller.position
+    result = Picker(GraspSampler(closed, panda()), controller, gripper, options=OPTIONS).pick(
+        Target(can.rows, None, "can", "test", 1.0)
+    )
+    assert result.outcome in (PickOutcome.NO_GRASP, PickOutcome.NO_WAY)
+    assert result.reason
+    np.testing.assert_array_equal(controller.position, at)
+    assert gripper.opening() == gripper.stroke
+
+
+def test_spheres_of_a_held_object_cover_it_and_are_few() -> None:
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3)) * [1.0, 0.5, 0.2]
+    reach = np.full(len(points), 1e-3)
+    spheres = covering_spheres(points, reach, most=30)
+    assert 5 < len(spheres) <= 30
+    inside = spheres[None, :, 3] - np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2)
+    assert (inside.max(axis=1) >= reach - 1e-12).all()
+    with pytest.raises(InputError):
+        covering_spheres(points[:0], reach[:0])
+
+
+def test_options_that_make_no_sense_are_refused() -> None:
+    for wrong in ({"lift": 0.0}, {"free": 0.3}, {"speed": 0.0}, {"tries": 0}, {"force": -1.0}, {"budget_ms": 0.0}):
+        with pytest.raises(InputError, match="options"):
+            PickOptions(**wrong)
+    with pytest.raises(InputError, match="gripper"):
+        Picker(sampler(), FakeController(panda().home), FakeGripper(stroke=0.05))
