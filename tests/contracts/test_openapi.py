@@ -31,7 +31,14 @@ def test_two_thousand_generated_requests_meet_no_fault_and_errors_are_problems(a
     schemathesis = pytest.importorskip("schemathesis", reason="schemathesis is not installed")
     from hypothesis import HealthCheck, Phase, given, settings
 
-    schema = schemathesis.openapi.from_dict(api.client.get("/openapi.json").json())
+    document = api.client.get("/openapi.json").json()
+    del document["paths"]["/v1/maps/{map_id}/upload"]  # takes a zip alone, and has tests of its own
+    for item in document["paths"].values():
+        for operation in item.values():
+            content = operation.get("requestBody", {}).get("content", {})
+            for kind in set(content) - {"application/json"}:  # schemathesis writes neither npy nor msgpack
+                del content[kind]
+    schema = schemathesis.openapi.from_dict(document)
     operations = [operation.ok() for operation in schema.get_all_operations()]
     # Deleting the map that all are asked about would make the rest of them 404.
     operations = [o for o in operations if not (o.method.upper() == "DELETE" and "{map_id}" in o.path)]

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from splatbot.gaussians import GaussianModel
-from tests.e2e.test_serve_cli import refused, serving
+from tests.e2e.test_serve_cli import serving
 
 LOG = "synthetic:tabletop?frames=300&width=160&height=120"
 
@@ -74,7 +74,3 @@ def test_sigterm_ends_event_streams_and_jobs_within_the_time_allowed(tmp_path: P
                 pass
         assert process.wait(20) == 0
     assert (tmp_path / "maps" / "desk" / "current").is_file(), "what was mapped is saved"
-
-
-def test_a_service_for_others_does_not_start_without_a_key(tmp_path: Path) -> None:
-    assert "--new-key" in refused("--data", str(tmp_path), "--host", "0.0.0.0")
