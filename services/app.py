@@ -6,38 +6,70 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware.cors import CORSMiddleware
 
 import splatbot
+from splatbot.services.codecs import describe_bodies
+from splatbot.services.guard import Guard
 from splatbot.services.limits import BodyLimit
 from splatbot.services.problems import install_problem_handlers
-from splatbot.services.ros.node import RosNode
-from splatbot.services.routes import distance, health, maps, render, ros
-from splatbot.services.settings import ServiceSettings
-from splatbot.services.store import MapStore
+from splatbot.services.requests import HEADER, RequestLog
+from splatbot.services.routes import (
+    collisions,
+    distance,
+    frames,
+    grasps,
+    health,
+    jobs,
+    maps,
+    plans,
+    render,
+    ros,
+    trajectories,
+    trials,
+    views,
+)
+from splatbot.services.runtime import Runtime
+from splatbot.services.sides import Sides
 
 _DESCRIPTION = """
-Questions about maps of 3D Gaussians. Lengths are metres in the map's world frame, quaternions are wxyz, camera axes are
-OpenCV's (x right, y down, z forward). Every answer names the `map_version` it was computed on; errors are
-`application/problem+json`.
+Questions about maps of 3D Gaussians. Lengths are metres in the map's world frame, angles radians, quaternions wxyz,
+camera axes OpenCV's (x right, y down, z forward). Every answer names the `map_version` it was computed on; errors are
+`application/problem+json`. Arrays may travel as `application/x-npy` or `application/msgpack` instead of JSON.
 """
 
 
-def create_app(settings: ServiceSettings, store: MapStore) -> FastAPI:
-    """The service on the maps of ``store``, which others may go on writing to."""
-    node = RosNode(store)
+def create_app(runtime: Runtime) -> FastAPI:
+    """The service on ``runtime``, which begins with the application and ends with it."""
+    settings = runtime.settings
+    sides = Sides(settings, runtime.store, runtime.arms, on_frame=runtime.take)
 
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        node.start()
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await run_in_threadpool(sides.start)
+        await run_in_threadpool(runtime.start)
         yield
-        node.stop()
+        await run_in_threadpool(sides.stop)
+        await run_in_threadpool(runtime.close)
 
     app = FastAPI(title="splatbot", version=splatbot.__version__, description=_DESCRIPTION, lifespan=lifespan)
-    app.state.ros = node
-    app.state.settings = settings
-    app.state.store = store
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
+    app.state.runtime = runtime
+    app.state.ros = sides.ros
+    # The last one added is the first to see a request.
+    uploads = {"/upload": settings.max_upload_bytes}
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, larger=uploads)
+    app.add_middleware(Guard, settings=settings)
+    if settings.cors_origins:
+        headers = ["Authorization", "Content-Type", "X-API-Key", "Idempotency-Key", HEADER]
+        app.add_middleware(
+            CORSMiddleware, allow_origins=settings.cors_origins, allow_methods=["*"], allow_headers=headers
+        )
+    app.add_middleware(RequestLog, counter=runtime.metrics)
     install_problem_handlers(app)
-    for group in (health, maps, distance, render, ros):
+    describe_bodies(app)
+    for group in (
+        health, maps, frames, distance, collisions, render, views, plans, grasps, trajectories, trials, jobs, ros
+    ):  # fmt: skip
         app.include_router(group.router)
     return app

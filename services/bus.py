@@ -131,6 +131,7 @@ class Bus:
         self._numbers: dict[str, int] = {}
         self._readers: list[Subscription] = []
         self._dropped: dict[str, int] = {}
+        self._closed = False
 
     def publish(self, topic: str, value: Any) -> None:
         """Let ``value`` be the topic's latest, and queue it for the topic's readers."""
@@ -170,6 +171,9 @@ class Bus:
                     if reader.wants(message.topic):
                         reader._offer(message)
             self._readers.append(reader)
+            closed = self._closed
+        if closed:
+            reader.close()
         return reader
 
     def forget(self, prefix: str) -> None:
@@ -189,6 +193,14 @@ class Bus:
         """How many subscriptions are open."""
         with self._lock:
             return len(self._readers)
+
+    def close(self) -> None:
+        """End every subscription, those to come as well; publishing goes on to nobody."""
+        with self._lock:
+            self._closed = True
+            readers = list(self._readers)
+        for reader in readers:
+            reader.close()
 
     def _leave(self, reader: Subscription) -> None:
         with self._lock:

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import hashlib
+import secrets
 from typing import Annotated, Any
 
-from fastapi import Depends, Path, Request
+from fastapi import Depends, Header, Path, Request, Response
 
 from splatbot.services.problems import MEDIA_TYPE
+from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore, ServedMap
 
+# Version 3 of a map in this process is not version 3 in the next: tags of different processes must differ.
+_PROCESS = secrets.token_hex(4)
+
+
+def _runtime(request: Request) -> Runtime:
+    runtime: Runtime = request.app.state.runtime
+    return runtime
+
 
 def _store(request: Request) -> MapStore:
-    store: MapStore = request.app.state.store
-    return store
+    return _runtime(request).store
 
 
 def _settings(request: Request) -> ServiceSettings:
-    settings: ServiceSettings = request.app.state.settings
-    return settings
+    return _runtime(request).settings
 
 
 def _served_map(
@@ -31,6 +40,7 @@ def _served_map(
     return served
 
 
+Service = Annotated[Runtime, Depends(_runtime)]
 Store = Annotated[MapStore, Depends(_store)]
 Settings = Annotated[ServiceSettings, Depends(_settings)]
 Served = Annotated[ServedMap, Depends(_served_map)]
@@ -39,9 +49,12 @@ Served = Annotated[ServedMap, Depends(_served_map)]
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries of the problem documents that a route may answer with."""
     what = {
-        404: "no map of that name",
+        404: "nothing of that name",
+        409: "does not fit what is there: the name is taken, the arm moves, the key was used",
         413: "more than one request may ask",
+        415: "the body is of a kind that is not taken",
         422: "the request makes no sense; `detail` names the field and `hint` the fix",
+        507: "the disk is full",
         503: "not ready; try again after Retry-After seconds",
     }
     example = {"type": "urn:splatbot:problem:input", "title": "...", "status": 0, "detail": "...", "hint": "..."}
@@ -54,3 +67,39 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 def example(body: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
     """The OpenAPI entry of a JSON answer with an example."""
     return {200: {"content": {"application/json": {"example": body}}}}
+
+
+def etag(served: ServedMap, what: str = "") -> str:
+    """Names what is shown of one state of a map."""
+    key = f"{_PROCESS} {served.id} {served.map_version} {served.state} {what}"
+    return f'"{hashlib.sha256(key.encode()).hexdigest()[:20]}"'
+
+
+def version_headers(served: ServedMap, tag: str) -> dict[str, str]:
+    """What goes with an answer that may be kept until the map changes."""
+    return {"X-Map-Version": str(served.map_version), "ETag": tag, "Cache-Control": "no-cache"}
+
+
+def unchanged(request: Request, served: ServedMap, tag: str) -> Response | None:
+    """304 for a client that has this already."""
+    if tag in request.headers.get("if-none-match", ""):
+        return Response(status_code=304, headers=version_headers(served, tag))
+    return None
+
+
+def idempotency_key(
+    key: Annotated[
+        str | None,
+        Header(
+            alias="Idempotency-Key",
+            max_length=200,
+            description="asked again with the same key, the same job is returned",
+            examples=["0f2c"],
+        ),
+    ] = None,
+) -> str | None:
+    """The request's Idempotency-Key."""
+    return key
+
+
+IdempotencyKey = Annotated[str | None, Depends(idempotency_key)]

@@ -103,13 +103,22 @@ class Jobs:
         self._jobs: dict[str, Job] = {}
         self._handles: dict[str, JobHandle] = {}
         self._keys: dict[str, tuple[str, str]] = {}
+        self._abandoned: dict[str, Callable[[], None]] = {}
         self._waiting: queue.Queue[tuple[JobHandle, Work] | None] = queue.Queue()
         self._closed = False
         self._threads = [threading.Thread(target=self._run, name=f"job-{i}", daemon=True) for i in range(workers)]
         for thread in self._threads:
             thread.start()
 
-    def submit(self, kind: str, work: Work, *, key: str | None = None, request: str = "") -> tuple[Job, bool]:
+    def submit(
+        self,
+        kind: str,
+        work: Work,
+        *,
+        key: str | None = None,
+        request: str = "",
+        abandoned: Callable[[], None] | None = None,
+    ) -> tuple[Job, bool]:
         """Queue work; the job and whether it is new.
 
         Args:
@@ -117,18 +126,16 @@ class Jobs:
             work: runs in a thread and returns the result; its SplatbotErrors become the job's detail.
             key: of the request (Idempotency-Key): asked again with it, the same job is returned.
             request: what the key stands for; another request under the same key is refused.
+            abandoned: called instead of ``work`` when the job is cancelled before it begins.
 
         Raises:
             BusyError: as many jobs wait as may, or the service is about to stop.
             IdempotencyError: the key belongs to another request.
         """
         with self._lock:
-            if key is not None and key in self._keys:
-                job_id, before = self._keys[key]
-                if before != request:
-                    hint = "use a new key for a new request"
-                    raise IdempotencyError("was used for another request.", field="Idempotency-Key", hint=hint)
-                return self._jobs[job_id], False
+            known = self._known(key, request)
+            if known is not None:
+                return known, False
             waiting = sum(job.state == "queued" for job in self._jobs.values())
             if self._closed or waiting >= self._capacity:
                 why = "the service is stopping" if self._closed else f"{waiting} jobs wait"
@@ -140,8 +147,19 @@ class Jobs:
                 self._keys[key] = job.id, request
             self._tell(job)
             self._waiting.put((handle, work))
+            if abandoned is not None:
+                self._abandoned[job.id] = abandoned
             self._forget_old()
         return job, True
+
+    def known(self, key: str | None, request: str) -> Job | None:
+        """The job that a request with this key was given before, if there was one.
+
+        Raises:
+            IdempotencyError: the key belongs to another request.
+        """
+        with self._lock:
+            return self._known(key, request)
 
     def get(self, job_id: str) -> Job:
         """The job as it stands.
@@ -166,8 +184,12 @@ class Jobs:
         with self._lock:
             job = self._find(job_id)
             self._handles[job_id].cancelled.set()
+            abandoned = None
             if job.state == "queued":
                 job = self._put(replace(job, state="cancelled", ended=time.time()))
+                abandoned = self._abandoned.pop(job_id, None)
+        if abandoned is not None:
+            abandoned()
         return job
 
     def close(self, timeout_s: float) -> None:
@@ -194,6 +216,7 @@ class Jobs:
             if job.state != "queued":
                 return
             self._put(replace(job, state="running", started=time.time()))
+            self._abandoned.pop(handle.id, None)
         try:
             result = work(handle)
             self._change(handle.id, state="succeeded", progress=1.0, detail=None, result=result, ended=time.time())
@@ -218,6 +241,15 @@ class Jobs:
 
     def _tell(self, job: Job) -> None:
         self._bus.publish(job_topic(job.id), job)
+
+    def _known(self, key: str | None, request: str) -> Job | None:
+        if key is None or key not in self._keys:
+            return None
+        job_id, before = self._keys[key]
+        if before != request:
+            hint = "use a new key for a new request"
+            raise IdempotencyError("was used for another request.", field="Idempotency-Key", hint=hint)
+        return self._jobs[job_id]
 
     def _find(self, job_id: str) -> Job:
         if job_id not in self._jobs:

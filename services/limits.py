@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -9,20 +11,26 @@ from splatbot.services.problems import problem
 
 
 class BodyLimit:
-    """ASGI middleware that answers 413 to a body of more than ``max_bytes``."""
+    """ASGI middleware that answers 413 to a body of more than ``max_bytes``.
 
-    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
+    Args:
+        larger: other bounds for paths that end so.
+    """
+
+    def __init__(self, app: ASGIApp, max_bytes: int, larger: Mapping[str, int] | None = None) -> None:
         self.app = app
         self.max_bytes = max_bytes
+        self.larger = dict(larger or {})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        most = next((n for end, n in self.larger.items() if scope["path"].endswith(end)), self.max_bytes)
         told = dict(scope["headers"]).get(b"content-length", b"")
-        detail = f"The body has more than {self.max_bytes} bytes."
-        if told.isdigit() and int(told) > self.max_bytes:
+        detail = f"The body has more than {most} bytes."
+        if told.isdigit() and int(told) > most:
             # The body is not read, so the connection cannot serve another request.
             refusal = problem(413, detail, headers={"Connection": "close"})
             await refusal(scope, receive, send)
@@ -33,7 +41,7 @@ class BodyLimit:
             nonlocal taken
             message = await receive()
             taken += len(message.get("body", b""))
-            if taken > self.max_bytes:  # raised where the application reads the body, so its handlers answer
+            if taken > most:  # raised where the application reads the body, so its handlers answer
                 raise HTTPException(413, detail, headers={"Connection": "close"})
             return message
 

@@ -11,6 +11,7 @@ from typing import Protocol
 from splatbot.errors import MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
+from splatbot.protocols import FrameSource
 from splatbot.services.store import MapStore, State
 from splatbot.services.topics import FRAME, RESULT, map_topic
 from splatbot.slam import FrameResult
@@ -81,6 +82,8 @@ class LiveMapping:
     def stop(self, timeout_s: float | None = None) -> None:
         """End after the frame in work; wait for that up to ``timeout_s`` [s] where a thread of its own does it."""
         self._stop.set()
+        if isinstance(self._source, FrameSource):
+            self._source.close()  # the thread may be waiting for a frame
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 

@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from splatbot.errors import InputError, SplatbotError
 
@@ -35,6 +36,12 @@ class ProblemResponse(JSONResponse):
     """A JSON response of the problem media type."""
 
     media_type = MEDIA_TYPE
+
+
+class NotReadyError(SplatbotError):
+    """The service does not answer now."""
+
+    http_status = 503
 
 
 class BusyError(SplatbotError):
@@ -78,6 +85,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(SplatbotError, _on_splatbot_error)
     app.add_exception_handler(RequestValidationError, _on_invalid_request)
     app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(ClientDisconnect, _on_client_gone)
     app.add_exception_handler(Exception, _on_unexpected_error)
 
 
@@ -110,6 +118,10 @@ def _on_invalid_request(request: Request, error: Exception) -> ProblemResponse:
 def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, HTTPException)
     return problem(error.status_code, str(error.detail), headers=error.headers, map_version=_version(request))
+
+
+def _on_client_gone(request: Request, _error: Exception) -> ProblemResponse:
+    return problem(400, "The body was not sent to its end.", map_version=_version(request))  # nobody reads it
 
 
 def _on_unexpected_error(request: Request, _error: Exception) -> ProblemResponse:

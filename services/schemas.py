@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from splatbot.errors import InputError
+from splatbot.geometry import pose_from_quat
+from splatbot.services.arrays import Configurations, Points
 
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Mode = Literal["rgb", "depth", "normal", "alpha"]
 
 
-class _Request(BaseModel):
+class Request(BaseModel):
     model_config = ConfigDict(extra="forbid")
+
+
+class Pose(Request):
+    """A rigid transform."""
+
+    translation: Vector3 = Field((0.0, 0.0, 0.0), description="[m]")
+    quat_wxyz: Vector4 = Field((1.0, 0.0, 0.0, 0.0), description="rotation")
+
+    def matrix(self, field: str) -> NDArray[np.float64]:
+        """(4, 4).
+
+        Raises:
+            InputError: a number is not finite, or the quaternion is zero.
+        """
+        try:
+            return pose_from_quat(self.translation, self.quat_wxyz)
+        except ValueError as error:
+            raise InputError(f"{error}.", field=field, hint="no rotation is quat_wxyz (1, 0, 0, 0)") from error
 
 
 class Health(BaseModel):
@@ -51,26 +75,26 @@ class MapList(BaseModel):
     maps: list[MapInfo]
 
 
-class DistanceRequest(_Request):
+class MapRequest(Request):
+    """A map to be made: of a recording, or, without ``log``, of frames that will be pushed."""
+
+    id: str = Field(description="its name in URLs: a-z, 0-9, - and _")
+    log: str | None = Field(None, description="synthetic:SCENE?..., or a folder under one of the service's log roots")
+    camera: str | None = Field(None, description="preset of intrinsics (tum_fr1, ...) instead of the log's own")
+    max_frames: Annotated[int, Field(ge=1)] | None = Field(None, description="read no more than these")
+    robot_base: Pose | None = Field(None, description="T_world_base, for questions about the arm")
+
+
+class DistanceRequest(Request):
     """Points to be asked about."""
 
-    points: list[Vector3] = Field(description="(P, 3), world frame [m]")
+    points: Points = Field(description="(P, 3), world frame [m]")
     n_sigma: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(
         2.0, description="standard deviations at which a Gaussian's surface is taken to be"
     )
 
 
-class DistanceAnswer(BaseModel):
-    """One entry per point."""
-
-    map_version: int
-    n_sigma: float
-    distance: list[float | None] = Field(description="standard deviations from the nearest Gaussian; null: empty map")
-    index: list[int] = Field(description="that Gaussian's row in the map; -1: empty map")
-    inside: list[bool] = Field(description="distance <= n_sigma")
-
-
-class CameraIn(_Request):
+class CameraIn(Request):
     """Pinhole intrinsics [px]; integer coordinates are pixel centres, as in OpenCV."""
 
     fx: float
@@ -81,7 +105,7 @@ class CameraIn(_Request):
     height: int
 
 
-class RenderRequest(_Request):
+class RenderRequest(Request):
     """A view to be drawn. The pose is a matrix, or a translation and a quaternion, or left out for the default view."""
 
     mode: Mode = "rgb"
@@ -98,3 +122,137 @@ class RenderRequest(_Request):
         if self.T_world_camera is not None and self.translation is not None:
             raise ValueError("give either T_world_camera or translation and quat_wxyz")
         return self
+
+
+class ViewIn(Request):
+    """One camera of a batch."""
+
+    camera: CameraIn
+    pose: Pose = Field(description="T_world_camera")
+
+
+class ViewsRequest(Request):
+    """Several views at once, as a policy with several cameras asks for them."""
+
+    views: list[ViewIn] = Field(min_length=1)
+    modes: list[Mode] = Field(["rgb"], min_length=1, max_length=4)
+
+
+class CollisionsRequest(Request):
+    """Configurations of an arm to be asked about."""
+
+    q: Configurations = Field(description="(C, J) joint values [rad or m]")
+    robot: str = Field("panda", description="as `splatbot robot list` names it")
+    base: Pose | None = Field(None, description="T_world_base; by default what the map knows")
+    margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="room to keep [m]")
+    opening: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = Field(None, description="of the gripper [m]")
+    gradient: bool = Field(False, description="also the clearance's gradient over the joints")
+
+
+class IkRequest(Request):
+    """A pose of the tool to be reached."""
+
+    pose: Pose = Field(description="T_base_tcp, or T_world_tcp with `map`")
+    robot: str = "panda"
+    near: list[float] | None = Field(None, description="posture to stay near [rad or m]; default: home")
+    seeds: Annotated[int, Field(ge=1, le=256)] = 32
+    map: str | None = Field(None, description="keep only what is free in this map")
+    base: Pose | None = Field(None, description="T_world_base; by default what the map knows")
+    margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+
+
+class PlanRequest(Request):
+    """A motion to be planned; the goal is joints or a pose of the tool."""
+
+    start: list[float] | None = Field(None, description="(J,) [rad or m]; default: the robot's home")
+    goal: list[float] | None = Field(None, description="(J,) [rad or m]")
+    goal_pose: Pose | None = Field(None, description="T_base_tcp")
+    robot: str = "panda"
+    base: Pose | None = Field(None, description="T_world_base; by default what the map knows")
+    margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="room to keep to the map [m]")
+    budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    speed: Annotated[float, Field(gt=0, le=1)] = Field(1.0, description="share of the joints' limits of velocity")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(50.0, description="of the trajectory's points [Hz]")
+
+    @model_validator(mode="after")
+    def _one_goal(self) -> Self:
+        if (self.goal is None) == (self.goal_pose is None):
+            raise ValueError("give one of goal and goal_pose")
+        return self
+
+
+class PictureHint(Request):
+    """A place in a picture: a pixel, or the corners of a rectangle."""
+
+    camera: CameraIn
+    pose: Pose = Field(description="T_world_camera")
+    pixel: tuple[float, float] | None = Field(None, description="(u, v) [px]")
+    box: Vector4 | None = Field(None, description="(u0, v0, u1, v1) [px]")
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.pixel is None) == (self.box is None):
+            raise ValueError("give one of pixel and box")
+        return self
+
+
+class GraspsRequest(Request):
+    """A thing to be grasped: named, pointed at in the world, or in a picture."""
+
+    target: str | None = Field(None, max_length=200, description='words, as "largest box" or "red cup"')
+    point: Vector3 | None = Field(None, description="on or in the thing, world frame [m]")
+    picture: PictureHint | None = None
+    robot: str = "panda"
+    base: Pose | None = Field(None, description="T_world_base, z up; by default what the map knows")
+    hand_only: bool = Field(False, description="leave the arm out")
+    approach: Literal["any", "top", "side"] = "any"
+    friction: Annotated[float, Field(gt=0, le=2)] = 0.5
+    samples: Annotated[int, Field(ge=10, le=5000)] = Field(400, description="places tried: the knob of time")
+    wanted: Annotated[int, Field(ge=1, le=100)] = 10
+    margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+
+    @model_validator(mode="after")
+    def _one_hint(self) -> Self:
+        if sum(hint is not None for hint in (self.target, self.point, self.picture)) != 1:
+            raise ValueError("give one of target, point and picture")
+        return self
+
+
+class TrajectoryRequest(Request):
+    """A planned motion to be followed."""
+
+    plan: str = Field(description="id of a plan")
+    arm: str = Field("fake", description="which arm, as GET /v1/arms lists them")
+
+
+class TrialsRequest(Request):
+    """Trials in the twin."""
+
+    scene: str = Field("empty", description="a shipped scene")
+    plan: str | None = Field(None, description="id of a plan to follow; default: the scene's own moves")
+    trials: Annotated[int, Field(ge=1, le=100)] = 1
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of the first trial; 0 displaces nothing")
+    force: list[str] = Field([], max_length=32, description="effects that are on whatever the scene calls for")
+    forbid: list[str] = Field([], max_length=32, description="effects that are off")
+
+
+class JobInfo(BaseModel):
+    """A job as it stands."""
+
+    id: str
+    kind: str
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    progress: float = Field(description="0..1")
+    detail: str | None
+    result: dict[str, Any] | None
+    created: float = Field(description="Unix time [s]")
+    started: float | None
+    ended: float | None
+
+
+class JobList(BaseModel):
+    """All jobs, the oldest first."""
+
+    jobs: list[JobInfo]

@@ -11,34 +11,53 @@ import uvicorn
 
 from splatbot.errors import InputError
 from splatbot.services.app import create_app
-from splatbot.services.settings import ServiceSettings
-from splatbot.services.store import MapStore
+from splatbot.services.runtime import Runtime, check_exposure
 
 
-def run_service(
-    settings: ServiceSettings, store: MapStore, *, on_start: Callable[[str], None] = lambda url: None
-) -> None:
-    """Serve ``store`` until SIGTERM or Ctrl-C; requests that are under way are answered first.
+class _Server(uvicorn.Server):
+    """Tells the runtime when it is told to end, so that event streams end before uvicorn waits for them."""
+
+    def __init__(self, config: uvicorn.Config, runtime: Runtime) -> None:
+        super().__init__(config)
+        self._runtime = runtime
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._runtime.drain()
+        await super().shutdown(sockets)
+
+
+def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda url: None) -> None:
+    """Serve until SIGTERM or Ctrl-C; requests that are under way are answered first, and maps saved.
 
     Args:
         on_start: called with the base URL once the port is taken.
 
     Raises:
         InputError: the address cannot be listened on.
+        ConfigError: others could ask without a key, or TLS is not whole.
     """
-    listener = _listen(settings.host, settings.port)
-    host, port = listener.getsockname()[:2]
-    on_start(f"http://{'[' + host + ']' if ':' in host else host}:{port}")
+    settings = runtime.settings
+    check_exposure(settings)
+    listeners = [_listen(settings.host, settings.port)]
+    if settings.ros_port is not None:
+        listeners.append(_listen(settings.host, settings.ros_port))
+    host, port = listeners[0].getsockname()[:2]
+    scheme = "https" if settings.tls_cert is not None else "http"
+    on_start(f"{scheme}://{'[' + host + ']' if ':' in host else host}:{port}")
     config = uvicorn.Config(
-        create_app(settings, store),
-        log_level="info",
+        create_app(runtime),
+        log_config=None,  # the process' own, see splatbot.services.requests
+        access_log=False,  # the application's names the request's id, and no query, which may hold a key
         timeout_graceful_shutdown=settings.shutdown_s,
         ws_max_size=settings.max_message_bytes,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
+        server_header=False,
     )
     # After its graceful end uvicorn raises the signal again for whoever else listens: here it has done its work.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        uvicorn.Server(config).run(sockets=[listener])
+        _Server(config, runtime).run(sockets=listeners)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

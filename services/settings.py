@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import (
     BaseSettings,
+    NoDecode,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
     SettingsError,
@@ -16,20 +17,64 @@ from pydantic_settings import (
 )
 
 from splatbot.errors import ConfigError
+from splatbot.services.keys import check_hash
+
+Words = Annotated[tuple[str, ...], NoDecode]
+"""Several words: a list in YAML, with commas between them in the environment."""
 
 
 class ServiceSettings(BaseSettings):
-    """Address and limits of the service."""
+    """Address, keys and limits of the service."""
 
     model_config = SettingsConfigDict(env_prefix="SPLATBOT_", extra="forbid")
 
     host: str = Field("127.0.0.1", description="address to listen on; 0.0.0.0 for every interface")
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
+    ros_port: int | None = Field(None, ge=0, le=65535, description="a port for roslib clients too (9090 is theirs)")
+    viewer_port: int | None = Field(None, ge=0, le=65535, description="port of the viewer, on this machine alone")
+    record: Path | None = Field(None, description="an MCAP file that every topic is recorded into")
+    api_keys: Words = Field((), description="hashes that `splatbot serve --new-key` prints; needed beyond loopback")
+    tls_cert: Path | None = Field(None, description="certificate chain (PEM); with tls_key the service speaks HTTPS")
+    tls_key: Path | None = Field(None, description="its private key (PEM)")
+    cors_origins: Words = Field((), description="web pages' origins that may ask; none by default")
+    data_dir: Path | None = Field(None, description="folder that maps are kept in; none: in memory alone")
+    log_roots: Words = Field((), description="folders whose recordings may be mapped by POST /v1/maps")
+    save_every_s: float = Field(30.0, gt=0, description="how often growing maps are saved to data_dir [s]")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")
+    max_configurations: int = Field(10_000, ge=1, description="joint configurations in one request")
+    max_views: int = Field(16, ge=1, description="views in one render request")
+    max_pixels: int = Field(2_100_000, ge=1, description="pixels of one rendered view, or of one pushed frame")
+    max_plan_ms: float = Field(10_000, gt=0, description="longest budget of one planning request [ms]")
+    max_frames: int = Field(100_000, ge=1, description="frames of one log that is mapped by POST /v1/maps")
+    max_waiting_frames: int = Field(4, ge=1, description="pushed frames of one map that may wait")
     max_body_bytes: int = Field(16 * 2**20, ge=1024, description="size of a request's body [bytes]")
+    max_upload_bytes: int = Field(2**30, ge=1024, description="size of an uploaded recording, packed [bytes]")
+    max_unpacked_bytes: int = Field(4 * 2**30, ge=1024, description="size of an uploaded recording, unpacked [bytes]")
     max_message_bytes: int = Field(32 * 2**20, ge=1024, description="size of one WebSocket message [bytes]")
-    max_pixels: int = Field(2_100_000, ge=1, description="pixels of one rendered view")
+    max_requests: int = Field(64, ge=1, description="requests that are worked on at once; more are answered 503")
+    requests_per_s: float = Field(500.0, gt=0, description="of one client in the long run; more are answered 429")
+    max_streams: int = Field(64, ge=1, description="event streams that are open at once")
+    max_jobs: int = Field(16, ge=1, description="jobs that may wait")
+    job_workers: int = Field(2, ge=1, description="jobs that run at once")
     shutdown_s: int = Field(10, ge=0, description="how long running requests may take to end after SIGTERM [s]")
+    log_json: bool = Field(False, description="one JSON object a line instead of text")
+
+    @field_validator("api_keys", "cors_origins", "log_roots", mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        return tuple(word.strip() for word in value.split(",") if word.strip()) if isinstance(value, str) else value
+
+    @field_validator("api_keys")
+    @classmethod
+    def _hashed(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for key in value:
+            check_hash(key)
+        return value
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this machine can ask."""
+        return self.host in ("localhost", "::1") or self.host.startswith("127.")
 
     @classmethod
     def settings_customise_sources(

@@ -20,6 +20,7 @@ from splatbot.sim.solids import rotation_of
 
 _OPAQUE = 0.3  # fainter Gaussians are no surface
 _ABOVE = 0.008  # [m] over the table: lower is the table's own noise
+_BESIDE = 0.03  # [m] from a thing that may move: what is left of the map there is of the thing
 _FEWEST, _LARGEST = 40, 0.35  # Gaussians of an object; [m] across
 
 
@@ -148,3 +149,18 @@ def _add_objects(
             f"{name}: {len(cluster)} Gaussians, {1e3 * found.error:.1f} mm from its surface "
             f"(95 %: {1e3 * found.worst:.1f} mm)"
         )
+    if clutter.movable:
+        _gather_strays(points, used, support, labels)
+
+
+def _gather_strays(points: Array, used: np.ndarray, support: Support, labels: np.ndarray) -> None:
+    """Gives what is beside a thing the thing's label: as clutter, which stays where it is, it would nail it down."""
+    here = labels[used]
+    loose, fitted = np.flatnonzero((here == -1) & (support.height(points) > 0)), np.flatnonzero(here > 0)
+    if not len(fitted):
+        return
+    for part in np.array_split(loose, max(1, len(loose) * len(fitted) // 1_000_000)):
+        away = np.linalg.norm(points[part, None] - points[None, fitted], axis=-1)
+        nearest = away.argmin(axis=1)
+        near = away[np.arange(len(part)), nearest] < _BESIDE
+        labels[used[part[near]]] = here[fitted[nearest[near]]]

@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -87,7 +87,7 @@ class ReplayCamera:
             LogError: the log cannot be opened.
         """
         log, _, query = uri.removeprefix(PREFIX).partition("?")
-        kinds = {f.name: type(f.default) for f in fields(ReplayOptions)}
+        kinds: dict[str, type] = {name: type(value) for name, value in asdict(ReplayOptions()).items()}
         pairs = [pair for pair in query.split("&") if pair]
         values = {}
         for key, _, text in (pair.partition("=") for pair in pairs if pair.partition("=")[0] in kinds):

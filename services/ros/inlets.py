@@ -16,6 +16,7 @@ from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of
 from splatbot.logs.tum import MAX_DIFFERENCE
 from splatbot.logs.undistort import Undistorter
 from splatbot.services.bus import Bus
+from splatbot.services.problems import BusyError
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import joints_of
 from splatbot.services.ros.outlets import FROM_ROS
@@ -45,6 +46,7 @@ class RosInlets:
         self, graph: RosGraph, bus: Bus, *, robot: str = "panda", on_frame: Callable[[Frame], Any] | None = None
     ) -> None:
         self._bus, self._robot, self._on_frame = bus, robot, on_frame
+        self.dropped = 0
         self._pairs = FramePairs()
         self._news = graph.subscribe(COLOR, DEPTH, INFO, JOINTS, capacity=_WAITING)
         self._thread = threading.Thread(target=self._run, name="ros-inlets", daemon=True)
@@ -66,6 +68,8 @@ class RosInlets:
                 continue
             try:
                 self._take(news.topic, value)
+            except BusyError:
+                self.dropped += 1  # as a camera's frames that nobody takes
             except SplatbotError as error:
                 _log.warning("%s from a client: %s", news.topic, error)
             except Exception:  # one odd message must not end the others

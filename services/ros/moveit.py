@@ -15,7 +15,7 @@ from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal, time_path
 from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
-from splatbot.robots.store import load_robot
+from splatbot.services.arms import known_robot
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.requests import entries, entry, joints, number, pose, vector
@@ -72,7 +72,7 @@ class MoveItServices:
                 "trajectory": {"joint_trajectory": trajectory.to_ros(rate=_RATE)},
             }
 
-        told = answer | _coded(work)
+        told = answer | coded(work)
         return {"motion_plan_response": told | {"planning_time": time.perf_counter() - begin}}
 
     def ik(self, args: Mapping[str, Any]) -> dict[str, Any]:
@@ -96,7 +96,7 @@ class MoveItServices:
                 return _code(PlanStatus.NO_IK_SOLUTION, f"{found.reached} of {found.tried} tries reached it, none free")
             return {"solution": {"joint_state": {"name": list(robot.chain.names), "position": found.q[0]}}}
 
-        return {"solution": {}} | _coded(work)
+        return {"solution": {}} | coded(work)
 
     def validity(self, args: Mapping[str, Any]) -> dict[str, Any]:
         """moveit_msgs/GetStateValidity; the contact is the one of least clearance.
@@ -126,13 +126,7 @@ class MoveItServices:
         return {"valid": valid, "contacts": contacts, "cost_sources": [], "constraint_result": limits}
 
     def _place(self) -> tuple[ServedMap, RobotModel, NDArray[np.float64]]:
-        """The map that is asked, the arm, and where it stands."""
-        served = main_map(self._store)
-        known = served.workspace.T_world_base if served.workspace is not None else None
-        if known is None:
-            hint = "keep a scene.yaml beside the map: splatbot info MAP --fit-plane estimates one"
-            raise FrameError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
-        return served, load_robot(self._name), known
+        return robot_place(self._store, self._name)
 
     def _in_base(self, args: Any, path: str) -> bool:
         frame = str(entry(args, path) or MAP_FRAME).strip("/")
@@ -188,6 +182,21 @@ def main_map(store: MapStore) -> ServedMap:
     return next((served for served in maps if served.id == "default"), maps[0])
 
 
+def robot_place(store: MapStore, robot: str) -> tuple[ServedMap, RobotModel, NDArray[np.float64]]:
+    """The main map, an arm, and where it stands there, T_world_base (4, 4).
+
+    Raises:
+        MapNotFoundError: there is no map.
+        FrameError: where the robot stands is not known.
+    """
+    served = main_map(store)
+    known = served.workspace.T_world_base if served.workspace is not None else None
+    if known is None:
+        hint = "keep a scene.yaml beside the map: splatbot info MAP --fit-plane estimates one"
+        raise FrameError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
+    return served, known_robot(robot), known
+
+
 def _joint_goal(goal: Any, robot: RobotModel) -> NDArray[np.float64]:
     named = {str(entry(c, "joint_name")): number(c, "position") for c in entries(goal, "joint_constraints")}
     missing = [name for name in robot.chain.names if name not in named]
@@ -197,7 +206,7 @@ def _joint_goal(goal: Any, robot: RobotModel) -> NDArray[np.float64]:
     return np.array([named[name] for name in robot.chain.names])
 
 
-def _coded(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def coded(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """What ``work`` gives with a success code, or the code and reason of its error."""
     try:
         return _code(PlanStatus.SUCCESS, "") | work()

@@ -6,7 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 from splatbot.frame import Frame
+from splatbot.services.arms import Arms
+from splatbot.services.ros.follow import FollowJointTrajectory
 from splatbot.services.ros.graph import RosGraph
+from splatbot.services.ros.grasping import GraspServices
 from splatbot.services.ros.inlets import RosInlets
 from splatbot.services.ros.moveit import MoveItServices
 from splatbot.services.ros.nvblox import NvbloxServices
@@ -20,17 +23,25 @@ class RosNode:
 
     Args:
         store: the maps, and the bus that tells of them.
+        arms: what follows the motions that clients send; None: nothing.
         robot: whose joints /joint_states are, and which plans are made for where a request names none.
         on_frame: called with each frame that clients publish; None: nobody maps them.
     """
 
     def __init__(
-        self, store: MapStore, *, robot: str = "panda", on_frame: Callable[[Frame], Any] | None = None
+        self,
+        store: MapStore,
+        *,
+        arms: Arms | None = None,
+        robot: str = "panda",
+        on_frame: Callable[[Frame], Any] | None = None,
     ) -> None:
         self.graph = RosGraph()
         RosApi(self.graph)
         MoveItServices(self.graph, store, robot=robot)
         NvbloxServices(self.graph, store)
+        GraspServices(self.graph, store, robot=robot)
+        self._follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
         self._outlets = RosOutlets(store.bus, self.graph)
         self._inlets = RosInlets(self.graph, store.bus, robot=robot, on_frame=on_frame)
 
@@ -38,8 +49,12 @@ class RosNode:
         """Begin."""
         self._outlets.start()
         self._inlets.start()
+        if self._follow is not None:
+            self._follow.start()
 
     def stop(self) -> None:
         """End."""
         self._outlets.stop()
         self._inlets.stop()
+        if self._follow is not None:
+            self._follow.stop()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from rosbags.interfaces import Nodetype
 
@@ -88,12 +88,11 @@ def _type_definition(kind: str) -> dict[str, Any]:
     constants, fields = typestore().fielddefs[kind]
     names, types, lengths = [], [], []
     for name, (node, what) in fields:
-        length = -1
-        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            (node, what), length = what  # of a sequence 0
+        many = node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        (inner, inner_what), length = cast(tuple[tuple[Any, Any], int], what) if many else ((node, what), -1)
         names.append(name)
-        types.append(what if node is Nodetype.NAME else what[0])
-        lengths.append(length)
+        types.append(inner_what if inner is Nodetype.NAME else inner_what[0])
+        lengths.append(length)  # of a sequence 0
     return {
         "type": kind,
         "fieldnames": names,

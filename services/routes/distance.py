@@ -5,37 +5,46 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Body
+from fastapi import APIRouter, Depends, Request, Response
 
-from splatbot.services.dependencies import Served, Settings, example, problems
+from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.dependencies import Served, Settings, problems
 from splatbot.services.problems import TooLargeError
-from splatbot.services.schemas import DistanceAnswer, DistanceRequest
+from splatbot.services.schemas import DistanceRequest
 
 router = APIRouter(prefix="/v1/maps", tags=["collision"])
 
-_BODY = Body(
-    openapi_examples={
-        "two points": {"value": {"points": [[0.1, 0.0, 0.8], [0.1, 0.0, 0.3]]}},
-        "a thicker surface": {"value": {"points": [[0.1, 0.0, 0.8]], "n_sigma": 3.0}},
-    }
-)
+_EXAMPLES = {
+    "two points": {"points": [[0.1, 0.0, 0.8], [0.1, 0.0, 0.3]]},
+    "a thicker surface": {"points": [[0.1, 0.0, 0.8]], "n_sigma": 3.0},
+}
 _ANSWER = {"map_version": 12, "n_sigma": 2.0, "distance": [0.4, 31.7], "index": [1042, 977], "inside": [True, False]}
+_Body = Annotated[DistanceRequest, Depends(body_of(DistanceRequest, array="points"))]
 
 
-@router.post("/{map_id}/distance", responses=example(_ANSWER) | problems(404, 413, 422, 503))
-def distance(served: Served, settings: Settings, request: Annotated[DistanceRequest, _BODY]) -> DistanceAnswer:
-    """How many standard deviations each point is from the nearest Gaussian, which that is, and whether it is inside."""
-    if len(request.points) > settings.max_points:
+@router.post(
+    "/{map_id}/distance",
+    response_class=Response,
+    responses=gives(_ANSWER, npy="distance (P,) float32") | problems(404, 413, 415, 422, 503),
+    openapi_extra=takes(DistanceRequest, _EXAMPLES, npy="points (P, 3)"),
+)
+def distance(request: Request, served: Served, settings: Settings, asked: _Body) -> Response:
+    """How many standard deviations each point is from the nearest Gaussian, which that is, and whether it is inside.
+
+    In an empty map the distance is null (infinity in npy and msgpack) and the index -1.
+    """
+    if len(asked.points) > settings.max_points:
         raise TooLargeError(
-            f"has {len(request.points)} rows, at most {settings.max_points} are answered at once.",
+            f"has {len(asked.points)} rows, at most {settings.max_points} are answered at once.",
             field="points",
             hint="split the request, or raise SPLATBOT_MAX_POINTS",
         )
-    found = served.field.mahalanobis(np.asarray(request.points, dtype=np.float64).reshape(-1, 3))
-    return DistanceAnswer(
-        map_version=found.map_version,
-        n_sigma=request.n_sigma,
-        distance=[d if np.isfinite(d) else None for d in found.distance.tolist()],
-        index=found.index.tolist(),
-        inside=(found.distance <= request.n_sigma).tolist(),
-    )
+    found = served.field.mahalanobis(asked.points.reshape(-1, 3))
+    body = {
+        "map_version": found.map_version,
+        "n_sigma": asked.n_sigma,
+        "distance": found.distance,
+        "index": found.index,
+        "inside": found.distance.astype(np.float64) <= asked.n_sigma,
+    }
+    return answer(request, body, array="distance")

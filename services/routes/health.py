@@ -1,15 +1,15 @@
-"""Whether the process lives and whether it can answer."""
+"""Whether the process lives, whether it can answer, and what it measures of itself."""
 
 from __future__ import annotations
 
 import importlib
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
 
 import splatbot
 from splatbot.errors import NativeError
-from splatbot.services.dependencies import Store, example, problems
-from splatbot.services.problems import MapNotReadyError
+from splatbot.services.dependencies import Service, Store, example, problems
+from splatbot.services.problems import MapNotReadyError, NotReadyError
 from splatbot.services.schemas import Health
 
 router = APIRouter(tags=["health"])
@@ -25,18 +25,30 @@ def healthz(store: Store) -> Health:
     "/readyz",
     responses=example({"status": "ready", "version": "0.1.0", "maps": {"default": 3}}) | problems(503),
 )
-def readyz(store: Store) -> Health:
-    """Ready: the native module loads and at least one map has a state."""
+def readyz(service: Service) -> Health:
+    """Ready: the native module loads, the maps that it was started with have a state, and it is not about to end."""
     try:
         importlib.import_module("splatbot._native")
     except ImportError as error:
         raise NativeError(
             f"cannot be loaded ({error}).", field="splatbot._native", hint="reinstall splatbot"
         ) from error
-    versions = _versions(store)
-    if not versions:
-        raise MapNotReadyError("No map has a state yet.", hint="GET /v1/maps tells how far mapping is")
-    return Health(status="ready", version=splatbot.__version__, maps=versions)
+    if service.draining:
+        raise NotReadyError("The service is about to end.", hint="ask another one")
+    waiting = [m.id for m in service.store.list() if m.awaited and m.snapshot is None]
+    if waiting:
+        raise MapNotReadyError(f"No state yet: {', '.join(waiting)}.", hint="GET /v1/maps tells how far mapping is")
+    return Health(status="ready", version=splatbot.__version__, maps=_versions(service.store))
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"example": 'splatbot_map_gaussians{map="default"} 48213.0\n'}}}},
+)
+def metrics(service: Service) -> Response:
+    """For Prometheus."""
+    return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 def _versions(store: Store) -> dict[str, int]:

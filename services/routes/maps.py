@@ -1,13 +1,40 @@
-"""Which maps there are."""
+"""Maps: which there are, made from recordings, exported, deleted."""
 
 from __future__ import annotations
 
-from typing import Any
+import shutil
+import tempfile
+from contextlib import suppress
+from functools import partial
+from pathlib import Path as FilePath
+from typing import Annotated, Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Depends, Path, Request, Response
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.responses import FileResponse
 
-from splatbot.services.dependencies import Served, Store, example, problems
-from splatbot.services.schemas import Bounds, MapInfo, MapList
+from splatbot.errors import InputError, MapNotFoundError
+from splatbot.formats import WRITTEN, save_gaussians
+from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.dependencies import (
+    IdempotencyKey,
+    Served,
+    Service,
+    Store,
+    etag,
+    example,
+    problems,
+    unchanged,
+    version_headers,
+)
+from splatbot.services.library import check_id
+from splatbot.services.mapping import check_length, map_recording, map_upload, workspace_of
+from splatbot.services.problems import MapNotReadyError, TooLargeError
+from splatbot.services.recordings import open_allowed
+from splatbot.services.routes.jobs import accepted, starts
+from splatbot.services.schemas import Bounds, MapInfo, MapList, MapRequest
 from splatbot.services.store import ServedMap
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
@@ -24,6 +51,15 @@ _EXAMPLE: dict[str, Any] = {
     "stamp": 1.3,
     "bounds": {"low": [-0.8, -0.5, 0.4], "high": [0.9, 0.4, 1.9]},
 }
+_CREATE = {
+    "a synthetic log": {"id": "tabletop", "log": "synthetic:tabletop?frames=8&width=160&height=120"},
+    "frames that will be pushed": {
+        "id": "robot",
+        "robot_base": {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]},
+    },
+}
+_FILE: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "the file"}}
+_FormatName = Annotated[str, Path(description=f"one of {', '.join(WRITTEN)}", examples=["ply"])]
 
 
 @router.get("", responses=example({"maps": [_EXAMPLE]}))
@@ -32,10 +68,166 @@ def list_maps(store: Store) -> MapList:
     return MapList(maps=[_info(served) for served in store.list()])
 
 
+@router.post(
+    "",
+    status_code=202,
+    responses=starts("a job maps the recording")
+    | {201: {"description": "an empty map, to which frames can be pushed", "model": MapInfo}}
+    | problems(409, 415, 422, 503),
+    openapi_extra=takes(MapRequest, _CREATE),
+)
+def create_map(
+    asked: Annotated[MapRequest, Depends(body_of(MapRequest))], service: Service, key: IdempotencyKey
+) -> Response:
+    """Make a map of a recording, by a job; or, without `log`, an empty one for frames that will be pushed."""
+    check_id(asked.id)
+    base = asked.robot_base.matrix("robot_base") if asked.robot_base is not None else None
+    if asked.log is None:
+        served = service.open_stream(asked.id, workspace=workspace_of("synthetic:", base))
+        place = {"Location": f"/v1/maps/{asked.id}"}
+        return Response(_info(served).model_dump_json(), 201, place, media_type="application/json")
+    request = asked.model_dump_json()
+    known = service.jobs.known(key, request)
+    if known is not None:
+        return accepted(known)
+    log = open_allowed(asked.log, service.settings.log_roots, camera=asked.camera)
+    total = check_length(log, service.settings.max_frames, asked.max_frames)
+    service.store.add(asked.id, source=log.name, state="mapping", workspace=workspace_of(log.uri, base), awaited=False)
+    try:
+        work = map_recording(service, asked.id, log, total)
+        gone = partial(_forget, service, asked.id)
+        return accepted(service.jobs.submit("map", work, key=key, request=request, abandoned=gone)[0])
+    except Exception:
+        service.store.remove(asked.id)  # no room for the job: as if nothing had been asked
+        raise
+
+
+@router.post(
+    "/{map_id}/upload",
+    status_code=202,
+    responses=starts("a job unpacks and maps the recording") | problems(409, 413, 415, 422, 503),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
+)
+async def upload_map(
+    request: Request,
+    service: Service,
+    key: IdempotencyKey,
+    map_id: Annotated[str, Path(description="of the map to be made", examples=["desk"])],
+) -> Response:
+    """Make a map of a recording that is sent as a zip of a folder in TUM layout; a job unpacks and maps it."""
+    check_id(map_id)
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/zip":
+        raise HTTPException(415, "The body is no application/zip.")
+    if (known := service.jobs.known(key, f"upload {map_id}")) is not None:
+        return accepted(known)
+    service.store.add(map_id, source="an upload", state="mapping", awaited=False)
+    folder = FilePath(tempfile.mkdtemp(prefix="splatbot-upload-"))
+    try:
+        await _receive(request, folder / "recording.zip", service.settings.max_upload_bytes)
+        work = map_upload(service, map_id, folder / "recording.zip")
+        gone = partial(_forget, service, map_id, folder)
+        return accepted(service.jobs.submit("map", work, key=key, request=f"upload {map_id}", abandoned=gone)[0])
+    except BaseException:  # also of a client that has gone: nothing is left of it
+        service.store.remove(map_id)
+        await run_in_threadpool(_discard, folder)
+        raise
+
+
 @router.get("/{map_id}", responses=example(_EXAMPLE) | problems(404))
-def get_map(served: Served) -> MapInfo:
+def get_map(served: Served, request: Request, response: Response) -> Any:
     """One map as it is now; `state` and `detail` tell how mapping its log goes."""
+    tag = etag(served)
+    if (kept := unchanged(request, served, tag)) is not None:
+        return kept
+    response.headers.update(version_headers(served, tag))
     return _info(served)
+
+
+@router.delete("/{map_id}", status_code=204, responses=problems(404))
+def delete_map(served: Served, service: Service) -> Response:
+    """End the map's making, and forget it, on disk too. Answers that are under way keep the state they took."""
+    service.remove(served.id)
+    return Response(status_code=204)
+
+
+@router.get(
+    "/{map_id}/splats.{format}",
+    response_class=FileResponse,
+    responses=_FILE | problems(404, 422, 503),
+)
+def export_map(served: Served, request: Request, format: _FormatName) -> Response:
+    """The map as a file, in each format that splatbot writes."""
+    if format not in WRITTEN:
+        raise InputError(f"is {format[:20]!r}.", field="format", hint=f"use {', '.join(WRITTEN)}")
+    snapshot = served.ready
+    tag = etag(served, format)
+    if (kept := unchanged(request, served, tag)) is not None:
+        return kept
+    folder = FilePath(tempfile.mkdtemp(prefix="splatbot-export-"))
+    path = folder / f"{served.id}.{format}"
+    try:
+        save_gaussians(snapshot.model, path)
+    except BaseException:
+        _discard(folder)
+        raise
+    headers = version_headers(served, tag)
+    after = BackgroundTask(_discard, folder)
+    kind = "application/octet-stream"
+    return FileResponse(path, media_type=kind, filename=path.name, headers=headers, background=after)
+
+
+@router.get(
+    "/{map_id}/trajectory",
+    response_class=Response,
+    responses=gives(
+        {
+            "map_version": 12,
+            "stamps": [0.0, 0.033],
+            "T_world_camera": [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]] * 2,
+        },
+        npy="T_world_camera (N, 4, 4)",
+    )
+    | problems(404, 503),
+)
+def trajectory(served: Served, request: Request) -> Response:
+    """The camera's path in the map's world, as the latest state knows it."""
+    tag = etag(served, "trajectory " + request.headers.get("accept", ""))
+    if (kept := unchanged(request, served, tag)) is not None:
+        return kept
+    path = served.trajectory
+    if path is None:
+        raise MapNotReadyError(f"Map {served.id!r} knows no trajectory.", hint="map a log, or push frames")
+    body = {"map_version": served.map_version, "stamps": path.stamps, "T_world_camera": path.T_world_camera}
+    return answer(request, body, array="T_world_camera", headers=version_headers(served, tag))
+
+
+async def _receive(request: Request, path: FilePath, most: int) -> None:
+    """Write the body to a file as it comes."""
+    taken = 0
+    with path.open("xb") as file:
+        async for chunk in request.stream():
+            taken += len(chunk)
+            if taken > most:
+                hint = "send a shorter recording, or raise SPLATBOT_MAX_UPLOAD_BYTES"
+                raise TooLargeError(f"has more than {most} bytes.", field="upload", hint=hint)
+            await run_in_threadpool(file.write, chunk)
+
+
+def _forget(service: Service, map_id: str, folder: FilePath | None = None) -> None:
+    """Leave nothing of a map whose making was cancelled before it began."""
+    with suppress(MapNotFoundError):
+        service.remove(map_id)
+    if folder is not None:
+        _discard(folder)
+
+
+def _discard(folder: FilePath) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _info(served: ServedMap) -> MapInfo:

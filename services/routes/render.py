@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import secrets
 from typing import Annotated, Any
 
 import numpy as np
@@ -11,19 +9,14 @@ from fastapi import APIRouter, Body, Query, Request, Response
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import InputError
-from splatbot.geometry import pose_from_quat
 from splatbot.rasterize.views import default_view, depth_limits, render_view, to_png
-from splatbot.services.dependencies import Served, Settings, problems
+from splatbot.services.dependencies import Served, Settings, etag, problems, unchanged, version_headers
 from splatbot.services.problems import TooLargeError
-from splatbot.services.schemas import Mode, RenderRequest
+from splatbot.services.schemas import Mode, Pose, RenderRequest
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import ServedMap
 
 router = APIRouter(prefix="/v1/maps", tags=["views"])
-
-# Version 3 of a map in this process is not version 3 in the next: tags of different processes must differ.
-_PROCESS = secrets.token_hex(4)
 
 _PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {}}, "description": "PNG; X-Map-Version and ETag name the state that was drawn"}
@@ -55,10 +48,10 @@ def render_default(
     fov_deg: Annotated[float, Query(gt=0, lt=180, examples=[60.0])] = 60.0,
 ) -> Response:
     """The map seen whole, for a browser: from where 90 % of it is in view, along the world's z axis."""
-    _check_size(width, height, settings)
-    tag = _tag(served, f"{mode} {width} {height} {fov_deg}")
-    if tag in request.headers.get("if-none-match", ""):
-        return Response(status_code=304, headers=_headers(served, tag))
+    check_size(width, height, settings)
+    tag = etag(served, f"{mode} {width} {height} {fov_deg}")
+    if (kept := unchanged(request, served, tag)) is not None:
+        return kept
     camera, pose = default_view(served.ready.model, width=width, height=height, fov_deg=fov_deg)
     return _png(served, tag, camera, pose, mode, None)
 
@@ -68,7 +61,7 @@ def render(served: Served, settings: Settings, request: Annotated[RenderRequest,
     """The map seen by a given camera from a given pose."""
     model = served.ready.model
     if request.camera is not None:
-        _check_size(request.camera.width, request.camera.height, settings)
+        check_size(request.camera.width, request.camera.height, settings)
         camera = Camera(**request.camera.model_dump())
         _, pose = default_view(model, width=camera.width, height=camera.height, fov_deg=_fov_deg(camera))
     else:
@@ -76,8 +69,8 @@ def render(served: Served, settings: Settings, request: Annotated[RenderRequest,
     if request.T_world_camera is not None:
         pose = np.asarray(request.T_world_camera, dtype=np.float64)
     elif request.translation is not None and request.quat_wxyz is not None:
-        pose = _pose(request.translation, request.quat_wxyz)
-    tag = _tag(served, request.model_dump_json())
+        pose = Pose(translation=request.translation, quat_wxyz=request.quat_wxyz).matrix("quat_wxyz")
+    tag = etag(served, request.model_dump_json())
     return _png(served, tag, camera, pose, request.mode, request.depth_range_m)
 
 
@@ -90,23 +83,19 @@ def _png(
     depth_range: tuple[float, float] | None,
 ) -> Response:
     view = render_view(served.ready.model, camera, T_world_camera, mode)
-    headers = _headers(served, tag)
+    headers = version_headers(served, tag)
     if mode == "depth":
         depth_range = depth_range or depth_limits(view)
         headers["X-Depth-Range-M"] = "{:.4f} {:.4f}".format(*depth_range)
     return Response(to_png(view, mode, depth_range=depth_range), media_type="image/png", headers=headers)
 
 
-def _headers(served: ServedMap, tag: str) -> dict[str, str]:
-    return {"X-Map-Version": str(served.map_version), "ETag": tag, "Cache-Control": "no-cache"}
+def check_size(width: int, height: int, settings: ServiceSettings) -> None:
+    """Refuse a view of more pixels than one may cost.
 
-
-def _tag(served: ServedMap, view: str) -> str:
-    key = f"{_PROCESS} {served.id} {served.map_version} {view}"
-    return f'"{hashlib.sha256(key.encode()).hexdigest()[:20]}"'
-
-
-def _check_size(width: int, height: int, settings: ServiceSettings) -> None:
+    Raises:
+        TooLargeError: it is.
+    """
     if width * height > settings.max_pixels:
         raise TooLargeError(
             f"{width}x{height} has more than {settings.max_pixels} pixels.",
@@ -117,10 +106,3 @@ def _check_size(width: int, height: int, settings: ServiceSettings) -> None:
 
 def _fov_deg(camera: Camera) -> float:
     return float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx)))
-
-
-def _pose(translation: tuple[float, ...], quat_wxyz: tuple[float, ...]) -> NDArray[np.float64]:
-    try:
-        return pose_from_quat(translation, quat_wxyz)
-    except ValueError as error:
-        raise InputError(f"{error}.", field="quat_wxyz", hint="use (1, 0, 0, 0) for no rotation") from error

@@ -51,7 +51,7 @@ class _Wire:
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket
         self.graph: RosGraph = socket.app.state.ros.graph
-        self.most_bytes: int = socket.app.state.settings.max_message_bytes
+        self.most_bytes: int = socket.app.state.runtime.settings.max_message_bytes
 
     async def send(self, data: str | bytes) -> None:
         """Send text as text, bytes as binary."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse
 from splatbot.logs import Log
+from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.results.metrics import without_nan
 from splatbot.robots.robot import RobotModel
@@ -19,7 +20,7 @@ from splatbot.sim.compare.recorded import ArmRecord, BaseInMap, base_in_map, pos
 from splatbot.sim.compare.replay import Replay, find_knots, replay
 from splatbot.sim.compare.views import SeenView, Surroundings, TwinViews, ViewAgreement, surroundings
 from splatbot.sim.twin import Twin
-from splatbot.workspace import fit_workspace
+from splatbot.workspace import Workspace, find_workspace, fit_workspace
 
 KIND = "sim-to-real"
 _SHOWN = 3  # frames whose images are kept
@@ -68,6 +69,7 @@ class LogComparison:
         }
         residuals = self.base.residuals
         found["base_residual_m"] = float(np.sqrt(np.mean(residuals[:, 0] ** 2))) if len(residuals) else None
+        found["base_median_m"] = float(np.median(residuals[:, 0])) if len(residuals) else None
         found["base_residual_rad"] = float(np.sqrt(np.mean(residuals[:, 1] ** 2))) if len(residuals) else None
         if self.replay is not None and self.replay.errors:
             away = np.array([(error.position_m, error.angle_rad) for error in self.replay.errors])
@@ -77,7 +79,11 @@ class LogComparison:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON takes it, images left out."""
-        base = {"T_world_base": self.base.T_world_base.tolist(), "source": self.base.source}
+        base = {
+            "T_world_base": self.base.T_world_base.tolist(),
+            "source": self.base.source,
+            "left_out": list(self.base.left_out),
+        }
         return without_nan(
             {
                 "kind": KIND,
@@ -125,7 +131,6 @@ def compare_log(
     """
     record, tracked = read_arm(log.uri), run.load_poses()
     model = GaussianModel.load(run.map)
-    held_out = {row.index for row in run.load_frames() if row.held_out}
     stamps = _stamps(log, run)
     known = sorted(index for index in stamps if index < len(log))
     if not known or not tracked:
@@ -133,26 +138,19 @@ def compare_log(
             f"has no tracked frame in common with {log.name}.", file=run.path, hint="give the run that mapped this log"
         )
     by_arm = {i: T for i in known if (T := record.camera_at(stamps[i], robot)) is not None}
-    base = base_in_map(by_arm, tracked, record.source) if by_arm else _told_base(record, model)
+    place = find_workspace(run.path) or record.workspace
+    base = base_in_map(by_arm, tracked, record.source) if by_arm else _told_base(place, model)
     poses = by_arm or {i: np.asarray(inverse(base.T_world_base) @ T) for i, T in tracked.items() if i < len(log)}
-    around = surroundings(model, run.map, base.T_world_base, robot)
-    chosen = _spread(sorted(poses), frames)
+    around = surroundings(model, run.map, base.T_world_base, robot, place.support_plane)
+    gaps = {i: pose_gap(base.T_world_base @ T, tracked[i]) for i, T in poses.items() if i in tracked}
+    looks = _Looks(log, poses, gaps, {row.index for row in run.load_frames() if row.held_out})
     notes = [] if around.support is not None else ["no level plane within the arm's reach: nothing stands on anything"]
-    views: list[ViewAgreement] = []
-    shown: dict[int, SeenView] = {}
     done: Replay | None = None
     interrupted = False
     try:
-        looker = TwinViews(around)
-        notes += looker.world.notes
-        keep = set(_spread(chosen, _SHOWN))
-        for k, index in enumerate(chosen):
-            gap = pose_gap(base.T_world_base @ poses[index], tracked[index]) if index in tracked else None
-            view, seen = looker.compare(log[index], poses[index], held_out=index in held_out, gap=gap)
-            views.append(view)
-            if index in keep:
-                shown[index] = seen
-            tell("frames", (k + 1) / len(chosen))
+        twin = TwinViews(around)
+        notes += twin.world.notes
+        looks.through(twin, _spread(sorted(poses), frames), tell)
         tell("the arm's motion", 0.0)
         done = _replay(record, [stamps.get(i, np.nan) for i in range(len(log))], around, robot)
         tell("the arm's motion", 1.0)
@@ -166,12 +164,42 @@ def compare_log(
         poses=record.source if by_arm else "as tracked: the log does not tell the arm's",
         base=base,
         support=None if around.support is None else (around.support.offset, around.support.error),
-        views=tuple(views),
-        shown=shown,
+        views=tuple(looks.views),
+        shown=looks.shown,
         replay=done,
         notes=tuple(notes),
         interrupted=interrupted,
     )
+
+
+@dataclass
+class _Looks:
+    """Frames beside the twin's images, as far as they were looked at.
+
+    Args:
+        log: of the frames.
+        poses: T_base_camera (4, 4) by frame.
+        gaps: from the tracked ones [m, rad].
+        held_out: frames that were kept out of the map.
+    """
+
+    log: Log
+    poses: Mapping[int, Array]
+    gaps: Mapping[int, tuple[float, float]]
+    held_out: set[int]
+    views: list[ViewAgreement] = field(default_factory=list)
+    shown: dict[int, SeenView] = field(default_factory=dict)
+
+    def through(self, twin: TwinViews, chosen: Sequence[int], tell: Tell) -> None:
+        keep = set(_spread(chosen, _SHOWN))
+        for k, index in enumerate(chosen):
+            view, seen = twin.compare(
+                self.log[index], self.poses[index], held_out=index in self.held_out, gap=self.gaps.get(index)
+            )
+            self.views.append(view)
+            if index in keep:
+                self.shown[index] = seen
+            tell("frames", (k + 1) / len(chosen))
 
 
 def _replay(record: ArmRecord, stamps: Sequence[float], around: Surroundings, robot: RobotModel) -> Replay | None:
@@ -179,14 +207,14 @@ def _replay(record: ArmRecord, stamps: Sequence[float], around: Surroundings, ro
     return None if knots is None else replay(knots, Twin(around.scene(robot.name), robot=robot))
 
 
-def _told_base(record: ArmRecord, model: GaussianModel) -> BaseInMap:
-    if record.workspace.T_world_base is not None:
-        T, source = record.workspace.T_world_base, "scene.yaml of the log"
+def _told_base(place: Workspace, model: GaussianModel) -> BaseInMap:
+    if place.T_world_base is not None:
+        T, source = place.T_world_base, "scene.yaml"
     else:
         proposed = fit_workspace(model).T_world_base
         assert proposed is not None
         T, source = proposed, "proposed from the map: the log does not tell the arm's poses"
-    return BaseInMap(T, np.zeros((0, 2)), (), source)
+    return BaseInMap(T, np.zeros((0, 2)), (), (), source)
 
 
 def _stamps(log: Log, run: RunFolder) -> dict[int, float]:

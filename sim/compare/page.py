@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import html
+from collections import Counter
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -10,13 +12,17 @@ from numpy.typing import NDArray
 
 from splatbot.rasterize.views import depth_limits
 from splatbot.report.images import colour_png, depth_png, difference_png
-from splatbot.report.parts import document, image, note, pictures, section, table, tiles
+from splatbot.report.parts import details, document, image, note, pictures, section, table, tiles
 from splatbot.results.units import NONE, count, decibels, metres, number, percent
+from splatbot.sim.compare.agreement import Interval
 from splatbot.sim.compare.log_twin import KIND, LogComparison
-from splatbot.sim.compare.plots import frames_plot, replay_plot
+from splatbot.sim.compare.plots import frames_plot, policies_plot, replay_plot
+from splatbot.sim.compare.trials import KIND as SIM_TO_SIM
+from splatbot.sim.compare.trials import TrialResults
 from splatbot.sim.compare.views import SeenView, ViewAgreement
 
 _GAIN = 3.0  # of difference images
+_STOPPED = '<section class="banner warn"><b>Interrupted</b>; this is what was done until then.</section>\n'
 
 
 def log_rows(found: LogComparison) -> list[tuple[str, str]]:
@@ -24,7 +30,7 @@ def log_rows(found: LogComparison) -> list[tuple[str, str]]:
     s = found.summary()
     rows = [
         ("camera poses", found.poses),
-        ("base in the map", found.base.source + _residual(s)),
+        ("base in the map", found.base.source + _residual(s, found.base.left_out)),
         ("support", "none within reach" if found.support is None else _support(*found.support)),
     ]
     for part, name in (("all", "frames"), ("held_out", "held-out frames")):
@@ -47,10 +53,9 @@ def log_rows(found: LogComparison) -> list[tuple[str, str]]:
 def log_section(found: LogComparison) -> list[str]:
     """The parts of a page on a log."""
     rows = log_rows(found)
-    stop = '<section class="banner warn"><b>Interrupted</b>; this is what was compared until then.</section>\n'
     replayed = found.replay
     return [
-        stop if found.interrupted else "",
+        _STOPPED if found.interrupted else "",
         tiles(_tiles(found)),
         section(
             f"{KIND}: {html.escape(found.log)} against the twin of {html.escape(found.map)}", table(("", ""), rows)
@@ -73,6 +78,91 @@ def log_section(found: LogComparison) -> list[str]:
 def log_html(found: LogComparison) -> str:
     """The page of a sim-to-real comparison."""
     return document(f"{found.log}: {KIND}", f"twin of {found.map}, arm {found.robot}", log_section(found))
+
+
+def policy_rows(found: TrialResults) -> list[tuple[str, ...]]:
+    """The policies of a sim-to-sim comparison as cells; the last rows are the measures over all of them."""
+    agreed = found.agreement()
+    if agreed is None:
+        return []
+    rows = [(p.name, _share(p.in_map), _share(p.in_held_out), _signed(p.drop), str(p.refused)) for p in agreed.policies]
+    mean = ("mean drop", "", "", _signed(agreed.drop), "")
+    correlation = ("Pearson r", "", "", _signed(agreed.pearson), "")
+    return [*rows, mean, correlation, ("mean maximum rank violation", "", "", _signed(agreed.mmrv), "")]
+
+
+POLICY_HEAD = ("policy", "success, map's twin", "success, held-out twin", "drop", "refused")
+
+
+def promise_rows(found: TrialResults) -> list[tuple[str, ...]]:
+    """Promised clearance against that in the held-out twin, as cells."""
+    return [
+        (
+            f"{1e3 * row.low:g} to {1e3 * row.high:g} mm" if np.isfinite(row.high) else f"{1e3 * row.low:g} mm or more",
+            str(row.count),
+            _share(row.kept),
+            str(row.touched),
+            metres(row.promised),
+            metres(row.measured),
+            f"{-1e3 * row.worst:+.1f} mm",
+        )
+        for row in found.reliability()
+    ]
+
+
+PROMISE_HEAD = (
+    "promised",
+    "motions",
+    "kept",
+    "touched",
+    "median promised",
+    "median measured",
+    "worst against promised",
+)
+
+
+def trials_title(found: TrialResults) -> str:
+    """What the figures are of, in a line."""
+    return f"{SIM_TO_SIM}: {found.task}, the map's twin against the held-out twin, {len(found.cases)} cases"
+
+
+def trials_section(found: TrialResults) -> list[str]:
+    """The parts of a page on policies in two twins."""
+    agreed = found.agreement()
+    whys = Counter((trial.policy, trial.why_held_out) for trial in found.trials if trial.why_held_out)
+    failures = [(policy, why, str(n)) for (policy, why), n in whys.most_common(40)]
+    return [
+        _STOPPED if found.interrupted else "",
+        section(
+            html.escape(trials_title(found)),
+            table(POLICY_HEAD, policy_rows(found)),
+            note("Shares and differences with 95 % intervals: Wilson's for shares, others over resampled cases."),
+            image(policies_plot(agreed), "success in both twins") if agreed is not None else "",
+        ),
+        section(f"Promised clearance, {html.escape(found.task)}", table(PROMISE_HEAD, promise_rows(found))),
+        details(
+            f"What went wrong in the held-out twin, {html.escape(found.task)}", table(("policy", "why", ""), failures)
+        ),
+    ]
+
+
+def trials_html(results: Sequence[TrialResults]) -> str:
+    """The page of a sim-to-sim comparison."""
+    parts = [part for found in results for part in trials_section(found)]
+    return document(f"held-out twin: {SIM_TO_SIM}", "policies that see only a map, in its twin and in another", parts)
+
+
+def _share(interval: Interval) -> str:
+    if interval.value is None:
+        return NONE
+    return f"{percent(interval.value)} ({percent(interval.low)} to {percent(interval.high)})"
+
+
+def _signed(interval: Interval) -> str:
+    if interval.value is None:
+        return interval.note
+    ends = NONE if interval.low is None or interval.high is None else f"{interval.low:.2f} to {interval.high:.2f}"
+    return f"{interval.value:.2f} ({ends})" + (f"; {interval.note}" if interval.note else "")
 
 
 def _tiles(found: LogComparison) -> list[tuple[str, str]]:
@@ -125,11 +215,15 @@ def _rings() -> str:
     )
 
 
-def _residual(summary: dict[str, float | None]) -> str:
-    away, turn = summary["base_residual_m"], summary["base_residual_rad"]
+def _residual(summary: dict[str, float | None], left_out: Sequence[int]) -> str:
+    away, turn, median = (summary[f"base_{name}"] for name in ("residual_m", "residual_rad", "median_m"))
     if away is None or turn is None:
         return ""
-    return f"; the arm's and the tracked camera differ by {metres(away)} and {np.degrees(turn):.2f} deg RMS"
+    without = f"; contradict each other in frames {', '.join(map(str, left_out))}" if left_out else ""
+    return (
+        f"; the arm's and the tracked camera differ by {metres(median)} (median), {metres(away)} and "
+        f"{np.degrees(turn):.2f} deg RMS{without}"
+    )
 
 
 def _support(height: float, error: float) -> str:

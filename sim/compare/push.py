@@ -19,11 +19,13 @@ from splatbot.sim.world import OBJECT
 
 NEAR = 0.03  # [m] from the goal that counts as there
 _UPRIGHT = float(np.cos(0.5))  # a thing that leans more has tipped over
-_FINGER = 0.0125  # [m], radius of the fingers
+_TIP = 0.01  # [m] that the fingers' tips are ahead of the tool's frame
+_TILT = np.pi / 4  # of the tool from straight down, forwards: the fingers, not the hand, meet the thing
 _LOWEST = 0.03  # [m] of the tool over the table
 _RUN = 0.05  # [m] before contact
 _OVER = 0.25  # [m] over the table that the tool comes from
 _APPROACH, _DOWN, _REST = 2.0, 1.0, 0.5  # [s]
+_POSTURES = 8  # above the thing that are tried
 _RATE = 50.0  # [Hz] of the samples; between them a motion is a cubic
 
 
@@ -65,16 +67,24 @@ class Push:
         """See :class:`splatbot.sim.compare.trials.Task`."""
         return self.map_twin, self.held_out(case)
 
-    def succeeded(self, case: PushCase, twin: Twin, result: TwinResult) -> bool:
-        """Whether the thing is where it should be, and upright."""
+    def failure(self, case: PushCase, twin: Twin, result: TwinResult) -> str:
+        """That the thing tipped over, or how far it is from where it should be."""
         name = case.true if twin is not self.map_twin else case.believed.name if case.believed is not None else ""
         things = {thing.name: thing for thing in twin.world.scene.movable}
-        if name not in things or result.stopped is not None:
-            return False
+        if name not in things:
+            return "the map lacks it"
+        if result.stopped is not None:
+            return "; ".join(result.warnings) or "stopped"
         body = twin.data.body(OBJECT + name)
-        goal = np.asarray(things[name].at)[:2] + case.distance * case.direction
-        upright = float(np.asarray(body.xmat)[8]) >= _UPRIGHT
-        return bool(upright and np.linalg.norm(np.asarray(body.xpos)[:2] - goal) <= NEAR)
+        if float(np.asarray(body.xmat)[8]) < _UPRIGHT:
+            return "tipped over"
+        went = np.asarray(body.xpos)[:2] - np.asarray(things[name].at)[:2]
+        off = went - case.distance * case.direction
+        if np.linalg.norm(off) <= NEAR:
+            return ""
+        along = float(off @ case.direction)
+        aside = float(np.linalg.norm(off - along * case.direction))
+        return f"{1e3 * abs(along):.0f} mm {'beyond' if along > 0 else 'short'}, {1e3 * aside:.0f} mm aside"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,40 +113,50 @@ class Pusher:
         back, tall = extents(case.believed, d)
         middle = np.asarray(case.believed.at) * [1, 1, 0] + self.aside * np.array([-d[1], d[0], 0.0])
         z = np.array([0.0, 0.0, max(_LOWEST, self.height * tall)])
-        begin, end = middle - (back + _FINGER + _RUN) * d + z, middle + (case.distance - back - _FINGER) * d + z
+        begin, end = middle - (back + _TIP + _RUN) * d + z, middle + (case.distance - back - _TIP) * d + z
         above = np.array([begin[0], begin[1], _OVER])
-        return self._motion(above, begin, end, float(np.arctan2(d[1], d[0])))
+        z_tool = np.sin(_TILT) * d - np.array([0.0, 0.0, np.cos(_TILT)])
+        y_tool = np.array([d[1], -d[0], 0.0])  # as at home: the other way round the wrist is near its limits
+        return self._motion(above, begin, end, np.stack([np.cross(y_tool, z_tool), y_tool, z_tool], axis=1))
 
-    def _motion(self, above: Array, begin: Array, end: Array, yaw: float) -> Attempt | None:
-        R = rotation_of((np.pi, 0.0, yaw))
-        first = self._reach(R, above, self.robot.home, seeds=32)
-        if first is None:
-            return None
+    def _motion(self, above: Array, begin: Array, end: Array, R: Array) -> Attempt | None:
+        """The first of several postures above the thing from which the whole way is within the joints' limits."""
         stretch = max(float(np.linalg.norm(end - begin)) / self.speed, 2 / _RATE)
-        lines = [(above, begin, _DOWN), (begin, end, stretch), (end, end, _REST)]
-        t = np.arange(0.0, _APPROACH, 1 / _RATE)
-        q = list(minimum_jerk(t, np.array([0.0, _APPROACH]), np.stack([self.robot.home, first]), 0))
-        times, now, at = list(t), _APPROACH, first
-        for a, b, seconds in lines:
-            local = np.linspace(0.0, seconds, max(3, round(seconds * _RATE)), endpoint=False)
-            for moment, place in zip(
-                local, minimum_jerk(local, np.array([0.0, seconds]), np.stack([a, b]), 0), strict=True
-            ):
-                found = self._reach(R, place, at, seeds=1)
-                if found is None:
-                    return None
-                at = found
-                times.append(now + float(moment))
-                q.append(at)
-            now += seconds
-        motion = motion_from_samples(times, np.array(q))
-        return Attempt(replace(motion, opening=np.zeros(len(times))))
+        times, places = _way([(above, begin, _DOWN), (begin, end, stretch), (end, end, _REST)])
+        for first in solve_ik(self.robot, _pose(R, above), near=self.robot.home).q[:_POSTURES]:
+            q = self._along(first, places, R)
+            if q is not None:
+                t = np.arange(0.0, _APPROACH, 1 / _RATE)
+                approach = minimum_jerk(t, np.array([0.0, _APPROACH]), np.stack([self.robot.home, first]), 0)
+                motion = motion_from_samples(np.append(t, _APPROACH + times), np.concatenate([approach, q]))
+                return Attempt(replace(motion, opening=np.zeros(len(motion.time))))
+        return None
 
-    def _reach(self, R: Array, at: Array, near: Array, *, seeds: int) -> Array | None:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, at
-        found = solve_ik(self.robot, T, near=near, seeds=seeds).q
-        return found[0] if len(found) else None
+    def _along(self, first: Array, places: Array, R: Array) -> Array | None:
+        found = [first]
+        for place in places:
+            nearest = solve_ik(self.robot, _pose(R, place), near=found[-1], seeds=1).q
+            if not len(nearest):
+                return None
+            found.append(nearest[0])
+        return np.array(found[1:])
+
+
+def _way(lines: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array]:
+    """Times (N,) [s] and places (N, 3) on lines (from, to, seconds), at rest at the end of each."""
+    times, places, now = [], [], 0.0
+    for a, b, seconds in lines:
+        t = np.linspace(0.0, seconds, max(3, round(seconds * _RATE)), endpoint=False)
+        times.append(now + t)
+        places.append(minimum_jerk(t, np.array([0.0, seconds]), np.stack([a, b]), 0))
+        now += seconds
+    return np.concatenate(times), np.concatenate(places)
+
+
+def _pose(R: Array, at: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, at
+    return T
 
 
 def push_policies(robot: RobotModel) -> tuple[Pusher, ...]:

@@ -48,12 +48,15 @@ class Reach:
         """See :class:`splatbot.sim.compare.trials.Task`."""
         return self.map_twin, self.held_out(case)
 
-    def succeeded(self, case: ReachCase, twin: Twin, result: TwinResult) -> bool:
-        """Nothing was touched, physics was sound, and every joint is within 20 mrad of the goal."""
-        if result.touches or result.stopped is not None or twin.follower is None:
-            return False
-        at = np.asarray(twin.data.qpos)[twin.follower.qpos]
-        return bool(np.abs(at - case.goal).max() <= _ARRIVED)
+    def failure(self, case: ReachCase, twin: Twin, result: TwinResult) -> str:
+        """What was touched, or that physics broke, or that a joint is more than 20 mrad from the goal."""
+        if result.touches:
+            first = result.touches[0]
+            return f"{first.part} touches {first.other} at {first.first:.2f} s"
+        if result.stopped is not None or twin.follower is None:
+            return "; ".join(result.warnings) or "stopped"
+        off = float(np.abs(np.asarray(twin.data.qpos)[twin.follower.qpos] - case.goal).max())
+        return f"{1e3 * off:.0f} mrad from the goal" if off > _ARRIVED else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,7 @@ def find_knots(record: ArmRecord, stamps: Sequence[float], robot: RobotModel) ->
 
     Args:
         record: of the arm.
-        stamps: of the log's frames [s].
+        stamps: of the log's frames [s]; NaN where a frame has none.
         robot: the twin's arm.
     """
     index: list[int] = []
@@ -95,6 +95,8 @@ def find_knots(record: ArmRecord, stamps: Sequence[float], robot: RobotModel) ->
     tools: list[Array] = []
     told = 0
     for i, stamp in enumerate(stamps):
+        if not np.isfinite(stamp):
+            continue
         joints, tool = record.joints_at(stamp, robot), record.tool_at(stamp)
         if joints is None and tool is None:
             continue

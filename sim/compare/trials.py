@@ -64,8 +64,8 @@ class Task(Protocol[Case]):
         """The twin of the map and the held-out twin."""
         ...
 
-    def succeeded(self, case: Case, twin: Twin, result: TwinResult) -> bool:
-        """Whether a motion that a twin has just followed did it."""
+    def failure(self, case: Case, twin: Twin, result: TwinResult) -> str:
+        """Why a motion that a twin has just followed did not do it, in a few words; empty if it did."""
         ...
 
 
@@ -80,7 +80,7 @@ class Trial:
         promised: clearance [m]; None: nothing was promised.
         room_map, room_held_out: least room around the arm [m]; None without a motion.
         touched: whether the arm touched anything in the held-out twin.
-        why: what went wrong in the held-out twin, in words; empty after success.
+        why_map, why_held_out: what went wrong there, in words; empty after success.
     """
 
     policy: str
@@ -92,7 +92,8 @@ class Trial:
     room_map: float | None = None
     room_held_out: float | None = None
     touched: bool = False
-    why: str = ""
+    why_map: str = ""
+    why_held_out: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,30 +182,24 @@ def run_trials(
 def _trial(task: Task[Case], policy: Policy[Case], case: Case, number: int, in_map: Twin, held_out: Twin) -> Trial:
     attempt = policy.act(case)
     if attempt is None:
-        return Trial(policy.name, number, True, False, False, why="refused")
+        return Trial(policy.name, number, True, False, False, why_map="refused", why_held_out="refused")
     believed = in_map.follow(attempt.motion)
-    good_there = task.succeeded(case, in_map, believed)
+    why_map = task.failure(case, in_map, believed)
     found = held_out.follow(attempt.motion)
-    good = task.succeeded(case, held_out, found)
+    why_held_out = task.failure(case, held_out, found)
     return Trial(
         policy=policy.name,
         case=number,
         refused=False,
-        in_map=good_there,
-        in_held_out=good,
+        in_map=not why_map,
+        in_held_out=not why_held_out,
         promised=attempt.promised,
         room_map=believed.near.room,
         room_held_out=found.near.room,
         touched=bool(found.touches),
-        why="" if good else _why(found),
+        why_map=why_map,
+        why_held_out=why_held_out,
     )
-
-
-def _why(result: TwinResult) -> str:
-    if result.touches:
-        touch = result.touches[0]
-        return f"{touch.part} touches {touch.other} at {touch.first:.2f} s"
-    return "; ".join(result.warnings) or "not where it should be"
 
 
 def join(a: TrialResults, b: TrialResults) -> TrialResults:

@@ -18,7 +18,7 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.rasterize.views import colorize, render_view
 from splatbot.robots.robot import RobotModel
-from splatbot.segmentation import Support, find_support
+from splatbot.segmentation import Support, find_support, given_support
 from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.solids import rpy_of
 from splatbot.sim.world import World, build_world
@@ -118,7 +118,9 @@ class Surroundings:
         return np.asarray(self.inside(points) & (self.support.height(points) > ABOVE))
 
 
-def surroundings(model: GaussianModel, file: Path, T_world_base: Array, robot: RobotModel) -> Surroundings:
+def surroundings(
+    model: GaussianModel, file: Path, T_world_base: Array, robot: RobotModel, plane: Array | None = None
+) -> Surroundings:
     """The part of a map within an arm's reach, and the level plane there.
 
     Args:
@@ -126,22 +128,28 @@ def surroundings(model: GaussianModel, file: Path, T_world_base: Array, robot: R
         file: that it is in.
         T_world_base: (4, 4) of the arm.
         robot: the arm, whose reach bounds the part.
+        plane: (n, d) that things stand on, n · p + d = 0 in the map's frame; None: it is sought.
     """
     T_base_world = inverse(T_world_base)
     points = transform_points(T_base_world, model.means.detach().double().numpy())
     shoulder, reach = _reach(robot)
     near = (np.linalg.norm(points - shoulder, axis=1) < reach) & (model.opacities.detach().numpy() >= _OPAQUE)
-    support = find_support(points[near])
+    if plane is None:
+        support = find_support(points[near])
+    else:
+        support = given_support(points[near], plane[:3] @ T_world_base[:3, :3], -float(plane @ T_world_base[:, 3]))
     low, high = shoulder - reach, shoulder + reach
     if support is not None:
         low[2] = support.offset / support.normal[2] - _UNDER
-    clutter = {
+    clutter: dict[str, Any] = {
         "file": str(file.resolve()),
         "at": T_base_world[:3, 3].tolist(),
         "rpy": rpy_of(T_base_world[:3, :3]),
         "low": low.tolist(),
         "high": high.tolist(),
     }
+    if support is not None:
+        clutter["support"] = [*support.normal.tolist(), -support.offset]
     return Surroundings(model, T_world_base, support, low, high, {"name": file.parent.name, "map": clutter})
 
 

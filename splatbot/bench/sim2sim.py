@@ -1,4 +1,4 @@
-"""`splatbot sim2real --held-out`: policies on maps of noisy films of tables, tried in the map's and in a held-out twin."""
+"""Policies on maps of noisy films of tables, tried in the map's twin and in a held-out one: sim-to-sim."""
 
 from __future__ import annotations
 
@@ -126,11 +126,11 @@ def work_table(seed: int = 0) -> Tabletop:
     rng = np.random.default_rng(seed)
     things: list[Solid] = []
     for k, place in enumerate(_PLACES):
-        x, y = np.asarray(place) + rng.uniform(-_JITTER, _JITTER, 2)
+        x, y = (np.asarray(place) + rng.uniform(-_JITTER, _JITTER, 2)).tolist()
         if k % 2:
-            things.append(Can((x, y, 0.0), float(rng.uniform(0.03, 0.045)), float(rng.uniform(0.09, 0.20))))
+            things.append(Can((x, y, 0.0), float(rng.uniform(0.035, 0.05)), float(rng.uniform(0.08, 0.15))))
         else:
-            width, depth, height = rng.uniform([0.05, 0.05, 0.08], [0.10, 0.10, 0.20])
+            width, depth, height = rng.uniform([0.06, 0.06, 0.08], [0.10, 0.10, 0.15]).tolist()
             things.append(Block((x, y, height / 2), (width, depth, height), float(rng.uniform(-1.5, 1.5))))
     return Tabletop((*tabletop().solids[:_FIXED], *things))
 
@@ -172,7 +172,8 @@ def movable_truth(table: Tabletop) -> Scene:
 def middle_of(solid: Solid) -> Array:
     """Of a solid (3,) [m]."""
     if isinstance(solid, Can):
-        return np.asarray(solid.foot) + [0.0, 0.0, solid.height / 2]
+        x, y, z = solid.foot
+        return np.array([x, y, z + solid.height / 2])
     assert isinstance(solid, Block | Ball)
     return np.asarray(solid.center, dtype=np.float64)
 
@@ -187,7 +188,7 @@ def _free_direction(table: Tabletop, index: int, rng: np.random.Generator) -> Ar
     """One of those directions (2,) in which a thing and the hand behind it have room, or the one with most."""
     rest = Tabletop(tuple(solid for k, solid in enumerate(table.solids) if k not in (0, index)))
     middle = middle_of(table.solids[index])
-    angles = np.arange(8) * np.pi / 4 + rng.uniform(0.0, np.pi / 4)
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 8) + rng.uniform(0.0, np.pi / 8)  # away from the arm
     ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     along = np.linspace(-0.12, DISTANCE + 0.05, 12)[:, None]
     rooms = []

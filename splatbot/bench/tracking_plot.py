@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import matplotlib
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import FuncFormatter
 
 from splatbot.bench.results import Results
 
@@ -30,10 +32,24 @@ def plot_tracking(results: Results, out: Path) -> None:
                 axis.plot([ms], [error], "o", color="#d1495b", markersize=9)
         axis.set(title=log, xlabel="median per frame [ms]", ylabel="ATE RMSE [mm]", xscale="log", yscale="log")
         axis.grid(alpha=0.3, which="both")
+        for side, form in ((axis.xaxis, _spaced), (axis.yaxis, _plain)):
+            side.set_major_formatter(FuncFormatter(form))
+            side.set_minor_formatter(FuncFormatter(form))
+        axis.tick_params(which="both", labelsize=7)
     figure.tight_layout()
     for suffix in ("png", "svg"):
         figure.savefig(out / f"tracking.{suffix}", dpi=130)
     plt.close(figure)
+
+
+def _plain(value: float, _: int) -> str:
+    return f"{value:g}"
+
+
+def _spaced(value: float, _: int) -> str:
+    """A number of a logarithmic axis; only some of each decade, or side by side they would overlap."""
+    digit = round(value / 10 ** math.floor(math.log10(value)))
+    return f"{value:g}" if digit in (1, 2, 3, 5, 7) else ""
 
 
 def _points(results: Results, log: str) -> list[tuple[str | None, str, float, float]]:

@@ -26,6 +26,7 @@ COMMANDS = {
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
     "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "view": _Command("splatbot.cli.view", "view", "Show a map in a web browser, or write it as one HTML page."),
     "plan": _Command(
         "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
     ),
@@ -58,6 +59,16 @@ COMMANDS = {
         "splatbot.cli.bench_planning",
         "bench_planning",
         "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
+    ),
+    "bench grasping": _Command(
+        "splatbot.cli.bench_grasping",
+        "bench_grasping",
+        "Measure grasping: candidates a second, time to a ranked list, contacts against exact shapes.",
+    ),
+    "bench service": _Command(
+        "splatbot.cli.bench_service",
+        "bench_service",
+        "Measure the service: frames mapped and questions answered at once, and what HTTP costs.",
     ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }

@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import json
-import re
 import shutil
-import subprocess
-import sys
-import time
-import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.client import Client, Distances
 from splatbot.errors import SplatbotError
 from splatbot.geometry import transform_points
 from splatbot.logs import Log, open_log
 from splatbot.logs.record import record
 from splatbot.run import Progress, map_log
+from splatbot.serving import serving
 from splatbot.sim.effects.base import Effects
 from splatbot.sim.effects.depth_noise import DepthNoise
 
-_START_S = 120.0  # the service imports torch first
 _TABLE_M = 1e-3  # a ray-cast point this near to z = 0 is on the table
 _TIP_M = 0.005  # radius of the fingertip that is asked about: a camera with 2 mm of noise cannot place a bare point
 
@@ -62,10 +54,10 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
     )
     _say(f"    trajectory error {_mm(metrics['ate_rmse_m'])}, {metrics['gaussians']} Gaussians")
     question = _question(scene)
-    with _service(out / "map.ply", out / "service.log") as url:
-        _say(f"3/4 serving the map on {url}")
+    with serving("--map", str(out / "map.ply"), log=out / "service.log") as service, Client(service.url) as client:
+        _say(f"3/4 serving the map on {service.url}")
         _say("4/4 asking it over HTTP: POST /v1/maps/default/distance")
-        answer = _ask(f"{url}/v1/maps/default/distance", {"points": _tips(question.places).tolist()})
+        answer = client.distance("default", _tips(question.places))
     wrong = _judge(question, answer)
     _say(f"report: {out / 'report.html'}      serve it again: splatbot serve --map {out / 'map.ply'}")
     return 1 if wrong else 0
@@ -107,11 +99,11 @@ def _tips(places: NDArray[np.float64]) -> NDArray[np.float64]:
     return (places[:, None] + ball).reshape(-1, 3)
 
 
-def _judge(question: _Question, answer: dict[str, Any]) -> int:
+def _judge(question: _Question, answer: Distances) -> int:
     """Print each answer beside the truth; how many contradict it."""
     wrong = 0
-    touched = np.asarray(answer["inside"]).reshape(len(question.places), -1)
-    nearest = np.asarray(answer["distance"], dtype=np.float64).reshape(touched.shape).min(axis=1)
+    touched = answer.inside.reshape(len(question.places), -1)
+    nearest = answer.distance.reshape(touched.shape).min(axis=1)
     rows = zip(question.names, question.places, question.occupied, touched.sum(axis=1), nearest, strict=True)
     for name, place, occupied, inside, distance in rows:
         at = ", ".join(f"{x:+.3f}" for x in place)
@@ -120,48 +112,8 @@ def _judge(question: _Question, answer: dict[str, Any]) -> int:
         _say(f"    a fingertip {name} ({at}) m: {said}  [{verdict}]")
         _say(f"        {inside} of its {touched.shape[1]} points are inside, the nearest at {distance:.1f} sigma")
         wrong += bool(inside) != occupied
-    _say(f"    answered on map_version {answer['map_version']}")
+    _say(f"    answered on map_version {answer.map_version}")
     return wrong
-
-
-@contextmanager
-def _service(map_file: Path, log: Path) -> Iterator[str]:
-    """The service on a map as a process of its own, which writes ``log``; yields its base URL once it is ready."""
-    command = [sys.executable, "-m", "splatbot", "serve", "--map", str(map_file), "--port", "0"]
-    with log.open("w", encoding="utf-8") as errors:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
-        try:
-            yield _url(process, log)
-        finally:
-            process.terminate()
-            try:
-                process.communicate(timeout=20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-
-
-def _url(process: subprocess.Popen[str], log: Path) -> str:
-    assert process.stdout is not None
-    found = re.search(r"http://\S+", process.stdout.readline())
-    if found is None:
-        raise SplatbotError("the service did not start.", file=log, hint="that file says why")
-    deadline = time.monotonic() + _START_S
-    while time.monotonic() < deadline:
-        try:
-            with urllib.request.urlopen(f"{found[0]}/readyz", timeout=5):
-                return found[0]
-        except OSError:
-            time.sleep(0.1)
-    raise SplatbotError(f"the service was not ready within {_START_S:.0f} s.", file=log, hint="that file says why")
-
-
-def _ask(url: str, question: dict[str, Any]) -> dict[str, Any]:
-    request = urllib.request.Request(
-        url, data=json.dumps(question).encode(), headers={"content-type": "application/json"}
-    )
-    with urllib.request.urlopen(request, timeout=30) as response:
-        answer: dict[str, Any] = json.load(response)
-    return answer
 
 
 def _tell(progress: Progress) -> None:

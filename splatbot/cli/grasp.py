@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from splatbot.grasping.affordance import Hint, View
-    from splatbot.grasping.types import Grasp, GraspResult
+    from splatbot.grasping.types import GraspResult
     from splatbot.segmentation import MapScene
 
 
@@ -91,6 +91,7 @@ def grasp(
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.places import PlaceAffordance
     from splatbot.grasping.sampler import GraspSampler
+    from splatbot.grasping.summary import summary
     from splatbot.grasping.tags import TagAffordance
     from splatbot.grasping.words import WordAffordance
     from splatbot.report.grasp_view import grasp_png
@@ -124,50 +125,6 @@ def grasp(
     result.unwrap()
     _print(result, folder)
     return 0
-
-
-def summary(result: GraspResult) -> dict[str, Any]:
-    """A result as JSON has it; lengths in metres, poses as position and quaternion wxyz."""
-    return {
-        "target": {
-            "label": result.target.label,
-            "backend": result.target.backend,
-            "score": result.target.score,
-            "gaussians": len(result.target.rows),
-            "notes": list(result.target.notes),
-        },
-        "grasps": [_grasp_summary(grasp) for grasp in result.grasps],
-        "best_rejected": _grasp_summary(result.best_rejected) if result.best_rejected is not None else None,
-        "rejected": dict(result.rejected),
-        "candidates": result.candidates,
-        "notes": list(result.notes),
-        "seconds": dict(result.seconds),
-        "map_version": result.map_version,
-    }
-
-
-def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
-    from splatbot.geometry import rotation_to_quat
-
-    def pose(T: NDArray[np.float64]) -> dict[str, Any]:
-        return {"position": T[:3, 3].tolist(), "quaternion_wxyz": rotation_to_quat(T[:3, :3]).tolist()}
-
-    return {
-        "T_world_tcp": pose(grasp.T_world_tcp),
-        "T_world_pregrasp": pose(grasp.T_world_pregrasp),
-        "width_m": grasp.width,
-        "opening_m": grasp.opening,
-        "contacts": grasp.contacts.tolist(),
-        "normals": grasp.normals.tolist(),
-        "approach": grasp.approach,
-        "terms": dict(grasp.terms),
-        "total": grasp.total,
-        "room_m": grasp.room,
-        "q": grasp.q.tolist() if grasp.q is not None else None,
-        "q_pregrasp": grasp.q_pregrasp.tolist() if grasp.q_pregrasp is not None else None,
-        "approach_path": grasp.approach_path.tolist() if grasp.approach_path is not None else None,
-        "rejected": grasp.rejected,
-    }
 
 
 def _scene(map_: Path, base: Pose | None) -> MapScene:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from splatbot.errors import InputError
-from splatbot.gaussians import GaussianModel, Snapshot
-from splatbot.services.server import run_service
-from splatbot.services.settings import ServiceSettings, load_settings
-from splatbot.services.store import MapStore
+if TYPE_CHECKING:
+    from splatbot.logs import Log
+    from splatbot.protocols import FrameSource
+    from splatbot.services.runtime import Runtime
 
 MAP_ID = "default"
 
@@ -18,58 +17,107 @@ def serve(
     *,
     map: Path | None = None,
     log: str | None = None,
+    data: Path | None = None,
     camera: str | None = None,
     host: str | None = None,
     port: int | None = None,
+    ros_port: int | None = None,
+    viewer_port: int | None = None,
+    record: Path | None = None,
     config: Path | None = None,
     service_config: Path | None = None,
-) -> None:
-    """Answer questions about a map over HTTP until Ctrl-C or SIGTERM.
+    new_key: bool = False,
+) -> int:
+    """Answer questions about maps over HTTP until Ctrl-C or SIGTERM.
 
     Examples:
         splatbot serve --map runs/demo/map.ply
         splatbot serve --log recordings/desk --port 8080
+        splatbot serve --camera "replay:recordings/desk?loop=1" --viewer-port 8001 --ros-port 9090
+        SPLATBOT_LOG_ROOTS=recordings splatbot serve --data maps
+        splatbot serve --new-key
         curl localhost:8000/v1/maps/default/distance -H 'content-type: application/json' -d '{"points": [[0, 0, 1]]}'
 
     Then http://localhost:8000/docs lists every question with examples, and
-    http://localhost:8000/v1/maps/default/render shows the map.
+    http://localhost:8000/v1/maps/default/render shows the map. Every setting is a variable SPLATBOT_NAME, too.
 
     Args:
         map: a map file, or a run folder that holds map.ply.
         log: a log that is mapped while the service runs; the answers follow the map's latest state.
-        camera: intrinsics of the log, instead of its own (as for `splatbot map`).
-        host: address to listen on (default 127.0.0.1; 0.0.0.0 for every interface), or SPLATBOT_HOST.
+        data: folder that maps made by clients are kept in and served from again, or SPLATBOT_DATA_DIR.
+        camera: a camera that is mapped while the service runs (replay:LOG plays a recording in real time); or, with
+            --log, intrinsics instead of the log's own.
+        host: address to listen on (default 127.0.0.1; 0.0.0.0 for every interface, which needs keys), or SPLATBOT_HOST.
         port: port to listen on (default 8000; 0 takes a free one), or SPLATBOT_PORT.
+        ros_port: one more port, for roslib clients that want a port of their own (usually 9090); rosbridge is at
+            /rosbridge of --port in any case, Foxglove at /foxglove.
+        viewer_port: show the map in the browser at this port, on this machine alone.
+        record: record every topic into this MCAP file; what was mapped can be mapped again from it.
         config: YAML file with the configuration of mapping.
-        service_config: YAML file with the service's address and limits.
+        service_config: YAML file with the service's address, keys and limits.
+        new_key: print a new API key and its hash for SPLATBOT_API_KEYS, and leave.
     """
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
-    settings = load_settings(service_config, host=host, port=port)
-    if (map is None) == (log is None):
-        raise InputError("give either a map or a log.", field="--map, --log", hint="e.g. --map runs/demo/map.ply")
-    store = MapStore()
-    if map is not None:
-        path = map / "map.ply" if map.is_dir() else map
-        store.add(MAP_ID, source=path.name, state="static", snapshot=Snapshot(GaussianModel.load(path), map_version=1))
-        run_service(settings, store, on_start=_announce)
-    elif log is not None:
-        _serve_log(store, log, camera, config, settings)
+    from splatbot.errors import InputError
 
-
-def _serve_log(store: MapStore, uri: str, camera: str | None, config: Path | None, settings: ServiceSettings) -> None:
+    if new_key:
+        return _print_new_key()
     from splatbot.config import load_config
     from splatbot.logs import open_log
-    from splatbot.services.live import LiveMapping
+    from splatbot.robots.cameras import is_camera, open_camera
+    from splatbot.services.requests import configure_logging
+    from splatbot.services.runtime import Runtime, check_exposure
+    from splatbot.services.server import run_service
+    from splatbot.services.settings import load_settings
+
+    given = {"host": host, "port": port, "ros_port": ros_port, "viewer_port": viewer_port, "record": record}
+    settings = load_settings(service_config, data_dir=data, **given)
+    configure_logging(as_json=settings.log_json)
+    device = camera if camera is not None and is_camera(camera) else None
+    sources = sum(source is not None for source in (map, log, device))
+    if sources > 1 or (sources == 0 and settings.data_dir is None):
+        hint = "e.g. --map runs/demo/map.ply; or --data DIR, for maps that clients make"
+        raise InputError("give a map, a log or a camera.", field="--map, --log, --camera", hint=hint)
+    check_exposure(settings)
+    runtime = Runtime(settings, config=load_config(config))
+    if map is not None:
+        _add_map(runtime, map)
+    elif device is not None:
+        _follow(runtime, open_camera(device))
+    elif log is not None:
+        _follow(runtime, open_log(log, camera=camera))
+    try:
+        run_service(runtime, on_start=_announce)
+    finally:
+        runtime.close()
+    return 0
+
+
+def _add_map(runtime: Runtime, map_: Path) -> None:
+    from splatbot.gaussians import GaussianModel, Snapshot
+    from splatbot.workspace import find_workspace
+
+    path = map_ / "map.ply" if map_.is_dir() else map_
+    snapshot = Snapshot(GaussianModel.load(path), map_version=1)
+    runtime.store.add(MAP_ID, source=path.name, state="static", snapshot=snapshot, workspace=find_workspace(path))
+
+
+def _follow(runtime: Runtime, source: Log | FrameSource) -> None:
+    from splatbot.robots.cameras.replay import PREFIX
+    from splatbot.services.mapping import workspace_of
     from splatbot.slam import Slam
 
-    source = open_log(uri, camera=camera)
-    store.add(MAP_ID, source=source.name, state="mapping")
-    mapping = LiveMapping(store, MAP_ID, source, Slam(load_config(config)))
-    mapping.start()
-    try:
-        run_service(settings, store, on_start=_announce)
-    finally:
-        mapping.stop(timeout_s=settings.shutdown_s)
+    workspace = workspace_of(source.uri.removeprefix(PREFIX), None)
+    runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace)
+    runtime.follow(MAP_ID, source, Slam(runtime.config))
+
+
+def _print_new_key() -> int:
+    from splatbot.services.keys import hash_key, new_key
+
+    key = new_key()
+    print(f"key (for clients; shown once): {key}")
+    print(f"hash (for the service):        SPLATBOT_API_KEYS={hash_key(key)}")
+    return 0
 
 
 def _announce(url: str) -> None:

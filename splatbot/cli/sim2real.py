@@ -6,9 +6,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+
+if TYPE_CHECKING:
+    from splatbot.bench.sim2sim import SimToSimPlan
+
+Tell = Callable[[str, float], None]
 
 
 def sim2real(
@@ -16,33 +21,70 @@ def sim2real(
     map: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     robot: str = "panda",
     frames: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    held_out: bool = False,
+    task: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction] = (),
+    tables: Annotated[int, tyro.conf.arg(metavar="N")] = 2,
+    trials: Annotated[int, tyro.conf.arg(metavar="N")] = 10,
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    quick: bool = False,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     quiet: bool = False,
 ) -> int:
-    """Say how far the twin is from a recorded log.
+    """Say how far the twin is from a recorded log, and from a held-out twin.
 
-    Sim-to-real: colour, depth and silhouettes of the twin at the log's recorded camera poses, and the arm's motion done
-    again by the twin's arm. The arm's poses are those of the log's ee_poses.txt and ee_T_camera, or of its joints.txt
-    and the mount in scene.yaml. Writes sim2real.json and sim2real.html.
+    Sim-to-real, of a log: colour, depth and silhouettes of the twin at the log's recorded camera poses, and the arm's
+    motion done again by the twin's arm. The arm's poses are those of the log's ee_poses.txt and ee_T_camera, or of its
+    joints.txt and the mount in scene.yaml. Writes sim2real.json and sim2real.html.
+
+    Sim-to-sim, with --held-out: policies that see nothing but the map of a noisy film, in the twin of that map and in a
+    held-out twin of the true shapes with other friction, masses, gains and delays, all effects on. Success in both,
+    the drop, Pearson's r and the mean maximum rank violation, promised against measured clearance. Writes sim2sim.json
+    and sim2sim.html.
 
     Examples:
         splatbot sim2real /data/arm --map runs/arm
         splatbot sim2real /data/arm --map runs/arm --frames 12 --out runs/arm-twin
+        splatbot sim2real --held-out
+        splatbot sim2real --held-out --task reach --tables 1 --trials 20
 
     Args:
         log: a recording that was mapped.
         map: the folder of the run that mapped it.
         robot: the twin's arm; one with other joints than the log's stands in by its tool's poses.
         frames: how many to compare, evenly spaced; 0: all.
+        held_out: compare the map's twin with a held-out one, on synthetic tables.
+        task: reach or push; once for each, both by default.
+        tables: different ones, each filmed and mapped.
+        trials: of each task on each table.
+        seed: of tables, problems and physics.
+        quick: two trials of each task on a table filmed briefly, to see whether it runs.
         out: folder to write to; by default runs/sim2real.
-        json: another place for the JSON file.
+        json: another place for the JSON file of the log, or else of the held-out twin.
         quiet: print only errors.
     """
     from splatbot.errors import InputError
 
-    if log is None or map is None:
-        raise InputError("are needed, both.", field="LOG, --map", hint="splatbot sim2real LOG --map RUN")
+    if (log is None) != (map is None) or (log is None and not held_out):
+        raise InputError("are needed, both.", field="LOG, --map", hint="splatbot sim2real LOG --map RUN, or --held-out")
+    folder = out if out is not None else Path("runs") / "sim2real"
+    interrupted = False
+    with _progress(quiet) as tell:
+        if log is not None and map is not None:
+            interrupted = _compare_log(log, map, robot, frames, folder, json, tell, quiet)
+            json = None
+        if held_out and not interrupted:
+            plan = _plan(task, tables, trials, seed, quick)
+            interrupted = _compare_twins(plan, folder, json, tell, quiet)
+    if not quiet:
+        print(f"written to {folder}")
+    return 130 if interrupted else 0
+
+
+def _compare_log(
+    log: str, map: Path, robot: str, frames: int, folder: Path, json: Path | None, tell: Tell, quiet: bool
+) -> bool:
+    """Whether it was interrupted."""
     from splatbot.cli.tables import print_table
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
@@ -51,31 +93,78 @@ def sim2real(
     from splatbot.sim.compare.page import log_html, log_rows
 
     run = RunFolder(map)
-    with _progress(quiet) as tell:
-        found = compare_log(reopen_log(run, uri=log), run, load_robot(robot), frames=frames, tell=tell)
-    folder = out if out is not None else Path("runs") / "sim2real"
-    _write(folder, json, found.to_dict(), log_html(found))
+    found = compare_log(reopen_log(run, uri=log), run, load_robot(robot), frames=frames, tell=tell)
+    _write(folder, "sim2real", json, found.to_dict(), log_html(found))
     if not quiet:
         print_table(log_rows(found), title=f"{KIND}: {found.log} against the twin of {found.map}")
-        print(f"written to {folder}")
-    return 130 if found.interrupted else 0
+    return found.interrupted
 
 
-def _write(folder: Path, json: Path | None, values: dict[str, Any], page: str) -> None:
+def _plan(task: tuple[str, ...], tables: int, trials: int, seed: int, quick: bool) -> SimToSimPlan:
+    from splatbot.bench.sim2sim import TASKS, SimToSimPlan
+    from splatbot.errors import InputError
+
+    unknown = [name for name in task if name not in TASKS]
+    if unknown:
+        raise InputError(f"there is no {unknown[0]!r}.", field="--task", hint=f"tasks: {', '.join(TASKS)}")
+    if min(tables, trials) < 1:
+        raise InputError("are below 1.", field="--tables, --trials", hint="give positive numbers")
+    if quick:
+        return SimToSimPlan(task or TASKS, 1, 2, (24, 160), 4000, seed)
+    return SimToSimPlan(task or TASKS, tables, trials, seed=seed)
+
+
+def _compare_twins(plan: SimToSimPlan, folder: Path, json: Path | None, tell: Tell, quiet: bool) -> bool:
+    """Whether it was interrupted."""
+    from rich.table import Table
+
+    from splatbot.bench.sim2sim import run_sim_to_sim
+    from splatbot.cli.bench_tables import wide_console
+    from splatbot.sim.compare.page import (
+        POLICY_HEAD,
+        PROMISE_HEAD,
+        policy_rows,
+        promise_rows,
+        trials_html,
+        trials_title,
+    )
+    from splatbot.sim.compare.trials import KIND
+
+    results = run_sim_to_sim(plan, folder, tell)
+    interrupted = not results or any(found.interrupted for found in results)
+    values = {"kind": KIND, "interrupted": interrupted, "tasks": [found.to_dict() for found in results]}
+    _write(folder, "sim2sim", json, values, trials_html(results))
+    if quiet:
+        return interrupted
+    console = wide_console()
+    for found in results:
+        for title, head, rows in (
+            (trials_title(found), POLICY_HEAD, policy_rows(found)),
+            (f"{KIND}: promised clearance, {found.task}", PROMISE_HEAD, promise_rows(found)),
+        ):
+            if rows:
+                table = Table(*head, title=title)
+                for row in rows:
+                    table.add_row(*row)
+                console.print(table)
+    return interrupted
+
+
+def _write(folder: Path, name: str, json: Path | None, values: dict[str, Any], page: str) -> None:
     import json as text
 
     from splatbot.atomic import atomic_write
 
     for path, content in (
-        (json if json is not None else folder / "sim2real.json", text.dumps(values, indent=1, allow_nan=False) + "\n"),
-        (folder / "sim2real.html", page),
+        (json if json is not None else folder / f"{name}.json", text.dumps(values, indent=1, allow_nan=False) + "\n"),
+        (folder / f"{name}.html", page),
     ):
         with atomic_write(path) as file:
             file.write(content.encode())
 
 
 @contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+def _progress(quiet: bool) -> Iterator[Tell]:
     if quiet or not sys.stderr.isatty():
         yield lambda what, share: None
         return

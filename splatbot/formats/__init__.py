@@ -10,7 +10,10 @@ from splatbot.errors import FormatError
 if TYPE_CHECKING:  # torch takes seconds to import, and trajectories need none of it
     from splatbot.gaussians import GaussianModel
 
-__all__ = ["load_gaussians", "save_gaussians"]
+__all__ = ["WRITTEN", "load_gaussians", "save_gaussians"]
+
+WRITTEN = ("ply",)
+"""Suffixes of the formats that maps are written in."""
 
 _KNOWN = "3DGS PLY (.ply)"
 
@@ -40,7 +43,7 @@ def save_gaussians(model: GaussianModel, path: str | Path) -> None:
     Raises:
         FormatError: the suffix is unknown.
     """
-    if Path(path).suffix.lower() != ".ply":
+    if Path(path).suffix.lower().removeprefix(".") not in WRITTEN:
         raise FormatError("the suffix names no known format.", file=path, field="format", hint=f"use {_KNOWN}")
     from splatbot.formats.ply import save_ply
 

@@ -14,7 +14,7 @@ from splatbot.protocols import Array, HandShape
 FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
 SLACK = 0.003  # [m] between each pad and the target as the hand comes
 OPENINGS = 0.002  # [m] that openings are rounded up to
-_CHUNK, _SAMPLE = 256, 250  # hands at once; points for a first look
+_CHUNK, _SAMPLE = 32, 250  # hands at once; points for a first look
 _GIVE = 0.003  # [m] that implied sides are off by and do not stop a hand
 _TOUCH = 0.003  # [m] between a pad and what it presses
 _LOOK = 0.03  # [m] of room beyond which more is no better
@@ -77,11 +77,11 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     T[..., :3, 0], T[..., :3, 1], T[..., :3, 2] = np.cross(yy, zz), yy, zz
     T[..., :3, 3] = pairs.contacts.mean(axis=1)[:, None, None] - zz * places[None, None, :, None]
     pair = np.broadcast_to(np.arange(len(pairs))[:, None, None], shape).ravel()
-    T = T.reshape(-1, 4, 4)
-    steep = -(T[:, :3, 2] @ up) >= lowest
-    T, pair = T[steep], pair[steep]
-    zero = np.zeros(len(T))
-    return Hands(T, pair, pairs.width[pair] + 2 * SLACK, zero, zero.copy(), zero.copy())
+    poses = T.reshape(-1, 4, 4)
+    steep = -(poses[:, :3, 2] @ up) >= lowest
+    poses, pair = poses[steep], pair[steep]
+    zero = np.zeros(len(poses))
+    return Hands(poses, pair, pairs.width[pair] + 2 * SLACK, zero, zero.copy(), zero.copy())
 
 
 def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
@@ -89,12 +89,12 @@ def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: floa
     step = max(1, len(surface) // _SAMPLE)
     p = (surface.points[::step] - surface.center).astype(np.float32)
     free = np.ones(len(hands), np.bool_)
-    for k in range(0, len(hands), 4 * _CHUNK):
-        T = hands.T[k : k + 4 * _CHUNK]
+    for k in range(0, len(hands), 32 * _CHUNK):
+        T = hands.T[k : k + 32 * _CHUNK]
         axes, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - surface.center).astype(np.float32)
         x, y, z = (axes[:, :, i] @ p.T - np.einsum("ij,ij->i", axes[:, :, i], at)[:, None] for i in range(3))
         across = (np.abs(x) < hand.palm_size[0] / 2) & (np.abs(y) < hand.palm_size[1] / 2)
-        free[k : k + 4 * _CHUNK] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(axis=1)
+        free[k : k + 32 * _CHUNK] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(axis=1)
     return free
 
 
@@ -156,7 +156,7 @@ def _measured(
 
 
 def _held(
-    x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], half: Array, hand: HandShape
+    x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], half: NDArray[np.float32], hand: HandShape
 ) -> Array:
     """Of four by four parts of each pad, the share that has the surface under it, of the lesser pad."""
     column = np.floor((x / hand.width + 0.5) * 4)

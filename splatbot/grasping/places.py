@@ -122,7 +122,8 @@ def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_]) -> Target:
     seeds = _visible(scene, view, mask)
     if not len(seeds):
         raise AffordanceError("shows nothing of the map.", field="mask", hint="mark a thing in the picture")
-    votes = np.bincount(scene.labels[seeds] + 1, minlength=len(scene.objects) + 1)[1:]
+    labels = scene.labels[seeds]
+    votes = np.bincount(labels[labels >= 0], minlength=len(scene.objects))
     share = votes / len(seeds)
     if not len(votes) or share.sum() < _CLEAR / 2:
         rows = scene.grown(seeds)

@@ -27,8 +27,8 @@ from splatbot.planning.cartesian import along
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.segmentation import MapScene
 
-_HANDS = 3000  # whose room beside the target is looked at
-_TRIED = 400  # hands whose room in the map is looked at
+_HANDS = 2000  # whose room beside the target is looked at
+_TRIED = 200  # hands whose room in the map is looked at
 _ASKED = 60  # of them that an arm is asked for
 _TOP, _LOWEST = np.cos(np.radians(40.0)), -0.26  # cosine between the approach and down: from the top; the least of all
 _LEVEL = 0.5  # of a side approach, at most
@@ -190,7 +190,7 @@ class _Search:
         return hands.select(np.abs(hands.T[:, :3, 2] @ up) < _LEVEL) if o.approach == "side" else hands
 
     def _promising(self, hands: Hands) -> Hands:
-        """At most 3000, those whose palm has room, of the best pairs."""
+        """At most 2000, those whose palm has room, of the best pairs."""
         free = clear_palm(hands, self.surface, self.s.hand, retreat=self.o.pregrasp)
         self.log.drop(_IN_TARGET, (~free).sum())
         hands = hands.select(free)

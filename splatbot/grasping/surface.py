@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
@@ -15,11 +16,14 @@ from splatbot.protocols import Array
 from splatbot.segmentation import MapScene
 from splatbot.segmentation.parts import nearest_of
 
-MOST = 2500  # points that are looked at
+MOST = 1800  # points that are looked at
+_OFTEN = 0.2  # of the keyframes that the best Gaussians are supported by
 _SMOOTH = 0.006  # [m] over which normals are averaged
-_LONELY = 0.25  # of the usual crowd around a point; those with less are strays
+_LONELY = 4.0  # times the usual area of a point; those with more are strays
+_WITHIN = 0.45  # winding number, from where on a point is within what was seen
 _CELL = 0.002  # [m] of the picture of a face
 _DISC, _OVERHANG = 0.004, 0.5  # [m] that a Gaussian covers of it at most; standard deviations
+_GAP = 5  # cells between Gaussians that are no edge
 _STEP = 0.006  # [m] from where on a difference in height is an edge
 _FACING, _TURNED = 0.7, 0.1  # cosines between a direction and the normals of what faces it, and of what it still sees
 _TURNED_AWAY = 0.7  # below it a normal is of another face
@@ -56,6 +60,12 @@ class Surface:
     def __len__(self) -> int:
         return len(self.points)
 
+    def select(self, chosen: NDArray[np.int64]) -> Surface:
+        """The points that are named, about the same centre."""
+        columns = (self.points, self.normals, self.half, self.spread)
+        points, normals, half, spread = (column[chosen] for column in columns)
+        return Surface(points, normals, half, spread, self.seen[chosen], self.doubt[chosen], self.center)
+
 
 def target_surface(
     scene: MapScene, rows: NDArray[np.int64], *, observers: Array | None = None, seed: int = 0
@@ -68,31 +78,29 @@ def target_surface(
         scene: the map.
         rows: of the target.
         observers: (N, 3) where each Gaussian of the map was seen from [m, world], NaN where that is not known.
-        seed: of which Gaussians are kept where there are more than 2500.
+        seed: of which Gaussians are kept where there are more than 1800.
     """
     rng = np.random.default_rng(seed)
+    seen_by = scene.model.observations.numpy()[rows]  # what few keyframes saw is often smeared beyond an edge
+    rows = rows[seen_by >= _OFTEN * np.percentile(seen_by, 90)] if len(rows) else rows
     chosen = rows if len(rows) <= MOST else np.sort(rng.choice(rows, MOST, replace=False))
-    model = scene.model.select(_index(chosen))
+    model = scene.model.select(torch.from_numpy(chosen))
     points = model.means.detach().double().numpy()
     scales = np.sort(model.scales.detach().double().numpy(), axis=1)
     center = _middle(scene, points)
     outward = points - center
     if observers is not None:
-        known = np.isfinite(observers[chosen]).all(axis=1)
-        outward = np.where(known[:, None], observers[chosen] - points, outward)
+        outward = np.where(np.isfinite(observers[chosen]), observers[chosen] - points, outward)
     normals = shortest_axes(model).detach().double().numpy()
     normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
-    normals, kept = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
+    normals, areas = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
     doubt = _doubts(model, scales)
     half = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
-    columns = (x[kept] for x in (points, normals, half, scales[:, 2], np.ones(len(points), np.bool_), doubt))
-    return _completed(scene, Surface(*columns, center))
-
-
-def _index(rows: NDArray[np.int64]):  # type: ignore[no-untyped-def]
-    import torch
-
-    return torch.from_numpy(rows)
+    kept = np.flatnonzero(areas < _LONELY * np.median(areas))
+    apart = np.sqrt(areas)
+    spread = np.where(apart > 2 * scales[:, 2], 1.2 * apart, scales[:, 2])  # where only some of many are looked at
+    seen = Surface(points, normals, half, spread, np.ones(len(points), np.bool_), doubt, center)
+    return _completed(scene, seen.select(kept), areas[kept])
 
 
 def _doubts(model: GaussianModel, scales: Array) -> Array:
@@ -111,8 +119,8 @@ def _middle(scene: MapScene, points: Array) -> Array:
     return transform_points(scene.T_world_base, (low + high) / 2)
 
 
-def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Normals averaged with those of neighbours on the same side, and which points are no strays (M,).
+def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, Array]:
+    """Normals averaged with those of neighbours on the same side, and the area that each point stands for (M,) [m²].
 
     Round Gaussians have little to say.
     """
@@ -125,10 +133,10 @@ def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, ND
     weight *= np.maximum(flatness, 0.05).astype(np.float32)
     mean = (weight @ n).astype(np.float64)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    return mean, np.asarray(crowd > _LONELY * np.median(crowd))
+    return mean, np.asarray(2 * np.pi * _SMOOTH**2 / crowd, dtype=np.float64)
 
 
-def _completed(scene: MapScene, seen: Surface) -> Surface:
+def _completed(scene: MapScene, seen: Surface, areas: Array) -> Surface:
     """With the sides that go down from its top to the support, and back from the face that was seen in front."""
     up = scene.up
     parts = [_sides(seen, up, _floor(scene, seen, up))]
@@ -139,7 +147,9 @@ def _completed(scene: MapScene, seen: Surface) -> Surface:
     thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
     thin = thin[:: 1 + len(thin) // MOST]
     points, normals = points[thin], normals[thin]
-    outer = ~_inside(points, normals, np.concatenate([seen.points, points]), np.concatenate([seen.normals, normals]))
+    outer = _enclosed(points, seen, areas) < _WITHIN
+    points, normals = points[outer], normals[outer]
+    outer = ~_inside(points, normals)
     points, normals, n = points[outer], normals[outer], int(outer.sum())
     if n == 0:
         return seen
@@ -193,7 +203,7 @@ def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
     """
     along = seen.points @ face
     facing = along[seen.normals @ face > _FACING]
-    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 2))
+    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 5))
     if near - far > _SHOWN:
         flat = float((near - facing < _SHOWN).mean()) > 0.7
         return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
@@ -216,7 +226,7 @@ def _sides(
     across = _frame(direction)
     flat = seen.points @ across.T  # the last is the height
     heights, low = _picture(flat[facing], seen.spread[facing])
-    below, _ = _picture(flat[seen.normals @ direction < -_FACING], None, like=(heights.shape, low))
+    below, _ = _picture(flat[seen.normals @ direction < -_TURNED], None, like=(heights.shape, low))
     edges = _edges(heights)
     if not len(edges[0]):
         return none
@@ -276,12 +286,13 @@ def _picture(
 
 def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Cells (E, 2) at which a face ends, the way out (E, 2), its height there (E,) and that beyond (E,)."""
+    kernel = np.ones((_GAP, _GAP), np.uint8)
     known = np.isfinite(heights).astype(np.uint8)
-    closed = cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    closed = cv2.morphologyEx(known, cv2.MORPH_CLOSE, kernel)
     filled = np.where(np.isfinite(heights), heights, -np.inf)
     holes = (closed == 1) & (known == 0)
     if holes.any():
-        spread = cv2.dilate(np.where(np.isfinite(filled), filled, -1e9), np.ones((5, 5), np.uint8))
+        spread = cv2.dilate(np.where(np.isfinite(filled), filled, -1e9), kernel)
         filled = np.where(holes, spread, filled)
     found, outs, tops, beyonds = [], [], [], []
     padded = np.pad(filled, 1, constant_values=-np.inf)
@@ -303,28 +314,41 @@ def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
     return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)
 
 
-def _inside(points: Array, normals: Array, others: Array, other_normals: Array) -> NDArray[np.bool_]:
-    """Whether what points (P, 3) face first is another surface from behind (P,): they are within the target."""
-    middle = others.mean(axis=0)
-    p, q = (points - middle).astype(np.float32), (others - middle).astype(np.float32)
-    n, m = normals.astype(np.float32), other_normals.astype(np.float32)
-    found = np.zeros(len(p), np.bool_)
-    square = (q**2).sum(axis=1)
+def _enclosed(points: Array, seen: Surface, areas: Array) -> Array:
+    """How far points (P, 3) are surrounded by what was seen (P,): the winding number (Barill et al. 2018), 1 within."""
+    middle = seen.center
+    p, q = (points - middle).astype(np.float32), (seen.points - middle).astype(np.float32)
+    dipole = (seen.normals * areas[:, None] / (4 * np.pi)).astype(np.float32)
+    own, square = np.einsum("ij,ij->i", dipole, q), (q**2).sum(axis=1)
+    found = np.zeros(len(p))
+    for k in range(0, len(p), 256):
+        a = p[k : k + 256]
+        away = np.maximum((a**2).sum(axis=1)[:, None] - 2 * (a @ q.T) + square, _ROWS**2)
+        found[k : k + 256] = ((own - a @ dipole.T) / (away * np.sqrt(away))).sum(axis=1)
+    return found
+
+
+def _inside(points: Array, normals: Array) -> NDArray[np.bool_]:
+    """Whether what points (P, 3) face first is another of them from behind (P,): they are within the target."""
+    if not len(points):
+        return np.zeros(0, np.bool_)
+    p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
+    found, square = np.zeros(len(p), np.bool_), (p**2).sum(axis=1)
     for k in range(0, len(p), 256):
         a, d = p[k : k + 256], n[k : k + 256]
-        ahead = d @ q.T - np.einsum("ij,ij->i", a, d)[:, None]
-        aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ q.T) + square - ahead**2
+        ahead = d @ p.T - np.einsum("ij,ij->i", a, d)[:, None]
+        aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + square - ahead**2
         ahead[(ahead < _SEEN) | (aside > _TUBE**2)] = np.inf
         first = ahead.argmin(axis=1)
         hit = np.isfinite(ahead[np.arange(len(a)), first])
-        found[k : k + 256] = hit & (np.einsum("ij,ij->i", m[first], d) > 0.3)
+        found[k : k + 256] = hit & (np.einsum("ij,ij->i", n[first], d) > 0.3)
     return found
 
 
 def _unseen(points: Array, normals: Array, seen: Surface) -> NDArray[np.bool_]:
     """Whether nothing that was seen within 6 mm of each of points (P, 3) faces the same way (P,)."""
     new = np.ones(len(points), np.bool_)
-    reach = max(_SEEN, 3.0 * float(np.median(seen.spread)))
+    reach = max(_SEEN, 2.0 * float(np.median(seen.spread)))
     for way in (*np.eye(3), *-np.eye(3)):
         asked, known = normals @ way > 0.5, seen.normals @ way > 0.3
         if asked.any() and known.any():

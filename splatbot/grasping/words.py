@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, transform_points
@@ -218,7 +219,7 @@ def _sized(looks: _Looks, word: str) -> Array:
     return np.asarray(1.0 / (1.0 + np.exp(-4.0 * (values - middle) / max(abs(middle), 1e-6))))
 
 
-def _ranked(looks: _Looks, word: str, among: Array) -> Array:
+def _ranked(looks: _Looks, word: str, among: NDArray[np.bool_]) -> Array:
     """1 for the first of those that still count, less by how far others are behind."""
     values = _measure(looks, word)
     best = values[among].max() if among.any() else 0.0

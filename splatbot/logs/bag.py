@@ -105,10 +105,9 @@ class BagLog(LogBase):
         """The poses of /ground_truth/pose, T_world_camera; None where there are none."""
         if TRUTH not in self._reader.topics:
             return None
-        rows = [
-            self._checked(TRUTH, lambda m=m: (seconds_of(m.header.stamp), pose_of(m.pose))) for m in self._all(TRUTH)
-        ]
-        return Trajectory(np.array([stamp for stamp, _ in rows]), np.stack([T for _, T in rows]))
+        messages = list(self._all(TRUTH))
+        poses = self._checked(TRUTH, lambda: np.stack([pose_of(m.pose) for m in messages]))
+        return Trajectory(np.array([seconds_of(m.header.stamp) for m in messages]), poses)
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -148,8 +147,9 @@ class BagLog(LogBase):
 
     def _recorded_camera(self) -> Camera:
         topic = self._given.get("info") or self._info_topic()
-        for message in self._all(topic):
-            return self._checked(topic, lambda m=message: camera_of(m))  # type: ignore[misc]
+        first = next(iter(self._all(topic)), None)
+        if first is not None:
+            return self._checked(topic, lambda: camera_of(first))
         raise LogError("holds no message.", file=self.path, field=topic, hint="give --camera FILE")
 
     def _info_topic(self) -> str:

@@ -23,19 +23,26 @@ _STRINGS = ("string", "wstring")
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 
-# What the JAZZY store lacks; the fields as ros-controls/control_msgs has them.
+# What the JAZZY store lacks: ros-controls/control_msgs' action as the topics of ROS 1's actionlib.
+_JOINT_TOLERANCE = "string name\nfloat64 position\nfloat64 velocity\nfloat64 acceleration\n"
+_FOLLOW = "control_msgs/msg/FollowJointTrajectory"
+_STATUS = "std_msgs/Header header\nactionlib_msgs/GoalStatus status\n"
 _MORE = {
-    "control_msgs/msg/JointTrajectoryControllerState": (
-        "std_msgs/Header header\nstring[] joint_names\n"
-        "trajectory_msgs/JointTrajectoryPoint reference\ntrajectory_msgs/JointTrajectoryPoint feedback\n"
-        "trajectory_msgs/JointTrajectoryPoint error\ntrajectory_msgs/JointTrajectoryPoint output\n"
-        "string[] multi_dof_joint_names\n"
-        "trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_reference\n"
-        "trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_feedback\n"
-        "trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_error\n"
-        "trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_output\n"
-        "float64 speed_scaling_factor\n"
+    "control_msgs/msg/JointTolerance": _JOINT_TOLERANCE,
+    f"{_FOLLOW}Goal": (
+        "trajectory_msgs/JointTrajectory trajectory\ncontrol_msgs/JointTolerance[] path_tolerance\n"
+        "control_msgs/JointTolerance[] goal_tolerance\nbuiltin_interfaces/Duration goal_time_tolerance\n"
     ),
+    f"{_FOLLOW}Feedback": (
+        "std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint desired\n"
+        "trajectory_msgs/JointTrajectoryPoint actual\ntrajectory_msgs/JointTrajectoryPoint error\n"
+    ),
+    f"{_FOLLOW}Result": "int32 error_code\nstring error_string\n",
+    f"{_FOLLOW}ActionGoal": (
+        f"std_msgs/Header header\nactionlib_msgs/GoalID goal_id\n{_FOLLOW.replace('/msg', '')}Goal goal\n"
+    ),
+    f"{_FOLLOW}ActionFeedback": f"{_STATUS}{_FOLLOW.replace('/msg', '')}Feedback feedback\n",
+    f"{_FOLLOW}ActionResult": f"{_STATUS}{_FOLLOW.replace('/msg', '')}Result result\n",
 }
 
 

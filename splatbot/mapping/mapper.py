@@ -15,7 +15,7 @@ from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
-from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, weigh
+from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, fuse_normals, weigh
 from splatbot.mapping.exposure import in_exposure_of_map
 from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
 from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images, resized
@@ -260,7 +260,7 @@ class Mapper:
 
     def _weigh(self, depth: torch.Tensor, camera: Camera, T_world_camera: NDArray[np.float64]) -> None:
         evidence = weigh(self.model, depth, camera, T_world_camera, self._noise)
-        self.model = count(fuse_depth(self.model, evidence), evidence)
+        self.model = count(fuse_normals(fuse_depth(self.model, evidence), evidence), evidence)
 
     def _leave_out_what_moves(self, keyframe: Keyframe, view: View) -> None:
         moving = self._movers.find(

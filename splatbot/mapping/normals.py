@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +11,39 @@ from splatbot.camera import Camera
 _SAMPLES = 7  # along each side of the window
 _SAME = 0.05  # share of its depth by which a pixel of the same surface differs at most
 _AGREE = 2.5  # a sample farther from the first fit, in the fit's own RMS, is left out of the second
+_FLAT = 0.01  # RMS distance from its plane [share of depth], above which a window holds more than one surface
 _LEAST = 8  # samples that a plane needs
+
+
+def smooth_normals(depth: NDArray[np.float32], camera: Camera, reach: int) -> NDArray[np.float64]:
+    """Unit normals (H, W, 3) towards the camera; zero where the window holds an edge or too little depth.
+
+    The planes are those of :func:`fitted_normals` over all pixels of the window, by sums over boxes.
+
+    Args:
+        depth: (H, W) [m], 0 missing.
+        reach: half the window's side [px].
+    """
+    side = (2 * reach + 1,) * 2
+    known = depth > 0
+    value = np.where(known, 1.0 / np.where(known, depth, 1.0), 0.0).astype(np.float64)
+    y, x = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]].astype(np.float64)
+    x, y = (x - camera.cx) / camera.fx * known, (y - camera.cy) / camera.fy * known
+
+    def total(image: NDArray[np.float64]) -> NDArray[np.float64]:
+        summed = cv2.boxFilter(image, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(summed, dtype=np.float64)
+
+    count = total(known.astype(np.float64))
+    n = np.maximum(count, 1)
+    mx, my, mv = total(x) / n, total(y) / n, total(value) / n
+    xv, yv, vv = total(x * value) - n * mx * mv, total(y * value) - n * my * mv, total(value * value) - n * mv * mv
+    moments = total(x * x) - n * mx * mx, total(x * y) - n * mx * my, total(y * y) - n * my * my
+    slope = _slope(*moments, xv, yv)
+    rms = np.sqrt(np.maximum(vv - slope[..., 0] * xv - slope[..., 1] * yv, 0.0) / n)
+    flat = known & (count > 0.5 * side[0] ** 2) & (rms * depth < _FLAT)
+    normals = _from_inverse_depth(slope, mv - slope[..., 0] * mx - slope[..., 1] * my)
+    return np.where(flat[..., None], normals, 0.0)
 
 
 def fitted_normals(
@@ -36,15 +69,14 @@ def fitted_normals(
     used = (z > 0) & (np.abs(z - center[:, None]) < _SAME * center[:, None])
     inverse = 1.0 / np.where(used, z, 1.0)
     x, y = right / camera.fx, down / camera.fy
-    slope, at_center, residual = _fit(inverse, x, y, used)
+    here = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy], 1)
+    _, _, residual = _fit(inverse, x, y, used)
     rms = np.sqrt((used * residual**2).sum(1) / np.maximum(used.sum(1), 1))
     used &= np.abs(residual) <= _AGREE * rms[:, None] + 1e-9
     slope, at_center, _ = _fit(inverse, x, y, used)
-    here = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy], 1)
-    normals = np.concatenate([slope, (at_center - (slope * here).sum(1))[:, None]], 1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    known = (used.sum(1, keepdims=True) >= _LEAST) & np.isfinite(length) & (length > 0)
-    return np.where(known, -normals / np.where(known, length, 1.0), 0.0)
+    normals = _from_inverse_depth(slope, at_center - (slope * here).sum(1))
+    normals[used.sum(1) < _LEAST] = 0.0
+    return normals
 
 
 def _fit(
@@ -55,10 +87,29 @@ def _fit(
     mx, my, mv = ((used * t).sum(1) / n for t in (x, y, value))
     dx, dy, dv = x - mx[:, None], y - my[:, None], value - mv[:, None]
     xx, xy, yy, xv, yv = ((used * a * b).sum(1) for a, b in ((dx, dx), (dx, dy), (dy, dy), (dx, dv), (dy, dv)))
-    determinant = xx * yy - xy * xy
-    known = determinant > 1e-6 * (xx + yy) ** 2  # or all samples lie on one line
-    safe = np.where(known, determinant, 1.0)
-    slope = np.where(known[:, None], np.stack([yy * xv - xy * yv, xx * yv - xy * xv], 1) / safe[:, None], np.nan)
+    slope = _slope(xx, xy, yy, xv, yv)
     at_center = mv - slope[:, 0] * mx - slope[:, 1] * my
     residual = dv - slope[:, :1] * dx - slope[:, 1:] * dy
     return slope, at_center, residual
+
+
+def _slope(
+    xx: NDArray[np.float64],
+    xy: NDArray[np.float64],
+    yy: NDArray[np.float64],
+    xv: NDArray[np.float64],
+    yv: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(..., 2) of least squares by central moments (...); NaN where all samples lie on one line."""
+    determinant = xx * yy - xy * xy
+    known = determinant > 1e-6 * (xx + yy) ** 2
+    safe = np.where(known, determinant, np.nan)
+    return np.stack([(yy * xv - xy * yv) / safe, (xx * yv - xy * xv) / safe], -1)
+
+
+def _from_inverse_depth(slope: NDArray[np.float64], at_axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit normals (..., 3) towards the camera of planes 1/z = at_axis + slope · (x/z, y/z); zero of NaN."""
+    normals = -np.concatenate([slope, at_axis[..., None]], -1)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    known = np.isfinite(length) & (length > 0)
+    return np.where(known, normals / np.where(known, length, 1.0), 0.0)

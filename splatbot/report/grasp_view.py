@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.gaussians import GaussianModel
@@ -23,7 +24,13 @@ _SIDES = (np.array([-0.8, 0.35, 0.6]), np.array([-0.25, -0.9, 0.45]))  # where f
 
 
 def grasp_png(
-    scene: MapScene, rows: Array, robot: RobotKinematics, grasp: Grasp, *, width: int = 1280, height: int = 480
+    scene: MapScene,
+    rows: NDArray[np.int64],
+    robot: RobotKinematics,
+    grasp: Grasp,
+    *,
+    width: int = 1280,
+    height: int = 480,
 ) -> bytes:
     """Two views of the target, tinted, with the hand at the grasp, before it, and its contacts in green.
 
@@ -63,10 +70,10 @@ def _hand(robot: RobotKinematics, T_world_tcp: Array, opening: float, color: Arr
     return balls(transform_points(T, spheres.centers[own]), spheres.radii[own], color, opacity)
 
 
-def _tinted(model: GaussianModel, rows: Array) -> GaussianModel:
+def _tinted(model: GaussianModel, rows: NDArray[np.int64]) -> GaussianModel:
     """The map with the target's colours drawn towards orange."""
     tinted = model.clone()
-    index = torch.from_numpy(np.asarray(rows, np.int64))
+    index = torch.from_numpy(rows)
     colors = 0.55 * model.colors[index] + 0.45 * torch.from_numpy(_TARGET).to(model.means.dtype)
     tinted.sh[index, 0] = rgb_to_sh(colors)
     return tinted

@@ -11,6 +11,7 @@ import numpy as np
 from splatbot.protocols import Array
 
 _PLAIN = 1.3  # a hull is taken only where every primitive's error is this many times larger
+_FOOT = 0.3  # of a hull's height whose points stand on the floor
 _TRIM = 1.0  # [%] of the points that may stick out of a box or cylinder on each side
 
 
@@ -37,15 +38,20 @@ def fit(points: Array, floor: float) -> Fit:
     Tried are an upright box, an upright cylinder, a ball and, where they all fail, the convex hull.
     """
     best = min(primitive_fits(points, floor), key=lambda f: f.error)
-    hull = _hull(points)
+    hull = _hull(points, *_heights(points, floor))
     return hull if best.error > _PLAIN * max(hull.error, 2e-3) else best
 
 
 def primitive_fits(points: Array, floor: float) -> list[Fit]:
     """An upright box, an upright cylinder and a ball for points (P, 3) [m] that stand on the height ``floor``."""
-    low = min(floor, float(points[:, 2].min())) if floor > points[:, 2].min() - 0.03 else float(points[:, 2].min())
-    high = float(np.percentile(points[:, 2], 100 - _TRIM))
+    low, high = _heights(points, floor)
     return [_box(points, low, high), _cylinder(points, low, high), _ball(points)]
+
+
+def _heights(points: Array, floor: float) -> tuple[float, float]:
+    """Bottom and top [m]: what begins a little over the floor stands on it."""
+    lowest = float(points[:, 2].min())
+    return min(floor, lowest) if floor > lowest - 0.03 else lowest, float(np.percentile(points[:, 2], 100 - _TRIM))
 
 
 def _box(points: Array, low: float, high: float) -> Fit:
@@ -87,10 +93,12 @@ def _ball(points: Array) -> Fit:
     return _fit({"kind": "sphere", "radius": radius}, x[:3], np.linalg.norm(points - x[:3], axis=1) - radius)
 
 
-def _hull(points: Array) -> Fit:
+def _hull(points: Array, low: float, high: float) -> Fit:
+    """Down to ``low``, as the others are: clusters begin where the table's noise ends, and would fall and tip."""
     import open3d as o3d
 
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    foot = points[points[:, 2] < low + _FOOT * (high - low)] * [1.0, 1.0, 0.0] + [0.0, 0.0, low]
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.concatenate([points, foot])))
     mesh, _ = cloud.compute_convex_hull()
     middle = points.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()

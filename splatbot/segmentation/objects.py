@@ -8,6 +8,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError
@@ -25,6 +26,7 @@ FEWEST, LARGEST = 40, 0.35  # Gaussians of an object; [m] across
 _APART = 0.012  # [m] between Gaussians of one object
 _LEDGE = 0.15  # [m] across, from where on a thing may be a support of others
 _SHARE, _PLANES, _DEEPEST = 0.1, 3, 1  # of its points that its plane has; planes looked at; supports on supports
+_SPACED = 2.2  # times the usual size of Gaussians: in a coarse map they are farther apart
 _AROUND = 0.05  # [m] around what was pointed at that is looked at
 _STRAY = 0.006  # [m] around an object within which faint Gaussians are its own
 _OVER = 0.7  # of what is above a plane that is over it
@@ -134,7 +136,7 @@ def segment(
         box: (2, 3) corners of the space that is looked at, in that frame [m]; None: 2 m around.
         plane: (4,) = (n, d), the support where it is known: n · p + d = 0 [world]; None: it is looked for.
         names: what a scene file calls things.
-        apart: objects have more than this between their Gaussians [m].
+        apart: objects have more than this between their Gaussians [m]; in a coarse map it is more.
 
     Raises:
         InputError: nothing of the map is in the box.
@@ -146,6 +148,7 @@ def segment(
     used = np.flatnonzero(solid_rows(model) & ((points >= low - ABOVE) & (points <= high)).all(axis=1))
     if not len(used):
         raise InputError(f"has nothing between {low.tolist()} and {high.tolist()}.", field="map", hint="see scene.yaml")
+    apart = max(apart, _SPACED * float(model.scales[torch.from_numpy(used)].amax(dim=1).median()))
     support = find_support(points[used]) if plane is None else _known(plane, T, points[used])
     above = used if support is None else used[above_support(support, points[used])]
     labels = np.full(len(model), -1, np.int32)

@@ -12,7 +12,7 @@ from splatbot.tracking.align import SoftPrior, align
 from splatbot.tracking.budget import Budget
 from splatbot.tracking.candidate import Candidate, Judged, judge, score
 from splatbot.tracking.features import Expectation, FeaturePose, Features, detect, match_pose
-from splatbot.tracking.health import verdict_of
+from splatbot.tracking.health import is_explained, verdict_of
 from splatbot.tracking.predict import Prediction
 from splatbot.tracking.prepare import PreparedFrame
 from splatbot.tracking.recover import KeyframeSearch
@@ -48,6 +48,7 @@ class Attempt:
         self._budget = budget
         self._wide = wide
         self._search = search  # given while lost
+        self._looked_anywhere = search is not None
 
     def run(self, prediction: Prediction, T_before: Array) -> Judged:
         """The best pose from a prediction; ``T_before`` is where the camera was last."""
@@ -61,6 +62,15 @@ class Attempt:
         if doubtful and matched is None and self.config.wide == "needed":
             starts += self._register(start)
         candidates = [self._direct(begun, matched) for begun in starts if begun is start or self._fits_one_more()]
+        found = self._judge(candidates)
+        if matched is not None and not self._looked_anywhere and not is_explained(found.health):
+            matched = self._match_anywhere(found.T_world_camera)
+            if matched is not None:
+                begun = self._start("features", matched.T_world_camera, start)
+                found = self._judge([*candidates, self._direct(begun, matched)])
+        return found
+
+    def _judge(self, candidates: Sequence[Candidate]) -> Judged:
         with self._budget.run("health", self._health_units * len(candidates)):
             return judge(self._prepared, candidates, self.config)
 
@@ -130,24 +140,37 @@ class Attempt:
         return self._match_near(self.features, T_expected)
 
     def _match_near(self, features: Features, T_expected: Array) -> FeaturePose | None:
-        """Match with the nearest keyframes, the latest and the first: near to where they should be, or anywhere."""
-        keyframes, camera = self._keyframes, self._prepared.frame.camera
-        chosen = sorted(
-            {*order_by_distance(keyframes, T_expected)[: self.config.match_keyframes], 0, len(keyframes) - 1}
-        )
-        views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in chosen]
-        units = len(features) * sum(len(known) for known, _ in views)
+        """Match with keyframes near to where features should be; anywhere, if too few are there."""
+        views, units = self._views_to_match(features, T_expected)
+        camera = self._prepared.frame.camera
         with self._budget.run("match near", units, under="features"):
             near = match_pose(features, views, camera, Expectation(T_expected, self.config.match_radius * camera.width))
         if near is not None and len(near.points) >= self.config.match_enough:
             return near
+        return self._match_anywhere(T_expected) or near
+
+    def _match_anywhere(self, T_expected: Array) -> FeaturePose | None:
+        """Match with the same keyframes wherever in the image, if there is time."""
+        if self.features is None:
+            return None
+        views, units = self._views_to_match(self.features, T_expected)
         if not self._budget.fits(
-            ("match all", units), *self._direct_work(near) * 2, self._health_work, self._health_work
+            ("match all", units), *self._direct_work(None) * 2, self._health_work, self._health_work
         ):
             self._budget.skip("features anywhere")
-            return near
+            return None
+        self._looked_anywhere = True
         with self._budget.run("match all", units, under="features"):
-            return match_pose(features, views, camera)
+            return match_pose(self.features, views, self._prepared.frame.camera)
+
+    def _views_to_match(self, features: Features, T_expected: Array) -> tuple[list[tuple[Features, Array]], int]:
+        """The nearest keyframes, the latest and the first, with their poses; how many pairs of keypoints there are."""
+        keyframes = self._keyframes
+        chosen = sorted(
+            {*order_by_distance(keyframes, T_expected)[: self.config.match_keyframes], 0, len(keyframes) - 1}
+        )
+        views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in chosen]
+        return views, len(features) * sum(len(known) for known, _ in views)
 
     def _keypoints(self) -> int | None:
         """How many keypoints there is time to find and match, with two alignments to follow."""

@@ -26,6 +26,8 @@ _INLIER = 3.0  # [σ]
 _MIN_CONTRAST = 0.1
 # On a table, or before a wall, depth agrees wherever the camera slides along it; colour does not.
 _FEW_PHOTOMETRIC = 0.55
+# With fewer inliers of either kind, another pose may explain the frame better.
+_EXPLAINED = 0.6
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,11 @@ class Health:
     geometric_inliers: float
     score: float
     contrast: float
+
+
+def is_explained(health: Health) -> bool:
+    """Whether a pose explains the frame so well that no other need be looked for."""
+    return min(health.photometric_inliers, health.geometric_inliers) >= _EXPLAINED
 
 
 def measure(

@@ -5,25 +5,63 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import httpx
 import numpy as np
 import pytest
 import uvicorn
+from fastapi import FastAPI
+from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.geometry import pose_from_quat
 from splatbot.services.app import create_app
+from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
+from splatbot.workspace import Workspace
 
 
 @dataclass(frozen=True)
 class Service:
-    """A running service: what a client sees of it, and its store."""
+    """A running service: what a client sees of it, and its parts."""
 
     client: httpx.Client
-    store: MapStore
+    runtime: Runtime
+    app: FastAPI
+    url: str
+
+    @property
+    def store(self) -> MapStore:
+        """Its maps."""
+        return self.runtime.store
+
+    def ws(self, path: str) -> str:
+        """The address of a WebSocket."""
+        return f"ws://127.0.0.1:{self.client.base_url.port}{path}"
+
+
+@contextmanager
+def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterator[Service]:
+    """A real server on a real socket, until the block ends."""
+    runtime = Runtime(settings, store)
+    app = create_app(runtime)
+    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws_max_size=settings.max_message_bytes)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive(), "the server did not start"
+        time.sleep(0.01)
+    url = f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    with httpx.Client(base_url=url, timeout=60) as client:
+        yield Service(client, runtime, app, url)
+    runtime.drain()
+    server.should_exit = True
+    thread.join(20)
+    assert not thread.is_alive(), "the server did not end"
 
 
 def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
@@ -40,21 +78,48 @@ def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
     return Snapshot(model, version)
 
 
+def table_with_box() -> Snapshot:
+    """A table top at z = 0, z up, and a box of 4 x 6 x 8 cm on it at (0.5, 0, 0)."""
+    size = np.array([0.04, 0.06, 0.08])
+    grids = [_sheet(np.array([0.5, 0.0, 0.0]), 2, np.array([0.6, 0.8]), 0.02)]
+    for axis in range(3):
+        for side in (-1, 1):
+            center = np.array([0.5, 0.0, 0.04])
+            center[axis] += side * size[axis] / 2
+            grids.append(_sheet(center, axis, np.delete(size, axis), 0.005))
+    means, scales = (np.concatenate(parts) for parts in zip(*grids, strict=True))
+    n, table = len(means), len(grids[0][0])
+    colors = np.where(np.arange(n)[:, None] < table, [0.5, 0.5, 0.5], [0.9, 0.1, 0.1])
+    model = GaussianModel.from_activated(
+        means=means, quats=np.tile([1.0, 0, 0, 0], (n, 1)), scales=scales, opacities=np.full(n, 0.95), colors=colors
+    )
+    model.observations += 9
+    return Snapshot(model, 1)
+
+
+def _sheet(
+    center: NDArray[np.float64], axis: int, size: NDArray[np.float64], step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres and scales of flat Gaussians on a rectangle across an axis."""
+    a, b = (np.arange(-s / 2 + step / 2, s / 2, step) for s in size)
+    u, v = (g.ravel() for g in np.meshgrid(a, b))
+    means = np.tile(center, (len(u), 1))
+    others = [k for k in range(3) if k != axis]
+    means[:, others[0]] += u
+    means[:, others[1]] += v
+    scales = np.full((len(u), 3), step / 2)
+    scales[:, axis] = 0.0003
+    return means, scales
+
+
 @pytest.fixture
 def service() -> Iterator[Service]:
     """The service on the map "wall", with small limits."""
     store = MapStore()
-    store.add("wall", source="wall.ply", state="static", snapshot=wall())
-    settings = ServiceSettings(max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480)
-    config = uvicorn.Config(create_app(settings, store), host="127.0.0.1", port=0, log_level="warning")
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive(), "the server did not start"
-        time.sleep(0.01)
-    port = server.servers[0].sockets[0].getsockname()[1]
-    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
-        yield Service(client, store)
-    server.should_exit = True
-    thread.join(10)
+    beside = Workspace(T_world_base=pose_from_quat((0.0, 0.5, -1.0), (0.7071068, 0.7071068, 0.0, 0.0)))
+    store.add("wall", source="wall.ply", state="static", snapshot=wall(), workspace=beside)
+    settings = ServiceSettings(
+        max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480, max_message_bytes=2_000_000
+    )
+    with running(settings, store) as it:
+        yield it

@@ -34,7 +34,7 @@ def serving(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Clie
         process.wait(10)
 
 
-def _refused(*arguments: str) -> str:
+def refused(*arguments: str) -> str:
     done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
@@ -60,10 +60,10 @@ def test_a_map_is_served_until_sigterm_which_ends_cleanly(map_file: Path, by: st
 
 
 def test_wrong_arguments_are_named_with_their_fix(map_file: Path, tmp_path: Path) -> None:
-    assert "--map" in _refused()
-    assert "--map" in _refused("--map", str(map_file), "--log", "synthetic:tabletop")
-    assert "none.ply" in _refused("--map", str(tmp_path / "none.ply"))
-    assert "nowhere" in _refused("--log", str(tmp_path / "nowhere"))
+    assert "--map" in refused()
+    assert "--map" in refused("--map", str(map_file), "--log", "synthetic:tabletop")
+    assert "none.ply" in refused("--map", str(tmp_path / "none.ply"))
+    assert "nowhere" in refused("--log", str(tmp_path / "nowhere"))
 
 
 def test_a_port_that_is_taken_is_named(map_file: Path) -> None:
@@ -71,9 +71,9 @@ def test_a_port_that_is_taken_is_named(map_file: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
-        assert port in _refused("--map", str(map_file), "--port", port)
+        assert port in refused("--map", str(map_file), "--port", port)
 
 
 def test_a_damaged_map_is_named(map_file: Path) -> None:
     map_file.write_bytes(map_file.read_bytes()[:-100])
-    assert "map.ply" in _refused("--map", str(map_file))
+    assert "map.ply" in refused("--map", str(map_file))

@@ -9,9 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"]
-DOCUMENTS += [
-    f"docs/{name}.md" for name in ("stability", "simulate", "bench", "mapping", "planning", "picking", "twin")
-]
+DOCUMENTS += [f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))]
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)

@@ -10,7 +10,7 @@ import pytest
 from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
-from splatbot.workspace import Workspace, find_workspace, fit_workspace
+from splatbot.workspace import NamedPlace, Workspace, find_workspace, fit_workspace
 
 
 def _table(seed: int = 0) -> tuple[GaussianModel, np.ndarray]:
@@ -115,3 +115,17 @@ def test_a_map_without_an_upward_surface_is_refused() -> None:
         fit_workspace(model, up=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="Gaussians"):
         fit_workspace(GaussianModel.empty())
+
+
+def test_names_of_things_are_written_and_read_again(tmp_path: Path) -> None:
+    things = (NamedPlace("cup", np.array([0.1, 0.2, 0.3]), ("mug",)), NamedPlace("box", np.array([1.0, 0.0, 0.0])))
+    Workspace(objects=things).save(tmp_path / "scene.yaml")
+    found = Workspace.load(tmp_path / "scene.yaml").objects
+    assert [(o.name, o.aliases, o.at.tolist()) for o in found] == [(o.name, o.aliases, o.at.tolist()) for o in things]
+
+
+@pytest.mark.parametrize("text", ["cup", "[cup]", "[{name: cup}]", "[{name: cup, at: [1, 2]}]", "[{at: [1, 2, 3]}]"])
+def test_things_without_name_or_place_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(f"objects: {text}\n")
+    with pytest.raises(FormatError, match="objects"):
+        Workspace.load(tmp_path / "scene.yaml")

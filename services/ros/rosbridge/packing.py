@@ -31,7 +31,7 @@ def check_compression(value: Any) -> Compression:
     """
     for known in get_args(Compression):
         if value == known:
-            return known  # type: ignore[no-any-return]
+            return known
     hint = f"use {', '.join(get_args(Compression))}"
     raise InputError(f"is {str(value)[:40]!r}.", field="compression", hint=hint)
 

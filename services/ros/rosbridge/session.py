@@ -8,11 +8,11 @@ import itertools
 import json
 import logging
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 from splatbot.errors import InputError, SplatbotError
 from splatbot.logs.ros_types import build, full_name
-from splatbot.services.ros.graph import RosGraph, Service, resolve
+from splatbot.services.ros.graph import Handler, RosGraph, Service, resolve
 from splatbot.services.ros.rosbridge.packing import (
     Fragments,
     check_compression,
@@ -207,7 +207,7 @@ class RosbridgeSession:
         async def relay(args: Mapping[str, Any]) -> dict[str, Any]:
             return await self._ask_client(name, args)
 
-        self._graph.serve(name, Service(str(operation.get("type", "")), relay, self.number))
+        self._graph.serve(name, Service(str(operation.get("type", "")), cast(Handler, relay), self.number))
         self._served.add(name)
 
     def _unadvertise_service(self, operation: dict[str, Any]) -> None:

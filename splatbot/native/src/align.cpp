@@ -392,6 +392,17 @@ Weights adapted(const std::vector<DenseTerm>& terms, const AlignMatches& matches
           .matches = of_sparse > 0.0 ? 1.0 / std::max(of_sparse, kLeastExcess) : before.matches};
 }
 
+// Ten to a freedom; fewer fit noise, and a step from them may lead anywhere.
+constexpr std::size_t kLeastPoints = 60;
+
+// Whether a level says enough of the pose: small levels of distant or patchy surfaces have next to no points.
+bool is_worth_a_step(std::size_t level, std::span<const AlignReference> references, const AlignMatches& matches,
+                     const AlignPrior* prior) {
+  std::size_t n = matches.points.size() / 3;
+  for (const AlignReference& reference : references) n += reference.levels[level].gray.size();
+  return n >= kLeastPoints || prior != nullptr;
+}
+
 }  // namespace
 
 AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& reference, std::span<const double, 16> T,
@@ -455,6 +466,7 @@ AlignResult align(std::span<const AlignImage> levels, std::span<const AlignRefer
   std::copy(T_start.begin(), T_start.end(), result.T_camera_world.begin());
   Weights weights{.dense = plan.dense_weight, .matches = 1.0};
   for (std::size_t level = levels.size(); level-- > plan.finest;) {
+    if (level > plan.finest && !is_worth_a_step(level, references, matches, prior)) continue;
     std::vector<DenseTerm> terms;
     for (const AlignReference& reference : references) {
       terms.emplace_back(levels[level], reference.levels[level], reference.T_world_reference);

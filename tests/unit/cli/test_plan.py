@@ -49,7 +49,7 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     page = (out / "plan.html").read_text()
     assert "http://" not in page
     assert "https://" not in page
-    assert page.count("<script") == 2
+    assert page.count("<script") == 3
 
 
 def test_the_base_is_taken_from_the_scene_beside_the_map_and_a_pose_is_reached(

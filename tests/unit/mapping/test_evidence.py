@@ -9,8 +9,18 @@ import pytest
 import torch
 
 from splatbot.gaussians import GaussianModel
-from splatbot.geometry import inverse, se3_exp, transform_points
-from splatbot.mapping.evidence import DepthNoise, Evidence, count, first_uncertainty, fuse_depth, weigh
+from splatbot.gaussians.shape import shortest_axes
+from splatbot.geometry import inverse, quat_multiply, se3_exp, transform_points
+from splatbot.mapping.evidence import (
+    DepthNoise,
+    Evidence,
+    count,
+    first_uncertainty,
+    fuse_depth,
+    fuse_normals,
+    stable,
+    weigh,
+)
 from splatbot.mapping.keyframes import Keyframe
 from tests.rgbd import CAMERA, Array
 from tests.unit.mapping.conftest import MakeKeyframe
@@ -114,6 +124,7 @@ def test_fusing_adds_information_and_moves_the_mean_by_its_share() -> None:
         torch.tensor([0.005]),
         torch.tensor([9e-6]),
         torch.tensor([[0.0, 0.0, 1.0]]),
+        torch.zeros(1, 3),
     )
     fused = fuse_depth(model, evidence)
     information = 1 / 16e-6 + 1 / 9e-6
@@ -137,9 +148,44 @@ def test_many_looks_average_their_noise_and_never_claim_certainty(make_keyframe:
     assert (model.observations >= 30).all()
 
 
+def tilts(model: GaussianModel, normal: Array) -> Array:
+    """Angles (N,) [deg] from each disc's axis to a normal."""
+    cosine = np.abs(shortest_axes(model).double().numpy() @ normal)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def test_looks_turn_discs_into_the_surface_and_average_their_noise(make_keyframe: MakeKeyframe) -> None:
+    rng = np.random.default_rng(5)
+    keyframe = make_keyframe(POSE, normal=SLANTED, distance=1.5)
+    normal = np.array(SLANTED) / np.linalg.norm(SLANTED)
+    surface = CAMERA.backproject(keyframe.depth.numpy())[20:100:8, 20:140:8].reshape(-1, 3).astype(np.float64)
+    model = flat(transform_points(POSE, surface), sigma=3e-3)
+    upright = np.concatenate([np.ones((len(model), 1)), 0.1 * rng.standard_normal((len(model), 3))], 1)
+    model.quats = torch.from_numpy(quat_multiply(upright, model.quats)).float()
+    assert 10 < np.median(tilts(model, normal)) < tilts(model, normal).max() < 45
+    for _ in range(12):
+        noisy = keyframe.depth + torch.from_numpy(rng.normal(0, 4e-3, (120, 160)).astype(np.float32))
+        evidence = weigh(model, noisy, CAMERA, POSE, NOISE)
+        model = count(fuse_normals(fuse_depth(model, evidence), evidence), evidence)
+    assert np.percentile(tilts(model, normal), 95) < 4
+
+
+def test_a_disc_of_another_surface_or_at_an_edge_is_not_turned(make_keyframe: MakeKeyframe) -> None:
+    keyframe = make_keyframe(distance=1.0)
+    keyframe.depth[:, 80:] = 1.3
+    model = flat(np.array([[0.2, 0.0, 1.3], [-0.3, 0.0, 1.0], [-0.012, 0.0, 1.0]]))
+    model.quats[1] = torch.tensor([np.cos(0.5), np.sin(0.5), 0.0, 0.0])  # turned by 57 degrees
+    evidence = weighed(model, keyframe)
+    assert evidence.supported.tolist() == [True, True, True]
+    turned = fuse_normals(model, evidence)
+    assert torch.equal(turned.quats[1:], model.quats[1:])
+    assert not torch.isnan(turned.quats).any()
+
+
 def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> None:
     model = flat(np.zeros((3, 3)), sigma=1e-3)
-    nothing = (torch.zeros(3), torch.full((3,), torch.inf), torch.zeros(3, 3))
+    model.observations[:] = 3
+    nothing = (torch.zeros(3), torch.full((3,), torch.inf), torch.zeros(3, 3), torch.zeros(3, 3))
     looks = [([0, 0, 1], [1, 1, 0])] * 2 + [([0, 1, 1], [1, 0, 0])]
     for supported, through in looks:
         model = count(model, Evidence(torch.tensor(supported) > 0, torch.tensor(through) > 0, *nothing))
@@ -147,6 +193,24 @@ def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> N
     assert model.opacities[0] < 1e-3
     assert model.opacities[1] > 0.3
     assert model.opacities[2] == pytest.approx(0.8)
+
+
+def test_what_is_hardly_known_goes_a_look_earlier_than_what_is_stable() -> None:
+    model = flat(np.zeros((3, 3)), sigma=1e-3)
+    model.observations[:] = torch.tensor([3, 2, 3])
+    model.uncertainty[2] = 6e-3  # of a disc of 1 cm
+    assert stable(model).tolist() == [True, False, False]
+    away = Evidence(
+        torch.zeros(3) > 0,
+        torch.ones(3) > 0,
+        torch.zeros(3),
+        torch.full((3,), torch.inf),
+        torch.zeros(3, 3),
+        torch.zeros(3, 3),
+    )
+    once, twice = count(model, away), count(count(model, away), away)
+    assert (once.opacities > 0.5).all()
+    assert (twice.opacities > 0.1).tolist() == [True, False, False]
 
 
 def test_a_new_gaussian_is_as_uncertain_as_the_sensor_and_a_guess_far_more() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splatbot.mapping.normals import fitted_normals
+from splatbot.mapping.normals import fitted_normals, smooth_normals
 from tests.rgbd import CAMERA
 
 ROWS, COLUMNS = (grid.ravel() for grid in np.mgrid[0 : CAMERA.height : 3, 0 : CAMERA.width : 3])
@@ -62,3 +62,15 @@ def test_too_few_samples_or_samples_in_one_line_have_no_normal() -> None:
     for depth in (dot, line):
         assert (fitted_normals(depth, CAMERA, np.array([30]), np.array([40]), reach=6) == 0).all()
     assert fitted_normals(full, CAMERA, np.zeros(0, np.int64), np.zeros(0, np.int64), reach=6).shape == (0, 3)
+
+
+def test_smooth_normals_are_those_of_the_fit_to_all_pixels_and_none_at_a_step() -> None:
+    normal = unit(0.4, 0.1, 1)
+    depth = plane(normal, 1.2)
+    depth[:, CAMERA.width // 2 :] += 0.5
+    found = smooth_normals(depth, CAMERA, 4)
+    middle = CAMERA.width // 2
+    np.testing.assert_allclose(found[:, 10 : middle - 4], np.broadcast_to(-normal, (120, middle - 14, 3)), atol=1e-4)
+    assert (found[:, middle - 4 : middle + 4] == 0).all()
+    depth[50:60] = 0
+    assert (smooth_normals(depth, CAMERA, 4)[52:58] == 0).all()

@@ -110,7 +110,7 @@ def test_an_added_robot_is_found_by_its_name_and_is_the_same(
     np.testing.assert_array_equal(again.self_collision_pairs, robot.self_collision_pairs)
     for field in ("lower", "upper", "velocity", "acceleration", "jerk", "effort"):
         np.testing.assert_array_equal(getattr(again.chain, field), getattr(robot.chain, field))
-    with pytest.raises(InputError, match="robots: panda, ur5"):
+    with pytest.raises(InputError, match="robots: panda, panda-2f140, ur5"):
         load_robot("ur6")
 
 

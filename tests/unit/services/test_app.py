@@ -11,6 +11,7 @@ import pytest
 
 from splatbot.errors import FormatError, NativeError
 from splatbot.services.app import create_app
+from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 
@@ -19,7 +20,7 @@ def _ask(method: str, path: str, *, error: Exception | None = None, **request: A
     """One request to an application with small limits, whose route /boom raises ``error``."""
     store = MapStore()
     store.add("growing", source="a log", state="mapping")
-    app = create_app(ServiceSettings(max_body_bytes=1024), store)
+    app = create_app(Runtime(ServiceSettings(max_body_bytes=1024), store))
 
     def boom() -> None:
         assert error is not None
@@ -92,13 +93,15 @@ def test_a_body_over_the_limit_is_refused_whether_or_not_it_tells_its_length(tol
 def test_every_route_shows_an_example_and_its_problems_in_the_api_description() -> None:
     description = _ask("GET", "/openapi.json").json()
     operations = [(p, m, op) for p, item in description["paths"].items() for m, op in item.items() if p != "/boom"]
-    assert len(operations) >= 7
+    assert len(operations) >= 25
     for path, method, operation in operations:
         where = f"{method} {path}"
-        if method == "post":
-            assert operation["requestBody"]["content"]["application/json"]["examples"], where
-        (media, content), *_ = operation["responses"]["200"]["content"].items()
-        assert media == "image/png" or content["example"], where
+        body = operation.get("requestBody", {}).get("content", {})
+        if "application/json" in body:
+            assert body["application/json"]["examples"], where
+        done = next(answer for status, answer in operation["responses"].items() if status.startswith("2"))
+        for media, content in done.get("content", {}).items():
+            assert media != "application/json" or content["example"], where
         assert all("example" in p or "examples" in p.get("schema", p) for p in operation.get("parameters", [])), where
-        if "{map_id}" in path:
+        if "{map_id}" in path and not path.endswith("/upload"):  # which makes the map
             assert "application/problem+json" in operation["responses"]["404"]["content"], where

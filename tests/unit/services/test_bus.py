@@ -147,3 +147,12 @@ def test_what_is_forgotten_is_no_longer_latched() -> None:
 def test_a_queue_without_room_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 1"):
         Bus().subscribe("a", capacity=0)
+
+
+def test_a_closed_bus_ends_its_readers_and_those_that_come_later() -> None:
+    bus = Bus()
+    before = bus.subscribe("a")
+    bus.close()
+    bus.publish("a", 1)
+    assert before.get(5) is None
+    assert bus.subscribe("a").get(5) is None

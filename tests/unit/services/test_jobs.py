@@ -93,8 +93,10 @@ def test_a_running_job_ends_when_cancelled_and_a_waiting_one_never_begins(jobs: 
         return {}
 
     running, _ = jobs.submit("first", _until_cancelled)
-    waiting, _ = jobs.submit("second", begin)
+    abandoned: list[str] = []
+    waiting, _ = jobs.submit("second", begin, abandoned=lambda: abandoned.append("second"))
     assert jobs.cancel(waiting.id).state == "cancelled"
+    assert abandoned == ["second"], "what was made for it can be undone"
     jobs.cancel(running.id)
     assert _ended(jobs, running).state == "cancelled"
     assert _ended(jobs, jobs.submit("third", lambda handle: {})[0]).state == "succeeded"

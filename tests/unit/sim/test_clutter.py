@@ -15,7 +15,7 @@ from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
 from splatbot.errors import ConfigError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.robots.panda import panda
-from splatbot.segmentation import find_support
+from splatbot.segmentation import find_support, fit
 from splatbot.sim.clutter import MapParts, map_parts
 from splatbot.sim.maps.ellipsoids import merge
 from splatbot.sim.motion import hold
@@ -143,3 +143,26 @@ def test_harmonics_are_evaluated_only_where_a_camera_sees_some(
     (decision,) = (d for d in results[0].decisions if d.name == "view_color")
     assert decision.on == on
     assert decision.why
+
+
+def test_strays_of_a_thing_that_may_move_go_with_it() -> None:
+    """Gaussians that hang together with nothing, 3 cm beside the carton and farther; as clutter they would hold it."""
+    strays = scanned().select(torch.arange(3))
+    strays.means[:] = torch.tensor([[0.45, 0.10, 0.147], [0.36, 0.10, 0.06], [0.45, 0.30, 0.12]])
+    model = GaussianModel.concatenate([scanned(), strays])
+    held, free = (map_parts(model, Clutter(file="scan.ply", movable=m), np.zeros(3)) for m in (False, True))
+    carton = next(k for k, thing in enumerate(free.objects) if thing.shapes[0].kind == "box")
+    assert held.labels[-3:].tolist() == [-1, -1, -1]
+    assert free.labels[-3] == carton
+    assert free.labels[-1] == -1
+    assert len(free.ellipsoids.centers) <= len(held.ellipsoids.centers)
+
+
+def test_a_hull_stands_on_the_floor_although_its_lowest_points_are_above_it() -> None:
+    rng = np.random.default_rng(0)
+    u = rng.uniform(0, 2 * np.pi, 4000)
+    z = rng.uniform(0.012, 0.12, 4000)
+    r = 0.04 * (1 - z / 0.2) * (1 + 0.6 * (np.cos(u) > 0))  # neither a box, nor a cylinder, nor a ball
+    found = fit(np.stack([r * np.cos(u) + 0.5, r * np.sin(u), z], axis=1), 0.0)
+    assert found.shape["kind"] == "mesh"
+    assert found.at[2] + np.array(found.shape["points"])[:, 2].min() == pytest.approx(0.0, abs=1e-9)

@@ -77,6 +77,17 @@ def test_the_base_is_where_both_cameras_agree(rng: np.random.Generator) -> None:
     assert off.residuals[:, 1] == pytest.approx(0.002, rel=0.3)
 
 
+def test_a_frame_that_was_tracked_wrong_does_not_move_the_base(rng: np.random.Generator) -> None:
+    arm = {i: se3_exp(rng.normal(size=6)) for i in range(20)}
+    tracked = {i: T_MAP_BASE @ T @ se3_exp(rng.normal(scale=5e-4, size=6)) for i, T in arm.items()}
+    sound = base_in_map(arm, tracked, "test")
+    assert sound.left_out == ()
+    wrong = base_in_map(arm, tracked | {7: tracked[7] @ se3_exp([0.09, 0, 0, 0, 0.08, 0])}, "test")
+    assert wrong.left_out == (7,)
+    assert pose_gap(wrong.T_world_base, sound.T_world_base)[0] < 5e-4
+    assert wrong.residuals[7, 0] == pytest.approx(0.09, rel=0.05)
+
+
 def test_without_a_common_frame_the_error_says_how_many_there_are() -> None:
     with pytest.raises(InputError, match=r"no frame in common .* \(1 tracked, 2 told\)"):
         base_in_map({0: np.eye(4), 1: np.eye(4)}, {7: np.eye(4)}, "test")
@@ -107,6 +118,19 @@ def test_a_thing_that_the_map_lacks_costs_overlap_and_depth(tmp_path: Path) -> N
         assert getattr(less, name) < getattr(whole, name) - 0.1
     for name in ("part_l1_m", "physics_l1_m"):
         assert getattr(less, name) > getattr(whole, name) + 0.001
+
+
+def test_a_plane_that_the_log_names_counts_in_the_maps_frame(tmp_path: Path) -> None:
+    sought = around(tmp_path, TABLE, *THINGS)
+    up = T_MAP_BASE[:3, 2]
+    named = np.append(up, -float(up @ T_MAP_BASE[:3, 3]) - 0.02)  # 2 cm over the table
+    given = surroundings(sought.model, tmp_path / "map.ply", T_MAP_BASE, panda(), named)
+    assert sought.support is not None
+    assert given.support is not None
+    assert sought.support.offset == pytest.approx(0.0, abs=2e-3)
+    assert given.support.offset == pytest.approx(0.02)
+    table = next(thing for thing in TwinViews(given).world.scene.objects if thing.name == "map-table")
+    assert table.at[2] == pytest.approx(0.02)
 
 
 def test_masked_pixels_do_not_count(tmp_path: Path) -> None:
@@ -146,7 +170,7 @@ def _tools(count: int, spacing: float) -> tuple[Array, Trajectory]:
 
 def test_tool_poses_are_done_again_by_ik_to_a_tenth_of_a_millimetre() -> None:
     _, tool = _tools(4, 1.0)
-    knots = find_knots(ArmRecord(tool), list(tool.stamps), panda())
+    knots = find_knots(ArmRecord(tool), [*tool.stamps, np.nan], panda())  # the last frame could not be read
     assert knots is not None
     found = replay(knots, Twin(make_scene({"name": "bare"})))
     assert (found.source, found.poses, found.reached, found.slower) == (BY_IK, 4, 4, 1.0)

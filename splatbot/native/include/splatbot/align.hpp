@@ -91,7 +91,8 @@ struct AlignResult {
 };
 
 // Gauss-Newton over the levels, coarse to fine. Each reference has its own exposure, which is marginalised (Schur
-// complement) and follows the step; it starts neutral on every level. `prior` may be null.
+// complement) and follows the step; it starts neutral on every level. `prior` may be null; without one, a level above the
+// finest with fewer than 60 points and matches is passed over.
 //
 // The spread is taken at the result, over kAlignCells cells: what residuals of one cell have in common (blur, a depth
 // that is wrong all over a surface) counts as often as it occurs, whatever the noise model says. With C the curvature,

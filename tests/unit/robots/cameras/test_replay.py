@@ -45,7 +45,7 @@ def test_a_loop_goes_on_with_increasing_stamps(make_log: MakeLog) -> None:
 
 def test_a_slow_reader_loses_the_oldest_frames(make_log: MakeLog) -> None:
     camera = ReplayCamera(open_log(make_log(20)), ReplayOptions(speed=100))
-    taken = []
+    taken: list[int] = []
     for frame in camera:
         if not taken:
             time.sleep(0.3)
@@ -75,7 +75,7 @@ def test_dropped_and_broken_frames_are_the_same_each_time(make_log: MakeLog) -> 
 
 def test_a_device_that_is_unplugged_raises_after_the_frames_before(make_log: MakeLog) -> None:
     camera = ReplayCamera(open_log(make_log()), ReplayOptions(unplug=3))
-    taken = []
+    taken: list[int] = []
     with pytest.raises(DeviceError, match="is gone"):
         taken.extend(frame.index for frame in camera)
     assert taken == [0, 1, 2]

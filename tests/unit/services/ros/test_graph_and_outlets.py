@@ -145,7 +145,8 @@ def test_nobody_pays_for_messages_that_nobody_reads(told: tuple[MapStore, RosGra
 
 
 def test_images_of_a_client_become_frames_and_joints_reach_the_bus(make_log: MakeLog) -> None:
-    graph, bus, frames = RosGraph(), Bus(), []
+    graph, bus = RosGraph(), Bus()
+    frames: list[Frame] = []
     inlets = RosInlets(graph, bus, on_frame=frames.append)
     inlets.start()
     log = open_log(make_log())

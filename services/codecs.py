@@ -1,0 +1,200 @@
+"""Bodies in JSON, msgpack or npy: what a request says it sends, and what it says it takes."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any, TypeVar
+
+import msgpack
+import numpy as np
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+from pydantic.json_schema import models_json_schema
+from starlette.exceptions import HTTPException
+
+from splatbot.client import pack_array
+from splatbot.errors import InputError
+
+JSON = "application/json"
+NPY = "application/x-npy"
+MSGPACK = "application/msgpack"
+
+_M = TypeVar("_M", bound=BaseModel)
+_KINDS = "biuf"  # of numpy's dtypes that travel
+_BODIES: dict[str, type[BaseModel]] = {}
+
+
+def body_of(model: type[_M], *, array: str | None = None) -> Callable[[Request], Coroutine[Any, Any, _M]]:
+    """A dependency that reads a ``model`` from a body of any of the three kinds.
+
+    Args:
+        model: of the body.
+        array: the field that a bare npy array stands for; None: npy is not taken.
+    """
+    _BODIES[model.__name__] = model
+
+    async def read(request: Request) -> _M:
+        kind = request.headers.get("content-type", JSON).partition(";")[0].strip().lower()
+        body = await request.body()
+        try:
+            if kind == NPY and array is not None:
+                return model.model_validate({array: decode_npy(body)})
+            if kind == MSGPACK:
+                return model.model_validate(decode_msgpack(body))
+            if kind == JSON:
+                return model.model_validate_json(body)
+        except ValidationError as error:
+            found = [e | {"loc": ("body", *e["loc"])} for e in error.errors(include_url=False, include_context=False)]
+            raise RequestValidationError(found) from error
+        taken = ", ".join([JSON, MSGPACK, *([NPY] if array is not None else [])])
+        raise HTTPException(415, f"The body is {kind[:80]!r}; taken are {taken}.")
+
+    return read
+
+
+def takes(model: type[BaseModel], examples: Mapping[str, Any], *, npy: str = "") -> dict[str, Any]:
+    """The OpenAPI entry of a request's body; ``npy`` says what a bare array would hold."""
+    schema = {"$ref": f"#/components/schemas/{model.__name__}"}
+    content: dict[str, Any] = {
+        JSON: {"schema": schema, "examples": {name: {"value": dict(value)} for name, value in examples.items()}},
+        MSGPACK: {"schema": schema | {"description": "arrays as {dtype, shape, data}"}},
+    }
+    if npy:
+        content[NPY] = {"schema": {"type": "string", "format": "binary", "description": npy}}
+    return {"requestBody": {"required": True, "content": content}}
+
+
+def gives(example: Mapping[str, Any], *, npy: str = "") -> dict[int | str, dict[str, Any]]:
+    """The OpenAPI entry of an answer; ``npy`` says what a bare array holds."""
+    content: dict[str, Any] = {
+        JSON: {"example": dict(example)},
+        MSGPACK: {"schema": {"type": "string", "format": "binary", "description": "arrays as {dtype, shape, data}"}},
+    }
+    if npy:
+        content[NPY] = {"schema": {"type": "string", "format": "binary", "description": npy}}
+    return {200: {"content": content, "description": "in the kind that `Accept` names; JSON by default"}}
+
+
+def answer(
+    request: Request, body: Mapping[str, Any], *, array: str | None = None, headers: Mapping[str, str] | None = None
+) -> Response:
+    """``body`` in the kind that the request accepts; JSON has no infinity and no NaN, they become null.
+
+    Args:
+        array: the entry that is sent alone where npy is accepted.
+    """
+    accepted = request.headers.get("accept", "")
+    told = dict(headers or {})
+    if "map_version" in body:
+        told["X-Map-Version"] = str(body["map_version"])
+    if array is not None and NPY in accepted:
+        return Response(encode_npy(body[array]), media_type=NPY, headers=told)
+    if MSGPACK in accepted:
+        return Response(msgpack.packb(body, default=pack_array), media_type=MSGPACK, headers=told)
+    return Response(json.dumps(plain(body), allow_nan=False), media_type=JSON, headers=told)
+
+
+def decode_npy(body: bytes) -> NDArray[Any]:
+    """The array of an npy file; objects, and so pickles, are refused.
+
+    Raises:
+        InputError: it is no npy file, of another kind of number, or shorter or longer than it says.
+    """
+    stream = io.BytesIO(body)
+    try:
+        version = npy.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"npy version {version}")
+        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, fortran, dtype = read(stream)
+    except Exception as error:  # numpy reads the header with Python's own tokenizer, which raises as it likes
+        raise InputError("is no npy array.", field="body", hint="send what numpy.save writes") from error
+    return _array(body[stream.tell() :], dtype, shape, "F" if fortran else "C")
+
+
+def encode_npy(array: NDArray[Any]) -> bytes:
+    """An npy file."""
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def decode_msgpack(body: bytes) -> Any:
+    """What a msgpack body holds, with its arrays.
+
+    Raises:
+        InputError: it is none, or an array is not what it says.
+    """
+    try:
+        return msgpack.unpackb(body, object_hook=_unpacked, strict_map_key=True, max_ext_len=0)
+    except InputError:
+        raise
+    except (ValueError, TypeError, msgpack.UnpackException, RecursionError) as error:
+        raise InputError("is no msgpack.", field="body", hint="send a map with text keys") from error
+
+
+def plain(value: Any) -> Any:
+    """As JSON can say it."""
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            told = value.astype(object)
+            told[~np.isfinite(value)] = None
+            return told.tolist()
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return plain(np.asarray(value))
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return value
+
+
+def describe_bodies(app: FastAPI) -> None:
+    """Let the OpenAPI document name the models that :func:`takes` refers to."""
+    original = app.openapi
+
+    def described() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = original()
+            _, found = models_json_schema(
+                [(model, "validation") for model in _BODIES.values()], ref_template="#/components/schemas/{model}"
+            )
+            document.setdefault("components", {}).setdefault("schemas", {}).update(found.get("$defs", {}))
+            app.openapi_schema = document
+        return app.openapi_schema
+
+    app.openapi = described  # type: ignore[method-assign]
+
+
+def _unpacked(value: dict[str, Any]) -> Any:
+    if set(value) != {"dtype", "shape", "data"}:
+        return value
+    dtype, shape, data = value["dtype"], value["shape"], value["data"]
+    whole = isinstance(shape, list) and all(isinstance(n, int) and n >= 0 for n in shape)
+    if not (isinstance(dtype, str) and isinstance(data, bytes) and whole):
+        raise InputError("is no array.", field="dtype, shape, data", hint="text, whole numbers, bytes")
+    try:
+        kind = np.dtype(dtype)
+    except (TypeError, ValueError, SyntaxError) as error:
+        raise InputError(f"is {dtype[:20]!r}.", field="dtype", hint='give e.g. "<f4"') from error
+    return _array(data, kind, tuple(shape), "C")
+
+
+def _array(data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], order: Any) -> NDArray[Any]:
+    if dtype.kind not in _KINDS or dtype.itemsize > 8 or dtype.subdtype is not None:
+        raise InputError(f"is {str(dtype)[:40]}.", field="dtype", hint="send numbers, e.g. <f4 or |u1")
+    count = 1
+    for n in shape:
+        count *= n
+    if len(shape) > 4 or count * dtype.itemsize != len(data):
+        hint = "send as many bytes as the shape has"
+        raise InputError(f"{len(data)} bytes are not {list(shape)[:5]} of {dtype}.", field="shape", hint=hint)
+    return np.frombuffer(data, dtype).reshape(shape, order=order)

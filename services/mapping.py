@@ -1,0 +1,88 @@
+"""Mapping jobs: a recording becomes a map while it is served."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from splatbot.config import Config
+from splatbot.errors import InputError, LogError
+from splatbot.logs import Log
+from splatbot.services.jobs import JobCancelled, JobHandle, Work
+from splatbot.services.live import LiveMapping
+from splatbot.services.recordings import open_allowed, unpack
+from splatbot.services.runtime import Runtime
+from splatbot.slam import FrameResult
+from splatbot.workspace import Workspace, find_workspace
+
+
+def check_length(log: Log, settings_max: int, wanted: int | None) -> int:
+    """How many frames of a log are mapped.
+
+    Raises:
+        InputError: more than the service maps.
+    """
+    total = len(log) if wanted is None else min(len(log), wanted)
+    if total > settings_max:
+        hint = "give max_frames, or raise SPLATBOT_MAX_FRAMES"
+        raise InputError(f"has {total} frames, at most {settings_max} are mapped.", field="log", hint=hint)
+    return total
+
+
+def map_recording(runtime: Runtime, map_id: str, log: Log, total: int) -> Work:
+    """The work of a job that maps the first ``total`` frames of a log into ``map_id``, which is in the store."""
+    return lambda handle: _map(runtime, map_id, log, total, runtime.config, handle)
+
+
+def map_upload(runtime: Runtime, map_id: str, archive: Path) -> Work:
+    """The work of a job that unpacks an uploaded recording, maps it, and removes both archive and recording."""
+
+    def work(handle: JobHandle) -> dict[str, Any]:
+        settings = runtime.settings
+        try:
+            handle.tell(0.0, "unpacking")
+            folder = archive.with_suffix("")
+            home = unpack(archive, folder, max_bytes=settings.max_unpacked_bytes, max_pixels=settings.max_pixels)
+            log = open_allowed(str(home), [str(folder)])
+            total = check_length(log, settings.max_frames, None)
+            return _map(runtime, map_id, log, total, runtime.config, handle)
+        except InputError as error:
+            runtime.store.set_state(map_id, "failed", error.message)
+            raise
+        finally:
+            shutil.rmtree(archive.parent, ignore_errors=True)
+
+    return work
+
+
+def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
+    """Where the robot stands: as told, else as the recording's scene.yaml says."""
+    if robot_base is not None:
+        return Workspace(T_world_base=robot_base)
+    return None if uri.startswith("synthetic:") else find_workspace(uri)
+
+
+def _map(runtime: Runtime, map_id: str, log: Log, total: int, config: Config, handle: JobHandle) -> dict[str, Any]:
+    from splatbot.slam import Slam
+
+    frames = (log.read(i) for i in range(total))
+    tracked = 0
+
+    def told(result: FrameResult) -> None:
+        nonlocal tracked
+        tracked += result.verdict != "lost"
+        if handle.cancelled.is_set():
+            mapping.stop()
+        else:
+            handle.tell((result.index + 1) / total, f"frame {result.index + 1} of {total}")
+
+    mapping = LiveMapping(runtime.store, map_id, frames, Slam(config), on_result=told)
+    mapping.run()
+    served = runtime.store.get(map_id)
+    runtime.save(map_id)
+    if handle.cancelled.is_set():
+        raise JobCancelled
+    if served.state == "failed":
+        raise LogError(served.detail or "mapping failed.", field="log")
+    return {"map": map_id, "map_version": served.map_version, "frames": total, "tracked": tracked}

@@ -1,0 +1,103 @@
+"""What Prometheus is told: requests, mapping stages, lost frames, sizes of maps, queues and jobs."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter as Count
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from splatbot.services.bus import Bus
+from splatbot.services.jobs import Jobs
+from splatbot.services.store import MapStore
+from splatbot.services.topics import RESULT, map_topic
+from splatbot.slam import FrameResult
+
+_REQUEST_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
+_STAGE_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1)
+_WAITING = 4096  # results that may wait to be counted
+
+
+class Metrics:
+    """One registry, fed by the bus (a thread counts frame results), by requests, and by a look at the rest when asked.
+
+    Args:
+        store: whose maps are told, and whose bus is listened to.
+        jobs: that are counted.
+    """
+
+    def __init__(self, store: MapStore, jobs: Jobs) -> None:
+        self.registry = CollectorRegistry()
+        r = self.registry
+        self._requests = Histogram(
+            "splatbot_request_seconds", "Requests by route and status", ["method", "route", "status"],
+            buckets=_REQUEST_S, registry=r,
+        )  # fmt: skip
+        self._stages = Histogram(
+            "splatbot_frame_stage_seconds", "Stages of the frames", ["stage"], buckets=_STAGE_S, registry=r
+        )
+        self._frames = Counter("splatbot_frames", "Frames by what became of them", ["map", "verdict"], registry=r)
+        r.register(_Present(store, jobs))
+        self._results = store.bus.subscribe(map_topic("*", RESULT), capacity=_WAITING, latched=False)
+        self._thread = threading.Thread(target=self._count_frames, name="metrics", daemon=True)
+        self._thread.start()
+
+    def count(self, method: str, route: str, status: int, seconds: float) -> None:
+        """One request was answered."""
+        self._requests.labels(method, route, str(status)).observe(seconds)
+
+    def text(self) -> bytes:
+        """In Prometheus' text format."""
+        return generate_latest(self.registry)
+
+    def close(self) -> None:
+        """Count no more."""
+        self._results.close()
+        self._thread.join(5)
+
+    def _count_frames(self) -> None:
+        for message in self._results:
+            result: FrameResult = message.value
+            self._frames.labels(message.topic.split("/")[1], result.verdict).inc()
+            for stage, ms in result.stage_ms.items():
+                self._stages.labels(stage).observe(1e-3 * ms)
+
+
+class _Present(Collector):
+    """What is read off at the moment of asking."""
+
+    def __init__(self, store: MapStore, jobs: Jobs) -> None:
+        self._store, self._bus, self._jobs = store, store.bus, jobs
+
+    def collect(self) -> Iterator[Metric]:
+        """The families."""
+        maps = self._store.list()
+        told = {
+            "gaussians": ("Gaussians in the map", lambda m: len(m.snapshot.model) if m.snapshot else 0),
+            "bytes": ("Size of the map", lambda m: m.snapshot.model.nbytes if m.snapshot else 0),
+            "version": ("Published states", lambda m: m.map_version),
+        }
+        for name, (what, value) in told.items():
+            family = GaugeMetricFamily(f"splatbot_map_{name}", what, labels=["map"])
+            for served in maps:
+                family.add_metric([served.id], value(served))
+            yield family
+        yield _dropped(self._bus)
+        yield GaugeMetricFamily("splatbot_bus_readers", "Open subscriptions", value=self._bus.readers)
+        family = GaugeMetricFamily("splatbot_jobs", "Jobs by state", labels=["kind", "state"])
+        for (kind, state), number in Count((job.kind, job.state) for job in self._jobs.list()).items():
+            family.add_metric([kind, state], number)
+        yield family
+
+
+def _dropped(bus: Bus) -> Metric:
+    family = CounterMetricFamily("splatbot_bus_dropped", "Messages that readers were too slow for", labels=["topic"])
+    kinds: Count[str] = Count()
+    for topic, number in bus.dropped.items():
+        kinds[topic.split("/")[0] + "/" + topic.rsplit("/", 1)[-1] if topic.startswith("maps/") else topic] += number
+    for kind, number in kinds.items():
+        family.add_metric([kind], number)
+    return family

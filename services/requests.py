@@ -1,0 +1,97 @@
+"""Every request has an id, a line in the log and its place in the metrics."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import secrets
+import time
+from contextvars import ContextVar
+from typing import Protocol
+
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+HEADER = "X-Request-ID"
+request_id: ContextVar[str] = ContextVar("request_id", default="")
+
+_log = logging.getLogger("splatbot.requests")
+_GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
+class RequestCounter(Protocol):
+    """What counts requests."""
+
+    def count(self, method: str, route: str, status: int, seconds: float) -> None:
+        """One request was answered."""
+        ...
+
+
+class RequestLog:
+    """ASGI middleware: takes the client's X-Request-ID or makes one, returns it, logs and counts the request."""
+
+    def __init__(self, app: ASGIApp, counter: RequestCounter) -> None:
+        self.app = app
+        self._counter = counter
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        given = dict(scope["headers"]).get(HEADER.lower().encode(), b"").decode("latin-1")
+        this = given if _GIVEN.fullmatch(given) else secrets.token_hex(8)
+        token = request_id.set(this)
+        status, begin = 500, time.perf_counter()
+
+        async def told(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                MutableHeaders(scope=message)[HEADER] = this
+            await send(message)
+
+        try:
+            await self.app(scope, receive, told)
+        finally:
+            seconds = time.perf_counter() - begin
+            route = scope.get("route")
+            # The route's template, not the path: ids and typing errors must not make a series each.
+            self._counter.count(scope["method"], getattr(route, "path", "unknown"), status, seconds)
+            if status >= 500 or getattr(route, "path", "") not in ("/healthz", "/readyz", "/metrics"):
+                _log.info("%s %s %d %.1f ms", scope["method"], scope["path"], status, 1e3 * seconds)
+            request_id.reset(token)
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record with its time, level, logger, message and the request it belongs to."""
+        told = {
+            "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            "request_id": request_id.get() or None,
+            "error": self.formatException(record.exc_info) if record.exc_info else None,
+        }
+        return json.dumps({name: value for name, value in told.items() if value is not None})
+
+
+class TextFormatter(logging.Formatter):
+    """``LEVEL: message``, with the request where there is one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as a line."""
+        line = super().format(record)
+        this = request_id.get()
+        return f"{line} [{this}]" if this else line
+
+
+def configure_logging(*, as_json: bool) -> None:
+    """Log to stderr, from INFO on."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonFormatter() if as_json else TextFormatter("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

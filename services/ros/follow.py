@@ -1,0 +1,167 @@
+"""FollowJointTrajectory as actionlib's topics: a client sends a goal, reads feedback, may cancel, gets a result."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from splatbot.collision import RobotSpheres
+from splatbot.errors import InputError, SplatbotError
+from splatbot.logs.ros_frames import header
+from splatbot.logs.ros_types import Message, build
+from splatbot.protocols import Feedback
+from splatbot.robots.robot import RobotModel
+from splatbot.services.arms import Arms
+from splatbot.services.bus import Message as News
+from splatbot.services.jobs import ENDED, Job
+from splatbot.services.ros.graph import RosGraph
+from splatbot.services.ros.messages import waypoints_of
+from splatbot.services.ros.moveit import robot_place
+from splatbot.services.ros.waypoints import Waypoints
+from splatbot.services.store import MapStore
+
+_TYPE = "control_msgs/msg/FollowJointTrajectoryAction"
+_ACTIVE, _PREEMPTED, _SUCCEEDED, _ABORTED, _REJECTED = 1, 2, 3, 4, 5  # of actionlib_msgs/GoalStatus
+_OK, _INVALID_GOAL, _PATH_TOLERANCE = 0, -1, -4  # of control_msgs/FollowJointTrajectory
+_STATES = {"succeeded": (_SUCCEEDED, _OK), "cancelled": (_PREEMPTED, _OK), "failed": (_ABORTED, _PATH_TOLERANCE)}
+_WAITING = 64
+
+_log = logging.getLogger(__name__)
+
+
+def action_topic(arm: str, part: str) -> str:
+    """`/ARM_controller/follow_joint_trajectory/PART`, with part goal, cancel, feedback or result."""
+    return f"/{arm}_controller/follow_joint_trajectory/{part}"
+
+
+class FollowJointTrajectory:
+    """Lets the service's arms follow what clients send, if it is free in the main map.
+
+    Straight edges between the goal's points are certified against the map and the arm itself before anything moves; a
+    goal that is not free, does not begin where the arm is, or comes while it moves, is rejected with the reason.
+
+    Args:
+        graph: where the topics are.
+        arms: what follows.
+        store: the maps, and the bus that tells of motions.
+    """
+
+    def __init__(self, graph: RosGraph, arms: Arms, store: MapStore) -> None:
+        self._graph, self._arms, self._store = graph, arms, store
+        self._lock = threading.Lock()
+        self._goals: dict[str, tuple[str, Message]] = {}
+        topics = []
+        for arm in arms.names:
+            kinds = {"goal": f"{_TYPE}Goal", "cancel": "actionlib_msgs/msg/GoalID"}
+            topics += [graph.advertise(action_topic(arm, part), kind) for part, kind in kinds.items()]
+            for part in ("feedback", "result"):
+                graph.advertise(action_topic(arm, part), f"{_TYPE}{part.capitalize()}")
+        self._asked = graph.subscribe(*topics, capacity=_WAITING) if topics else None
+        self._news = store.bus.subscribe("motions/*", "jobs/*", capacity=_WAITING, latched=False)
+        self._threads = [
+            threading.Thread(target=self._take_all, name="ros-goals", daemon=True),
+            threading.Thread(target=self._tell_all, name="ros-feedback", daemon=True),
+        ]
+
+    def start(self) -> None:
+        """Begin."""
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """End; arms that move go on, they are not ours."""
+        if self._asked is not None:
+            self._asked.close()
+        self._news.close()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(timeout_s)
+
+    def _take_all(self) -> None:
+        for news in self._asked or ():
+            arm = news.topic.split("/")[1].removesuffix("_controller")
+            try:
+                if news.topic.endswith("/cancel"):
+                    self._cancel(arm, news.value.message.id)
+                else:
+                    self._begin(arm, news.value.message)
+            except Exception:  # one odd goal must not end the others
+                _log.exception("%s could not be followed", news.topic)
+
+    def _begin(self, arm: str, goal: Message) -> None:
+        try:
+            path = self._checked(self._arms.get(arm).robot, goal.goal.trajectory)
+            with self._lock:  # before the motion's first news are looked at
+                job = self._arms.send(arm, path)
+                self._goals[job.id] = arm, goal.goal_id
+        except SplatbotError as error:
+            self._result(arm, goal.goal_id, _REJECTED, _INVALID_GOAL, str(error))
+
+    def _checked(self, robot: RobotModel, trajectory: Message) -> Waypoints:
+        names, times, given = waypoints_of(trajectory)
+        if sorted(names) != sorted(robot.chain.names):
+            hint = f"name {', '.join(robot.chain.names)}"
+            raise InputError(f"are {', '.join(names)[:200]}.", field="joint_names", hint=hint)
+        q = given[:, [names.index(name) for name in robot.chain.names]]
+        if not robot.within_limits(q, 1e-6).all():
+            raise InputError("leave the joints' limits.", field="points", hint="plan within them")
+        served, _, base = robot_place(self._store, robot.name)
+        arm = RobotSpheres(robot, T_world_base=base)
+        ends = (q[:-1], q[1:]) if len(q) > 1 else (q, q)
+        edges = arm.certify(served.field, np.ascontiguousarray(ends[0]), np.ascontiguousarray(ends[1]))
+        if edges.in_collision.any():
+            first = int(np.argmax(edges.in_collision))
+            raise InputError(f"are not free after point {first}.", field="points", hint="plan in the map as it is now")
+        return Waypoints(times, q)
+
+    def _cancel(self, arm: str, goal: str) -> None:
+        """An empty id cancels all of the arm's goals."""
+        with self._lock:
+            jobs = [job for job, (owner, known) in self._goals.items() if owner == arm and goal in ("", known.id)]
+        for job in jobs:
+            self._arms.motions.cancel(job)
+
+    def _tell_all(self) -> None:
+        for news in self._news:
+            try:
+                self._tell(news)
+            except Exception:
+                _log.exception("%s could not be told", news.topic)
+
+    def _tell(self, news: News) -> None:
+        job_id, value = news.topic.split("/", 1)[1], news.value
+        with self._lock:
+            known = self._goals.get(job_id)
+            if known is not None and isinstance(value, Job) and value.state in ENDED:
+                del self._goals[job_id]
+        if known is None:
+            return
+        arm, goal = known
+        if isinstance(value, Feedback):
+            self._feedback(arm, goal, value)
+        elif isinstance(value, Job) and value.state in ENDED:
+            status, code = _STATES[value.state]
+            self._result(arm, goal, status, code, value.detail or "")
+
+    def _feedback(self, arm: str, goal: Message, told: Feedback) -> None:
+        points = {
+            "actual": {"positions": told.position, "velocities": told.velocity},
+            "desired": {"positions": told.desired},
+            "error": {"positions": told.desired - told.position},
+        }
+        names = list(self._arms.get(arm).robot.chain.names)
+        self._publish(arm, "feedback", goal, _ACTIVE, "", points | {"joint_names": names})
+
+    def _result(self, arm: str, goal: Message, status: int, code: int, text: str) -> None:
+        self._publish(arm, "result", goal, status, text, {"error_code": code, "error_string": text})
+
+    def _publish(self, arm: str, part: str, goal: Message, status: int, text: str, values: dict[str, Any]) -> None:
+        told = {"goal_id": goal, "status": status, "text": text}
+        message = build(
+            f"{_TYPE}{part.capitalize()}", {"header": header(time.time(), ""), "status": told, part: values}
+        )
+        self._graph.publish(action_topic(arm, part), message)

@@ -1,0 +1,97 @@
+"""How a hand takes hold of a thing in the map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Depends, Request, Response
+
+from splatbot.camera import Camera
+from splatbot.errors import InputError
+from splatbot.grasping.affordance import BoxHint, Hint, NameHint, PixelHint, PointHint, View, find_target
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.places import PlaceAffordance
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.summary import summary
+from splatbot.grasping.words import WordAffordance
+from splatbot.segmentation import segment
+from splatbot.services.arms import known_robot
+from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.dependencies import Served, Service, problems
+from splatbot.services.robots_in_maps import base_in
+from splatbot.services.schemas import GraspsRequest
+from splatbot.services.topics import GRASPS, map_topic
+
+router = APIRouter(prefix="/v1/maps", tags=["grasping"])
+
+_BASE = {"translation": [0.0, 0.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+_EXAMPLES = {
+    "by its name": {"target": "largest box", "base": _BASE},
+    "by a point, the hand alone": {"point": [0.5, 0.0, 0.08], "base": _BASE, "hand_only": True, "samples": 100},
+}
+_ANSWER = {
+    "map_version": 12,
+    "target": {"label": "box", "backend": "words", "score": 0.9, "gaussians": 540, "notes": []},
+    "grasps": [{"total": 0.81, "width_m": 0.04, "approach": "top", "terms": {"closure": 0.9}}],
+    "best_rejected": None,
+    "rejected": {},
+    "candidates": 2100,
+    "notes": [],
+    "seconds": {"contacts": 0.05},
+}
+
+
+@router.post(
+    "/{map_id}/grasps",
+    response_class=Response,
+    responses=gives(_ANSWER) | problems(404, 415, 422, 503),
+    openapi_extra=takes(GraspsRequest, _EXAMPLES),
+)
+def grasps(
+    request: Request,
+    served: Served,
+    service: Service,
+    asked: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))],
+) -> Response:
+    """Grasps of one thing, best first, with each term of their scores; none is a problem that says what they fell to.
+
+    Words are rules on names, colours, shapes, sizes and places; what fits two things is refused.
+    """
+    robot, base = known_robot(asked.robot), base_in(served, asked.base)
+    known = served.workspace if asked.base is None else None  # box and plane belong to the map's own base
+    scene = segment(
+        served.ready,
+        base,
+        box=known.box if known is not None else None,
+        plane=known.support_plane if known is not None else None,
+        names=served.workspace.objects if served.workspace is not None else (),
+    )
+    found = find_target(_hint(asked), scene, [WordAffordance(), PlaceAffordance()])
+    sampler = GraspSampler(scene, robot, hand_only=asked.hand_only, margin=asked.margin)
+    options = GraspOptions(
+        friction=asked.friction,
+        samples=asked.samples,
+        wanted=asked.wanted,
+        approach=asked.approach,
+        seed=asked.seed,
+    )
+    result = sampler.sample(found, options)
+    result.unwrap()
+    service.bus.publish(map_topic(served.id, GRASPS), result)
+    return answer(request, summary(result) | {"map_version": served.map_version})
+
+
+def _hint(asked: GraspsRequest) -> Hint:
+    if asked.target is not None:
+        return NameHint(asked.target)
+    if asked.point is not None:
+        return PointHint(np.array(asked.point))
+    if asked.picture is None:
+        raise InputError("is missing.", field="target", hint="give one of target, point and picture")
+    picture = asked.picture
+    view = View(Camera(**picture.camera.model_dump()), picture.pose.matrix("picture.pose"))
+    if picture.pixel is not None:
+        return PixelHint(*picture.pixel, view)
+    assert picture.box is not None
+    return BoxHint(*picture.box, view)

@@ -1,0 +1,139 @@
+"""Motions planned among the Gaussians, and configurations that reach a pose."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, Path, Request, Response
+
+from splatbot.geometry import inverse
+from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal, time_path
+from splatbot.robots.ik import solve_ik
+from splatbot.services.arms import known_robot
+from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.dependencies import Served, Service, problems
+from splatbot.services.plans import Plan
+from splatbot.services.problems import TooLargeError
+from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
+from splatbot.services.schemas import IkRequest, PlanRequest
+from splatbot.services.topics import PLAN, map_topic
+
+router = APIRouter(tags=["motion"])
+
+_BASE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
+_DOWN = {"translation": [0.4, 0.2, 0.4], "quat_wxyz": [0.0, 1.0, 0.0, 0.0]}
+_EXAMPLES = {
+    "to joints": {"goal": [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], "base": _BASE},
+    "the tool to a pose": {"goal_pose": _DOWN, "base": _BASE, "budget_ms": 300},
+}
+_ANSWER = {
+    "id": "0d6c1b7f2a3e4f50",
+    "map_version": 12,
+    "status": "SUCCESS",
+    "code": 1,
+    "cost_rad": 1.24,
+    "seconds": 0.1,
+    "first_seconds": 0.003,
+    "duration_s": 1.9,
+    "certified": True,
+    "clearance_m": 0.05,
+    "margin_m": 0.0,
+    "waypoints": [[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]],
+    "trajectory": {"joint_names": ["panda_joint1"], "points": []},
+}
+_IK_EXAMPLES = {
+    "straight down": {"pose": _DOWN},
+    "near a posture": {"pose": _DOWN, "seeds": 16, "near": [0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8]},
+}
+_IK_ANSWER = {"q": [[0.1, 0.2, 0.3, -2.0, 0.0, 1.6, 0.8]], "tried": 32, "reached": 30}
+
+
+@router.post(
+    "/v1/maps/{map_id}/plans",
+    response_class=Response,
+    responses=gives(_ANSWER) | problems(404, 413, 415, 422, 503),
+    openapi_extra=takes(PlanRequest, _EXAMPLES),
+)
+def plan(
+    request: Request,
+    served: Served,
+    service: Service,
+    asked: Annotated[PlanRequest, Depends(body_of(PlanRequest))],
+) -> Response:
+    """A certified motion, with its trajectory as ROS' JointTrajectory; `id` is what POST /v1/trajectories takes.
+
+    No motion is a problem (422) whose `code` is that of moveit_msgs/MoveItErrorCodes.
+    """
+    if asked.budget_ms > service.settings.max_plan_ms:
+        hint = "give less, or raise SPLATBOT_MAX_PLAN_MS"
+        raise TooLargeError(f"is more than {service.settings.max_plan_ms:g}.", field="budget_ms", hint=hint)
+    robot, base = known_robot(asked.robot), base_in(served, asked.base)
+    start = robot.home if asked.start is None else joints_of(robot, asked.start, "start")
+    goal = (
+        PoseGoal(base @ asked.goal_pose.matrix("goal_pose"))
+        if asked.goal_pose is not None
+        else JointGoal(joints_of(robot, asked.goal or [], "goal"))
+    )
+    planner = GaussianRRTStar(served.field, robot, T_world_base=base, margin=asked.margin)
+    result = planner.plan(start, goal, budget_ms=asked.budget_ms, seed=asked.seed)
+    trajectory = time_path(result.unwrap(), planner.arm, served.field, velocity_scale=asked.speed)
+    kept = service.plans.add(served.id, robot.name, result, trajectory)
+    service.bus.publish(map_topic(served.id, PLAN), trajectory)
+    return answer(request, _told(kept, asked.rate))
+
+
+@router.get("/v1/plans/{plan_id}", response_class=Response, responses=gives(_ANSWER) | problems(404))
+def get_plan(
+    request: Request,
+    service: Service,
+    plan_id: Annotated[str, Path(description="as POST .../plans named it", examples=["0d6c1b7f2a3e4f50"])],
+) -> Response:
+    """A plan again; the latest 256 are kept."""
+    return answer(request, _told(service.plans.get(plan_id), 50.0))
+
+
+@router.post(
+    "/v1/ik",
+    response_class=Response,
+    responses=gives(_IK_ANSWER, npy="q (K, J)") | problems(404, 415, 422, 503),
+    openapi_extra=takes(IkRequest, _IK_EXAMPLES),
+)
+def ik(request: Request, service: Service, asked: Annotated[IkRequest, Depends(body_of(IkRequest))]) -> Response:
+    """Configurations that bring the tool to a pose, nearest to `near` first; with `map`, those that are free in it."""
+    robot = known_robot(asked.robot)
+    pose, free = asked.pose.matrix("pose"), None
+    told: dict[str, Any] = {}
+    if asked.map is not None:
+        served = service.store.get(asked.map)
+        _, arm = arm_in(served, asked.robot, asked.base, asked.margin)
+        field = served.field
+        pose = inverse(arm.T_world_base) @ pose
+        told["map_version"] = served.map_version
+
+        def free(q: Any) -> Any:
+            return ~arm.check(field, q).in_collision
+
+    near = None if asked.near is None else joints_of(robot, asked.near, "near")
+    found = solve_ik(robot, pose, near=near, seeds=asked.seeds, free=free)
+    return answer(request, told | {"q": found.q, "tried": found.tried, "reached": found.reached}, array="q")
+
+
+def _told(plan: Plan, rate: float) -> dict[str, Any]:
+    result, trajectory = plan.result, plan.trajectory
+    path, certificate = result.unwrap(), trajectory.certificate
+    return {
+        "id": plan.id,
+        "map_version": certificate.map_version,
+        "status": result.status.name,
+        "code": int(result.status),
+        "cost_rad": path.cost,
+        "seconds": result.seconds,
+        "first_seconds": result.first_seconds,
+        "duration_s": trajectory.duration,
+        "certified": certificate.certified,
+        "clearance_m": certificate.clearance,
+        "margin_m": certificate.margin,
+        "waypoints": np.asarray(path.waypoints),
+        "trajectory": trajectory.to_ros(rate=rate),
+    }

@@ -1,0 +1,102 @@
+"""Arms that follow planned motions."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from splatbot.protocols import Feedback
+from splatbot.services.codecs import body_of, plain, takes
+from splatbot.services.dependencies import IdempotencyKey, Service, example, problems
+from splatbot.services.jobs import ENDED, Job
+from splatbot.services.routes.jobs import JOB, accepted, info, starts
+from splatbot.services.schemas import JobInfo, TrajectoryRequest
+from splatbot.services.topics import job_topic, motion_topic
+
+router = APIRouter(prefix="/v1", tags=["motion"])
+
+_JOB = JOB | {"kind": "trajectory", "detail": None}
+_ARM = {"name": "fake", "robot": "panda", "busy": False, "state": "idle", "position": [0.0] * 7}
+_MotionId = Annotated[str, Path(description="as the 202 answer named it", examples=["5f0c2a9b1d3e4f60"])]
+
+
+def _motion(service: Service, job_id: _MotionId) -> Job:
+    return service.arms.motions.get(job_id)
+
+
+@router.get("/arms", responses=example({"arms": [_ARM]}))
+def list_arms(service: Service) -> dict[str, Any]:
+    """The arms that can follow plans: "fake" moves as told, "twin" is simulated."""
+    return {"arms": [{"name": name} for name in service.arms.names]}
+
+
+@router.get("/arms/{name}", responses=example(_ARM) | problems(422))
+def get_arm(
+    service: Service, name: Annotated[str, Path(description="as GET /v1/arms lists it", examples=["fake"])]
+) -> dict[str, Any]:
+    """Where an arm is; plans for it start there."""
+    arm = service.arms.get(name)
+    at = arm.feedback
+    state = at.state.value if at is not None else "idle"
+    position = at.position.tolist() if at is not None else arm.robot.home.tolist()
+    return {"name": name, "robot": arm.robot.name, "busy": arm.busy, "state": state, "position": position}
+
+
+@router.post(
+    "/trajectories",
+    status_code=202,
+    responses=starts("the arm moves") | problems(404, 409, 415, 422, 503),
+    openapi_extra=takes(TrajectoryRequest, {"a plan": {"plan": "0d6c1b7f2a3e4f50", "arm": "fake"}}),
+)
+def send_trajectory(
+    service: Service,
+    asked: Annotated[TrajectoryRequest, Depends(body_of(TrajectoryRequest))],
+    key: IdempotencyKey,
+) -> Response:
+    """Let an arm follow a plan that begins where the arm is. 409: it moves already, or stands elsewhere."""
+    plan = service.plans.get(asked.plan)
+    job = service.arms.send(asked.arm, plan.trajectory, key=key, request=asked.model_dump_json())
+    return accepted(job, under="/v1/trajectories")
+
+
+@router.get("/trajectories/{job_id}", responses=example(_JOB) | problems(404))
+def get_trajectory(service: Service, job_id: _MotionId) -> JobInfo:
+    """How a motion stands: "succeeded" at its end, "failed" after a fault, "cancelled" when it was stopped."""
+    return info(service.arms.motions.get(job_id))
+
+
+@router.delete("/trajectories/{job_id}", responses=example(_JOB | {"state": "cancelled"}) | problems(404))
+def stop_trajectory(service: Service, job_id: _MotionId) -> JobInfo:
+    """Stop the arm, within one period of its controller."""
+    return info(service.arms.motions.cancel(job_id))
+
+
+@router.get("/trajectories/{job_id}/events", response_class=EventSourceResponse, responses=problems(404, 503))
+async def trajectory_events(
+    service: Service, watched: Annotated[Job, Depends(_motion)]
+) -> AsyncIterator[ServerSentEvent]:
+    """The arm's feedback while it moves ("feedback"), and at last how the motion ended, as server-sent events."""
+    with service.bus.subscribe(job_topic(watched.id), motion_topic(watched.id), capacity=64) as news:
+        async for message in news:
+            value: Job | Feedback = message.value
+            if isinstance(value, Feedback):
+                yield ServerSentEvent(data=_feedback(value), event="feedback")
+            elif value.state in ENDED:
+                yield ServerSentEvent(data=info(value).model_dump(), event=value.state)
+                return
+
+
+def _feedback(feedback: Feedback) -> Any:
+    return plain(
+        {
+            "time": feedback.time,
+            "state": feedback.state.value,
+            "position": feedback.position,
+            "velocity": feedback.velocity,
+            "desired": feedback.desired,
+            "error": feedback.error,
+        }
+    )

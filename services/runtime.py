@@ -1,0 +1,214 @@
+"""Everything that a running service holds, and how it begins and ends."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterable
+from contextlib import suppress
+
+from splatbot.config import Config
+from splatbot.errors import ConfigError, SplatbotError
+from splatbot.frame import Frame
+from splatbot.services.arms import Arms
+from splatbot.services.jobs import Jobs
+from splatbot.services.library import MapLibrary
+from splatbot.services.live import LiveMapping, Mapper
+from splatbot.services.metrics import Metrics
+from splatbot.services.plans import Plans
+from splatbot.services.pushed import PushedFrames, StreamEndedError
+from splatbot.services.settings import ServiceSettings
+from splatbot.services.store import MapExistsError, MapStore, ServedMap
+from splatbot.workspace import Workspace
+
+_log = logging.getLogger(__name__)
+
+
+class Runtime:
+    """The parts of one service, put together.
+
+    Args:
+        settings: address, keys and limits.
+        store: the maps; None makes one.
+        config: of the mapping that clients ask for.
+
+    Attributes:
+        store: maps and their bus.
+        jobs: work that outlasts a request.
+        arms: that follow plans.
+        plans: the latest ones.
+        metrics: for Prometheus.
+        library: maps on disk; None: in memory alone.
+        draining: the service is about to end.
+    """
+
+    def __init__(
+        self, settings: ServiceSettings, store: MapStore | None = None, *, config: Config | None = None
+    ) -> None:
+        self.settings = settings
+        self.store = store or MapStore()
+        self.bus = self.store.bus
+        self.config = config or Config()
+        self.jobs = Jobs(self.bus, workers=settings.job_workers, capacity=settings.max_jobs)
+        self.arms = Arms(self.bus)
+        self.plans = Plans()
+        self.metrics = Metrics(self.store, self.jobs)
+        self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
+        self.draining = False
+        self._streams: dict[str, PushedFrames] = {}
+        self._mappings: dict[str, LiveMapping] = {}
+        self._waiting: list[LiveMapping] = []
+        self._started = False
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
+
+    def start(self) -> None:
+        """Serve the maps that were saved, and go on saving; begin to map what is to be followed."""
+        if self.library is not None:
+            self.library.load_all(self.store)
+            self._keeper.start()
+        with self._lock:
+            self._started, waiting = True, list(self._waiting)
+            self._waiting.clear()
+        for mapping in waiting:
+            mapping.start()
+
+    def follow(self, map_id: str, source: Iterable[Frame], mapper: Mapper) -> None:
+        """Map frames in a thread of their own, once the service has begun; ``map_id`` is in the store."""
+        mapping = LiveMapping(self.store, map_id, source, mapper)
+        with self._lock:
+            self._mappings[map_id] = mapping
+            if not self._started:
+                self._waiting.append(mapping)  # a recording of the service holds its first frame too
+                return
+        mapping.start()
+
+    def open_stream(
+        self, map_id: str, *, config: Config | None = None, workspace: Workspace | None = None
+    ) -> ServedMap:
+        """A new map that is fed by :meth:`stream`'s frames.
+
+        Raises:
+            MapExistsError: the name is taken.
+        """
+        from splatbot.slam import Slam
+
+        served = self.store.add(map_id, source="pushed frames", state="mapping", workspace=workspace, awaited=False)
+        frames = PushedFrames(self.settings.max_waiting_frames)
+        mapping = LiveMapping(self.store, map_id, frames, Slam(self.config), on_result=frames.answer)
+        with self._lock:
+            self._streams[map_id], self._mappings[map_id] = frames, mapping
+        mapping.start()
+        threading.Thread(target=_abandon_after, args=(mapping, frames), name=f"stream-{map_id}", daemon=True).start()
+        return served
+
+    def stream(self, map_id: str) -> PushedFrames:
+        """Where the frames of a map are pushed.
+
+        Raises:
+            MapNotFoundError: no map of that name.
+            StreamEndedError: it is not made of pushed frames.
+        """
+        self.store.get(map_id)
+        with self._lock:
+            frames = self._streams.get(map_id)
+        if frames is None:
+            hint = 'create a map for frames: POST /v1/maps {"id": ...}'
+            raise StreamEndedError(f"map {map_id!r} is not made of pushed frames.", hint=hint)
+        return frames
+
+    def take(self, frame: Frame, map_id: str = "ros") -> None:
+        """Map a frame that was published, not pushed into a map: the first one makes the map.
+
+        Raises:
+            BusyError: as many frames wait as may; this one is dropped.
+            InputError: the frame does not fit those before, or the map is made of something else.
+        """
+        with suppress(MapExistsError):
+            self.open_stream(map_id)
+        self.stream(map_id).push(frame)
+
+    def remove(self, map_id: str) -> None:
+        """End the map's making, serve it no longer, and delete what was saved of it.
+
+        Raises:
+            MapNotFoundError: no map of that name.
+        """
+        self.store.remove(map_id)
+        self._end(map_id, "the map was deleted", 0.0)
+        if self.library is not None:
+            self.library.remove(map_id)
+
+    def save(self, map_id: str) -> None:
+        """Keep the map's present state on disk, where there is a folder for it.
+
+        Raises:
+            SaveError: it cannot be written.
+        """
+        if self.library is not None:
+            self.library.save(self.store.get(map_id))
+
+    def drain(self) -> None:
+        """Begin to end: take no more work, close event streams; answers that are under way are still given."""
+        self.draining = True
+        self.bus.close()
+
+    def close(self) -> None:
+        """End jobs, motions and mappings, and save every map."""
+        self.draining = True
+        timeout = float(self.settings.shutdown_s)
+        self.arms.close(timeout)
+        self.jobs.close(timeout)
+        for map_id in list(self._mappings):
+            self._end(map_id, "the service stops", timeout)
+        if not self._ended.is_set():
+            self._ended.set()
+            self._save_all()
+        self.metrics.close()
+        self.bus.close()
+
+    def _end(self, map_id: str, why: str, timeout_s: float) -> None:
+        with self._lock:
+            frames, mapping = self._streams.pop(map_id, None), self._mappings.pop(map_id, None)
+        if frames is not None:
+            frames.end(why)
+        if mapping is not None:
+            mapping.stop(timeout_s)
+
+    def _keep(self) -> None:
+        while not self._ended.wait(self.settings.save_every_s):
+            self._save_all()
+
+    def _save_all(self) -> None:
+        if self.library is None:
+            return
+        for served in self.store.list():
+            if served.state == "static":
+                continue  # it is a file already
+            try:
+                self.library.save(served)
+            except SplatbotError as error:
+                _log.error("%s", error)
+
+
+def check_exposure(settings: ServiceSettings) -> None:
+    """Nothing that other machines can reach is without keys, and TLS is whole.
+
+    Raises:
+        ConfigError: it is not so.
+    """
+    if not settings.loopback and not settings.api_keys:
+        hint = "make one with `splatbot serve --new-key` and set SPLATBOT_API_KEYS, or listen on 127.0.0.1"
+        raise ConfigError(f"{settings.host} can be reached by others and there is no key.", field="api_keys", hint=hint)
+    if (settings.tls_cert is None) != (settings.tls_key is None):
+        raise ConfigError("one of the two is missing.", field="tls_cert, tls_key", hint="give both")
+    for name in ("tls_cert", "tls_key"):
+        path = getattr(settings, name)
+        if path is not None and not path.is_file():
+            raise ConfigError("does not exist.", file=path, field=name, hint="check the path")
+
+
+def _abandon_after(mapping: LiveMapping, frames: PushedFrames) -> None:
+    mapping.wait()
+    frames.abandon("mapping has ended")

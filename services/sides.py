@@ -1,0 +1,58 @@
+"""What stands beside the HTTP service: topics and services of ROS, a recording of them, the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from splatbot.frame import Frame
+from splatbot.services.arms import Arms
+from splatbot.services.ros.node import RosNode
+from splatbot.services.ros.recorder import McapRecorder
+from splatbot.services.settings import ServiceSettings
+from splatbot.services.store import MapStore
+from splatbot.services.viewer.viewer import Viewer
+
+
+class Sides:
+    """Begins and ends with the application.
+
+    Args:
+        settings: which of them there are.
+        store: the maps.
+        arms: what follows the motions that ROS clients send.
+        on_frame: called with each frame that ROS clients publish.
+
+    Raises:
+        InputError: the viewer's port is taken.
+    """
+
+    def __init__(
+        self, settings: ServiceSettings, store: MapStore, arms: Arms, *, on_frame: Callable[[Frame], Any]
+    ) -> None:
+        self.ros = RosNode(store, arms=arms, on_frame=on_frame)
+        self._record = settings.record
+        self._recorder: McapRecorder | None = None
+        # The viewer knows no keys: whoever is elsewhere comes through a tunnel.
+        port = settings.viewer_port
+        self.viewer = Viewer(store, host="127.0.0.1", port=port) if port is not None else None
+
+    def start(self) -> None:
+        """Begin.
+
+        Raises:
+            LogError: there is a recording of that name already.
+        """
+        self.ros.start()
+        if self._record is not None:
+            self._recorder = McapRecorder(self.ros.graph, self._record)
+        if self.viewer is not None:
+            self.viewer.start()
+
+    def stop(self) -> None:
+        """End; the recording is whole then."""
+        self.ros.stop()
+        if self._recorder is not None:
+            self._recorder.stop()
+        if self.viewer is not None:
+            self.viewer.stop()

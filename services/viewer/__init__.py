@@ -1,0 +1,1 @@
+"""A live view of maps in a web browser (viser)."""

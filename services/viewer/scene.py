@@ -1,0 +1,183 @@
+"""What a viewer shows of one map: splats, the camera and its way, the robot, its planned motion."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import trimesh
+import viser
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import rotation_to_quat
+from splatbot.grasping.types import Grasp
+from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.protocols import Array
+from splatbot.rasterize.views import default_view
+from splatbot.services.viewer.splats import Coloring, pieces
+from splatbot.trajectory import Trajectory
+
+_MOST_FRUSTA = 60
+_FRUSTUM = 0.04  # [m]
+_ROOM = 0.1  # [m] of clearance and more is green
+_GREY, _BLUE, _AMBER = (150, 150, 150), (40, 120, 255), (255, 170, 0)
+_PATH_POINTS = 60
+
+
+def open_server(host: str, port: int) -> viser.ViserServer:
+    """viser's server, at the next free port where ``port`` is taken; without its banner.
+
+    Raises:
+        InputError: the address cannot be listened on.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            return viser.ViserServer(host=host, port=port, label="splatbot", verbose=False)
+    except OSError as error:
+        raise InputError(f"cannot listen on {host} port {port}.", field="viewer_port", hint="give another") from error
+
+
+def close_server(server: viser.ViserServer) -> None:
+    """End it, without a word."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+class MapScene:
+    """Draws one map into a viser server; each call shows what it is given and sends only what has changed.
+
+    Args:
+        server: viser's.
+        up: (3,) direction upwards in the map; None: as an upright first camera has it.
+    """
+
+    def __init__(self, server: viser.ViserServer, *, up: Array | None = None) -> None:
+        self._server = server
+        self._up = np.array([0.0, -1.0, 0.0]) if up is None else np.asarray(up)
+        server.scene.set_up_direction(tuple(self._up.tolist()))
+        self._drawn: dict[tuple[int, int, int], tuple[bytes, Any]] = {}
+        self._balls: dict[str, Any] = {}
+        self._unit = trimesh.creation.icosphere(subdivisions=2)
+
+    def look(self, position: Array, target: Array, *, fov_deg: float = 50.0) -> None:
+        """Where browsers that come from now on look from, and at what [m]; the view's height in degrees."""
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = tuple(position.tolist()), tuple(target.tolist())
+        camera.up, camera.fov = tuple(self._up.tolist()), float(np.radians(fov_deg))
+
+    def look_at_all(self, model: GaussianModel) -> None:
+        """Let browsers begin where most of a map is in view."""
+        if len(model):
+            _, T = default_view(model)
+            target = np.median(model.means.numpy(), axis=0)
+            self.look(T[:3, 3], target)
+
+    def show_map(self, model: GaussianModel, coloring: Coloring = "rgb", *, T_world_camera: Array | None = None) -> int:
+        """The Gaussians; returns how many pieces were sent."""
+        found, sent = pieces(model, coloring, T_world_camera=T_world_camera), 0
+        with self._server.atomic():
+            for key in self._drawn.keys() - found.keys():
+                self._drawn.pop(key)[1].remove()
+            for key, splats in found.items():
+                digest = splats.digest
+                old = self._drawn.get(key)
+                if old is not None and old[0] == digest:
+                    continue
+                values = splats.centers, splats.covariances, splats.rgbs, splats.opacities
+                if old is None:
+                    handle = self._server.scene.add_gaussian_splats(f"/map/{key}", *values)
+                else:
+                    handle = old[1]
+                    handle.set_gaussians(*values)
+                self._drawn[key] = digest, handle
+                sent += 1
+        return sent
+
+    def show_way(self, trajectory: Trajectory, camera: Camera | None = None) -> None:
+        """The camera's way as a line, and frusta along it."""
+        at = trajectory.positions.astype(np.float32)
+        if len(at) >= 2:
+            lines = np.stack([at[:-1], at[1:]], axis=1)
+            self._server.scene.add_line_segments("/camera/way", lines, _BLUE, thickness=0.002)
+        chosen = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MOST_FRUSTA)).astype(int)) if len(at) else ()
+        for number, i in enumerate(chosen):
+            self._frustum(f"/camera/frusta/{number}", trajectory.T_world_camera[i], camera, _GREY)
+
+    def show_camera(self, T_world_camera: Array, camera: Camera | None = None) -> None:
+        """Where the camera is now."""
+        self._frustum("/camera/now", T_world_camera, camera, _BLUE)
+
+    def show_robot(self, arm: RobotSpheres, q: Array, field: GaussianCollisionField | None, name: str = "now") -> None:
+        """The robot's spheres at joints ``q`` (J,): red where they touch the map, green from 10 cm of room on."""
+        centers = arm.centers(q[None])[0]
+        rgb = clearance_colors(field, centers, arm.spheres.radii)
+        if name not in self._balls:
+            self._balls[name] = self._server.scene.add_batched_meshes_simple(
+                f"/robot/{name}",
+                np.asarray(self._unit.vertices, np.float32),
+                np.asarray(self._unit.faces, np.uint32),
+                batched_wxyzs=np.tile([1.0, 0, 0, 0], (len(centers), 1)).astype(np.float32),
+                batched_positions=centers.astype(np.float32),
+                batched_scales=arm.spheres.radii.astype(np.float32),
+                batched_colors=rgb,
+                lod="off",
+                opacity=0.5 if name == "plan" else None,
+            )
+            return
+        handle = self._balls[name]
+        handle.batched_positions, handle.batched_colors = centers.astype(np.float32), rgb
+
+    def show_plan(self, arm: RobotSpheres, plan: RobotTrajectory) -> None:
+        """The way of the tool along a planned motion."""
+        q = plan.at(np.linspace(0.0, plan.duration, _PATH_POINTS)).position
+        last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])
+        at = arm.centers(q)[:, last].astype(np.float32)
+        lines = np.stack([at[:-1], at[1:]], axis=1)
+        self._server.scene.add_line_segments("/robot/path", lines, _AMBER, thickness=0.008)
+
+    def show_grasps(self, grasps: Sequence[Grasp]) -> None:
+        """Each grasp as the hand's straight way and the line between its fingers, the greener the better."""
+        if not grasps:
+            self._server.scene.remove_by_name("/grasps")
+            return
+        ways = [(g.T_world_pregrasp[:3, 3], g.T_world_tcp[:3, 3]) for g in grasps]
+        lines = np.array([line for way, g in zip(ways, grasps, strict=True) for line in (way, g.contacts)], np.float32)
+        rgb = np.array([(1.0 - g.total, g.total, 0.1) for g in grasps for _ in range(2)])
+        colors = np.repeat(np.rint(255 * rgb)[:, None], 2, axis=1).astype(np.uint8)
+        self._server.scene.add_line_segments("/grasps", lines, colors, thickness=0.004)
+
+    def html(self) -> str:
+        """The scene as one page that needs nothing else."""
+        return str(self._server.get_scene_serializer().as_html())
+
+    def _frustum(self, name: str, T: Array, camera: Camera | None, color: tuple[int, int, int]) -> None:
+        fov = 2 * np.arctan(0.5 * camera.height / camera.fy) if camera is not None else 0.8
+        aspect = camera.width / camera.height if camera is not None else 4 / 3
+        self._server.scene.add_camera_frustum(
+            name,
+            float(fov),
+            aspect,
+            scale=_FRUSTUM,
+            color=color,
+            wxyz=rotation_to_quat(T[:3, :3]),
+            position=T[:3, 3],
+        )
+
+
+def clearance_colors(
+    field: GaussianCollisionField | None, centers: Array, radii: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """RGB (S, 3) of spheres (S, 3), (S,) [m]: red without room to the map, yellow at 5 cm, green at 10; grey: none."""
+    if field is None or not len(field):
+        return np.tile(np.array(_GREY, np.uint8), (len(centers), 1))
+    room = field.clearance(np.column_stack([centers, radii]), cut=_ROOM).distance
+    share = np.clip(room / _ROOM, 0.0, 1.0)
+    red, green = np.clip(2 - 2 * share, 0, 1), np.clip(2 * share, 0, 1)
+    return np.rint(255 * np.column_stack([red, green, 0.1 * np.ones_like(share)])).astype(np.uint8)

@@ -1,0 +1,110 @@
+"""A map's Gaussians as a browser draws them, in pieces of space, so that only what has changed is sent again."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.gaussians.shape import covariances
+from splatbot.geometry import inverse, transform_points
+from splatbot.protocols import Array
+from splatbot.rasterize.views import facing_normals
+
+Coloring = Literal["rgb", "depth", "normal", "uncertainty"]
+COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
+
+_EDGE = 0.5  # [m] of a piece
+_MOST_PIECES = 256
+_LEAST_VARIANCE = 1.2e-7  # [m²]: covariances travel as 16-bit floats, whose steps are 6e-8 here
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """Gaussians of one piece.
+
+    Args:
+        centers: (N, 3) float32 [m].
+        covariances: (N, 3, 3) float32 [m²].
+        rgbs: (N, 3) float32, 0..1.
+        opacities: (N, 1) float32, 0..1.
+    """
+
+    centers: NDArray[np.float32]
+    covariances: NDArray[np.float32]
+    rgbs: NDArray[np.float32]
+    opacities: NDArray[np.float32]
+
+    @property
+    def digest(self) -> bytes:
+        """Of the values: two pieces that look the same have the same."""
+        parts = (self.centers, self.covariances, self.rgbs, self.opacities)
+        return hashlib.blake2b(b"".join(np.ascontiguousarray(p).tobytes() for p in parts), digest_size=16).digest()
+
+
+def pieces(
+    model: GaussianModel, coloring: Coloring = "rgb", *, T_world_camera: Array | None = None
+) -> dict[tuple[int, int, int], Splats]:
+    """The Gaussians by cube of space of half a metre, or of twice, four times, ... that where there would be too many.
+
+    Args:
+        model: the map.
+        coloring: what colours tell: the map's own; depth seen by a camera, red near and blue far; the direction of the
+            surface, light blue where it faces that camera; or how little a Gaussian's place is known, red for least.
+        T_world_camera: (4, 4) of that camera; None: the world's origin.
+    """
+    if not len(model):
+        return {}
+    means = model.means.numpy()
+    edge = _EDGE
+    while len(keys := np.unique(np.floor(means / edge).astype(np.int64), axis=0)) > _MOST_PIECES:
+        edge *= 2
+    keys, piece = np.unique(np.floor(means / edge).astype(np.int64), axis=0, return_inverse=True)
+    order = np.argsort(piece.ravel(), kind="stable")
+    bounds = np.searchsorted(piece.ravel()[order], np.arange(len(keys) + 1))
+    with torch.no_grad():
+        spread = covariances(model).numpy() + np.eye(3, dtype=np.float32) * np.float32(_LEAST_VARIANCE)
+        opacity = model.opacities.numpy()[:, None]
+    rgb = colors(model, coloring, T_world_camera=T_world_camera)
+    found = {}
+    for i, (x, y, z) in enumerate(keys.tolist()):
+        rows = order[bounds[i] : bounds[i + 1]]
+        found[x, y, z] = Splats(means[rows], spread[rows], rgb[rows], opacity[rows])
+    return found
+
+
+def colors(model: GaussianModel, coloring: Coloring, *, T_world_camera: Array | None = None) -> NDArray[np.float32]:
+    """RGB (N, 3) in 0..1; see :func:`pieces`.
+
+    Raises:
+        InputError: there is no such colouring.
+    """
+    with torch.no_grad():
+        if coloring == "rgb":
+            return model.colors.clamp(0, 1).numpy().astype(np.float32)
+        if coloring == "uncertainty":
+            return _turbo(model.uncertainty.numpy())
+        T_camera_world = np.eye(4) if T_world_camera is None else inverse(T_world_camera)
+        if coloring == "normal":
+            normals = facing_normals(model, T_camera_world).numpy()
+            return (0.5 + 0.5 * normals * np.array([1, -1, -1])).astype(np.float32)
+        if coloring == "depth":
+            return _turbo(-transform_points(T_camera_world, model.means.numpy())[:, 2])
+    raise InputError(f"is {coloring!r}.", field="coloring", hint=f"use {', '.join(COLORINGS)}")
+
+
+def _turbo(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """RGB (N, 3) of values (N,), blue at their 2nd percentile, red at the 98th."""
+    if not len(values):
+        return np.zeros((0, 3), np.float32)
+    low, high = np.percentile(values, [2, 98])
+    shares = np.clip((values - low) / max(high - low, 1e-9), 0, 1)
+    bgr = cv2.applyColorMap(np.rint(255 * shares).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)
+    return (bgr[:, 0, ::-1] / 255).astype(np.float32)

@@ -1,0 +1,209 @@
+"""The live viewer: follows a bus and shows its main map, at most twice a second."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from splatbot.camera import Camera
+from splatbot.collision import RobotSpheres
+from splatbot.frame import Frame
+from splatbot.grasping.types import GraspResult
+from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.protocols import Array
+from splatbot.services.arms import known_robot
+from splatbot.services.bus import Message
+from splatbot.services.store import MapStore, ServedMap
+from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
+from splatbot.services.viewer.scene import MapScene, close_server, open_server
+from splatbot.services.viewer.splats import COLORINGS, Coloring
+from splatbot.slam import FrameResult
+from splatbot.trajectory import Trajectory
+
+_PERIOD_S = 0.5
+_WAITING = 256
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class _News:
+    """The latest of everything; what is None has not come, or has been shown."""
+
+    served: ServedMap | None = None
+    result: FrameResult | None = None
+    trajectory: Trajectory | None = None
+    plan: RobotTrajectory | None = None
+    grasps: GraspResult | None = None
+    joints: JointState | None = None
+    camera: Camera | None = None
+
+
+class Viewer:
+    """A web page at http://HOST:PORT that shows a map as it grows.
+
+    Args:
+        store: the maps; ``map_id`` is shown, or the first one there is.
+        host, port: where the page is served, at the next free port where that one is taken; 0 takes any.
+        robot: the arm that is shown where its base is known.
+        map_id: None: the first.
+
+    Raises:
+        InputError: the host cannot be listened on.
+    """
+
+    def __init__(
+        self,
+        store: MapStore,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        robot: str = "panda",
+        map_id: str | None = None,
+    ) -> None:
+        self._store, self._map_id, self._robot_name = store, map_id, robot
+        self.server = open_server(host, port)
+        self._host, self.port = host, self.server.get_port()
+        self._scene = MapScene(self.server)
+        self._news, self._lock = _News(), threading.Lock()
+        self._served: ServedMap | None = None
+        self._pose: Array | None = None
+        self._arm: RobotSpheres | None = None
+        self._plan: RobotTrajectory | None = None
+        self._camera: Camera | None = None
+        self._coloring: Coloring = "rgb"
+        self._stale = False
+        self._add_controls()
+        self._reader = store.bus.subscribe("maps/*", "robot/*/joints", capacity=_WAITING)
+        self._stopping = threading.Event()
+        work = {"viewer-collect": self._collect, "viewer-draw": self._draw}
+        self._threads = [threading.Thread(target=run, name=name, daemon=True) for name, run in work.items()]
+
+    def start(self) -> None:
+        """Begin."""
+        for thread in self._threads:
+            thread.start()
+        _log.info("the viewer is at http://%s:%d", self._host, self.port)
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """End, and close the page's connections."""
+        self._stopping.set()
+        self._reader.close()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(timeout_s)
+        close_server(self.server)
+
+    def html(self) -> str:
+        """What is shown now as one page that needs nothing else."""
+        return self._scene.html()
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        self._state = gui.add_markdown("waiting for a map")
+        coloring = gui.add_dropdown("colours", COLORINGS, initial_value="rgb")
+        self._slider = gui.add_slider("planned motion", 0.0, 1.0, 0.01, 0.0, disabled=True)
+        self._timings = gui.add_markdown("")
+
+        @coloring.on_update
+        def _(_: Any) -> None:
+            self._coloring, self._stale = coloring.value, True
+
+        @self._slider.on_update
+        def _(_: Any) -> None:
+            self._show_plan_at(self._slider.value)
+
+    def _collect(self) -> None:
+        """Keep the latest of each kind: what comes faster than it is drawn is passed over."""
+        for message in self._reader:
+            with self._lock:
+                self._take(message)
+
+    def _take(self, message: Message) -> None:
+        value = message.value
+        if isinstance(value, JointState):
+            self._news.joints = value
+            return
+        _, map_id, kind = message.topic.split("/", 2)
+        self._map_id = self._map_id or map_id
+        if map_id != self._map_id:
+            return
+        if kind == STATE:
+            self._news.served = value
+        elif kind == RESULT:
+            self._news.result = value
+        elif kind == TRAJECTORY:
+            self._news.trajectory = value
+        elif kind == PLAN:
+            self._news.plan = value
+        elif kind == GRASPS:
+            self._news.grasps = value
+        elif kind == FRAME and isinstance(value, Frame):
+            self._news.camera = value.camera
+
+    def _draw(self) -> None:
+        while not self._stopping.is_set():
+            begun = time.monotonic()
+            with self._lock:
+                news, self._news = self._news, _News()
+            try:
+                self._show(news)
+            except Exception:  # one odd value must not end the view
+                _log.exception("the viewer could not show what is new")
+            self._stopping.wait(max(_PERIOD_S - (time.monotonic() - begun), 0.05))
+
+    def _show(self, news: _News) -> None:
+        self._camera = news.camera or self._camera
+        if news.result is not None:
+            self._show_result(news.result)
+        if news.served is not None:
+            self._take_map(news.served)
+        served = self._served
+        if served is not None and served.snapshot is not None and (news.served is not None or self._stale):
+            self._stale = False
+            self._scene.show_map(served.snapshot.model, self._coloring, T_world_camera=self._pose)
+        if news.trajectory is not None:
+            self._scene.show_way(news.trajectory, self._camera)
+        if news.plan is not None and self._arm is not None:
+            self._plan = news.plan
+            self._scene.show_plan(self._arm, news.plan)
+            self._slider.disabled = False
+            self._show_plan_at(self._slider.value)
+        if news.grasps is not None:
+            self._scene.show_grasps(news.grasps.grasps)
+        if news.joints is not None and self._arm is not None and served is not None:
+            self._scene.show_robot(self._arm, news.joints.position, served.field)
+
+    def _take_map(self, served: ServedMap) -> None:
+        first = self._served is None or self._served.snapshot is None
+        self._served = served
+        self._state.content = f"**{served.id}** {served.state}, version {served.map_version}"
+        if served.snapshot is None:
+            return
+        if first:
+            self._scene.look_at_all(served.snapshot.model)
+        if served.trajectory is not None and first:
+            self._scene.show_way(served.trajectory, self._camera)
+        base = served.workspace.T_world_base if served.workspace is not None else None
+        if base is not None and self._arm is None:
+            robot = known_robot(self._robot_name)
+            self._arm = RobotSpheres(robot, T_world_base=base)
+            self._scene.show_robot(self._arm, np.asarray(robot.home), served.field)
+
+    def _show_result(self, result: FrameResult) -> None:
+        if result.T_world_camera is not None:
+            self._pose = result.T_world_camera
+            self._scene.show_camera(result.T_world_camera, self._camera)
+        rows = "\n".join(f"| {name} | {ms:.1f} |" for name, ms in result.stage_ms.items())
+        self._timings.content = f"frame {result.index}: {result.verdict}\n\n| stage | ms |\n|---|---|\n{rows}"
+
+    def _show_plan_at(self, share: float) -> None:
+        arm, plan, served = self._arm, self._plan, self._served
+        if arm is not None and plan is not None and served is not None:
+            q = plan.at(share * plan.duration).position
+            self._scene.show_robot(arm, np.asarray(q), served.field, "plan")

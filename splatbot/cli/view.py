@@ -1,0 +1,67 @@
+"""`splatbot view`: a map in a web browser."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def view(
+    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|RUN")],
+    /,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    robot: str = "panda",
+    html: Path | None = None,
+) -> None:
+    """Show a map's Gaussians in a web browser, with the camera's way and the robot where they are known.
+
+    Examples:
+        splatbot view runs/demo
+        splatbot view runs/demo --port 9000
+        splatbot view runs/demo --html demo.html
+
+    Args:
+        map: a map file, or a run folder that holds map.ply.
+        host: address to listen on.
+        port: port to listen on; 0 takes a free one.
+        robot: the arm to show where a scene.yaml beside the map tells its base.
+        html: write one page that needs nothing else, and leave.
+    """
+    from splatbot.atomic import atomic_write
+    from splatbot.gaussians import GaussianModel, Snapshot
+    from splatbot.services.store import MapStore
+    from splatbot.services.viewer.page import map_page
+    from splatbot.services.viewer.viewer import Viewer
+    from splatbot.trajectory import Trajectory
+    from splatbot.workspace import find_workspace
+
+    file = map / "map.ply" if map.is_dir() else map
+    model, workspace = GaussianModel.load(file), find_workspace(map)
+    path = file.with_name("trajectory.tum")
+    trajectory = Trajectory.load(path) if path.exists() else None
+    if html is not None:
+        with atomic_write(html) as handle:
+            handle.write(map_page(model, trajectory=trajectory, workspace=workspace, robot=robot).encode())
+        print(f"{html}: {html.stat().st_size / 1e6:.1f} MB")
+        return
+    store = MapStore()
+    store.add(
+        "default",
+        source=file.name,
+        state="static",
+        snapshot=Snapshot(model, 1),
+        trajectory=trajectory,
+        workspace=workspace,
+    )
+    viewer = Viewer(store, host=host, port=port, robot=robot)
+    viewer.start()
+    print(f"http://{host}:{viewer.port} shows {file}; Ctrl-C ends", flush=True)
+    try:
+        threading.Event().wait()
+    finally:
+        viewer.stop()

@@ -1,0 +1,1 @@
+"""Programs of other people's libraries, run in processes of their own against a running service."""

@@ -1,0 +1,40 @@
+"""`splatbot serve --camera replay:...`: a camera with faults is mapped, told to ROS clients and recorded."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+from websockets.sync.client import connect
+
+from splatbot.logs import open_log
+from tests.e2e.test_serve_cli import serving
+
+LOG = "synthetic:tabletop?frames=12&width=160&height=120"
+
+
+def test_a_camera_that_is_unplugged_leaves_its_map_odometry_and_a_recording_that_is_a_log(tmp_path: Path) -> None:
+    camera = f"replay:{LOG}&speed=0.1&unplug=9"
+    options = "--record", str(tmp_path / "all.mcap"), "--ros-port", "0", "--viewer-port", "0"
+    with serving("--camera", camera, *options) as (process, client):
+        url = f"ws://127.0.0.1:{client.base_url.port}/rosbridge"
+        with connect(url, max_size=None) as socket:
+            socket.send(json.dumps({"op": "subscribe", "topic": "/odom"}))
+            told = json.loads(socket.recv(timeout=60))
+            assert told["msg"]["header"]["frame_id"] == "map"
+        deadline = time.monotonic() + 60
+        while (described := client.get("/v1/maps/default").json())["state"] == "mapping":
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        assert (described["state"], described["detail"]) == ("failed", "is gone.")
+        assert described["gaussians"] > 500
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+    recorded, original = open_log(tmp_path / "all.mcap"), open_log(LOG)
+    assert len(recorded) == 9
+    for a, b in zip(original, recorded, strict=False):
+        np.testing.assert_array_equal(a.rgb, b.rgb)
+        np.testing.assert_array_equal(a.depth, b.depth)

@@ -1,0 +1,95 @@
+"""`splatbot grasp`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatbot.robots.panda import panda
+from splatbot.workspace import NamedPlace, Workspace
+from tests.unit.cli.conftest import RunCommand
+from tests.unit.grasping.things import BOX, CAN, model
+
+BASE = ("--base", 0, 0, 0, 1, 0, 0, 0)
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    path = tmp_path / "map.ply"
+    model().save(path)
+    return path
+
+
+def test_ranked_grasps_are_printed_written_and_drawn(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    answer = run("grasp", "--map", map_file, *BASE, "--target", "red box", "--wanted", 3, "--out", out)
+    assert answer.code == 0, answer.err
+    for word in ("closure", "room", "limits", "red box", "by rules"):
+        assert word in answer.out
+    found = json.loads((out / "grasp.json").read_text())
+    assert found["target"]["backend"] == "rules"
+    assert len(found["grasps"]) == 3
+    best = found["grasps"][0]
+    assert best["width_m"] == pytest.approx(BOX.size[1], abs=2e-3)
+    assert np.abs(BOX.distance(np.array(best["contacts"]))).max() < 3e-3
+    np.testing.assert_allclose(panda().tcp(np.array(best["q"]))[:3, 3], best["T_world_tcp"]["position"], atol=1e-4)
+    picture = cv2.imread(str(out / "grasp.png"))
+    assert picture is not None
+    assert picture.shape == (480, 1280, 3)
+    assert picture.std() > 5
+
+
+def test_names_and_base_come_from_the_scene_beside_the_map(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    names = (NamedPlace("soup", np.array([0.50, -0.15, 0.12])),)
+    Workspace(T_world_base=np.eye(4), objects=names).save(tmp_path / "scene.yaml")
+    answer = run("grasp", "--map", map_file, "--target", "soup", "--out", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    found = json.loads((tmp_path / "out" / "grasp.json").read_text())
+    assert (found["target"]["label"], found["target"]["backend"]) == ("soup", "scene")
+    assert np.abs(CAN.distance(np.array(found["grasps"][0]["contacts"]))).max() < 3e-3
+
+
+def test_a_point_and_the_hand_alone(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    words = ("--point", 0.50, -0.15, 0.12, "--hand-only", "--approach", "top", "--out", tmp_path / "out")
+    answer = run("grasp", "--map", map_file, *BASE, *words)
+    assert answer.code == 0, answer.err
+    best = json.loads((tmp_path / "out" / "grasp.json").read_text())["grasps"][0]
+    assert best["q"] is None
+    assert best["approach"] == "top"
+    assert "near" in best["terms"]
+
+
+def test_what_cannot_be_grasped_is_said_counted_and_drawn(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    answer = run("grasp", "--map", map_file, *BASE, "--target", "largest box", "--out", tmp_path / "out")
+    assert answer.code == 1
+    assert "120 mm apart, and the hand opens 80 mm" in answer.err
+    found = json.loads((tmp_path / "out" / "grasp.json").read_text())
+    assert found["grasps"] == []
+    assert sum(found["rejected"].values()) > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "give one of them"),
+        (("--target", "box", "--point", 0, 0, 0), "are 2"),
+        (("--target", "box"), "about equally"),
+        (("--target", "screwdriver"), "no word of the rules"),
+        (("--pixel", 10, 10), "has no pictures"),
+        (("--point", 0.3, -0.05, 0.0), "there is no object"),
+        (("--target", "red box", "--friction", 9), "friction"),
+        (("--target", "red box", "--robot", "nobody"), "robot"),
+        (("--target", "red box", "--margin", "wide"), "--margin"),
+    ],
+)
+def test_wrong_questions_are_answered_in_one_line(
+    words: tuple[object, ...], message: str, run: RunCommand, map_file: Path
+) -> None:
+    answer = run("grasp", "--map", map_file, *BASE, *words)
+    assert answer.code in (1, 2)
+    assert message in answer.err
+    assert "Traceback" not in answer.err

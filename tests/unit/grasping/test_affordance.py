@@ -1,0 +1,126 @@
+"""Who says where: pixels, points, masks, rectangles, and backends one after the other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatbot.camera import Camera
+from splatbot.errors import InputError
+from splatbot.geometry import inverse, look_at, transform_points
+from splatbot.grasping.affordance import (
+    AffordanceError,
+    BoxHint,
+    Hint,
+    MaskHint,
+    NameHint,
+    PixelHint,
+    PointHint,
+    Target,
+    View,
+    find_target,
+)
+from splatbot.grasping.places import PlaceAffordance, point_at
+from splatbot.grasping.words import WordAffordance
+from splatbot.segmentation import MapScene
+from tests.unit.grasping.things import BALL, BOX, CAN, scene, target_of
+
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
+VIEW = View(CAMERA, look_at(np.array([0.0, -0.4, 0.6]), np.array([0.5, 0.0, 0.0])))
+PLACE = [PlaceAffordance()]
+
+
+def _pixel(point: tuple[float, float, float]) -> tuple[float, float]:
+    u, v = CAMERA.project(transform_points(inverse(VIEW.T_world_camera), np.array(point)))
+    return float(u), float(v)
+
+
+def test_a_pixel_shows_the_point_that_is_there() -> None:
+    top = (0.50, -0.15, 0.12)
+    np.testing.assert_allclose(point_at(scene(), VIEW, *_pixel(top)), top, atol=4e-3)
+
+
+@pytest.mark.parametrize("solid", [BOX, CAN, BALL])
+def test_a_pixel_and_a_point_on_a_thing_name_its_gaussians(solid: object) -> None:
+    wanted = target_of(scene(), solid, "it")  # type: ignore[arg-type]
+    middle = np.median(scene().model.means.double().numpy()[wanted.rows], axis=0)
+    high = tuple(scene().model.means.double().numpy()[wanted.rows].max(axis=0)[2:3])
+    at = (float(middle[0]), float(middle[1]), float(high[0]))
+    for hint in (PixelHint(*_pixel(at), VIEW), PointHint(np.array(at))):
+        found = find_target(hint, scene(), PLACE)
+        assert found.number == wanted.number
+        assert found.backend == "place"
+        np.testing.assert_array_equal(found.rows, wanted.rows)
+
+
+def test_a_mask_and_a_rectangle_name_what_fills_them() -> None:
+    wanted = target_of(scene(), CAN, "can")
+    u, v = np.array(
+        [_pixel((0.50 + dx, -0.15 + dy, z)) for dx in (-0.02, 0.02) for dy in (-0.02, 0.02) for z in (0.03, 0.12)]
+    ).T
+    box = BoxHint(u.min(), v.min(), u.max(), v.max(), VIEW)
+    mask = np.zeros((240, 320), bool)
+    mask[int(v.min()) : int(v.max()), int(u.min()) : int(u.max())] = True
+    for hint in (box, MaskHint(mask, VIEW)):
+        found = find_target(hint, scene(), PLACE)
+        assert found.number == wanted.number
+        assert found.score > 0.6
+
+
+def test_a_mask_over_two_things_is_refused_and_names_both() -> None:
+    mask = np.zeros((240, 320), bool)
+    for top in ((0.45, 0.10, 0.12), (0.50, -0.15, 0.12)):
+        u, v = (round(x) for x in _pixel(top))
+        mask[v - 3 : v + 4, u - 5 : u + 6] = True
+    with pytest.raises(AffordanceError, match="about equally") as caught:
+        find_target(MaskHint(mask, VIEW), scene(), PLACE)
+    assert len(caught.value.candidates) >= 2
+
+
+def test_the_table_is_no_target() -> None:
+    with pytest.raises(AffordanceError, match=r"there is no object; the nearest object is [\d.]+ cm away"):
+        find_target(PointHint(np.array([0.30, -0.05, 0.0])), scene(), PLACE)
+
+
+@pytest.mark.parametrize(
+    ("hint", "message"),
+    [
+        (PixelHint(320.0, 10.0, VIEW), "pixel: is \\(320, 10\\) in a picture of 320x240"),
+        (PixelHint(float("nan"), 10.0, VIEW), "pixel"),
+        (PointHint(np.array([np.nan, 0.0, 0.0])), "point"),
+        (MaskHint(np.ones((2, 2), bool), VIEW), "mask"),
+        (BoxHint(400.0, 0.0, 500.0, 10.0, VIEW), "box"),
+    ],
+)
+def test_hints_that_make_no_sense_are_refused(hint: Hint, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        find_target(hint, scene(), PLACE)
+
+
+def test_a_pixel_that_shows_nothing_is_said() -> None:
+    up = View(CAMERA, look_at(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 3.0])))
+    with pytest.raises(AffordanceError, match="shows nothing of the map"):
+        find_target(PixelHint(10.0, 10.0, up), scene(), PLACE)
+
+
+class _Unsure:
+    name = "unsure"
+
+    def understands(self, hint: Hint) -> bool:
+        return True
+
+    def locate(self, hint: Hint, scene: MapScene) -> Target:
+        raise AffordanceError("cannot tell.", field="target")
+
+
+def test_the_next_backend_is_asked_and_the_answer_says_who_gave_it() -> None:
+    found = find_target(NameHint("red box"), scene(), [_Unsure(), WordAffordance()])
+    assert found.backend == "rules"
+    assert any("unsure: target: cannot tell." in note for note in found.notes)
+
+
+def test_when_nobody_knows_all_of_them_are_quoted() -> None:
+    with pytest.raises(AffordanceError, match=r"unsure: .*cannot tell.*\| rules: "):
+        find_target(NameHint("flying saucer"), scene(), [_Unsure(), WordAffordance()])
+    with pytest.raises(AffordanceError, match="none of 1 backends understands"):
+        find_target(NameHint("box"), scene(), PLACE)

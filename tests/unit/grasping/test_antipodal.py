@@ -1,0 +1,83 @@
+"""Pairs of contacts against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatbot.grasping.antipodal import PairSearch, antipodal_pairs
+from splatbot.grasping.surface import Surface, target_surface
+from tests.unit.grasping.things import BALL, BIG, BOX, CAN, THINGS, scene, target_of
+
+FRICTION = 0.5
+
+
+def _surface(name: str) -> Surface:
+    return target_surface(scene(), target_of(scene(), THINGS[name], name).rows)
+
+
+def _search(name: str, stroke: float = 0.08) -> PairSearch:
+    return antipodal_pairs(_surface(name), stroke=stroke, friction=FRICTION, samples=400)
+
+
+@pytest.mark.parametrize("name", ["box", "can", "ball"])
+def test_contacts_are_on_the_surface_within_a_millimetre_and_a_half(name: str) -> None:
+    pairs = _search(name).pairs
+    assert len(pairs) > 30
+    off = np.abs(THINGS[name].distance(pairs.contacts.reshape(-1, 3)))
+    assert np.percentile(off, 95) < 1.5e-3
+    assert np.percentile(off, 99) < 3e-3
+
+
+@pytest.mark.parametrize("name", ["box", "can", "ball"])
+def test_the_line_between_contacts_lies_in_both_true_friction_cones(name: str) -> None:
+    """Normals by central differences of the exact distance; 6 degrees are left for the Gaussians' spacing."""
+    pairs = _search(name).pairs
+    step = 1e-5 * np.eye(3)
+    line = pairs.contacts[:, 1] - pairs.contacts[:, 0]
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    solid = THINGS[name]
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        at = pairs.contacts[:, side]
+        true = np.stack([solid.distance(at + d) - solid.distance(at - d) for d in step], axis=1)
+        true /= np.linalg.norm(true, axis=1, keepdims=True)
+        angle = np.degrees(np.arccos(np.clip(sign * np.einsum("ij,ij->i", true, line), -1, 1)))
+        assert np.percentile(angle, 95) < np.degrees(np.arctan(FRICTION)) + 6.0
+
+
+def test_widths_are_those_of_the_shapes() -> None:
+    box = _search("box").pairs
+    assert np.median(np.abs(box.width[box.closure > 0.9] - BOX.size[1])) < 0.5e-3
+    can = _search("can").pairs
+    assert np.median(can.width[can.closure > 0.9]) == pytest.approx(2 * CAN.radius, abs=2e-3)
+    ball = _search("ball").pairs
+    assert np.median(ball.width[ball.closure > 0.9]) == pytest.approx(2 * BALL.radius, abs=3e-3)
+
+
+def test_what_is_wider_than_the_hand_has_no_pairs_and_its_width_is_told() -> None:
+    found = _search("big")
+    assert len(found.pairs) == 0
+    assert found.too_wide > 100
+    assert found.narrowest == pytest.approx(BIG.size[0], abs=2e-3)
+
+
+def test_a_slippery_surface_leaves_only_nearly_opposite_contacts() -> None:
+    pairs = antipodal_pairs(_surface("ball"), stroke=0.08, friction=0.1, samples=400).pairs
+    middle = pairs.contacts.mean(axis=1)
+    assert len(pairs)
+    assert np.linalg.norm(middle - BALL.center, axis=1).max() < 0.1 * BALL.radius + 4e-3
+
+
+def test_the_same_seed_gives_the_same_pairs() -> None:
+    np.testing.assert_array_equal(_search("can").pairs.contacts, _search("can").pairs.contacts)
+
+
+def test_a_map_ten_kilometres_from_its_origin_has_the_same_widths() -> None:
+    surface = _surface("box")
+    from dataclasses import replace
+
+    far = np.array([1e4, -1e4, 0.0])
+    moved = replace(surface, points=surface.points + far, center=surface.center + far)
+    here, there = (antipodal_pairs(s, stroke=0.08, friction=FRICTION, samples=200).pairs for s in (surface, moved))
+    assert len(here) == len(there)
+    np.testing.assert_allclose(there.width, here.width, atol=1e-5)

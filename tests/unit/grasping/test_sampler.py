@@ -1,0 +1,179 @@
+"""Ranked grasps: where the hand is, what it touches, whether the arm gets there, and what is said when it does not."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from splatbot.bench.tabletop import Block, Solid, Tabletop
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.errors import InputError
+from splatbot.geometry import inverse, transform_points
+from splatbot.grasping.affordance import Target
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.reach import Reached
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.score import WEIGHTS
+from splatbot.grasping.types import GraspResult, NoGraspError
+from splatbot.protocols import Array
+from splatbot.robots.panda import panda
+from splatbot.robots.wide_hand import panda_2f140
+from splatbot.segmentation import segment
+from tests.unit.grasping.things import BIG, BOX, CAN, TABLE, THINGS, colored, model, scene, seen_from_above, target_of
+
+COVER = 0.005  # [m] that the spheres of a hand reach beyond it
+
+
+@cache
+def sampler() -> GraspSampler:
+    return GraspSampler(scene(), panda())
+
+
+@cache
+def grasped(name: str) -> GraspResult:
+    return sampler().sample(target_of(scene(), THINGS[name], name))
+
+
+@pytest.mark.parametrize("name", ["box", "can", "ball"])
+def test_things_are_grasped_within_reach_and_ranked(name: str) -> None:
+    result = grasped(name)
+    assert len(result.grasps) >= 3
+    totals = [g.total for g in result.grasps]
+    assert totals == sorted(totals, reverse=True)
+    for g in result.grasps:
+        assert set(g.terms) == set(WEIGHTS) - {"near"}
+        assert all(0.0 <= value <= 1.0 for value in g.terms.values())
+        assert g.width <= g.opening <= 0.08
+        assert np.abs(THINGS[name].distance(g.contacts)).max() < 3e-3
+        assert not g.rejected
+
+
+@pytest.mark.parametrize("name", ["box", "can"])
+def test_the_arm_is_at_the_grasp_and_its_straight_way_touches_nothing_true(name: str) -> None:
+    others = Tabletop((TABLE, *(s for key, s in THINGS.items() if key != name)))
+    for g in grasped(name).grasps[:4]:
+        assert g.q is not None
+        assert g.q_pregrasp is not None
+        assert g.approach_path is not None
+        np.testing.assert_allclose(panda().tcp(g.q), g.T_world_tcp, atol=1e-5)
+        np.testing.assert_allclose(panda().tcp(g.q_pregrasp), g.T_world_pregrasp, atol=2e-3)
+        arm = RobotSpheres(panda(), opening=g.opening)
+        between = np.concatenate(
+            [np.linspace(a, b, 5) for a, b in zip(g.approach_path, g.approach_path[1:], strict=False)]
+        )
+        moving = arm.spheres.link > 0
+        centers = arm.centers(between)[:, moving]
+        room = others.distance(centers.reshape(-1, 3)).reshape(centers.shape[:2]) - arm.spheres.radii[moving]
+        assert room.min() > -1e-3
+
+
+@pytest.mark.parametrize("name", ["box", "can", "ball"])
+def test_fingers_and_palm_are_outside_of_the_true_thing(name: str) -> None:
+    hand = panda().hand
+    assert hand is not None
+    for g in grasped(name).grasps:
+        x, z = np.meshgrid(np.linspace(-0.5, 0.5, 7) * hand.width, np.linspace(-hand.palm, hand.tip, 9))
+        for sign in (-1.0, 1.0):
+            pad = np.stack([x.ravel(), np.full(x.size, sign * g.opening / 2), z.ravel()], axis=1)
+            assert THINGS[name].distance(transform_points(g.T_world_tcp, pad)).min() > 0.0
+        palm = np.c_[0, 0, -hand.palm]
+        assert THINGS[name].distance(transform_points(g.T_world_tcp, palm)).min() > 0.0
+
+
+def test_top_and_side_are_what_was_asked_for() -> None:
+    target = target_of(scene(), CAN, "can")
+    top = sampler().sample(target, GraspOptions(approach="top")).grasps
+    side = sampler().sample(target, GraspOptions(approach="side")).grasps
+    assert {g.approach for g in top} == {"top"}
+    assert {g.approach for g in side} <= {"side", "front"}
+    assert top
+    assert side
+
+
+def test_what_is_too_large_is_refused_with_its_width() -> None:
+    result = grasped("big")
+    assert not result
+    with pytest.raises(NoGraspError, match=r"farther apart than the hand opens.*120 mm apart.*opens 80 mm"):
+        result.unwrap()
+
+
+def test_a_wider_hand_takes_it() -> None:
+    found = GraspSampler(scene(), panda_2f140()).sample(target_of(scene(), BIG, "big"))
+    assert found.unwrap().width == pytest.approx(BIG.size[0], abs=3e-3)
+
+
+class _Nowhere:
+    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
+        return Reached(None, None, 0.0, 0.0, "it is too far", "are too far")
+
+
+def test_without_reach_the_best_is_told_with_its_reason_and_all_are_counted() -> None:
+    sampler = GraspSampler(scene(), panda(), make_reach=lambda around, whole: _Nowhere())
+    result = sampler.sample(target_of(scene(), BOX, "box"))
+    assert not result.grasps
+    assert result.best_rejected is not None
+    assert result.best_rejected.rejected == "it is too far"
+    assert result.rejected["hands: are too far"] > 0
+    with pytest.raises(NoGraspError, match="it is too far"):
+        result.unwrap()
+
+
+def test_the_counts_of_hands_add_up() -> None:
+    result = grasped("can")
+    hands = sum(count for reason, count in result.rejected.items() if reason.startswith("hands"))
+    assert hands + len(result.grasps) <= result.candidates
+    assert hands > 0.5 * result.candidates
+
+
+def test_a_hand_alone_needs_no_arm() -> None:
+    found = GraspSampler(scene(), panda(), hand_only=True).sample(target_of(scene(), BOX, "box")).unwrap()
+    assert found.q is None
+    assert "arm" not in found.terms
+
+
+def test_a_neighbour_on_one_side_turns_the_hand_away_from_it() -> None:
+    near: dict[str, Solid] = {
+        "box": Block((0.45, 0.0, 0.05), (0.05, 0.05, 0.10)),
+        "wall": Block((0.45, 0.06, 0.075), (0.12, 0.04, 0.15)),
+    }
+    crowded = segment(colored(near, 20_000, {}), np.eye(4))
+    target = target_of(crowded, near["box"], "box")
+    field = GaussianCollisionField(colored({"wall": near["wall"]}, 20_000, {}), 1.0)
+    grasps = GraspSampler(crowded, panda()).sample(target).grasps
+    assert grasps
+    T_tcp_link = inverse(panda().T_link_tcp)
+    for g in grasps:
+        spheres = panda().spheres(g.opening)
+        own = spheres.link == 7
+        at = transform_points(g.T_world_tcp @ T_tcp_link, spheres.centers[own])
+        assert field.clearance(np.c_[at, spheres.radii[own]]).distance.min() > -1e-3
+
+
+def test_sides_that_nobody_saw_are_implied_and_told() -> None:
+    above = segment(seen_from_above(model()), np.eye(4))
+    result = GraspSampler(above, panda()).sample(target_of(above, BOX, "box"))
+    best = result.unwrap()
+    assert any("implied" in note for note in result.notes)
+    assert best.terms["seen"] < 0.5
+    assert best.width == pytest.approx(BOX.size[1], abs=8e-3)
+    assert np.abs(BOX.distance(best.contacts)).max() < 4e-3
+
+
+def test_the_same_seed_gives_the_same_grasps() -> None:
+    again = sampler().sample(target_of(scene(), CAN, "can"))
+    np.testing.assert_array_equal([g.T_world_tcp for g in again.grasps], [g.T_world_tcp for g in grasped("can").grasps])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("friction", 0.0), ("samples", 0), ("approach", "below"), ("pregrasp", -1.0)]
+)
+def test_options_out_of_range_are_refused(field: str, value: object) -> None:
+    with pytest.raises(InputError, match=field):
+        GraspOptions(**{field: value})  # type: ignore[arg-type]
+
+
+def test_a_target_of_nothing_is_refused() -> None:
+    with pytest.raises(InputError, match="ghost"):
+        sampler().sample(Target(np.zeros(0, np.int64), None, "ghost", "test", 1.0))
