@@ -12,6 +12,7 @@ from splatbot.sim.world import gripper_joints
 SPEED = 0.1  # [m/s] of the opening
 _THERE = 1e-3  # [m]
 _STILL = 2e-3  # [m/s] of a finger
+_PRESSED = 0.9  # share of the force from which on something is held
 
 
 class TwinGripper:
@@ -61,19 +62,16 @@ class TwinGripper:
 
     def moving(self) -> bool:
         """Whether the fingers are still on their way."""
-        if self._there():
-            return False
         fast = float(np.abs(self._twin.data.qvel[self._dofs]).max()) > _STILL
-        pressed = abs(self._command - self.opening()) * self._stiffness
-        return fast or pressed < 0.95 * self._force
+        return not self._there() and (fast or not self._presses())
 
     def opening(self) -> float:
         """Between the fingers now [m]."""
         return float(self._twin.data.qpos[self._qpos].sum())
 
     def holds(self) -> bool:
-        """Whether the fingers rest, away from where they were sent."""
-        return not self._there() and not self.moving()
+        """Whether the fingers press on something, away from where they were sent."""
+        return not self._there() and self._presses()
 
     def stop(self) -> None:
         """Stay where they are."""
@@ -91,3 +89,6 @@ class TwinGripper:
 
     def _there(self) -> bool:
         return abs(self.opening() - self._wanted) < _THERE
+
+    def _presses(self) -> bool:
+        return abs(self._command - self.opening()) * self._stiffness > _PRESSED * self._force
