@@ -43,7 +43,7 @@ def test_two_thousand_generated_requests_meet_no_fault_and_errors_are_problems(a
     # Deleting the map that all are asked about would make the rest of them 404.
     operations = [o for o in operations if not (o.method.upper() == "DELETE" and "{map_id}" in o.path)]
     operations = [o for o in operations if not o.path.endswith("/events")]
-    each = -(-CASES // len(operations))
+    each = 3 * CASES // (2 * len(operations))  # calls without parameters are asked but once
     asked, statuses = 0, set()
     for operation in operations:
         quiet = settings(
@@ -73,5 +73,5 @@ def test_two_thousand_generated_requests_meet_no_fault_and_errors_are_problems(a
                 assert kinds.startswith("application/problem+json"), (case.path, response.status_code, response.text)
 
         ask()
-    assert asked >= 0.8 * CASES
+    assert asked >= CASES
     assert {200, 422} <= statuses

@@ -63,6 +63,7 @@ def test_a_restart_serves_the_last_saved_map_whatever_ended_the_service(
         assert [p.name for p in (tmp_path / "maps" / "desk").iterdir() if p.name.endswith(".tmp")] == []
 
 
+@pytest.mark.long
 def test_sigterm_ends_event_streams_and_jobs_within_the_time_allowed(tmp_path: Path) -> None:
     with serving("--data", str(tmp_path / "maps")) as (process, client):
         job = client.post("/v1/maps", json={"id": "desk", "log": LOG}).json()["id"]
