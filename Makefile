@@ -42,7 +42,8 @@ test: $(INSTALL_STAMP) ## the test suite without its long part (at most 12 minut
 	$(BIN)/python -m pytest -m "not long" $(PYTEST_ARGS)
 
 .PHONY: test-long
-test-long: $(INSTALL_STAMP) ## the long tests: end-to-end on real logs, load, sanitizers, wheel and sdist (at most 45 minutes)
+test-long: $(INSTALL_STAMP) ## the long tests: end-to-end on real logs, browser, load, sanitizers, wheel and sdist (at most 45 minutes)
+	.ci/browser-deps.sh
 	$(BIN)/python -m pytest -m long $(PYTEST_ARGS)
 
 .PHONY: check

@@ -47,8 +47,8 @@ def create_app(runtime: Runtime) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        await run_in_threadpool(runtime.start)
         await run_in_threadpool(sides.start)
+        await run_in_threadpool(runtime.start)
         yield
         await run_in_threadpool(sides.stop)
         await run_in_threadpool(runtime.close)

@@ -57,21 +57,31 @@ class Runtime:
         self.draining = False
         self._streams: dict[str, PushedFrames] = {}
         self._mappings: dict[str, LiveMapping] = {}
+        self._waiting: list[LiveMapping] = []
+        self._started = False
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
 
     def start(self) -> None:
-        """Serve the maps that were saved, and go on saving."""
+        """Serve the maps that were saved, and go on saving; begin to map what is to be followed."""
         if self.library is not None:
             self.library.load_all(self.store)
             self._keeper.start()
+        with self._lock:
+            self._started, waiting = True, list(self._waiting)
+            self._waiting.clear()
+        for mapping in waiting:
+            mapping.start()
 
     def follow(self, map_id: str, source: Iterable[Frame], mapper: Mapper) -> None:
-        """Map frames in a thread of their own; ``map_id`` is in the store."""
+        """Map frames in a thread of their own, once the service has begun; ``map_id`` is in the store."""
         mapping = LiveMapping(self.store, map_id, source, mapper)
         with self._lock:
             self._mappings[map_id] = mapping
+            if not self._started:
+                self._waiting.append(mapping)  # a recording of the service holds its first frame too
+                return
         mapping.start()
 
     def open_stream(

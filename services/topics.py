@@ -7,6 +7,7 @@
 | ``maps/{id}/result`` | :class:`splatbot.slam.FrameResult`: odometry, verdict, keyframe, stage timings |
 | ``maps/{id}/trajectory`` | :class:`splatbot.trajectory.Trajectory`: all poses so far, at each published state |
 | ``maps/{id}/plan`` | :class:`splatbot.planning.RobotTrajectory`: the latest planned motion |
+| ``maps/{id}/grasps`` | :class:`splatbot.grasping.types.GraspResult`: the grasps that were found last |
 | ``jobs/{id}`` | :class:`splatbot.services.jobs.Job`: each change of a job |
 | ``motions/{id}`` | :class:`splatbot.protocols.Feedback`: what an arm does that follows a trajectory |
 | ``robot/{name}/joints`` | :class:`JointState`: the robot's latest joints |
@@ -24,6 +25,7 @@ FRAME = "frame"
 RESULT = "result"
 TRAJECTORY = "trajectory"
 PLAN = "plan"
+GRASPS = "grasps"
 JOINTS = "joints"
 
 

@@ -1,8 +1,8 @@
-"""Grasps as moveit_msgs/GraspPlanning asks for them, and as markers."""
+"""Grasps as moveit_msgs/GraspPlanning asks for them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
 from splatbot.grasping.words import WordAffordance
 from splatbot.logs.ros_frames import header, pose_message
-from splatbot.logs.ros_types import Message, build, to_plain
+from splatbot.logs.ros_types import to_plain
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 from splatbot.segmentation import segment
@@ -23,16 +23,16 @@ from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.moveit import coded, robot_place
 from splatbot.services.ros.requests import entries, entry, vector
 from splatbot.services.store import MapStore
+from splatbot.services.topics import GRASPS, map_topic
 
-GRASP_SERVICE, MARKERS = "/plan_grasps", "/grasps/markers"
-_ARROW = 0  # of visualization_msgs/Marker
+GRASP_SERVICE = "/plan_grasps"
 
 
 class GraspServices:
     """GraspPlanning on the main map of a store.
 
     The target is the thing of that ``target.id`` (a name of the map's scene.yaml, or words such as "the red cube"), or
-    what is at its pose. The answer's grasps are sorted, best first, and shown as arrows on /grasps/markers.
+    what is at its pose. The answer's grasps are sorted, best first, and told on the bus.
 
     Args:
         graph: is told of the service.
@@ -41,8 +41,7 @@ class GraspServices:
     """
 
     def __init__(self, graph: RosGraph, store: MapStore, *, robot: str = "panda") -> None:
-        self._graph, self._store, self._robot = graph, store, robot
-        graph.advertise(MARKERS, "visualization_msgs/msg/MarkerArray")
+        self._store, self._robot = store, robot
         graph.serve(GRASP_SERVICE, Service("moveit_msgs/srv/GraspPlanning", self.plan))
 
     def plan(self, args: Mapping[str, Any]) -> dict[str, Any]:
@@ -52,12 +51,12 @@ class GraspServices:
             served, robot, base = robot_place(self._store, self._robot)
             known = served.workspace
             assert known is not None
-            scene = segment(served.ready.model, base, box=known.box, plane=known.support_plane, names=known.objects)
+            scene = segment(served.ready, base, box=known.box, plane=known.support_plane, names=known.objects)
             target = find_target(_hint(args), scene, [WordAffordance(), PlaceAffordance()])
             found = GraspSampler(scene, robot).sample(target, GraspOptions())
             found.unwrap()
             stamp = served.ready.stamp
-            self._graph.publish(MARKERS, grasps_message(found.grasps, stamp), latched=True)
+            self._store.bus.publish(map_topic(served.id, GRASPS), found)
             return {"grasps": [_told(i, grasp, robot, stamp) for i, grasp in enumerate(found.grasps)]}
 
         return {"grasps": []} | coded(work)
@@ -102,21 +101,3 @@ def _fingers(opening: float) -> dict[str, Any]:
 
 def _vector(values: Array) -> dict[str, float]:
     return dict(zip("xyz", values.tolist(), strict=True))
-
-
-def grasps_message(grasps: Sequence[Grasp], stamp: float) -> Message:
-    """visualization_msgs/MarkerArray: an arrow for each grasp from its start to the thing, the greener the better."""
-    markers = [
-        {
-            "header": header(stamp, MAP_FRAME),
-            "ns": "grasps",
-            "id": i,
-            "type": _ARROW,
-            "pose": {"orientation": {"w": 1.0}},
-            "scale": {"x": 0.004, "y": 0.01, "z": 0.0},
-            "color": {"r": 1.0 - grasp.total, "g": grasp.total, "b": 0.1, "a": 1.0},
-            "points": [_vector(T[:3, 3]) for T in (grasp.T_world_pregrasp, grasp.T_world_tcp)],
-        }
-        for i, grasp in enumerate(grasps)
-    ]
-    return build("visualization_msgs/msg/MarkerArray", markers=markers)

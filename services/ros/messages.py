@@ -14,9 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
+from splatbot.grasping.types import Grasp
 from splatbot.logs.ros_frames import header, joint_state_message, pose_message, time_of
 from splatbot.logs.ros_types import Message, build
 from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.protocols import Array
 from splatbot.services.topics import JointState
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
@@ -25,7 +27,7 @@ MAP_FRAME, CAMERA_FRAME = "map", "camera"
 
 _FLOAT32 = 7  # of sensor_msgs/PointField
 _SPLAT_FIELDS = ("opacity", "scale_x", "scale_y", "scale_z", "rot_x", "rot_y", "rot_z", "rot_w")
-_SPHERE, _LINE_STRIP = 2, 4  # of visualization_msgs/Marker
+_ARROW, _LINE_STRIP = 0, 4  # of visualization_msgs/Marker
 
 
 def point_cloud_message(model: GaussianModel, stamp: float, *, splats: bool = True) -> Message:
@@ -160,40 +162,39 @@ def waypoints_of(message: Message) -> tuple[tuple[str, ...], NDArray[np.float64]
 
 def camera_way_message(trajectory: Trajectory) -> Message:
     """visualization_msgs/MarkerArray: the camera's way as a line in the map frame."""
-    points = [dict(zip("xyz", p, strict=True)) for p in trajectory.positions.tolist()]
-    return _markers([_marker("camera", 0, _LINE_STRIP, 0.005, (0.1, 0.8, 1.0), points=points)], trajectory)
-
-
-def spheres_message(stamp: float, centers: ArrayLike, radii: ArrayLike, colors: ArrayLike) -> Message:
-    """visualization_msgs/MarkerArray of S spheres in the map frame: (S, 3) [m], (S,) [m], RGB (S, 3) 0..1."""
-    at, r, rgb = (np.asarray(a, np.float64) for a in (centers, radii, colors))
-    markers = []
-    for i in range(len(at)):
-        marker = _marker("robot", i, _SPHERE, 2 * float(r[i]), rgb[i].tolist())
-        marker["pose"] = {"position": dict(zip("xyz", at[i].tolist(), strict=True)), "orientation": {"w": 1.0}}
-        marker["header"] = header(stamp, MAP_FRAME)
-        markers.append(marker)
-    return build("visualization_msgs/msg/MarkerArray", markers=markers)
-
-
-def _markers(markers: Sequence[dict[str, Any]], trajectory: Trajectory) -> Message:
     stamp = float(trajectory.stamps[-1]) if len(trajectory) else 0.0
-    for marker in markers:
-        marker["header"] = header(stamp, MAP_FRAME)
-    return build("visualization_msgs/msg/MarkerArray", markers=list(markers))
+    line = _marker("camera", 0, _LINE_STRIP, (0.005, 0.0), (0.1, 0.8, 1.0), trajectory.positions, stamp)
+    return build("visualization_msgs/msg/MarkerArray", markers=[line])
+
+
+def grasps_message(grasps: Sequence[Grasp]) -> Message:
+    """visualization_msgs/MarkerArray: an arrow for each grasp from its start to the thing, the greener the better."""
+    arrows = []
+    for i, grasp in enumerate(grasps):
+        ends = np.stack([grasp.T_world_pregrasp[:3, 3], grasp.T_world_tcp[:3, 3]])
+        arrows.append(_marker("grasps", i, _ARROW, (0.004, 0.01), (1.0 - grasp.total, grasp.total, 0.1), ends))
+    return build("visualization_msgs/msg/MarkerArray", markers=arrows)
 
 
 def _marker(
-    ns: str, number: int, kind: int, width: float, color: Sequence[float], *, points: Sequence[Any] = ()
+    ns: str,
+    number: int,
+    kind: int,
+    widths: tuple[float, float],
+    color: tuple[float, float, float],
+    points: Array,
+    stamp: float = 0.0,
 ) -> dict[str, Any]:
+    """visualization_msgs/Marker along points (N, 3) [m] of the map frame; of an arrow, widths of shaft and head [m]."""
     return {
+        "header": header(stamp, MAP_FRAME),
         "ns": ns,
         "id": number,
         "type": kind,
         "pose": {"orientation": {"w": 1.0}},
-        "scale": {"x": width, "y": width, "z": width},
-        "color": {"r": color[0], "g": color[1], "b": color[2], "a": 1.0},
-        "points": list(points),
+        "scale": {"x": widths[0], "y": widths[1]},
+        "color": dict(zip("rgb", color, strict=True)) | {"a": 1.0},
+        "points": [dict(zip("xyz", point, strict=True)) for point in points.tolist()],
     }
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from splatbot.frame import Frame
+from splatbot.grasping.types import GraspResult
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_frames import camera_info_message, image_message
 from splatbot.logs.ros_types import Message
@@ -18,6 +19,7 @@ from splatbot.services.ros.messages import (
     CAMERA_FRAME,
     MAP_FRAME,
     camera_way_message,
+    grasps_message,
     joint_trajectory_message,
     joints_message,
     log_message,
@@ -27,7 +29,7 @@ from splatbot.services.ros.messages import (
     transform_message,
 )
 from splatbot.services.store import ServedMap
-from splatbot.services.topics import FRAME, PLAN, RESULT, STATE, TRAJECTORY, JointState
+from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
 
@@ -41,6 +43,7 @@ ODOMETRY, POINTS, PATH, MARKERS, PLANNED, TF, ROSOUT = (
     "/tf",
     "/rosout",
 )
+GRASP_MARKERS = "/grasps/markers"
 TYPES = {
     COLOR: "sensor_msgs/msg/Image",
     DEPTH: "sensor_msgs/msg/Image",
@@ -50,6 +53,7 @@ TYPES = {
     POINTS: "sensor_msgs/msg/PointCloud2",
     PATH: "nav_msgs/msg/Path",
     MARKERS: "visualization_msgs/msg/MarkerArray",
+    GRASP_MARKERS: "visualization_msgs/msg/MarkerArray",
     PLANNED: "trajectory_msgs/msg/JointTrajectory",
     JOINTS: "sensor_msgs/msg/JointState",
     ROSOUT: "rcl_interfaces/msg/Log",  # Foxglove takes a rosbridge for ROS 2 only where there is one
@@ -80,6 +84,7 @@ class RosOutlets:
             STATE: self._state,
             TRAJECTORY: self._trajectory,
             PLAN: self._plan,
+            GRASPS: self._grasps,
         }
         for topic, kind in TYPES.items():
             graph.advertise(topic, kind)
@@ -143,6 +148,9 @@ class RosOutlets:
 
     def _plan(self, prefix: str, plan: RobotTrajectory) -> None:
         self._tell(prefix, PLANNED, lambda: joint_trajectory_message(plan, frame_id=MAP_FRAME), latched=True)
+
+    def _grasps(self, prefix: str, found: GraspResult) -> None:
+        self._tell(prefix, GRASP_MARKERS, lambda: grasps_message(found.grasps), latched=True)
 
 
 class _RosoutHandler(logging.Handler):

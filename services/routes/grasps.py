@@ -18,9 +18,10 @@ from splatbot.grasping.words import WordAffordance
 from splatbot.segmentation import segment
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import Served, problems
+from splatbot.services.dependencies import Served, Service, problems
 from splatbot.services.robots_in_maps import base_in
 from splatbot.services.schemas import GraspsRequest
+from splatbot.services.topics import GRASPS, map_topic
 
 router = APIRouter(prefix="/v1/maps", tags=["grasping"])
 
@@ -48,7 +49,10 @@ _ANSWER = {
     openapi_extra=takes(GraspsRequest, _EXAMPLES),
 )
 def grasps(
-    request: Request, served: Served, asked: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))]
+    request: Request,
+    served: Served,
+    service: Service,
+    asked: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))],
 ) -> Response:
     """Grasps of one thing, best first, with each term of their scores; none is a problem that says what they fell to.
 
@@ -74,6 +78,7 @@ def grasps(
     )
     result = sampler.sample(found, options)
     result.unwrap()
+    service.bus.publish(map_topic(served.id, GRASPS), result)
     return answer(request, summary(result) | {"map_version": served.map_version})
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import rotation_to_quat
+from splatbot.grasping.types import Grasp
 from splatbot.planning import Trajectory as RobotTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import default_view
@@ -139,6 +141,17 @@ class MapScene:
         at = arm.centers(q)[:, last].astype(np.float32)
         lines = np.stack([at[:-1], at[1:]], axis=1)
         self._server.scene.add_line_segments("/robot/path", lines, _AMBER, thickness=0.008)
+
+    def show_grasps(self, grasps: Sequence[Grasp]) -> None:
+        """Each grasp as the hand's straight way and the line between its fingers, the greener the better."""
+        if not grasps:
+            self._server.scene.remove_by_name("/grasps")
+            return
+        ways = [(g.T_world_pregrasp[:3, 3], g.T_world_tcp[:3, 3]) for g in grasps]
+        lines = np.array([line for way, g in zip(ways, grasps, strict=True) for line in (way, g.contacts)], np.float32)
+        rgb = np.array([(1.0 - g.total, g.total, 0.1) for g in grasps for _ in range(2)])
+        colors = np.repeat(np.rint(255 * rgb)[:, None], 2, axis=1).astype(np.uint8)
+        self._server.scene.add_line_segments("/grasps", lines, colors, thickness=0.004)
 
     def html(self) -> str:
         """The scene as one page that needs nothing else."""

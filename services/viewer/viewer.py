@@ -13,12 +13,13 @@ import numpy as np
 from splatbot.camera import Camera
 from splatbot.collision import RobotSpheres
 from splatbot.frame import Frame
+from splatbot.grasping.types import GraspResult
 from splatbot.planning import Trajectory as RobotTrajectory
 from splatbot.protocols import Array
 from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
 from splatbot.services.store import MapStore, ServedMap
-from splatbot.services.topics import FRAME, PLAN, RESULT, STATE, TRAJECTORY, JointState
+from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
 from splatbot.services.viewer.scene import MapScene, close_server, open_server
 from splatbot.services.viewer.splats import COLORINGS, Coloring
 from splatbot.slam import FrameResult
@@ -38,6 +39,7 @@ class _News:
     result: FrameResult | None = None
     trajectory: Trajectory | None = None
     plan: RobotTrajectory | None = None
+    grasps: GraspResult | None = None
     joints: JointState | None = None
     camera: Camera | None = None
 
@@ -139,6 +141,8 @@ class Viewer:
             self._news.trajectory = value
         elif kind == PLAN:
             self._news.plan = value
+        elif kind == GRASPS:
+            self._news.grasps = value
         elif kind == FRAME and isinstance(value, Frame):
             self._news.camera = value.camera
 
@@ -170,6 +174,8 @@ class Viewer:
             self._scene.show_plan(self._arm, news.plan)
             self._slider.disabled = False
             self._show_plan_at(self._slider.value)
+        if news.grasps is not None:
+            self._scene.show_grasps(news.grasps.grasps)
         if news.joints is not None and self._arm is not None and served is not None:
             self._scene.show_robot(self._arm, news.joints.position, served.field)
 

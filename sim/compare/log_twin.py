@@ -69,6 +69,7 @@ class LogComparison:
         }
         residuals = self.base.residuals
         found["base_residual_m"] = float(np.sqrt(np.mean(residuals[:, 0] ** 2))) if len(residuals) else None
+        found["base_median_m"] = float(np.median(residuals[:, 0])) if len(residuals) else None
         found["base_residual_rad"] = float(np.sqrt(np.mean(residuals[:, 1] ** 2))) if len(residuals) else None
         if self.replay is not None and self.replay.errors:
             away = np.array([(error.position_m, error.angle_rad) for error in self.replay.errors])
@@ -78,7 +79,11 @@ class LogComparison:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON takes it, images left out."""
-        base = {"T_world_base": self.base.T_world_base.tolist(), "source": self.base.source}
+        base = {
+            "T_world_base": self.base.T_world_base.tolist(),
+            "source": self.base.source,
+            "left_out": list(self.base.left_out),
+        }
         return without_nan(
             {
                 "kind": KIND,
@@ -209,7 +214,7 @@ def _told_base(place: Workspace, model: GaussianModel) -> BaseInMap:
         proposed = fit_workspace(model).T_world_base
         assert proposed is not None
         T, source = proposed, "proposed from the map: the log does not tell the arm's poses"
-    return BaseInMap(T, np.zeros((0, 2)), (), source)
+    return BaseInMap(T, np.zeros((0, 2)), (), (), source)
 
 
 def _stamps(log: Log, run: RunFolder) -> dict[int, float]:

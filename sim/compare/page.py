@@ -30,7 +30,7 @@ def log_rows(found: LogComparison) -> list[tuple[str, str]]:
     s = found.summary()
     rows = [
         ("camera poses", found.poses),
-        ("base in the map", found.base.source + _residual(s)),
+        ("base in the map", found.base.source + _residual(s, found.base.left_out)),
         ("support", "none within reach" if found.support is None else _support(*found.support)),
     ]
     for part, name in (("all", "frames"), ("held_out", "held-out frames")):
@@ -215,11 +215,15 @@ def _rings() -> str:
     )
 
 
-def _residual(summary: dict[str, float | None]) -> str:
-    away, turn = summary["base_residual_m"], summary["base_residual_rad"]
+def _residual(summary: dict[str, float | None], left_out: Sequence[int]) -> str:
+    away, turn, median = (summary[f"base_{name}"] for name in ("residual_m", "residual_rad", "median_m"))
     if away is None or turn is None:
         return ""
-    return f"; the arm's and the tracked camera differ by {metres(away)} and {np.degrees(turn):.2f} deg RMS"
+    without = f"; contradict each other in frames {', '.join(map(str, left_out))}" if left_out else ""
+    return (
+        f"; the arm's and the tracked camera differ by {metres(median)} (median), {metres(away)} and "
+        f"{np.degrees(turn):.2f} deg RMS{without}"
+    )
 
 
 def _support(height: float, error: float) -> str:

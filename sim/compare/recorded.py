@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from splatbot.errors import FormatError, InputError
-from splatbot.geometry import inverse, so3_log, transform_points
+from splatbot.geometry import inverse, so3_log
 from splatbot.logs.calibration import read_object
 from splatbot.logs.joints import JointRecord, find_joints
 from splatbot.protocols import Array
@@ -20,6 +20,8 @@ from splatbot.workspace import Workspace, find_workspace
 TOOL_POSES = "ee_poses.txt"
 _MOUNT = "ee_T_camera"
 _INTRINSICS = "intrinsics.json"
+_OUTLIER, _ALIKE = 3.0, np.array([1e-3, 2e-3])  # times the median gap; [m], [rad] that are never too much
+_ROUNDS = 4
 _NEAR = 0.01  # [s] that a pose's stamp may be off its frame's
 
 
@@ -102,17 +104,21 @@ class BaseInMap:
         residuals: (F, 2) by frame, of the camera's pose by the arm against that by tracking [m, rad]; empty where the
             base is not known by poses.
         frames: (F,) of the log.
+        left_out: of them, those whose two poses contradict each other, as after a tracking failure.
         source: how it is known, in words.
     """
 
     T_world_base: Array
     residuals: Array
     frames: tuple[int, ...]
+    left_out: tuple[int, ...]
     source: str
 
 
 def base_in_map(T_base_camera: Mapping[int, Array], T_world_camera: Mapping[int, Array], source: str) -> BaseInMap:
     """The base from one camera's poses in both frames: mean rotation (chordal L2; Hartley et al. 2013), mean place.
+
+    Frames that differ by more than three times the median from it are left out.
 
     Args:
         T_base_camera: (4, 4) by frame of the log, as the arm has it.
@@ -130,13 +136,24 @@ def base_in_map(T_base_camera: Mapping[int, Array], T_world_camera: Mapping[int,
             hint="give the run that mapped this log",
         )
     theirs, ours = (np.array([poses[i] for i in frames]) for poses in (T_base_camera, T_world_camera))
+    kept = np.ones(len(frames), np.bool_)
+    for _ in range(_ROUNDS):
+        T = _between(theirs[kept], ours[kept])
+        gaps = np.array([pose_gap(T @ a, b) for a, b in zip(theirs, ours, strict=True)])
+        limit = np.maximum(_OUTLIER * np.median(gaps, axis=0), _ALIKE)
+        again = (gaps <= limit).all(axis=1)
+        if (again == kept).all():
+            break
+        kept = again if again.any() else kept
+    return BaseInMap(T, gaps, tuple(frames), tuple(np.array(frames)[~kept].tolist()), source)
+
+
+def _between(theirs: Array, ours: Array) -> Array:
     U, _, Vt = np.linalg.svd((ours[:, :3, :3] @ theirs[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
     T = np.eye(4)
     T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     T[:3, 3] = (ours[:, :3, 3] - theirs[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
-    away = np.linalg.norm(transform_points(T, theirs[:, :3, 3]) - ours[:, :3, 3], axis=1)
-    turn = [pose_gap(T @ a, b)[1] for a, b in zip(theirs, ours, strict=True)]
-    return BaseInMap(T, np.stack([away, turn], axis=1), tuple(frames), source)
+    return T
 
 
 def pose_gap(a: Array, b: Array) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -97,19 +97,18 @@ def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, s
     found: dict[str, TrialResults] = {}
     stopped = False
     with threads(1):
-        for number in range(plan.tables):
-            seed = plan.seed + _TABLES * number
-            try:
+        try:
+            for number in range(plan.tables):
                 tell(f"filming and mapping table {number + 1} of {plan.tables}", 0.0)
-                place = map_table(plan, folder / f"map-{number}.ply", seed)
-            except KeyboardInterrupt:
-                stopped = True
-            for task in plan.tasks:
-                if not stopped:
-                    more = _reach(plan, place, tell) if task == "reach" else _push(plan, place, tell)
+                place = map_table(plan, folder / f"map-{number}.ply", plan.seed + _TABLES * number)
+                for task in plan.tasks:
+                    more = _TRY[task](plan, place, tell)
                     found[task] = join(found[task], more) if task in found else more
-                    stopped = more.interrupted
-    return tuple(found.values())
+                    if more.interrupted:
+                        raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            stopped = True
+    return tuple(replace(one, interrupted=stopped) for one in found.values())
 
 
 def map_table(plan: SimToSimPlan, file: Path, seed: int) -> MappedTable:
@@ -160,6 +159,9 @@ def _push(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
         cases.append(PushCase(match, f"thing{index}", direction, DISTANCE, place.seed + k))
     task = Push(cases, map_twin, lambda case: HeldOutTwin(true, draw(Spread(), case.seed)))
     return run_trials(task, push_policies(panda()), seed=plan.seed, tell=tell)
+
+
+_TRY = {"reach": _reach, "push": _push}
 
 
 def movable_truth(table: Tabletop) -> Scene:

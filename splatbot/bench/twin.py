@@ -15,7 +15,7 @@ import numpy as np
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
-from splatbot.bench.twin_bounds import FILMED, FORCED
+from splatbot.bench.twin_bounds import EXACT, FILMED, FORCED
 from splatbot.bench.twin_composite import exact_map, filmed_map
 from splatbot.bench.twin_paths import DEPTH, try_paths
 from splatbot.errors import NativeError
@@ -197,7 +197,7 @@ def _composites(results: Results, plan: TwinPlan) -> None:
     except NativeError as error:
         results.add("composite picture", "overlap", None, "", note=str(error))
         return
-    for case, found in (("composite picture, exact map", exact), (FILMED, filmed)):
+    for case, found in ((EXACT, exact), (FILMED, filmed)):
         results.add(case, "least overlap", float(found.overlap.min()), "", note="IoU of the robot's pixels")
         results.add(case, "median overlap", float(np.median(found.overlap)), "", note=f"{len(found.overlap)} poses")
         results.add(case, "farthest wrong pixel", float(found.astray.max()), "px", note="from the robot's outline")

@@ -57,6 +57,7 @@ def pick(
     """
     from splatbot.atomic import atomic_write
     from splatbot.errors import InputError
+    from splatbot.grasping.affordance import NameHint, find_target
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.pick import Picker, PickError, PickOptions
     from splatbot.grasping.sampler import GraspSampler
@@ -64,13 +65,14 @@ def pick(
     from splatbot.sim.scene import load_scene
     from splatbot.sim.twin import Twin
 
+    backends = _backends(vlm=vlm)
     twin = Twin(load_scene(scene))
     controller = TwinController(twin)
     robot = twin.world.robot
     if controller.gripper is None or robot is None:
         raise InputError("has no fingers.", field=scene, hint="give the scene a robot with a gripper, as panda")
     known = _known(twin, views, seed)
-    found = _target(target, known, vlm=vlm)
+    found = find_target(NameHint(target), known, backends)
     options = PickOptions(
         lift=lift,
         force=force,
@@ -105,16 +107,15 @@ def _known(twin: Twin, views: int, seed: int) -> MapScene:
     return segment(scan(twin, views=views, seed=seed), base_of(twin.scene), names=names)
 
 
-def _target(words: str, scene: MapScene, *, vlm: bool) -> Target:
-    from splatbot.grasping.affordance import NameHint, find_target
+def _backends(*, vlm: bool) -> list[Affordance]:
     from splatbot.grasping.words import WordAffordance
 
-    backends: list[Affordance] = [WordAffordance()]
-    if vlm:
-        from splatbot.grasping.vision import EndpointModel, VisionAffordance
+    rules = WordAffordance()
+    if not vlm:
+        return [rules]
+    from splatbot.grasping.vision import EndpointModel, VisionAffordance
 
-        backends.insert(0, VisionAffordance(EndpointModel.from_environment(), rules=WordAffordance()))
-    return find_target(NameHint(words), scene, backends)
+    return [VisionAffordance(EndpointModel.from_environment(), rules=rules), rules]
 
 
 def _heights(twin: Twin) -> dict[str, float]:

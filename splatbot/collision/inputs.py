@@ -9,6 +9,7 @@ from torch import Tensor
 from splatbot.errors import InputError
 
 LARGEST_RADIUS = 1e4  # [m]
+FARTHEST = 1e9  # [m or rad]; squares of what lies beyond, in units of a small Gaussian, overflow in float32
 
 
 def as_float64(values: ArrayLike | Tensor) -> NDArray[np.float64]:
@@ -20,7 +21,7 @@ def rows(values: ArrayLike | Tensor, name: str, width: int, meaning: str) -> NDA
     """``values`` as (P, width) finite float64, C-contiguous.
 
     Raises:
-        InputError: another shape, or a value that is not finite (the message names the row).
+        InputError: another shape, or a value that is not finite or beyond 1e9 (the message names the row).
     """
     array = as_float64(values)
     if array.ndim != 2 or array.shape[1] != width:
@@ -28,6 +29,9 @@ def rows(values: ArrayLike | Tensor, name: str, width: int, meaning: str) -> NDA
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
         raise InputError(f"row {int(np.argmax(bad))} is not finite.", field=name, hint=f"give finite {meaning}")
+    far = (np.abs(array) > FARTHEST).any(axis=1)
+    if far.any():
+        raise InputError(f"row {int(np.argmax(far))} is beyond {FARTHEST:g}.", field=name, hint=f"give {meaning}")
     return np.ascontiguousarray(array)
 
 

@@ -15,7 +15,7 @@ _IMPLIED = 0.1  # weight of implied points beside seen ones
 _LEAST = 3e-4  # [m] between two sides
 _LEAN = 0.25  # [rad] that closing directions are varied by
 _ROUNDS = 3
-_CHUNK = 256
+_CHUNK = 64
 
 Array32 = NDArray[np.float32]
 

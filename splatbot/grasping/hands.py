@@ -14,7 +14,7 @@ from splatbot.protocols import Array, HandShape
 FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
 SLACK = 0.003  # [m] between each pad and the target as the hand comes
 OPENINGS = 0.002  # [m] that openings are rounded up to
-_CHUNK, _SAMPLE = 256, 250  # hands at once; points for a first look
+_CHUNK, _SAMPLE = 32, 250  # hands at once; points for a first look
 _GIVE = 0.003  # [m] that implied sides are off by and do not stop a hand
 _TOUCH = 0.003  # [m] between a pad and what it presses
 _LOOK = 0.03  # [m] of room beyond which more is no better
@@ -89,12 +89,12 @@ def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: floa
     step = max(1, len(surface) // _SAMPLE)
     p = (surface.points[::step] - surface.center).astype(np.float32)
     free = np.ones(len(hands), np.bool_)
-    for k in range(0, len(hands), 4 * _CHUNK):
-        T = hands.T[k : k + 4 * _CHUNK]
+    for k in range(0, len(hands), 32 * _CHUNK):
+        T = hands.T[k : k + 32 * _CHUNK]
         axes, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - surface.center).astype(np.float32)
         x, y, z = (axes[:, :, i] @ p.T - np.einsum("ij,ij->i", axes[:, :, i], at)[:, None] for i in range(3))
         across = (np.abs(x) < hand.palm_size[0] / 2) & (np.abs(y) < hand.palm_size[1] / 2)
-        free[k : k + 4 * _CHUNK] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(axis=1)
+        free[k : k + 32 * _CHUNK] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(axis=1)
     return free
 
 

@@ -28,7 +28,7 @@ from splatbot.protocols import Array, RobotKinematics
 from splatbot.segmentation import MapScene
 
 _HANDS = 2000  # whose room beside the target is looked at
-_TRIED = 400  # hands whose room in the map is looked at
+_TRIED = 200  # hands whose room in the map is looked at
 _ASKED = 60  # of them that an arm is asked for
 _TOP, _LOWEST = np.cos(np.radians(40.0)), -0.26  # cosine between the approach and down: from the top; the least of all
 _LEVEL = 0.5  # of a side approach, at most

@@ -25,7 +25,8 @@ _SAME_SIDE = 0.7  # cosine below which a measured normal is that of another surf
 _LEAST_TURN = 0.1  # share of a new normal in the mean of all
 _GUESS = 0.05  # σ of a guessed depth [share of it]
 _DOUBT = 1.0  # odds of a Gaussian fall by e with each look through it
-_GONE = 3  # looks through it, net of support, after which it goes
+_STABLE_LOOKS, _STABLE_WIDTH = 3, 0.5  # support, and share of its width below which σ of its mean is, of a stable one
+_GONE, _GONE_UNSTABLE = 3, 2  # looks through it, net of support, after which a Gaussian goes
 
 
 @dataclass(frozen=True)
@@ -137,13 +138,20 @@ def fuse_normals(model: GaussianModel, evidence: Evidence) -> GaussianModel:
 def count(model: GaussianModel, evidence: Evidence) -> GaussianModel:
     """The model with the evidence counted: what is seen through is doubted, and its opacity taken back by as much.
 
-    A guess that is seen through was wrong.
+    A guess that is seen through was wrong, and one that is not :func:`stable` goes a look earlier.
     """
+    limit = torch.where(stable(model), _GONE, _GONE_UNSTABLE)
     supported, through = evidence.supported, evidence.seen_through
     misses = torch.where(supported, (model.misses - 1).clamp_min(0), model.misses + through.int())
     logits = model.opacity_logits - _DOUBT * through.float()
-    logits[(through & (model.observations == 0)) | (misses >= _GONE)] = -10.0
+    logits[(through & (model.observations == 0)) | (misses >= limit)] = -10.0
     return replace(model, observations=model.observations + supported.int(), misses=misses, opacity_logits=logits)
+
+
+def stable(model: GaussianModel) -> Tensor:
+    """Which Gaussians (N,) are well measured: supported thrice, the mean known to half the width of the disc."""
+    width = model.log_scales.median(1).values.exp()
+    return (model.observations >= _STABLE_LOOKS) & (model.uncertainty < _STABLE_WIDTH * width)
 
 
 def first_uncertainty(model: GaussianModel, T_world_camera: NDArray[np.float64], noise: DepthNoise) -> Tensor:

@@ -31,12 +31,19 @@ def test_two_thousand_generated_requests_meet_no_fault_and_errors_are_problems(a
     schemathesis = pytest.importorskip("schemathesis", reason="schemathesis is not installed")
     from hypothesis import HealthCheck, Phase, given, settings
 
-    schema = schemathesis.openapi.from_dict(api.client.get("/openapi.json").json())
+    document = api.client.get("/openapi.json").json()
+    del document["paths"]["/v1/maps/{map_id}/upload"]  # takes a zip alone, and has tests of its own
+    for item in document["paths"].values():
+        for operation in item.values():
+            content = operation.get("requestBody", {}).get("content", {})
+            for kind in set(content) - {"application/json"}:  # schemathesis writes neither npy nor msgpack
+                del content[kind]
+    schema = schemathesis.openapi.from_dict(document)
     operations = [operation.ok() for operation in schema.get_all_operations()]
     # Deleting the map that all are asked about would make the rest of them 404.
     operations = [o for o in operations if not (o.method.upper() == "DELETE" and "{map_id}" in o.path)]
     operations = [o for o in operations if not o.path.endswith("/events")]
-    each = -(-CASES // len(operations))
+    each = 3 * CASES // (2 * len(operations))  # calls without parameters are asked but once
     asked, statuses = 0, set()
     for operation in operations:
         quiet = settings(
@@ -66,5 +73,5 @@ def test_two_thousand_generated_requests_meet_no_fault_and_errors_are_problems(a
                 assert kinds.startswith("application/problem+json"), (case.path, response.status_code, response.text)
 
         ask()
-    assert asked >= 0.8 * CASES
+    assert asked >= CASES
     assert {200, 422} <= statuses

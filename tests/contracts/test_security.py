@@ -18,6 +18,9 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from splatbot.client import pack_array
 from splatbot.errors import ConfigError
@@ -79,6 +82,18 @@ def test_strangers_are_refused_everywhere_but_at_the_probes(locked: Service, hea
         assert response.headers["www-authenticate"] == "Bearer"
     assert locked.client.get("/healthz", headers=raw).status_code == 200
     assert locked.client.get("/readyz", headers=raw).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/rosbridge", "/foxglove", "/"])
+def test_websockets_of_strangers_are_refused_and_a_key_may_stand_in_their_url(locked: Service, path: str) -> None:
+    url = locked.url.replace("http://", "ws://") + path
+    for stranger in (url, f"{url}?api_key=spb_guess"):
+        with pytest.raises(InvalidStatus) as caught, connect(stranger):
+            pass
+        assert caught.value.response.status_code == 403
+    protocols = [Subprotocol("foxglove.sdk.v1")] if path == "/foxglove" else None
+    with connect(f"{url}?api_key={KEYS[0]}", subprotocols=protocols) as socket:
+        assert socket.protocol.state.name == "OPEN"
 
 
 def test_a_key_is_known_by_its_hash_alone_and_nothing_keeps_the_key() -> None:

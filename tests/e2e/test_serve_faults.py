@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from splatbot.gaussians import GaussianModel
-from tests.e2e.test_serve_cli import refused, serving
+from tests.e2e.test_serve_cli import serving
 
 LOG = "synthetic:tabletop?frames=300&width=160&height=120"
 
@@ -63,6 +63,7 @@ def test_a_restart_serves_the_last_saved_map_whatever_ended_the_service(
         assert [p.name for p in (tmp_path / "maps" / "desk").iterdir() if p.name.endswith(".tmp")] == []
 
 
+@pytest.mark.long
 def test_sigterm_ends_event_streams_and_jobs_within_the_time_allowed(tmp_path: Path) -> None:
     with serving("--data", str(tmp_path / "maps")) as (process, client):
         job = client.post("/v1/maps", json={"id": "desk", "log": LOG}).json()["id"]
@@ -74,7 +75,3 @@ def test_sigterm_ends_event_streams_and_jobs_within_the_time_allowed(tmp_path: P
                 pass
         assert process.wait(20) == 0
     assert (tmp_path / "maps" / "desk" / "current").is_file(), "what was mapped is saved"
-
-
-def test_a_service_for_others_does_not_start_without_a_key(tmp_path: Path) -> None:
-    assert "--new-key" in refused("--data", str(tmp_path), "--host", "0.0.0.0")

@@ -17,7 +17,7 @@ LOG = "synthetic:tabletop?frames=12&width=160&height=120"
 
 
 def test_a_camera_that_is_unplugged_leaves_its_map_odometry_and_a_recording_that_is_a_log(tmp_path: Path) -> None:
-    camera = f"replay:{LOG}&speed=0.5&unplug=9"
+    camera = f"replay:{LOG}&speed=0.1&unplug=9"
     options = "--record", str(tmp_path / "all.mcap"), "--ros-port", "0", "--viewer-port", "0"
     with serving("--camera", camera, *options) as (process, client):
         url = f"ws://127.0.0.1:{client.base_url.port}/rosbridge"

@@ -50,7 +50,7 @@ def test_what_is_too_wide_is_no_grasp_and_nothing_moves(run: RunCommand, scene: 
 
 def test_wrong_words_are_named(run: RunCommand, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SPLATBOT_VLM_URL", raising=False)
-    assert run("pick", scene, "--target", "zeppelin").code == 2
+    assert run("pick", scene, "--target", "zeppelin", "--views", 2).code == 2
     answer = run("pick", scene, "--target", "can", "--vlm")
     assert answer.code == 2
     assert "SPLATBOT_VLM_URL" in answer.err

@@ -196,6 +196,8 @@ def test_numpy_and_torch_of_any_float_type_and_order_give_the_same_answer() -> N
         ([0.0, 0.0, 0.0], r"points: is \(3,\)"),
         ([[0.0, 0, 0], [np.nan, 0, 0]], "points: row 1 is not finite"),
         ([[np.inf, 0, 0]], "points: row 0 is not finite"),
+        ([[0.0, 0, 0], [0, 0, -2e9]], "points: row 1 is beyond 1e"),
+        ([[1e300, 0, 0]], "points: row 0 is beyond 1e"),
     ],
 )
 def test_points_that_make_no_sense_are_named_instead_of_called_free(points: object, message: str) -> None:
@@ -241,3 +243,11 @@ def test_the_native_border_converts_nothing_silently() -> None:
         CollisionField(np.zeros((2, 3), np.float32), quats, means + 1, names, **options)
     with pytest.raises(ValueError, match="negative"):
         CollisionField(means, quats, means + 1, names - 1, **options)
+
+
+@pytest.mark.parametrize("far", [1e3, 1e6, 1e9])
+def test_a_point_as_far_away_as_may_be_asked_has_its_distance(far: float) -> None:
+    model = _model([[0.0, 0, 0]], [[0.01, 0.01, 0.01]])
+    found = GaussianCollisionField(model).mahalanobis([[far, 0, 0], [0, -far, 0]])
+    np.testing.assert_allclose(found.distance, far / 0.01, rtol=1e-5)
+    assert (found.index == 0).all()

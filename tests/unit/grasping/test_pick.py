@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
 from splatbot.collision import RobotSpheres
 from splatbot.errors import GripperError, InputError
+from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.held import covering_spheres
 from splatbot.grasping.options import GraspOptions
@@ -94,7 +96,7 @@ def test_in_the_twin_it_is_lifted_and_carried_and_stays_in_the_hand(name: str) -
     ]  # fmt: skip
     assert height(world, name) - before == pytest.approx(OPTIONS.lift, abs=0.01)
     assert {other: height(world, other) for other in others} == pytest.approx(others, abs=2e-3)
-    assert result.opening == pytest.approx(result.unwrap().width, abs=6e-3)
+    assert result.opening == pytest.approx(result.unwrap().width, abs=0.012)  # pads give way, most around a ball
     # What is attached is where the object is: planning takes it along from here.
     assert result.attached is not None
     assert result.q is not None
@@ -120,7 +122,7 @@ def test_what_is_held_is_carried_around_what_is_in_the_way() -> None:
     # Planning minds the object: a goal at which it alone would be in the table is refused.
     assert result.attached is not None
     longer = result.attached.copy()
-    longer[:, 2] += 0.5
+    longer[:, 2] += panda().tcp(panda().home)[2, 3]
     planner = GaussianRRTStar(sampler().field, panda(), attached=longer)
     assert planner.plan(panda().home, panda().home + 1e-3).path is None
 
@@ -247,16 +249,15 @@ def test_with_a_gripper_on_a_serial_port() -> None:
 
 
 def test_a_target_without_a_way_moves_nothing() -> None:
-    """A roof over everything: hands would fit under it, but no arm gets there from home."""
-    walls = (Block((0.30, 0.0, 0.30), (0.02, 1.6, 0.9)), Block((0.5, 0.0, 0.45), (0.5, 1.6, 0.02)))
-    closed = segment(Tabletop((TABLE, CAN, *walls)).gaussians(30_000), np.eye(4))
-    can = min(closed.objects, key=lambda o: float(np.linalg.norm(o.center - np.array(NAMES["can"]))))
+    """A wall between the arm and the table: hands would fit, but no arm gets there."""
+    wall = Tabletop((Block((0.35, 0.0, 0.6), (0.02, 2.0, 1.4)),)).gaussians(30_000)
+    plain = scene()
+    labels = np.concatenate([plain.labels, np.full(len(wall), -1, np.int32)])
+    closed = replace(plain, model=GaussianModel.concatenate([plain.model, wall]), labels=labels)
     gripper = FakeGripper(width=0.06)
     controller = FakeController(panda().home)
     at = controller.position
-    result = Picker(GraspSampler(closed, panda()), controller, gripper, options=OPTIONS).pick(
-        Target(can.rows, None, "can", "test", 1.0)
-    )
+    result = Picker(GraspSampler(closed, panda()), controller, gripper, options=OPTIONS).pick(target("can"))
     assert result.outcome in (PickOutcome.NO_GRASP, PickOutcome.NO_WAY)
     assert result.reason
     np.testing.assert_array_equal(controller.position, at)

@@ -11,7 +11,16 @@ import torch
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.geometry import inverse, quat_multiply, se3_exp, transform_points
-from splatbot.mapping.evidence import DepthNoise, Evidence, count, first_uncertainty, fuse_depth, fuse_normals, weigh
+from splatbot.mapping.evidence import (
+    DepthNoise,
+    Evidence,
+    count,
+    first_uncertainty,
+    fuse_depth,
+    fuse_normals,
+    stable,
+    weigh,
+)
 from splatbot.mapping.keyframes import Keyframe
 from tests.rgbd import CAMERA, Array
 from tests.unit.mapping.conftest import MakeKeyframe
@@ -175,6 +184,7 @@ def test_a_disc_of_another_surface_or_at_an_edge_is_not_turned(make_keyframe: Ma
 
 def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> None:
     model = flat(np.zeros((3, 3)), sigma=1e-3)
+    model.observations[:] = 3
     nothing = (torch.zeros(3), torch.full((3,), torch.inf), torch.zeros(3, 3), torch.zeros(3, 3))
     looks = [([0, 0, 1], [1, 1, 0])] * 2 + [([0, 1, 1], [1, 0, 0])]
     for supported, through in looks:
@@ -183,6 +193,24 @@ def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> N
     assert model.opacities[0] < 1e-3
     assert model.opacities[1] > 0.3
     assert model.opacities[2] == pytest.approx(0.8)
+
+
+def test_what_is_hardly_known_goes_a_look_earlier_than_what_is_stable() -> None:
+    model = flat(np.zeros((3, 3)), sigma=1e-3)
+    model.observations[:] = torch.tensor([3, 2, 3])
+    model.uncertainty[2] = 6e-3  # of a disc of 1 cm
+    assert stable(model).tolist() == [True, False, False]
+    away = Evidence(
+        torch.zeros(3) > 0,
+        torch.ones(3) > 0,
+        torch.zeros(3),
+        torch.full((3,), torch.inf),
+        torch.zeros(3, 3),
+        torch.zeros(3, 3),
+    )
+    once, twice = count(model, away), count(count(model, away), away)
+    assert (once.opacities > 0.5).all()
+    assert (twice.opacities > 0.1).tolist() == [True, False, False]
 
 
 def test_a_new_gaussian_is_as_uncertain_as_the_sensor_and_a_guess_far_more() -> None:

@@ -77,6 +77,17 @@ def test_the_base_is_where_both_cameras_agree(rng: np.random.Generator) -> None:
     assert off.residuals[:, 1] == pytest.approx(0.002, rel=0.3)
 
 
+def test_a_frame_that_was_tracked_wrong_does_not_move_the_base(rng: np.random.Generator) -> None:
+    arm = {i: se3_exp(rng.normal(size=6)) for i in range(20)}
+    tracked = {i: T_MAP_BASE @ T @ se3_exp(rng.normal(scale=5e-4, size=6)) for i, T in arm.items()}
+    sound = base_in_map(arm, tracked, "test")
+    assert sound.left_out == ()
+    wrong = base_in_map(arm, tracked | {7: tracked[7] @ se3_exp([0.09, 0, 0, 0, 0.08, 0])}, "test")
+    assert wrong.left_out == (7,)
+    assert pose_gap(wrong.T_world_base, sound.T_world_base)[0] < 5e-4
+    assert wrong.residuals[7, 0] == pytest.approx(0.09, rel=0.05)
+
+
 def test_without_a_common_frame_the_error_says_how_many_there_are() -> None:
     with pytest.raises(InputError, match=r"no frame in common .* \(1 tracked, 2 told\)"):
         base_in_map({0: np.eye(4), 1: np.eye(4)}, {7: np.eye(4)}, "test")

@@ -6,11 +6,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from splatbot.bench import sim2sim
 from splatbot.bench.sim2sim import middle_of, movable_truth, work_table
 from splatbot.bench.tabletop import Block, Can, Tabletop
 from splatbot.bench.twin_paths import truth_scene
@@ -264,3 +266,22 @@ def test_results_of_two_tables_are_those_of_one_task() -> None:
     assert agreed.policies[0].in_map.value == pytest.approx(2 / 3)
     with pytest.raises(InputError):
         join(a, TrialResults("t", ("q",), ()))
+
+
+def test_a_stop_while_a_table_is_mapped_keeps_the_tables_before_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole = run_trials(_Still((True, False)), [_Waits("a")])
+    mapped: list[int] = []
+
+    def map_one(plan: sim2sim.SimToSimPlan, file: Path, seed: int) -> None:
+        if len(mapped) == 2:
+            raise KeyboardInterrupt
+        mapped.append(seed)
+
+    monkeypatch.setattr(sim2sim, "map_table", map_one)
+    monkeypatch.setattr(sim2sim, "_TRY", {"reach": lambda plan, place, tell: whole})
+    (found,) = sim2sim.run_sim_to_sim(sim2sim.SimToSimPlan(("reach",), tables=5), tmp_path)
+    assert found.interrupted
+    assert found.cases == (0, 1, 2, 3)
+    assert len(set(mapped)) == 2

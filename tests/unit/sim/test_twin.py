@@ -84,7 +84,7 @@ def test_the_room_around_the_arm_is_the_distance_to_the_nearest_thing() -> None:
     at = middle - 0.15 * aside / np.linalg.norm(aside)
     ball = {"name": "ball", "shapes": [{"kind": "sphere", "radius": 0.03}], "at": at.tolist()}
     near = Twin(_scene(objects=[ball])).follow(hold(panda().home, 0.1)).near
-    assert near.room == pytest.approx(0.15 - 0.04 - 0.03, abs=2e-3)
+    assert near.room == pytest.approx(0.15 - hand.radius - 0.03, abs=2e-3)  # type: ignore[attr-defined]
     assert (near.part, near.other) == ("link7", "ball")
 
 

@@ -55,6 +55,14 @@ print(*found.overlap)
 print(*found.astray)
 """
 
+_FILMED = """
+from splatbot.bench.twin_composite import filmed_map
+found = filmed_map(6, 40, width=240)
+print(*found.overlap)
+print(*found.plain_db)
+print(*found.composite_db)
+"""
+
 _MOVED = """
 import sys, numpy as np
 from splatbot.gaussians import GaussianModel
@@ -181,6 +189,16 @@ def test_a_robot_among_gaussians_is_in_front_exactly_where_it_is_nearer() -> Non
     assert np.median(overlap) > 0.99
     assert overlap.min() > 0.98
     assert astray.max() < 4.0
+
+
+@pytest.mark.long
+def test_where_no_body_is_the_picture_is_as_good_as_the_maps_alone() -> None:
+    """A map of a noisy film, seen from where frames were taken that it was not given."""
+    overlap, plain, composite = (np.array(line.split(), float) for line in run_drawing(_FILMED))
+    assert len(overlap) == 6
+    assert overlap.min() > 0.98
+    assert plain.min() > 20.0
+    assert np.abs(plain - composite).max() < 0.1
 
 
 def test_the_gaussians_of_a_movable_object_move_with_it(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,8 @@ import pytest
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import rotation_to_quat
 from splatbot.services.ros.graph import RosGraph
-from splatbot.services.ros.grasping import GRASP_SERVICE, MARKERS, GraspServices
+from splatbot.services.ros.grasping import GRASP_SERVICE, GraspServices
+from splatbot.services.ros.outlets import GRASP_MARKERS, RosOutlets
 from splatbot.services.ros.wire import to_json
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
@@ -49,7 +52,7 @@ def _block_on_a_table() -> GaussianModel:
 
 
 @pytest.fixture(scope="module")
-def graph() -> RosGraph:
+def graph() -> Iterator[RosGraph]:
     graph, store = RosGraph(), MapStore()
     workspace = Workspace(
         T_world_base=np.eye(4),
@@ -59,7 +62,10 @@ def graph() -> RosGraph:
     snapshot = Snapshot(_block_on_a_table(), 1, 2.0)
     store.add("desk", source="a", state="static", snapshot=snapshot, workspace=workspace)
     GraspServices(graph, store)
-    return graph
+    outlets = RosOutlets(store.bus, graph)
+    outlets.start()
+    yield graph
+    outlets.stop()
 
 
 def _ask(graph: RosGraph, target: dict[str, Any]) -> dict[str, Any]:
@@ -83,7 +89,10 @@ def test_grasps_of_the_block_hold_it_from_both_sides_best_first(graph: RosGraph)
         assert sum(grasp["pre_grasp_posture"]["points"][0]["positions"]) >= closed
         assert grasp["grasp_pose"]["header"]["frame_id"] == "map"
         assert len(grasp["joint_state"]["position"]) == 7
-    told = graph.latched(MARKERS)
+    for _ in range(200):
+        if (told := graph.latched(GRASP_MARKERS)) is not None:
+            break
+        time.sleep(0.01)
     assert told is not None
     assert len(told.message.markers) == len(grasps)
 

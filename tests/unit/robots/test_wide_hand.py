@@ -1,0 +1,49 @@
+"""Hands as boxes, and the Panda's wide one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatbot.geometry import inverse, transform_points
+from splatbot.protocols import HasHand
+from splatbot.robots.cover import uncovered
+from splatbot.robots.panda import panda
+from splatbot.robots.robot import RobotModel
+from splatbot.robots.store import load_robot
+from splatbot.robots.wide_hand import panda_2f140
+
+
+def test_the_pandas_hand_is_as_published() -> None:
+    hand = panda().hand
+    assert hand is not None
+    assert hand.stroke == 0.08
+    assert hand.force == 70.0
+    assert hand.tip == pytest.approx(0.0088, abs=1e-4)
+    assert hand.palm == pytest.approx(0.1034 - 0.066, abs=5e-4)
+    assert hand.palm_size == pytest.approx((0.063, 0.204), abs=6e-3)
+
+
+def test_the_wide_hand_opens_by_140_mm_along_y_of_the_tool() -> None:
+    robot = load_robot("panda-2f140")
+    assert robot is panda_2f140()
+    assert isinstance(robot, HasHand)
+    assert robot.hand is not None
+    assert robot.hand.stroke == pytest.approx(0.14)
+    for opening in (0.0, 0.07, 0.14):
+        spheres = robot.spheres(opening)
+        own = spheres.link == 7
+        at = transform_points(inverse(robot.T_link_tcp), spheres.centers[own])
+        fingers = at[:, 2] > -0.05
+        gap = np.abs(at[fingers, 1]) - spheres.radii[own][fingers]
+        assert gap.min() == pytest.approx(opening / 2, abs=0.005)
+
+
+@pytest.mark.parametrize("robot", [panda(), panda_2f140()], ids=lambda robot: robot.name)
+def test_its_spheres_cover_its_shapes_and_home_is_free_of_itself(robot: RobotModel) -> None:
+    from splatbot.collision import RobotSpheres
+
+    links = robot.spheres(0.0)
+    assert uncovered(robot.shapes, links, 0.004) < 1e-6
+    assert not RobotSpheres(robot).check(None, robot.home[None]).in_collision[0]
+    assert len(robot.self_collision_pairs) >= 15
