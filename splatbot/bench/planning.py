@@ -72,7 +72,7 @@ class PlanningPlan:
     @classmethod
     def quick_plan(cls, *, peers: bool = False, say: Say = lambda text: None) -> PlanningPlan:
         """A run of seconds."""
-        return cls(5000, 3, 2, (3.0, 28.0), peers, (28.0,), (24, 160), 2, True, say)
+        return cls(5000, 3, 2, (28.0, 100.0), peers, (28.0,), (24, 160), 2, True, say)
 
 
 def run_planning(plan: PlanningPlan, out: Path) -> Results:
