@@ -50,7 +50,9 @@ def locked() -> Iterator[Service]:
 
 @pytest.fixture(scope="module")
 def open_() -> Iterator[Service]:
-    settings = ServiceSettings(max_upload_bytes=2_000_000, max_unpacked_bytes=3_000_000, max_body_bytes=300_000)
+    settings = ServiceSettings(
+        max_upload_bytes=2_000_000, max_unpacked_bytes=3_000_000, max_body_bytes=300_000, requests_per_s=1e6
+    )
     with running(settings, _store()) as service:
         yield service
 
