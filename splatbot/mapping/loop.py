@@ -105,6 +105,8 @@ class LoopCloser:
         self.anchor = keyframe.number
         if anchor is None:
             return
+        if self.correction is not None:  # it came after the loop, and moves with its neighbour
+            self.correction[keyframe.number] = self.correction[anchor.number]
         step = self._odometry(anchor, keyframe, view)
         self.graph.edges.append(step)
         T_chain = anchor.T_world_camera @ step.T_first_second

@@ -80,6 +80,22 @@ def test_a_worker_that_is_alone_makes_the_map_that_the_mapper_makes() -> None:
     assert torch.equal(worker.snapshot().model.opacity_logits, alone.snapshot().model.opacity_logits)
 
 
+def test_a_keyframe_that_comes_before_a_loop_is_closed_moves_with_its_neighbour(mapper: Mapper) -> None:
+    worker = MappingWorker(mapper)
+    for x in (0.0, 0.4):
+        insert(worker, at(x))
+    with worker.paused():
+        mapper.loops.correction = {0: np.eye(4), 1: at(0.1)}  # as a loop found by the thread leaves it
+    insert(worker, at(0.8))
+    with worker.paused():
+        moved = worker.close_loops()
+    np.testing.assert_allclose(moved[2], at(0.1))
+    placed = {k.number: k.T_world_camera[0, 3] for k in worker.keyframes}
+    assert placed == pytest.approx({0: 0.0, 1: 0.5, 2: 0.9})
+    assert not worker.has_loop
+    worker.close()
+
+
 def test_handing_over_does_not_wait_for_fusion(mapper: Mapper, monkeypatch: pytest.MonkeyPatch) -> None:
     gate = threading.Event()
     fuse = mapper.fuse
