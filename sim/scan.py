@@ -13,6 +13,7 @@ from splatbot.geometry import look_at, rotation_to_quat, transform_points
 from splatbot.protocols import Array
 from splatbot.sim.effects.registry import make_effects
 from splatbot.sim.motion import base_of
+from splatbot.sim.rays import cast, pixel_rays
 from splatbot.sim.twin import Twin
 from splatbot.tracking.prepare import normals_of
 
@@ -83,22 +84,14 @@ def _pose(middle: Array, k: int, views: int) -> Array:
 
 def _frame(twin: Twin, camera: Camera, T_world_camera: Array, index: int) -> Frame:
     """Depth along the optical axis and colours; the arm is 0 in both."""
-    model = twin.world.model
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    world = np.ascontiguousarray(
-        rays.reshape(-1, 3) @ T_world_camera[:3, :3].T
-    )  # 1 m along the axis: distance is depth
-    geoms, depth = np.full(len(world), -1, np.int32), np.zeros(len(world))
-    origin = np.ascontiguousarray(T_world_camera[:3, 3])
-    mujoco.mj_multiRay(model, twin.data, origin, world.ravel(), None, 1, -1, geoms, depth, None, len(world), _FARTHEST)
-    hit = (geoms >= 0) & (depth > 0) & (depth <= _FARTHEST) & ~twin.world.of_robot[geoms]
-    rgb = np.where(hit[:, None], 255.0 * np.asarray(model.geom_rgba)[geoms, :3], 0.0)
-    shape = (camera.height, camera.width)
+    world = twin.world
+    geoms, depth = cast(world.model, twin.data, pixel_rays(camera), T_world_camera, _FARTHEST)
+    hit = (depth > 0) & ~world.of_robot[geoms]
+    rgb = np.where(hit[..., None], 255.0 * np.asarray(world.model.geom_rgba)[geoms, :3], 0.0)
     return Frame(
         float(index),
-        rgb.reshape(*shape, 3).astype(np.uint8),
-        np.where(hit, depth, 0.0).reshape(shape).astype(np.float32),
+        rgb.astype(np.uint8),
+        np.where(hit, depth, 0.0).astype(np.float32),
         camera,
         index,
         source=f"scan of {twin.scene.name} #{index}",

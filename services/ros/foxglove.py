@@ -14,6 +14,7 @@ from splatbot.errors import InputError
 from splatbot.logs.ros_types import definition
 from splatbot.services.bus import Subscription
 from splatbot.services.ros.graph import RosGraph
+from splatbot.services.ros.requests import json_object
 from splatbot.services.ros.rosbridge.subscriptions import Send
 from splatbot.services.ros.wire import RosMessage
 
@@ -54,7 +55,7 @@ class FoxgloveSession:
     async def receive(self, text: str | bytes) -> None:
         """Do what a client's message asks; never raises for what it holds."""
         try:
-            self._do(self._parse(text))
+            self._do(json_object(text, self._most_bytes))
         except InputError as error:
             await self._status(_ERROR, str(error))
 
@@ -67,17 +68,6 @@ class FoxgloveSession:
             task.cancel()
             with suppress(asyncio.CancelledError, Exception):
                 await task
-
-    def _parse(self, text: str | bytes) -> dict[str, Any]:
-        if isinstance(text, bytes) or len(text) > self._most_bytes:
-            raise InputError("is binary, or too long.", field="message", hint="send JSON; nothing can be published")
-        try:
-            values = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise InputError("is no JSON.", field="message", hint='send {"op": ...}') from error
-        if not isinstance(values, dict):
-            raise InputError("is no JSON object.", field="message", hint='send {"op": ...}')
-        return values
 
     def _do(self, values: dict[str, Any]) -> None:
         if values.get("op") == "subscribe":

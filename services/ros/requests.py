@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,25 @@ from numpy.typing import NDArray
 from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat
 from splatbot.robots.robot import RobotModel
+
+
+def json_object(text: str | bytes, most_bytes: int) -> dict[str, Any]:
+    """A client's message as JSON.
+
+    Raises:
+        InputError: it is binary, too long, or no JSON object.
+    """
+    if isinstance(text, bytes):
+        raise InputError("is binary.", field="message", hint="send JSON as text")
+    if len(text) > most_bytes:
+        raise InputError(f"has more than {most_bytes} bytes.", field="message", hint="send less at once")
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError("is no JSON.", field="message", hint='send {"op": ...}') from error
+    if not isinstance(values, dict):
+        raise InputError("is no JSON object.", field="message", hint='send {"op": ...}')
+    return values
 
 
 def entry(args: Any, path: str) -> Any:

@@ -19,6 +19,7 @@ from splatbot.protocols import Array
 from splatbot.rasterize.views import colorize, render_view
 from splatbot.robots.robot import RobotModel
 from splatbot.segmentation import Support, find_support, given_support
+from splatbot.sim.rays import Pixels, cast, pixel_rays
 from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.solids import rpy_of
 from splatbot.sim.world import World, build_world
@@ -177,7 +178,8 @@ class TwinViews:
         sensor = np.where(used, np.nan_to_num(frame.depth, nan=0.0, posinf=0.0), np.float32(0)).astype(np.float32)
         rows, columns = _grid(frame.camera)
         coarse = np.ix_(rows, columns)
-        shapes = self._cast(frame.camera, T_base_camera, rows, columns)
+        rays = pixel_rays(frame.camera, rows, columns)
+        shapes = cast(self.world.model, self._data, rays, T_base_camera, _MISSED)[1].astype(np.float32)
         points = _points(sensor, frame.camera, T_base_camera)
         part = np.where(self._around.inside(points), sensor, np.float32(0))
         stands = self._around.stands(points) & (sensor > 0)
@@ -211,20 +213,6 @@ class TwinViews:
         )
         return found, seen
 
-    def _cast(
-        self, camera: Camera, T_base_camera: Array, rows: NDArray[np.int64], columns: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
-        """Depth (h, w) [m] of the shapes at those pixels, 0 where there are none."""
-        rays = _rays(camera, rows, columns).reshape(-1, 3)
-        world = np.ascontiguousarray(rays @ T_base_camera[:3, :3].T)  # of length 1 along the axis: distance is depth
-        geoms, depth = np.zeros(len(rays), np.int32), np.zeros(len(rays))
-        origin = np.ascontiguousarray(T_base_camera[:3, 3])
-        mujoco.mj_multiRay(
-            self.world.model, self._data, origin, world.ravel(), None, 1, -1, geoms, depth, None, len(rays), _MISSED
-        )
-        missed = (depth < 0) | (depth > _MISSED)
-        return np.where(missed, 0.0, depth).reshape(len(rows), len(columns)).astype(np.float32)
-
 
 def overlap(a: Mask, b: Mask, among: Mask) -> float | None:
     """Intersection over union of two masks among some pixels; None where both are empty."""
@@ -232,7 +220,7 @@ def overlap(a: Mask, b: Mask, among: Mask) -> float | None:
     return int((a & b & among).sum()) / union if union else None
 
 
-def _grid(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _grid(camera: Camera) -> tuple[Pixels, Pixels]:
     step = max(1, camera.width // _RAYS)
     return np.arange(step // 2, camera.height, step), np.arange(step // 2, camera.width, step)
 
@@ -241,19 +229,11 @@ def _points(
     depth: NDArray[np.float32],
     camera: Camera,
     T_base_camera: Array,
-    rows: NDArray[np.int64] | None = None,
-    columns: NDArray[np.int64] | None = None,
+    rows: Pixels | None = None,
+    columns: Pixels | None = None,
 ) -> Array:
     """What a depth image, of all pixels or of those, shows (h, w, 3), in the base's frame [m]."""
-    if rows is None or columns is None:
-        rows, columns = np.arange(camera.height), np.arange(camera.width)
-    return transform_points(T_base_camera, _rays(camera, rows, columns) * depth[..., None].astype(np.float64))
-
-
-def _rays(camera: Camera, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Array:
-    """Through pixels' centres (h, w, 3), 1 m along the optical axis."""
-    v, u = np.meshgrid(rows, columns, indexing="ij")
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    return transform_points(T_base_camera, pixel_rays(camera, rows, columns) * depth[..., None].astype(np.float64))
 
 
 def _reach(robot: RobotModel) -> tuple[Array, float]:

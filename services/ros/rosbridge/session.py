@@ -13,6 +13,7 @@ from typing import Any, cast
 from splatbot.errors import InputError, SplatbotError
 from splatbot.logs.ros_types import build, full_name
 from splatbot.services.ros.graph import Handler, RosGraph, Service, resolve
+from splatbot.services.ros.requests import json_object
 from splatbot.services.ros.rosbridge.packing import (
     Fragments,
     check_compression,
@@ -76,7 +77,7 @@ class RosbridgeSession:
         """Do what a client's message asks; never raises for what it holds."""
         operation: dict[str, Any] = {}
         try:
-            operation = self._parse(text)
+            operation = json_object(text, self._most_bytes)
             done = self._operation(operation.get("op"))(operation)
             if inspect.isawaitable(done):
                 await done
@@ -98,19 +99,6 @@ class RosbridgeSession:
                 answer.set_result({"result": False, "values": "its server has gone"})
         for call in list(self._calls):
             call.cancel()
-
-    def _parse(self, text: str | bytes) -> dict[str, Any]:
-        if isinstance(text, bytes):
-            raise InputError("is binary.", field="message", hint="send JSON as text")
-        if len(text) > self._most_bytes:
-            raise InputError(f"has more than {self._most_bytes} bytes.", field="message", hint="send less at once")
-        try:
-            values = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise InputError("is no JSON.", field="message", hint='send {"op": ...}') from error
-        if not isinstance(values, dict):
-            raise InputError("is no JSON object.", field="message", hint='send {"op": ...}')
-        return values
 
     def _operation(self, name: Any) -> Callable[[dict[str, Any]], Awaitable[None] | None]:
         if not isinstance(name, str) or name not in self._operations:
