@@ -10,7 +10,7 @@ import tyro
 
 if TYPE_CHECKING:
     from splatbot.grasping.affordance import Affordance, Target
-    from splatbot.grasping.pick import PickResult
+    from splatbot.grasping.pick_types import PickResult
     from splatbot.segmentation import MapScene
     from splatbot.sim.twin import Twin
 
@@ -59,7 +59,8 @@ def pick(
     from splatbot.errors import InputError
     from splatbot.grasping.affordance import NameHint, find_target
     from splatbot.grasping.options import GraspOptions
-    from splatbot.grasping.pick import Picker, PickError, PickOptions
+    from splatbot.grasping.pick import Picker
+    from splatbot.grasping.pick_types import PickError, PickOptions
     from splatbot.grasping.sampler import GraspSampler
     from splatbot.sim.controller import TwinController
     from splatbot.sim.scene import load_scene

@@ -17,7 +17,8 @@ from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.held import covering_spheres
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.pick import Picker, PickError, PickOptions, PickOutcome, PickResult, PickStage
+from splatbot.grasping.pick import Picker
+from splatbot.grasping.pick_types import PickError, PickOptions, PickOutcome, PickResult, PickStage
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
 from splatbot.planning import GaussianRRTStar
