@@ -6,19 +6,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import mujoco
 import numpy as np
 
+from splatbot.collision import GaussianCollisionField
+from splatbot.collision.solids import SolidGate
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_to_rotation
 from splatbot.protocols import Array
 from splatbot.segmentation import Fit, Support, clusters, find_support, fit, given_support
-from splatbot.sim.maps.ellipsoids import Ellipsoids, merge
+from splatbot.sim.maps.ellipsoids import Ellipsoids, merge, surface_points
 from splatbot.sim.scene import Clutter, Scene, SceneObject
-from splatbot.sim.solids import rotation_of
+from splatbot.sim.solids import rotation_of, rpy_of
 
-_OPAQUE = 0.3  # fainter Gaussians are no surface
+_SOLID = SolidGate(min_opacity=0.3)  # fainter Gaussians, and those that no depth supports, are no surface
+_TABLE = 0.02  # [m] thick; what is below its top was hardly seen
+_RIM = 0.5  # [%] of the table's Gaussians that may lie beyond its edge on each side
 _ABOVE = 0.008  # [m] over the table: lower is the table's own noise
 _BESIDE = 0.03  # [m] from a thing that may move: what is left of the map there is of the thing
 _FEWEST, _LARGEST = 40, 0.35  # Gaussians of an object; [m] across
@@ -56,11 +61,10 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     """
     R, t = rotation_of(clutter.rpy), np.asarray(clutter.at)
     means = model.means.detach().numpy().astype(np.float64) @ R.T + t
-    solid = model.opacities.detach().numpy() >= _OPAQUE
-    used = np.flatnonzero(solid & ((means >= clutter.low) & (means <= clutter.high)).all(axis=1))
+    used = np.flatnonzero(_SOLID.solid(model) & ((means >= clutter.low) & (means <= clutter.high)).all(axis=1))
     if not len(used):
         raise InputError(
-            f"{clutter.file}: none of {len(means)} Gaussians is between {clutter.low} and {clutter.high}.",
+            f"{clutter.file}: none of {len(means)} Gaussians is solid and between {clutter.low} and {clutter.high}.",
             field="map",
             hint="name another part by low and high, or place the map by at and rpy",
         )
@@ -71,7 +75,7 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     support = find_support(points) if clutter.support is None else _given(points, clutter.support)
     if support is not None:
         labels[used[support.inside]] = 0
-        objects.append(_table(support))
+        objects.append(_table(support, points))
         notes.append(f"table: {int(support.inside.sum())} Gaussians, RMS {1e3 * support.error:.1f} mm from the plane")
         if clutter.objects:
             _add_objects(points, used, support, clutter, labels, objects, notes)
@@ -80,9 +84,11 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     M = R @ quat_to_rotation(quats) * scales[:, None, :] if len(left) else np.zeros((0, 3, 3))
     weights = np.sort(scales, axis=1)[:, 1:].prod(axis=1) if len(left) else np.zeros(0)
     rest = merge(means[left], M @ M.transpose(0, 2, 1), weights, base, clutter.ellipsoids)
+    beyond = 1e3 * np.percentile(_beyond(rest, model, R, t), [50, 95])
     notes.append(
         f"clutter: {len(left)} Gaussians as {len(rest.centers)} ellipsoids, "
-        f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm)"
+        f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm), which reach "
+        f"{beyond[0]:.1f} mm beyond the field (95 %: {beyond[1]:.1f} mm)"
     )
     return MapParts(model, tuple(objects), rest, tuple(notes), labels)
 
@@ -109,6 +115,16 @@ def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
     return geoms
 
 
+def _beyond(ellipsoids: Ellipsoids, model: GaussianModel, R: Array, t: Array) -> Array:
+    """How far (E,) the ellipsoids reach out of what collisions are asked of [m]: a path past them may touch."""
+    if not len(ellipsoids.centers):
+        return np.zeros(1)
+    points = surface_points(ellipsoids)
+    field = GaussianCollisionField(model, min_opacity=_SOLID.min_opacity)
+    room = field.clearance((points.reshape(-1, 3) - t) @ R).distance.reshape(points.shape[:2])
+    return np.maximum(room.max(axis=1), 0.0)
+
+
 def _given(points: Array, plane: tuple[float, float, float, float]) -> Support:
     length = float(np.linalg.norm(plane[:3]))
     if length < 1e-6 or plane[2] <= 0:
@@ -116,12 +132,25 @@ def _given(points: Array, plane: tuple[float, float, float, float]) -> Support:
     return given_support(points, np.array(plane[:3]) / length, -plane[3] / length)
 
 
-def _table(support: Support) -> SceneObject:
+def _table(support: Support, points: Array) -> SceneObject:
+    """As far as it was seen: an endless plane would stand in the way of an arm that reaches past the table's edge."""
     n = support.normal
-    roll, pitch = float(np.arctan2(-n[1], n[2])), float(np.arcsin(np.clip(n[0], -1, 1)))
-    at = n * support.offset
-    values = {"name": "map-table", "shapes": [{"kind": "plane"}], "at": at.tolist(), "rpy": [roll, pitch, 0.0]}
-    return SceneObject.model_validate(values)
+    along = np.cross([0.0, 1.0, 0.0], n)
+    along /= np.linalg.norm(along)
+    flat = np.stack([along, np.cross(n, along)], axis=1)
+    seen = points[support.inside] @ flat
+    if len(seen) < _FEWEST:
+        roll, pitch = float(np.arctan2(-n[1], n[2])), float(np.arcsin(np.clip(n[0], -1, 1)))
+        values = {"shapes": [{"kind": "plane"}], "at": (n * support.offset).tolist(), "rpy": [roll, pitch, 0.0]}
+        return SceneObject.model_validate({"name": "map-table", **values})
+    yaw = float(np.radians(cv2.minAreaRect(seen.astype(np.float32))[2]))
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    low, high = np.percentile(seen @ turn, [_RIM, 100 - _RIM], axis=0)
+    axes = flat @ turn
+    at = axes @ ((low + high) / 2) + n * (support.offset - _TABLE / 2)
+    shape = {"kind": "box", "size": [*np.maximum(high - low, _TABLE).tolist(), _TABLE]}
+    rpy = rpy_of(np.c_[axes, n])
+    return SceneObject.model_validate({"name": "map-table", "shapes": [shape], "at": at.tolist(), "rpy": rpy})
 
 
 def _add_objects(

@@ -10,7 +10,9 @@ import numpy as np
 
 from splatbot.protocols import Array
 
-_PLAIN = 1.3  # a hull is taken only where every primitive's error is this many times larger
+# A hull follows the noise of its points, and has no side that nobody saw: it is taken only where every primitive's
+# error is larger than _PLAIN times the hull's, and by more than noise [m].
+_PLAIN, _NOISE = 1.3, 3e-3
 _FOOT = 0.3  # of a hull's height whose points stand on the floor
 _TRIM = 1.0  # [%] of the points that may stick out of a box or cylinder on each side
 
@@ -39,7 +41,7 @@ def fit(points: Array, floor: float) -> Fit:
     """
     best = min(primitive_fits(points, floor), key=lambda f: f.error)
     hull = _hull(points, *_heights(points, floor))
-    return hull if best.error > _PLAIN * max(hull.error, 2e-3) else best
+    return hull if best.error > _PLAIN * hull.error + _NOISE else best
 
 
 def primitive_fits(points: Array, floor: float) -> list[Fit]:
