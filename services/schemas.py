@@ -21,6 +21,10 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+BASE_EXAMPLE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
+"""A robot's base in a map whose world is a level camera: z up, below it."""
+
+
 class Pose(Request):
     """A rigid transform."""
 
@@ -230,7 +234,9 @@ class TrajectoryRequest(Request):
 class TrialsRequest(Request):
     """Trials in the twin."""
 
-    scene: str = Field("empty", description="a shipped scene")
+    scene: str | None = Field(None, description="a shipped scene; default: empty")
+    map: str | None = Field(None, description="instead: a map of this service, as the shapes that physics takes it for")
+    base: Pose | None = Field(None, description="T_world_base in the map; default: the map's own")
     plan: str | None = Field(None, description="id of a plan to follow; default: the scene's own moves")
     trials: Annotated[int, Field(ge=1, le=100)] = 1
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of the first trial; 0 displaces nothing")

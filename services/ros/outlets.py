@@ -88,7 +88,7 @@ class RosOutlets:
         }
         for topic, kind in TYPES.items():
             graph.advertise(topic, kind)
-        self._news = bus.subscribe("maps/*", "robot/*/joints", capacity=_WAITING)
+        self._news = bus.subscribe("maps/*", "robot/*/joints", "arms/*/joints", capacity=_WAITING)
         self._thread = threading.Thread(target=self._run, name="ros-outlets", daemon=True)
         self._rosout = _RosoutHandler(graph)
 
@@ -107,10 +107,11 @@ class RosOutlets:
     def _run(self) -> None:
         for news in self._news:
             try:
+                group, map_id, kind = news.topic.split("/", 2)
                 if isinstance(news.value, JointState):
-                    self._graph.publish(JOINTS, joints_message(news.value))
+                    own = f"/{map_id}" if group == "arms" else ""
+                    self._graph.publish(own + JOINTS, joints_message(news.value))
                     continue
-                _, map_id, kind = news.topic.split("/", 2)
                 if kind in self._convert:
                     self._convert[kind](self._prefix(map_id), news.value)
             except Exception:  # one odd message must not silence the others

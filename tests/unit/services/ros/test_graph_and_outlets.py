@@ -32,7 +32,7 @@ from splatbot.services.ros.messages import (
 )
 from splatbot.services.ros.outlets import FROM_ROS, ODOMETRY, POINTS, ROSOUT, TF, RosOutlets
 from splatbot.services.store import MapStore
-from splatbot.services.topics import FRAME, RESULT, JointState, map_topic, robot_topic
+from splatbot.services.topics import FRAME, RESULT, JointState, arm_topic, map_topic, robot_topic
 from splatbot.slam import FrameResult
 from tests.conftest import MakeLog
 
@@ -120,6 +120,17 @@ def test_a_second_map_has_names_of_its_own(told: tuple[MapStore, RosGraph], rng:
     for name in ("default", "desk-2"):
         store.add(name, source="a", state="static", snapshot=Snapshot(_model(rng), 1))
     assert _until(lambda: graph.latched("/maps/desk_2/map/points")) is not None
+
+
+def test_joints_of_an_arm_have_a_topic_of_their_own_beside_the_robot_s(told: tuple[MapStore, RosGraph]) -> None:
+    store, graph = told
+    reader = graph.subscribe("/twin/joint_states", "/joint_states", capacity=4)
+    for topic, value in ((arm_topic("twin", "joints"), 0.5), (robot_topic("panda", "joints"), 0.25)):
+        store.bus.publish(topic, JointState(1.0, ("a",), np.array([value])))
+    news = [reader.get(5), reader.get(5)]
+    assert all(one is not None for one in news)
+    got = {one.topic: one.value.message.position.tolist() for one in news if one is not None}
+    assert got == {"/twin/joint_states": [0.5], "/joint_states": [0.25]}
 
 
 def test_warnings_come_out_on_rosout(told: tuple[MapStore, RosGraph]) -> None:
