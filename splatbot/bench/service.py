@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
+from splatbot.bench.service_clients import Asked, Questions, asking
 from splatbot.bench.timing import measure
-from splatbot.client import Client, ServiceError
+from splatbot.client import Client
 from splatbot.collision import GaussianCollisionField
 from splatbot.formats import load_gaussians
 from splatbot.frame import Frame
 from splatbot.logs import open_log
-from splatbot.serving import serving
+from splatbot.serving import Serving, serving
 
 _MAP = "live"
 
@@ -48,27 +49,12 @@ class ServicePlan:
     say: Callable[[str], None] = lambda text: None
 
 
-@dataclass
-class _Tally:
-    """What came back: latencies [s] counted from when each was due, and errors."""
-
-    seconds: list[float] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def add(self, seconds: float, error: str | None) -> None:
-        with self.lock:
-            if error is None:
-                self.seconds.append(seconds)
-            else:
-                self.errors.append(error)
-
-
 def run_service_bench(plan: ServicePlan, folder: Path) -> Results:
     """Measure, and write service.json and service.csv into ``folder``.
 
     Questions are asked at fixed times whatever the answers take (open loop), so that a slow answer delays no other
-    question and its delay is counted. The frames come from a client, as a robot's would.
+    question and its delay is counted. The frames come from a client, as a robot's would; those who ask are a process of
+    their own, of the lowest priority: on a robot they are other machines.
     """
     folder.mkdir(parents=True, exist_ok=True)
     results = Results(describe_machine((1,), peak_ms=20.0))
@@ -83,9 +69,10 @@ def run_service_bench(plan: ServicePlan, folder: Path) -> Results:
         stamps = _Stamps(frames, plan.rate)
         _push(client, stamps, 2.0)  # there must be a map to ask about
         before = _resident(service.process)
-        for name, clients in (("no questions", 0), (f"{plan.clients} clients x {plan.per_s:g}/s", plan.clients)):
-            plan.say(f"{name}, {plan.seconds:g} s")
-            _measure_case(results, service.url, client, stamps, plan, name, clients)
+        plan.say(f"no questions, {plan.seconds:g} s")
+        alone = _measure_mapping(results, service, client, stamps, plan, "no questions")
+        plan.say(f"questions, {plan.seconds:g} s")
+        _measure_questions(results, service, client, stamps, plan, alone)
         results.add("service", "memory before", before, "MiB")
         results.add("service", "memory after", _resident(service.process), "MiB")
         client.end(_MAP)
@@ -111,57 +98,77 @@ class _Stamps:
         return replace(frame, stamp=self._number * self.period)
 
 
-def _push(client: Client, frames: _Stamps, seconds: float) -> tuple[list[float], int]:
-    """Milliseconds of each frame's push, and how many were dropped because the one before was not done."""
-    begin, ms, dropped = time.perf_counter(), [], 0
+@dataclass(frozen=True)
+class _Pushed:
+    """What frames took [ms]: the mapper for each, and from pushing it to the answer; and how many were dropped."""
+
+    mapper: list[float]
+    answered: list[float]
+    dropped: int
+
+
+def _push(client: Client, frames: _Stamps, seconds: float) -> _Pushed:
+    """A frame each period; those are dropped that are due while the one before is not done."""
+    begin, mapper, answered, dropped = time.perf_counter(), [], [], 0
     due = begin
     while due < begin + seconds:
         time.sleep(max(0.0, due - time.perf_counter()))
         start = time.perf_counter()
-        client.push(_MAP, frames.next())
-        ms.append(1e3 * (time.perf_counter() - start))
+        placed = client.push(_MAP, frames.next())
+        answered.append(1e3 * (time.perf_counter() - start))
+        mapper.append(sum(placed.stage_ms.values()))
         due += frames.period
         while due < time.perf_counter():  # a camera does not wait
             due += frames.period
             dropped += 1
-    return ms, dropped
+    return _Pushed(mapper, answered, dropped)
 
 
-def _measure_case(
-    results: Results, url: str, client: Client, frames: _Stamps, plan: ServicePlan, name: str, clients: int
+@dataclass(frozen=True)
+class _Cost:
+    """Of mapping for a while: 95 % of the frames took the mapper ``p95`` [ms] or less; the service ran ``cpu`` [s]."""
+
+    p95: float
+    cpu: float | None
+
+
+def _measure_mapping(
+    results: Results, service: Serving, client: Client, frames: _Stamps, plan: ServicePlan, case: str
+) -> _Cost:
+    before = _cpu_seconds(service.process)
+    pushed = _push(client, frames, plan.seconds)
+    after = _cpu_seconds(service.process)
+    results.add(case, "frames", len(pushed.mapper), "")
+    results.add(case, "dropped", pushed.dropped, "")
+    for share in (50, 95):
+        results.add(case, f"frame p{share}", float(np.percentile(pushed.mapper, share)), "ms")
+        results.add(case, f"pushed and answered p{share}", float(np.percentile(pushed.answered, share)), "ms")
+    cpu = None if before is None or after is None else after - before
+    results.add(case, "service's processors", None if cpu is None else cpu / plan.seconds, "cores")
+    return _Cost(float(np.percentile(pushed.mapper, 95)), cpu)
+
+
+def _measure_questions(
+    results: Results, service: Serving, client: Client, frames: _Stamps, plan: ServicePlan, alone: _Cost
 ) -> None:
-    tally, end = _Tally(), time.perf_counter() + plan.seconds
-    askers = [threading.Thread(target=_ask, args=(url, plan, tally, i, end)) for i in range(clients)]
-    for asker in askers:
-        asker.start()
-    ms, dropped = _push(client, frames, plan.seconds)
-    for asker in askers:
-        asker.join()
-    results.add(name, "frames", len(ms), "")
-    results.add(name, "frame p50", float(np.percentile(ms, 50)), "ms")
-    results.add(name, "frame p95", float(np.percentile(ms, 95)), "ms")
-    results.add(name, "dropped", dropped, "")
-    if clients:
-        waits = 1e3 * np.array(tally.seconds or [np.nan])
-        results.add(name, "questions", len(tally.seconds), "")
-        results.add(name, "errors", len(tally.errors), "", note=tally.errors[0] if tally.errors else None)
-        for share in (50, 95, 99, 100):
-            results.add(name, f"answer p{share}", float(np.percentile(waits, share)), "ms")
+    case = f"{plan.clients} clients x {plan.per_s:g}/s"
+    with asking(Questions(service.url, _MAP, plan.clients, plan.per_s, plan.points, plan.seconds)) as clients:
+        cost = _measure_mapping(results, service, client, frames, plan, case)
+        asked = clients.result()
+    results.add(case, "frame p95 grows by", 100 * (cost.p95 / alone.p95 - 1), "%")
+    _add_answers(results, case, asked)
+    results.add(case, "clients' processors", asked.cpu_s / plan.seconds, "cores")
+    if cost.cpu is not None and alone.cpu is not None:
+        each = 1e3 * (cost.cpu - alone.cpu) / max(1, len(asked.seconds))
+        results.add(case, "service's processors for an answer", each, "ms")
 
 
-def _ask(url: str, plan: ServicePlan, tally: _Tally, number: int, end: float) -> None:
-    rng = np.random.default_rng(number)
-    points = rng.uniform((-0.5, -0.5, 0.2), (0.5, 0.5, 1.5), (plan.points, 3))
-    due = time.perf_counter() + rng.uniform(0, 1 / plan.per_s)
-    with Client(url, retries=0, timeout_s=30) as client:
-        while due < end:
-            time.sleep(max(0.0, due - time.perf_counter()))
-            try:
-                client.distance(_MAP, points)
-                tally.add(time.perf_counter() - due, None)
-            except ServiceError as error:
-                tally.add(0.0, str(error))
-            due += 1 / plan.per_s
+def _add_answers(results: Results, case: str, asked: Asked) -> None:
+    waits = 1e3 * np.array(asked.seconds or [np.nan])
+    results.add(case, "questions", len(asked.seconds), "")
+    results.add(case, "errors", len(asked.errors), "", note=asked.errors[0] if asked.errors else None)
+    for share in (50, 95, 99, 100):
+        results.add(case, f"answer p{share}", float(np.percentile(waits, share)), "ms")
 
 
 def _measure_one(results: Results, client: Client, plan: ServicePlan) -> None:
@@ -191,3 +198,13 @@ def _resident(process: subprocess.Popen[str]) -> float | None:
     except OSError:
         return None
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS")), None)
+
+
+def _cpu_seconds(process: subprocess.Popen[str]) -> float | None:
+    """Processor time of a process so far [s]; None where the system does not tell."""
+    try:
+        told = Path(f"/proc/{process.pid}/stat").read_text()
+    except OSError:
+        return None
+    user, system = told.rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
