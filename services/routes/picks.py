@@ -40,8 +40,8 @@ def pick(
     """Pick a thing in the physics of a scene: scan it, find grasps, plan, approach, close, lift, check.
 
     The whole way is certified before the arm moves. A pick that ends otherwise than "picked" is a result, not a failure
-    of the job; cancelling stops the arm. `progress` grows by the stages: grasp, plan, open, move, approach, close, lift,
-    check and, with `home`, carry.
+    of the job; cancelling stops the arm. `progress` grows by the stages: grasp, plan, open, move, approach, close,
+    lift, check and, with `home`, carry.
     """
     if asked.scene not in scene_names():
         raise InputError(f"is {asked.scene[:80]!r}.", field="scene", hint=f"scenes: {', '.join(scene_names())}")
