@@ -7,7 +7,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from splatbot.logs import open_log
 from splatbot.serving import Serving, serving
 
 _MAP = "live"
+_TURNS = 2
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,10 @@ def run_service_bench(plan: ServicePlan, folder: Path) -> Results:
     ):
         client.create_map(_MAP)
         stamps = _Stamps(frames, plan.rate)
-        _push(client, stamps, 2.0)  # there must be a map to ask about
+        plan.say("mapping all that is to be seen")
+        _push(service, client, stamps, min(2 * (len(frames) - 1) / plan.rate, plan.seconds))
         before = _resident(service.process)
-        plan.say(f"no questions, {plan.seconds:g} s")
-        alone = _measure_mapping(results, service, client, stamps, plan, "no questions")
-        plan.say(f"questions, {plan.seconds:g} s")
-        _measure_questions(results, service, client, stamps, plan, alone)
+        _measure_mapping(results, service, client, stamps, plan)
         results.add("service", "memory before", before, "MiB")
         results.add("service", "memory after", _resident(service.process), "MiB")
         client.end(_MAP)
@@ -98,69 +97,73 @@ class _Stamps:
         return replace(frame, stamp=self._number * self.period)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Pushed:
-    """What frames took [ms]: the mapper for each, and from pushing it to the answer; and how many were dropped."""
+    """What frames took [ms]: the mapper for each, and from pushing it to the answer; how many were dropped; and the
+    service's processor time meanwhile [s], None where the system does not tell.
+    """
 
-    mapper: list[float]
-    answered: list[float]
-    dropped: int
+    mapper: list[float] = field(default_factory=list)
+    answered: list[float] = field(default_factory=list)
+    dropped: int = 0
+    cpu_s: float | None = 0.0
+
+    def add(self, more: _Pushed) -> None:
+        self.mapper += more.mapper
+        self.answered += more.answered
+        self.dropped += more.dropped
+        self.cpu_s = None if self.cpu_s is None or more.cpu_s is None else self.cpu_s + more.cpu_s
 
 
-def _push(client: Client, frames: _Stamps, seconds: float) -> _Pushed:
+def _push(service: Serving, client: Client, frames: _Stamps, seconds: float) -> _Pushed:
     """A frame each period; those are dropped that are due while the one before is not done."""
-    begin, mapper, answered, dropped = time.perf_counter(), [], [], 0
-    due = begin
+    found, before = _Pushed(), _cpu_seconds(service.process)
+    due = begin = time.perf_counter()
     while due < begin + seconds:
         time.sleep(max(0.0, due - time.perf_counter()))
         start = time.perf_counter()
         placed = client.push(_MAP, frames.next())
-        answered.append(1e3 * (time.perf_counter() - start))
-        mapper.append(sum(placed.stage_ms.values()))
+        found.answered.append(1e3 * (time.perf_counter() - start))
+        found.mapper.append(sum(placed.stage_ms.values()))
         due += frames.period
         while due < time.perf_counter():  # a camera does not wait
             due += frames.period
-            dropped += 1
-    return _Pushed(mapper, answered, dropped)
-
-
-@dataclass(frozen=True)
-class _Cost:
-    """Of mapping for a while: 95 % of the frames took the mapper ``p95`` [ms] or less; the service ran ``cpu`` [s]."""
-
-    p95: float
-    cpu: float | None
-
-
-def _measure_mapping(
-    results: Results, service: Serving, client: Client, frames: _Stamps, plan: ServicePlan, case: str
-) -> _Cost:
-    before = _cpu_seconds(service.process)
-    pushed = _push(client, frames, plan.seconds)
+            found.dropped += 1
     after = _cpu_seconds(service.process)
+    found.cpu_s = None if before is None or after is None else after - before
+    return found
+
+
+def _measure_mapping(results: Results, service: Serving, client: Client, frames: _Stamps, plan: ServicePlan) -> None:
+    """Without questions and with them by turns: a map grows, and a machine is not as quick at all times."""
+    alone, asked_at = _Pushed(), _Pushed()
+    asked = Asked([], [], 0.0)
+    part = plan.seconds / _TURNS
+    for turn in range(_TURNS):
+        plan.say(f"no questions, then questions, {part:g} s each ({turn + 1} of {_TURNS})")
+        alone.add(_push(service, client, frames, part))
+        with asking(Questions(service.url, _MAP, plan.clients, plan.per_s, plan.points, part)) as clients:
+            asked_at.add(_push(service, client, frames, part))
+            asked = asked.and_then(clients.result())
+    case = f"{plan.clients} clients x {plan.per_s:g}/s"
+    for name, pushed in (("no questions", alone), (case, asked_at)):
+        _add_frames(results, name, pushed, plan.seconds)
+    growth = float(np.percentile(asked_at.mapper, 95) / np.percentile(alone.mapper, 95)) - 1
+    results.add(case, "frame p95 grows by", 100 * growth, "%")
+    _add_answers(results, case, asked)
+    results.add(case, "clients' processors", asked.cpu_s / plan.seconds, "cores")
+    if asked_at.cpu_s is not None and alone.cpu_s is not None:
+        each = 1e3 * (asked_at.cpu_s - alone.cpu_s) / max(1, len(asked.seconds))
+        results.add(case, "service's processors for an answer", each, "ms")
+
+
+def _add_frames(results: Results, case: str, pushed: _Pushed, seconds: float) -> None:
     results.add(case, "frames", len(pushed.mapper), "")
     results.add(case, "dropped", pushed.dropped, "")
     for share in (50, 95):
         results.add(case, f"frame p{share}", float(np.percentile(pushed.mapper, share)), "ms")
         results.add(case, f"pushed and answered p{share}", float(np.percentile(pushed.answered, share)), "ms")
-    cpu = None if before is None or after is None else after - before
-    results.add(case, "service's processors", None if cpu is None else cpu / plan.seconds, "cores")
-    return _Cost(float(np.percentile(pushed.mapper, 95)), cpu)
-
-
-def _measure_questions(
-    results: Results, service: Serving, client: Client, frames: _Stamps, plan: ServicePlan, alone: _Cost
-) -> None:
-    case = f"{plan.clients} clients x {plan.per_s:g}/s"
-    with asking(Questions(service.url, _MAP, plan.clients, plan.per_s, plan.points, plan.seconds)) as clients:
-        cost = _measure_mapping(results, service, client, frames, plan, case)
-        asked = clients.result()
-    results.add(case, "frame p95 grows by", 100 * (cost.p95 / alone.p95 - 1), "%")
-    _add_answers(results, case, asked)
-    results.add(case, "clients' processors", asked.cpu_s / plan.seconds, "cores")
-    if cost.cpu is not None and alone.cpu is not None:
-        each = 1e3 * (cost.cpu - alone.cpu) / max(1, len(asked.seconds))
-        results.add(case, "service's processors for an answer", each, "ms")
+    results.add(case, "service's processors", None if pushed.cpu_s is None else pushed.cpu_s / seconds, "cores")
 
 
 def _add_answers(results: Results, case: str, asked: Asked) -> None:

@@ -56,6 +56,10 @@ class Asked:
     errors: list[str]
     cpu_s: float
 
+    def and_then(self, more: Asked) -> Asked:
+        """Both together."""
+        return Asked(self.seconds + more.seconds, self.errors + more.errors, self.cpu_s + more.cpu_s)
+
 
 class Asking:
     """Clients at work in another process."""
