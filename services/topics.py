@@ -56,6 +56,11 @@ def robot_topic(robot: str, kind: str) -> str:
     return f"robot/{robot}/{kind}"
 
 
+def arm_topic(arm: str, kind: str) -> str:
+    """The topic of one of the service's arms; two may be of one robot's model."""
+    return f"arms/{arm}/{kind}"
+
+
 def job_topic(job_id: str) -> str:
     """The topic of a job."""
     return f"jobs/{job_id}"
