@@ -224,6 +224,21 @@ class GraspsRequest(Request):
         return self
 
 
+class PicksRequest(Request):
+    """A thing to be picked in the twin."""
+
+    scene: str = Field("tabletop_clutter", description="a shipped scene")
+    target: str = Field(max_length=200, description='a name of the scene, or words as "largest box"')
+    views: Annotated[int, Field(ge=2, le=24)] = Field(8, description="of the scan")
+    lift: Annotated[float, Field(gt=0.03, le=1)] = Field(0.15, description="how far up [m]")
+    force: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="of the fingers [N]")
+    tries: Annotated[int, Field(ge=1, le=20)] = Field(5, description="grasps whose way is looked for")
+    budget_ms: Annotated[float, Field(gt=0)] = Field(200.0, description="for the way to each: the knob of time [ms]")
+    margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
+    home: bool = Field(False, description="carry it to where the arm began")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of sensor noise and search")
+
+
 class TrajectoryRequest(Request):
     """A planned motion to be followed."""
 

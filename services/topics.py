@@ -58,7 +58,7 @@ def robot_topic(robot: str, kind: str) -> str:
 
 
 def arm_topic(arm: str, kind: str) -> str:
-    """The topic of an arm, e.g. ``arm_topic("twin", JOINTS)``."""
+    """The topic of one of the service's arms; two may be of one robot's model."""
     return f"arms/{arm}/{kind}"
 
 

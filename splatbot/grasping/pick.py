@@ -68,6 +68,7 @@ class Picker:
         gripper: its fingers.
         options: how.
         stop: asked all the time; True ends the pick.
+        on_step: told of each stage that is done.
 
     Raises:
         InputError: the gripper opens less than the robot's hand.
@@ -81,13 +82,14 @@ class Picker:
         *,
         options: PickOptions | None = None,
         stop: Callable[[], bool] | None = None,
+        on_step: Callable[[PickStep], None] | None = None,
     ) -> None:
         if gripper.stroke < sampler.hand.stroke - 1e-6:
             text = f"opens {gripper.stroke:g} m, the hand of the robot {sampler.hand.stroke:g} m."
             raise InputError(text, field="gripper", hint="give the robot that has this gripper")
         self.sampler, self.controller, self.gripper = sampler, controller, gripper
         self.options = options or PickOptions()
-        self._stop = stop
+        self._stop, self._on_step = stop, on_step
         self._T = sampler.scene.T_world_base
 
     def pick(self, target: Target, *, grasps: GraspResult | None = None) -> PickResult:
@@ -293,6 +295,8 @@ class _Pick:
         now = time.perf_counter()
         self.steps.append(PickStep(self.stage, now - self._began, note))
         self._began = now
+        if self.p._on_step is not None:
+            self.p._on_step(self.steps[-1])
 
     def _ended(self, end: _EndedError) -> PickResult:
         """The arm at rest; fingers as they are."""

@@ -62,7 +62,9 @@ def test_every_documented_example_is_answered_as_documented(api: Service) -> Non
             response = api.client.post(where, json=body)
             assert response.status_code in (200, 201, 202), f"{path}, {name}: {response.text}"
             asked += 1
-    assert asked >= 16
+    for job in api.runtime.jobs.list():
+        api.runtime.jobs.cancel(job.id)  # the tests that follow need not wait for what was asked for here
+    assert asked >= 18
 
 
 def _examples(operation: dict[str, Any]) -> dict[str, Any]:

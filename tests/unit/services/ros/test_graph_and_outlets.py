@@ -92,6 +92,20 @@ def test_odometry_turns_the_covariance_to_the_map_s_axes() -> None:
     assert (message.header.frame_id, message.child_frame_id) == ("map", "camera")
 
 
+def test_joints_come_out_as_the_robot_s_and_as_the_arm_s(told: tuple[MapStore, RosGraph]) -> None:
+    store, graph = told
+    reader = graph.subscribe(JOINTS, "/fake/joint_states", "/twin/joint_states", capacity=16)
+    for arm, q in (("fake", 0.5), ("twin", 1.5)):
+        state = JointState(1.0, ("a",), np.array([q]))
+        store.bus.publish(robot_topic("panda", "joints"), state)
+        store.bus.publish(arm_topic(arm, "joints"), state)
+    news = [m for m in (reader.get(5) for _ in range(4)) if m is not None]
+    told_joints = [(m.topic, float(m.value.message.position[0])) for m in news]
+    assert sorted(told_joints) == [
+        ("/fake/joint_states", 0.5), (JOINTS, 0.5), (JOINTS, 1.5), ("/twin/joint_states", 1.5)
+    ]  # fmt: skip
+
+
 def test_news_of_a_map_come_out_under_their_ros_names(
     told: tuple[MapStore, RosGraph], rng: np.random.Generator
 ) -> None:
@@ -120,17 +134,6 @@ def test_a_second_map_has_names_of_its_own(told: tuple[MapStore, RosGraph], rng:
     for name in ("default", "desk-2"):
         store.add(name, source="a", state="static", snapshot=Snapshot(_model(rng), 1))
     assert _until(lambda: graph.latched("/maps/desk_2/map/points")) is not None
-
-
-def test_joints_of_an_arm_have_a_topic_of_their_own_beside_the_robot_s(told: tuple[MapStore, RosGraph]) -> None:
-    store, graph = told
-    reader = graph.subscribe("/twin/joint_states", "/joint_states", capacity=4)
-    for topic, value in ((arm_topic("twin", "joints"), 0.5), (robot_topic("panda", "joints"), 0.25)):
-        store.bus.publish(topic, JointState(1.0, ("a",), np.array([value])))
-    news = [reader.get(5), reader.get(5)]
-    assert all(one is not None for one in news)
-    got = {one.topic: one.value.message.position.tolist() for one in news if one is not None}
-    assert got == {"/twin/joint_states": [0.5], "/joint_states": [0.25]}
 
 
 def test_warnings_come_out_on_rosout(told: tuple[MapStore, RosGraph]) -> None:
