@@ -52,8 +52,8 @@ class PreparedFrame:
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide.
 
-    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels. The finest, which decides
-    the pose, has no grey along occluding edges.
+    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels. The finest decides the
+    pose and has no grey along occluding edges.
     """
     started = time.perf_counter()
     depth = usable_depth(frame, config)
