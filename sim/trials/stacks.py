@@ -1,0 +1,119 @@
+"""What the stacks of a trial have in common: the scan goes in, grasps and ways to them come out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from splatbot.grasping.affordance import Target, find_target
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.pick_types import PickOptions
+from splatbot.grasping.places import PlaceAffordance
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.types import Grasp, GraspResult
+from splatbot.grasping.ways import Leg, MapWays, Way, Ways
+from splatbot.planning import JointGoal
+from splatbot.protocols import Array
+from splatbot.robots.panda import panda
+from splatbot.segmentation import MapScene, segment
+from splatbot.sim.trials.look import Look
+
+LIFT = 0.18  # [m]; 15 cm are asked for
+BUDGET_MS = 28.0  # of the search for a way
+OPTIONS = PickOptions(lift=LIFT, budget_ms=BUDGET_MS, tries=8, grasp=GraspOptions())
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What a stack made of a scan.
+
+    Args:
+        scene: its surface, segmented.
+        sampler: of grasps on it.
+        make_ways: finds the ways to a target's grasps.
+        world_bytes: of what it plans in.
+        seconds: that building it took.
+    """
+
+    scene: MapScene
+    sampler: GraspSampler
+    make_ways: Callable[[Target], Ways]
+    world_bytes: int
+    seconds: float
+
+
+class Stack(Protocol):
+    """A way to represent what was seen."""
+
+    @property
+    def name(self) -> str:
+        """As tables have it."""
+        ...
+
+    def learn(self, look: Look) -> Knowledge:
+        """Make a world of a scan."""
+        ...
+
+
+class GaussianStack:
+    """The Gaussians of the map, certified all along."""
+
+    name = "gaussians"
+
+    def learn(self, look: Look) -> Knowledge:
+        """See :class:`Stack`."""
+        begin = time.perf_counter()
+        scene = segment(look.snapshot, look.T_world_base)
+        sampler = GraspSampler(scene, panda(), observers=look.observers)
+        seconds = look.seconds + time.perf_counter() - begin
+        world = look.snapshot.model.nbytes + sampler.field.nbytes
+        return Knowledge(scene, sampler, lambda target: MapWays(sampler, target, OPTIONS), world, seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """A target, grasps of it, and the way to one.
+
+    Args:
+        target: as it was found.
+        grasps: of it.
+        ways: to them, each looked for once.
+        seconds: to the ranked list.
+    """
+
+    target: Target
+    grasps: GraspResult
+    ways: Ways
+    seconds: float
+
+
+def decide(known: Knowledge, look: Look) -> Decision:
+    """Find what was clicked at, and grasps of it.
+
+    Raises:
+        AffordanceError: there is nothing.
+    """
+    target = find_target(look.hint, known.scene, [PlaceAffordance()])
+    begin = time.perf_counter()
+    grasps = known.sampler.sample(target, OPTIONS.grasp)
+    return Decision(target, grasps, _Remembered(known.make_ways(target)), time.perf_counter() - begin)
+
+
+class _Remembered:
+    """Ways that are found once, so that two twins follow the same."""
+
+    def __init__(self, ways: Ways) -> None:
+        self._ways = ways
+        self._found: dict[int, Way | str] = {}
+
+    def to(self, grasp: Grasp, start: Array) -> Way | str:
+        """As when it was first asked."""
+        if id(grasp) not in self._found:
+            self._found[id(grasp)] = self._ways.to(grasp, start)
+        return self._found[id(grasp)]
+
+    def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
+        """Asked anew."""
+        return self._ways.onwards(way, start, goal)
