@@ -20,8 +20,7 @@ TABLE, OBSTACLE = "table", "obstacle"
 SENSOR = ("depth_noise", "depth_holes:share=0.05")
 _AREA = ((0.36, -0.26), (0.64, 0.26))  # [m] corners of where things stand
 _BETWEEN = (0.02, 0.05)  # [m] of room between the things of a table top; drawn
-_DENSITY = (200.0, 700.0)  # [kg/m³]
-_MASS = (0.04, 0.5)  # [kg]
+_MASS = (0.1, 0.5)  # [kg]
 _FRICTION = (0.5, 0.9)
 _SETTLE = 1.5  # [s] until all is at rest
 _EVERY = 5  # of the table tops, one has something that moves
@@ -56,13 +55,12 @@ class TrialScene:
 @dataclass(frozen=True)
 class _Thing:
     """Something that may stand on the table: its shapes about its origin, the origin's height as it stands, how far it
-    reaches from there sideways [m], its volume [m³], and whether the hand goes around it."""
+    reaches from there sideways [m], and whether the hand goes around it."""
 
     kind: str
     shapes: tuple[dict[str, Any], ...]
     height: float
     radius: float
-    volume: float
     fits: bool = True
 
 
@@ -107,34 +105,34 @@ def _box(rng: np.random.Generator) -> _Thing:
     narrow, wide, high = (float(rng.uniform(*r)) for r in ((0.03, 0.062), (0.045, 0.11), (0.04, 0.12)))
     size = (wide, narrow, high)
     shape = {"kind": "box", "size": size}
-    return _Thing("box", (shape,), high / 2, float(np.hypot(wide, narrow)) / 2, wide * narrow * high)
+    return _Thing("box", (shape,), high / 2, float(np.hypot(wide, narrow)) / 2)
 
 
 def _can(rng: np.random.Generator) -> _Thing:
     r, h = float(rng.uniform(0.018, 0.033)), float(rng.uniform(0.06, 0.14))
-    return _Thing("can", ({"kind": "cylinder", "radius": r, "height": h},), h / 2, r, np.pi * r * r * h)
+    return _Thing("can", ({"kind": "cylinder", "radius": r, "height": h},), h / 2, r)
 
 
 def _lying(rng: np.random.Generator) -> _Thing:
     r, h = float(rng.uniform(0.02, 0.032)), float(rng.uniform(0.09, 0.14))
     shape = {"kind": "cylinder", "radius": r, "height": h, "rpy": [np.pi / 2, 0.0, 0.0]}
-    return _Thing("lying can", (shape,), r, float(np.hypot(r, h / 2)), np.pi * r * r * h)
+    return _Thing("lying can", (shape,), r, float(np.hypot(r, h / 2)))
 
 
 def _ball(rng: np.random.Generator) -> _Thing:
     r = float(rng.uniform(0.022, 0.034))
-    return _Thing("ball", ({"kind": "sphere", "radius": r},), r, r, 4 / 3 * np.pi * r**3)
+    return _Thing("ball", ({"kind": "sphere", "radius": r},), r, r)
 
 
 def _egg(rng: np.random.Generator) -> _Thing:
     a, b, c = float(rng.uniform(0.03, 0.045)), float(rng.uniform(0.022, 0.032)), float(rng.uniform(0.022, 0.032))
-    return _Thing("egg", ({"kind": "ellipsoid", "axes": [a, b, c]},), c, a, 4 / 3 * np.pi * a * b * c)
+    return _Thing("egg", ({"kind": "ellipsoid", "axes": [a, b, c]},), c, a)
 
 
 def _book(rng: np.random.Generator) -> _Thing:
     size = (float(rng.uniform(0.15, 0.20)), float(rng.uniform(0.11, 0.14)), float(rng.uniform(0.02, 0.035)))
     around = float(np.hypot(*size[:2])) / 2
-    return _Thing("book", ({"kind": "box", "size": size},), size[2] / 2, around, float(np.prod(size)), False)
+    return _Thing("book", ({"kind": "box", "size": size},), size[2] / 2, around, False)
 
 
 def _cup(rng: np.random.Generator) -> _Thing:
@@ -148,7 +146,7 @@ def _cup(rng: np.random.Generator) -> _Thing:
     for turn in np.arange(staves) * 2 * np.pi / staves:
         at = [middle * float(np.cos(turn)), middle * float(np.sin(turn)), 0.0]
         shapes.append({"kind": "box", "size": [wall, wide, h], "at": at, "rpy": [0.0, 0.0, float(turn)]})
-    return _Thing("cup", tuple(shapes), h / 2, r, 2 * np.pi * r * wall * h + np.pi * r * r * 0.006)
+    return _Thing("cup", tuple(shapes), h / 2, r)
 
 
 def _tool(rng: np.random.Generator) -> _Thing:
@@ -159,8 +157,7 @@ def _tool(rng: np.random.Generator) -> _Thing:
         {"kind": "box", "size": [0.035, 0.07, head], "at": [length / 2, 0.0, 0.0]},
         {"kind": "box", "size": [0.02, head, head], "at": [-length / 2, 0.0, 0.0]},
     )
-    volume = np.pi * r * r * length + 0.035 * 0.07 * head + 0.02 * head**2
-    return _Thing("mallet", shapes, head / 2, length / 2 + 0.03, volume)
+    return _Thing("mallet", shapes, head / 2, length / 2 + 0.03)
 
 
 _CONVEX: tuple[Callable[[np.random.Generator], _Thing], ...] = (_box, _can, _ball, _lying, _box, _egg)
@@ -177,14 +174,13 @@ def _placed(things: list[_Thing], rng: np.random.Generator) -> list[tuple[_Thing
         if at is None:
             continue
         taken.append((at, thing.radius))
-        mass = float(np.clip(thing.volume * rng.uniform(*_DENSITY), *_MASS))
         value = {
             "name": f"{thing.kind.replace(' ', '-')}-{k}",
             "shapes": thing.shapes,
             "at": [*at.tolist(), thing.height + 5e-4],
             "rpy": [0.0, 0.0, float(rng.uniform(-np.pi, np.pi))],
             "movable": True,
-            "mass": mass,
+            "mass": float(rng.uniform(*_MASS)),
             "friction": float(rng.uniform(*_FRICTION)),
             "color": _COLORS[colors[k % len(_COLORS)]],
         }

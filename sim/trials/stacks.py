@@ -22,6 +22,7 @@ from splatbot.sim.trials.look import Look
 
 LIFT = 0.18  # [m]; 15 cm are asked for
 BUDGET_MS = 28.0  # of the search for a way
+_OFTEN = 3  # keyframes that must support what is no air
 OPTIONS = PickOptions(lift=LIFT, budget_ms=BUDGET_MS, tries=8, grasp=GraspOptions())
 
 
@@ -31,15 +32,13 @@ class Knowledge:
 
     Args:
         scene: its surface, segmented.
-        sampler: of grasps on it.
-        make_ways: finds the ways to a target's grasps.
+        towards: for a target, who samples its grasps and who finds ways to them.
         world_bytes: of what it plans in.
         seconds: that building it took.
     """
 
     scene: MapScene
-    sampler: GraspSampler
-    make_ways: Callable[[Target], Ways]
+    towards: Callable[[Target], tuple[GraspSampler, Ways]]
     world_bytes: int
     seconds: float
 
@@ -65,11 +64,11 @@ class GaussianStack:
     def learn(self, look: Look) -> Knowledge:
         """See :class:`Stack`."""
         begin = time.perf_counter()
-        scene = segment(look.snapshot, look.T_world_base)
-        sampler = GraspSampler(scene, panda(), observers=look.observers)
+        scene = segment(look.snapshot, look.T_world_base, cut=False)
+        sampler = GraspSampler(scene, panda(), observers=look.observers, min_observations=_OFTEN)
         seconds = look.seconds + time.perf_counter() - begin
         world = look.snapshot.model.nbytes + sampler.field.nbytes
-        return Knowledge(scene, sampler, lambda target: MapWays(sampler, target, OPTIONS), world, seconds)
+        return Knowledge(scene, lambda target: (sampler, MapWays(sampler, target, OPTIONS)), world, seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +77,14 @@ class Decision:
 
     Args:
         target: as it was found.
+        sampler: of its grasps.
         grasps: of it.
         ways: to them, each looked for once.
         seconds: to the ranked list.
     """
 
     target: Target
+    sampler: GraspSampler
     grasps: GraspResult
     ways: Ways
     seconds: float
@@ -96,9 +97,10 @@ def decide(known: Knowledge, look: Look) -> Decision:
         AffordanceError: there is nothing.
     """
     target = find_target(look.hint, known.scene, [PlaceAffordance()])
+    sampler, ways = known.towards(target)
     begin = time.perf_counter()
-    grasps = known.sampler.sample(target, OPTIONS.grasp)
-    return Decision(target, grasps, _Remembered(known.make_ways(target)), time.perf_counter() - begin)
+    grasps = sampler.sample(target, OPTIONS.grasp)
+    return Decision(target, sampler, grasps, _Remembered(ways), time.perf_counter() - begin)
 
 
 class _Remembered:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_types import PickOutcome, PickResult, PickStage
 from splatbot.planning.follow import follow
 from splatbot.protocols import Array
+from splatbot.sim.camera import TwinCamera
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.controller import TwinController
 from splatbot.sim.touch import Touches
@@ -24,13 +26,16 @@ from splatbot.sim.trials.scenes import TABLE, TrialScene
 from splatbot.sim.trials.shake import Shake
 from splatbot.sim.trials.stacks import OPTIONS, Decision, Knowledge, Stack, decide
 from splatbot.sim.twin import Twin
+from splatbot.sim.video import Video
 from splatbot.sim.world import OBJECT
 
 RISE = 0.15  # [m] that a thing must be lifted
 KEPT = 0.12  # [m] over where it stood, after it was shaken
 _TAKEN_FOR = 0.04  # [m] between a target's middle and that of what was found
 _EVERY = 5  # control periods between looks at what touches
-_HAND = ("finger1", "finger2")
+_TWINS = ("ideal", "reality")
+
+Watch = Callable[[Any, float], None]
 
 
 class Failure(StrEnum):
@@ -113,19 +118,22 @@ class TrialRow:
         return cls(**{**values, **twins})
 
 
-def run_trial(trial: TrialScene, stacks: Sequence[Stack], *, frames: int = 32, width: int = 320) -> list[TrialRow]:
+def run_trial(
+    trial: TrialScene, stacks: Sequence[Stack], *, frames: int = 32, width: int = 320, videos: Path | None = None
+) -> list[TrialRow]:
     """Scan a scene, and let each stack pick its target.
 
     Args:
         trial: the scene.
         stacks: who picks.
         frames, width: of the scan, see :func:`splatbot.sim.trials.look.look`.
+        videos: folder for films of picks that failed in reality; None: none are made.
     """
     seen = look(trial, frames=frames, width=width)
-    return [pick_with(stack, trial, seen) for stack in stacks]
+    return [pick_with(stack, trial, seen, videos=videos) for stack in stacks]
 
 
-def pick_with(stack: Stack, trial: TrialScene, seen: Look) -> TrialRow:
+def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | None = None) -> TrialRow:
     """One stack's pick of what was seen, in both twins."""
     known = stack.learn(seen)
     decision: Decision | None = None
@@ -135,21 +143,32 @@ def pick_with(stack: Stack, trial: TrialScene, seen: Look) -> TrialRow:
         both = Attempt(False, Failure.PERCEPTION, "no target", error.message)
         return _row(stack, trial, known, None, None, both, both)
     results = []
-    for twin in (Twin(trial.scene), HeldOutTwin(trial.scene, draw(Spread(), trial.seed))):
-        results.append(attempt(known, decision, trial, seen, twin))
+    mistaken = _mistaken(known, decision.target, trial)
+    for twin in (Twin(trial.scene), _reality(trial)):
+        results.append(attempt(decision, trial, twin, mistaken=mistaken))
     (ideal, first), (reality, _) = results
+    if videos is not None and not reality.success:
+        _film(decision, trial, videos / f"{trial.family}-{trial.seed}-{stack.name}.mp4")
     return _row(stack, trial, known, decision, first, ideal, reality)
 
 
 def attempt(
-    known: Knowledge, decision: Decision, trial: TrialScene, seen: Look, twin: Twin
+    decision: Decision, trial: TrialScene, twin: Twin, *, mistaken: bool = False, watch: Watch | None = None
 ) -> tuple[Attempt, PickResult]:
-    """The pick in a twin, then the shaking."""
-    controller = _Watched(twin)
+    """The pick in a twin, then the shaking.
+
+    Args:
+        decision: what to pick and how.
+        trial: the scene.
+        twin: of it.
+        mistaken: whether the decision is about something else than the trial's target.
+        watch: called with MuJoCo's data and the time [s] after every control period.
+    """
+    controller = _Watched(twin, watch)
     assert controller.gripper is not None
     before = _height(twin, trial.target)
     picker = Picker(
-        known.sampler, controller, controller.gripper, options=OPTIONS, make_ways=lambda target: decision.ways
+        decision.sampler, controller, controller.gripper, options=OPTIONS, make_ways=lambda target: decision.ways
     )
     result = picker.pick(decision.target, grasps=decision.grasps)
     rose = _height(twin, trial.target) - before
@@ -157,7 +176,7 @@ def attempt(
     kept, shaken = rose, ""
     if result and result.q is not None:
         try:
-            done = follow(controller, Shake(known.sampler.robot.chain, result.q))
+            done = follow(controller, Shake(decision.sampler.robot.chain, result.q))
             shaken = "" if done else done.fault or f"the arm ended {done.state}"
         except SplatbotError as error:
             shaken = error.message
@@ -167,7 +186,7 @@ def attempt(
     if result and not success:
         outcome = "dropped" if rose >= RISE else "lost"
         reason = shaken or f"rose {1e3 * rose:.0f} mm, {1e3 * kept:.0f} mm after it was shaken"
-    failure = "" if success else _failure(result, early, _mistaken(known, decision.target, trial))
+    failure = "" if success else _failure(result, early, mistaken)
     touched = controller.touched(trial.target)
     return Attempt(success, failure, outcome, reason, rose, kept, touched, result.opening), result
 
@@ -175,19 +194,35 @@ def attempt(
 class _Watched(TwinController):
     """A twin's controller that takes note of what its arm touches."""
 
-    def __init__(self, twin: Twin) -> None:
-        self._touches, self._periods = Touches(twin.world), 0
+    def __init__(self, twin: Twin, watch: Watch | None) -> None:
+        self._touches, self._periods, self._watch = Touches(twin.world), 0, watch
         super().__init__(twin)
 
     def _advance(self, q: Array, velocity: Array, acceleration: Array) -> None:
         super()._advance(q, velocity, acceleration)
         self._periods += 1
+        if self._watch is not None:
+            self._watch(self.twin.data, self._clock)
         if self._periods % _EVERY == 0:
             self._touches.look(self.twin.data, self._clock)
 
     def touched(self, target: str) -> tuple[str, ...]:
         """Everything but the target that the arm has touched, and itself where it has."""
         return tuple(sorted({touch.other for touch in self._touches.found} - {target}))
+
+
+def _reality(trial: TrialScene) -> HeldOutTwin:
+    return HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
+
+
+def _film(decision: Decision, trial: TrialScene, path: Path) -> None:
+    """The pick in reality once more, with a camera."""
+    twin = _reality(trial)
+    video = Video(path, TwinCamera(twin.world, seed=trial.seed))
+    try:
+        attempt(decision, trial, twin, watch=video)
+    finally:
+        video.close()
 
 
 def _failure(result: PickResult, touched: tuple[str, ...], mistaken: bool) -> Failure:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
@@ -26,6 +26,7 @@ from splatbot.planning.cartesian import StraightResult, straight_line
 from splatbot.protocols import Array
 
 _N_SIGMA = 1.0  # of a held object's Gaussians
+_SIDES = 5  # on which the object must be around a stray within it; the sixth may be open, as a cup's
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,8 @@ class MapWays:
         away = np.full(len(means), np.inf)
         for sphere in self._object:
             away = np.minimum(away, np.linalg.norm(means - sphere[:3], axis=1) - sphere[3])
-        return self.s.collision_field(around.select(torch.from_numpy(away > 0.0)))
+        inside = (away <= 0.0) | enclosed(means, self._object)
+        return self.s.collision_field(around.select(torch.from_numpy(~inside)))
 
     def _up(self, arm: RobotSpheres, q: Array, by: float) -> StraightResult:
         return straight_line(arm, self._beside, q, raised(self.s, arm, q, by))
@@ -171,6 +173,21 @@ def target_spheres(sampler: GraspSampler, target: Target) -> Array:
     """A target as spheres (A, 4) [m, world] that cover its surface, what was not seen of it included."""
     surface = target_surface(sampler.scene, target.rows, observers=sampler.observers)
     return covering_spheres(surface.points, np.where(surface.seen, 0.0, surface.spread) + _N_SIGMA * surface.doubt)
+
+
+def enclosed(points: Array, spheres: Array) -> NDArray[np.bool_]:
+    """Which points (P, 3) have spheres (A, 4) on at least five of six sides: they are within what these cover."""
+    low, high = (spheres[:, :3] - spheres[:, 3:]).min(axis=0), (spheres[:, :3] + spheres[:, 3:]).max(axis=0)
+    found = np.zeros(len(points), np.bool_)
+    rows = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+    between = spheres[None, :, :3] - points[rows, None]
+    sides = np.zeros(len(rows), np.int64)
+    for k in range(3):
+        aside = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
+        sides += (aside & (between[..., k] > 0)).any(axis=1).astype(np.int64)
+        sides += (aside & (between[..., k] < 0)).any(axis=1)
+    found[rows] = sides >= _SIDES
+    return found
 
 
 def in_hand(arm: RobotSpheres, q: Array, spheres: Array) -> Array:

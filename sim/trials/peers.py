@@ -1,0 +1,151 @@
+"""Two other stacks on the same frames and poses: a mesh of fused depth, and a point cloud in an octree."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from splatbot.collision.evidence import measured_depths
+from splatbot.collision.fcl_models import fcl_mesh, fcl_octree, octomap_bytes
+from splatbot.frame import Frame
+from splatbot.geometry import inverse
+from splatbot.grasping.affordance import Target
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.ways import Ways
+from splatbot.protocols import Array
+from splatbot.robots.panda import panda
+from splatbot.segmentation import segment
+from splatbot.sim.scan import discs
+from splatbot.sim.trials.look import Look
+from splatbot.sim.trials.solid import SolidReach, SolidWays, SolidWorld
+from splatbot.sim.trials.stacks import OPTIONS, Knowledge
+
+VOXEL = 0.004  # [m] of the mesh's distances and of the cloud
+LEAF = 0.01  # [m] of the octree
+_TRUNCATION = 0.016  # [m]
+_FARTHEST = 1.5  # [m] of depth that is used
+_THROUGH = 0.03  # [m] that a frame must see behind a point to have seen through it
+_NORMALS = 0.012, 24  # [m] around a point, and points, that its normal is fitted to
+_FEW = 3  # neighbours without which a point is a stray
+_NODE, _LEAF_NODE = 304, 16  # bytes of FCL's BVNode<OBBRSS> and of OctoMap's OcTreeNode, on 64 bits
+
+
+class MeshStack:
+    """Truncated signed distances, marching cubes, and python-fcl on the triangles."""
+
+    name = "mesh"
+
+    def learn(self, look: Look) -> Knowledge:
+        """See :class:`splatbot.sim.trials.stacks.Stack`."""
+        begin = time.perf_counter()
+        mesh = _fused(look)
+        vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+        normals, colors = np.asarray(mesh.vertex_normals), np.asarray(mesh.vertex_colors)
+
+        def around(rows: NDArray[np.int64]) -> Any:
+            own = np.zeros(len(vertices), np.bool_)
+            own[rows] = True
+            return fcl_mesh(vertices, triangles[~own[triangles].any(axis=1)])
+
+        world = SolidWorld(fcl_mesh(vertices, triangles), around)
+        size = vertices.nbytes + triangles.nbytes + 2 * len(triangles) * _NODE
+        return _known(look, vertices, normals, colors, world, size, begin)
+
+
+class CloudStack:
+    """Points with normals, and python-fcl on an octree of them."""
+
+    name = "cloud"
+
+    def learn(self, look: Look) -> Knowledge:
+        """See :class:`splatbot.sim.trials.stacks.Stack`."""
+        begin = time.perf_counter()
+        cloud = _cloud(look)
+        points, normals, colors = (np.asarray(x) for x in (cloud.points, cloud.normals, cloud.colors))
+
+        def around(rows: NDArray[np.int64]) -> Any:
+            return fcl_octree(np.delete(points, rows, axis=0), LEAF)
+
+        world = SolidWorld(fcl_octree(points, LEAF), around)
+        size = points.nbytes + normals.nbytes + len(octomap_bytes(points, LEAF)) // 2 * _LEAF_NODE
+        return _known(look, points, normals, colors, world, size, begin)
+
+
+def _known(
+    look: Look, points: Array, normals: Array, colors: Array, world: SolidWorld, size: int, begin: float
+) -> Knowledge:
+    """The surface as discs for segmentation and grasps; the world for the arm."""
+    scene = segment(discs(points, normals, colors, VOXEL), look.T_world_base, cut=False)
+    robot = panda()
+
+    def towards(target: Target) -> tuple[GraspSampler, Ways]:
+        reach = SolidReach(robot, scene.T_world_base, world, target.rows)
+        sampler = GraspSampler(scene, robot, observers=points + 0.5 * normals, make_reach=lambda around, whole: reach)
+        return sampler, SolidWays(sampler, target, OPTIONS, world)
+
+    return Knowledge(scene, towards, size, time.perf_counter() - begin)
+
+
+def _usable(frame: Frame) -> NDArray[np.float32]:
+    return np.where(frame.valid & (frame.depth < _FARTHEST), frame.depth, 0.0).astype(np.float32)
+
+
+def _tracked(look: Look) -> list[tuple[Frame, Array]]:
+    return [(f, T) for f, T in zip(look.frames, look.T_world_camera, strict=True) if np.isfinite(T).all()]
+
+
+def _fused(look: Look) -> Any:
+    volume = o3d.pipelines.integration.ScalableTSDFVolume(
+        voxel_length=VOXEL,
+        sdf_trunc=_TRUNCATION,
+        color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
+    )
+    for frame, T in _tracked(look):
+        image = o3d.geometry.RGBDImage.create_from_color_and_depth(
+            _image(frame.rgb),
+            _image(_usable(frame)),
+            depth_scale=1.0,
+            depth_trunc=_FARTHEST,
+            convert_rgb_to_intensity=False,
+        )
+        volume.integrate(image, _pinhole(frame), inverse(T))
+    mesh = volume.extract_triangle_mesh()
+    mesh.compute_vertex_normals()
+    return mesh
+
+
+def _image(pixels: NDArray[Any]) -> Any:
+    buffer: Any = np.ascontiguousarray(pixels)
+    return o3d.geometry.Image(buffer)
+
+
+def _pinhole(frame: Frame) -> Any:
+    c = frame.camera
+    return o3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+
+
+def _cloud(look: Look) -> Any:
+    """Averaged over voxels, without strays and without what later frames see through."""
+    whole = o3d.geometry.PointCloud()
+    for frame, T in _tracked(look):
+        depth = _usable(frame)
+        part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(frame.camera.backproject(depth)[depth > 0]))
+        part.colors = o3d.utility.Vector3dVector(frame.rgb[depth > 0] / 255.0)
+        part.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(*_NORMALS))
+        part.orient_normals_towards_camera_location(np.zeros(3))
+        part.transform(T)
+        whole += part
+    cloud = whole.voxel_down_sample(VOXEL)
+    cloud.normalize_normals()
+    cloud, _ = cloud.remove_radius_outlier(_FEW, 2 * VOXEL)
+    points = np.asarray(cloud.points)
+    votes = np.zeros(len(points))
+    for frame, T in _tracked(look):
+        rows, measured, z = measured_depths(points, _usable(frame), frame.camera, T)
+        votes[rows[measured > z + _THROUGH]] -= 1
+        votes[rows[np.abs(measured - z) <= _THROUGH]] += 1
+    return cloud.select_by_index(np.flatnonzero(votes >= 0).tolist())
