@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.collision.evidence import DepthView
 from splatbot.config import Config
 from splatbot.errors import InputError
 from splatbot.frame import Frame, PosePrior
@@ -33,7 +34,7 @@ from splatbot.slam import Slam
 
 _MIDDLE, _AWAY = np.array([0.5, 0.0, 0.05]), 0.6  # [m] what the camera looks at, and from how far
 _RINGS = ((45.0, (-130, -80, -40, 0, 40, 80)), (65.0, (80, 40, 0, -40, -80)))  # [deg] over the table: turns around it
-_FARTHEST = 0.95  # [m] of depth that is used
+FARTHEST = 0.95  # [m] of depth that is used
 _RATE = 4.0  # [Hz]
 _KNOWN = (5e-4, 5e-4)  # [m], [rad] standard deviation of the camera's pose by the arm's joints
 # Fine Gaussians, left where depth put them: refinement for pictures moves means by millimetres, too much for grasps.
@@ -63,6 +64,21 @@ class Look:
     hint: PixelHint
     seconds: float
 
+    @property
+    def tracked(self) -> list[tuple[Frame, Array]]:
+        """Frames that were not lost, with their poses (4, 4)."""
+        return [(f, T) for f, T in zip(self.frames, self.T_world_camera, strict=True) if np.isfinite(T).all()]
+
+    @property
+    def views(self) -> list[DepthView]:
+        """The depth of these, as far as it was used."""
+        return [(usable_depth(frame), frame.camera, T) for frame, T in self.tracked]
+
+
+def usable_depth(frame: Frame) -> NDArray[np.float32]:
+    """Depth (H, W) [m] where it is not the arm's and not too far; 0 elsewhere."""
+    return np.where(frame.valid & (frame.depth < FARTHEST), frame.depth, 0.0).astype(np.float32)
+
 
 def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Config | None = None) -> Look:
     """Move the camera over the scene and map what it sees.
@@ -90,7 +106,7 @@ def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Confi
     )
     shot = tuple(effects(mask(log[k])) for k in range(frames))
     begin = time.perf_counter()
-    slam = Slam(config or Config.model_validate({"mapping": MAPPING, "tracking": {"max_depth": _FARTHEST}}))
+    slam = Slam(config or Config.model_validate({"mapping": MAPPING, "tracking": {"max_depth": FARTHEST}}))
     for frame, T in zip(shot, told, strict=True):
         prior = PosePrior(np.diag(2 * sigma**2), T_world_camera=inverse(told[0]) @ T)
         slam.process(replace(frame, prior=prior))

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from splatbot.collision.evidence import measured_depths
 from splatbot.collision.fcl_models import fcl_mesh, fcl_octree, octomap_bytes
-from splatbot.frame import Frame
 from splatbot.geometry import inverse
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.sampler import GraspSampler
@@ -20,18 +19,20 @@ from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
 from splatbot.sim.scan import discs
-from splatbot.sim.trials.look import Look
+from splatbot.sim.trials.look import FARTHEST, Look, usable_depth
 from splatbot.sim.trials.solid import SolidReach, SolidWays, SolidWorld
 from splatbot.sim.trials.stacks import OPTIONS, Knowledge
 
 VOXEL = 0.004  # [m] of the mesh's distances and of the cloud
 LEAF = 0.01  # [m] of the octree
-_TRUNCATION = 0.016  # [m]
-_FARTHEST = 1.5  # [m] of depth that is used
+_OUT = 0.5  # [m] from a surface to whom it faces
+_SEEN = 3.0  # views that a voxel of the mesh takes
+_GREY = 0.6  # of the mesh, whose colours nobody asks for
 _THROUGH = 0.03  # [m] that a frame must see behind a point to have seen through it
 _NORMALS = 0.012, 24  # [m] around a point, and points, that its normal is fitted to
 _FEW = 3  # neighbours without which a point is a stray
-_NODE, _LEAF_NODE = 304, 16  # bytes of FCL's BVNode<OBBRSS> and of OctoMap's OcTreeNode, on 64 bits
+_NODE, _LEAF_NODE = 256, 16  # bytes of FCL's BVNode<OBBRSS>, as measured, and of OctoMap's OcTreeNode
+_SINGLE = 2  # float64 over float32, in which coordinates could be kept
 
 
 class MeshStack:
@@ -44,16 +45,16 @@ class MeshStack:
         begin = time.perf_counter()
         mesh = _fused(look)
         vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
-        normals, colors = np.asarray(mesh.vertex_normals), np.asarray(mesh.vertex_colors)
+        normals = np.asarray(mesh.vertex_normals)
 
         def around(rows: NDArray[np.int64]) -> Any:
             own = np.zeros(len(vertices), np.bool_)
             own[rows] = True
             return fcl_mesh(vertices, triangles[~own[triangles].any(axis=1)])
 
-        world = SolidWorld(fcl_mesh(vertices, triangles), around)
-        size = vertices.nbytes + triangles.nbytes + 2 * len(triangles) * _NODE
-        return _known(look, vertices, normals, colors, world, size, begin)
+        world = SolidWorld(vertices, fcl_mesh(vertices, triangles), around)
+        size = vertices.nbytes // _SINGLE + triangles.nbytes + 2 * len(triangles) * _NODE
+        return _known(look, vertices, normals, np.full_like(vertices, _GREY), world, size, begin)
 
 
 class CloudStack:
@@ -70,8 +71,10 @@ class CloudStack:
         def around(rows: NDArray[np.int64]) -> Any:
             return fcl_octree(np.delete(points, rows, axis=0), LEAF)
 
-        world = SolidWorld(fcl_octree(points, LEAF), around)
-        size = points.nbytes + normals.nbytes + len(octomap_bytes(points, LEAF)) // 2 * _LEAF_NODE
+        world = SolidWorld(points, fcl_octree(points, LEAF), around)
+        voxels = len(np.unique(np.floor(points / LEAF).astype(np.int64), axis=0))
+        nodes = voxels + len(octomap_bytes(points, LEAF)) // 2  # of which each inner one is two bytes
+        size = (points.nbytes + normals.nbytes) // _SINGLE + nodes * _LEAF_NODE
         return _known(look, points, normals, colors, world, size, begin)
 
 
@@ -84,55 +87,35 @@ def _known(
 
     def towards(target: Target) -> tuple[GraspSampler, Ways]:
         reach = SolidReach(robot, scene.T_world_base, world, target.rows)
-        sampler = GraspSampler(scene, robot, observers=points + 0.5 * normals, make_reach=lambda around, whole: reach)
+        observers = points + _OUT * normals
+        sampler = GraspSampler(
+            scene, robot, observers=observers, views=look.views, make_reach=lambda around, whole: reach
+        )
         return sampler, SolidWays(sampler, target, OPTIONS, world)
 
     return Knowledge(scene, towards, size, time.perf_counter() - begin)
 
 
-def _usable(frame: Frame) -> NDArray[np.float32]:
-    return np.where(frame.valid & (frame.depth < _FARTHEST), frame.depth, 0.0).astype(np.float32)
-
-
-def _tracked(look: Look) -> list[tuple[Frame, Array]]:
-    return [(f, T) for f, T in zip(look.frames, look.T_world_camera, strict=True) if np.isfinite(T).all()]
-
-
 def _fused(look: Look) -> Any:
-    volume = o3d.pipelines.integration.ScalableTSDFVolume(
-        voxel_length=VOXEL,
-        sdf_trunc=_TRUNCATION,
-        color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
-    )
-    for frame, T in _tracked(look):
-        image = o3d.geometry.RGBDImage.create_from_color_and_depth(
-            _image(frame.rgb),
-            _image(_usable(frame)),
-            depth_scale=1.0,
-            depth_trunc=_FARTHEST,
-            convert_rgb_to_intensity=False,
-        )
-        volume.integrate(image, _pinhole(frame), inverse(T))
-    mesh = volume.extract_triangle_mesh()
+    """Triangles of the truncated signed distances of all depth (Curless and Levoy 1996), in voxels seen three times."""
+    single = o3d.core.SizeVector((1,))
+    kinds = (o3d.core.float32, o3d.core.float32)
+    grid = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, (single, single), VOXEL, 16, 20_000)
+    for depth, camera, T in look.views:
+        image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(depth))
+        K, T_camera_world = o3d.core.Tensor.from_numpy(camera.K), o3d.core.Tensor.from_numpy(inverse(T))
+        blocks = grid.compute_unique_block_coordinates(image, K, T_camera_world, 1.0, FARTHEST)
+        grid.integrate(blocks, image, K, T_camera_world, 1.0, FARTHEST)
+    mesh = grid.extract_triangle_mesh(_SEEN).to_legacy()
     mesh.compute_vertex_normals()
     return mesh
-
-
-def _image(pixels: NDArray[Any]) -> Any:
-    buffer: Any = np.ascontiguousarray(pixels)
-    return o3d.geometry.Image(buffer)
-
-
-def _pinhole(frame: Frame) -> Any:
-    c = frame.camera
-    return o3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
 
 
 def _cloud(look: Look) -> Any:
     """Averaged over voxels, without strays and without what later frames see through."""
     whole = o3d.geometry.PointCloud()
-    for frame, T in _tracked(look):
-        depth = _usable(frame)
+    for frame, T in look.tracked:
+        depth = usable_depth(frame)
         part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(frame.camera.backproject(depth)[depth > 0]))
         part.colors = o3d.utility.Vector3dVector(frame.rgb[depth > 0] / 255.0)
         part.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(*_NORMALS))
@@ -144,8 +127,8 @@ def _cloud(look: Look) -> Any:
     cloud, _ = cloud.remove_radius_outlier(_FEW, 2 * VOXEL)
     points = np.asarray(cloud.points)
     votes = np.zeros(len(points))
-    for frame, T in _tracked(look):
-        rows, measured, z = measured_depths(points, _usable(frame), frame.camera, T)
+    for frame, T in look.tracked:
+        rows, measured, z = measured_depths(points, usable_depth(frame), frame.camera, T)
         votes[rows[measured > z + _THROUGH]] -= 1
         votes[rows[np.abs(measured - z) <= _THROUGH]] += 1
     return cloud.select_by_index(np.flatnonzero(votes >= 0).tolist())

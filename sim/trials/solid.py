@@ -18,7 +18,7 @@ from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.reach import Reached
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
-from splatbot.grasping.ways import Leg, Way, in_hand, raised, target_spheres
+from splatbot.grasping.ways import Leg, Way, in_hand, raised, target_spheres, within
 from splatbot.planning import JointGoal, Path
 from splatbot.planning.cartesian import straight_line
 from splatbot.planning.problem import Certificate
@@ -37,10 +37,12 @@ class SolidWorld:
     """What an arm must not touch, as python-fcl's geometries.
 
     Args:
+        points: (P, 3) that it was made of [m].
         whole: all of it.
-        around: without the target, given its rows among the points that the world was made of.
+        around: without some, given their rows.
     """
 
+    points: Array
     whole: Any
     around: Callable[[NDArray[np.int64]], Any]
 
@@ -131,6 +133,9 @@ class SolidWays:
         self._T = sampler.scene.T_world_base
         self._around = world.around(target.rows)
         self._object = target_spheres(sampler, target)
+        own = within(world.points, self._object)
+        own[target.rows] = True
+        self._beside = world.around(np.flatnonzero(own))
 
     def to(self, grasp: Grasp, start: Array) -> Way | str:
         """See :class:`splatbot.grasping.ways.Ways`."""
@@ -148,12 +153,12 @@ class SolidWays:
         if approach is None:
             return "its approach is blocked"
         q = approach[-1]
-        closed = SolidArm(self.robot, self._T, grasp.width, self._around)
+        closed = SolidArm(self.robot, self._T, grasp.width, self._beside)
         attached = in_hand(closed.spheres, q, self._object)
         free = straight(closed, closed.free, q, raised(self.s, closed.spheres, q, self.o.free))
         if free is None:
             return "it cannot be lifted"
-        loaded = SolidArm(self.robot, self._T, grasp.width, self._around, attached)
+        loaded = SolidArm(self.robot, self._T, grasp.width, self._beside, attached)
         top = raised(self.s, closed.spheres, free[-1], self.o.lift - self.o.free)
         lift = straight(loaded, loaded.free, free[-1], top)
         if lift is None:
@@ -171,7 +176,7 @@ class SolidWays:
 
     def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
         """See :class:`splatbot.grasping.ways.Ways`."""
-        loaded = SolidArm(self.robot, self._T, way.grasp.width, self._around, way.attached)
+        loaded = SolidArm(self.robot, self._T, way.grasp.width, self._beside, way.attached)
         path = self._connect(loaded, start, np.asarray(goal.q, dtype=np.float64))
         return "no path was found" if path is None else _leg(path, loaded)
 

@@ -65,7 +65,7 @@ class GaussianStack:
         """See :class:`Stack`."""
         begin = time.perf_counter()
         scene = segment(look.snapshot, look.T_world_base, cut=False)
-        sampler = GraspSampler(scene, panda(), observers=look.observers, min_observations=_OFTEN)
+        sampler = GraspSampler(scene, panda(), observers=look.observers, views=look.views, min_observations=_OFTEN)
         seconds = look.seconds + time.perf_counter() - begin
         world = look.snapshot.model.nbytes + sampler.field.nbytes
         return Knowledge(scene, lambda target: (sampler, MapWays(sampler, target, OPTIONS)), world, seconds)

@@ -19,7 +19,6 @@ from splatbot.grasping.held import covering_spheres
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.sampler import GraspSampler
-from splatbot.grasping.surface import target_surface
 from splatbot.grasping.types import Grasp
 from splatbot.planning import GaussianRRTStar, JointGoal, Path
 from splatbot.planning.cartesian import StraightResult, straight_line
@@ -158,11 +157,7 @@ class MapWays:
 
     def _without_strays(self, around: GaussianModel) -> GaussianCollisionField:
         """What is around the target, less what is within it: its own strays, which segmentation has left out."""
-        means = around.means.detach().double().numpy()
-        away = np.full(len(means), np.inf)
-        for sphere in self._object:
-            away = np.minimum(away, np.linalg.norm(means - sphere[:3], axis=1) - sphere[3])
-        inside = (away <= 0.0) | enclosed(means, self._object)
+        inside = within(around.means.detach().double().numpy(), self._object)
         return self.s.collision_field(around.select(torch.from_numpy(~inside)))
 
     def _up(self, arm: RobotSpheres, q: Array, by: float) -> StraightResult:
@@ -171,22 +166,22 @@ class MapWays:
 
 def target_spheres(sampler: GraspSampler, target: Target) -> Array:
     """A target as spheres (A, 4) [m, world] that cover its surface, what was not seen of it included."""
-    surface = target_surface(sampler.scene, target.rows, observers=sampler.observers)
+    surface = sampler.surface(target)
     return covering_spheres(surface.points, np.where(surface.seen, 0.0, surface.spread) + _N_SIGMA * surface.doubt)
 
 
-def enclosed(points: Array, spheres: Array) -> NDArray[np.bool_]:
-    """Which points (P, 3) have spheres (A, 4) on at least five of six sides: they are within what these cover."""
+def within(points: Array, spheres: Array) -> NDArray[np.bool_]:
+    """Which points (P, 3) are in spheres (A, 4), or have some of them on five of six sides: an object's own strays."""
     low, high = (spheres[:, :3] - spheres[:, 3:]).min(axis=0), (spheres[:, :3] + spheres[:, 3:]).max(axis=0)
     found = np.zeros(len(points), np.bool_)
-    rows = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     between = spheres[None, :, :3] - points[rows, None]
     sides = np.zeros(len(rows), np.int64)
     for k in range(3):
-        aside = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
-        sides += (aside & (between[..., k] > 0)).any(axis=1).astype(np.int64)
-        sides += (aside & (between[..., k] < 0)).any(axis=1)
-    found[rows] = sides >= _SIDES
+        beside = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
+        sides += (beside & (between[..., k] > 0)).any(axis=1)
+        sides += (beside & (between[..., k] < 0)).any(axis=1)
+    found[rows] = (sides >= _SIDES) | (np.linalg.norm(between, axis=2) <= spheres[:, 3]).any(axis=1)
     return found
 
 
