@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -14,8 +15,8 @@ from splatbot.config import Config
 from splatbot.errors import InputError
 from splatbot.frame import Frame, PosePrior
 from splatbot.gaussians import Snapshot
-from splatbot.geometry import inverse, look_at, se3_exp
-from splatbot.grasping.affordance import PixelHint, View
+from splatbot.geometry import inverse, look_at, se3_exp, transform_points
+from splatbot.grasping.affordance import PointHint
 from splatbot.logs.raycast import Moving, Surface
 from splatbot.logs.shapes import box
 from splatbot.logs.textures import Texture
@@ -36,9 +37,10 @@ _MIDDLE, _AWAY = np.array([0.5, 0.0, 0.05]), 0.6  # [m] what the camera looks at
 _RINGS = ((45.0, (-130, -80, -40, 0, 40, 80)), (65.0, (80, 40, 0, -40, -80)))  # [deg] over the table: turns around it
 FARTHEST = 0.95  # [m] of depth that is used
 _RATE = 4.0  # [Hz]
+_LOOKED = 4  # of the frames, one is looked at for a click
 _KNOWN = (5e-4, 5e-4)  # [m], [rad] standard deviation of the camera's pose by the arm's joints
 # Fine Gaussians, left where depth put them: refinement for pictures moves means by millimetres, too much for grasps.
-MAPPING = {"stride": 2, "new_depth": 0.01, "rate_means": 0.0, "refine_iterations": 2, "final_iterations": 20}
+MAPPING = {"stride": 1, "new_depth": 0.01, "rate_means": 0.0, "refine_iterations": 0, "final_iterations": 0}
 _TABLE = Surface(box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05))
 
 
@@ -52,7 +54,7 @@ class Look:
         T_world_base: (4, 4), as the joints had it at the first frame.
         snapshot: of the map.
         observers: (N, 3) where each Gaussian was first seen from [m, world], NaN where that is not known.
-        hint: the target, clicked at in one of the frames.
+        hint: the target, clicked at in one of the frames: what its depth has there.
         seconds: of mapping.
     """
 
@@ -61,7 +63,7 @@ class Look:
     T_world_base: Array
     snapshot: Snapshot
     observers: Array
-    hint: PixelHint
+    hint: PointHint
     seconds: float
 
     @property
@@ -122,7 +124,7 @@ def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Confi
         inverse(told[0]),
         snapshot,
         _observers(snapshot, keyframes),
-        _click(trial, log, poses),
+        _click(trial, log, shot, poses),
         seconds,
     )
 
@@ -175,24 +177,23 @@ def _observers(snapshot: Snapshot, T_world_keyframe: Array) -> Array:
     return np.asarray(known[np.where(inside, anchors, len(T_world_keyframe))])
 
 
-def _click(trial: TrialScene, log: WristLog, poses: Array) -> PixelHint:
-    """The middle of the target's pixels in the tracked frame that shows most of it, as somebody would click at it."""
+def _click(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Array) -> PointHint:
+    """The middle of the target's pixels with depth, in the tracked frame that has most of them, as one would click."""
     twin = Twin(trial.scene)
-    best: tuple[int, int, NDArray[np.bool_]] | None = None
-    for k in range(0, len(log), 4):
+    best: tuple[int, NDArray[np.bool_]] | None = None
+    for k in range(0, len(frames), _LOOKED):
         if not np.isfinite(poses[k]).all():
             continue
         twin.reset(log.joints[k])
-        T = log.ground_truth.T_world_camera[k]
-        geoms, _ = cast(twin.world.model, twin.data, pixel_rays(log.camera), T, 3.0)
+        geoms, _ = cast(twin.world.model, twin.data, pixel_rays(log.camera), log.ground_truth.T_world_camera[k], 3.0)
         owners = np.array([*twin.world.owner, ""])
-        shows = (owners[geoms] == trial.target) & ~log.shows_robot(k)
-        if best is None or shows.sum() > best[1]:
-            best = k, int(shows.sum()), shows
-    if best is None or not best[1]:
+        shows = (owners[geoms] == trial.target) & ~log.shows_robot(k) & (usable_depth(frames[k]) > 0)
+        if best is None or shows.sum() > best[1].sum():
+            best = k, shows
+    if best is None or not best[1].any():
         raise InputError("is in no picture.", field=trial.target, hint="give another seed")
-    k, _, shows = best
+    k, shows = best
     v, u = np.nonzero(shows)
     nearest = int(np.argmin((v - v.mean()) ** 2 + (u - u.mean()) ** 2))
-    view = View(log.camera, poses[k], log[k].rgb)
-    return PixelHint(float(u[nearest]), float(v[nearest]), view)
+    at = log.camera.backproject(usable_depth(frames[k]))[v[nearest], u[nearest]].astype(np.float64)
+    return PointHint(transform_points(poses[k], at))

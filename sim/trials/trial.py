@@ -207,8 +207,9 @@ class _Watched(TwinController):
             self._touches.look(self.twin.data, self._clock)
 
     def touched(self, target: str) -> tuple[str, ...]:
-        """Everything but the target that the arm has touched, and itself where it has."""
-        return tuple(sorted({touch.other for touch in self._touches.found} - {target}))
+        """The things but the target that the arm has touched."""
+        things = {thing.name for thing in self.twin.scene.objects} - {target}
+        return tuple(sorted({touch.other for touch in self._touches.found} & things))
 
 
 def _reality(trial: TrialScene) -> HeldOutTwin:
