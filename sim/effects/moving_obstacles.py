@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def place_on(thing: SceneObject, time: float) -> Array:
-    """Where (3,) [m] on its path an object is at a time [s]: linear between places, after the last back to the first."""
+    """Where (3,) [m] an object is on its path at a time [s]: linear between places, there and back again."""
     times, places = np.array([p.t for p in thing.path]), np.array([p.at for p in thing.path])
     length = times[-1]
     t = time % (2 * length)

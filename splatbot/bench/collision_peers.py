@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 import torch
-from numpy.typing import NDArray
 
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop

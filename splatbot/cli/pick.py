@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from splatbot.grasping.affordance import Affordance, Target
+    from splatbot.grasping.affordance import Target
     from splatbot.grasping.pick_types import PickResult
     from splatbot.segmentation import MapScene
     from splatbot.sim.twin import Twin
@@ -56,6 +56,7 @@ def pick(
         out: folder to write to; by default runs/pick.
     """
     from splatbot.atomic import atomic_write
+    from splatbot.cli.affordances import name_backends
     from splatbot.errors import InputError
     from splatbot.grasping.affordance import NameHint, find_target
     from splatbot.grasping.options import GraspOptions
@@ -66,7 +67,7 @@ def pick(
     from splatbot.sim.scene import load_scene
     from splatbot.sim.twin import Twin
 
-    backends = _backends(vlm=vlm)
+    backends = name_backends(vlm=vlm)
     twin = Twin(load_scene(scene))
     controller = TwinController(twin)
     robot = twin.world.robot
@@ -106,17 +107,6 @@ def _known(twin: Twin, views: int, seed: int) -> MapScene:
     movable = [thing.name for thing in twin.scene.objects if thing.movable]
     names = [NamedPlace(name, twin.data.body(f"object/{name}").xipos.copy()) for name in movable]
     return segment(scan(twin, views=views, seed=seed), base_of(twin.scene), names=names)
-
-
-def _backends(*, vlm: bool) -> list[Affordance]:
-    from splatbot.grasping.words import WordAffordance
-
-    rules = WordAffordance()
-    if not vlm:
-        return [rules]
-    from splatbot.grasping.vision import EndpointModel, VisionAffordance
-
-    return [VisionAffordance(EndpointModel.from_environment(), rules=rules), rules]
 
 
 def _heights(twin: Twin) -> dict[str, float]:

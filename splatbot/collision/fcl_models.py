@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splatbot.protocols import Array
 
 
-def fcl_mesh(vertices: Array, triangles: NDArray[np.integer[Any]]) -> Any:
+def fcl_mesh(vertices: Array, triangles: NDArray[Any]) -> Any:
     """A bounding volume hierarchy of vertices (V, 3) [m] and triangles (T, 3).
 
     Raises:
