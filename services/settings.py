@@ -31,6 +31,8 @@ class ServiceSettings(BaseSettings):
     host: str = Field("127.0.0.1", description="address to listen on; 0.0.0.0 for every interface")
     port: int = Field(8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
     ros_port: int | None = Field(None, ge=0, le=65535, description="a port for roslib clients too (9090 is theirs)")
+    zenoh_router: str | None = Field(None, description="where ROS 2 nodes meet over Zenoh, e.g. tcp/localhost:7447")
+    ros_domain: int = Field(0, ge=0, le=232, description="their ROS_DOMAIN_ID")
     viewer_port: int | None = Field(None, ge=0, le=65535, description="port of the viewer, on this machine alone")
     record: Path | None = Field(None, description="an MCAP file that every topic is recorded into")
     api_keys: Words = Field((), description="hashes that `splatbot serve --new-key` prints; needed beyond loopback")

@@ -1,4 +1,4 @@
-"""What stands beside the HTTP service: topics and services of ROS, a recording of them, the viewer."""
+"""What stands beside the HTTP service: topics and services of ROS, Zenoh, a recording, the viewer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from splatbot.frame import Frame
 from splatbot.services.arms import Arms
 from splatbot.services.ros.node import RosNode
 from splatbot.services.ros.recorder import McapRecorder
+from splatbot.services.ros.zenoh_bridge import ZenohBridge
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.services.viewer.viewer import Viewer
@@ -25,12 +26,15 @@ class Sides:
 
     Raises:
         InputError: the viewer's port is taken.
+        ConfigError: Zenoh is not installed, or its router's address malformed.
     """
 
     def __init__(
         self, settings: ServiceSettings, store: MapStore, arms: Arms, *, on_frame: Callable[[Frame], Any]
     ) -> None:
         self.ros = RosNode(store, arms=arms, on_frame=on_frame)
+        router = settings.zenoh_router
+        self._zenoh = ZenohBridge(self.ros.graph, router, domain=settings.ros_domain) if router is not None else None
         self._record = settings.record
         self._recorder: McapRecorder | None = None
         # The viewer knows no keys: whoever is elsewhere comes through a tunnel.
@@ -44,6 +48,8 @@ class Sides:
             LogError: there is a recording of that name already.
         """
         self.ros.start()
+        if self._zenoh is not None:
+            self._zenoh.start()
         if self._record is not None:
             self._recorder = McapRecorder(self.ros.graph, self._record)
         if self.viewer is not None:
@@ -51,6 +57,8 @@ class Sides:
 
     def stop(self) -> None:
         """End; the recording is whole then."""
+        if self._zenoh is not None:
+            self._zenoh.stop()
         self.ros.stop()
         if self._recorder is not None:
             self._recorder.stop()

@@ -6,22 +6,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import mujoco
 import numpy as np
 
+from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
-from splatbot.geometry import quat_to_rotation
+from splatbot.geometry import inverse, quat_to_rotation, transform_points
 from splatbot.protocols import Array
-from splatbot.segmentation import Fit, Support, clusters, find_support, fit, given_support
-from splatbot.sim.maps.ellipsoids import Ellipsoids, merge
+from splatbot.segmentation import MapScene, Support, fit, segment
+from splatbot.segmentation.objects import FEWEST, OPAQUE, solid_rows
+from splatbot.sim.maps.ellipsoids import Ellipsoids, merge, surface_points
 from splatbot.sim.scene import Clutter, Scene, SceneObject
-from splatbot.sim.solids import rotation_of
+from splatbot.sim.solids import pose_at, rpy_of
 
-_OPAQUE = 0.3  # fainter Gaussians are no surface
-_ABOVE = 0.008  # [m] over the table: lower is the table's own noise
+_TABLE = 0.02  # [m] thick; what is below its top was hardly seen
+_RIM = 0.5  # [%] of the table's Gaussians that may lie beyond its edge on each side
 _BESIDE = 0.03  # [m] from a thing that may move: what is left of the map there is of the thing
-_FEWEST, _LARGEST = 40, 0.35  # Gaussians of an object; [m] across
+_ON_TABLE = -2  # as segmentation labels them
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,35 +57,39 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     Raises:
         InputError: nothing of the map is in the part that is used.
     """
-    R, t = rotation_of(clutter.rpy), np.asarray(clutter.at)
-    means = model.means.detach().numpy().astype(np.float64) @ R.T + t
-    solid = model.opacities.detach().numpy() >= _OPAQUE
-    used = np.flatnonzero(solid & ((means >= clutter.low) & (means <= clutter.high)).all(axis=1))
+    T_scene_map = pose_at(clutter.at, clutter.rpy)
+    R = T_scene_map[:3, :3]
+    means = transform_points(T_scene_map, model.means.detach().double().numpy())
+    used = np.flatnonzero(solid_rows(model) & ((means >= clutter.low) & (means <= clutter.high)).all(axis=1))
     if not len(used):
         raise InputError(
-            f"{clutter.file}: none of {len(means)} Gaussians is between {clutter.low} and {clutter.high}.",
+            f"{clutter.file}: none of {len(means)} Gaussians is solid and between {clutter.low} and {clutter.high}.",
             field="map",
             hint="name another part by low and high, or place the map by at and rpy",
         )
-    points, labels = means[used], np.full(len(means), -2, dtype=np.int32)
+    labels = np.full(len(means), -2, dtype=np.int32)
     labels[used] = -1
     objects: list[SceneObject] = []
     notes: list[str] = []
-    support = find_support(points) if clutter.support is None else _given(points, clutter.support)
-    if support is not None:
-        labels[used[support.inside]] = 0
-        objects.append(_table(support))
-        notes.append(f"table: {int(support.inside.sum())} Gaussians, RMS {1e3 * support.error:.1f} mm from the plane")
+    plane = None if clutter.support is None else _in_map(clutter.support, T_scene_map)
+    scene = segment(model, inverse(T_scene_map), box=[clutter.low, clutter.high], plane=plane)
+    if scene.support is not None:
+        on = used[scene.labels[used] == _ON_TABLE]
+        labels[on] = 0
+        objects.append(_table(scene.support, means[on]))
+        notes.append(f"table: {len(on)} Gaussians, RMS {1e3 * scene.support.error:.1f} mm from the plane")
         if clutter.objects:
-            _add_objects(points, used, support, clutter, labels, objects, notes)
+            _add_objects(scene, means, used, clutter, labels, objects, notes)
     left = np.flatnonzero(labels == -1)
     quats, scales = (x.detach().numpy().astype(np.float64)[left] for x in (model.quats, model.scales))
     M = R @ quat_to_rotation(quats) * scales[:, None, :] if len(left) else np.zeros((0, 3, 3))
     weights = np.sort(scales, axis=1)[:, 1:].prod(axis=1) if len(left) else np.zeros(0)
     rest = merge(means[left], M @ M.transpose(0, 2, 1), weights, base, clutter.ellipsoids)
+    beyond = 1e3 * np.percentile(_beyond(rest, model, T_scene_map), [50, 95])
     notes.append(
         f"clutter: {len(left)} Gaussians as {len(rest.centers)} ellipsoids, "
-        f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm)"
+        f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm), which reach "
+        f"{beyond[0]:.1f} mm beyond the field (95 %: {beyond[1]:.1f} mm)"
     )
     return MapParts(model, tuple(objects), rest, tuple(notes), labels)
 
@@ -109,48 +116,78 @@ def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
     return geoms
 
 
-def _given(points: Array, plane: tuple[float, float, float, float]) -> Support:
+def _beyond(ellipsoids: Ellipsoids, model: GaussianModel, T_scene_map: Array) -> Array:
+    """How far (E,) the ellipsoids reach out of what collisions are asked of [m]: a path past them may touch."""
+    if not len(ellipsoids.centers):
+        return np.zeros(1)
+    points = surface_points(ellipsoids)
+    field = GaussianCollisionField(model, min_opacity=OPAQUE)
+    in_map = transform_points(inverse(T_scene_map), points.reshape(-1, 3))
+    room = field.clearance(in_map).distance.reshape(points.shape[:2])
+    return np.maximum(room.max(axis=1), 0.0)
+
+
+def _in_map(plane: tuple[float, float, float, float], T_scene_map: Array) -> Array:
+    """A plane (n, d) of the scene, n · p + d = 0, in the map's frame (4,)."""
     length = float(np.linalg.norm(plane[:3]))
     if length < 1e-6 or plane[2] <= 0:
         raise InputError(f"is {list(plane)}.", field="map.support", hint="give n, d with n upwards")
-    return given_support(points, np.array(plane[:3]) / length, -plane[3] / length)
+    normal = np.array(plane[:3]) / length
+    return np.append(normal @ T_scene_map[:3, :3], plane[3] / length + normal @ T_scene_map[:3, 3])
 
 
-def _table(support: Support) -> SceneObject:
+def _table(support: Support, on: Array) -> SceneObject:
+    """As far as it was seen: an endless plane would stand in the way of an arm that reaches past the table's edge."""
     n = support.normal
-    roll, pitch = float(np.arctan2(-n[1], n[2])), float(np.arcsin(np.clip(n[0], -1, 1)))
-    at = n * support.offset
-    values = {"name": "map-table", "shapes": [{"kind": "plane"}], "at": at.tolist(), "rpy": [roll, pitch, 0.0]}
-    return SceneObject.model_validate(values)
+    along = np.cross([0.0, 1.0, 0.0], n)
+    along /= np.linalg.norm(along)
+    flat = np.stack([along, np.cross(n, along)], axis=1)
+    seen = on @ flat
+    if len(seen) < FEWEST:
+        roll, pitch = float(np.arctan2(-n[1], n[2])), float(np.arcsin(np.clip(n[0], -1, 1)))
+        values = {"shapes": [{"kind": "plane"}], "at": (n * support.offset).tolist(), "rpy": [roll, pitch, 0.0]}
+        return SceneObject.model_validate({"name": "map-table", **values})
+    yaw = float(np.radians(cv2.minAreaRect(seen.astype(np.float32))[2]))
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    low, high = np.percentile(seen @ turn, [_RIM, 100 - _RIM], axis=0)
+    axes = flat @ turn
+    at = axes @ ((low + high) / 2) + n * (support.offset - _TABLE / 2)
+    shape = {"kind": "box", "size": [*np.maximum(high - low, _TABLE).tolist(), _TABLE]}
+    rpy = rpy_of(np.c_[axes, n])
+    return SceneObject.model_validate({"name": "map-table", "shapes": [shape], "at": at.tolist(), "rpy": rpy})
 
 
 def _add_objects(
-    points: Array,
+    scene: MapScene,
+    means: Array,
     used: np.ndarray,
-    support: Support,
     clutter: Clutter,
     labels: np.ndarray,
     objects: list[SceneObject],
     notes: list[str],
 ) -> None:
-    above = np.flatnonzero((support.height(points) > _ABOVE) & ~support.inside)
-    for rows in clusters(points[above]):
-        cluster = points[above[rows]]
-        if len(cluster) < _FEWEST or np.ptp(cluster, axis=0).max() > _LARGEST:
-            continue
-        floor = support.offset / support.normal[2]
-        found: Fit = fit(cluster, floor)
+    for thing in scene.objects:
+        points = means[thing.rows[scene.solid[thing.rows]]]
+        found = fit(points, _floor(scene, points))
         number = len(objects)
-        labels[used[above[rows]]] = number
+        labels[thing.rows] = number
         name = f"map-{found.shape['kind']}-{number}"
         values = {"name": name, "shapes": [found.shape], "at": found.at.tolist(), "movable": clutter.movable}
         objects.append(SceneObject.model_validate(values))
         notes.append(
-            f"{name}: {len(cluster)} Gaussians, {1e3 * found.error:.1f} mm from its surface "
+            f"{name}: {len(points)} Gaussians, {1e3 * found.error:.1f} mm from its surface "
             f"(95 %: {1e3 * found.worst:.1f} mm)"
         )
-    if clutter.movable:
-        _gather_strays(points, used, support, labels)
+    if clutter.movable and scene.support is not None:
+        _gather_strays(means[used], used, scene.support, labels)
+
+
+def _floor(scene: MapScene, points: Array) -> float:
+    """Height of what things stand on [m], under their middle."""
+    under = scene.under(points) or scene.support
+    assert under is not None
+    x, y = points[:, :2].mean(axis=0)
+    return float((under.offset - under.normal[:2] @ [x, y]) / under.normal[2])
 
 
 def _gather_strays(points: Array, used: np.ndarray, support: Support, labels: np.ndarray) -> None:

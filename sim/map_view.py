@@ -13,7 +13,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, pose_from_quat, quat_multiply, rotation_to_quat, transform_points
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_rgbd
-from splatbot.sim.solids import rotation_of
+from splatbot.sim.solids import pose_at
 from splatbot.sim.view import View
 from splatbot.sim.world import OBJECT, World
 
@@ -34,9 +34,7 @@ class MapView:
         assert world.scene.map is not None
         self.camera, self._model = camera, parts.model
         self._sh_degree = world.harmonics
-        self._T_world_map = np.eye(4)
-        self._T_world_map[:3, :3] = rotation_of(world.scene.map.rpy)
-        self._T_world_map[:3, 3] = world.scene.map.at
+        self._T_world_map = pose_at(world.scene.map.at, world.scene.map.rpy)
         self._loose = [
             (int(world.model.body(OBJECT + thing.name).id), torch.from_numpy(np.flatnonzero(parts.labels == label)))
             for label, thing in enumerate(parts.objects)

@@ -159,6 +159,13 @@ def rotation_of(rpy: Vec3) -> Array:
     )
 
 
+def pose_at(at: Vec3, rpy: Vec3) -> Array:
+    """Pose (4, 4) of something that is placed at ``at`` [m] and turned by ``rpy`` [rad]."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation_of(rpy), at
+    return T
+
+
 def quat_of(rpy: Vec3) -> list[float]:
     """Quaternion wxyz of roll, pitch, yaw [rad]."""
     return [float(v) for v in rotation_to_quat(rotation_of(rpy))]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatbot.geometry import rotation_to_quat
+from splatbot.geometry import quat_to_rotation, rotation_to_quat
 from splatbot.protocols import Array
 
 REACH = 0.9  # [m] from the base, as far as an arm of this size reaches
@@ -72,6 +72,16 @@ def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: 
     return Ellipsoids(
         centers, axes, rotation_to_quat(R), float(distance.mean()), float(np.percentile(distance, 95))
     )  # fmt: skip
+
+
+def surface_points(ellipsoids: Ellipsoids) -> Array:
+    """Points (E, 14, 3) of their surfaces [m]: the ends of the axes, and the middles of the octants."""
+    corners = np.stack(np.meshgrid(*3 * [[-1.0, 1.0]], indexing="ij"), axis=-1).reshape(-1, 3) / np.sqrt(3)
+    directions = np.concatenate([np.eye(3), -np.eye(3), corners])
+    local = ellipsoids.axes[:, None] * directions
+    return np.asarray(
+        ellipsoids.centers[:, None] + np.einsum("eij,epj->epi", quat_to_rotation(ellipsoids.quats), local)
+    )
 
 
 def _cells(means: Array, base: Array, size: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from splatbot.bench.timing import threads
 from splatbot.bench.truth import Truth
 from splatbot.bench.twin_paths import truth_scene
 from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_error
+from splatbot.formats.ply import save_ply
 from splatbot.geometry import inverse
 from splatbot.protocols import Array
 from splatbot.results.margin import REACH, SHARE
@@ -116,7 +117,7 @@ def map_table(plan: SimToSimPlan, file: Path, seed: int) -> MappedTable:
     table = work_table(seed)
     mapped = map_film(shoot(table, *plan.film, seed=seed))
     file.parent.mkdir(parents=True, exist_ok=True)
-    mapped.snapshot.model.save(file)
+    save_ply(mapped.snapshot.model, file, bookkeeping=True)  # what no depth supports is air to physics, too
     return MappedTable(table, mapped, file, seed)
 
 

@@ -10,8 +10,11 @@ import numpy as np
 
 from splatbot.protocols import Array
 
-_PLAIN = 1.3  # a hull is taken only where every primitive's error is this many times larger
+# A hull follows the noise of its points, and has no side that nobody saw: it is taken only where every primitive's
+# error is larger than _PLAIN times the hull's, and by more than noise [m].
+_PLAIN, _NOISE = 1.3, 3e-3
 _FOOT = 0.3  # of a hull's height whose points stand on the floor
+_BARE = 0.25  # of its radius that a ball may stick out over its points
 _TRIM = 1.0  # [%] of the points that may stick out of a box or cylinder on each side
 
 
@@ -39,7 +42,7 @@ def fit(points: Array, floor: float) -> Fit:
     """
     best = min(primitive_fits(points, floor), key=lambda f: f.error)
     hull = _hull(points, *_heights(points, floor))
-    return hull if best.error > _PLAIN * max(hull.error, 2e-3) else best
+    return hull if best.error > _PLAIN * hull.error + _NOISE else best
 
 
 def primitive_fits(points: Array, floor: float) -> list[Fit]:
@@ -86,11 +89,17 @@ def _circle(points: Array) -> tuple[Array, float]:
 
 
 def _ball(points: Array) -> Fit:
-    """Least squares in |p|² = 2 c·p + (r² - |c|²)."""
+    """Least squares in |p|² = 2 c·p + (r² - |c|²); infinitely wrong where its top is far over all points.
+
+    A ring that lies flat is on the surface of many balls.
+    """
     A = np.c_[2 * points, np.ones(len(points))]
     x = np.linalg.lstsq(A, (points**2).sum(axis=1), rcond=None)[0]
     radius = float(np.sqrt(max(x[3] + x[:3] @ x[:3], 1e-6)))
-    return _fit({"kind": "sphere", "radius": radius}, x[:3], np.linalg.norm(points - x[:3], axis=1) - radius)
+    shape = {"kind": "sphere", "radius": radius}
+    if x[2] + radius > points[:, 2].max() + _BARE * radius:
+        return Fit(shape, x[:3], np.inf, np.inf)
+    return _fit(shape, x[:3], np.linalg.norm(points - x[:3], axis=1) - radius)
 
 
 def _hull(points: Array, low: float, high: float) -> Fit:

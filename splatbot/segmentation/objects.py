@@ -17,7 +17,7 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.parts import cut_at_steps, nearest_of, region
-from splatbot.segmentation.plane import NEAR, Support, find_support
+from splatbot.segmentation.plane import NEAR, Support, find_support, given_support
 from splatbot.workspace import NamedPlace
 
 OPAQUE = 0.3  # fainter Gaussians are no surface
@@ -176,9 +176,7 @@ def _known(plane: ArrayLike, T_world_base: Array, points: Array) -> Support:
     values = np.asarray(plane, dtype=np.float64)
     normal = T_world_base[:3, :3].T @ values[:3]
     offset = -float(values[3] + values[:3] @ T_world_base[:3, 3])
-    away = points @ normal - offset
-    inside = np.abs(away) < NEAR
-    return Support(normal, offset, float(np.sqrt(np.mean(away[inside] ** 2))) if inside.any() else 0.0, inside)
+    return given_support(points, normal, offset)
 
 
 def _things(
@@ -237,7 +235,8 @@ def _holds(plane: Support, points: Array) -> bool:
 def above_support(support: Support, points: Array) -> NDArray[np.bool_]:
     """Which points (P, 3) are higher than the support's own noise."""
     height = support.height(points)
-    noise = 1.48 * float(np.median(np.abs(height[np.abs(height) < NEAR])))
+    near = np.abs(height[np.abs(height) < NEAR])
+    noise = 1.48 * float(np.median(near)) if len(near) else 0.0
     return np.asarray(height > np.clip(3.0 * noise, LOWEST, ABOVE))
 
 

@@ -24,7 +24,7 @@ from splatbot.sim.compare.recorded import ArmRecord, base_in_map, pose_gap, read
 from splatbot.sim.compare.replay import BY_IK, RECORDED, find_knots, replay
 from splatbot.sim.compare.views import Surroundings, TwinViews, overlap, surroundings
 from splatbot.sim.scene import make_scene
-from splatbot.sim.solids import rotation_of, rpy_of
+from splatbot.sim.solids import Box, rotation_of, rpy_of
 from splatbot.sim.twin import Twin
 from splatbot.trajectory import Trajectory
 
@@ -130,7 +130,9 @@ def test_a_plane_that_the_log_names_counts_in_the_maps_frame(tmp_path: Path) -> 
     assert sought.support.offset == pytest.approx(0.0, abs=2e-3)
     assert given.support.offset == pytest.approx(0.02)
     table = next(thing for thing in TwinViews(given).world.scene.objects if thing.name == "map-table")
-    assert table.at[2] == pytest.approx(0.02)
+    (shape,) = table.shapes
+    assert isinstance(shape, Box)
+    assert table.at[2] + shape.size[2] / 2 == pytest.approx(0.02)
 
 
 def test_masked_pixels_do_not_count(tmp_path: Path) -> None:

@@ -11,8 +11,10 @@ from splatbot.bench.tabletop import Block, Tabletop
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_multiply, rotation_to_quat, se3_exp, transform_points
+from splatbot.protocols import Array
 from splatbot.sim.maps.placed import placed_scene
-from splatbot.sim.scene import make_scene
+from splatbot.sim.scene import SceneObject, make_scene
+from splatbot.sim.solids import Box, rotation_of
 from splatbot.sim.twin import Twin
 from splatbot.workspace import Workspace
 
@@ -48,7 +50,8 @@ def test_the_table_and_the_carton_are_where_they_are_from_the_base(run: Path, fi
     np.testing.assert_allclose(scene.gravity, [0, 0, -9.81], atol=1e-6)
     world = Twin(scene).world
     objects = {thing.name: thing for thing in world.scene.objects}
-    np.testing.assert_allclose(objects["map-table"].at, [0, 0, 0], atol=1e-5)
+    assert _top(objects["map-table"]) == pytest.approx([0.6, 0.0, 0.0], abs=1e-3)
+    assert _top(objects["map-table"])[2] == pytest.approx(0.0, abs=1e-5)
     np.testing.assert_allclose(objects["map-box-1"].at[:2], [0.5, 0.15], atol=2e-3)
 
 
@@ -57,7 +60,14 @@ def test_a_plane_that_is_given_counts_more_than_one_that_would_be_found(run: Pat
     at = T_WORLD_BASE[:3, 3] + 0.004 * up
     Workspace(T_WORLD_BASE, None, np.append(up, -float(up @ at))).save(run / "scene.yaml")
     table = Twin(make_scene(placed_scene(run))).world.scene.objects[0]
-    np.testing.assert_allclose(table.at, [0, 0, 0.004], atol=1e-5)
+    assert _top(table)[2] == pytest.approx(0.004, abs=1e-5)
+
+
+def _top(table: SceneObject) -> Array:
+    """The middle of a table's upper face (3,) [m]."""
+    (shape,) = table.shapes
+    assert isinstance(shape, Box)
+    return np.asarray(table.at) + rotation_of(table.rpy)[:, 2] * shape.size[2] / 2
 
 
 def test_a_mount_that_leans_feels_gravity_from_aside(run: Path) -> None:
