@@ -7,6 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+import torch
+
+from splatbot.collision.evidence import gather_evidence
 from splatbot.grasping.affordance import Target, find_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_types import PickOptions
@@ -64,10 +68,14 @@ class GaussianStack:
     def learn(self, look: Look) -> Knowledge:
         """See :class:`Stack`."""
         begin = time.perf_counter()
-        scene = segment(look.snapshot, look.T_world_base, cut=False)
-        sampler = GraspSampler(scene, panda(), observers=look.observers, views=look.views, min_observations=_OFTEN)
+        # Flying pixels at edges and ghosts of what moved: more frames saw through them than saw them.
+        solid = np.flatnonzero(~gather_evidence(look.snapshot.model, look.views).seen_through)
+        model = look.snapshot.model.select(torch.from_numpy(solid))
+        scene = segment(model, look.T_world_base, cut=False)
+        observers = look.observers[solid]
+        sampler = GraspSampler(scene, panda(), observers=observers, views=look.views, min_observations=_OFTEN)
         seconds = look.seconds + time.perf_counter() - begin
-        world = look.snapshot.model.nbytes + sampler.field.nbytes
+        world = model.nbytes + sampler.field.nbytes
         return Knowledge(scene, lambda target: (sampler, MapWays(sampler, target, OPTIONS)), world, seconds)
 
 
