@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import multiprocessing
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -140,6 +141,7 @@ def _results(plan: TrialsPlan, folder: Path, wanted: Sequence[tuple[int, tuple[s
     if plan.jobs == 1 or len(jobs) < 2:
         yield from map(_job, jobs)
         return
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes that begin now, which are as many as was asked for
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(plan.jobs, len(jobs)), mp_context=context, initializer=_alone) as pool:
         futures = {pool.submit(_job, job) for job in jobs}
@@ -154,7 +156,7 @@ def _results(plan: TrialsPlan, folder: Path, wanted: Sequence[tuple[int, tuple[s
 
 
 def _alone() -> None:
-    """One thread a process; the processes are as many as was asked for."""
+    """One thread a process."""
     torch.set_num_threads(1)
 
 

@@ -12,9 +12,11 @@ import numpy as np
 from splatbot.sim.compare.agreement import wilson
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.trials.scenes import TrialScene
+from splatbot.sim.trials.shake import RATE, Shake, strength
 from splatbot.sim.trials.trial import TrialRow
 
 _MEGA = 1e6
+_SAMPLES = 2001  # of the shaking
 
 
 def summaries(rows: Sequence[TrialRow]) -> list[dict[str, Any]]:
@@ -49,13 +51,19 @@ def physics(trial: TrialScene) -> dict[str, Any]:
     """What the twins of trials compute with: without it success means nothing."""
     twin = HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
     option, robot = twin.world.model.opt, twin.world.robot
+    assert robot is not None
+    assert robot.gripper is not None
     spread = Spread()
+    shake = Shake(robot.chain, robot.home)
+    places = robot.tcp(np.array([shake.reference(float(t))[0] for t in np.linspace(0.0, shake.duration, _SAMPLES)]))
     return {
-        "finger_force_n": None if robot is None or robot.gripper is None else robot.gripper.force,
+        "finger_force_n": robot.gripper.force,
         "cone": "elliptic" if option.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC) else "pyramidal",
         "impratio": float(option.impratio),
         "timestep_ms": 1e3 * twin.timestep,
         "friction": sorted({thing.friction for thing in trial.scene.movable}),
+        "shake_hz": RATE,
+        "shake_m_s2": round(strength(shake, places[:, :3, 3]), 1),
         "held_out_friction": spread.friction,
         "held_out_mass": spread.mass,
         "held_out_gain": spread.gain,

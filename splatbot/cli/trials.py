@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -64,7 +63,6 @@ def trials(
 
     count = trials if trials is not None else 250 if full else 24 if scenes == "isolated" else 50
     plan = TrialsPlan(scenes, count, stacks, first, jobs, frames, width, videos)
-    os.environ.setdefault("OMP_NUM_THREADS", "1" if jobs > 1 else str(os.cpu_count() or 1))
     folder = out if out is not None else Path("runs") / "trials"
     with shares(quiet) as tell:
         rows, interrupted = run_trials(plan, folder, tell=tell)

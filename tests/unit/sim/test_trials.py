@@ -20,7 +20,7 @@ from splatbot.sim.trials.run import FILE, TrialsPlan, read_rows, run_trials
 from splatbot.sim.trials.scenes import OBSTACLE, make_trial
 from splatbot.sim.trials.shake import SHARE, Shake
 from splatbot.sim.trials.surfaces import surfaces_of
-from splatbot.sim.trials.table import summaries, table_rows
+from splatbot.sim.trials.table import physics, summaries, table_rows
 from splatbot.sim.trials.trial import KEPT, RISE, Attempt, TrialRow
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA
@@ -123,6 +123,16 @@ def test_the_table_counts_what_the_rows_say() -> None:
     assert ours["by_kind"] == {"can": "2 of 3"}
     assert (theirs["success"], theirs["drop"]) == (0.0, 0.0)
     assert [words[0] for words in table_rows([ours, theirs])] == ["ours", "theirs"]
+
+
+def test_the_physics_that_a_table_holds_for_is_that_of_the_twin() -> None:
+    trial = make_trial(1)
+    found = physics(trial)
+    assert found["finger_force_n"] == 70.0
+    assert found["friction"] == sorted({thing.friction for thing in trial.scene.movable})
+    option = Twin(trial.scene).world.model.opt
+    assert (found["impratio"], found["timestep_ms"]) == (option.impratio, pytest.approx(1e3 * option.timestep))
+    assert 5.0 < found["shake_m_s2"] < 20.0
 
 
 def test_what_is_written_is_not_done_again_and_a_line_cut_short_is(tmp_path: Path) -> None:
