@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from splatbot.grasping.affordance import Affordance
     from splatbot.sim.picking import TwinPick
 
 
@@ -54,13 +53,14 @@ def pick(
         out: folder to write to; by default runs/pick.
     """
     from splatbot.atomic import atomic_write
+    from splatbot.cli.affordances import name_backends
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.pick_types import PickError, PickOptions
     from splatbot.sim.picking import pick_in_twin
     from splatbot.sim.scene import load_scene
     from splatbot.sim.twin import Twin
 
-    backends = _backends(vlm=vlm)
+    backends = name_backends(vlm=vlm)
     options = PickOptions(lift=lift, force=force, tries=tries, grasp=GraspOptions(seed=seed), seed=seed)
     twin = Twin(load_scene(scene))
     picked = pick_in_twin(twin, target, backends, options, views=views, margin=margin, home=home, seed=seed)
@@ -72,17 +72,6 @@ def pick(
     if not picked.result:
         raise PickError(picked.result)
     return 0
-
-
-def _backends(*, vlm: bool) -> list[Affordance]:
-    from splatbot.grasping.words import WordAffordance
-
-    rules = WordAffordance()
-    if not vlm:
-        return [rules]
-    from splatbot.grasping.vision import EndpointModel, VisionAffordance
-
-    return [VisionAffordance(EndpointModel.from_environment(), rules=rules), rules]
 
 
 def _print(picked: TwinPick, folder: Path) -> None:
