@@ -24,8 +24,8 @@ class _Section(BaseModel):
 _EFFORT: dict[float, dict[str, Any]] = {
     0: {"n_pixels": 2400, "iterations": 4, "features": "always", "n_features": 500},
     100: {"n_pixels": 4800, "iterations": 8, "features": "always", "n_features": 2000},
-    300: {"n_pixels": 9600, "iterations": 10, "features": "always", "n_features": 3000},
-    1000: {"n_pixels": 19200, "iterations": 12, "features": "always", "n_features": 4000},
+    300: {"n_pixels": 9600, "iterations": 10, "features": "always", "n_features": 2000},
+    1000: {"n_pixels": 19200, "iterations": 12, "features": "always", "n_features": 2000},
 }
 
 
@@ -187,8 +187,8 @@ class LoopsConfig(_Section):
     max_drift: float = Field(
         default=0.05, gt=0, description="a loop that asks for more drift per way is a look-alike [m/m, rad/rad]"
     )
-    min_shift: float = Field(default=0.01, gt=0, description="smaller gaps are left as they are [m]")
-    min_turn: float = Field(default=0.01, gt=0, description="smaller gaps are left as they are [rad]")
+    min_shift: float = Field(default=0.002, gt=0, description="smaller gaps are left as they are [m]")
+    min_turn: float = Field(default=0.001, gt=0, description="smaller gaps are left as they are [rad]")
     max_strain: float = Field(default=6.0, gt=0, description="a loop that stretches a measured motion more is none [σ]")
 
 

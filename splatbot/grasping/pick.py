@@ -39,6 +39,7 @@ class Picker:
         gripper: its fingers.
         options: how.
         stop: asked all the time; True ends the pick.
+        on_step: told of each stage that is done.
         make_ways: gives, for a target, who finds the ways to its grasps; by default
             :class:`splatbot.grasping.ways.MapWays`.
 
@@ -54,6 +55,7 @@ class Picker:
         *,
         options: PickOptions | None = None,
         stop: Callable[[], bool] | None = None,
+        on_step: Callable[[PickStep], None] | None = None,
         make_ways: Callable[[Target], Ways] | None = None,
     ) -> None:
         if gripper.stroke < sampler.hand.stroke - 1e-6:
@@ -61,7 +63,7 @@ class Picker:
             raise InputError(text, field="gripper", hint="give the robot that has this gripper")
         self.sampler, self.controller, self.gripper = sampler, controller, gripper
         self.options = options or PickOptions()
-        self._stop = stop
+        self._stop, self._on_step = stop, on_step
         self.make_ways = make_ways or (lambda target: MapWays(sampler, target, self.options))
 
     def pick(self, target: Target, *, grasps: GraspResult | None = None) -> PickResult:
@@ -201,6 +203,8 @@ class _Pick:
         now = time.perf_counter()
         self.steps.append(PickStep(self.stage, now - self._began, note))
         self._began = now
+        if self.p._on_step is not None:
+            self.p._on_step(self.steps[-1])
 
     def _ended(self, end: _EndedError) -> PickResult:
         """The arm at rest; fingers as they are."""

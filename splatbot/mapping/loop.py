@@ -30,6 +30,8 @@ _TRIED = 2  # candidates by looks that are verified for a keyframe
 _UNKNOWN = np.diag([0.5**2] * 3 + [0.5**2] * 3)  # covariance of a motion that could not be measured
 # Lens and depth are calibrated to this share: over a long way the error adds up [1].
 _CALIBRATION = 5e-3
+# A loop that the solved graph leaves more open than this is wrong [m], [rad].
+_OPEN = 1e-2, 2e-2
 _JUMP = 5e-3, 5e-3  # [m], [rad]: a keyframe was moved so far by its other neighbours; its own motion is measured
 
 
@@ -193,7 +195,7 @@ class LoopCloser:
         poses = self.graph.optimised()
         moved, turned = largest(edge.residual(poses) for edge in loops)
         strained = max(_strain(edge, poses) for edge in self.graph.edges if not edge.loop)
-        if moved > limits.min_shift or turned > 2 * limits.min_turn or strained > limits.max_strain:
+        if moved > _OPEN[0] or turned > _OPEN[1] or strained > limits.max_strain:
             self.graph.edges = [edge for edge in self.graph.edges if all(edge is not loop for loop in loops)]
             self.rejected += len(loops)
             return

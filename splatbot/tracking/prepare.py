@@ -18,6 +18,8 @@ from splatbot.frame import Frame
 Image = NDArray[np.float32]
 
 _FLYING_STEP = 0.03  # share of its depth by which a flying pixel differs from both surfaces
+# Where depth jumps by more than this share and this many σ between neighbours, two surfaces meet.
+_JUMP_STEP, _JUMP_SIGMAS = 0.03, 6.0
 _LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of one pixel is none
 
 
@@ -25,7 +27,7 @@ _LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of 
 class Level:
     """One pyramid level: grey (H, W) in 0..1, depth (H, W) [m] with 0 missing, and the camera of that size.
 
-    Grey is NaN where it may not be used.
+    Grey is NaN where it may not be used: masked, or on the finest level of a frame mixed of two surfaces.
     """
 
     gray: Image
@@ -50,7 +52,8 @@ class PreparedFrame:
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide.
 
-    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels.
+    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels. The finest decides the
+    pose and has no grey along occluding edges.
     """
     started = time.perf_counter()
     depth = usable_depth(frame, config)
@@ -63,7 +66,18 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     levels = [Level(smoothed(level.gray), level.depth, level.camera)]
     while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
         levels.append(halve(levels[-1]))
+    levels[0] = Level(gray_of_one_surface(levels[0], config), levels[0].depth, levels[0].camera)
     return PreparedFrame(frame, depth, tuple(levels), started)
+
+
+def gray_of_one_surface(level: Level, config: TrackingConfig) -> Image:
+    """Grey (H, W), NaN along occluding edges: where depth jumps within a pixel's 3x3, more than its noise explains.
+
+    Smoothing and interpolation mix the grey of two surfaces there, and from elsewhere others meet. The errors of such
+    pixels do not average out: a few per cent of all, they would pull the pose along with the parallax.
+    """
+    floor, quad = (_JUMP_SIGMAS * sigma for sigma in (config.sigma_depth_floor, config.sigma_depth_quad))
+    return np.asarray(_native.gray_of_one_surface(level.depth, level.gray, _JUMP_STEP, floor, quad))
 
 
 def smoothed(gray: Image) -> Image:

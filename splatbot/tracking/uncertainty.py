@@ -19,7 +19,7 @@ _LEAST = 1e-3
 _PLACEMENT = 0.02
 # Calibration of lens and depth is good to this share: such an error is the same in every frame, so along a path it adds
 # up, and does not average out.
-_CALIBRATION = 0.6e-3
+_CALIBRATION = 0.2e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <stdexcept>
 #include <vector>
 
 #include "arrays.hpp"
@@ -56,4 +57,19 @@ void define_depth(nb::module_& m) {
         return owned(std::move(out), {pixels.shape(0)});
       },
       "depth"_a.noconvert(), "pixels"_a.noconvert(), "Median depth of the 5x5 pixels around each; NaN where two surfaces meet.");
+  m.def(
+      "gray_of_one_surface",
+      [](Image depth, Image gray, float step, float floor, float quad) {
+        if (gray.shape(0) != depth.shape(0) || gray.shape(1) != depth.shape(1)) {
+          throw std::invalid_argument("gray and depth differ in shape");
+        }
+        std::vector<float> out(depth.size());
+        {
+          nb::gil_scoped_release release;
+          splatbot::gray_of_one_surface(view(depth), span_of(gray), step, floor, quad, out);
+        }
+        return owned(std::move(out), {depth.shape(0), depth.shape(1)});
+      },
+      "depth"_a.noconvert(), "gray"_a.noconvert(), "step"_a, "floor"_a, "quad"_a,
+      "Grey, NaN where surfaces of different depth meet.");
 }

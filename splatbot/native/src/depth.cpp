@@ -76,4 +76,30 @@ void depth_around(const DepthImage& depth, std::span<const float> pixels, std::s
   }
 }
 
+void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, float step, float floor, float quad,
+                         std::span<float> out) {
+  const int width = depth.width, height = depth.height;
+  constexpr float kMissing = std::numeric_limits<float>::infinity(), kNaN = std::numeric_limits<float>::quiet_NaN();
+  // Of three pixels of a column, with a spare one on each side.
+  std::vector<float> near(static_cast<std::size_t>(width) + 2, kMissing), far(static_cast<std::size_t>(width) + 2, 0.0F);
+  for (int v = 0; v < height; ++v) {
+    const std::size_t at = static_cast<std::size_t>(v) * width;
+    const float* here = depth.z.data() + at;
+    const float* above = v > 0 ? here - width : here;
+    const float* below = v + 1 < height ? here + width : here;
+    for (int u = 0; u < width; ++u) {
+      const float a = above[u], b = here[u], c = below[u];
+      const auto present = [](float z) { return z > 0.0F ? z : kMissing; };
+      near[u + 1] = std::min(present(a), std::min(present(b), present(c)));
+      far[u + 1] = std::max(a, std::max(b, c));
+    }
+    for (int u = 0; u < width; ++u) {
+      const float nearest = std::min(near[u], std::min(near[u + 1], near[u + 2]));
+      const float farthest = std::max(far[u], std::max(far[u + 1], far[u + 2]));
+      const float tolerance = std::max(step * nearest, floor + quad * nearest * nearest);
+      out[at + u] = farthest - nearest > tolerance ? kNaN : gray[at + u];  // false where nothing is measured
+    }
+  }
+}
+
 }  // namespace splatbot

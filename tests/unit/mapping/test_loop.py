@@ -143,6 +143,22 @@ def test_a_circuit_that_drifts_closes_without_a_gap() -> None:
     assert gap(closed, truth) < 0.6 * gap(open_, truth)
 
 
+def test_a_gap_of_a_centimetre_closes_before_frames_are_aligned_to_both_sides_of_it() -> None:
+    size = "width=160&height=120"
+    log = open_log(
+        f"synthetic:room?trajectory=laps&frames={FRAMES + AGAIN}&rate={FRAMES / 20}&{size}&effects=depth_noise"
+    )
+    assert log.ground_truth is not None
+    truth, gaps = log.ground_truth.T_world_camera, []
+    for enabled in (False, True):
+        slam = Slam(small_config(loops__enabled=enabled, mapping__refine_iterations=1))
+        for frame in log:
+            slam.process(frame)
+        gaps.append(gap(slam, [inverse(truth[0]) @ T for T in truth]))
+    assert 0.008 < gaps[0] < 0.015
+    assert gaps[1] < 0.6 * gaps[0]  # 4.0 of 10.5 mm
+
+
 def checkered(T_world_camera: Array, stamp: float, period: float) -> Frame:
     """A wall with patches of 5 cm and random colours that repeat every ``period`` [m] to the side."""
     colors = np.random.default_rng(1).integers(30, 226, (40, round(period / 0.05), 3), dtype=np.uint8)

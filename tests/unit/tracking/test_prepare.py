@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from splatbot.frame import Frame
 from splatbot.geometry import so3_exp
 from splatbot.tracking.prepare import (
     Level,
+    gray_of_one_surface,
     halve,
     halve_depth,
     normals_of,
@@ -141,8 +144,40 @@ def test_the_pyramid_halves_and_starts_at_most_as_wide_as_asked() -> None:
     for level in levels:
         assert level.gray.shape == level.depth.shape == (level.camera.height, level.camera.width)
         assert level.gray.dtype == level.depth.dtype == np.float32
-        assert 0.0 <= level.gray.min() < level.gray.max() <= 1.0
+        assert 0.0 <= np.nanmin(level.gray) < np.nanmax(level.gray) <= 1.0
         assert level.camera.cx == pytest.approx((level.camera.width - 1) / 2)
+
+
+def test_grey_is_left_out_on_both_sides_of_an_occluding_edge_and_nowhere_else() -> None:
+    gray = np.full((120, 160), 0.5, np.float32)
+    left_out = np.isnan(gray_of_one_surface(Level(gray, two_walls(), CAMERA), small_config().tracking))
+    expected = np.zeros(left_out.shape, bool)
+    expected[:, 79:81] = True
+    assert np.array_equal(left_out, expected)
+
+
+def test_grey_stays_on_slanted_surfaces_on_noisy_ones_and_beside_holes(rng: np.random.Generator) -> None:
+    R = np.eye(4)
+    R[:3, :3] = so3_exp([0, 0.4, 0])
+    depth = wall_depth(CAMERA, R, (0.0, 0.0, 1.0), 1.5)
+    depth += np.where(depth > 0, (1e-3 + 2e-3 * depth**2) * rng.standard_normal(depth.shape).clip(-2, 2), 0)
+    depth[40:60, 50:70] = 0
+    gray = np.full(depth.shape, 0.5, np.float32)
+    kept = gray_of_one_surface(Level(gray, depth.astype(np.float32), CAMERA), small_config().tracking)
+    assert np.array_equal(kept, gray)
+
+
+def test_coarse_levels_keep_their_grey_at_edges_and_a_mask_stays_left_out() -> None:
+    frame = wall_frame(np.eye(4))
+    mask = np.ones(frame.depth.shape, bool)
+    mask[20:40, 20:40] = False
+    depth = frame.depth.copy()
+    depth[:, 80:] *= 1.5
+    levels = prepare(replace(frame, depth=depth, mask=mask), small_config().tracking).levels
+    assert np.isnan(levels[0].gray[:, 79:81]).all()
+    assert np.isnan(levels[0].gray[20:40, 20:40]).all()
+    assert np.isfinite(levels[1].gray[:, 35:]).all()
+    assert np.isnan(levels[1].gray[10:20, 10:20]).all()
 
 
 @pytest.mark.parametrize(("size", "levels"), [((160, 120), 4), ((64, 48), 3), ((30, 16), 1), ((1, 1), 1)])
