@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.cli.map_page import page_of_map
 from splatbot.client import Client, Distances
 from splatbot.errors import SplatbotError
 from splatbot.geometry import transform_points
@@ -35,7 +36,7 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
         splatbot demo --out runs/demo --frames 80
 
     Args:
-        out: folder for the recording (log/), the map, metrics and report.html; an earlier demo there is replaced.
+        out: folder for the recording (log/), the map, metrics and the report; an earlier demo there is replaced.
         frames: length of the recording.
     """
     scene = open_log(f"synthetic:tabletop?frames={frames}")
@@ -44,7 +45,7 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
     effects = Effects([DepthNoise(why="a depth camera measures no table top exactly")])
     record(effects.over(scene), out / "log", ground_truth=scene.ground_truth)
     _say("2/4 mapping the recording")
-    run = map_log(open_log(out / "log"), out=out, on_progress=_tell, effects=effects.report())
+    run = map_log(open_log(out / "log"), out=out, on_progress=_tell, effects=effects.report(), map_page=page_of_map)
     if run.exit_code:
         _say(f"mapping ended early: {run.error or 'interrupted'}")
         return run.exit_code

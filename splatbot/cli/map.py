@@ -38,7 +38,7 @@ def map_log_command(
 ) -> int:
     """Turn an RGB-D log into a map of Gaussians.
 
-    Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml and report.html.
+    Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml, report.html and map.html.
     Ctrl-C saves what has been mapped so far; so does a frame that cannot be read. Every 30 s, and when the frames are
     through, the whole state is saved too (RUN/state), for --resume and --localise.
 
@@ -94,6 +94,7 @@ def map_log_command(
     if max_frames is not None and max_frames < 1:
         raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
 
+    from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display
     from splatbot.logs import open_log
     from splatbot.robots.in_view import without_robot
@@ -119,6 +120,7 @@ def map_log_command(
             resume=saved if resume is not None else None,
             localise=saved if localise is not None else None,
             source={"camera": _lasting(camera) if camera else None, "robot": robot},
+            map_page=page_of_map,
         )
     if out is None:
         _link_latest(folder)

@@ -31,6 +31,7 @@ def report_html(
     trajectory: Trajectory,
     track: TrajectoryScore | None,
     views: ViewScores,
+    map_page: str | None = None,
 ) -> str:
     """The page of one run, as text.
 
@@ -41,6 +42,7 @@ def report_html(
         trajectory: the tracked poses.
         track: the trajectory against its reference, where there is one.
         views: the held-out views.
+        map_page: file beside the report that shows the map, to be turned.
     """
     name = str(metrics["log"]["name"])
     parts = [
@@ -51,7 +53,7 @@ def report_html(
         section("Frames in doubt", _doubts(rows)),
         section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
         section("Time per frame", image(stages_plot(rows), "milliseconds per stage"), _stages(metrics), _pace(metrics)),
-        section("Map", image(gaussians_plot(rows), "Gaussians over frames")),
+        section("Map", _turned(map_page), image(gaussians_plot(rows), "Gaussians over frames")),
         section("Simulated sensor effects", _effects(metrics["effects"])),
         details("Configuration", f"<pre>{html.escape(config.to_yaml())}</pre>"),
         details("Versions", table(("", ""), _versions())),
@@ -90,6 +92,16 @@ def _no_reference(track: TrajectoryScore | None) -> str:
     if track is not None:
         return note("The estimate is aligned to the reference by a rigid motion (no scale); the dot is the start.")
     return note("No reference poses: there is no trajectory error to show. The dot is the start.")
+
+
+def _turned(page: str | None) -> str:
+    if page is None:
+        return ""
+    name = html.escape(page)
+    return (
+        f'<iframe src="{name}" title="the map" loading="lazy" style="width:100%;height:28rem;border:0"></iframe>\n'
+        + note(f'Drag to turn it, or open <a href="{name}">{name}</a>, which lies beside this page.')
+    )
 
 
 def _doubts(rows: Sequence[FrameRow]) -> str:

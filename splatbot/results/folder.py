@@ -79,6 +79,7 @@ class RunFolder:
         self.metrics = self.path / "metrics.json"
         self.map = self.path / "map.ply"
         self.report = self.path / "report.html"
+        self.map_page = self.path / "map.html"
 
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
@@ -110,6 +111,7 @@ class RunFolder:
     ) -> None:
         """Write all but the report. An older report goes first: it would describe another map."""
         self.report.unlink(missing_ok=True)
+        self.map_page.unlink(missing_ok=True)
         save_ply(model, self.map, bookkeeping=True)  # what was never observed must not collide later
         self._save_trajectory(trajectory)
         lines = [json.dumps(asdict(row)) for row in rows]
@@ -124,6 +126,10 @@ class RunFolder:
     def save_report(self, html: str) -> None:
         """Write ``report.html``."""
         _write_text(self.report, html)
+
+    def save_map_page(self, html: str) -> None:
+        """Write ``map.html``."""
+        _write_text(self.map_page, html)
 
     def load_config(self) -> Config:
         """The configuration that the run used; the present environment does not change it."""

@@ -15,7 +15,7 @@ from splatbot.results.metrics import cost_metrics
 from splatbot.results.scoring import score_trajectory
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.loop import FrameLoop
-from splatbot.run.outcome import Outcome
+from splatbot.run.outcome import MapPage, Outcome
 from splatbot.run.pacing import FrameSource, PacedSource
 from splatbot.run.progress import Progress
 from splatbot.run.saving import Saver, resume_loop
@@ -56,6 +56,7 @@ def map_log(
     localise: SavedRun | None = None,
     source: dict[str, Any] | None = None,
     effects: Sequence[Mapping[str, Any]] | None = None,
+    map_page: MapPage | None = None,
 ) -> RunResult:
     """Map a log and write the run folder ``out``.
 
@@ -81,6 +82,7 @@ def map_log(
         resume: go on where this run was saved; ``log`` must be its log, and ``config`` and ``slam`` are the run's.
         source: what else it takes to open the log again, kept beside its uri in ``metrics.json`` under "log".
         effects: the account of the sensor effects that the log's frames went through; None takes the log's own.
+        map_page: makes a page of the finished map, which the report shows; None: it shows none.
 
     Raises:
         LogError: the log is empty, no frame could be read, or it is not the log of ``resume``; nothing is written then.
@@ -116,6 +118,7 @@ def map_log(
             return Outcome(
                 loop=loop,
                 source=source or {},
+                map_page=map_page,
                 localised_in=str(localise.folder.resolve()) if localise is not None else None,
                 effects=list(log.effects if effects is None else effects),
                 interrupts=interrupts,

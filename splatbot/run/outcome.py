@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from splatbot import __version__
+from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
 from splatbot.report import report_html
 from splatbot.results.folder import FrameRow, RunFolder
@@ -15,6 +18,11 @@ from splatbot.results.scoring import TrajectoryScore, ViewScores, score_views, t
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.loop import FrameLoop
 from splatbot.trajectory import Trajectory
+
+MapPage = Callable[[GaussianModel, Trajectory], str]
+"""Makes of a map and the camera's way a page on which both can be turned."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -33,6 +41,7 @@ class Outcome:
     views: ViewScores = field(default_factory=ViewScores)
     finished: bool = False
     localised_in: str | None = None
+    map_page: MapPage | None = None
 
     def save(self, folder: RunFolder) -> None:
         """Save first; then score and report, which a signal may cut short without loss."""
@@ -62,6 +71,7 @@ class Outcome:
         self.views = score_views(self.loop.source.log, self.model, held_out)
         folder.save_metrics(self.metrics())
         self.loop.progress("reporting")
+        turned = self._save_map_page(folder)
         folder.save_report(
             report_html(
                 rows=self.rows,
@@ -70,8 +80,20 @@ class Outcome:
                 trajectory=self.trajectory,
                 track=self.track,
                 views=self.views,
+                map_page=turned,
             )
         )
+
+    def _save_map_page(self, folder: RunFolder) -> str | None:
+        """Its name, for the report beside it; None if there is none."""
+        if self.map_page is None or not len(self.model):
+            return None
+        try:
+            folder.save_map_page(self.map_page(self.model, self.trajectory))
+        except (SplatbotError, OSError) as error:
+            _log.warning("the report has no map to turn: %s", error)
+            return None
+        return folder.map_page.name
 
     def metrics(self) -> dict[str, Any]:
         """The contents of ``metrics.json``."""

@@ -18,7 +18,7 @@ from splatbot.trajectory import Trajectory
 from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot
 
 BAD = 6  # the frame that is damaged
-FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "state"}
+FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "map.html", "state"}
 
 
 def truncated_png(log: Path) -> None:
@@ -183,7 +183,7 @@ def test_impatient_interrupts_never_leave_a_torn_file(sound_log: Path, tmp_path:
     assert present <= FILES
     if "metrics.json" in present:  # written last: everything else is there, and whole
         metrics = metrics_of(tmp_path / "run")
-        assert present >= FILES - {"report.html"}
+        assert present >= FILES - {"report.html", "map.html"}
         assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == metrics["tracked"]
     if "map.ply" in present:
         GaussianModel.load(tmp_path / "run" / "map.ply")

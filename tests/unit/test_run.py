@@ -353,3 +353,22 @@ def test_a_frame_of_another_size_ends_the_run_or_is_left_out(log: Log, tmp_path:
     assert stopped.exit_code == 2
     skipped = map_log(log, out=tmp_path / "skip", slam=Strict(log.ground_truth), on_bad_frame="skip")
     assert (skipped.metrics["frames"], skipped.metrics["skipped"], skipped.metrics["held_out"]) == (15, 1, 1)
+
+
+def test_the_report_shows_a_page_of_the_map_where_one_is_made_and_says_why_not(
+    log: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    map_log(
+        log, slam=oracle(log), out=tmp_path / "with", map_page=lambda model, path: f"<p>{len(model)} {len(path)}</p>"
+    )
+    words = (tmp_path / "with" / "map.html").read_text()
+    assert words == f"<p>{len(GaussianModel.load(tmp_path / 'with' / 'map.ply'))} 16</p>"
+    assert '<iframe src="map.html"' in (tmp_path / "with" / "report.html").read_text()
+
+    def fails(model: GaussianModel, path: Trajectory) -> str:
+        raise OSError("no port is free")
+
+    map_log(log, slam=oracle(log), out=tmp_path / "without", map_page=fails)
+    assert "no port is free" in caplog.text
+    assert "iframe" not in (tmp_path / "without" / "report.html").read_text()
+    assert not (tmp_path / "without" / "map.html").exists()
