@@ -10,6 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
 import splatbot
+from splatbot.priority import stand_back, switch_quickly
 from splatbot.services.codecs import describe_bodies
 from splatbot.services.guard import Guard
 from splatbot.services.limits import BodyLimit
@@ -23,6 +24,7 @@ from splatbot.services.routes import (
     health,
     jobs,
     maps,
+    picks,
     plans,
     render,
     ros,
@@ -47,6 +49,8 @@ def create_app(runtime: Runtime) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        stand_back(settings.niceness)  # this thread starts all those that answer
+        switch_quickly()
         await run_in_threadpool(sides.start)
         await run_in_threadpool(runtime.start)
         yield
@@ -69,7 +73,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     install_problem_handlers(app)
     describe_bodies(app)
     for group in (
-        health, maps, frames, distance, collisions, render, views, plans, grasps, trajectories, trials, jobs, ros
+        health, maps, frames, distance, collisions, render, views, plans, grasps, picks, trajectories, trials, jobs, ros
     ):  # fmt: skip
         app.include_router(group.router)
     return app

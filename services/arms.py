@@ -18,7 +18,7 @@ from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot, robot_names
 from splatbot.services.bus import Bus
 from splatbot.services.jobs import Job, JobCancelled, JobHandle, Jobs
-from splatbot.services.topics import JOINTS, JointState, motion_topic, robot_topic
+from splatbot.services.topics import JOINTS, JointState, arm_topic, motion_topic, robot_topic
 
 _TOLD_EVERY_S = 0.02
 
@@ -179,6 +179,7 @@ class Arms:
         names = arm.robot.chain.names
         joints = JointState(time.time(), names, feedback.position, np.asarray(feedback.velocity))
         self._bus.publish(robot_topic(arm.robot.name, JOINTS), joints)
+        self._bus.publish(arm_topic(arm.name, JOINTS), joints)
         self._bus.publish(motion_topic(handle.id), feedback)
         if not handle.cancelled.is_set():
             handle.tell(feedback.time / duration if duration > 0 else 1.0)

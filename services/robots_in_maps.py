@@ -1,4 +1,4 @@
-"""Where the robot stands in a served map, and what it is for collision checks."""
+"""Where the robot stands in a served map, what it is for collision checks, and the things around it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
 from splatbot.robots.robot import RobotModel
+from splatbot.segmentation import MapScene, segment
 from splatbot.services.arms import known_robot
 from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap
@@ -34,6 +35,28 @@ def arm_in(
     """A robot and its spheres where it stands in the map."""
     model = known_robot(robot)
     return model, RobotSpheres(model, T_world_base=base_in(served, base), margin=margin, opening=opening)
+
+
+def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -> MapScene:
+    """The things on the table of a map, worked out once for each of its states and bases.
+
+    Args:
+        served: the map.
+        base: T_world_base (4, 4).
+        as_known: the base is the map's own, and so are its box and plane.
+    """
+    known = served.workspace
+
+    def make() -> MapScene:
+        return segment(
+            served.ready,
+            base,
+            box=known.box if known is not None and as_known else None,
+            plane=known.support_plane if known is not None and as_known else None,
+            names=known.objects if known is not None else (),
+        )
+
+    return served.derived.get(("things", base.tobytes(), as_known), make)
 
 
 def joints_of(model: RobotModel, values: list[float], field: str) -> NDArray[np.float64]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from splatbot.config import Config
 from splatbot.errors import ConfigError, SplatbotError
 from splatbot.frame import Frame
+from splatbot.rasterize.native import native
 from splatbot.services.arms import Arms
 from splatbot.services.jobs import Jobs
 from splatbot.services.library import MapLibrary
@@ -62,6 +64,9 @@ class Runtime:
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
+        # A thread has the priority of the one that starts it, and those that answer have a lower one.
+        self._starter = ThreadPoolExecutor(1, "starter")
+        self._starter.submit(native().num_threads).result()  # the kernels' threads, too
 
     def start(self) -> None:
         """Serve the maps that were saved, and go on saving; begin to map what is to be followed."""
@@ -72,7 +77,7 @@ class Runtime:
             self._started, waiting = True, list(self._waiting)
             self._waiting.clear()
         for mapping in waiting:
-            mapping.start()
+            self._begin(mapping)
 
     def follow(self, map_id: str, source: Iterable[Frame], mapper: Mapper) -> None:
         """Map frames in a thread of their own, once the service has begun; ``map_id`` is in the store."""
@@ -82,7 +87,7 @@ class Runtime:
             if not self._started:
                 self._waiting.append(mapping)  # a recording of the service holds its first frame too
                 return
-        mapping.start()
+        self._begin(mapping)
 
     def open_stream(
         self, map_id: str, *, config: Config | None = None, workspace: Workspace | None = None
@@ -99,7 +104,7 @@ class Runtime:
         mapping = LiveMapping(self.store, map_id, frames, Slam(self.config), on_result=frames.answer)
         with self._lock:
             self._streams[map_id], self._mappings[map_id] = frames, mapping
-        mapping.start()
+        self._begin(mapping)
         threading.Thread(target=_abandon_after, args=(mapping, frames), name=f"stream-{map_id}", daemon=True).start()
         return served
 
@@ -167,6 +172,9 @@ class Runtime:
             self._save_all()
         self.metrics.close()
         self.bus.close()
+
+    def _begin(self, mapping: LiveMapping) -> None:
+        self._starter.submit(mapping.start).result()
 
     def _end(self, map_id: str, why: str, timeout_s: float) -> None:
         with self._lock:

@@ -21,6 +21,10 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+BASE_EXAMPLE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
+"""A robot's base in a map whose world is a level camera: z up, below it."""
+
+
 class Pose(Request):
     """A rigid transform."""
 
@@ -220,6 +224,21 @@ class GraspsRequest(Request):
         return self
 
 
+class PicksRequest(Request):
+    """A thing to be picked in the twin."""
+
+    scene: str = Field("tabletop_clutter", description="a shipped scene")
+    target: str = Field(max_length=200, description='a name of the scene, or words as "largest box"')
+    views: Annotated[int, Field(ge=2, le=24)] = Field(8, description="of the scan")
+    lift: Annotated[float, Field(gt=0.03, le=1)] = Field(0.15, description="how far up [m]")
+    force: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="of the fingers [N]")
+    tries: Annotated[int, Field(ge=1, le=20)] = Field(5, description="grasps whose way is looked for")
+    budget_ms: Annotated[float, Field(gt=0)] = Field(200.0, description="for the way to each: the knob of time [ms]")
+    margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
+    home: bool = Field(False, description="carry it to where the arm began")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of sensor noise and search")
+
+
 class TrajectoryRequest(Request):
     """A planned motion to be followed."""
 
@@ -230,7 +249,9 @@ class TrajectoryRequest(Request):
 class TrialsRequest(Request):
     """Trials in the twin."""
 
-    scene: str = Field("empty", description="a shipped scene")
+    scene: str | None = Field(None, description="a shipped scene; default: empty")
+    map: str | None = Field(None, description="instead: a map of this service, as the shapes that physics takes it for")
+    base: Pose | None = Field(None, description="T_world_base in the map; default: the map's own")
     plan: str | None = Field(None, description="id of a plan to follow; default: the scene's own moves")
     trials: Annotated[int, Field(ge=1, le=100)] = 1
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of the first trial; 0 displaces nothing")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.gaussians import Snapshot
 from splatbot.services.bus import Bus
+from splatbot.services.derived import Derived
 from splatbot.services.problems import MapNotReadyError
 from splatbot.services.topics import STATE, TRAJECTORY, map_topic
 from splatbot.trajectory import Trajectory
@@ -40,6 +41,7 @@ class ServedMap:
         trajectory: of the camera, as far as ``snapshot`` knows it; None where there was none.
         workspace: where the robot stands in it, where that is known.
         awaited: the service counts as ready only once this map has a state.
+        derived: what has been worked out from the snapshot.
     """
 
     id: str
@@ -50,6 +52,7 @@ class ServedMap:
     trajectory: Trajectory | None = None
     workspace: Workspace | None = None
     awaited: bool = True
+    derived: Derived = dataclasses.field(default_factory=Derived, repr=False, compare=False)
 
     @property
     def map_version(self) -> int:
@@ -68,14 +71,14 @@ class ServedMap:
             raise MapNotReadyError(f"Map {self.id!r} has no state{because}.", hint="see GET /v1/maps for its progress")
         return self.snapshot
 
-    @cached_property
+    @property
     def field(self) -> GaussianCollisionField:
         """The collision field of this state, built by the first question.
 
         Raises:
             MapNotReadyError: nothing is published yet.
         """
-        return GaussianCollisionField(self.ready)
+        return self.derived.get("field", lambda: GaussianCollisionField(self.ready))
 
 
 class MapStore:
@@ -123,7 +126,8 @@ class MapStore:
             current = self._find(map_id)
             if current.snapshot is not None and snapshot.map_version <= current.map_version:
                 return
-            self._put(replace(current, snapshot=snapshot, trajectory=trajectory or current.trajectory))
+            later = trajectory or current.trajectory
+            self._put(replace(current, snapshot=snapshot, trajectory=later, derived=Derived()))
             if trajectory is not None:
                 self.bus.publish(map_topic(map_id, TRAJECTORY), trajectory)
 

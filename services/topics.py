@@ -11,6 +11,7 @@
 | ``jobs/{id}`` | :class:`splatbot.services.jobs.Job`: each change of a job |
 | ``motions/{id}`` | :class:`splatbot.protocols.Feedback`: what an arm does that follows a trajectory |
 | ``robot/{name}/joints`` | :class:`JointState`: the robot's latest joints |
+| ``arms/{name}/joints`` | :class:`JointState`: those of one of the service's arms |
 """
 
 from __future__ import annotations
@@ -54,6 +55,11 @@ def map_topic(map_id: str, kind: str) -> str:
 def robot_topic(robot: str, kind: str) -> str:
     """The topic of a robot, e.g. ``robot_topic("panda", JOINTS)``."""
     return f"robot/{robot}/{kind}"
+
+
+def arm_topic(arm: str, kind: str) -> str:
+    """The topic of one of the service's arms; two may be of one robot's model."""
+    return f"arms/{arm}/{kind}"
 
 
 def job_topic(job_id: str) -> str:

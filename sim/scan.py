@@ -57,7 +57,11 @@ def scan(twin: Twin, *, views: int = 8, width: int = 320, spacing: float = SPACI
         _measured(frame, poses[frame.index]) for frame in effects.over(frames)), strict=True))  # fmt: skip
     base = base_of(twin.scene)
     away = np.linalg.norm((points - base[:3, 3])[:, :2], axis=1) > _STAND
-    points, normals, colors = _averaged(points[away], normals[away], colors[away], spacing)
+    return discs(*_averaged(points[away], normals[away], colors[away], spacing), spacing)
+
+
+def discs(points: Array, normals: Array, colors: Array, spacing: float) -> GaussianModel:
+    """Thin Gaussians at points (P, 3) [m] across normals (P, 3) that lie about ``spacing`` [m] apart."""
     return GaussianModel.from_activated(
         means=points,
         quats=rotation_to_quat(_upright(normals)),

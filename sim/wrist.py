@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +41,7 @@ class WristLog(LogBase):
         T_link_camera: (4, 4), the camera on the last link.
         width: [px]
         rate: frames a second.
+        moving: what else moves in the scene.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class WristLog(LogBase):
         T_link_camera: Array = T_PANDA_CAMERA,
         width: int = 320,
         rate: float = 30.0,
+        moving: Mapping[str, Moving] | None = None,
     ) -> None:
         self.name, self.uri = "wrist", "wrist"
         height, f = width * 3 // 4, 0.7 * width
@@ -61,8 +63,8 @@ class WristLog(LogBase):
         T = T_scene_base @ robot.fk(joints)
         stamps = np.arange(len(joints)) / rate
         self.ground_truth = Trajectory(stamps, T[:, -1] @ T_link_camera)
-        moving = {f"link {k}": Moving(found, _pose_of(stamps, T[:, k])) for k, found in _seen_links(robot).items()}
-        self.scene = Scene(surfaces, moving)
+        links = {f"link {k}": Moving(found, _pose_of(stamps, T[:, k])) for k, found in _seen_links(robot).items()}
+        self.scene = Scene(surfaces, links | dict(moving or {}))
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -73,7 +75,7 @@ class WristLog(LogBase):
         return Frame(stamp, rgb, depth, self.camera, index, joints=self.joints[index].copy(), source=f"wrist#{index}")
 
     def shows_robot(self, index: int) -> NDArray[np.bool_]:
-        """Pixels (H, W) of a frame in which the arm is seen."""
+        """Pixels (H, W) of a frame in which the arm, or what else moves, is seen."""
         stamp = float(self.ground_truth.stamps[index])
         return self.scene.moving_mask(self.camera, self.ground_truth.T_world_camera[index], stamp)
 

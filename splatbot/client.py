@@ -94,6 +94,7 @@ class Placed:
         keyframe: whether it entered the map.
         gaussians: in the map afterwards.
         map_version: the latest state.
+        stage_ms: what each stage of tracking and mapping took [ms].
     """
 
     T_world_camera: NDArray[np.float64] | None
@@ -101,6 +102,7 @@ class Placed:
     keyframe: bool
     gaussians: int
     map_version: int
+    stage_ms: dict[str, float]
 
 
 class Client:
@@ -175,7 +177,14 @@ class Client:
             "joints": None if frame.joints is None else frame.joints.tolist(),
         }
         told = self._packed("POST", f"/v1/maps/{quote(map_id, safe='')}/frames", body)
-        return Placed(told["T_world_camera"], told["verdict"], told["keyframe"], told["gaussians"], told["map_version"])
+        return Placed(
+            T_world_camera=told["T_world_camera"],
+            verdict=told["verdict"],
+            keyframe=told["keyframe"],
+            gaussians=told["gaussians"],
+            map_version=told["map_version"],
+            stage_ms=told["stage_ms"],
+        )
 
     def end(self, map_id: str) -> None:
         """No more frames will be pushed."""
@@ -232,6 +241,22 @@ class Client:
     def grasps(self, map_id: str, **asked: Any) -> dict[str, Any]:
         """Ranked grasps of a thing; see POST /v1/maps/{map_id}/grasps for how it is named. No grasp is an error."""
         return self._json("POST", f"/v1/maps/{quote(map_id, safe='')}/grasps", asked)
+
+    def pick(self, scene: str, target: str, *, key: str | None = None, **more: Any) -> dict[str, Any]:
+        """Pick a thing in the twin of a shipped scene: the job, to be watched by :meth:`wait` or :meth:`events`.
+
+        Args:
+            scene: its name.
+            target: a name of the scene, or words.
+            key: Idempotency-Key: asked again with it, the same job is returned.
+            more: views, lift, force, tries, budget_ms, margin, home, seed.
+        """
+        headers = {"Idempotency-Key": key} if key else {}
+        return self._json("POST", "/v1/picks", {"scene": scene, "target": target, **more}, headers)
+
+    def cancel(self, job_id: str) -> dict[str, Any]:
+        """Cancel a job; as it stands then."""
+        return self._json("DELETE", f"/v1/jobs/{quote(job_id, safe='')}")
 
     def ik(self, pose: Mapping[str, Any], **more: Any) -> NDArray[np.float64]:
         """Configurations (K, J) that bring the tool to a pose."""

@@ -17,7 +17,7 @@ from splatbot.logs.ros_frames import header, pose_message
 from splatbot.logs.ros_types import to_plain
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.segmentation import segment
+from splatbot.services.robots_in_maps import things_in
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.moveit import coded, robot_place
@@ -49,9 +49,7 @@ class GraspServices:
 
         def work() -> dict[str, Any]:
             served, robot, base = robot_place(self._store, self._robot)
-            known = served.workspace
-            assert known is not None
-            scene = segment(served.ready, base, box=known.box, plane=known.support_plane, names=known.objects)
+            scene = things_in(served, base, as_known=True)
             target = find_target(_hint(args), scene, [WordAffordance(), PlaceAffordance()])
             found = GraspSampler(scene, robot).sample(target, GraspOptions())
             found.unwrap()

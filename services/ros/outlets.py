@@ -29,7 +29,8 @@ from splatbot.services.ros.messages import (
     transform_message,
 )
 from splatbot.services.store import ServedMap
-from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
+from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState, arm_topic
+from splatbot.services.topics import JOINTS as ARM_JOINTS
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
 
@@ -88,7 +89,7 @@ class RosOutlets:
         }
         for topic, kind in TYPES.items():
             graph.advertise(topic, kind)
-        self._news = bus.subscribe("maps/*", "robot/*/joints", capacity=_WAITING)
+        self._news = bus.subscribe("maps/*", "robot/*/joints", arm_topic("*", ARM_JOINTS), capacity=_WAITING)
         self._thread = threading.Thread(target=self._run, name="ros-outlets", daemon=True)
         self._rosout = _RosoutHandler(graph)
 
@@ -107,12 +108,12 @@ class RosOutlets:
     def _run(self) -> None:
         for news in self._news:
             try:
+                what, name, kind = news.topic.split("/", 2)
                 if isinstance(news.value, JointState):
-                    self._graph.publish(JOINTS, joints_message(news.value))
-                    continue
-                _, map_id, kind = news.topic.split("/", 2)
-                if kind in self._convert:
-                    self._convert[kind](self._prefix(map_id), news.value)
+                    prefix = f"/{name}" if what == "arms" else ""
+                    self._graph.publish(prefix + JOINTS, joints_message(news.value))
+                elif kind in self._convert:
+                    self._convert[kind](self._prefix(name), news.value)
             except Exception:  # one odd message must not silence the others
                 _log.exception("%s could not be told to ROS", news.topic)
 

@@ -10,15 +10,19 @@ from splatbot.services.codecs import answer, body_of, gives, takes
 from splatbot.services.dependencies import Served, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in
-from splatbot.services.schemas import CollisionsRequest
+from splatbot.services.schemas import BASE_EXAMPLE, CollisionsRequest
 
 router = APIRouter(prefix="/v1/maps", tags=["collision"])
 
 _HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
-_BASE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
 _EXAMPLES = {
-    "one configuration": {"q": [_HOME], "base": _BASE},
-    "with room and gradients": {"q": [_HOME, [0.4, *_HOME[1:]]], "base": _BASE, "margin": 0.02, "gradient": True},
+    "one configuration": {"q": [_HOME], "base": BASE_EXAMPLE},
+    "with room and gradients": {
+        "q": [_HOME, [0.4, *_HOME[1:]]],
+        "base": BASE_EXAMPLE,
+        "margin": 0.02,
+        "gradient": True,
+    },
 }
 _ANSWER = {
     "map_version": 12,

@@ -15,11 +15,10 @@ from splatbot.grasping.places import PlaceAffordance
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.summary import summary
 from splatbot.grasping.words import WordAffordance
-from splatbot.segmentation import segment
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
 from splatbot.services.dependencies import Served, Service, problems
-from splatbot.services.robots_in_maps import base_in
+from splatbot.services.robots_in_maps import base_in, things_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS, map_topic
 
@@ -59,14 +58,7 @@ def grasps(
     Words are rules on names, colours, shapes, sizes and places; what fits two things is refused.
     """
     robot, base = known_robot(asked.robot), base_in(served, asked.base)
-    known = served.workspace if asked.base is None else None  # box and plane belong to the map's own base
-    scene = segment(
-        served.ready,
-        base,
-        box=known.box if known is not None else None,
-        plane=known.support_plane if known is not None else None,
-        names=served.workspace.objects if served.workspace is not None else (),
-    )
+    scene = things_in(served, base, as_known=asked.base is None)
     found = find_target(_hint(asked), scene, [WordAffordance(), PlaceAffordance()])
     sampler = GraspSampler(scene, robot, hand_only=asked.hand_only, margin=asked.margin)
     options = GraspOptions(

@@ -16,16 +16,15 @@ from splatbot.services.dependencies import Served, Service, problems
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
-from splatbot.services.schemas import IkRequest, PlanRequest
+from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
 from splatbot.services.topics import PLAN, map_topic
 
 router = APIRouter(tags=["motion"])
 
-_BASE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
 _DOWN = {"translation": [0.4, 0.2, 0.4], "quat_wxyz": [0.0, 1.0, 0.0, 0.0]}
 _EXAMPLES = {
-    "to joints": {"goal": [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], "base": _BASE},
-    "the tool to a pose": {"goal_pose": _DOWN, "base": _BASE, "budget_ms": 300},
+    "to joints": {"goal": [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], "base": BASE_EXAMPLE},
+    "the tool to a pose": {"goal_pose": _DOWN, "base": BASE_EXAMPLE, "budget_ms": 300},
 }
 _ANSWER = {
     "id": "0d6c1b7f2a3e4f50",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Response
@@ -11,8 +12,10 @@ from splatbot.planning import Trajectory
 from splatbot.services.codecs import body_of, plain, takes
 from splatbot.services.dependencies import IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobHandle
+from splatbot.services.robots_in_maps import base_in
 from splatbot.services.routes.jobs import accepted, starts
-from splatbot.services.schemas import TrialsRequest
+from splatbot.services.schemas import BASE_EXAMPLE, TrialsRequest
+from splatbot.services.twins_of_maps import scene_of_map
 from splatbot.sim.motion import motion_from_trajectory
 from splatbot.sim.scene import Scene, load_scene, scene_names
 
@@ -23,27 +26,48 @@ router = APIRouter(prefix="/v1/sim", tags=["simulation"])
     "/trials",
     status_code=202,
     responses=starts("a job runs the trials; its result holds one entry for each") | problems(404, 415, 422, 503),
-    openapi_extra=takes(TrialsRequest, {"three displaced scenes": {"scene": "tabletop_clutter", "trials": 3}}),
+    openapi_extra=takes(
+        TrialsRequest,
+        {
+            "three displaced scenes": {"scene": "tabletop_clutter", "trials": 3},
+            "a plan in a map": {"map": "default", "plan": "0123456789abcdef", "base": BASE_EXAMPLE},
+        },
+    ),
 )
 def trials(
     service: Service, asked: Annotated[TrialsRequest, Depends(body_of(TrialsRequest))], key: IdempotencyKey
 ) -> Response:
     """Try a motion in a scene's physics: how well the arm follows, what it touches, what falls.
 
-    Trial i has the seed `seed` + i, which displaces movable objects by millimetres.
+    Trial i has the seed `seed` + i, which displaces movable objects by millimetres. In a map, which has no moves of its
+    own, a plan is followed; `notes` of a result say what the map was taken for.
     """
-    if asked.scene not in scene_names():
-        raise InputError(f"is {asked.scene[:80]!r}.", field="scene", hint=f"scenes: {', '.join(scene_names())}")
-    scene = load_scene(asked.scene).with_effects(force=asked.force, forbid=asked.forbid)
-    trajectory = service.plans.get(asked.plan).trajectory if asked.plan is not None else None
+    plan = service.plans.get(asked.plan) if asked.plan is not None else None
+    if asked.map is None:
+        scene = _shipped(asked.scene or "empty")
+        place: AbstractContextManager[Scene] = nullcontext(scene.with_effects(force=asked.force, forbid=asked.forbid))
+    elif asked.scene is not None:
+        raise InputError("is given beside a map.", field="scene", hint="give one of the two")
+    elif plan is None:
+        raise InputError("is missing.", field="plan", hint="a map has no moves of its own: plan one in it")
+    else:
+        served = service.store.get(asked.map)
+        _ = served.ready  # a map without a state is told at once, not by the job
+        place = scene_of_map(served, base_in(served, asked.base), plan.robot, force=asked.force, forbid=asked.forbid)
 
     def work(handle: JobHandle) -> dict[str, Any]:
-        return {
-            "scene": asked.scene,
-            "trials": [_trial(scene, trajectory, asked, i, handle) for i in range(asked.trials)],
-        }
+        with place as scene:
+            trajectory = plan.trajectory if plan is not None else None
+            done = [_trial(scene, trajectory, asked, i, handle) for i in range(asked.trials)]
+        return {"scene": asked.scene or ("empty" if asked.map is None else None), "map": asked.map, "trials": done}
 
     return accepted(service.jobs.submit("trials", work, key=key, request=asked.model_dump_json())[0])
+
+
+def _shipped(name: str) -> Scene:
+    if name not in scene_names():
+        raise InputError(f"is {name[:80]!r}.", field="scene", hint=f"scenes: {', '.join(scene_names())}")
+    return load_scene(name)
 
 
 def _trial(

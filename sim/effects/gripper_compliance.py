@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 _STIFF = 2000.0  # [N/m] of the servo where the scene gives none
-_PAD_SOLREF = (0.01, 1.0)  # rubber: contacts that settle in 10 ms
+_PAD_SOLREF = (0.005, 1.0)  # rubber: contacts that settle in 5 ms; slower ones let 70 N sink 7 mm into 50 g
 _PAD_SOLIMP = (0.8, 0.95, 0.002, 0.5, 2.0)
 _HOLDING = ("grasp", "hang", "squeeze")
 

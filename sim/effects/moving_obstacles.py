@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatbot.protocols import Array
 from splatbot.sim.effects.physics import Hook, PhysicsEffect, names_of
 
 if TYPE_CHECKING:
@@ -13,21 +14,25 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 
+def place_on(thing: SceneObject, time: float) -> Array:
+    """Where (3,) [m] an object is on its path at a time [s]: linear between places, there and back again."""
+    times, places = np.array([p.t for p in thing.path]), np.array([p.at for p in thing.path])
+    length = times[-1]
+    t = time % (2 * length)
+    t = t if t <= length else 2 * length - t
+    return np.array([np.interp(t, times, column) for column in places.T])
+
+
 class Carried(Hook):
     """Puts each obstacle where its path says, there and back again."""
 
     def __init__(self, paths: list[tuple[int, SceneObject]]) -> None:
-        self._paths = [
-            (body, np.array([p.t for p in thing.path]), np.array([p.at for p in thing.path])) for body, thing in paths
-        ]
+        self._paths = paths
 
     def on_step(self, data: Any, time: float) -> None:
-        """Linear between places; after the last, back to the first."""
-        for body, times, places in self._paths:
-            length = times[-1]
-            t = time % (2 * length)
-            t = t if t <= length else 2 * length - t
-            data.mocap_pos[body] = [np.interp(t, times, places[:, k]) for k in range(3)]
+        """Where they are now."""
+        for body, thing in self._paths:
+            data.mocap_pos[body] = place_on(thing, time)
 
 
 class MovingObstacles(PhysicsEffect):

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 import torch
-from numpy.typing import NDArray
 
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.collision.fcl_models import fcl_mesh, fcl_octree
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_to_rotation
 from splatbot.logs.shapes import Mesh, box, cylinder, sphere
@@ -144,40 +144,11 @@ def _coal_spheres(coal: Any, world: Any) -> Ask:
 
 
 def _fcl_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
-    fcl = importlib.import_module("fcl")
-    model = fcl.BVHModel()
-    model.beginModel(len(vertices), len(triangles))
-    model.addSubModel(vertices, triangles)
-    model.endModel()
-    return _fcl_spheres(fcl, model)
+    return _fcl_spheres(importlib.import_module("fcl"), fcl_mesh(vertices, triangles))
 
 
 def _fcl_octree(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
-    fcl = importlib.import_module("fcl")
-    data = octomap_bytes(_points_of(scene), OCTREE_VOXEL)  # which it takes as signed numbers
-    return _fcl_spheres(fcl, fcl.OcTree(OCTREE_VOXEL, np.frombuffer(data, np.int8).tolist()))
-
-
-def octomap_bytes(points: Array, voxel: float) -> bytes:
-    """OctoMap's binary tree of 16 levels (Hornung et al. 2013) with the voxels of points (P, 3) [m] occupied.
-
-    A node is two bytes, two bits a child: (0, 0) unknown, (0, 1) occupied, (1, 1) a node, which follows depth first.
-    """
-    keys = np.unique(np.floor(points / voxel).astype(np.int64) + (1 << 15), axis=0)
-    found = bytearray()
-
-    def write(part: NDArray[np.int64], level: int) -> None:
-        bits = (part >> level) & 1
-        child = bits[:, 0] + 2 * bits[:, 1] + 4 * bits[:, 2]
-        present = [part[child == i] for i in range(8)]
-        word = sum((0b10 if level == 0 else 0b11) << (2 * i) for i in range(8) if len(present[i]))
-        found.extend(word.to_bytes(2, "little"))
-        for below in present:
-            if level and len(below):
-                write(below, level - 1)
-
-    write(keys, 15)
-    return bytes(found)
+    return _fcl_spheres(importlib.import_module("fcl"), fcl_octree(_points_of(scene), OCTREE_VOXEL))
 
 
 def _fcl_spheres(fcl: Any, model: Any) -> Ask:

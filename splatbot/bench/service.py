@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,15 +14,17 @@ import numpy as np
 
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
+from splatbot.bench.service_clients import Asked, Questions, asking
 from splatbot.bench.timing import measure
-from splatbot.client import Client, ServiceError
+from splatbot.client import Client
 from splatbot.collision import GaussianCollisionField
 from splatbot.formats import load_gaussians
 from splatbot.frame import Frame
 from splatbot.logs import open_log
-from splatbot.serving import serving
+from splatbot.serving import Serving, serving
 
 _MAP = "live"
+_TURNS = 2
 
 
 @dataclass(frozen=True)
@@ -48,27 +50,12 @@ class ServicePlan:
     say: Callable[[str], None] = lambda text: None
 
 
-@dataclass
-class _Tally:
-    """What came back: latencies [s] counted from when each was due, and errors."""
-
-    seconds: list[float] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def add(self, seconds: float, error: str | None) -> None:
-        with self.lock:
-            if error is None:
-                self.seconds.append(seconds)
-            else:
-                self.errors.append(error)
-
-
 def run_service_bench(plan: ServicePlan, folder: Path) -> Results:
     """Measure, and write service.json and service.csv into ``folder``.
 
     Questions are asked at fixed times whatever the answers take (open loop), so that a slow answer delays no other
-    question and its delay is counted. The frames come from a client, as a robot's would.
+    question and its delay is counted. The frames come from a client, as a robot's would; those who ask are a process of
+    their own, of the lowest priority: on a robot they are other machines.
     """
     folder.mkdir(parents=True, exist_ok=True)
     results = Results(describe_machine((1,), peak_ms=20.0))
@@ -81,11 +68,10 @@ def run_service_bench(plan: ServicePlan, folder: Path) -> Results:
     ):
         client.create_map(_MAP)
         stamps = _Stamps(frames, plan.rate)
-        _push(client, stamps, 2.0)  # there must be a map to ask about
+        plan.say("mapping all that is to be seen")
+        _push(service, client, stamps, min(2 * (len(frames) - 1) / plan.rate, plan.seconds))
         before = _resident(service.process)
-        for name, clients in (("no questions", 0), (f"{plan.clients} clients x {plan.per_s:g}/s", plan.clients)):
-            plan.say(f"{name}, {plan.seconds:g} s")
-            _measure_case(results, service.url, client, stamps, plan, name, clients)
+        _measure_mapping(results, service, client, stamps, plan)
         results.add("service", "memory before", before, "MiB")
         results.add("service", "memory after", _resident(service.process), "MiB")
         client.end(_MAP)
@@ -111,57 +97,81 @@ class _Stamps:
         return replace(frame, stamp=self._number * self.period)
 
 
-def _push(client: Client, frames: _Stamps, seconds: float) -> tuple[list[float], int]:
-    """Milliseconds of each frame's push, and how many were dropped because the one before was not done."""
-    begin, ms, dropped = time.perf_counter(), [], 0
-    due = begin
+@dataclass
+class _Pushed:
+    """What frames took [ms]: the mapper for each, and from pushing it to the answer; how many were dropped; and the
+    service's processor time meanwhile [s], None where the system does not tell.
+    """
+
+    mapper: list[float] = field(default_factory=list)
+    answered: list[float] = field(default_factory=list)
+    dropped: int = 0
+    cpu_s: float | None = 0.0
+
+    def add(self, more: _Pushed) -> None:
+        self.mapper += more.mapper
+        self.answered += more.answered
+        self.dropped += more.dropped
+        self.cpu_s = None if self.cpu_s is None or more.cpu_s is None else self.cpu_s + more.cpu_s
+
+
+def _push(service: Serving, client: Client, frames: _Stamps, seconds: float) -> _Pushed:
+    """A frame each period; those are dropped that are due while the one before is not done."""
+    found, before = _Pushed(), _cpu_seconds(service.process)
+    due = begin = time.perf_counter()
     while due < begin + seconds:
         time.sleep(max(0.0, due - time.perf_counter()))
         start = time.perf_counter()
-        client.push(_MAP, frames.next())
-        ms.append(1e3 * (time.perf_counter() - start))
+        placed = client.push(_MAP, frames.next())
+        found.answered.append(1e3 * (time.perf_counter() - start))
+        found.mapper.append(sum(placed.stage_ms.values()))
         due += frames.period
         while due < time.perf_counter():  # a camera does not wait
             due += frames.period
-            dropped += 1
-    return ms, dropped
+            found.dropped += 1
+    after = _cpu_seconds(service.process)
+    found.cpu_s = None if before is None or after is None else after - before
+    return found
 
 
-def _measure_case(
-    results: Results, url: str, client: Client, frames: _Stamps, plan: ServicePlan, name: str, clients: int
-) -> None:
-    tally, end = _Tally(), time.perf_counter() + plan.seconds
-    askers = [threading.Thread(target=_ask, args=(url, plan, tally, i, end)) for i in range(clients)]
-    for asker in askers:
-        asker.start()
-    ms, dropped = _push(client, frames, plan.seconds)
-    for asker in askers:
-        asker.join()
-    results.add(name, "frames", len(ms), "")
-    results.add(name, "frame p50", float(np.percentile(ms, 50)), "ms")
-    results.add(name, "frame p95", float(np.percentile(ms, 95)), "ms")
-    results.add(name, "dropped", dropped, "")
-    if clients:
-        waits = 1e3 * np.array(tally.seconds or [np.nan])
-        results.add(name, "questions", len(tally.seconds), "")
-        results.add(name, "errors", len(tally.errors), "", note=tally.errors[0] if tally.errors else None)
-        for share in (50, 95, 99, 100):
-            results.add(name, f"answer p{share}", float(np.percentile(waits, share)), "ms")
+def _measure_mapping(results: Results, service: Serving, client: Client, frames: _Stamps, plan: ServicePlan) -> None:
+    """Without questions and with them by turns: a map grows, and a machine is not as quick at all times."""
+    alone, asked_at = _Pushed(), _Pushed()
+    asked = Asked([], [], 0.0)
+    part = plan.seconds / _TURNS
+    for turn in range(_TURNS):
+        plan.say(f"no questions, then questions, {part:g} s each ({turn + 1} of {_TURNS})")
+        alone.add(_push(service, client, frames, part))
+        with asking(Questions(service.url, _MAP, plan.clients, plan.per_s, plan.points, part)) as clients:
+            asked_at.add(_push(service, client, frames, part))
+            asked = asked.and_then(clients.result())
+    case = f"{plan.clients} clients x {plan.per_s:g}/s"
+    for name, pushed in (("no questions", alone), (case, asked_at)):
+        _add_frames(results, name, pushed, plan.seconds)
+    growth = float(np.percentile(asked_at.mapper, 95) / np.percentile(alone.mapper, 95)) - 1
+    results.add(case, "frame p95 grows by", 100 * growth, "%")
+    _add_answers(results, case, asked)
+    results.add(case, "clients' processors", asked.cpu_s / plan.seconds, "cores")
+    if asked_at.cpu_s is not None and alone.cpu_s is not None:
+        each = 1e3 * (asked_at.cpu_s - alone.cpu_s) / max(1, len(asked.seconds))
+        results.add(case, "service's processors for an answer", each, "ms")
 
 
-def _ask(url: str, plan: ServicePlan, tally: _Tally, number: int, end: float) -> None:
-    rng = np.random.default_rng(number)
-    points = rng.uniform((-0.5, -0.5, 0.2), (0.5, 0.5, 1.5), (plan.points, 3))
-    due = time.perf_counter() + rng.uniform(0, 1 / plan.per_s)
-    with Client(url, retries=0, timeout_s=30) as client:
-        while due < end:
-            time.sleep(max(0.0, due - time.perf_counter()))
-            try:
-                client.distance(_MAP, points)
-                tally.add(time.perf_counter() - due, None)
-            except ServiceError as error:
-                tally.add(0.0, str(error))
-            due += 1 / plan.per_s
+def _add_frames(results: Results, case: str, pushed: _Pushed, seconds: float) -> None:
+    results.add(case, "frames", len(pushed.mapper), "")
+    results.add(case, "dropped", pushed.dropped, "")
+    for share in (50, 95):
+        results.add(case, f"frame p{share}", float(np.percentile(pushed.mapper, share)), "ms")
+        results.add(case, f"pushed and answered p{share}", float(np.percentile(pushed.answered, share)), "ms")
+    results.add(case, "service's processors", None if pushed.cpu_s is None else pushed.cpu_s / seconds, "cores")
+
+
+def _add_answers(results: Results, case: str, asked: Asked) -> None:
+    waits = 1e3 * np.array(asked.seconds or [np.nan])
+    results.add(case, "questions", len(asked.seconds), "")
+    results.add(case, "errors", len(asked.errors), "", note=asked.errors[0] if asked.errors else None)
+    for share in (50, 95, 99, 100):
+        results.add(case, f"answer p{share}", float(np.percentile(waits, share)), "ms")
 
 
 def _measure_one(results: Results, client: Client, plan: ServicePlan) -> None:
@@ -191,3 +201,13 @@ def _resident(process: subprocess.Popen[str]) -> float | None:
     except OSError:
         return None
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS")), None)
+
+
+def _cpu_seconds(process: subprocess.Popen[str]) -> float | None:
+    """Processor time of a process so far [s]; None where the system does not tell."""
+    try:
+        told = Path(f"/proc/{process.pid}/stat").read_text()
+    except OSError:
+        return None
+    user, system = told.rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")

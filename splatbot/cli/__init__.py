@@ -34,6 +34,7 @@ COMMANDS = {
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
     "pick": _Command("splatbot.cli.pick", "pick", "Pick a named thing in the twin: look, grasp, plan, lift, check."),
+    "trials": _Command("splatbot.cli.trials", "trials", "Pick from many seeded scenes, and say how often and why not."),
     "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),
     "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
     "sim2real": _Command(

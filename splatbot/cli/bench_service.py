@@ -55,8 +55,10 @@ def bench_service(
         results.write_json(json)
     console = wide_console()
     tell_machine(console, results.machine)
-    parts = {"frames mapped": ["frames", "frame p50", "frame p95", "dropped"]}
+    parts = {"frames mapped": ["frames", "frame p50", "frame p95", "frame p95 grows by", "dropped"]}
+    parts["frames, from the push to the answer"] = [f"pushed and answered p{share}" for share in (50, 95)]
     parts["questions"] = ["questions", "errors", *(f"answer p{share}" for share in (50, 95, 99, 100))]
+    parts["processor time"] = ["service's processors", "clients' processors", "service's processors for an answer"]
     rest = [row for row in results.rows if row.metric not in {name for names in parts.values() for name in names}]
     for title, metrics in parts.items():
         console.print(figure_table(title, (row for row in results.rows if row.metric in metrics), metrics))

@@ -28,6 +28,7 @@ def grasp(
     box: Annotated[tuple[float, float, float, float] | None, tyro.conf.arg(metavar="U0 V0 U1 V1")] = None,
     mask: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
     tag: int | None = None,
+    vlm: bool = False,
     index: Annotated[int, tyro.conf.arg(metavar="I")] = 0,
     robot: str = "panda",
     base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
@@ -53,6 +54,7 @@ def grasp(
         splatbot grasp --map runs/latest --target "largest box"
         splatbot grasp --map runs/latest --target "red cup" --approach top
         splatbot grasp --map runs/latest --pixel 320 210 --index 12
+        SPLATBOT_VLM_URL=http://127.0.0.1:8000/v1 SPLATBOT_VLM_MODEL=qwen splatbot grasp --map runs/a --target mug --vlm
         splatbot grasp --map map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --point 0.1 0.2 0.6 --hand-only
 
     Args:
@@ -63,6 +65,8 @@ def grasp(
         box: corners of a rectangle in a picture of the run [px].
         mask: a picture of the same size, not black where the thing is.
         tag: number of an AprilTag 36h11 on the thing.
+        vlm: ask the vision-language model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL for the target too; it and the
+            rules must not contradict each other.
         index: which picture of the run, from 0.
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml beside the map (see
@@ -85,15 +89,17 @@ def grasp(
     given = [flag for flag, value in places.items() if value is not None]
     if len(given) != 1:
         raise InputError(f"are {len(given)}.", field=", ".join(places), hint="give one of them")
+    if vlm and target is None:
+        raise InputError("is about names.", field="--vlm", hint="give --target too")
 
     from splatbot.atomic import atomic_write
+    from splatbot.cli.affordances import name_backends
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.places import PlaceAffordance
     from splatbot.grasping.sampler import GraspSampler
     from splatbot.grasping.summary import summary
     from splatbot.grasping.tags import TagAffordance
-    from splatbot.grasping.words import WordAffordance
     from splatbot.report.grasp_view import grasp_png
     from splatbot.robots.store import load_robot
 
@@ -103,7 +109,7 @@ def grasp(
     arm = load_robot(robot)
     scene = _scene(map, base)
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
-    found = find_target(hint, scene, [WordAffordance(), PlaceAffordance(), TagAffordance()])
+    found = find_target(hint, scene, [*name_backends(vlm=vlm), PlaceAffordance(), TagAffordance()])
     sampler = GraspSampler(
         scene,
         arm,

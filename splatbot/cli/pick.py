@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 if TYPE_CHECKING:
-    from splatbot.grasping.affordance import Affordance, Target
-    from splatbot.grasping.pick_types import PickResult
-    from splatbot.segmentation import MapScene
-    from splatbot.sim.twin import Twin
+    from splatbot.sim.picking import TwinPick
 
 
 def pick(
@@ -56,98 +53,31 @@ def pick(
         out: folder to write to; by default runs/pick.
     """
     from splatbot.atomic import atomic_write
-    from splatbot.errors import InputError
-    from splatbot.grasping.affordance import NameHint, find_target
+    from splatbot.cli.affordances import name_backends
     from splatbot.grasping.options import GraspOptions
-    from splatbot.grasping.pick import Picker
     from splatbot.grasping.pick_types import PickError, PickOptions
-    from splatbot.grasping.sampler import GraspSampler
-    from splatbot.sim.controller import TwinController
+    from splatbot.sim.picking import pick_in_twin
     from splatbot.sim.scene import load_scene
     from splatbot.sim.twin import Twin
 
-    backends = _backends(vlm=vlm)
+    backends = name_backends(vlm=vlm)
+    options = PickOptions(lift=lift, force=force, tries=tries, grasp=GraspOptions(seed=seed), seed=seed)
     twin = Twin(load_scene(scene))
-    controller = TwinController(twin)
-    robot = twin.world.robot
-    if controller.gripper is None or robot is None:
-        raise InputError("has no fingers.", field=scene, hint="give the scene a robot with a gripper, as panda")
-    known = _known(twin, views, seed)
-    found = find_target(NameHint(target), known, backends)
-    options = PickOptions(
-        lift=lift,
-        force=force,
-        tries=tries,
-        grasp=GraspOptions(seed=seed),
-        carry_to=tuple(controller.position.tolist()) if home else None,
-        seed=seed,
-    )
-    before = _heights(twin)
-    picker = Picker(GraspSampler(known, robot, margin=margin), controller, controller.gripper, options=options)
-    result = picker.pick(found)
-    rose = {name: height - before[name] for name, height in _heights(twin).items()}
+    picked = pick_in_twin(twin, target, backends, options, views=views, margin=margin, home=home, seed=seed)
     folder = out if out is not None else Path("runs") / "pick"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "pick.json") as handle:
-        handle.write(json.dumps(_summary(result, found, rose), indent=2).encode())
-    _print(result, found, rose, folder)
-    if not result:
-        raise PickError(result)
+        handle.write(json.dumps(picked.summary(), indent=2).encode())
+    _print(picked, folder)
+    if not picked.result:
+        raise PickError(picked.result)
     return 0
 
 
-def _known(twin: Twin, views: int, seed: int) -> MapScene:
-    """What a scan tells, with the names of the scene's objects."""
-    from splatbot.segmentation import segment
-    from splatbot.sim.motion import base_of
-    from splatbot.sim.scan import scan
-    from splatbot.workspace import NamedPlace
-
-    movable = [thing.name for thing in twin.scene.objects if thing.movable]
-    names = [NamedPlace(name, twin.data.body(f"object/{name}").xipos.copy()) for name in movable]
-    return segment(scan(twin, views=views, seed=seed), base_of(twin.scene), names=names)
-
-
-def _backends(*, vlm: bool) -> list[Affordance]:
-    from splatbot.grasping.words import WordAffordance
-
-    rules = WordAffordance()
-    if not vlm:
-        return [rules]
-    from splatbot.grasping.vision import EndpointModel, VisionAffordance
-
-    return [VisionAffordance(EndpointModel.from_environment(), rules=rules), rules]
-
-
-def _heights(twin: Twin) -> dict[str, float]:
-    movable = [thing.name for thing in twin.scene.objects if thing.movable]
-    return {name: float(twin.data.body(f"object/{name}").xipos[2]) for name in movable}
-
-
-def _summary(result: PickResult, target: Target, rose: dict[str, float]) -> dict[str, Any]:
-    grasp = result.grasp
-    return {
-        "outcome": result.outcome,
-        "stage": result.stage,
-        "reason": result.reason,
-        "target": {"label": target.label, "backend": target.backend, "score": target.score},
-        "steps": [{"stage": s.stage, "seconds": s.seconds, "note": s.note} for s in result.steps],
-        "grasp": None
-        if grasp is None
-        else {
-            "T_world_tcp": grasp.T_world_tcp.tolist(),
-            "width_m": grasp.width,
-            "approach": grasp.approach,
-            "total": grasp.total,
-        },
-        "opening_m": result.opening,
-        "rose_m": rose,
-    }
-
-
-def _print(result: PickResult, target: Target, rose: dict[str, float], folder: Path) -> None:
+def _print(picked: TwinPick, folder: Path) -> None:
     from splatbot.cli.tables import print_table
 
+    result, target = picked.result, picked.target
     rows = [(str(step.stage), f"{step.seconds:6.2f} s  {step.note}") for step in result.steps]
-    rows += [(f"{name} rose", f"{1e3 * by:+.0f} mm") for name, by in rose.items() if abs(by) > 0.005]
+    rows += [(f"{name} rose", f"{1e3 * by:+.0f} mm") for name, by in picked.rose.items() if abs(by) > 0.005]
     print_table([*rows, ("written to", str(folder))], title=f"{target.label} ({target.backend}): {result.outcome}")

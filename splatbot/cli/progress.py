@@ -29,6 +29,20 @@ def progress_display(*, quiet: bool = False) -> Iterator[Callable[[Progress], No
         yield PlainLines()
 
 
+@contextmanager
+def shares(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+    """A callback for what is done now and the share (0..1) that is done, shown on a terminal alone."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda what, share: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task("", total=1.0)
+        yield lambda what, share: bars.update(task, description=what, completed=share)
+
+
 class PlainLines:
     """Writes a line when two seconds have passed, a phase begins, or a frame is lost or unreadable."""
 

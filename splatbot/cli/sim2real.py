@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -63,13 +61,14 @@ def sim2real(
         json: another place for the JSON file of the log, or else of the held-out twin.
         quiet: print only errors.
     """
+    from splatbot.cli.progress import shares
     from splatbot.errors import InputError
 
     if (log is None) != (map is None) or (log is None and not held_out):
         raise InputError("are needed, both.", field="LOG, --map", hint="splatbot sim2real LOG --map RUN, or --held-out")
     folder = out if out is not None else Path("runs") / "sim2real"
     interrupted = False
-    with _progress(quiet) as tell:
+    with shares(quiet) as tell:
         if log is not None and map is not None:
             interrupted = _compare_log(log, map, robot, frames, folder, json, tell, quiet)
             json = None
@@ -161,16 +160,3 @@ def _write(folder: Path, name: str, json: Path | None, values: dict[str, Any], p
     ):
         with atomic_write(path) as file:
             file.write(content.encode())
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Tell]:
-    if quiet or not sys.stderr.isatty():
-        yield lambda what, share: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task("", total=1.0)
-        yield lambda what, share: bars.update(task, description=what, completed=share)

@@ -18,6 +18,8 @@ from splatbot.protocols import Array
 # the depth, as a structured-light camera's noise does (Khoshelham & Elberink 2012: sigma = 1.4e-3 z^2).
 TOLERANCE, TOLERANCE_PER_Z2 = 0.01, 0.006  # [m], [1/m]
 
+DepthView = tuple[NDArray[np.float32], Camera, Array]  # depth (H, W) [m, 0: none], its camera, T_world_camera (4, 4)
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -41,18 +43,26 @@ class Evidence:
         return Evidence(self.hits[rows], self.passes[rows])
 
 
-def gather_evidence(model: GaussianModel, views: Iterable[tuple[NDArray[np.float32], Camera, Array]]) -> Evidence:
+def gather_evidence(model: GaussianModel, views: Iterable[DepthView]) -> Evidence:
     """Count over views, each a depth image (H, W) [m, 0 or NaN: none], its camera and T_world_camera (4, 4).
 
     Raises:
         InputError: a depth image is not of its camera's size.
     """
-    means = model.means.detach().numpy().astype(np.float64)
-    hits, passes = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
+    return evidence_at(model.means.detach().numpy().astype(np.float64), views)
+
+
+def evidence_at(points: Array, views: Iterable[DepthView]) -> Evidence:
+    """The same of points (P, 3) [m, world].
+
+    Raises:
+        InputError: a depth image is not of its camera's size.
+    """
+    hits, passes = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for depth, camera, T_world_camera in views:
         if depth.shape != (camera.height, camera.width):
             raise InputError(f"is {depth.shape}.", field="depth", hint=f"give ({camera.height}, {camera.width})")
-        rows, measured, z = measured_depths(means, depth, camera, T_world_camera)
+        rows, measured, z = measured_depths(points, depth, camera, T_world_camera)
         tolerance = TOLERANCE + TOLERANCE_PER_Z2 * z**2
         hits[rows[np.abs(measured - z) <= tolerance]] += 1
         passes[rows[measured - z > tolerance]] += 1

@@ -112,6 +112,7 @@ class PickResult:
         attached: (A, 4) spheres of the object in the last link's frame, as planning takes it along; None likewise.
         q: (J,) where the arm was told to be last; None: it did not move.
         error: of a part that failed.
+        planned: seconds that the search for the way to the pre-grasp took; None: there is no way.
     """
 
     outcome: PickOutcome
@@ -123,6 +124,7 @@ class PickResult:
     attached: Array | None = None
     q: Array | None = None
     error: SplatbotError | None = None
+    planned: float | None = None
 
     def __bool__(self) -> bool:
         return self.outcome is PickOutcome.PICKED

@@ -20,12 +20,13 @@ from splatbot.grasping.affordance import (
 )
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import MapObject, MapScene
 from splatbot.segmentation.objects import FEWEST, LARGEST
 from splatbot.segmentation.parts import find_faces
 
 NEAR = 0.02  # [m] around a point within which an object's Gaussian must be
 _CLEAR = 0.6  # share of a mask's objects that one must have
+_WITHIN = "it was pointed at within it, not at its surface"
 _UNSEGMENTED = "it is no object of its own: what was marked of its faces is taken for it"
 
 
@@ -91,12 +92,34 @@ def at_point(scene: MapScene, point: Array, *, backend: str = "place", label: st
         others = [a for i, a in enumerate(away) if i != k]
         score = 1.0 if not others else float(np.clip((min(others) - away[k]) / NEAR, 0.0, 1.0))
         return Target(found.rows, point, label or found.name or f"object {k}", backend, score, (), k)
+    around = _around(scene, point)
+    if around is not None:
+        return Target(
+            around.rows,
+            point,
+            label or around.name or f"object {around.number}",
+            backend,
+            0.5,
+            (_WITHIN,),
+            around.number,
+        )
     rows = _face_at(scene, point)
     if len(rows):
         return Target(rows, point, label or "face", backend, 0.5, (_UNSEGMENTED,))
     where = ", ".join(f"{x:.3f}" for x in point)
     nearest = f"; the nearest object is {100 * min(away):.1f} cm away" if away else "; there are no objects"
     raise AffordanceError(f"at ({where}) there is no object{nearest}.", field="target", hint="point at an object")
+
+
+def _around(scene: MapScene, point: Array) -> MapObject | None:
+    """The smallest object in whose box a point is, as within a cup of which only the rim was mapped."""
+    local = transform_points(inverse(scene.T_world_base), point)
+    found = []
+    for thing in scene.objects:
+        low, high = scene.points[thing.rows].min(axis=0), scene.points[thing.rows].max(axis=0)
+        if ((local > low) & (local < high)).all():
+            found.append((float(np.prod(high - low)), thing.number))
+    return scene.objects[min(found)[1]] if found else None
 
 
 def _face_at(scene: MapScene, point: Array) -> NDArray[np.int64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField
+from splatbot.collision.evidence import DepthView
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
@@ -20,7 +21,7 @@ from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ArmReach, Reach, hand_of
 from splatbot.grasping.score import arm_terms, best_apart, hand_terms, totals
-from splatbot.grasping.surface import target_surface
+from splatbot.grasping.surface import Surface, target_surface
 from splatbot.grasping.sweep import swept_room, touches
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.planning.cartesian import along
@@ -82,6 +83,7 @@ class GraspSampler:
         make_reach: gives, for the map without the target and the whole map, who says whether the arm gets there; by
             default :class:`splatbot.grasping.reach.ArmReach`.
         observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known; None: nowhere is.
+        views: depth that was measured of the scene, which tells where there is nothing.
         n_sigma: where the surface of a Gaussian is; less than for planning, as the hand has to come near.
         min_observations: Gaussians that fewer keyframes support are air; see
             :class:`splatbot.collision.GaussianCollisionField`.
@@ -99,6 +101,7 @@ class GraspSampler:
         hand_only: bool = False,
         make_reach: MakeReach | None = None,
         observers: Array | None = None,
+        views: Sequence[DepthView] = (),
         n_sigma: float = 1.0,
         min_observations: int = 1,
         margin: float = 0.0,
@@ -107,7 +110,7 @@ class GraspSampler:
             raise InputError(f"is {observers.shape}.", field="observers", hint=f"give ({len(scene.model)}, 3)")
         if not 0.0 <= margin < np.inf:
             raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
-        self.scene, self.robot, self.observers = scene, robot, observers
+        self.scene, self.robot, self.observers, self.views = scene, robot, observers, tuple(views)
         self.hand = hand_of(robot)
         self.margin, self.n_sigma = margin, n_sigma
         self.min_observations = min_observations
@@ -123,6 +126,10 @@ class GraspSampler:
         if not len(target.rows):
             raise InputError("has no Gaussians.", field=target.label, hint="name another target")
         return _Search(self, target, options or GraspOptions()).run()
+
+    def surface(self, target: Target, *, seed: int = 0) -> Surface:
+        """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.surface.target_surface`."""
+        return target_surface(self.scene, target.rows, observers=self.observers, views=self.views, seed=seed)
 
     def collision_field(self, model: GaussianModel) -> GaussianCollisionField:
         """A part of the map as the hand and the arm avoid it."""
@@ -144,7 +151,7 @@ class _Search:
         self.log = _Log()
 
     def run(self) -> GraspResult:
-        self.surface = target_surface(self.s.scene, self.target.rows, observers=self.s.observers, seed=self.o.seed)
+        self.surface = self.s.surface(self.target, seed=self.o.seed)
         self.log.stage("surface")
         found = self._contacts()
         self.log.stage("contacts")

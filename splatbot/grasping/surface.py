@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatbot.collision.evidence import DepthView, evidence_at
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import rotations, shortest_axes
 from splatbot.geometry import inverse, transform_points
@@ -33,6 +35,7 @@ _SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
 _TUBE = 0.003  # [m] around a line within which it meets a point
 _SEEN = 0.006  # [m] around seen points of a side within which none is added
 _ROWS = 0.003  # [m] between added points
+_THROUGH = 2  # views that must see through a point that nobody saw
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +71,12 @@ class Surface:
 
 
 def target_surface(
-    scene: MapScene, rows: NDArray[np.int64], *, observers: Array | None = None, seed: int = 0
+    scene: MapScene,
+    rows: NDArray[np.int64],
+    *,
+    observers: Array | None = None,
+    views: Sequence[DepthView] = (),
+    seed: int = 0,
 ) -> Surface:
     """The surface of the Gaussians ``rows`` (M,) of a scene.
 
@@ -78,6 +86,7 @@ def target_surface(
         scene: the map.
         rows: of the target.
         observers: (N, 3) where each Gaussian of the map was seen from [m, world], NaN where that is not known.
+        views: depth that was measured; no side is implied where it saw through.
         seed: of which Gaussians are kept where there are more than 1800.
     """
     rng = np.random.default_rng(seed)
@@ -100,7 +109,7 @@ def target_surface(
     apart = np.sqrt(areas)
     spread = np.where(apart > 2 * scales[:, 2], 1.2 * apart, scales[:, 2])  # where only some of many are looked at
     seen = Surface(points, normals, half, spread, np.ones(len(points), np.bool_), doubt, center)
-    return _completed(scene, seen.select(kept), areas[kept])
+    return _completed(scene, seen.select(kept), areas[kept], views)
 
 
 def _doubts(model: GaussianModel, scales: Array) -> Array:
@@ -136,7 +145,7 @@ def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, Ar
     return mean, np.asarray(2 * np.pi * _SMOOTH**2 / crowd, dtype=np.float64)
 
 
-def _completed(scene: MapScene, seen: Surface, areas: Array) -> Surface:
+def _completed(scene: MapScene, seen: Surface, areas: Array, views: Sequence[DepthView]) -> Surface:
     """With the sides that go down from its top to the support, and back from the face that was seen in front."""
     up = scene.up
     parts = [_sides(seen, up, _floor(scene, seen, up))]
@@ -148,6 +157,8 @@ def _completed(scene: MapScene, seen: Surface, areas: Array) -> Surface:
     thin = thin[:: 1 + len(thin) // MOST]
     points, normals = points[thin], normals[thin]
     outer = _enclosed(points, seen, areas) < _WITHIN
+    evidence = evidence_at(points, views)
+    outer &= ~(evidence.seen_through & (evidence.passes >= _THROUGH))
     points, normals = points[outer], normals[outer]
     outer = ~_inside(points, normals)
     points, normals, n = points[outer], normals[outer], int(outer.sum())

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -18,12 +16,12 @@ from numpy.typing import NDArray
 from splatbot.gaussians import Snapshot
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper, Observation
+from splatbot.priority import stand_back, switch_quickly
 from splatbot.rasterize.native import native
 from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame
 
 _NICENESS = 5  # of the thread: where cores are short, the tracker goes first
-_SWITCH_S = 5e-4  # a tenth of Python's own: how long the tracker waits for the interpreter while mapping holds it
 _CHUNK = 1  # refinement steps between two looks at what has arrived
 
 
@@ -154,7 +152,7 @@ class MappingWorker:
         self._published = replace(self._mapper.snapshot(), map_version=self._published.map_version + 1)
 
     def _start(self, first: Keyframe) -> None:
-        sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_S))
+        switch_quickly()  # the tracker waits for the interpreter while mapping holds it
         self._thread = threading.Thread(target=self._run, args=(first,), name="mapping", daemon=True)
         self._thread.start()
 
@@ -226,5 +224,4 @@ def _stand_back() -> None:
     """Leave cores and interpreter to the tracker: one native thread, one of torch, and a lower priority."""
     native().keep_to_this_thread(True)
     torch.set_num_threads(1)
-    with suppress(OSError, AttributeError):  # elsewhere than on Linux a priority is not a thread's own
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+    stand_back(_NICENESS)

@@ -127,6 +127,7 @@ def segment(
     plane: ArrayLike | None = None,
     names: Sequence[NamedPlace] = (),
     apart: float = _APART,
+    cut: bool = True,
 ) -> MapScene:
     """Remove the support of a map and gather what stands on it.
 
@@ -137,6 +138,8 @@ def segment(
         plane: (4,) = (n, d), the support where it is known: n · p + d = 0 [world]; None: it is looked for.
         names: what a scene file calls things.
         apart: objects have more than this between their Gaussians [m]; in a coarse map it is more.
+        cut: what hangs together may be several things: one that is wide may be a support of others, and it is cut at
+            steps between level faces. Without, it is one, as a mallet is whose head is higher than its handle.
 
     Raises:
         InputError: nothing of the map is in the box.
@@ -158,7 +161,7 @@ def segment(
     objects: list[MapObject] = []
     colors = model.colors.detach().double().numpy()
     for rows in sorted(
-        _things(points, above, apart, _DEEPEST, labels, supports), key=lambda rows: (-len(rows), int(rows[0]))
+        _things(points, above, apart, _DEEPEST, labels, supports, cut), key=lambda rows: (-len(rows), int(rows[0]))
     ):
         labels[rows] = len(objects)
         objects.append(_described(len(objects), rows, points[rows], colors[rows], T))
@@ -183,20 +186,21 @@ def _things(
     deeper: int,
     labels: NDArray[np.int32],
     supports: list[Support],
+    cut: bool,
 ) -> list[NDArray[np.int64]]:
     """Rows of what hangs together; what stands together on a support of its own, as a stool or a shelf, apart."""
     found: list[NDArray[np.int64]] = []
     for part in clusters(points[used], apart=apart):
         rows = used[part]
         wide = float(np.ptp(points[rows], axis=0).max())
-        ledge = _ledge(points[rows]) if deeper and wide > _LEDGE else None
+        ledge = _ledge(points[rows]) if cut and deeper and wide > _LEDGE else None
         if ledge is not None:
             on = rows[above_support(ledge, points[rows])]
             supports.append(replace(ledge, inside=np.zeros(0, np.bool_)))
             labels[rows[np.abs(ledge.height(points[rows])) < NEAR]] = -1 - len(supports)
-            found += _things(points, on, apart, deeper - 1, labels, supports)
+            found += _things(points, on, apart, deeper - 1, labels, supports, cut)
         elif len(rows) >= FEWEST and wide <= LARGEST:
-            found += [rows[some] for some in cut_at_steps(points[rows], fewest=FEWEST)]
+            found += [rows[some] for some in cut_at_steps(points[rows], fewest=FEWEST)] if cut else [rows]
     return found
 
 

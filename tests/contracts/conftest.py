@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 import threading
 import time
 from collections.abc import Iterator
@@ -48,15 +49,25 @@ def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterato
     """A real server on a real socket, until the block ends."""
     runtime = Runtime(settings, store)
     app = create_app(runtime)
-    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws_max_size=settings.max_message_bytes)
+    config = uvicorn.Config(
+        app,
+        host="127.0.0.1",
+        port=0,
+        log_level="warning",
+        ws_max_size=settings.max_message_bytes,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     while not server.started:
         assert thread.is_alive(), "the server did not start"
         time.sleep(0.01)
-    url = f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    with httpx.Client(base_url=url, timeout=60) as client:
+    scheme = "http" if settings.tls_cert is None else "https"
+    url = f"{scheme}://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    trusted = True if settings.tls_cert is None else ssl.create_default_context(cafile=str(settings.tls_cert))
+    with httpx.Client(base_url=url, timeout=60, verify=trusted) as client:
         yield Service(client, runtime, app, url)
     runtime.drain()
     server.should_exit = True

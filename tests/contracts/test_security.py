@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import random
+import shutil
 import socket
+import ssl
 import struct
+import subprocess
 import threading
 import time
 import zipfile
@@ -22,7 +26,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from splatbot.client import pack_array
+from splatbot.client import Client, ServiceError, pack_array
 from splatbot.errors import ConfigError
 from splatbot.logs import open_log
 from splatbot.logs.record import record
@@ -121,6 +125,25 @@ def test_tls_is_whole_or_refused(tmp_path: Path) -> None:
         check_exposure(ServiceSettings(tls_cert=tmp_path / "a.pem"))
     with pytest.raises(ConfigError, match="does not exist"):
         check_exposure(ServiceSettings(tls_cert=tmp_path / "a.pem", tls_key=tmp_path / "b.pem"))
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
+def test_a_service_with_a_certificate_speaks_https_to_those_who_trust_it_alone(tmp_path: Path) -> None:
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    make = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+    make += ["-keyout", str(key), "-out", str(cert), "-days", "2", "-subj", "/CN=localhost"]
+    make += ["-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"]
+    subprocess.run(make, check=True, capture_output=True)
+    settings = ServiceSettings(tls_cert=cert, tls_key=key)
+    check_exposure(settings)
+    with running(settings, _store()) as service:
+        trusting = ssl.create_default_context(cafile=str(cert))
+        with Client(service.url, tls=trusting) as client:
+            assert client.maps()[0]["id"] == "wall"
+        with Client(service.url) as stranger, pytest.raises(ServiceError, match="CERTIFICATE_VERIFY_FAILED"):
+            stranger.maps()
+        with Client(service.url.replace("https", "http")) as plain, pytest.raises(ServiceError, match="no answer"):
+            plain.maps()
 
 
 def test_keys_come_from_the_environment_separated_by_commas(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,8 +303,17 @@ def test_mutated_bodies_are_refused_or_answered_and_never_break_the_service(open
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["application/x-npy", "application/msgpack", "application/json"])
-def test_two_thousand_mutated_bodies(open_: Service, kind: str) -> None:
-    _fuzz(open_, kind, 2000, seed=2)
+def test_two_thousand_mutated_bodies_break_nothing_and_leave_no_memory_behind(open_: Service, kind: str) -> None:
+    _fuzz(open_, kind, 500, seed=2)  # what the first ones allocate is kept for the next
+    before = _resident_mib()
+    _fuzz(open_, kind, 1500, seed=3)
+    assert _resident_mib() - before < 8.0
+
+
+def _resident_mib() -> float:
+    gc.collect()
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS"))
 
 
 def _fuzz(service: Service, kind: str, count: int, seed: int) -> None:

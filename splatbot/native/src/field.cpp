@@ -3,9 +3,11 @@
 
 #include <algorithm>
 #include <array>
+#include <numeric>
 #include <unordered_map>
 
 #include "solid_blocks.hpp"
+#include "solid_covers.hpp"
 #include "solid_grid.hpp"
 #include "splatbot/kernels.hpp"
 #include "splatbot/threads.hpp"
@@ -34,6 +36,27 @@ void widen(float box[6], const SolidBox& other) {
 void clear_box(float box[6]) {
   std::fill(box, box + 3, 1e30F);
   std::fill(box + 3, box + 6, -1e30F);
+}
+
+// The order of points (P, 3) along a Morton curve through their box: neighbours in it are neighbours in space.
+std::vector<std::uint32_t> along_a_curve(std::span<const double> points) {
+  constexpr double kCells = 1024.0;
+  double low[3] = {1e300, 1e300, 1e300}, high[3] = {-1e300, -1e300, -1e300};
+  for (std::size_t i = 0; i < points.size(); ++i) {
+    low[i % 3] = std::min(low[i % 3], points[i]);
+    high[i % 3] = std::max(high[i % 3], points[i]);
+  }
+  std::vector<std::uint64_t> keys(points.size() / 3);
+  std::vector<std::uint32_t> order(keys.size());
+  for (std::size_t i = 0; i < keys.size(); ++i) {
+    for (std::size_t k = 0; k < 3; ++k) {
+      const double share = (points[3 * i + k] - low[k]) / std::max(high[k] - low[k], 1e-300);
+      keys[i] |= spread_bits(static_cast<std::uint64_t>(std::min(share * kCells, kCells - 1.0))) << k;
+    }
+  }
+  std::iota(order.begin(), order.end(), 0U);
+  std::sort(order.begin(), order.end(), [&](std::uint32_t a, std::uint32_t b) { return keys[a] < keys[b]; });
+  return order;
 }
 
 SolidBox box_of(const SolidBlock& block) {
@@ -302,9 +325,9 @@ std::size_t CollisionField::bytes() const {
   std::size_t sum = block_of_.size() * sizeof(std::int32_t) + top_.size() * sizeof(SolidNode) +
                     views_.size() * sizeof(SolidBlockView);
   for (const auto& block : blocks_) {
-    sum += block ? sizeof(SolidBlock) + own_bytes(*block) : 0;
+    sum += block ? sizeof(SolidBlock) + own_bytes(*block) + block->covers.bytes.load() : 0;
   }
-  return sum + (grid_ ? grid_->marks.size() + grid_->bound.size() : 0);
+  return sum + top_covers_.bytes.load() + (grid_ ? grid_->marks.size() + grid_->bound.size() : 0);
 }
 
 std::size_t CollisionField::shared_bytes(const CollisionField& other) const {
@@ -336,11 +359,26 @@ void CollisionField::k_nearest(const SphereQueries& queries, std::size_t count, 
   });
 }
 
+SolidCoversView CollisionField::covers() const {
+  std::call_once(top_covers_.once, [this] {
+    block_covers_.assign(blocks_.size(), nullptr);
+    thread_pool()->run(blocks_.size(), [this](std::size_t b) {
+      if (blocks_[b]) {
+        block_covers_[b] = covers_of(*blocks_[b]).nodes.data();
+      }
+    });
+    cover_top(top_, blocks_, top_covers_);
+  });
+  return {top_covers_.nodes.data(), block_covers_.data()};
+}
+
 void CollisionField::mahalanobis(std::span<const double> points, std::span<double> distance,
                                  std::span<std::int32_t> id) const {
   const FieldKernels& k = *kernels().field;
+  const SolidCoversView covering = covers();
+  const std::vector<std::uint32_t> order = along_a_curve(points);
   in_parts(id.size(), [&](std::size_t begin, std::size_t end) {
-    k.mahalanobis(view_, points.data(), begin, end, distance.data(), id.data());
+    k.mahalanobis(view_, covering, points.data(), order.data(), begin, end, distance.data(), id.data());
   });
 }
 

@@ -21,16 +21,6 @@ constexpr std::uint64_t kLargeBlock = (std::uint64_t{1} << (3 * kBlockBits)) - 1
 constexpr float kSmallestAxis = 1e-9F;  // [m]; squares must not vanish
 constexpr std::size_t kChunk = 4096;
 
-// Bits of x three places apart.
-std::uint64_t spread(std::uint64_t x) {
-  x &= 0x1fffff;
-  x = (x | x << 32) & 0x1f00000000ffff;
-  x = (x | x << 16) & 0x1f0000ff0000ff;
-  x = (x | x << 8) & 0x100f00f00f00f00f;
-  x = (x | x << 4) & 0x10c30c30c30c30c3;
-  return (x | x << 2) & 0x1249249249249249;
-}
-
 constexpr float kHalfBlocks = 1 << (kBlockBits - 1);
 
 std::uint64_t place_of(const float* mean) {
@@ -38,7 +28,7 @@ std::uint64_t place_of(const float* mean) {
   for (int k = 0; k < 3; ++k) {
     const float at = mean[k] / kBlockEdge;
     constexpr float parts = 1 << kInBlockBits;
-    place |= spread(static_cast<std::uint64_t>(std::clamp((at - std::floor(at)) * parts, 0.0F, parts - 1.0F))) << k;
+    place |= spread_bits(static_cast<std::uint64_t>(std::clamp((at - std::floor(at)) * parts, 0.0F, parts - 1.0F))) << k;
   }
   return place;
 }
@@ -47,7 +37,7 @@ std::uint64_t key_of(const float* mean, float longest) {
   std::uint64_t block = 0;
   for (int k = 0; k < 3; ++k) {
     const float cell = std::floor(mean[k] / kBlockEdge);
-    block |= spread(static_cast<std::uint64_t>(std::clamp(cell, -kHalfBlocks, kHalfBlocks - 2.0F) + kHalfBlocks)) << k;
+    block |= spread_bits(static_cast<std::uint64_t>(std::clamp(cell, -kHalfBlocks, kHalfBlocks - 2.0F) + kHalfBlocks)) << k;
   }
   return (longest > kBlockEdge ? kLargeBlock : block) << kPlaceBits | place_of(mean);
 }

@@ -23,6 +23,16 @@ struct SolidItem {
 inline constexpr int kPlaceBits = 21;
 inline std::uint64_t block_key(std::uint64_t key) { return key >> kPlaceBits; }
 
+// The lowest 21 bits of x, three places apart: three such make a place along a Morton curve.
+inline std::uint64_t spread_bits(std::uint64_t x) {
+  x &= 0x1fffff;
+  x = (x | x << 32) & 0x1f00000000ffff;
+  x = (x | x << 16) & 0x1f0000ff0000ff;
+  x = (x | x << 8) & 0x100f00f00f00f00f;
+  x = (x | x << 4) & 0x10c30c30c30c30c3;
+  return (x | x << 2) & 0x1249249249249249;
+}
+
 SolidItem make_item(const Solids& solids, std::size_t i, float n_sigma);
 std::vector<SolidItem> make_items(const Solids& solids, float n_sigma);
 std::uint64_t key_of(const Solids& solids, std::size_t i, float n_sigma);  // as the item has it

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <atomic>
 #include <charconv>
+#include <chrono>
 #include <cstdlib>
 #include <exception>
 #include <stdexcept>
@@ -13,6 +14,7 @@
 #if defined(__linux__)
 #include <pthread.h>
 #include <sched.h>
+#include <sys/resource.h>
 #endif
 #if defined(__unix__) || defined(__APPLE__)
 #include <unistd.h>
@@ -23,6 +25,7 @@ namespace splatbot {
 namespace {
 
 constexpr unsigned kMaxThreads = 1024;
+constexpr std::int64_t kYieldedNs = 1'000'000'000;  // how long the pool is left to those of higher priority
 
 thread_local bool this_thread_alone = false;
 
@@ -40,6 +43,19 @@ const cpu_set_t& process_cpus() {
   return instance;
 }
 #endif
+
+// Of the calling thread: where cores are short, those of lower niceness go first.
+int niceness() {
+#if defined(__linux__)
+  return getpriority(PRIO_PROCESS, 0);
+#else
+  return 0;
+#endif
+}
+
+std::int64_t now_ns() {
+  return std::chrono::duration_cast<std::chrono::nanoseconds>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
 
 unsigned usable_cpus() {
 #if defined(__linux__)
@@ -109,7 +125,8 @@ struct ThreadPool::Loop {
   }
 };
 
-ThreadPool::ThreadPool(unsigned threads) : size_(std::max(1U, threads)) {
+ThreadPool::ThreadPool(unsigned threads)
+    : size_(std::max(1U, threads)), niceness_(niceness()), last_used_(now_ns() - kYieldedNs) {
   threads_.reserve(size_ - 1);
   for (unsigned i = 1; i < size_; ++i) {
     threads_.emplace_back([this] { work(); });
@@ -129,7 +146,7 @@ ThreadPool::~ThreadPool() {
 
 void ThreadPool::run_erased(std::size_t count, Function function, void* context) {
   std::unique_lock owner(owner_, std::defer_lock);
-  if (this_thread_alone || !owner.try_lock() || threads_.empty() || count < 2) {
+  if (this_thread_alone || threads_.empty() || count < 2 || yields() || !owner.try_lock()) {
     for (std::size_t i = 0; i < count; ++i) {
       function(context, i);
     }
@@ -150,6 +167,16 @@ void ThreadPool::run_erased(std::size_t count, Function function, void* context)
   if (loop.error) {
     std::rethrow_exception(loop.error);
   }
+}
+
+// Whether the calling thread leaves the workers, which have the priority of whoever made the pool, to others.
+bool ThreadPool::yields() {
+  thread_local const int mine = niceness();
+  if (mine <= niceness_) {
+    last_used_.store(now_ns(), std::memory_order_relaxed);
+    return false;
+  }
+  return now_ns() - last_used_.load(std::memory_order_relaxed) < kYieldedNs;
 }
 
 // A scheduler that wakes a sleeping thread likes to put it where the waker runs. With the waker busy for the whole

@@ -101,6 +101,26 @@ double distance_to(const Map& map, std::size_t i, const double* p) {
   return (high - least * least) * std::sqrt(sum(high, false));
 }
 
+double mahalanobis_to(const Map& map, std::size_t i, const double* p) {
+  double q[4], norm = 0.0, d[3], sum = 0.0;
+  for (std::size_t k = 0; k < 4; ++k) {
+    q[k] = static_cast<double>(map.quats[4 * i + k]);
+    norm += q[k] * q[k];
+  }
+  const double w = q[0], x = q[1], y = q[2], z = q[3], t = 2.0 / norm;
+  const double R[9] = {1 - t * (y * y + z * z), t * (x * y - w * z),     t * (x * z + w * y),
+                       t * (x * y + w * z),     1 - t * (x * x + z * z), t * (y * z - w * x),
+                       t * (x * z - w * y),     t * (y * z + w * x),     1 - t * (x * x + y * y)};
+  for (std::size_t k = 0; k < 3; ++k) {
+    d[k] = p[k] - static_cast<double>(map.means[3 * i + k]);
+  }
+  for (std::size_t k = 0; k < 3; ++k) {
+    const double part = (R[k] * d[0] + R[3 + k] * d[1] + R[6 + k] * d[2]) / static_cast<double>(map.scales[3 * i + k]);
+    sum += part * part;
+  }
+  return std::sqrt(sum);
+}
+
 std::vector<double> points_in_box(std::size_t count, unsigned seed) {
   std::mt19937 random(seed);
   std::uniform_real_distribution<double> uniform(-1.2, 1.2);
@@ -146,6 +166,24 @@ void check_distances(const Map& map, const CollisionField& field, bool packed) {
     }
     promise(found[i].distance <= truth, "no distance exceeds the true one");
     promise(found[i].distance >= truth - (packed ? 4e-3 : 2e-5), "no distance is far below the true one");
+  }
+}
+
+// The smallest Mahalanobis distance by looking at every Gaussian in float64.
+void check_mahalanobis(const Map& map, const CollisionField& field) {
+  const std::vector<double> points = points_in_box(300, 15);
+  std::vector<double> found(points.size() / 3);
+  std::vector<std::int32_t> id(found.size());
+  field.mahalanobis(points, found, id);
+  for (std::size_t i = 0; i < found.size(); ++i) {
+    double least = 1e30, own = 1e30;
+    for (std::size_t s = 0; s < map.ids.size(); ++s) {
+      const double here = mahalanobis_to(map, s, &points[3 * i]);
+      least = std::min(least, here);
+      own = map.ids[s] == id[i] ? here : own;
+    }
+    promise(std::abs(found[i] - own) <= 1e-4 * own + 1e-4, "a Mahalanobis distance is that of the Gaussian named");
+    promise(own <= least * (1.0 + 1e-3) + 1e-3, "no Gaussian is nearer than the one named");
   }
 }
 
@@ -283,6 +321,9 @@ void check_collision(const std::string& isa) {
       promise(answers(CollisionField(map.solids(), options), points) == want, "threads change no bit of a field's answers");
     }
     check_distances(map, field, packed);
+    if (!packed) {
+      check_mahalanobis(map, field);
+    }
     check_updates(map, options);
     check_arm(field);
   }

@@ -93,3 +93,15 @@ def test_wrong_questions_are_answered_in_one_line(
     assert answer.code in (1, 2)
     assert message in answer.err
     assert "Traceback" not in answer.err
+
+
+def test_a_model_is_asked_for_names_alone_and_must_be_named(
+    run: RunCommand, map_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("SPLATBOT_VLM_URL", raising=False)
+    answer = run("grasp", "--map", map_file, *BASE, "--target", "red box", "--vlm")
+    assert answer.code == 2
+    assert "SPLATBOT_VLM_URL" in answer.err
+    answer = run("grasp", "--map", map_file, *BASE, "--point", 0, 0, 0, "--vlm")
+    assert answer.code == 2
+    assert "--target" in answer.err

@@ -23,7 +23,7 @@ from splatbot.grasping.affordance import (
 from splatbot.grasping.places import PlaceAffordance, point_at
 from splatbot.grasping.words import WordAffordance
 from splatbot.segmentation import MapScene
-from tests.unit.grasping.things import BALL, BOX, CAN, scene, target_of
+from tests.unit.grasping.things import BALL, BIG, BOX, CAN, scene, target_of
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 VIEW = View(CAMERA, look_at(np.array([0.0, -0.4, 0.6]), np.array([0.5, 0.0, 0.0])))
@@ -51,6 +51,12 @@ def test_a_pixel_and_a_point_on_a_thing_name_its_gaussians(solid: object) -> Non
         assert found.number == wanted.number
         assert found.backend == "place"
         np.testing.assert_array_equal(found.rows, wanted.rows)
+
+
+def test_a_point_within_a_thing_names_it_and_says_so() -> None:
+    found = PlaceAffordance().locate(PointHint(np.array(BIG.center)), scene())
+    assert found.number == target_of(scene(), BIG, "big").number
+    assert "within" in found.notes[0]
 
 
 def test_a_mask_and_a_rectangle_name_what_fills_them() -> None:

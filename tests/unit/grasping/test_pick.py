@@ -21,6 +21,7 @@ from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_types import PickError, PickOptions, PickOutcome, PickResult, PickStage
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
+from splatbot.grasping.ways import within
 from splatbot.planning import GaussianRRTStar
 from splatbot.protocols import Gripper, MotionState
 from splatbot.robots.controllers import FakeController
@@ -274,6 +275,18 @@ def test_spheres_of_a_held_object_cover_it_and_are_few() -> None:
     assert (inside.max(axis=1) >= reach - 1e-12).all()
     with pytest.raises(InputError):
         covering_spheres(points[:0], reach[:0])
+
+
+def test_what_is_within_an_object_is_its_own_and_what_is_beside_or_under_it_is_not() -> None:
+    y, z = np.meshgrid(np.linspace(-0.04, 0.04, 9), np.linspace(0.0, 0.08, 9))
+    sides = [np.c_[np.full(81, x), y.ravel(), z.ravel()] for x in (-0.04, 0.04)]
+    walls = np.concatenate([*sides, *(side[:, [1, 0, 2]] for side in sides)])  # open above and below
+    spheres = np.c_[walls, np.full(len(walls), 0.008)]
+    floor = np.c_[y.ravel(), z.ravel() - 0.04, np.zeros(81), np.full(81, 0.008)]
+    cup = np.concatenate([spheres, floor])
+    asked = np.array([[0.0, 0.0, 0.03], [0.04, 0.01, 0.05], [0.06, 0.0, 0.04], [0.0, 0.0, -0.03], [0.0, 0.0, 0.12]])
+    np.testing.assert_array_equal(within(asked, cup), [True, True, False, False, False])
+    np.testing.assert_array_equal(within(asked, spheres), [False, True, False, False, False])
 
 
 def test_options_that_make_no_sense_are_refused() -> None:

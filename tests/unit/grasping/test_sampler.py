@@ -7,16 +7,22 @@ from functools import cache
 import numpy as np
 import pytest
 
+from splatbot.bench.collision_peers import solid_mesh
 from splatbot.bench.tabletop import Block, Solid, Tabletop
+from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.collision.evidence import DepthView
 from splatbot.errors import InputError
-from splatbot.geometry import inverse, transform_points
+from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import Reached
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.score import WEIGHTS
+from splatbot.grasping.surface import target_surface
 from splatbot.grasping.types import GraspResult, NoGraspError
+from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.robots.wide_hand import panda_2f140
@@ -159,6 +165,28 @@ def test_sides_that_nobody_saw_are_implied_and_told() -> None:
     assert best.terms["seen"] < 0.5
     assert best.width == pytest.approx(BOX.size[1], abs=8e-3)
     assert np.abs(BOX.distance(best.contacts)).max() < 4e-3
+
+
+def test_no_side_is_implied_where_depth_saw_through() -> None:
+    found = segment(seen_from_above(model()), np.eye(4))
+    target = target_of(found, BOX, "box")
+    camera = Camera(220.0, 220.0, 159.5, 119.5, 320, 240)
+
+    def views(*solids: Solid) -> list[DepthView]:
+        stage = Scene([Surface(solid_mesh(solid), Texture((0.5,) * 3, (0.5,) * 3)) for solid in solids])
+        poses = [
+            look_at(np.array([0.45 + 0.4 * np.cos(turn), 0.1 + 0.4 * np.sin(turn), 0.35]), np.array([0.45, 0.1, 0.05]))
+            for turn in np.arange(8) * np.pi / 4
+        ]
+        return [(stage.render(camera, T)[1], camera, T) for T in poses]
+
+    implied = [
+        int((~target_surface(found, target.rows, views=known).seen).sum())
+        for known in ((), views(TABLE, BOX), views(TABLE))
+    ]
+    assert implied[0] > 200
+    assert implied[1] > 0.9 * implied[0]
+    assert implied[2] < 0.1 * implied[0]
 
 
 def test_the_same_seed_gives_the_same_grasps() -> None:

@@ -71,6 +71,18 @@ def test_two_boxes_that_touch_are_cut_at_their_step() -> None:
     assert {round(float(side.mean())) for side in sides} == {0, 1}
 
 
+def test_a_mallet_is_one_thing_where_nothing_is_to_be_cut() -> None:
+    handle = Block((0.5, 0.0, 0.025), (0.18, 0.026, 0.026))
+    head, knob = Block((0.6, 0.0, 0.025), (0.035, 0.07, 0.05)), Block((0.4, 0.0, 0.025), (0.02, 0.05, 0.05))
+    top = Block((0.5, 0.0, -0.02), (0.7, 0.9, 0.04))
+    model = Tabletop((top, handle, head, knob)).gaussians(30_000)
+    assert len(segment(model, np.eye(4)).supports) > 1  # its handle is taken for one
+    found = segment(model, np.eye(4), cut=False)
+    assert len(found.supports) == 1
+    (whole,) = found.objects
+    np.testing.assert_allclose(np.sort(whole.size), [0.05, 0.07, 0.2275], atol=0.01)
+
+
 def test_a_box_seen_from_three_sides_stays_whole() -> None:
     points = Tabletop((BOX,)).gaussians(3000).means.double().numpy()
     assert len(cut_at_steps(points[points[:, 2] > 1e-3], fewest=40)) == 1

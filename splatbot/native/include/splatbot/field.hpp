@@ -3,9 +3,11 @@
 // grid of proven lower bounds of the distance. Immutable, so any number of threads may ask at once.
 #pragma once
 
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <mutex>
 #include <span>
 #include <vector>
 
@@ -29,6 +31,23 @@ struct Solids {
   std::span<const std::int32_t> ids;  // (N,), each once
 };
 
+// A metric that measures no less than those of some ellipsoids' own, and a ball in it that holds their centers.
+struct Cover {
+  double center[3];   // world [m], as float32 has them
+  double axes[3][3];  // their product with their transpose is the inverse of the metric
+  double radius;
+  double extent;  // [m] from the center to the ellipsoids' centers
+  double thin;    // [1/m] one over the least semi-axis
+};
+
+// Made by the first question that needs them.
+struct CoverTable {
+  std::once_flag once;
+  std::vector<SolidCover> nodes;  // in the order of a tree's nodes
+  Cover whole{};
+  std::atomic<std::size_t> bytes{0};
+};
+
 // The Gaussians whose means lie in one cube of space (those too large for a cube: in one block of their own).
 struct SolidBlock {
   std::uint64_t key;
@@ -38,6 +57,7 @@ struct SolidBlock {
   float corner[3] = {};            // of the packed means
   std::vector<SolidNode> nodes;
   float low[3], high[3], reach[3];
+  mutable CoverTable covers;
 };
 
 struct BoundGrid {
@@ -76,6 +96,7 @@ class CollisionField {
  private:
   CollisionField() = default;
   void finish();
+  SolidCoversView covers() const;
   std::vector<std::int32_t> blocks_by_id() const;
 
   FieldOptions options_;
@@ -86,6 +107,8 @@ class CollisionField {
   std::vector<SolidBlockView> views_;
   std::shared_ptr<const BoundGrid> grid_;
   SolidsView view_{};
+  mutable CoverTable top_covers_;
+  mutable std::vector<const SolidCover*> block_covers_;
 };
 
 }  // namespace splatbot

@@ -45,9 +45,10 @@ struct FieldKernels {
   // The k nearest, nearest first: (P, k) distances (+infinity: none) and ids.
   void (*k_nearest)(const SolidsView&, const SphereQueries&, int k, float cut, std::size_t begin, std::size_t end,
                     double* distance, std::int32_t* id);
-  // The smallest Mahalanobis distance and the lowest id that attains it; infinity and -1 if there is none.
-  void (*mahalanobis)(const SolidsView&, const double* points, std::size_t begin, std::size_t end, double* distance,
-                      std::int32_t* id);
+  // The smallest Mahalanobis distance and the lowest id that attains it; infinity and -1 if there is none. For points
+  // order[begin] to order[end - 1], quickest where each is near the one before.
+  void (*mahalanobis)(const SolidsView&, const SolidCoversView&, const double* points, const std::uint32_t* order,
+                      std::size_t begin, std::size_t end, double* distance, std::int32_t* id);
   // A proven lower bound of the signed distance at each point, from the grid alone; 0 outside of it.
   void (*grid_bounds)(const SolidsView&, const double* points, std::size_t begin, std::size_t end, float* out);
   // A line of columns of a grid, then a slice of it; steps: x1 - x0 bytes, line: 2 (x1 - x0) + 2 kBoundReach.

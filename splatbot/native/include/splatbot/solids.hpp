@@ -35,6 +35,23 @@ struct alignas(64) SolidNode {
   std::int32_t child[kFan];
 };
 
+inline constexpr float kCoverRounding = 4e-6F;
+
+// For each child of a node: in the metric of `whiten`, a triangle of rows, a point's distance from `center` less `radius`
+// is at most its distance from any of the ellipsoids below, each in the ellipsoid's own metric (1 on its surface).
+struct alignas(64) SolidCover {
+  float center[3][kFan];  // world [m]
+  float whiten[6][kFan];  // (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
+  float radius[kFan];
+  float thin[kFan];  // [1/m], one over the least semi-axis below: what a metre of rounding may come to
+};
+
+// Covers of a field's nodes, in the order of the nodes; an array for each block.
+struct SolidCoversView {
+  const SolidCover* top;
+  const SolidCover* const* blocks;
+};
+
 struct SolidBlockView {
   const SolidNode* nodes;  // the first is the root
   const SolidLeaf* leaves;

@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <atomic>
 #include <condition_variable>
 #include <cstddef>
+#include <cstdint>
 #include <memory>
 #include <mutex>
 #include <thread>
@@ -24,7 +26,8 @@ class ThreadPool {
   unsigned size() const noexcept { return size_; }
 
   // Calls task(i) for every i in [0, count) and returns when all are done. A pool busy with another caller's loop is
-  // not waited for: the caller then runs its tasks itself. The first exception of a task is rethrown here.
+  // not waited for: the caller then runs its tasks itself; so does one of lower priority than the pool's for a second
+  // after another has used it. The first exception of a task is rethrown here.
   template <class Task>
   void run(std::size_t count, Task&& task) {
     using Plain = std::remove_reference_t<Task>;
@@ -39,8 +42,11 @@ class ThreadPool {
   void run_erased(std::size_t count, Function function, void* context);
   void work();
   void keep_workers_off_this_cpu();
+  bool yields();
 
   unsigned size_;
+  int niceness_;                         // of the workers, who inherit it
+  std::atomic<std::int64_t> last_used_;  // [ns] by a thread of no lower priority
   std::mutex owner_;  // held by the caller whose loop is being run
   std::mutex mutex_;
   std::condition_variable wake_;

@@ -31,7 +31,34 @@ SB_INLINE float limit_of(const Search& search) {
   return limit < 3e38F ? limit : 3e38F;
 }
 
-// What a walk looks for: `nearer` says how far it need look, `leaf` takes what it finds.
+// The leaves `met` of a node: the one with the least bound, then those that are still to be looked at.
+template <class Search>
+SB_INLINE void visit_leaves(const SolidsView& s, const Split& p, Place place, std::uint32_t met, const float* bounds,
+                            Search& search) {
+  const SolidNode& node = node_at(s, place);
+  SolidLeaf room;
+  const auto visit = [&](int i) {
+    if (bounds[i] <= limit_of(search)) {
+      const std::int32_t leaf = ~node.child[i];
+      search.leaf(leaf_of(s.blocks[place.block], leaf, room), p, {place.block, leaf, 0, -1});
+    }
+  };
+  int first = -1;
+  for (std::uint32_t m = met; m != 0; m &= m - 1) {
+    const int i = __builtin_ctz(m);
+    first = first < 0 || bounds[i] < bounds[first] ? i : first;
+  }
+  if (first < 0) {
+    return;
+  }
+  visit(first);
+  for (std::uint32_t m = met & ~(1U << first); m != 0; m &= m - 1) {
+    visit(__builtin_ctz(m));
+  }
+}
+
+// What a walk looks for: `limit` says how far it need look, `enter` is told of each node whose children's bounds are
+// asked for, `leaf` takes what it finds.
 //
 // Boxes in order of their bounds; a bound is compared with `limit()` and a box is left out only if it is greater, so
 // that equals are all seen and the lowest id wins.
@@ -40,7 +67,6 @@ SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
   if (s.top == nullptr) {
     return;
   }
-  SolidLeaf room;
   Place stack[kStack];
   int n = 0;
   stack[n++] = {-1, 0, 0.0F};
@@ -50,17 +76,18 @@ SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
     if (place.bound > limit_of(search)) {
       continue;
     }
-    if (place.node < 0) {
-      search.leaf(leaf_of(s.blocks[place.block], ~place.node, room), p, {place.block, ~place.node, 0, -1});
-      continue;
-    }
     const SolidNode& node = node_at(s, place);
+    search.enter(place);
     std::uint32_t met = 0;
     const F limit = set1(limit_of(search));
     for (int at = 0; at < kFan; at += W) {
       const F b = search.bound(node, p, at);
       store(bounds + at, b);
       met |= bits(b <= limit) << at;
+    }
+    if (place.block >= 0 && node.child[0] < 0) {
+      visit_leaves(s, p, place, met, bounds, search);
+      continue;
     }
     const int first = n;
     for (; met != 0; met &= met - 1) {
@@ -89,6 +116,7 @@ struct NearestSearch {
     const float reach = best + slack;
     return reach > 0.0F ? reach * reach * (1.0F + 1e-5F) : 0.0F;
   }
+  SB_INLINE void enter(Place) {}
   SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
 
   SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
@@ -124,6 +152,7 @@ struct KSearch {
     const float reach = worst() + slack;
     return reach > 0.0F ? reach * reach * (1.0F + 1e-5F) : 0.0F;
   }
+  SB_INLINE void enter(Place) {}
   SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
 
   SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
@@ -158,23 +187,44 @@ struct KSearch {
 
 // Bounds are squared distances in units of the n-sigma ellipsoids.
 struct MahalanobisSearch {
-  float best = kInfinity;  // squared
+  const SolidCoversView& covers;
   float slack;
-  float n_sigma;
+  float best = kInfinity;  // squared
+  const SolidCover* cover = nullptr;
   Found found = {};
 
   SB_INLINE float limit() const { return best * (1.0F + 1e-5F); }
 
+  SB_INLINE void enter(Place place) {
+    cover = (place.block < 0 ? covers.top : covers.blocks[place.block]) + place.node;
+  }
+
+  SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const {
+    const F size = max(by_box(node, p, at), by_cover(p, at)) * set1(1.0F - 1e-5F);
+    return select(size > set1(0.0F), size * size, set1(0.0F));
+  }
+
   // Where p is delta beyond a box that reaches at least to the ellipsoid's own box, it is at least 1 + delta / extent
   // of that ellipsoid's size away.
-  SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const {
+  SB_INLINE F by_box(const SolidNode& node, const Split& p, int at) const {
     F most = set1(0.0F);
     for (int k = 0; k < 3; ++k) {
       const F beyond = gap(node.low[k], node.high[k], at, set1(p.hi[k])) - set1(slack);
       most = max(most, beyond / load(node.reach[k] + at));
     }
-    const F size = most * set1(1.0F - 1e-5F) + set1(1.0F);
-    return select(most > set1(0.0F), size * size, set1(0.0F));
+    return select(most > set1(0.0F), most + set1(1.0F), set1(0.0F));
+  }
+
+  // What float32 rounds off is below 4e-6 of |d|_1 over the least semi-axis, here and in a leaf together.
+  SB_INLINE F by_cover(const Split& p, int at) const {
+    const F x = set1(p.hi[0]) - load(cover->center[0] + at), y = set1(p.hi[1]) - load(cover->center[1] + at),
+            z = set1(p.hi[2]) - load(cover->center[2] + at);
+    const F u = load(cover->whiten[0] + at) * x;
+    const F v = fma(load(cover->whiten[1] + at), x, load(cover->whiten[2] + at) * y);
+    const F w = fma(load(cover->whiten[3] + at), x, fma(load(cover->whiten[4] + at), y, load(cover->whiten[5] + at) * z));
+    const F far = absolute(x) + absolute(y) + absolute(z);
+    const F rounded = load(cover->thin + at) * fma(set1(kCoverRounding), far, set1(slack));
+    return sqrt(fma(u, u, fma(v, v, w * w))) - load(cover->radius + at) - rounded;
   }
 
   SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
@@ -360,12 +410,20 @@ void field_k_nearest(const SolidsView& s, const SphereQueries& q, int k, float c
   }
 }
 
-void field_mahalanobis(const SolidsView& s, const double* points, std::size_t begin, std::size_t end, double* distance,
+void field_mahalanobis(const SolidsView& s, const SolidCoversView& covers, const double* points,
+                       const std::uint32_t* order, std::size_t begin, std::size_t end, double* distance,
                        std::int32_t* id) {
-  for (std::size_t i = begin; i < end; ++i) {
+  Found last;  // what was nearest to the point before leaves little to search, wherever it is
+  for (std::size_t at = begin; at < end; ++at) {
+    const std::size_t i = order[at];
     const Split p = split(points + 3 * i);
-    MahalanobisSearch search{.slack = 2.0F * p.slack, .n_sigma = s.n_sigma};
+    MahalanobisSearch search{.covers = covers, .slack = 2.0F * p.slack};
+    if (last.block >= 0) {
+      SolidLeaf room;
+      search.leaf(leaf_of(s.blocks[last.block], last.leaf, room), p, last);
+    }
     walk(s, p, search);
+    last = search.found;
     distance[i] = static_cast<double>(kInfinity);
     id[i] = -1;
     if (search.found.block >= 0) {

@@ -10,7 +10,8 @@ void field_nearest(const SolidsView& s, const SphereQueries& q, float cut, std::
                    NearestSolid* out);
 void field_k_nearest(const SolidsView& s, const SphereQueries& q, int k, float cut, std::size_t begin, std::size_t end,
                      double* distance, std::int32_t* id);
-void field_mahalanobis(const SolidsView& s, const double* points, std::size_t begin, std::size_t end, double* distance,
+void field_mahalanobis(const SolidsView& s, const SolidCoversView& covers, const double* points,
+                       const std::uint32_t* order, std::size_t begin, std::size_t end, double* distance,
                        std::int32_t* id);
 void field_grid_bounds(const SolidsView& s, const double* points, std::size_t begin, std::size_t end, float* out);
 void bound_columns(const BoundArgs& args, int y, std::uint8_t* steps);

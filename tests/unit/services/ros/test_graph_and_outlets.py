@@ -32,7 +32,7 @@ from splatbot.services.ros.messages import (
 )
 from splatbot.services.ros.outlets import FROM_ROS, ODOMETRY, POINTS, ROSOUT, TF, RosOutlets
 from splatbot.services.store import MapStore
-from splatbot.services.topics import FRAME, RESULT, JointState, map_topic, robot_topic
+from splatbot.services.topics import FRAME, RESULT, JointState, arm_topic, map_topic, robot_topic
 from splatbot.slam import FrameResult
 from tests.conftest import MakeLog
 
@@ -90,6 +90,20 @@ def test_odometry_turns_the_covariance_to_the_map_s_axes() -> None:
     moved = T[:3, :3] @ rng.multivariate_normal(np.zeros(3), C[:3, :3], 200_000).T  # of the camera, in the map
     np.testing.assert_allclose(np.cov(moved), message.pose.covariance.reshape(6, 6)[:3, :3], atol=3e-6)
     assert (message.header.frame_id, message.child_frame_id) == ("map", "camera")
+
+
+def test_joints_come_out_as_the_robot_s_and_as_the_arm_s(told: tuple[MapStore, RosGraph]) -> None:
+    store, graph = told
+    reader = graph.subscribe(JOINTS, "/fake/joint_states", "/twin/joint_states", capacity=16)
+    for arm, q in (("fake", 0.5), ("twin", 1.5)):
+        state = JointState(1.0, ("a",), np.array([q]))
+        store.bus.publish(robot_topic("panda", "joints"), state)
+        store.bus.publish(arm_topic(arm, "joints"), state)
+    news = [m for m in (reader.get(5) for _ in range(4)) if m is not None]
+    told_joints = [(m.topic, float(m.value.message.position[0])) for m in news]
+    assert sorted(told_joints) == [
+        ("/fake/joint_states", 0.5), (JOINTS, 0.5), (JOINTS, 1.5), ("/twin/joint_states", 1.5)
+    ]  # fmt: skip
 
 
 def test_news_of_a_map_come_out_under_their_ros_names(

@@ -1,0 +1,89 @@
+"""Things picked in the twin."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Response
+
+from splatbot.errors import InputError
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.pick_types import PickOptions, PickStage, PickStep
+from splatbot.grasping.words import WordAffordance
+from splatbot.services.codecs import body_of, plain, takes
+from splatbot.services.dependencies import IdempotencyKey, Service, problems
+from splatbot.services.jobs import JobCancelled, JobHandle
+from splatbot.services.problems import TooLargeError
+from splatbot.services.routes.jobs import accepted, starts
+from splatbot.services.schemas import PicksRequest
+from splatbot.sim.scene import Scene, load_scene, scene_names
+
+router = APIRouter(prefix="/v1/picks", tags=["grasping"])
+
+_EXAMPLES = {
+    "by its name": {"scene": "tabletop_clutter", "target": "can"},
+    "by words, carried home": {"scene": "tabletop_clutter", "target": "largest box", "force": 40.0, "home": True},
+}
+_STAGES = list(PickStage)
+
+
+@router.post(
+    "",
+    status_code=202,
+    responses=starts("a job picks it; its result tells the outcome, each stage, and how far each thing rose")
+    | problems(404, 409, 413, 415, 422, 503),
+    openapi_extra=takes(PicksRequest, _EXAMPLES),
+)
+def pick(
+    service: Service, asked: Annotated[PicksRequest, Depends(body_of(PicksRequest))], key: IdempotencyKey
+) -> Response:
+    """Pick a thing in the physics of a scene: scan it, find grasps, plan, approach, close, lift, check.
+
+    The whole way is certified before the arm moves. A pick that ends otherwise than "picked" is a result, not a failure
+    of the job; cancelling stops the arm. `progress` grows by the stages: grasp, plan, open, move, approach, close,
+    lift, check and, with `home`, carry.
+    """
+    if asked.scene not in scene_names():
+        raise InputError(f"is {asked.scene[:80]!r}.", field="scene", hint=f"scenes: {', '.join(scene_names())}")
+    if asked.budget_ms > service.settings.max_plan_ms:
+        hint = "give less, or raise SPLATBOT_MAX_PLAN_MS"
+        raise TooLargeError(f"is more than {service.settings.max_plan_ms:g}.", field="budget_ms", hint=hint)
+    options = PickOptions(
+        lift=asked.lift,
+        force=asked.force,
+        tries=asked.tries,
+        budget_ms=asked.budget_ms,
+        grasp=GraspOptions(seed=asked.seed),
+        seed=asked.seed,
+    )
+    scene = load_scene(asked.scene)
+    job, _ = service.jobs.submit(
+        "pick", lambda handle: _pick(scene, asked, options, handle), key=key, request=asked.model_dump_json()
+    )
+    return accepted(job)
+
+
+def _pick(scene: Scene, asked: PicksRequest, options: PickOptions, handle: JobHandle) -> dict[str, Any]:
+    from splatbot.sim.picking import pick_in_twin
+    from splatbot.sim.twin import Twin
+
+    def told(step: PickStep) -> None:
+        handle.tell((_STAGES.index(step.stage) + 1) / (len(_STAGES) + 1), f"{step.stage}: {step.note}")
+
+    handle.tell(0.0, f"scanning {scene.name}")
+    picked = pick_in_twin(
+        Twin(scene),
+        asked.target,
+        [WordAffordance()],
+        options,
+        views=asked.views,
+        margin=asked.margin,
+        home=asked.home,
+        seed=asked.seed,
+        stop=handle.cancelled.is_set,
+        on_step=told,
+    )
+    if handle.cancelled.is_set():
+        raise JobCancelled
+    result: dict[str, Any] = plain({"scene": scene.name} | picked.summary())
+    return result

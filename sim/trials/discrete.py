@@ -1,0 +1,97 @@
+"""RRT-Connect and shortcuts that ask at single configurations whether they are free, as most stacks do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.protocols import Array
+
+Free = Callable[[Array], NDArray[np.bool_]]  # of configurations (C, J)
+
+RESOLUTION = 1 / 32  # [rad] between the configurations of an edge that are asked
+_STEP = 0.6  # [rad] that a tree grows at once
+_CUTS = 40  # shortcuts that are tried
+
+
+def edge_free(free: Free, a: Array, b: Array) -> bool:
+    """Whether the configurations on the straight edge between two (J,) are free, ``b`` included."""
+    count = max(1, int(np.ceil(np.linalg.norm(b - a) / RESOLUTION)))
+    shares = np.arange(1, count + 1) / count
+    return bool(free(a + shares[:, None] * (b - a)).all())
+
+
+def connect(free: Free, lower: Array, upper: Array, start: Array, goal: Array, *, seconds: float, seed: int) -> Array:
+    """Waypoints (N, J) of a path made shorter, N = 0 if none was found in time (Kuffner and LaValle 2000).
+
+    Args:
+        free: says which configurations are.
+        lower, upper: (J,) limits of the joints.
+        start, goal: (J,), both free.
+        seconds: to find a first path in.
+        seed: of the samples.
+    """
+    until = time.perf_counter() + seconds
+    rng = np.random.default_rng(seed)
+    trees = _Tree(start), _Tree(goal)
+    if edge_free(free, start, goal):
+        return np.stack([start, goal])
+    while time.perf_counter() < until:
+        here, there = trees
+        grown = here.extend(free, rng.uniform(lower, upper))
+        if grown is not None:
+            met = there.reach(free, here.nodes[grown], until)
+            if met is not None:
+                path = np.concatenate([here.to_root(grown)[::-1], there.to_root(met)[1:]])
+                path = path if np.array_equal(path[0], start) else path[::-1]
+                return shortened(free, path, rng)
+        trees = there, here
+    return np.zeros((0, len(start)))
+
+
+def shortened(free: Free, path: Array, rng: np.random.Generator) -> Array:
+    """The path (N, J) after attempts to join two places on it straight."""
+    for _ in range(_CUTS):
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        low, high = np.sort(rng.uniform(0.0, along[-1], 2))
+        a, b = (np.array([np.interp(s, along, column) for column in path.T]) for s in (low, high))
+        if edge_free(free, a, b):
+            path = np.concatenate([path[along < low], a[None], b[None], path[along > high]])
+    return path
+
+
+class _Tree:
+    def __init__(self, root: Array) -> None:
+        self.nodes, self.parents = [root], [-1]
+
+    def extend(self, free: Free, to: Array) -> int | None:
+        """One step towards a configuration; the new node, or None if that is not free."""
+        nearest = int(np.argmin(np.linalg.norm(np.array(self.nodes) - to, axis=1)))
+        way = to - self.nodes[nearest]
+        length = float(np.linalg.norm(way))
+        end = self.nodes[nearest] + way * min(1.0, _STEP / max(length, 1e-12))
+        if length < 1e-9 or not edge_free(free, self.nodes[nearest], end):
+            return None
+        self.nodes.append(end)
+        self.parents.append(nearest)
+        return len(self.nodes) - 1
+
+    def reach(self, free: Free, to: Array, until: float) -> int | None:
+        """Steps towards a configuration until it is there; None if something is between."""
+        while time.perf_counter() < until:
+            node = self.extend(free, to)
+            if node is None:
+                return None
+            if np.linalg.norm(self.nodes[node] - to) < 1e-9:
+                return node
+        return None
+
+    def to_root(self, node: int) -> Array:
+        found = []
+        while node >= 0:
+            found.append(self.nodes[node])
+            node = self.parents[node]
+        return np.array(found)

@@ -1,0 +1,167 @@
+"""Many trials, over processes; each is written down when it is done, and what was done is not done again."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatbot.errors import FormatError, InputError
+from splatbot.sim.trials.scenes import FAMILIES, make_trial
+from splatbot.sim.trials.stacks import GaussianStack, Stack
+from splatbot.sim.trials.trial import TrialRow, run_trial
+
+FILE = "trials.jsonl"
+STACKS = ("gaussians", "mesh", "cloud")
+Tell = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class TrialsPlan:
+    """What to run.
+
+    Args:
+        family: of :data:`splatbot.sim.trials.scenes.FAMILIES`.
+        trials: seeds, from ``first`` on.
+        stacks: names of :data:`STACKS`.
+        first: seed.
+        jobs: processes.
+        frames, width: of each scan.
+        videos: whether to film what failed.
+
+    Raises:
+        InputError: a value is out of range, or a name unknown.
+    """
+
+    family: str = "tabletop"
+    trials: int = 50
+    stacks: tuple[str, ...] = ("gaussians",)
+    first: int = 0
+    jobs: int = 1
+    frames: int = 32
+    width: int = 320
+    videos: bool = False
+
+    def __post_init__(self) -> None:
+        if self.family not in FAMILIES:
+            raise InputError(f"is {self.family!r}.", field="scenes", hint=f"one of {', '.join(FAMILIES)}")
+        unknown = [name for name in self.stacks if name not in STACKS]
+        if unknown or not self.stacks:
+            raise InputError(f"are {', '.join(self.stacks) or 'none'}.", field="stacks", hint=f"of {', '.join(STACKS)}")
+        if self.trials < 1 or self.jobs < 1 or self.first < 0 or self.frames < 4 or self.width < 64:
+            hint = "give 1 trial and job or more, a seed of 0 or more, 4 frames of 64 pixels or more"
+            raise InputError("is out of range.", field="plan", hint=hint)
+
+    @property
+    def seeds(self) -> range:
+        """In their order."""
+        return range(self.first, self.first + self.trials)
+
+
+def stack_of(name: str) -> Stack:
+    """A stack by its name.
+
+    Raises:
+        InputError: python-fcl, which the others need, is not installed.
+    """
+    if name == "gaussians":
+        return GaussianStack()
+    if importlib.util.find_spec("fcl") is None:
+        raise InputError("needs python-fcl.", field=f"stack {name}", hint="pip install python-fcl")
+    from splatbot.sim.trials.peers import CloudStack, MeshStack
+
+    return MeshStack() if name == "mesh" else CloudStack()
+
+
+def run_trials(plan: TrialsPlan, folder: Path, *, tell: Tell = lambda what, share: None) -> tuple[list[TrialRow], bool]:
+    """All trials of a plan that ``folder`` does not have yet.
+
+    Returns:
+        The rows of the plan in the order of seeds and stacks, and whether Ctrl-C ended it early.
+
+    Raises:
+        FormatError: the file in the folder is damaged.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / FILE
+    done = {(row.family, row.seed, row.stack): row for row in read_rows(path)}
+    for name in plan.stacks:
+        stack_of(name)
+    wanted = [(seed, tuple(n for n in plan.stacks if (plan.family, seed, n) not in done)) for seed in plan.seeds]
+    wanted = [(seed, names) for seed, names in wanted if names]
+    interrupted = False
+    count = len(plan.seeds) - len(wanted)
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            for rows in _results(plan, folder, wanted):
+                for row in rows:
+                    done[row.family, row.seed, row.stack] = row
+                    file.write(json.dumps(row.to_dict()) + "\n")
+                file.flush()
+                count += 1
+                tell(f"{plan.family}, {count} of {len(plan.seeds)} scenes", count / len(plan.seeds))
+    except KeyboardInterrupt:
+        interrupted = True
+    keys = ((plan.family, seed, name) for name in plan.stacks for seed in plan.seeds)
+    return [done[key] for key in keys if key in done], interrupted
+
+
+def read_rows(path: Path) -> list[TrialRow]:
+    """The rows of a file, none if it is not there; a last line that was cut short is left out.
+
+    Raises:
+        FormatError: a line before the last is no row.
+    """
+    if not path.is_file():
+        return []
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    rows = []
+    for k, line in enumerate(lines):
+        try:
+            rows.append(TrialRow.from_dict(json.loads(line)))
+        except (json.JSONDecodeError, TypeError, KeyError) as error:
+            if k == len(lines) - 1 and not text.endswith("\n"):
+                path.write_text("".join(f"{whole}\n" for whole in lines[:-1]), encoding="utf-8")
+                break
+            raise FormatError(f"line {k + 1} is no trial ({error}).", file=path, hint="name another folder") from error
+    return rows
+
+
+def _results(plan: TrialsPlan, folder: Path, wanted: Sequence[tuple[int, tuple[str, ...]]]) -> Iterator[list[TrialRow]]:
+    jobs = [(plan, str(folder), seed, names) for seed, names in wanted]
+    if plan.jobs == 1 or len(jobs) < 2:
+        yield from map(_job, jobs)
+        return
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes that begin now, which are as many as was asked for
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(plan.jobs, len(jobs)), mp_context=context, initializer=_alone) as pool:
+        futures = {pool.submit(_job, job) for job in jobs}
+        try:
+            while futures:
+                ready, futures = wait(futures, return_when=FIRST_COMPLETED)
+                for future in ready:
+                    yield future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _alone() -> None:
+    """One thread a process."""
+    torch.set_num_threads(1)
+
+
+def _job(job: Any) -> list[TrialRow]:
+    plan, folder, seed, names = job
+    videos = Path(folder) if plan.videos else None
+    stacks = [stack_of(name) for name in names]
+    return run_trial(make_trial(seed, plan.family), stacks, frames=plan.frames, width=plan.width, videos=videos)

@@ -1,0 +1,226 @@
+"""Seeded table tops to pick from: single convex things, or cups, tools and clutter, with something that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.protocols import Array
+from splatbot.sim.scene import Scene, make_scene
+from splatbot.sim.solids import rpy_of
+from splatbot.sim.twin import Twin
+from splatbot.sim.world import OBJECT
+
+FAMILIES = ("tabletop", "isolated")
+TABLE, OBSTACLE = "table", "obstacle"
+SENSOR = ("depth_noise", "depth_holes:share=0.05")
+_AREA = ((0.36, -0.26), (0.64, 0.26))  # [m] corners of where things stand
+_BETWEEN = (0.02, 0.05)  # [m] of room between the things of a table top; drawn
+_MASS = (0.1, 0.5)  # [kg]
+_FRICTION = (0.5, 0.9)
+_SETTLE = 1.5  # [s] until all is at rest
+_EVERY = 5  # of the table tops, one has something that moves
+_TRIES = 300
+_COLORS = (
+    (0.85, 0.20, 0.18), (0.20, 0.45, 0.85), (0.95, 0.75, 0.15), (0.25, 0.65, 0.35), (0.60, 0.30, 0.70),
+    (0.95, 0.50, 0.15), (0.90, 0.90, 0.88), (0.30, 0.75, 0.75),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class TrialScene:
+    """What a trial is about.
+
+    Args:
+        scene: of the twin, everything at rest; the robot's base is its origin.
+        target: name of what is to be picked.
+        kind: of the target, in a word.
+        seed: of this scene.
+        family: of :data:`FAMILIES`.
+        moving: whether something moves through it.
+    """
+
+    scene: Scene
+    target: str
+    kind: str
+    seed: int
+    family: str
+    moving: bool
+
+
+@dataclass(frozen=True)
+class _Thing:
+    """Something that may stand on the table: its shapes about its origin, the origin's height as it stands, how far it
+    reaches from there sideways [m], and whether the hand goes around it."""
+
+    kind: str
+    shapes: tuple[dict[str, Any], ...]
+    height: float
+    radius: float
+    fits: bool = True
+
+
+def make_trial(seed: int, family: str = "tabletop") -> TrialScene:
+    """The scene of a seed; the same seed gives the same.
+
+    Things come to rest by physics before they are looked at.
+
+    Raises:
+        InputError: there is no such family.
+    """
+    if family not in FAMILIES:
+        raise InputError(f"is {family!r}.", field="scenes", hint=f"one of {', '.join(FAMILIES)}")
+    rng = np.random.default_rng((FAMILIES.index(family), seed))
+    things = [_CONVEX[seed % len(_CONVEX)](rng)] if family == "isolated" else _table_top(rng)
+    moving = family == "tabletop" and seed % _EVERY == _EVERY - 1
+    placed = _placed(things, rng)
+    values = [value for _, value in placed]
+    k = int(rng.choice([k for k, (thing, _) in enumerate(placed) if thing.fits]))
+    objects = [{"name": TABLE, "shapes": [{"kind": "plane"}], "color": [0.55, 0.45, 0.35]}, *values]
+    if moving:
+        objects.append(_obstacle(rng))
+    scene = make_scene(
+        {
+            "name": f"{family}-{seed}",
+            "objects": objects,
+            "camera": {"at": [1.25, -0.85, 0.75], "look_at": [0.45, 0.0, 0.12], "sensor": SENSOR},
+            "task": {"kind": "grasp"},
+        }
+    )
+    return TrialScene(_settled(scene), str(values[k]["name"]), placed[k][0].kind, seed, family, moving)
+
+
+def _table_top(rng: np.random.Generator) -> list[_Thing]:
+    things = [_cup(rng), _tool(rng), _can(rng), _box(rng)]
+    more: list[Callable[[np.random.Generator], _Thing]] = [_cup, _tool, _ball, _book, _box, _lying]
+    chosen = rng.choice(len(more), int(rng.integers(1, 4)), replace=False)
+    return things + [more[k](rng) for k in chosen]
+
+
+def _box(rng: np.random.Generator) -> _Thing:
+    narrow, wide, high = (float(rng.uniform(*r)) for r in ((0.03, 0.062), (0.045, 0.11), (0.04, 0.12)))
+    size = (wide, narrow, high)
+    shape = {"kind": "box", "size": size}
+    return _Thing("box", (shape,), high / 2, float(np.hypot(wide, narrow)) / 2)
+
+
+def _can(rng: np.random.Generator) -> _Thing:
+    r, h = float(rng.uniform(0.018, 0.033)), float(rng.uniform(0.06, 0.14))
+    return _Thing("can", ({"kind": "cylinder", "radius": r, "height": h},), h / 2, r)
+
+
+def _lying(rng: np.random.Generator) -> _Thing:
+    r, h = float(rng.uniform(0.02, 0.032)), float(rng.uniform(0.09, 0.14))
+    shape = {"kind": "cylinder", "radius": r, "height": h, "rpy": [np.pi / 2, 0.0, 0.0]}
+    return _Thing("lying can", (shape,), r, float(np.hypot(r, h / 2)))
+
+
+def _ball(rng: np.random.Generator) -> _Thing:
+    r = float(rng.uniform(0.022, 0.034))
+    return _Thing("ball", ({"kind": "sphere", "radius": r},), r, r)
+
+
+def _egg(rng: np.random.Generator) -> _Thing:
+    a, b, c = float(rng.uniform(0.03, 0.045)), float(rng.uniform(0.022, 0.032)), float(rng.uniform(0.022, 0.032))
+    return _Thing("egg", ({"kind": "ellipsoid", "axes": [a, b, c]},), c, a)
+
+
+def _book(rng: np.random.Generator) -> _Thing:
+    size = (float(rng.uniform(0.15, 0.20)), float(rng.uniform(0.11, 0.14)), float(rng.uniform(0.02, 0.035)))
+    around = float(np.hypot(*size[:2])) / 2
+    return _Thing("book", ({"kind": "box", "size": size},), size[2] / 2, around, False)
+
+
+def _cup(rng: np.random.Generator) -> _Thing:
+    """Hollow and open at the top: staves around a bottom."""
+    r, h, wall, staves = float(rng.uniform(0.028, 0.035)), float(rng.uniform(0.07, 0.11)), 0.004, 16
+    middle = r - wall / 2
+    wide = 2 * middle * np.tan(np.pi / staves) + wall / 2
+    shapes: list[dict[str, Any]] = [
+        {"kind": "cylinder", "radius": r - wall / 2, "height": 0.006, "at": [0.0, 0.0, 0.003 - h / 2]}
+    ]
+    for turn in np.arange(staves) * 2 * np.pi / staves:
+        at = [middle * float(np.cos(turn)), middle * float(np.sin(turn)), 0.0]
+        shapes.append({"kind": "box", "size": [wall, wide, h], "at": at, "rpy": [0.0, 0.0, float(turn)]})
+    return _Thing("cup", tuple(shapes), h / 2, r)
+
+
+def _tool(rng: np.random.Generator) -> _Thing:
+    """A mallet that lies: a handle between a head and a knob, which keep it off the table."""
+    r, length, head = float(rng.uniform(0.011, 0.015)), float(rng.uniform(0.13, 0.18)), float(rng.uniform(0.04, 0.05))
+    shapes: tuple[dict[str, Any], ...] = (
+        {"kind": "cylinder", "radius": r, "height": length, "rpy": [0.0, np.pi / 2, 0.0]},
+        {"kind": "box", "size": [0.035, 0.07, head], "at": [length / 2, 0.0, 0.0]},
+        {"kind": "box", "size": [0.02, head, head], "at": [-length / 2, 0.0, 0.0]},
+    )
+    return _Thing("mallet", shapes, head / 2, length / 2 + 0.03)
+
+
+_CONVEX: tuple[Callable[[np.random.Generator], _Thing], ...] = (_box, _can, _ball, _lying, _box, _egg)
+
+
+def _placed(things: list[_Thing], rng: np.random.Generator) -> list[tuple[_Thing, dict[str, Any]]]:
+    """Scene objects at places that are drawn until they keep clear of each other; what finds none is left out."""
+    taken: list[tuple[Array, float]] = []
+    found: list[tuple[_Thing, dict[str, Any]]] = []
+    colors = rng.permutation(len(_COLORS))
+    for k, thing in enumerate(things):
+        apart = float(rng.uniform(*_BETWEEN))
+        at = _free_place(thing.radius + apart, taken, rng)
+        if at is None:
+            continue
+        taken.append((at, thing.radius))
+        value = {
+            "name": f"{thing.kind.replace(' ', '-')}-{k}",
+            "shapes": thing.shapes,
+            "at": [*at.tolist(), thing.height + 5e-4],
+            "rpy": [0.0, 0.0, float(rng.uniform(-np.pi, np.pi))],
+            "movable": True,
+            "mass": float(rng.uniform(*_MASS)),
+            "friction": float(rng.uniform(*_FRICTION)),
+            "color": _COLORS[colors[k % len(_COLORS)]],
+        }
+        found.append((thing, value))
+    return found
+
+
+def _free_place(room: float, taken: list[tuple[Array, float]], rng: np.random.Generator) -> Array | None:
+    for _ in range(_TRIES):
+        at = rng.uniform(*np.array(_AREA))
+        if all(np.linalg.norm(at - other) > room + radius for other, radius in taken):
+            return at
+    return None
+
+
+def _obstacle(rng: np.random.Generator) -> dict[str, Any]:
+    """Somebody's lower arm that goes to and fro at the table's far side or beside it, over the things."""
+    side, speed = float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.05, 0.15))
+    z = float(rng.uniform(0.22, 0.30))
+    ends = [[0.75, side * 0.40, z], [0.45, side * 0.40, z]]
+    return {
+        "name": OBSTACLE,
+        "shapes": [{"kind": "capsule", "radius": 0.04, "height": 0.20, "rpy": [np.pi / 2, 0.0, 0.0]}],
+        "path": [{"t": 0.0, "at": ends[0]}, {"t": 0.30 / speed, "at": ends[1]}],
+        "color": (0.85, 0.65, 0.55),
+    }
+
+
+def _settled(scene: Scene) -> Scene:
+    """The scene with its movable things where physics brings them to rest."""
+    twin = Twin(scene)
+    assert twin.follower is not None
+    q = np.array(twin.data.qpos[twin.follower.qpos])
+    still = np.zeros_like(q)
+    for k in range(round(_SETTLE * twin.rate)):
+        twin.advance(k / twin.rate, q, still, still, None)
+    values = scene.model_dump()
+    for thing in values["objects"]:
+        if thing["movable"]:
+            body = twin.data.body(OBJECT + thing["name"])
+            thing["at"] = tuple(np.asarray(body.xpos).tolist())
+            thing["rpy"] = rpy_of(np.asarray(body.xmat).reshape(3, 3))
+    return make_scene({**values, "folder": scene.folder})

@@ -1,0 +1,129 @@
+"""What the stacks of a trial have in common: the scan goes in, grasps and ways to them come out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from splatbot.collision.evidence import gather_evidence
+from splatbot.grasping.affordance import Target, find_target
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.pick_types import PickOptions
+from splatbot.grasping.places import PlaceAffordance
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.types import Grasp, GraspResult
+from splatbot.grasping.ways import Leg, MapWays, Way, Ways
+from splatbot.planning import JointGoal
+from splatbot.protocols import Array
+from splatbot.robots.panda import panda
+from splatbot.segmentation import MapScene, segment
+from splatbot.sim.trials.look import Look
+
+LIFT = 0.18  # [m]; 15 cm are asked for
+BUDGET_MS = 28.0  # of the search for a way
+_OFTEN = 3  # keyframes that must support what is no air
+OPTIONS = PickOptions(lift=LIFT, budget_ms=BUDGET_MS, tries=8, grasp=GraspOptions())
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What a stack made of a scan.
+
+    Args:
+        scene: its surface, segmented.
+        towards: for a target, who samples its grasps and who finds ways to them.
+        world_bytes: of what it plans in.
+        seconds: that building it took.
+    """
+
+    scene: MapScene
+    towards: Callable[[Target], tuple[GraspSampler, Ways]]
+    world_bytes: int
+    seconds: float
+
+
+class Stack(Protocol):
+    """A way to represent what was seen."""
+
+    @property
+    def name(self) -> str:
+        """As tables have it."""
+        ...
+
+    def learn(self, look: Look) -> Knowledge:
+        """Make a world of a scan."""
+        ...
+
+
+class GaussianStack:
+    """The Gaussians of the map, certified all along."""
+
+    name = "gaussians"
+
+    def learn(self, look: Look) -> Knowledge:
+        """See :class:`Stack`."""
+        begin = time.perf_counter()
+        # Flying pixels at edges and ghosts of what moved: more frames saw through them than saw them.
+        solid = np.flatnonzero(~gather_evidence(look.snapshot.model, look.views).seen_through)
+        model = look.snapshot.model.select(torch.from_numpy(solid))
+        scene = segment(model, look.T_world_base, cut=False)
+        observers = look.observers[solid]
+        sampler = GraspSampler(scene, panda(), observers=observers, views=look.views, min_observations=_OFTEN)
+        seconds = look.seconds + time.perf_counter() - begin
+        world = model.nbytes + sampler.field.nbytes
+        return Knowledge(scene, lambda target: (sampler, MapWays(sampler, target, OPTIONS)), world, seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """A target, grasps of it, and the way to one.
+
+    Args:
+        target: as it was found.
+        sampler: of its grasps.
+        grasps: of it.
+        ways: to them, each looked for once.
+        seconds: to the ranked list.
+    """
+
+    target: Target
+    sampler: GraspSampler
+    grasps: GraspResult
+    ways: Ways
+    seconds: float
+
+
+def decide(known: Knowledge, look: Look) -> Decision:
+    """Find what was clicked at, and grasps of it.
+
+    Raises:
+        AffordanceError: there is nothing.
+    """
+    target = find_target(look.hint, known.scene, [PlaceAffordance()])
+    sampler, ways = known.towards(target)
+    begin = time.perf_counter()
+    grasps = sampler.sample(target, OPTIONS.grasp)
+    return Decision(target, sampler, grasps, _Remembered(ways), time.perf_counter() - begin)
+
+
+class _Remembered:
+    """Ways that are found once, so that two twins follow the same."""
+
+    def __init__(self, ways: Ways) -> None:
+        self._ways = ways
+        self._found: dict[int, Way | str] = {}
+
+    def to(self, grasp: Grasp, start: Array) -> Way | str:
+        """As when it was first asked."""
+        if id(grasp) not in self._found:
+            self._found[id(grasp)] = self._ways.to(grasp, start)
+        return self._found[id(grasp)]
+
+    def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
+        """Asked anew."""
+        return self._ways.onwards(way, start, goal)

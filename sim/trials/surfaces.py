@@ -1,0 +1,49 @@
+"""The objects of a twin's scene as textured meshes, for a camera that looks at them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.logs.raycast import Surface
+from splatbot.logs.shapes import Mesh, box, cylinder, sphere
+from splatbot.logs.textures import Texture
+from splatbot.sim.scene import SceneObject
+from splatbot.sim.solids import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, rotation_of
+from splatbot.sim.wrist import capsule_mesh
+
+_DARK = 0.7  # of the second colour
+_PERIOD = 0.03  # [m] of the pattern
+
+
+def surfaces_of(thing: SceneObject, *, placed: bool = True, seed: int = 0) -> list[Surface]:
+    """Meshes of an object's shapes, where the scene puts it, or in its own frame; mottled in its colour.
+
+    Raises:
+        InputError: a shape has no mesh here: planes, hulls and soft bodies.
+    """
+    r, g, b = thing.color
+    texture = Texture((r, g, b), (_DARK * r, _DARK * g, _DARK * b), _PERIOD, seed=seed)
+    R, at = (rotation_of(thing.rpy), np.asarray(thing.at)) if placed else (np.eye(3), np.zeros(3))
+    found = []
+    for shape in thing.shapes:
+        mesh = _mesh(shape, thing.name)
+        own = mesh.vertices @ rotation_of(shape.rpy).T + np.asarray(shape.at)
+        found.append(Surface(Mesh(own @ R.T + at, mesh.triangles), texture))
+    return found
+
+
+def _mesh(shape: Shape, name: str) -> Mesh:
+    """About the shape's middle."""
+    if isinstance(shape, Box):
+        return box(shape.size).placed([0.0, 0.0, -shape.size[2] / 2])
+    if isinstance(shape, Cylinder):
+        return cylinder(shape.radius, shape.height).placed([0.0, 0.0, -shape.height / 2])
+    if isinstance(shape, Sphere):
+        return sphere(shape.radius).placed([0.0, 0.0, -shape.radius])
+    if isinstance(shape, Ellipsoid):
+        ball = sphere(1.0).placed([0.0, 0.0, -1.0])
+        return Mesh(ball.vertices * np.asarray(shape.axes), ball.triangles)
+    if isinstance(shape, Capsule):
+        return capsule_mesh([0.0, 0.0, -shape.height / 2], [0.0, 0.0, shape.height / 2], shape.radius)
+    raise InputError(f"is a {shape.kind}.", field=name, hint="give boxes, cylinders, balls, ellipsoids or capsules")

@@ -1,0 +1,23 @@
+// SPDX-License-Identifier: Apache-2.0
+// Covers of the collision field's trees: how far at least, in their own sizes, the ellipsoids below a node are.
+//
+// Let every covariance S_i of some ellipsoids be at most M (as quadratic forms). Then (p - m_i)' S_i^-1 (p - m_i) is at
+// least |p - m_i|^2 in the metric of M^-1, and that distance at least the one to a center less the radius of the ball
+// that holds the means. M is the mean of the S_i, made larger until it covers each. Boxes alone leave most of a tree
+// to be searched: where Gaussians are flat and oblique, their boxes are as long as they are.
+#pragma once
+
+#include <span>
+
+#include "solid_grid.hpp"
+#include "splatbot/field.hpp"
+
+namespace splatbot {
+
+// The covers of a block's nodes, made at the first call by whichever thread that is.
+const CoverTable& covers_of(const SolidBlock& block);
+
+// Those of a tree over blocks, whose covers must have been made.
+void cover_top(std::span<const SolidNode> top, BlockList blocks, CoverTable& table);
+
+}  // namespace splatbot

@@ -1,0 +1,175 @@
+"""Picking trials: scenes, the way of the camera, what shakes, what is written down, and one tiny trial."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.errors import FormatError, InputError
+from splatbot.logs.raycast import Surface
+from splatbot.robots.panda import panda
+from splatbot.sim.compare.agreement import wilson
+from splatbot.sim.scene import SceneObject
+from splatbot.sim.trials.look import camera_path
+from splatbot.sim.trials.run import FILE, TrialsPlan, read_rows, run_trials
+from splatbot.sim.trials.scenes import OBSTACLE, make_trial
+from splatbot.sim.trials.shake import SHARE, Shake
+from splatbot.sim.trials.surfaces import surfaces_of
+from splatbot.sim.trials.table import physics, summaries, table_rows
+from splatbot.sim.trials.trial import KEPT, RISE, Attempt, TrialRow
+from splatbot.sim.twin import Twin
+from splatbot.sim.wrist import T_PANDA_CAMERA
+
+pytest.importorskip("mujoco")
+
+HELD = Attempt(True, "", "picked", "", 0.18, 0.175)
+SLIPPED = Attempt(False, "slip", "lost", "nothing is between the fingers any more", 0.02, 0.0, ("table",))
+
+
+def row(seed: int, stack: str, ideal: Attempt = HELD, reality: Attempt = HELD) -> TrialRow:
+    return TrialRow(seed, "tabletop", stack, "can", False, ideal, reality, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0)
+
+
+def test_a_seed_gives_one_scene_at_rest_whose_things_keep_apart() -> None:
+    for seed in range(6):
+        found, again = make_trial(seed), make_trial(seed)
+        assert found.scene == again.scene
+        assert found.target in {thing.name for thing in found.scene.movable}
+        assert found.moving == (seed == 4) == any(thing.name == OBSTACLE for thing in found.scene.objects)
+        for a, b in combinations(found.scene.movable, 2):
+            assert np.linalg.norm(np.subtract(a.at, b.at)[:2]) > 0.05
+        twin = Twin(found.scene)
+        assert twin.follower is not None
+        q = np.array(twin.data.qpos[twin.follower.qpos])
+        before = {t.name: np.array(twin.data.body(f"object/{t.name}").xpos) for t in found.scene.movable}
+        for k in range(300):
+            twin.advance(k / twin.rate, q, 0 * q, 0 * q, None)
+        for name, at in before.items():
+            assert np.linalg.norm(twin.data.body(f"object/{name}").xpos - at) < 2e-3, (seed, name)
+    assert {make_trial(seed, "isolated").kind for seed in range(6)} == {"box", "can", "ball", "lying can", "egg"}
+    with pytest.raises(InputError, match="zoo"):
+        make_trial(0, "zoo")
+
+
+def test_what_the_camera_is_shown_is_what_physics_computes_with() -> None:
+    size, at, yaw = np.array([0.1, 0.06, 0.04]), np.array([0.5, 0.1, 0.02]), 0.3
+    values = {"name": "box", "shapes": [{"kind": "box", "size": size.tolist()}], "at": at, "rpy": [0, 0, yaw]}
+    thing = SceneObject.model_validate(values)
+    (surface,) = surfaces_of(thing)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    local = (surface.mesh.vertices - at) @ turn
+    np.testing.assert_allclose(np.abs(local), np.broadcast_to(size / 2, local.shape), atol=1e-12)
+    for shape, away in (
+        ({"kind": "sphere", "radius": 0.03}, lambda p: np.linalg.norm(p, axis=1) - 0.03),
+        ({"kind": "cylinder", "radius": 0.02, "height": 0.1}, _off_cylinder),
+        (
+            {"kind": "ellipsoid", "axes": [0.04, 0.03, 0.02]},
+            lambda p: 0.02 * (np.linalg.norm(p / [0.04, 0.03, 0.02], axis=1) - 1),
+        ),
+    ):
+        found: list[Surface] = surfaces_of(SceneObject.model_validate({"name": "it", "shapes": [shape]}))
+        assert np.abs(away(found[0].mesh.vertices)).max() < 1e-9
+    with pytest.raises(InputError, match="plane"):
+        surfaces_of(SceneObject.model_validate({"name": "table", "shapes": [{"kind": "plane"}]}))
+
+
+def _off_cylinder(points: np.ndarray) -> np.ndarray:
+    out = np.maximum(np.linalg.norm(points[:, :2], axis=1) - 0.02, np.abs(points[:, 2]) - 0.05)
+    return np.where(np.linalg.norm(points[:, :2], axis=1) < 1e-9, np.abs(points[:, 2]) - 0.05, out)
+
+
+def test_the_camera_looks_at_the_table_from_around_and_the_hand_stays_above_the_things() -> None:
+    robot, q = panda(), camera_path(24)
+    assert (q > robot.chain.lower).all()
+    assert (q < robot.chain.upper).all()
+    links = robot.fk(q)
+    assert (links[:, -1] @ robot.T_link_tcp)[:, 2, 3].min() > 0.2
+    cameras = links[:, -1] @ T_PANDA_CAMERA
+    towards = np.array([0.5, 0.0, 0.05]) - cameras[:, :3, 3]
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    assert (cameras[:, :3, 2] * towards).sum(axis=1).min() > np.cos(np.radians(20.0))
+    turns = np.degrees(np.unwrap(np.arctan2(*(cameras[:, 1::-1, 3] - [0.0, 0.5]).T)))
+    assert np.ptp(turns) > 180.0
+
+
+def test_shaking_stays_within_the_limits_and_ends_where_it_began() -> None:
+    chain = panda().chain
+    shake = Shake(chain, panda().home)
+    t = np.linspace(0.0, shake.duration, 4001)
+    q, v = (np.array(x) for x in zip(*(shake.reference(float(x)) for x in t), strict=True))
+    np.testing.assert_allclose(q[[0, -1]], np.stack([shake.q, shake.q]), atol=1e-12)
+    np.testing.assert_allclose(v[[0, -1]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], v[1:-1], atol=1e-3)
+    acceleration = np.abs(np.gradient(v, t, axis=0)).max(axis=0)
+    assert (acceleration < 1.1 * SHARE * chain.acceleration).all()
+    assert (acceleration > 0.8 * SHARE * chain.acceleration).all()
+    assert (np.abs(v).max(axis=0) < chain.velocity).all()
+
+
+def test_the_table_counts_what_the_rows_say() -> None:
+    rows = [row(0, "ours"), row(1, "ours", HELD, SLIPPED), row(2, "ours"), row(0, "theirs", SLIPPED, SLIPPED)]
+    ours, theirs = summaries(rows)
+    interval = wilson(2, 3)
+    assert (ours["trials"], ours["successes"], ours["ideal"]) == (3, 2, 1.0)
+    assert (ours["low"], ours["high"]) == (interval.low, interval.high)
+    assert ours["drop"] == pytest.approx(1 / 3)
+    assert (ours["plan_ms"], ours["world_mb"], ours["touched_others"]) == (11.0, 5.0, 1)
+    assert ours["failures"] == {"slip": 1}
+    assert ours["by_kind"] == {"can": "2 of 3"}
+    assert (theirs["success"], theirs["drop"]) == (0.0, 0.0)
+    assert [words[0] for words in table_rows([ours, theirs])] == ["ours", "theirs"]
+
+
+def test_the_physics_that_a_table_holds_for_is_that_of_the_twin() -> None:
+    trial = make_trial(1)
+    found = physics(trial)
+    assert found["finger_force_n"] == 70.0
+    assert found["friction"] == sorted({thing.friction for thing in trial.scene.movable})
+    option = Twin(trial.scene).world.model.opt
+    assert (found["impratio"], found["timestep_ms"]) == (option.impratio, pytest.approx(1e3 * option.timestep))
+    assert 5.0 < found["shake_m_s2"] < 20.0
+
+
+def test_what_is_written_is_not_done_again_and_a_line_cut_short_is(tmp_path: Path) -> None:
+    path = tmp_path / FILE
+    kept = [row(0, "gaussians"), row(1, "gaussians", HELD, SLIPPED)]
+    lines = [json.dumps(one.to_dict()) for one in kept]
+    path.write_text("\n".join([*lines, lines[0][:40]]))
+    assert read_rows(path) == kept
+    assert path.read_text() == "".join(f"{line}\n" for line in lines)
+    rows, interrupted = run_trials(TrialsPlan(trials=2), tmp_path)
+    assert (rows, interrupted) == (kept, False)
+    path.write_text("\n".join([lines[0][:40], lines[1]]) + "\n")
+    with pytest.raises(FormatError, match="line 1"):
+        read_rows(path)
+
+
+def test_wrong_plans_are_named() -> None:
+    for values, word in (({"stacks": ("voxels",)}, "voxels"), ({"family": "zoo"}, "zoo"), ({"trials": 0}, "range")):
+        with pytest.raises(InputError, match=word):
+            replace(TrialsPlan(), **values)
+
+
+def test_one_thing_is_seen_picked_and_shaken_and_ctrl_c_keeps_it(tmp_path: Path) -> None:
+    def stop(what: str, share: float) -> None:
+        raise KeyboardInterrupt
+
+    plan = TrialsPlan(family="isolated", trials=2, first=1, frames=16, width=160)
+    rows, interrupted = run_trials(plan, tmp_path, tell=stop)
+    assert interrupted
+    (only,) = rows
+    assert (only.seed, only.kind, only.stack) == (1, "can", "gaussians")
+    assert only.ideal.success, only.ideal.reason
+    assert only.ideal.rose > RISE
+    assert only.ideal.kept > KEPT
+    thing = make_trial(1, "isolated").scene.movable[0].shapes[0]
+    assert thing.kind == "cylinder"
+    assert only.width_mm == pytest.approx(2e3 * thing.radius, abs=4.0)
+    assert only.plan_ms is not None
+    assert only.plan_ms < 500.0
+    assert read_rows(tmp_path / FILE) == rows
