@@ -40,10 +40,21 @@ def _served_map(
     return served
 
 
+def _asked_map(
+    request: Request,
+    store: Annotated[MapStore, Depends(_store)],
+    map_id: Annotated[str, Path(description="as GET /v1/maps lists it", examples=["default"])],
+) -> ServedMap:
+    store.frames_first.wait()
+    return _served_map(request, store, map_id)
+
+
 Service = Annotated[Runtime, Depends(_runtime)]
 Store = Annotated[MapStore, Depends(_store)]
 Settings = Annotated[ServiceSettings, Depends(_settings)]
 Served = Annotated[ServedMap, Depends(_served_map)]
+Asked = Annotated[ServedMap, Depends(_asked_map)]
+"""The same for what takes a while to answer: frames that are being mapped go first."""
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:

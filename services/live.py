@@ -115,7 +115,8 @@ class LiveMapping:
             if self._stop.is_set():
                 break
             bus.publish(frame_topic, frame)
-            result = self._mapper.process(frame)
+            with self._store.frames_first.mapping():
+                result = self._mapper.process(frame)
             bus.publish(result_topic, result)
             if result.keyframe:
                 self._publish()

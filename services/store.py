@@ -12,6 +12,7 @@ from splatbot.errors import InputError, MapNotFoundError
 from splatbot.gaussians import Snapshot
 from splatbot.services.bus import Bus
 from splatbot.services.derived import Derived
+from splatbot.services.frames_first import FramesFirst
 from splatbot.services.problems import MapNotReadyError
 from splatbot.services.topics import STATE, TRAJECTORY, map_topic
 from splatbot.trajectory import Trajectory
@@ -90,6 +91,7 @@ class MapStore:
 
     def __init__(self, bus: Bus | None = None) -> None:
         self.bus = bus or Bus()
+        self.frames_first = FramesFirst()
         self._lock = threading.Lock()
         self._maps: dict[str, ServedMap] = {}
 

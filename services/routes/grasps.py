@@ -17,7 +17,7 @@ from splatbot.grasping.summary import summary
 from splatbot.grasping.words import WordAffordance
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import Served, Service, problems
+from splatbot.services.dependencies import Asked, Service, problems
 from splatbot.services.robots_in_maps import base_in, things_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS, map_topic
@@ -49,7 +49,7 @@ _ANSWER = {
 )
 def grasps(
     request: Request,
-    served: Served,
+    served: Asked,
     service: Service,
     asked: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))],
 ) -> Response:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.rasterize.views import default_view, depth_limits, render_view, to_png
-from splatbot.services.dependencies import Served, Settings, etag, problems, unchanged, version_headers
+from splatbot.services.dependencies import Asked, Served, Settings, etag, problems, unchanged, version_headers
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import Mode, Pose, RenderRequest
 from splatbot.services.settings import ServiceSettings
@@ -57,7 +57,7 @@ def render_default(
 
 
 @router.post("/{map_id}/render", response_class=Response, responses=_PNG | problems(404, 413, 422, 503))
-def render(served: Served, settings: Settings, request: Annotated[RenderRequest, _BODY]) -> Response:
+def render(served: Asked, settings: Settings, request: Annotated[RenderRequest, _BODY]) -> Response:
     """The map seen by a given camera from a given pose."""
     model = served.ready.model
     if request.camera is not None:
