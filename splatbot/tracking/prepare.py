@@ -19,7 +19,7 @@ Image = NDArray[np.float32]
 
 _FLYING_STEP = 0.03  # share of its depth by which a flying pixel differs from both surfaces
 # Where depth jumps by more than this share and this many σ between neighbours, two surfaces meet.
-_JUMP_STEP, _JUMP_SIGMAS = 0.03, 6.0
+_JUMP_STEP, _JUMP_SIGMAS = 0.03, 10.0  # the bend of three noisy depths has 2.4 times the noise of one
 _LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of one pixel is none
 
 
@@ -71,7 +71,9 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
 
 
 def gray_of_one_surface(level: Level, config: TrackingConfig) -> Image:
-    """Grey (H, W), NaN along occluding edges: where depth jumps within a pixel's 3x3, more than its noise explains.
+    """Grey (H, W), NaN along occluding edges: where inverse depth bends from pixel to pixel, more than noise explains.
+
+    Along a plane it is linear, however slanted that is and however few pixels there are.
 
     Smoothing and interpolation mix the grey of two surfaces there, and from elsewhere others meet. The errors of such
     pixels do not average out: a few per cent of all, they would pull the pose along with the parallax.

@@ -79,25 +79,29 @@ void depth_around(const DepthImage& depth, std::span<const float> pixels, std::s
 void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, float step, float floor, float quad,
                          std::span<float> out) {
   const int width = depth.width, height = depth.height;
-  constexpr float kMissing = std::numeric_limits<float>::infinity(), kNaN = std::numeric_limits<float>::quiet_NaN();
-  // Of three pixels of a column, with a spare one on each side.
-  std::vector<float> near(static_cast<std::size_t>(width) + 2, kMissing), far(static_cast<std::size_t>(width) + 2, 0.0F);
+  constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
+  std::vector<float> inverse(depth.z.size());  // 0 where nothing is measured
+  for (std::size_t i = 0; i < inverse.size(); ++i) inverse[i] = depth.z[i] > 0.0F ? 1.0F / depth.z[i] : 0.0F;
+  std::copy(gray.begin(), gray.end(), out.begin());
+  const auto bends = [](const float* w, std::ptrdiff_t to, float limit) {
+    const float a = w[-to], b = w[to];
+    return (a > 0.0F) & (b > 0.0F) & (std::abs(a + b - 2.0F * w[0]) > limit);
+  };
   for (int v = 0; v < height; ++v) {
     const std::size_t at = static_cast<std::size_t>(v) * width;
-    const float* here = depth.z.data() + at;
-    const float* above = v > 0 ? here - width : here;
-    const float* below = v + 1 < height ? here + width : here;
+    const bool between = v > 0 && v + 1 < height;
     for (int u = 0; u < width; ++u) {
-      const float a = above[u], b = here[u], c = below[u];
-      const auto present = [](float z) { return z > 0.0F ? z : kMissing; };
-      near[u + 1] = std::min(present(a), std::min(present(b), present(c)));
-      far[u + 1] = std::max(a, std::max(b, c));
-    }
-    for (int u = 0; u < width; ++u) {
-      const float nearest = std::min(near[u], std::min(near[u + 1], near[u + 2]));
-      const float farthest = std::max(far[u], std::max(far[u + 1], far[u + 2]));
-      const float tolerance = std::max(step * nearest, floor + quad * nearest * nearest);
-      out[at + u] = farthest - nearest > tolerance ? kNaN : gray[at + u];  // false where nothing is measured
+      const float* w = inverse.data() + at + u;
+      if (w[0] <= 0.0F) continue;
+      const float z = depth.z[at + u];
+      const float limit = std::max(step * z, floor + quad * z * z) / (z * z);
+      const bool beside = u > 0 && u + 1 < width;
+      bool edge = beside && bends(w, 1, limit);
+      if (between) {
+        edge |= bends(w, width, limit);
+        if (beside) edge |= bends(w, width + 1, limit) | bends(w, width - 1, limit);
+      }
+      if (edge) out[at + u] = kNaN;
     }
   }
 }

@@ -167,6 +167,16 @@ def test_grey_stays_on_slanted_surfaces_on_noisy_ones_and_beside_holes(rng: np.r
     assert np.array_equal(kept, gray)
 
 
+def test_grey_stays_on_walls_seen_at_a_graze_in_a_small_image() -> None:
+    """Both sides of a corridor: depth grows by up to a twentieth from one pixel to the next."""
+    u = np.abs(np.arange(CAMERA.width) - CAMERA.cx) / CAMERA.fx
+    depth = np.tile((1.0 / np.maximum(u, 0.15)).astype(np.float32), (CAMERA.height, 1))
+    assert np.abs(np.diff(np.log(depth[0]))).max() > 0.04
+    gray = np.full(depth.shape, 0.5, np.float32)
+    left_out = np.isnan(gray_of_one_surface(Level(gray, depth, CAMERA), small_config().tracking))
+    assert not left_out.any()
+
+
 def test_coarse_levels_keep_their_grey_at_edges_and_a_mask_stays_left_out() -> None:
     frame = wall_frame(np.eye(4))
     mask = np.ones(frame.depth.shape, bool)

@@ -22,8 +22,9 @@ void halve_depth(const DepthImage& depth, std::span<float> out);
 // they span more than 5 % of it: two surfaces.
 void depth_around(const DepthImage& depth, std::span<const float> pixels, std::span<double> out);
 
-// out (H, W): gray (H, W), NaN where surfaces of different depth meet: where the nearest and the farthest of the measured
-// ones of a pixel's 3x3 differ by more than both `step` of the nearer and floor + quad z² [m], z being the nearer.
+// out (H, W): gray (H, W), NaN where surfaces of different depth meet: where inverse depth, which is linear along a plane
+// however slanted, bends between a measured pixel's opposite neighbours by what is both `step` of its depth z and
+// floor + quad z^2 [m] of it.
 void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, float step, float floor, float quad,
                          std::span<float> out);
 
