@@ -19,7 +19,7 @@ Image = NDArray[np.float32]
 
 _FLYING_STEP = 0.03  # share of its depth by which a flying pixel differs from both surfaces
 # Where depth jumps by more than this share and this many σ between neighbours, two surfaces meet.
-_JUMP_STEP, _JUMP_SIGMAS = 0.03, 10.0  # the bend of three noisy depths has 2.4 times the noise of one
+_JUMP_STEP, _JUMP_SIGMAS = 0.02, 8.0  # the bend of three noisy depths has 2.4 times the noise of one
 _LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of one pixel is none
 
 

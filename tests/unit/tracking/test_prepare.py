@@ -164,7 +164,8 @@ def test_grey_stays_on_slanted_surfaces_on_noisy_ones_and_beside_holes(rng: np.r
     depth[40:60, 50:70] = 0
     gray = np.full(depth.shape, 0.5, np.float32)
     kept = gray_of_one_surface(Level(gray, depth.astype(np.float32), CAMERA), small_config().tracking)
-    assert np.array_equal(kept, gray)
+    assert np.isnan(kept).mean() < 1e-3
+    assert np.isfinite(kept[38:62, 48:72]).all()  # around the hole
 
 
 def test_grey_stays_on_walls_seen_at_a_graze_in_a_small_image() -> None:
