@@ -9,7 +9,6 @@ import json
 import logging
 import secrets
 import threading
-import time
 from typing import Any
 
 from splatbot.errors import ConfigError, SplatbotError
@@ -135,7 +134,7 @@ class _Publisher:
         from zenoh import ext
 
         self._number += 1
-        stamp = ext.Int64(round((message.stamp or time.time()) * 1e9))
+        stamp = ext.Int64(round(message.stamp * 1e9))
         self._publisher.put(message.cdr, attachment=ext.z_serialize((ext.Int64(self._number), stamp, self._gid)))
 
 

@@ -27,6 +27,7 @@ from splatbot.robots.panda import panda
 from splatbot.sim.effects.moving_obstacles import place_on
 from splatbot.sim.effects.registry import make_effects
 from splatbot.sim.rays import cast, pixel_rays
+from splatbot.sim.solids import pose_at
 from splatbot.sim.trials.scenes import TrialScene
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.twin import Twin
@@ -159,15 +160,9 @@ def _log(trial: TrialScene, frames: int, width: int) -> WristLog:
     moving = {}
     for thing in trial.scene.carried:
         shown = surfaces_of(thing, placed=False)
-        moving[thing.name] = Moving(shown, lambda t, thing=thing: _pose(place_on(thing, t)))  # type: ignore[misc]
+        moving[thing.name] = Moving(shown, lambda t, thing=thing: pose_at(tuple(place_on(thing, t)), (0.0, 0.0, 0.0)))  # type: ignore[misc]
     joints = camera_path(frames)
     return WristLog(panda(), joints, [_TABLE, *still], T_scene_base=np.eye(4), width=width, rate=_RATE, moving=moving)
-
-
-def _pose(at: Array) -> Array:
-    T = np.eye(4)
-    T[:3, 3] = at
-    return T
 
 
 def _observers(snapshot: Snapshot, T_world_keyframe: Array) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatbot.collision.evidence import measured_depths
 from splatbot.collision.fcl_models import fcl_mesh, fcl_octree, octomap_bytes
-from splatbot.geometry import inverse
+from splatbot.evaluation.depth_fusion import DepthFusion
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.ways import Ways
@@ -26,7 +26,6 @@ from splatbot.sim.trials.stacks import OPTIONS, Knowledge
 VOXEL = 0.004  # [m] of the mesh's distances and of the cloud
 LEAF = 0.01  # [m] of the octree
 _OUT = 0.5  # [m] from a surface to whom it faces
-_SEEN = 3.0  # views that a voxel of the mesh takes
 _GREY = 0.6  # of the mesh, whose colours nobody asks for
 _THROUGH = 0.03  # [m] that a frame must see behind a point to have seen through it
 _NORMALS = 0.012, 24  # [m] around a point, and points, that its normal is fitted to
@@ -43,7 +42,10 @@ class MeshStack:
     def learn(self, look: Look) -> Knowledge:
         """See :class:`splatbot.sim.trials.stacks.Stack`."""
         begin = time.perf_counter()
-        mesh = _fused(look)
+        fusion = DepthFusion(VOXEL, FARTHEST)
+        for view in look.views:
+            fusion.add(*view)
+        mesh = fusion.mesh()
         vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
         normals = np.asarray(mesh.vertex_normals)
 
@@ -94,21 +96,6 @@ def _known(
         return sampler, SolidWays(sampler, target, OPTIONS, world)
 
     return Knowledge(scene, towards, size, time.perf_counter() - begin)
-
-
-def _fused(look: Look) -> Any:
-    """Triangles of the truncated signed distances of all depth (Curless and Levoy 1996), in voxels seen three times."""
-    single = o3d.core.SizeVector((1,))
-    kinds = (o3d.core.float32, o3d.core.float32)
-    grid = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, (single, single), VOXEL, 16, 20_000)
-    for depth, camera, T in look.views:
-        image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(depth))
-        K, T_camera_world = o3d.core.Tensor.from_numpy(camera.K), o3d.core.Tensor.from_numpy(inverse(T))
-        blocks = grid.compute_unique_block_coordinates(image, K, T_camera_world, 1.0, FARTHEST)
-        grid.integrate(blocks, image, K, T_camera_world, 1.0, FARTHEST)
-    mesh = grid.extract_triangle_mesh(_SEEN).to_legacy()
-    mesh.compute_vertex_normals()
-    return mesh
 
 
 def _cloud(look: Look) -> Any:

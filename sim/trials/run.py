@@ -92,7 +92,9 @@ def run_trials(plan: TrialsPlan, folder: Path, *, tell: Tell = lambda what, shar
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / FILE
-    done = {(row.family, row.seed, row.stack): row for row in read_rows(path)}
+    # Rows of another scan are of another trial, and stay in the file beside these.
+    same = (row for row in read_rows(path) if (row.frames, row.pixels) == (plan.frames, plan.width))
+    done = {(row.family, row.seed, row.stack): row for row in same}
     for name in plan.stacks:
         stack_of(name)
     wanted = [(seed, tuple(n for n in plan.stacks if (plan.family, seed, n) not in done)) for seed in plan.seeds]

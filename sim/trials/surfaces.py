@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from splatbot.errors import InputError
+from splatbot.geometry import transform_points
 from splatbot.logs.raycast import Surface
 from splatbot.logs.shapes import Mesh, box, cylinder, sphere
 from splatbot.logs.textures import Texture
 from splatbot.sim.scene import SceneObject
-from splatbot.sim.solids import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, rotation_of
+from splatbot.sim.solids import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, pose_at
 from splatbot.sim.wrist import capsule_mesh
 
 _DARK = 0.7  # of the second colour
@@ -24,12 +25,12 @@ def surfaces_of(thing: SceneObject, *, placed: bool = True, seed: int = 0) -> li
     """
     r, g, b = thing.color
     texture = Texture((r, g, b), (_DARK * r, _DARK * g, _DARK * b), _PERIOD, seed=seed)
-    R, at = (rotation_of(thing.rpy), np.asarray(thing.at)) if placed else (np.eye(3), np.zeros(3))
+    T = pose_at(thing.at, thing.rpy) if placed else np.eye(4)
     found = []
     for shape in thing.shapes:
         mesh = _mesh(shape, thing.name)
-        own = mesh.vertices @ rotation_of(shape.rpy).T + np.asarray(shape.at)
-        found.append(Surface(Mesh(own @ R.T + at, mesh.triangles), texture))
+        vertices = transform_points(T @ pose_at(shape.at, shape.rpy), mesh.vertices)
+        found.append(Surface(Mesh(vertices, mesh.triangles), texture))
     return found
 
 

@@ -89,6 +89,7 @@ class TrialRow:
         build_s: to make the stack's world of the frames, mapping included.
         world_bytes: of that world.
         width_mm: of the grasp; None: there was none.
+        frames, pixels: of the scan, and how wide its pictures are [px].
     """
 
     seed: int
@@ -103,6 +104,8 @@ class TrialRow:
     build_s: float
     world_bytes: int
     width_mm: float | None
+    frames: int
+    pixels: int
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON takes it."""
@@ -141,7 +144,7 @@ def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | Non
         decision = decide(known, seen)
     except AffordanceError as error:
         both = Attempt(False, Failure.PERCEPTION, "no target", error.message)
-        return _row(stack, trial, known, None, None, both, both)
+        return _row(stack, trial, seen, known, None, None, both, both)
     results = []
     mistaken = _mistaken(known, decision.target, trial)
     for twin in (Twin(trial.scene), _reality(trial)):
@@ -149,7 +152,7 @@ def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | Non
     (ideal, first), (reality, _) = results
     if videos is not None and not reality.success:
         _film(decision, trial, videos / f"{trial.family}-{trial.seed}-{stack.name}.mp4")
-    return _row(stack, trial, known, decision, first, ideal, reality)
+    return _row(stack, trial, seen, known, decision, first, ideal, reality)
 
 
 def attempt(
@@ -259,6 +262,7 @@ def _height(twin: Twin, name: str) -> float:
 def _row(
     stack: Stack,
     trial: TrialScene,
+    seen: Look,
     known: Knowledge,
     decision: Decision | None,
     result: PickResult | None,
@@ -279,4 +283,6 @@ def _row(
         build_s=known.seconds,
         world_bytes=known.world_bytes,
         width_mm=None if result is None or result.grasp is None else 1e3 * result.grasp.width,
+        frames=len(seen.frames),
+        pixels=seen.frames[0].camera.width,
     )

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from splatbot.bench.results import Results
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField
+from splatbot.evaluation.depth_fusion import DepthFusion
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
-from splatbot.geometry import inverse, transform_points
+from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.robots.in_view import reopen_log
@@ -41,13 +42,13 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     poses = folder.load_poses()
     field = GaussianCollisionField(GaussianModel.load(run / "map.ply"), min_observations=min_observations)
     rng = np.random.default_rng(0)
-    clouds, free, fusion = [], [], _DepthFusion()
+    clouds, free, fusion = [], [], DepthFusion(_VOXEL, _FARTHEST)
     each = -(-points // len(poses))
     for index, T in sorted(poses.items()):
         frame = log[index]
         v, u = np.nonzero(np.isfinite(frame.depth) & (frame.depth > 0))
         clouds.append(lifted(frame.depth, u[::3], v[::3], frame.camera, T))
-        fusion.add(frame, T)
+        fusion.add(frame.depth, frame.camera, T)
         chosen = rng.integers(0, len(u), each)
         surface = lifted(frame.depth, u[chosen], v[chosen], frame.camera, T)
         free.append(T[:3, 3] + rng.uniform(0.1, 0.95, (each, 1)) * (surface - T[:3, 3]))
@@ -55,7 +56,7 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     distance = field.clearance(queries).distance
     case = f"{name}, {len(queries)} points in free space"
     results.add(case, "Gaussians", float(len(field)), "")
-    raw, fused = _nearest(cloud, queries), _nearest(fusion.surface(), queries)
+    raw, fused = _nearest(cloud, queries), _nearest(fusion.points(), queries)
     compared = {
         "clearance against raw depth": distance - raw,
         "clearance against fused depth": distance - fused,
@@ -65,30 +66,6 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
         for share in (50, 90, 95):
             results.add(case, f"{metric}, {share} %", 1e3 * float(np.percentile(np.abs(error), share)), "mm")
     _picture(field, log[min(poses)], poses[min(poses)], cloud, out / f"{name}-field.jpg")
-
-
-class _DepthFusion:
-    """Depth images fused by Open3D into truncated signed distances."""
-
-    def __init__(self) -> None:
-        single = o3d.core.SizeVector((1,))
-        self._grid = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), (single, single), _VOXEL, 16, 20_000
-        )
-
-    def add(self, frame: Frame, T_world_camera: Array) -> None:
-        """Integrate one image; missing depth is 0 or not finite."""
-        known = np.isfinite(frame.depth) & (frame.depth < _FARTHEST)
-        depth = o3d.t.geometry.Image(_tensor(np.where(known, frame.depth, 0)))
-        K = o3d.core.Tensor.from_numpy(frame.camera.K)
-        T_camera_world = o3d.core.Tensor.from_numpy(inverse(T_world_camera))
-        blocks = self._grid.compute_unique_block_coordinates(depth, K, T_camera_world, 1.0, _FARTHEST)
-        self._grid.integrate(blocks, depth, K, T_camera_world, 1.0, _FARTHEST)
-
-    def surface(self) -> Array:
-        """Points (N, 3) [m, world] that were measured three times or more."""
-        points: Array = self._grid.extract_point_cloud(3.0).point.positions.numpy().astype(np.float64)
-        return points
 
 
 def lifted(depth: NDArray[np.float32], u: NDArray[np.int64], v: NDArray[np.int64], camera: Camera, T: Array) -> Array:

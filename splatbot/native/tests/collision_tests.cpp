@@ -2,6 +2,7 @@
 // The collision field and an arm in it, for the sanitizers to watch: packed and not, through updates, asked by many
 // threads while the next field is made; distances against bisection in float64. The number of threads changes no bit.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
@@ -56,9 +57,8 @@ struct Map {
 
 constexpr float kSigma = 2.0F;
 
-// The signed distance of a point to the n-sigma ellipsoid of Gaussian i: the root s of sum (a v / (a^2 - min a^2 +
-// s))^2 = 1 by bisection (Eberly, distance from a point to an ellipsoid).
-double distance_to(const Map& map, std::size_t i, const double* p) {
+// A point in the frame of Gaussian i: along its axes, from its mean.
+std::array<double, 3> seen_from(const Map& map, std::size_t i, const double* p) {
   double q[4], norm = 0.0;
   for (std::size_t k = 0; k < 4; ++k) {
     q[k] = static_cast<double>(map.quats[4 * i + k]);
@@ -68,14 +68,23 @@ double distance_to(const Map& map, std::size_t i, const double* p) {
   const double R[9] = {1 - t * (y * y + z * z), t * (x * y - w * z),     t * (x * z + w * y),
                        t * (x * y + w * z),     1 - t * (x * x + z * z), t * (y * z - w * x),
                        t * (x * z - w * y),     t * (y * z + w * x),     1 - t * (x * x + y * y)};
-  double a[3], v[3], least = 1e30;
+  std::array<double, 3> v{};
   for (std::size_t k = 0; k < 3; ++k) {
-    a[k] = static_cast<double>(kSigma) * static_cast<double>(map.scales[3 * i + k]);
-    least = std::min(least, a[k]);
-    v[k] = 0.0;
     for (std::size_t j = 0; j < 3; ++j) {
       v[k] += R[3 * j + k] * (p[j] - static_cast<double>(map.means[3 * i + j]));
     }
+  }
+  return v;
+}
+
+// The signed distance of a point to the n-sigma ellipsoid of Gaussian i: the root s of sum (a v / (a^2 - min a^2 +
+// s))^2 = 1 by bisection (Eberly, distance from a point to an ellipsoid).
+double distance_to(const Map& map, std::size_t i, const double* p) {
+  std::array<double, 3> v = seen_from(map, i, p);
+  double a[3], least = 1e30;
+  for (std::size_t k = 0; k < 3; ++k) {
+    a[k] = static_cast<double>(kSigma) * static_cast<double>(map.scales[3 * i + k]);
+    least = std::min(least, a[k]);
     v[k] = std::abs(v[k]);
   }
   double low = 0.0, high = 0.0, D[3];
@@ -102,20 +111,10 @@ double distance_to(const Map& map, std::size_t i, const double* p) {
 }
 
 double mahalanobis_to(const Map& map, std::size_t i, const double* p) {
-  double q[4], norm = 0.0, d[3], sum = 0.0;
-  for (std::size_t k = 0; k < 4; ++k) {
-    q[k] = static_cast<double>(map.quats[4 * i + k]);
-    norm += q[k] * q[k];
-  }
-  const double w = q[0], x = q[1], y = q[2], z = q[3], t = 2.0 / norm;
-  const double R[9] = {1 - t * (y * y + z * z), t * (x * y - w * z),     t * (x * z + w * y),
-                       t * (x * y + w * z),     1 - t * (x * x + z * z), t * (y * z - w * x),
-                       t * (x * z - w * y),     t * (y * z + w * x),     1 - t * (x * x + y * y)};
+  const std::array<double, 3> v = seen_from(map, i, p);
+  double sum = 0.0;
   for (std::size_t k = 0; k < 3; ++k) {
-    d[k] = p[k] - static_cast<double>(map.means[3 * i + k]);
-  }
-  for (std::size_t k = 0; k < 3; ++k) {
-    const double part = (R[k] * d[0] + R[3 + k] * d[1] + R[6 + k] * d[2]) / static_cast<double>(map.scales[3 * i + k]);
+    const double part = v[k] / static_cast<double>(map.scales[3 * i + k]);
     sum += part * part;
   }
   return std::sqrt(sum);

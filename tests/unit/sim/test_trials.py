@@ -32,7 +32,9 @@ SLIPPED = Attempt(False, "slip", "lost", "nothing is between the fingers any mor
 
 
 def row(seed: int, stack: str, ideal: Attempt = HELD, reality: Attempt = HELD) -> TrialRow:
-    return TrialRow(seed, "tabletop", stack, "can", False, ideal, reality, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0)
+    return TrialRow(
+        seed, "tabletop", stack, "can", False, ideal, reality, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0, 32, 320
+    )
 
 
 def test_a_seed_gives_one_scene_at_rest_whose_things_keep_apart() -> None:
@@ -155,11 +157,13 @@ def test_wrong_plans_are_named() -> None:
             replace(TrialsPlan(), **values)
 
 
-def test_one_thing_is_seen_picked_and_shaken_and_ctrl_c_keeps_it(tmp_path: Path) -> None:
+def test_one_thing_is_seen_picked_and_shaken_whatever_another_scan_gave_and_ctrl_c_keeps_it(tmp_path: Path) -> None:
     def stop(what: str, share: float) -> None:
         raise KeyboardInterrupt
 
     plan = TrialsPlan(family="isolated", trials=2, first=1, frames=16, width=160)
+    another = replace(row(1, "gaussians", SLIPPED), family="isolated")
+    (tmp_path / FILE).write_text(json.dumps(another.to_dict()) + "\n")
     rows, interrupted = run_trials(plan, tmp_path, tell=stop)
     assert interrupted
     (only,) = rows
@@ -172,4 +176,5 @@ def test_one_thing_is_seen_picked_and_shaken_and_ctrl_c_keeps_it(tmp_path: Path)
     assert only.width_mm == pytest.approx(2e3 * thing.radius, abs=4.0)
     assert only.plan_ms is not None
     assert only.plan_ms < 500.0
-    assert read_rows(tmp_path / FILE) == rows
+    assert (only.frames, only.pixels) == (16, 160)
+    assert read_rows(tmp_path / FILE) == [another, *rows]
