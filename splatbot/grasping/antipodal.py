@@ -15,6 +15,7 @@ _IMPLIED = 0.1  # weight of implied points beside seen ones
 _LEAST = 3e-4  # [m] between two sides
 _LEAN = 0.25  # [rad] that closing directions are varied by
 _ROUNDS = 3
+_TO_MIDDLE = 0.1  # weight of the middle of the contacts beside the lines of their normals
 _CHUNK = 64
 
 Array32 = NDArray[np.float32]
@@ -79,8 +80,9 @@ def antipodal_pairs(
 
     From a seed a finger closes against its normal, and along variations of that; the first surface that faces the other
     way is the second contact (Nguyen 1988: the line between the contacts lies in both friction cones).
-    Refining turns the line to the bisector of both normals and fits a plane to the Gaussians at each end, so that a
-    contact is on the surface that they have in common.
+    Refining turns the line to the bisector of both normals, moves it to where these meet, as a chord of a ball to its
+    diameter, and fits a plane to the Gaussians at each end, so that a contact is on the surface that they have in
+    common.
 
     Args:
         surface: of the target.
@@ -129,10 +131,10 @@ def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tu
 
 
 def _refined(surface: Surface, first: Array, second: Array, cone: float) -> Pairs:
-    """Contacts on planes fitted at both ends, the line turned towards both normals as long as that is better."""
+    """Contacts on planes fitted at both ends, the line moved and turned to both normals as long as that is better."""
     found = _fitted(surface, first, second, cone)
     for _ in range(_ROUNDS):
-        middle = found.contacts.mean(axis=1)
+        middle = _between(found)
         turned = found.normals[:, 1] - found.normals[:, 0]
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
         half = found.width[:, None] / 2
@@ -149,6 +151,15 @@ def _refined(surface: Surface, first: Array, second: Array, cone: float) -> Pair
             np.where(better, other.doubt, found.doubt),
         )
     return found
+
+
+def _between(pairs: Pairs) -> Array:
+    """The points (C, 3) nearest to the lines of both normals: of a ball's chord its centre, of a can's a point of its
+    axis. Normals along one line leave it open where on it; so they are the middle of the contacts as far as it is."""
+    middle = pairs.contacts.mean(axis=1)
+    across = np.eye(3) - pairs.normals[..., :, None] * pairs.normals[..., None, :]
+    aside = np.einsum("ckij,ckj->ci", across, pairs.contacts - middle[:, None])
+    return np.asarray(middle + np.linalg.solve(across.sum(axis=1) + _TO_MIDDLE * np.eye(3), aside[..., None])[..., 0])
 
 
 def _fitted(surface: Surface, first: Array, second: Array, cone: float) -> Pairs:
