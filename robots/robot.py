@@ -17,6 +17,7 @@ from splatbot.robots.joints import Joint
 from splatbot.robots.shapes import Shape
 
 SLACK = 0.008  # [m] that generated spheres may reach beyond the collision geometry
+_FLAT = 1e-4  # [m] behind the foremost of a finger that is its pad's face
 _SPACING = 2e-3  # [m] between points of the shapes that the hand is measured by
 
 
@@ -179,6 +180,7 @@ class RobotModel:
             width=float(2 * np.abs(finger[:, 0]).max()),
             thickness=float(np.ptp(finger[:, 1])),
             tip=float(finger[:, 2].max()),
+            pad=float(finger[finger[:, 1] < finger[:, 1].min() + _FLAT, 2].max()),
             palm=float(-front[:, 2].max()),
             palm_size=(float(2 * np.abs(front[:, 0]).max()), float(2 * np.abs(front[:, 1]).max())),
             force=self.gripper.force,

@@ -14,6 +14,7 @@ PAD = 0.006  # [m] around a contact that its plane is fitted to
 _IMPLIED = 0.1  # weight of implied points beside seen ones
 _LEAST = 3e-4  # [m] between two sides
 _LEAN = 0.25  # [rad] that closing directions are varied by
+_LEVEL = 0.05  # [rad] from which on a closing direction is not level
 _ROUNDS = 3
 _TO_MIDDLE = 0.1  # weight of the middle of the contacts beside the lines of their normals
 _CHUNK = 64
@@ -74,12 +75,20 @@ class PairSearch:
 
 
 def antipodal_pairs(
-    surface: Surface, *, stroke: float, friction: float, samples: int, seed: int = 0, near: Array | None = None
+    surface: Surface,
+    *,
+    stroke: float,
+    friction: float,
+    samples: int,
+    up: Array,
+    seed: int = 0,
+    near: Array | None = None,
 ) -> PairSearch:
     """Opposite contacts from ``samples`` seeds on the surface, each refined.
 
-    From a seed a finger closes against its normal, and along variations of that; the first surface that faces the other
-    way is the second contact (Nguyen 1988: the line between the contacts lies in both friction cones).
+    From a seed a finger closes against its normal, along a variation of that, and level where the cone allows it, as what
+    stands and was seen from above shows its widest place at its rim alone; the first surface that faces the other way
+    is the second contact (Nguyen 1988: the line between the contacts lies in both friction cones).
     Refining turns the line to the bisector of both normals, moves it to where these meet, as a chord of a ball to its
     diameter, and fits a plane to the Gaussians at each end, so that a contact is on the surface that they have in
     common.
@@ -89,6 +98,7 @@ def antipodal_pairs(
         stroke: widest opening [m].
         friction: coefficient.
         samples: seeds; the knob of time against how much of the surface is tried.
+        up: (3,) unit [world].
         seed: of their choice.
         near: (3,) [m, world] around which seeds are denser.
     """
@@ -98,11 +108,9 @@ def antipodal_pairs(
     chance = np.ones(len(surface)) if near is None else np.exp(-_distance(surface.points, near - center) / 0.03) + 0.05
     chance = chance * np.where(surface.seen, 1.0, 0.5)
     start = rng.choice(len(surface), min(samples, len(surface)), replace=False, p=chance / chance.sum())
-    origin = np.repeat(surface.points[start], 2, axis=0)
-    lean = rng.normal(0.0, _LEAN, (len(origin), 3)) * (np.arange(len(origin)) % 2)[:, None]
-    closing = -np.repeat(surface.normals[start], 2, axis=0) + lean
-    closing /= np.linalg.norm(closing, axis=1, keepdims=True)
     cone = np.arctan(friction)
+    closing, of = _closings(surface.normals[start], cone, up, rng)
+    origin = surface.points[start][of]
     end, away = _exits(surface, origin, closing, np.cos(cone))
     met, wide = np.isfinite(away), np.isfinite(away) & (away > stroke)
     narrowest = float(away[wide].min()) if wide.any() else np.inf
@@ -111,6 +119,19 @@ def antipodal_pairs(
     good = (pairs.closure > 0.0) & (pairs.width <= stroke) & (pairs.width > _LEAST)
     pairs = replace(pairs, contacts=pairs.contacts + center)
     return PairSearch(pairs.select(good), int((~met).sum()), int(wide.sum()), int((~good).sum()), narrowest)
+
+
+def _closings(
+    normals: Array, cone: float, up: Array, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.int64]]:
+    """Unit directions (C, 3) for seeds with normals (S, 3), and which seed each is of (C,)."""
+    lean = rng.normal(0.0, _LEAN, normals.shape)
+    level = -normals + np.outer(normals @ up, up)
+    steep = np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0))
+    slanted = np.flatnonzero((steep > _LEVEL) & (steep < cone))
+    closing = np.concatenate([-normals, -normals + lean, level[slanted]])
+    every = np.arange(len(normals))
+    return closing / np.linalg.norm(closing, axis=1, keepdims=True), np.concatenate([every, every, slanted])
 
 
 def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tuple[Array, Array]:
