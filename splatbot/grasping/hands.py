@@ -196,7 +196,8 @@ def _closure(local: list[NDArray[np.float32]], give: NDArray[np.float32], hand: 
         turned.append(np.arcsin((weight * beyond).sum(axis=1) / round_end))
     line = places[1] - places[0]
     line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
-    cosines = [
-        line[:, 1] * np.cos(turn) - sign * line[:, 2] * np.sin(turn) for sign, turn in zip((-1.0, 1.0), turned, strict=True)
-    ]
-    return np.asarray(1.0 - np.arccos(np.clip(np.minimum(*cosines), -1.0, 1.0)) / cone)
+    along, up = line[:, 1], line[:, 2]
+    cosine = np.minimum(
+        *(along * np.cos(t) - sign * up * np.sin(t) for sign, t in zip((-1.0, 1.0), turned, strict=True))
+    )
+    return np.asarray(1.0 - np.arccos(np.clip(cosine, -1.0, 1.0)) / cone)
