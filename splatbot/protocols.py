@@ -97,6 +97,7 @@ class HandShape:
         thickness: of a finger along y, outwards from its pad [m].
         tip: how far the fingers reach beyond the origin along z [m].
         pad: how far their pads are flat beyond it, below ``tip`` where the rest is rounded off [m]; may be negative.
+        pad_width: how wide they are flat along x [m]; 0 of round fingers.
         palm: how far behind the origin the palm is [m].
         palm_size: of the palm along x and y [m].
         force: between the fingers [N].
@@ -107,6 +108,7 @@ class HandShape:
     thickness: float
     tip: float
     pad: float
+    pad_width: float
     palm: float
     palm_size: tuple[float, float]
     force: float = 70.0

@@ -178,26 +178,32 @@ def _held(
 def _closure(local: list[NDArray[np.float32]], give: NDArray[np.float32], hand: HandShape, cone: float) -> Array:
     """How far inside of the friction cone the line between the places is where the pads touch first (K,).
 
-    Flat pads meet what stands out most under them, wherever a grasp was meant to be; on a round end they meet it with a
+    Flat pads meet what stands out most under them, wherever a grasp was meant to be; a round finger meets it with a
     face that is turned, which pushes it out.
     """
     x, y, z = local
-    round_end = max(hand.tip - hand.pad, 1e-6)
-    beyond = np.clip(z - hand.pad, 0.0, 0.999 * round_end)
-    set_back = round_end - np.sqrt(round_end**2 - beyond**2)
+    side, side_back = _rounded(np.abs(x) - hand.pad_width / 2, (hand.width - hand.pad_width) / 2)
+    end, end_back = _rounded(z - hand.pad, hand.tip - hand.pad)
+    side *= np.sign(x)
     under = (np.abs(x) < hand.width / 2) & (z < hand.tip) & (z > -hand.palm)
     places, turned = [], []
     for sign in (-1.0, 1.0):
-        height = np.where(under & (sign * y > 0.0), sign * y - set_back - give, -np.inf)
+        height = np.where(under & (sign * y > 0.0), sign * y - side_back - end_back - give, -np.inf)
         top = height.max(axis=1, keepdims=True)
         weight = np.exp((height - np.where(np.isfinite(top), top, 0.0)) / _SINK)
         weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
-        places.append(np.stack([(weight * values).sum(axis=1) for values in local], axis=1))
-        turned.append(np.arcsin((weight * beyond).sum(axis=1) / round_end))
+        places.append(np.stack([np.einsum("km,km->k", weight, values) for values in local], axis=1))
+        turned.append(np.stack([np.einsum("km,km->k", weight, values) for values in (side, end)], axis=1))
     line = places[1] - places[0]
     line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
-    along, up = line[:, 1], line[:, 2]
-    cosine = np.minimum(
-        *(along * np.cos(t) - sign * up * np.sin(t) for sign, t in zip((-1.0, 1.0), turned, strict=True))
-    )
-    return np.asarray(1.0 - np.arccos(np.clip(cosine, -1.0, 1.0)) / cone)
+    cosines = []
+    for sign, sines in zip((-1.0, 1.0), turned, strict=True):
+        facing = np.sqrt(np.maximum(1.0 - (sines**2).sum(axis=1), 0.0))
+        cosines.append(line[:, 1] * facing - sign * (line[:, [0, 2]] * sines).sum(axis=1))
+    return np.asarray(1.0 - np.arccos(np.clip(np.minimum(*cosines), -1.0, 1.0)) / cone)
+
+
+def _rounded(beyond: NDArray[np.float32], radius: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Of a face so far ``beyond`` its flat part, rounded off with a radius [m]: sine of its turn, and its set-back."""
+    sine = np.clip(beyond / max(radius, 1e-6), 0.0, 0.999).astype(np.float32)
+    return sine, (max(radius, 0.0) * (1.0 - np.sqrt(1.0 - sine**2))).astype(np.float32)

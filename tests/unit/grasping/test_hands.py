@@ -41,11 +41,11 @@ def _pairs(line: Array) -> Pairs:
     return Pairs(contacts, contacts / RADIUS, np.ones(1), np.ones(1), np.zeros(1))
 
 
-def _from_above(hand: HandShape, ahead: float) -> Hands:
-    """On the ball's diameter along y, its middle ``ahead`` of the tool [m]."""
+def _from_above(hand: HandShape, ahead: float, aside: float = 0.0) -> Hands:
+    """On the ball's diameter along y, its middle ``ahead`` of the tool, and ``aside`` along x [m]."""
     pairs = _pairs(np.array([0.0, 1.0, 0.0]))
     hands = place_hands(pairs, hand, rolls=1, depths=1, up=UP, lowest=0.9)
-    hands.T[:, :3, 3] = [0.0, 0.0, ahead]
+    hands.T[:, :3, 3] = [aside, 0.0, ahead]
     return beside_target(hands, pairs, _ball(), hand, retreat=0.1, n_sigma=1.0, friction=FRICTION)
 
 
@@ -59,15 +59,23 @@ def test_a_round_finger_end_pushes_a_ball_out_as_two_circles_that_meet(beyond: f
     assert closure == pytest.approx(1.0 - turned / np.arctan(FRICTION), abs=0.15)
 
 
+@pytest.mark.parametrize("aside", [0.0, 0.003, 0.006])
+def test_a_round_finger_pushes_a_ball_aside_that_is_not_before_its_middle(aside: float) -> None:
+    hand = _hand()
+    closure = _from_above(hand, hand.pad - 0.012, aside).closure[0]
+    turned = np.arcsin(aside / (RADIUS + hand.width / 2))
+    assert closure == pytest.approx(1.0 - turned / np.arctan(FRICTION), abs=0.1)
+
+
 def test_pads_that_are_flat_to_their_tips_hold_there_as_well() -> None:
-    flat = replace(_hand(), pad=_hand().tip)
+    flat = replace(_hand(), pad=_hand().tip, pad_width=_hand().width)
     assert _from_above(flat, flat.tip - 0.004).closure[0] > 0.85
     assert _from_above(_hand(), _hand().tip - 0.004).closure[0] < 0.6
 
 
 def test_places_that_are_not_opposite_are_outside_of_the_cone() -> None:
     """Two blocks of points whose middles are offset along the fingers by 0.7 of their distance: 35 degrees."""
-    hand = replace(_hand(), pad=_hand().tip)
+    hand = replace(_hand(), pad=_hand().tip, pad_width=_hand().width)
     z, x = (g.ravel() for g in np.meshgrid(np.linspace(-0.003, 0.003, 9), np.linspace(-0.006, 0.006, 9)))
     offset = 0.35 * 0.03
     sides = [np.stack([x, np.full(x.size, s * 0.015), z + s * offset], axis=1) for s in (-1.0, 1.0)]
@@ -93,3 +101,4 @@ def test_a_finger_that_is_a_box_is_flat_to_its_tip() -> None:
     hand = replace(robot, gripper=gripper).hand
     assert hand is not None
     assert hand.pad == hand.tip
+    assert hand.pad_width == hand.width
