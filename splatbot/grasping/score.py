@@ -14,7 +14,9 @@ from splatbot.grasping.surface import Surface
 from splatbot.protocols import Array, HandShape
 
 WEIGHTS: Mapping[str, float] = {
-    "closure": 3.0,  # how far inside of the friction cone the places are where the pads touch
+    # How far inside of the friction cone the places are where the pads touch: how much friction may be missing, and how
+    # far off hand and map may be. What does not hold is of no use, however well it is reached.
+    "closure": 6.0,
     "held": 2.0,  # how much of the pads is on the surface
     "centre": 2.0,  # how near the line between the contacts is to the target's middle
     "width": 1.0,  # how much of the stroke is left
