@@ -203,7 +203,7 @@ def _closure(local: list[NDArray[np.float32]], give: NDArray[np.float32], hand: 
     return np.asarray(1.0 - np.arccos(np.clip(np.minimum(*cosines), -1.0, 1.0)) / cone)
 
 
-def _rounded(beyond: NDArray[np.float32], radius: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _rounded(beyond: Array | NDArray[np.float32], radius: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Of a face so far ``beyond`` its flat part, rounded off with a radius [m]: sine of its turn, and its set-back."""
     sine = np.clip(beyond / max(radius, 1e-6), 0.0, 0.999).astype(np.float32)
     return sine, (max(radius, 0.0) * (1.0 - np.sqrt(1.0 - sine**2))).astype(np.float32)
