@@ -141,6 +141,12 @@ class MappingConfig(_Section):
     )
     refine_iterations: int = Field(default=15, ge=0, description="optimiser steps per keyframe: accuracy for time")
     final_iterations: int = Field(default=300, ge=0, description="optimiser steps once the log has ended")
+    densify_gradient: float = Field(
+        default=3e-4,
+        ge=0,
+        description="at the end of a log, Gaussians are split whose centres the loss pulls at by more, in the mean, in "
+        "pictures 2 wide: accuracy for memory and time",
+    )
     window: int = Field(default=8, ge=1, description="latest keyframes that refinement favours")
     depth_weight: float = Field(default=4.0, ge=0, description="weight of relative depth against colour")
     dssim_weight: float = Field(

@@ -15,6 +15,7 @@ from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
+from splatbot.mapping.densify import Pull, split
 from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, fuse_normals, weigh
 from splatbot.mapping.exposure import in_exposure_of_map
 from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
@@ -30,6 +31,7 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
 from splatbot.tracking.reference import Reference, make_reference
 
+_BEFORE = 3  # of the last steps, the share of one in so many goes before densifying: it tells where
 _REVEALED = 0.03  # share of a frame that the map has nothing of, from which on the frame is wanted
 
 
@@ -150,9 +152,12 @@ class Mapper:
             self._version += 1
 
     def finish(self) -> None:
-        """Refine over all keyframes once no more will come."""
+        """Refine over all keyframes once no more will come, and densify where their pictures ask for it."""
         self.refine(self.owed)
-        self._refiner.refine_all(self.model, self.keyframes, self.config.mapping.final_iterations)
+        steps, pull = self.config.mapping.final_iterations, Pull(len(self.model))
+        self._refiner.refine_all(self.model, self.keyframes, steps // _BEFORE, pull)
+        self._densify(pull)
+        self._refiner.refine_all(self.model, self.keyframes, steps - steps // _BEFORE)
         self._prune()
         self._version += 1
 
@@ -282,6 +287,11 @@ class Mapper:
         for new in (measured, guessed):
             new.uncertainty = first_uncertainty(new, keyframe.T_world_camera, self._noise)
         self.model = GaussianModel.concatenate([self.model, measured, guessed])
+        self._refiner.adam.extend(self.model)
+
+    def _densify(self, pull: Pull) -> None:
+        room = self.config.mapping.max_gaussians - len(self.model)
+        self.model = split(self.model, pull.strongest(self.config.mapping.densify_gradient, room))
         self._refiner.adam.extend(self.model)
 
     def _prune(self) -> None:

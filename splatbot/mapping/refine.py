@@ -14,6 +14,7 @@ from splatbot.config import MappingConfig
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.harmonics import sh_to_rgb
 from splatbot.gaussians.shape import shortest_axes
+from splatbot.mapping.densify import Pull
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
@@ -58,16 +59,18 @@ class Refiner:
             self._latest = keyframes[-1].number
             self.step(model, keyframes[-1] if fresh else self._draw(keyframes))
 
-    def refine_all(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
-        """Spend ``iterations`` steps on all keyframes alike."""
+    def refine_all(
+        self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int, pull: Pull | None = None
+    ) -> None:
+        """Spend ``iterations`` steps on all keyframes alike; ``pull`` gathers how hard they pull at the centres."""
         for _ in range(iterations if len(model) else 0):
-            self.step(model, keyframes[int(self._random.integers(len(keyframes)))])
+            self.step(model, keyframes[int(self._random.integers(len(keyframes)))], pull)
 
     def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
         pool = keyframes[-self.config.window :] if self._random.random() < 0.5 else keyframes
         return pool[int(self._random.integers(len(pool)))]
 
-    def step(self, model: GaussianModel, keyframe: Keyframe) -> float:
+    def step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None = None) -> float:
         """One step on one keyframe; returns the loss before it.
 
         Torch's threads spin after each operation and so starve the rasterizer's; one is several times faster here.
@@ -75,11 +78,11 @@ class Refiner:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            return self._step(model, keyframe)
+            return self._step(model, keyframe, pull)
         finally:
             torch.set_num_threads(threads)
 
-    def _step(self, model: GaussianModel, keyframe: Keyframe) -> float:
+    def _step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None) -> float:
         parameters = {name: getattr(model, name).detach().requires_grad_(True) for name in PARAMETERS}
         renders, alphas, meta = rasterization(
             parameters["means"],
@@ -94,13 +97,16 @@ class Refiner:
             render_mode="RGB+ED",
             depth_mode="plane",  # what tracking is aligned to
         )
+        rows = meta["visible_ids"][0]
+        centers = [] if pull is None else [meta["means2d"]]
         loss = self._loss(renders[0], alphas[0], keyframe)
-        grads = torch.autograd.grad(loss, list(parameters.values()))
+        grads = torch.autograd.grad(loss, [*parameters.values(), *centers])
+        if pull is not None:
+            pull.add(rows, grads[-1], keyframe.camera.width)
         visible = torch.zeros(len(model), dtype=torch.bool)
-        visible[meta["visible_ids"][0]] = True
-        rows = visible.nonzero()[:, 0]
+        visible[rows] = True
         means, normals = model.means.index_select(0, rows), shortest_axes(model, rows)
-        self.adam.step(model, dict(zip(PARAMETERS, grads, strict=True)), visible)
+        self.adam.step(model, dict(zip(PARAMETERS, grads, strict=bool(pull is None))), visible)
         self._keep_on_surface(model, rows, means, normals)
         self._keep_flat(model, keyframe, rows)
         return float(loss.detach())
