@@ -16,23 +16,30 @@ from splatbot.bench.results import Results
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField
 from splatbot.evaluation.depth_fusion import DepthFusion
+from splatbot.evaluation.geometry import depth_error
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
+from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.shapes import Mesh
+from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
+from splatbot.results.scoring import score_views
 from splatbot.robots.in_view import reopen_log
 
 _VOXEL = 0.01  # [m]
 _FARTHEST = 10.0  # [m]
+_GREY = (0.5, 0.5, 0.5)  # of the fused surface, whose colour nobody asks for
 
 
 def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observations: int = 1) -> None:
     """A mapped recording: clearance at random points in free space against its raw depth.
 
     That is once the nearest of all raw points, strays and noise towards the camera included, and once the surface that
-    Open3D fuses from the same images (truncated signed distances, in voxels of 1 cm; three measurements or more). How
-    far the two are apart is told beside: no map can be nearer to both.
+    Open3D fuses from the frames that were not held out (truncated signed distances, in voxels of 1 cm; three
+    measurements or more). How far the two are apart is told beside: no map can be nearer to both. So is how well that
+    surface foretells the depth of held-out frames, beside the map.
     Points are drawn along the rays of random pixels, before the measured depth. Writes ``NAME-field.jpg``: a slice
     of the field beside the picture that it cuts.
     """
@@ -42,13 +49,15 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     poses = folder.load_poses()
     field = GaussianCollisionField(GaussianModel.load(run / "map.ply"), min_observations=min_observations)
     rng = np.random.default_rng(0)
+    held_out = {row.index for row in folder.load_frames() if row.held_out}
     clouds, free, fusion = [], [], DepthFusion(_VOXEL, _FARTHEST)
     each = -(-points // len(poses))
     for index, T in sorted(poses.items()):
         frame = log[index]
         v, u = np.nonzero(np.isfinite(frame.depth) & (frame.depth > 0))
         clouds.append(lifted(frame.depth, u[::3], v[::3], frame.camera, T))
-        fusion.add(frame.depth, frame.camera, T)
+        if index not in held_out:
+            fusion.add(frame.depth, frame.camera, T)
         chosen = rng.integers(0, len(u), each)
         surface = lifted(frame.depth, u[chosen], v[chosen], frame.camera, T)
         free.append(T[:3, 3] + rng.uniform(0.1, 0.95, (each, 1)) * (surface - T[:3, 3]))
@@ -65,7 +74,21 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     for metric, error in compared.items():
         for share in (50, 90, 95):
             results.add(case, f"{metric}, {share} %", 1e3 * float(np.percentile(np.abs(error), share)), "mm")
+    fused_mesh = fusion.mesh()
+    mesh = Mesh(np.asarray(fused_mesh.vertices), np.asarray(fused_mesh.triangles).astype(np.uint32))
+    seen = Scene([Surface(mesh, Texture(_GREY, _GREY, 1.0))])
+    frames = [(log[index], poses[index]) for index in sorted(held_out & poses.keys())]
+    errors = [depth_error(seen.render(frame.camera, T)[1], frame.depth).l1 for frame, T in frames]
+    _add_mean(results, f"{name}, held-out views", "depth error, mean, fused depth", errors)
+    scores = score_views(log, GaussianModel.load(run / "map.ply"), {frame.index: T for frame, T in frames}).scores
+    _add_mean(results, f"{name}, held-out views", "depth error, mean, map", [score.depth_l1_m for score in scores])
     _picture(field, log[min(poses)], poses[min(poses)], cloud, out / f"{name}-field.jpg")
+
+
+def _add_mean(results: Results, case: str, metric: str, errors: list[float | None]) -> None:
+    known = [error for error in errors if error is not None]
+    if known:
+        results.add(case, metric, 1e3 * float(np.mean(known)), "mm")
 
 
 def lifted(depth: NDArray[np.float32], u: NDArray[np.int64], v: NDArray[np.int64], camera: Camera, T: Array) -> Array:
