@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -109,7 +110,8 @@ def grasp(
         friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
     )
     arm = load_robot(robot)
-    scene, seen_from = _scene(map, base)
+    views = _measured(map)
+    scene, seen_from = _scene(map, base, views)
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), PlaceAffordance(), TagAffordance()])
     sampler = GraspSampler(
@@ -117,7 +119,7 @@ def grasp(
         arm,
         hand_only=hand_only,
         observers=seen_from,
-        views=_measured(map),
+        views=views,
         n_sigma=n_sigma,
         min_observations=min_observations,
     )
@@ -136,14 +138,19 @@ def grasp(
     return 0
 
 
-def _scene(map_: Path, base: Pose | None) -> tuple[MapScene, NDArray[np.float64] | None]:
-    """What is in the map, and where each of its Gaussians was seen from."""
+def _scene(map_: Path, base: Pose | None, views: Sequence[DepthView]) -> tuple[MapScene, NDArray[np.float64] | None]:
+    """What is in the map, but for flying pixels at edges, and where each of its Gaussians was seen from."""
+    import torch
+
+    from splatbot.collision import gather_evidence
     from splatbot.gaussians import GaussianModel
     from splatbot.segmentation import segment
     from splatbot.workspace import find_workspace
 
     known = find_workspace(map_)
     model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
+    solid = torch.from_numpy(~gather_evidence(model, views).seen_through).nonzero()[:, 0]
+    model = model.select(solid)
     T = base_pose(base, map_)
     own = known is not None and base is None  # box and plane belong to the base of the file
     seen_from = _observers(map_, model)
@@ -168,7 +175,7 @@ def _observers(map_: Path, model: GaussianModel) -> NDArray[np.float64] | None:
 
 
 def _measured(map_: Path) -> tuple[DepthView, ...]:
-    """Depth of the run, of which what nobody saw of the thing must not be seen through."""
+    """Depth of the run: what more frames saw through than saw is not there, seen of the thing or not."""
     if not (map_ / "frames.jsonl").is_file():
         return ()
     from splatbot.results.folder import RunFolder
