@@ -17,6 +17,7 @@ from splatbot.robots.joints import Joint
 from splatbot.robots.shapes import Shape
 
 SLACK = 0.008  # [m] that generated spheres may reach beyond the collision geometry
+_FLAT = 1e-4  # [m] behind the foremost of a finger that is its pad's face
 _SPACING = 2e-3  # [m] between points of the shapes that the hand is measured by
 
 
@@ -170,6 +171,7 @@ class RobotModel:
         T_tcp_finger = T_tcp_link @ self.gripper.T_link_finger[0]
         finger = np.concatenate([shape.surface(_SPACING) for shape in self.gripper.shapes])
         finger = transform_points(T_tcp_finger, finger) * [1.0, np.sign(T_tcp_finger[1, 1]), 1.0]
+        pad = finger[finger[:, 1] < finger[:, 1].min() + _FLAT]
         own = [shape.surface(_SPACING) for shape in self.shapes if shape.link == len(self)]
         body = transform_points(T_tcp_link, np.concatenate(own)) if own else np.zeros((0, 3))
         palm = body[body[:, 2] > finger[:, 2].min()]  # what stands beside the fingers or between them
@@ -179,6 +181,8 @@ class RobotModel:
             width=float(2 * np.abs(finger[:, 0]).max()),
             thickness=float(np.ptp(finger[:, 1])),
             tip=float(finger[:, 2].max()),
+            pad=float(pad[:, 2].max()),
+            pad_width=float(2 * np.abs(pad[:, 0]).max()),
             palm=float(-front[:, 2].max()),
             palm_size=(float(2 * np.abs(front[:, 0]).max()), float(2 * np.abs(front[:, 1]).max())),
             force=self.gripper.force,

@@ -150,6 +150,12 @@ class MappingConfig(_Section):
         description="share of structure (1 - SSIM) in the colour loss; 0: colour alone, cheaper",
     )
     rate_means: float = Field(default=5e-4, ge=0, description="learning rate of positions [m]")
+    normal_share: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="share of a position's step that is taken along the normal: depth knows that, a picture guesses it",
+    )
     rate_quats: float = Field(default=1e-3, ge=0, description="learning rate of orientations")
     rate_scales: float = Field(default=5e-2, ge=0, description="learning rate of log-scales")
     rate_opacities: float = Field(default=2e-2, ge=0, description="learning rate of opacity logits")

@@ -87,7 +87,7 @@ class RobotKinematics(Protocol):
 
 @dataclass(frozen=True)
 class HandShape:
-    """Two fingers with flat pads that close on each other, as boxes in the tool's frame.
+    """Two fingers with flat pads that close on each other, as boxes in the tool's frame whose pads may end round.
 
     The hand comes along the tool's z and closes along its y; the tool's origin is between the pads.
 
@@ -96,6 +96,8 @@ class HandShape:
         width: of a finger along x [m].
         thickness: of a finger along y, outwards from its pad [m].
         tip: how far the fingers reach beyond the origin along z [m].
+        pad: how far their pads are flat beyond it, below ``tip`` where the rest is rounded off [m]; may be negative.
+        pad_width: how wide they are flat along x [m]; 0 of round fingers.
         palm: how far behind the origin the palm is [m].
         palm_size: of the palm along x and y [m].
         force: between the fingers [N].
@@ -105,6 +107,8 @@ class HandShape:
     width: float
     thickness: float
     tip: float
+    pad: float
+    pad_width: float
     palm: float
     palm_size: tuple[float, float]
     force: float = 70.0

@@ -19,9 +19,14 @@ def rotations(model: GaussianModel) -> Tensor:
     return torch.stack(rows, 1)
 
 
-def shortest_axes(model: GaussianModel) -> Tensor:
-    """Unit vectors (N, 3): the axis of the least scale of each Gaussian."""
-    return rotations(model)[torch.arange(len(model)), :, model.log_scales.argmin(1)]
+def shortest_axes(model: GaussianModel, rows: Tensor | None = None) -> Tensor:
+    """Unit vectors (M, 3): the axis of the least scale of each Gaussian, or of those that ``rows`` (M,) name."""
+    quats, scales = (x if rows is None else x.index_select(0, rows) for x in (model.quats, model.log_scales))
+    quats = torch.nn.functional.normalize(quats, dim=1)
+    w, v = quats[:, :1], quats[:, 1:]
+    axis = torch.nn.functional.one_hot(scales.argmin(1), 3).to(quats.dtype)
+    twice = 2 * torch.linalg.cross(v, axis)
+    return axis + w * twice + torch.linalg.cross(v, twice)
 
 
 def covariances(model: GaussianModel) -> Tensor:

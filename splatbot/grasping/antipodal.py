@@ -14,7 +14,9 @@ PAD = 0.006  # [m] around a contact that its plane is fitted to
 _IMPLIED = 0.1  # weight of implied points beside seen ones
 _LEAST = 3e-4  # [m] between two sides
 _LEAN = 0.25  # [rad] that closing directions are varied by
-_ROUNDS = 3
+_LEVEL = 0.05  # [rad] from which on a closing direction is not level
+_STEPS = (1.0, 0.5, 0.25)  # of the rounds of refining
+_TO_MIDDLE = 0.1  # weight of the middle of the contacts beside the lines of their normals
 _CHUNK = 64
 
 Array32 = NDArray[np.float32]
@@ -73,20 +75,30 @@ class PairSearch:
 
 
 def antipodal_pairs(
-    surface: Surface, *, stroke: float, friction: float, samples: int, seed: int = 0, near: Array | None = None
+    surface: Surface,
+    *,
+    stroke: float,
+    friction: float,
+    samples: int,
+    up: Array,
+    seed: int = 0,
+    near: Array | None = None,
 ) -> PairSearch:
     """Opposite contacts from ``samples`` seeds on the surface, each refined.
 
-    From a seed a finger closes against its normal, and along variations of that; the first surface that faces the other
-    way is the second contact (Nguyen 1988: the line between the contacts lies in both friction cones).
-    Refining turns the line to the bisector of both normals and fits a plane to the Gaussians at each end, so that a
-    contact is on the surface that they have in common.
+    From a seed a finger closes against its normal, along a variation of that, and level where the cone allows it, for
+    what is round and was seen from above shows its widest place at its rim alone; the first surface that faces the
+    other way is the second contact (Nguyen 1988: the line between the contacts lies in both friction cones).
+    Refining turns the line to the bisector of both normals, moves it to where these meet, as a chord of a ball to its
+    diameter, and fits a plane to the Gaussians at each end, so that a contact is on the surface that they have in
+    common.
 
     Args:
         surface: of the target.
         stroke: widest opening [m].
         friction: coefficient.
         samples: seeds; the knob of time against how much of the surface is tried.
+        up: (3,) unit [world].
         seed: of their choice.
         near: (3,) [m, world] around which seeds are denser.
     """
@@ -96,11 +108,9 @@ def antipodal_pairs(
     chance = np.ones(len(surface)) if near is None else np.exp(-_distance(surface.points, near - center) / 0.03) + 0.05
     chance = chance * np.where(surface.seen, 1.0, 0.5)
     start = rng.choice(len(surface), min(samples, len(surface)), replace=False, p=chance / chance.sum())
-    origin = np.repeat(surface.points[start], 2, axis=0)
-    lean = rng.normal(0.0, _LEAN, (len(origin), 3)) * (np.arange(len(origin)) % 2)[:, None]
-    closing = -np.repeat(surface.normals[start], 2, axis=0) + lean
-    closing /= np.linalg.norm(closing, axis=1, keepdims=True)
     cone = np.arctan(friction)
+    closing, of = _closings(surface.normals[start], cone, up, rng)
+    origin = surface.points[start][of]
     end, away = _exits(surface, origin, closing, np.cos(cone))
     met, wide = np.isfinite(away), np.isfinite(away) & (away > stroke)
     narrowest = float(away[wide].min()) if wide.any() else np.inf
@@ -109,6 +119,17 @@ def antipodal_pairs(
     good = (pairs.closure > 0.0) & (pairs.width <= stroke) & (pairs.width > _LEAST)
     pairs = replace(pairs, contacts=pairs.contacts + center)
     return PairSearch(pairs.select(good), int((~met).sum()), int(wide.sum()), int((~good).sum()), narrowest)
+
+
+def _closings(normals: Array, cone: float, up: Array, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
+    """Unit directions (C, 3) for seeds with normals (S, 3), and which seed each is of (C,)."""
+    lean = rng.normal(0.0, _LEAN, normals.shape)
+    level = -normals + np.outer(normals @ up, up)
+    steep = np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0))
+    slanted = np.flatnonzero((steep > _LEVEL) & (steep < cone))
+    closing = np.concatenate([-normals, -normals + lean, level[slanted]])
+    every = np.arange(len(normals))
+    return _unit(closing), np.concatenate([every, every, slanted])
 
 
 def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tuple[Array, Array]:
@@ -129,17 +150,20 @@ def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tu
 
 
 def _refined(surface: Surface, first: Array, second: Array, cone: float) -> Pairs:
-    """Contacts on planes fitted at both ends, the line turned towards both normals as long as that is better."""
+    """Contacts on planes fitted at both ends, the line moved and turned to both normals as far as that is better.
+
+    What is not gets a smaller step in the next round. Better contacts where less was seen are not better.
+    """
     found = _fitted(surface, first, second, cone)
-    for _ in range(_ROUNDS):
+    for step in _STEPS:
         middle = found.contacts.mean(axis=1)
-        turned = found.normals[:, 1] - found.normals[:, 0]
-        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
-        half = found.width[:, None] / 2
-        other = _fitted(surface, middle - half * turned, middle + half * turned, cone)
-        better = other.closure > found.closure
-        if not better.any():
-            break
+        through = (middle + step * (_between(found) - middle))[:, None]
+        line = (1.0 - step) * _unit(found.contacts[:, 1] - found.contacts[:, 0])
+        line = _unit(line + step * _unit(found.normals[:, 1] - found.normals[:, 0]))
+        along = np.einsum("ckj,cj->ck", found.contacts - through, line)[..., None]
+        first, second = np.moveaxis(through + along * line[:, None], 1, 0)
+        other = _fitted(surface, first, second, cone)
+        better = other.closure + other.seen > found.closure + found.seen
         pick = better[:, None, None]
         found = Pairs(
             np.where(pick, other.contacts, found.contacts),
@@ -151,13 +175,24 @@ def _refined(surface: Surface, first: Array, second: Array, cone: float) -> Pair
     return found
 
 
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
+
+
+def _between(pairs: Pairs) -> Array:
+    """The points (C, 3) nearest to the lines of both normals: of a ball's chord its centre, of a can's a point of its
+    axis. Normals along one line leave it open where on it; so they are the middle of the contacts as far as it is."""
+    middle = pairs.contacts.mean(axis=1)
+    across = np.eye(3) - pairs.normals[..., :, None] * pairs.normals[..., None, :]
+    aside = np.einsum("ckij,ckj->ci", across, pairs.contacts - middle[:, None])
+    return np.asarray(middle + np.linalg.solve(across.sum(axis=1) + _TO_MIDDLE * np.eye(3), aside[..., None])[..., 0])
+
+
 def _fitted(surface: Surface, first: Array, second: Array, cone: float) -> Pairs:
-    line = second - first
-    line = line / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
+    line = _unit(second - first)
     ends = [_plane(surface, at, out) for at, out in ((first, -line), (second, line))]
     contacts, normals = (np.stack([end[k] for end in ends], axis=1) for k in range(2))
-    across = contacts[:, 1] - contacts[:, 0]
-    across = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    across = _unit(contacts[:, 1] - contacts[:, 0])
     cosines = np.minimum(np.einsum("ij,ij->i", normals[:, 1], across), -np.einsum("ij,ij->i", normals[:, 0], across))
     closure = 1.0 - np.arccos(np.clip(cosines, -1.0, 1.0)) / cone
     seen, doubt = np.minimum(ends[0][2], ends[1][2]), np.maximum(ends[0][3], ends[1][3])
@@ -179,7 +214,7 @@ def _plane(surface: Surface, at: Array, out: Array) -> tuple[Array, Array, Array
         total[k : k + _CHUNK] = np.c_[weight @ values.astype(np.float32), weight.sum(axis=1)]
     count = np.maximum(total[:, -1:], 1e-9)
     mean = total[:, :-1] / count
-    normal = mean[:, 3:6] / np.maximum(np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True), 1e-12)
+    normal = _unit(mean[:, 3:6])
     tilt = np.einsum("ij,ij->i", normal, out)
     ahead = np.einsum("ij,ij->i", mean[:, :3] - at, normal) / np.maximum(tilt, 0.2)
     empty = total[:, -1] < _IMPLIED

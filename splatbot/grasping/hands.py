@@ -17,6 +17,7 @@ OPENINGS = 0.002  # [m] that openings are rounded up to
 _CHUNK, _SAMPLE = 32, 250  # hands at once; points for a first look
 _GIVE = 0.003  # [m] that implied sides are off by and do not stop a hand
 _TOUCH = 0.003  # [m] between a pad and what it presses
+_SINK = 0.001  # [m] that a pad gives way where it touches
 _LOOK = 0.03  # [m] of room beyond which more is no better
 
 
@@ -30,7 +31,8 @@ class Hands:
         opening: (K,) of the fingers as they come [m].
         room: (K,) to the target, beside the pads and behind, on the straight way to the grasp [m]; below 0: it is hit.
         stands_out: (K,) how far the target stands out beyond the contacts under the pads [m].
-        held: (K,) share of the pads that has something under it, 0..1.
+        held: (K,) share of the pads' flat ends that has something under it, 0..1.
+        closure: (K,) as of pairs, of where the pads touch as they close: what was planned as contacts may be beside it.
     """
 
     T: Array
@@ -39,6 +41,7 @@ class Hands:
     room: Array
     stands_out: Array
     held: Array
+    closure: Array
 
     def __len__(self) -> int:
         return len(self.T)
@@ -81,7 +84,7 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     steep = -(poses[:, :3, 2] @ up) >= lowest
     poses, pair = poses[steep], pair[steep]
     zero = np.zeros(len(poses))
-    return Hands(poses, pair, pairs.width[pair] + 2 * SLACK, zero, zero.copy(), zero.copy())
+    return Hands(poses, pair, pairs.width[pair] + 2 * SLACK, *(zero.copy() for _ in range(4)))
 
 
 def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
@@ -99,9 +102,9 @@ def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: floa
 
 
 def beside_target(
-    hands: Hands, pairs: Pairs, surface: Surface, hand: HandShape, *, retreat: float, n_sigma: float
+    hands: Hands, pairs: Pairs, surface: Surface, hand: HandShape, *, retreat: float, n_sigma: float, friction: float
 ) -> Hands:
-    """The hands with their opening, and their room to the target on a straight way of ``retreat`` [m].
+    """The hands with their opening, their room to the target on a straight way of ``retreat`` [m], and what they hold.
 
     Each Gaussian is the box around its ellipsoid along the hand's axes, which is no smaller. Under the pads it asks for
     a wider opening; beside a finger, behind its tip, or where the palm is, it is in the way.
@@ -110,7 +113,7 @@ def beside_target(
     p = (surface.points - center).astype(np.float32)
     axes = [np.ascontiguousarray((n_sigma * surface.half[:, :, i]).astype(np.float32).T) for i in range(3)]
     give = np.where(surface.seen, 0.0, _GIVE).astype(np.float32)
-    out = [np.empty(len(hands)) for _ in range(4)]
+    out = [np.empty(len(hands)) for _ in range(5)]
     half = (pairs.width[hands.pair] / 2).astype(np.float32)
     for k in range(0, len(hands), _CHUNK):
         T = hands.T[k : k + _CHUNK]
@@ -120,10 +123,11 @@ def beside_target(
             u = np.ascontiguousarray(R[:, :, i])
             local.append(u @ p.T - np.einsum("ij,ij->i", u, at)[:, None])
             reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)) - give)
-        for into, values in zip(out, _measured(local, reach, half[k : k + _CHUNK, None], hand, retreat), strict=True):
+        found = _measured(local, reach, half[k : k + _CHUNK, None], hand, retreat)
+        for into, values in zip(out, (*found, _closure(local, give, hand, np.arctan(friction))), strict=True):
             into[k : k + _CHUNK] = values
-    opening, room, stands_out, held = out
-    return replace(hands, opening=opening, room=room, stands_out=stands_out, held=held)
+    opening, room, stands_out, held, closure = out
+    return replace(hands, opening=opening, room=room, stands_out=stands_out, held=held, closure=closure)
 
 
 def _measured(
@@ -158,9 +162,9 @@ def _measured(
 def _held(
     x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], half: NDArray[np.float32], hand: HandShape
 ) -> Array:
-    """Of four by four parts of each pad, the share that has the surface under it, of the lesser pad."""
+    """Of four by four parts of the flat end of each pad, the share that has the surface under it, of the lesser pad."""
     column = np.floor((x / hand.width + 0.5) * 4)
-    line = np.floor((z - hand.tip) / hand.width * 4) + 4
+    line = np.floor((z - hand.pad) / hand.width * 4) + 4
     on = (column >= 0) & (column < 4) & (line >= 0) & (line < 4)
     part = np.left_shift(1, np.where(on, 4 * column + line, 0).astype(np.int32))
     found = []
@@ -169,3 +173,37 @@ def _held(
         bits = np.bitwise_or.reduce(np.where(touched, part, 0), axis=1)
         found.append(np.unpackbits(bits.astype(np.uint16)[:, None].view(np.uint8), axis=1).sum(axis=1) / 16)
     return np.minimum(*found)
+
+
+def _closure(local: list[NDArray[np.float32]], give: NDArray[np.float32], hand: HandShape, cone: float) -> Array:
+    """How far inside of the friction cone the line between the places is where the pads touch first (K,).
+
+    Flat pads meet what stands out most under them, wherever a grasp was meant to be; a round finger meets it with a
+    face that is turned, which pushes it out.
+    """
+    x, y, z = local
+    side, side_back = _rounded(np.abs(x) - hand.pad_width / 2, (hand.width - hand.pad_width) / 2)
+    end, end_back = _rounded(z - hand.pad, hand.tip - hand.pad)
+    side *= np.sign(x)
+    under = (np.abs(x) < hand.width / 2) & (z < hand.tip) & (z > -hand.palm)
+    places, turned = [], []
+    for sign in (-1.0, 1.0):
+        height = np.where(under & (sign * y > 0.0), sign * y - side_back - end_back - give, -np.inf)
+        top = height.max(axis=1, keepdims=True)
+        weight = np.exp((height - np.where(np.isfinite(top), top, 0.0)) / _SINK)
+        weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+        places.append(np.stack([np.einsum("km,km->k", weight, values) for values in local], axis=1))
+        turned.append(np.stack([np.einsum("km,km->k", weight, values) for values in (side, end)], axis=1))
+    line = places[1] - places[0]
+    line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
+    cosines = []
+    for sign, sines in zip((-1.0, 1.0), turned, strict=True):
+        facing = np.sqrt(np.maximum(1.0 - (sines**2).sum(axis=1), 0.0))
+        cosines.append(line[:, 1] * facing - sign * (line[:, [0, 2]] * sines).sum(axis=1))
+    return np.asarray(1.0 - np.arccos(np.clip(np.minimum(*cosines), -1.0, 1.0)) / cone)
+
+
+def _rounded(beyond: NDArray[np.float32], radius: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Of a face so far ``beyond`` its flat part, rounded off with a radius [m]: sine of its turn, and its set-back."""
+    sine = np.clip(beyond / max(radius, 1e-6), 0.0, 0.999).astype(np.float32)
+    return sine, (max(radius, 0.0) * (1.0 - np.sqrt(1.0 - sine**2))).astype(np.float32)

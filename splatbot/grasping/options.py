@@ -38,7 +38,7 @@ class GraspOptions:
     friction: float = 0.5
     samples: int = 400
     rolls: int = 12
-    depths: int = 3
+    depths: int = 5
     pregrasp: float = 0.10
     wanted: int = 10
     approach: str = "any"

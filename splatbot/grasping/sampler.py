@@ -181,6 +181,7 @@ class _Search:
             stroke=self.s.hand.stroke,
             friction=self.o.friction,
             samples=self.o.samples,
+            up=self.s.scene.up,
             seed=self.o.seed,
             near=self.target.point,
         )
@@ -212,7 +213,13 @@ class _Search:
         hands = self._promising(hands)
         if len(hands):
             hands = beside_target(
-                hands, self.pairs, self.surface, self.s.hand, retreat=self.o.pregrasp, n_sigma=self.s.n_sigma
+                hands,
+                self.pairs,
+                self.surface,
+                self.s.hand,
+                retreat=self.o.pregrasp,
+                n_sigma=self.s.n_sigma,
+                friction=self.o.friction,
             )
         uneven = hands.stands_out > FLUSH
         free = ~uneven & (hands.room > 0.0)

@@ -14,7 +14,7 @@ from splatbot.grasping.surface import Surface
 from splatbot.protocols import Array, HandShape
 
 WEIGHTS: Mapping[str, float] = {
-    "closure": 3.0,  # how far inside of the friction cone the contacts are
+    "closure": 3.0,  # how far inside of the friction cone the places are where the pads touch
     "held": 2.0,  # how much of the pads is on the surface
     "centre": 2.0,  # how near the line between the contacts is to the target's middle
     "width": 1.0,  # how much of the stroke is left
@@ -43,7 +43,7 @@ def hand_terms(
     line = line / np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
     aside = np.linalg.norm(np.cross(surface.center - middle, line), axis=1)
     found = {
-        "closure": pairs.closure[p],
+        "closure": hands.closure,
         "held": hands.held,
         "centre": 1.0 - aside / _FAR,
         "width": (hand.stroke - pairs.width[p]) / _SPARE,

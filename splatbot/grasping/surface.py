@@ -149,11 +149,15 @@ def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, Ar
 def _completed(scene: MapScene, seen: Surface, areas: Array, views: Sequence[DepthView]) -> Surface:
     """With the sides that go down from its top to the support, and back from the face that was seen in front."""
     up = scene.up
-    parts = [_sides(seen, up, _floor(scene, seen, up))]
+    floor = _floor(scene, seen, up)
+    parts = [_sides(seen, up, floor)]
     for face in _faces(seen.normals, up):
         back, mirrored = _back(seen, face, up)
         parts.append(_sides(seen, face, back, closed=True, mirrored=mirrored))
     points, normals = (np.concatenate([part[k] for part in parts]) for k in range(2))
+    # Sides go down to the floor; so where those of a face that was seen in front end above it, there is no bottom.
+    standing = (normals @ up > -_TURNED_AWAY) | (points @ up < floor + _STEP)
+    points, normals = points[standing], normals[standing]
     thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
     thin = thin[:: 1 + len(thin) // MOST]
     points, normals = points[thin], normals[thin]
@@ -246,7 +250,8 @@ def _sides(
         return none
     across = _frame(direction)
     flat = seen.points @ across.T  # the last is the height
-    heights, low = _picture(flat[facing], seen.spread[facing])
+    # A disc that is nearly seen from its edge reaches no farther across than that.
+    heights, low = _picture(flat[facing], (seen.spread * (seen.normals @ direction))[facing])
     below, _ = _picture(flat[seen.normals @ direction < -_TURNED], None, like=(heights.shape, low))
     edges = _edges(heights)
     if not len(edges[0]):

@@ -13,6 +13,7 @@ from torch import Tensor
 from splatbot.config import MappingConfig
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.harmonics import sh_to_rgb
+from splatbot.gaussians.shape import shortest_axes
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
@@ -97,17 +98,32 @@ class Refiner:
         grads = torch.autograd.grad(loss, list(parameters.values()))
         visible = torch.zeros(len(model), dtype=torch.bool)
         visible[meta["visible_ids"][0]] = True
+        rows = visible.nonzero()[:, 0]
+        means, normals = model.means.index_select(0, rows), shortest_axes(model, rows)
         self.adam.step(model, dict(zip(PARAMETERS, grads, strict=True)), visible)
-        self._keep_flat(model, keyframe, visible)
+        self._keep_on_surface(model, rows, means, normals)
+        self._keep_flat(model, keyframe, rows)
         return float(loss.detach())
 
-    def _keep_flat(self, model: GaussianModel, keyframe: Keyframe, visible: Tensor) -> None:
+    def _keep_on_surface(self, model: GaussianModel, rows: Tensor, means: Tensor, normals: Tensor) -> None:
+        """Take back most of what a step has moved means along their normals.
+
+        The depth of all looks has been fused there, by its noise. A step sees one picture, and colour says next to
+        nothing of how far a plain wall is; where along the surface a Gaussian belongs, it does say.
+
+        Args:
+            means, normals: (M, 3) [m] of ``rows`` before the step.
+        """
+        after = model.means.index_select(0, rows)
+        along = ((after - means) * normals).sum(1, keepdim=True)
+        model.means.index_copy_(0, rows, after.addcmul_(along, normals, value=self.config.normal_share - 1))
+
+    def _keep_flat(self, model: GaussianModel, keyframe: Keyframe, rows: Tensor) -> None:
         """Gaussians in view stay discs: thin, and no larger than ``config.max_pixels`` of this keyframe.
 
         Pictures do not ask for it: a needle before a plain wall changes no pixel, and a blob shows what its disc does.
         But both reach into free space, and the normal of a blob is any.
         """
-        rows = visible.nonzero()[:, 0]
         viewmat = keyframe.viewmat[0].to(torch.float32)
         z = model.means[rows] @ viewmat[2, :3] + viewmat[2, 3]
         limit = (self.config.max_pixels * z / float(keyframe.K[0, 0, 0])).log()

@@ -10,6 +10,7 @@ from splatbot.grasping.surface import Surface, target_surface
 from tests.unit.grasping.things import BALL, BIG, BOX, CAN, THINGS, scene, target_of
 
 FRICTION = 0.5
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def _surface(name: str) -> Surface:
@@ -17,7 +18,7 @@ def _surface(name: str) -> Surface:
 
 
 def _search(name: str, stroke: float = 0.08) -> PairSearch:
-    return antipodal_pairs(_surface(name), stroke=stroke, friction=FRICTION, samples=400)
+    return antipodal_pairs(_surface(name), stroke=stroke, friction=FRICTION, samples=400, up=UP)
 
 
 @pytest.mark.parametrize("name", ["box", "can", "ball"])
@@ -62,10 +63,25 @@ def test_what_is_wider_than_the_hand_has_no_pairs_and_its_width_is_told() -> Non
 
 
 def test_a_slippery_surface_leaves_only_nearly_opposite_contacts() -> None:
-    pairs = antipodal_pairs(_surface("ball"), stroke=0.08, friction=0.1, samples=400).pairs
+    pairs = antipodal_pairs(_surface("ball"), stroke=0.08, friction=0.1, samples=400, up=UP).pairs
     middle = pairs.contacts.mean(axis=1)
     assert len(pairs)
     assert np.linalg.norm(middle - BALL.center, axis=1).max() < 0.1 * BALL.radius + 4e-3
+
+
+@pytest.mark.parametrize("name", ["ball", "can"])
+def test_a_chord_becomes_a_diameter(name: str) -> None:
+    """A ball's middle, and a can's axis, lie on the line between opposite contacts."""
+    pairs = _search(name).pairs
+    middle = pairs.contacts.mean(axis=1)
+    level = np.abs(pairs.contacts[:, 1, 2] - pairs.contacts[:, 0, 2]) < 0.2 * pairs.width
+    if name == "can":
+        off = np.linalg.norm((middle - CAN.foot)[level, :2], axis=1)
+    else:
+        off = np.linalg.norm(middle - BALL.center, axis=1)
+    assert len(off) > 30
+    assert np.median(off) < 0.7e-3
+    assert np.percentile(off, 90) < 2.5e-3
 
 
 def test_the_same_seed_gives_the_same_pairs() -> None:
@@ -78,6 +94,8 @@ def test_a_map_ten_kilometres_from_its_origin_has_the_same_widths() -> None:
 
     far = np.array([1e4, -1e4, 0.0])
     moved = replace(surface, points=surface.points + far, center=surface.center + far)
-    here, there = (antipodal_pairs(s, stroke=0.08, friction=FRICTION, samples=200).pairs for s in (surface, moved))
+    here, there = (
+        antipodal_pairs(s, stroke=0.08, friction=FRICTION, samples=200, up=UP).pairs for s in (surface, moved)
+    )
     assert len(here) == len(there)
     np.testing.assert_allclose(there.width, here.width, atol=1e-5)

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 from splatbot.bench.collision_peers import solid_mesh
 from splatbot.bench.tabletop import Block, Solid, Tabletop
@@ -27,7 +28,19 @@ from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.robots.wide_hand import panda_2f140
 from splatbot.segmentation import segment
-from tests.unit.grasping.things import BIG, BOX, CAN, TABLE, THINGS, colored, model, scene, seen_from_above, target_of
+from tests.unit.grasping.things import (
+    BALL,
+    BIG,
+    BOX,
+    CAN,
+    TABLE,
+    THINGS,
+    colored,
+    model,
+    scene,
+    seen_from_above,
+    target_of,
+)
 
 COVER = 0.005  # [m] that the spheres of a hand reach beyond it
 
@@ -165,6 +178,31 @@ def test_sides_that_nobody_saw_are_implied_and_told() -> None:
     assert best.terms["seen"] < 0.5
     assert best.width == pytest.approx(BOX.size[1], abs=8e-3)
     assert np.abs(BOX.distance(best.contacts)).max() < 4e-3
+
+
+def test_no_bottom_is_implied_half_way_up_what_stands() -> None:
+    """Of a ball that was seen from above and in front, what is implied is its back, and sides down to the table."""
+    points = model().means.double().numpy()
+    own = (np.abs(BALL.distance(points)) < 1e-3) & (points[:, 2] > 1e-3)
+    shown = (points - BALL.center) @ [0.5, 0.0, 1.0] > -0.2 * BALL.radius
+    above = segment(model().select(torch.from_numpy(np.flatnonzero(~own | shown))), np.eye(4))
+    surface = target_surface(above, target_of(above, BALL, "ball").rows)
+    implied = surface.points[~surface.seen]
+    assert len(implied) > 100
+    down = surface.normals[~surface.seen][:, 2] < -0.7
+    assert not (down & (implied[:, 2] > 0.01)).any()
+
+
+def test_a_ball_is_held_across_its_middle_and_closure_is_that_of_the_pads_there() -> None:
+    """Two circles that meet: a round finger end's face is turned by asin(offset / (both radii))."""
+    hand = panda().hand
+    assert hand is not None
+    best = grasped("ball").unwrap()
+    assert np.linalg.norm(best.contacts.mean(axis=0) - BALL.center) < 3e-3
+    beyond = transform_points(inverse(best.T_world_tcp), np.array([BALL.center]))[0, 2] - hand.pad
+    turned = np.arcsin(max(beyond, 0.0) / (BALL.radius + hand.tip - hand.pad))
+    assert best.terms["closure"] == pytest.approx(1.0 - turned / np.arctan(GraspOptions().friction), abs=0.15)
+    assert best.terms["closure"] > 0.6
 
 
 def test_no_side_is_implied_where_depth_saw_through() -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from splatbot.gaussians import GaussianModel
+from splatbot.gaussians.shape import rotations
 from splatbot.geometry import se3_exp
 from splatbot.mapping.fusion import new_gaussians, view_of
 from splatbot.mapping.keyframes import Keyframe
@@ -199,3 +200,24 @@ def test_a_blob_becomes_a_disc_of_the_same_extent(make_keyframe: MakeKeyframe) -
     changed = sizes[:, 0] < 0.0039
     assert float(changed.double().mean()) > 0.9
     np.testing.assert_allclose(sizes[changed].numpy(), [[0.2 * 0.004, 0.004, 0.004]] * int(changed.sum()), rtol=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_step_moves_means_along_their_normals_by_the_stated_share_and_along_the_surface_in_full(
+    make_keyframe: MakeKeyframe, share: float
+) -> None:
+    keyframe = make_keyframe()
+    moves = []
+    for one in (1.0, share):
+        model = disturbed(keyframe)
+        before, normals = model.means.clone(), rotations(model)[:, :, 2]  # of a new Gaussian, z is the normal
+        refiner_for(model, mapping__normal_share=one).step(model, keyframe)
+        moves.append(model.means - before)
+    along, across = [], []
+    for move in moves:
+        part = (move * normals).sum(1, keepdim=True) * normals
+        along.append(part)
+        across.append(move - part)
+    assert along[0].norm(dim=1).max() > 1e-4
+    torch.testing.assert_close(along[1], share * along[0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(across[1], across[0], atol=1e-6, rtol=0)

@@ -20,6 +20,8 @@ def test_the_pandas_hand_is_as_published() -> None:
     assert hand.stroke == 0.08
     assert hand.force == 70.0
     assert hand.tip == pytest.approx(0.0088, abs=1e-4)
+    assert hand.pad == pytest.approx(0.0584 + 0.0413 - 0.1034, abs=1e-4)  # where its round end begins
+    assert hand.pad_width == pytest.approx(0.0, abs=1e-6)
     assert hand.palm == pytest.approx(0.1034 - 0.066, abs=5e-4)
     assert hand.palm_size == pytest.approx((0.063, 0.204), abs=6e-3)
 
