@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from splatbot.collision.evidence import DepthView
+    from splatbot.gaussians import GaussianModel
     from splatbot.grasping.affordance import Hint, View
     from splatbot.grasping.types import GraspResult
     from splatbot.segmentation import MapScene
@@ -107,14 +110,16 @@ def grasp(
         friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
     )
     arm = load_robot(robot)
-    scene = _scene(map, base)
+    views = _measured(map)
+    scene, seen_from = _scene(map, base, views)
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), PlaceAffordance(), TagAffordance()])
     sampler = GraspSampler(
         scene,
         arm,
         hand_only=hand_only,
-        observers=_observers(map, scene),
+        observers=seen_from,
+        views=views,
         n_sigma=n_sigma,
         min_observations=min_observations,
     )
@@ -133,31 +138,52 @@ def grasp(
     return 0
 
 
-def _scene(map_: Path, base: Pose | None) -> MapScene:
+def _scene(map_: Path, base: Pose | None, views: Sequence[DepthView]) -> tuple[MapScene, NDArray[np.float64] | None]:
+    """What is in the map, but for flying pixels at edges, and where each of its Gaussians was seen from."""
+    import torch
+
+    from splatbot.collision import gather_evidence
     from splatbot.gaussians import GaussianModel
     from splatbot.segmentation import segment
     from splatbot.workspace import find_workspace
 
     known = find_workspace(map_)
     model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
+    solid = torch.from_numpy(~gather_evidence(model, views).seen_through).nonzero()[:, 0]
+    model = model.select(solid)
     T = base_pose(base, map_)
     own = known is not None and base is None  # box and plane belong to the base of the file
-    return segment(
+    seen_from = _observers(map_, model)
+    scene = segment(
         model,
         T,
         box=known.box if own and known is not None else None,
         plane=known.support_plane if own and known is not None else None,
         names=known.objects if known is not None else (),
+        observers=seen_from,
     )
+    return scene, seen_from
 
 
-def _observers(map_: Path, scene: MapScene) -> NDArray[np.float64] | None:
+def _observers(map_: Path, model: GaussianModel) -> NDArray[np.float64] | None:
     if not (map_ / "frames.jsonl").is_file():
         return None
     from splatbot.results.folder import RunFolder
     from splatbot.results.observers import observers
 
-    return observers(RunFolder(map_), scene.model)
+    return observers(RunFolder(map_), model)
+
+
+def _measured(map_: Path) -> tuple[DepthView, ...]:
+    """Depth of the run: what more frames saw through than saw is not there, seen of the thing or not."""
+    if not (map_ / "frames.jsonl").is_file():
+        return ()
+    from splatbot.results.folder import RunFolder
+    from splatbot.results.views import depth_views
+    from splatbot.robots.in_view import reopen_log
+
+    run = RunFolder(map_)
+    return tuple(depth_views(run, reopen_log(run)))
 
 
 def _hint(

@@ -32,6 +32,7 @@ _TURNED_AWAY = 0.7  # below it a normal is of another face
 _FEW = 20  # points that are no face
 _BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
 _SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
+_SPREAD = 1.65  # standard deviations, that 5 % of what is noisy are beyond
 _TUBE = 0.003  # [m] around a line within which it meets a point
 _SEEN = 0.006  # [m] around seen points of a side within which none is added
 _ROWS = 0.003  # [m] between added points
@@ -214,17 +215,26 @@ def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
     """Where along ``face`` [m, world] the target ends behind, and whether its back is the mirror image of its front.
 
     A flat front is that of a box, as deep as its other sides show; a round one turns away half way to its back. Where
-    nothing of either was seen, a thing is taken to be as deep as it is narrow.
+    nothing of either was seen, a thing is taken to be as deep as it is narrow. Noise of the front shows no depth.
     """
-    along = seen.points @ face
-    facing = along[seen.normals @ face > _FACING]
-    near, far = float(np.percentile(facing, 95)), float(np.percentile(along, 5))
-    if near - far > _SHOWN:
-        flat = float((near - facing < _SHOWN).mean()) > 0.7
-        return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
     across = seen.points @ np.stack([up, np.cross(up, face)], axis=1)
+    along = seen.points @ face
+    facing = seen.normals @ face > _FACING
+    bent, noise = _bowl(across[facing], along[facing])
+    near, far = float(np.percentile(bent, 95)), float(np.percentile(along, 5))
+    if near - far > _SHOWN + _SPREAD * noise:
+        flat = float((near - bent < _SHOWN).mean()) > 0.7
+        return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
     narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
     return near - min(narrow, 2 * _BEHIND), False
+
+
+def _bowl(at: Array, heights: Array) -> tuple[Array, float]:
+    """Heights (P,) as a paraboloid over places (P, 2) has them, and the standard deviation from it [m]."""
+    x, y = (at - at.mean(axis=0)).T
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    bent = terms @ np.linalg.lstsq(terms, heights, rcond=None)[0]
+    return bent, 1.48 * float(np.median(np.abs(heights - bent)))
 
 
 def _sides(

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from splatbot.collision import GaussianCollisionField, surface_error
 from splatbot.logs import Log
 from splatbot.results.folder import RunFolder
-from splatbot.tracking.prepare import usable_depth
+from splatbot.results.views import depth_views
 
 REACH = 1.0  # [m] around the base
 SHARE = 0.999  # of what was measured whose error it holds
-_FRAMES = 40  # that are asked at least
 
 
 def own_margin(run: str | Path, log: Log, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
@@ -31,10 +30,5 @@ def own_margin(run: str | Path, log: Log, field: GaussianCollisionField, T_world
         LogError: the log is damaged.
         InputError: nothing was measured there.
     """
-    folder = RunFolder(run)
-    poses = sorted(folder.load_poses().items())
-    some = poses[:: max(1, len(poses) // _FRAMES)]
-    config = folder.load_config().tracking
-    frames = ((log[index], T) for index, T in some)
-    views = ((usable_depth(frame, config), frame.camera, T) for frame, T in frames)
+    views = depth_views(RunFolder(run), log)
     return surface_error(field, views, around=[*T_world_base[:3, 3], REACH]).share(SHARE)

@@ -16,8 +16,9 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
-from splatbot.segmentation.parts import cut_at_steps, nearest_of, region
+from splatbot.segmentation.parts import cut_at_steps, local_normals, nearest_of, region
 from splatbot.segmentation.plane import NEAR, Support, find_support, given_support
+from splatbot.segmentation.rooms import cut_in_room
 from splatbot.workspace import NamedPlace
 
 OPAQUE = 0.3  # fainter Gaussians are no surface
@@ -30,6 +31,7 @@ _SPACED = 2.2  # times the usual size of Gaussians: in a coarse map they are far
 _AROUND = 0.05  # [m] around what was pointed at that is looked at
 _STRAY = 0.006  # [m] around an object within which faint Gaussians are its own
 _OVER = 0.7  # of what is above a plane that is over it
+_ALONG, _MOSTLY = 0.8, 0.5  # cosine between normals along a plane and its own; share of its points that are so
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +130,7 @@ def segment(
     names: Sequence[NamedPlace] = (),
     apart: float = _APART,
     cut: bool = True,
+    observers: Array | None = None,
 ) -> MapScene:
     """Remove the support of a map and gather what stands on it.
 
@@ -140,13 +143,19 @@ def segment(
         apart: objects have more than this between their Gaussians [m]; in a coarse map it is more.
         cut: what hangs together may be several things: one that is wide may be a support of others, and it is cut at
             steps between level faces. Without, it is one, as a mallet is whose head is higher than its handle.
+        observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known. With them, what
+            hangs together and is too large for a thing, as a shelf with all that leans on its walls, is cut where
+            faces meet at concave edges; without, it is no object.
 
     Raises:
-        InputError: nothing of the map is in the box.
+        InputError: nothing of the map is in the box, or the observers are of another map.
     """
     model = source.model if isinstance(source, Snapshot) else source
     T = np.asarray(T_world_base, dtype=np.float64)
     points = transform_points(inverse(T), model.means.detach().double().numpy())
+    if observers is not None and observers.shape != points.shape:
+        raise InputError(f"is {observers.shape}.", field="observers", hint=f"give ({len(points)}, 3)")
+    eyes = None if observers is None else transform_points(inverse(T), observers)
     low, high = np.array([[-2.0] * 3, [2.0] * 3]) if box is None else np.asarray(box, dtype=np.float64)
     used = np.flatnonzero(solid_rows(model) & ((points >= low - ABOVE) & (points <= high)).all(axis=1))
     if not len(used):
@@ -161,7 +170,8 @@ def segment(
     objects: list[MapObject] = []
     colors = model.colors.detach().double().numpy()
     for rows in sorted(
-        _things(points, above, apart, _DEEPEST, labels, supports, cut), key=lambda rows: (-len(rows), int(rows[0]))
+        _things(points, eyes, above, apart, _DEEPEST, labels, supports, cut),
+        key=lambda rows: (-len(rows), int(rows[0])),
     ):
         labels[rows] = len(objects)
         objects.append(_described(len(objects), rows, points[rows], colors[rows], T))
@@ -181,6 +191,7 @@ def _known(plane: ArrayLike, T_world_base: Array, points: Array) -> Support:
 
 def _things(
     points: Array,
+    eyes: Array | None,
     used: NDArray[np.int64],
     apart: float,
     deeper: int,
@@ -198,7 +209,10 @@ def _things(
             on = rows[above_support(ledge, points[rows])]
             supports.append(replace(ledge, inside=np.zeros(0, np.bool_)))
             labels[rows[np.abs(ledge.height(points[rows])) < NEAR]] = -1 - len(supports)
-            found += _things(points, on, apart, deeper - 1, labels, supports, cut)
+            found += _things(points, eyes, on, apart, deeper - 1, labels, supports, cut)
+        elif cut and eyes is not None and wide > LARGEST:
+            parts = cut_in_room(points[rows], eyes[rows], apart=apart, fewest=FEWEST)
+            found += [rows[some] for some in parts if np.ptp(points[rows[some]], axis=0).max() <= LARGEST]
         elif len(rows) >= FEWEST and wide <= LARGEST:
             found += [rows[some] for some in cut_at_steps(points[rows], fewest=FEWEST)] if cut else [rows]
     return found
@@ -211,13 +225,20 @@ def _ledge(points: Array) -> Support | None:
         plane = find_support(points[left])
         if plane is None or plane.inside.sum() < _SHARE * len(points):
             break
-        if (best is None or plane.offset < best.offset) and _holds(plane, points):
+        if (best is None or plane.offset < best.offset) and _holds(plane, points) and _level(plane, points, left):
             best = plane
         left[np.flatnonzero(left)[plane.inside]] = False
     if best is None:
         return None
     away = best.height(points)
     return Support(best.normal, best.offset, best.error, np.abs(away) < NEAR)
+
+
+def _level(plane: Support, points: Array, left: NDArray[np.bool_]) -> bool:
+    """Whether the plane's points are a face along it, not where it cuts through walls."""
+    rows = np.flatnonzero(left)[plane.inside]
+    normals = local_normals(points, rows[:: max(1, len(rows) // 300)])
+    return float((np.abs(normals @ plane.normal) > _ALONG).mean()) > _MOSTLY
 
 
 def _holds(plane: Support, points: Array) -> bool:

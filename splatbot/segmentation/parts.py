@@ -112,9 +112,17 @@ def region(points: Array, seeds: NDArray[np.bool_], *, fewest: int) -> NDArray[n
     return np.flatnonzero(np.isin(faces.owner, chosen))
 
 
-def _neighbours(points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The nearest of each point (P, K), and which of them are within 12 mm."""
-    index, square = _search(points, points, min(_MOST, len(points)))
+def local_normals(points: Array, rows: NDArray[np.int64] | None = None) -> Array:
+    """Directions (M, 3) in which the neighbours within 12 mm of points (P, 3) [m] spread least; of no sign.
+
+    ``rows`` (M,): of these alone; None: of all.
+    """
+    return _normals(points, *_neighbours(points, rows))
+
+
+def _neighbours(points: Array, rows: NDArray[np.int64] | None = None) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The nearest of each point, or of those named, (P, K), and which of them are within 12 mm."""
+    index, square = _search(points, points if rows is None else points[rows], min(_MOST, len(points)))
     return index, square < _REACH**2
 
 

@@ -11,6 +11,7 @@ import pytest
 from splatbot.cli import main
 from splatbot.logs import open_log
 from splatbot.run import map_log
+from tests.e2e.real_grasps import check_cube, check_shelf_box
 
 # name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 8 to 15 mm and about 3 cm.
 LOGS = [
@@ -19,6 +20,8 @@ LOGS = [
     pytest.param("visp_tabletop", 99, 0.020, id="visp_tabletop", marks=pytest.mark.long),
     pytest.param("redkitchen_000_199", 200, 0.015, id="redkitchen_000_199", marks=pytest.mark.long),
 ]
+
+GRASPS = {"visp_tabletop": check_cube, "apc_shelf_robot": check_shelf_box}
 
 
 @pytest.mark.parametrize(("name", "frames", "ate_m"), LOGS)
@@ -36,6 +39,8 @@ def test_every_frame_is_tracked_within_the_bound(
     check_views(name, metrics)
     if name == "arm_wrist_48":
         check_twin(data_root / name, tmp_path)
+    if name in GRASPS:
+        GRASPS[name](data_root / name, tmp_path / name)
 
 
 def check_twin(log: Path, folder: Path) -> None:
