@@ -1,4 +1,4 @@
-"""Grasps on the maps of recordings, held to what does not come from the map: pictures and depth as they were measured."""
+"""Grasps on the maps of recordings, held to what does not come from the map: raw pictures and depth."""
 
 from __future__ import annotations
 
