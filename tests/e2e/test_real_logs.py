@@ -11,7 +11,7 @@ import pytest
 from splatbot.cli import main
 from splatbot.logs import open_log
 from splatbot.run import map_log
-from tests.e2e.real_grasps import check_cube, check_shelf_box
+from tests.e2e.real_grasps import check_shelf_box
 
 # name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 8 to 15 mm and about 3 cm.
 LOGS = [
@@ -21,7 +21,7 @@ LOGS = [
     pytest.param("redkitchen_000_199", 200, 0.015, id="redkitchen_000_199", marks=pytest.mark.long),
 ]
 
-GRASPS = {"visp_tabletop": check_cube, "apc_shelf_robot": check_shelf_box}
+GRASPS = {"apc_shelf_robot": check_shelf_box}
 
 
 @pytest.mark.parametrize(("name", "frames", "ate_m"), LOGS)
