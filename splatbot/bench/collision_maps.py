@@ -47,7 +47,8 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     name = str(folder.load_metrics()["log"]["name"])
     log = reopen_log(folder)
     poses = folder.load_poses()
-    field = GaussianCollisionField(GaussianModel.load(run / "map.ply"), min_observations=min_observations)
+    model = GaussianModel.load(folder.map)
+    field = GaussianCollisionField(model, min_observations=min_observations)
     rng = np.random.default_rng(0)
     held_out = {row.index for row in folder.load_frames() if row.held_out}
     clouds, free, fusion = [], [], DepthFusion(_VOXEL, _FARTHEST)
@@ -80,7 +81,7 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     frames = [(log[index], poses[index]) for index in sorted(held_out & poses.keys())]
     errors = [depth_error(seen.render(frame.camera, T)[1], frame.depth).l1 for frame, T in frames]
     _add_mean(results, f"{name}, held-out views", "depth error, mean, fused depth", errors)
-    scores = score_views(log, GaussianModel.load(run / "map.ply"), {frame.index: T for frame, T in frames}).scores
+    scores = score_views(log, model, {frame.index: T for frame, T in frames}).scores
     _add_mean(results, f"{name}, held-out views", "depth error, mean, map", [score.depth_l1_m for score in scores])
     _picture(field, log[min(poses)], poses[min(poses)], cloud, out / f"{name}-field.jpg")
 

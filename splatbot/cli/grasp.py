@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -110,7 +111,7 @@ def grasp(
         friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
     )
     arm = load_robot(robot)
-    views = _measured(map)
+    views, unread = _measured(map)
     scene, seen_from = _scene(map, base, views)
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), PlaceAffordance(), TagAffordance()])
@@ -125,6 +126,7 @@ def grasp(
     )
     sampler.margin = margin_of(margin, map, sampler.field, scene.T_world_base)
     result = sampler.sample(found, options)
+    result = replace(result, notes=(*unread, *result.notes))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
@@ -174,16 +176,24 @@ def _observers(map_: Path, model: GaussianModel) -> NDArray[np.float64] | None:
     return observers(RunFolder(map_), model)
 
 
-def _measured(map_: Path) -> tuple[DepthView, ...]:
-    """Depth of the run: what more frames saw through than saw is not there, seen of the thing or not."""
+def _measured(map_: Path) -> tuple[tuple[DepthView, ...], tuple[str, ...]]:
+    """Depth of the run, and a note where its log cannot be read any more.
+
+    What more frames saw through than saw is not there, seen of the thing or not.
+    """
     if not (map_ / "frames.jsonl").is_file():
-        return ()
+        return (), ()
+    from splatbot.errors import SplatbotError
     from splatbot.results.folder import RunFolder
     from splatbot.results.views import depth_views
     from splatbot.robots.in_view import reopen_log
 
     run = RunFolder(map_)
-    return tuple(depth_views(run, reopen_log(run)))
+    try:
+        log = reopen_log(run)
+    except SplatbotError as error:
+        return (), (f"What depth saw through was not asked, for the run's log cannot be read: {error}",)
+    return tuple(depth_views(run, log)), ()
 
 
 def _hint(

@@ -106,7 +106,7 @@ class Refiner:
         visible = torch.zeros(len(model), dtype=torch.bool)
         visible[rows] = True
         means, normals = model.means.index_select(0, rows), shortest_axes(model, rows)
-        self.adam.step(model, dict(zip(PARAMETERS, grads, strict=bool(pull is None))), visible)
+        self.adam.step(model, dict(zip(PARAMETERS, grads[: len(PARAMETERS)], strict=True)), visible)
         self._keep_on_surface(model, rows, means, normals)
         self._keep_flat(model, keyframe, rows)
         return float(loss.detach())

@@ -58,8 +58,12 @@ def test_the_map_is_read_by_the_same_client_from_our_server(subprotocol: str, se
 def test_topics_that_come_later_are_advertised(service: Service) -> None:
     with FoxgloveClient(service.ws("/foxglove")) as client:
         client.subscribe(POINTS)
+        _check(client.message(POINTS)[1])
+        late = "/maps/late/map/points"
+        assert late not in client.channels
         service.store.add("late", source="a", state="static", snapshot=wall())
-        client.subscribe("/maps/late/map/points", number=8)
+        client.subscribe(late, number=8)
+        _check(client.message(late, number=8)[1])
 
 
 def test_what_makes_no_sense_is_told_and_the_connection_stays(service: Service) -> None:

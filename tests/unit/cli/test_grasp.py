@@ -43,6 +43,19 @@ def test_ranked_grasps_are_printed_written_and_drawn(run: RunCommand, map_file: 
     assert picture.std() > 5
 
 
+def test_a_run_whose_log_is_gone_still_answers_and_says_what_was_not_asked(
+    run: RunCommand, map_file: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "frames.jsonl").write_text("")
+    (tmp_path / "trajectory.tum").write_text("")
+    (tmp_path / "metrics.json").write_text(json.dumps({"log": {"uri": str(tmp_path / "moved")}}))
+    out = tmp_path / "out"
+    answer = run("grasp", "--map", tmp_path, *BASE, "--target", "red box", "--wanted", 1, "--out", out)
+    assert answer.code == 0, answer.err
+    (note,) = [note for note in json.loads((out / "grasp.json").read_text())["notes"] if "saw through" in note]
+    assert "moved" in note
+
+
 def test_names_and_base_come_from_the_scene_beside_the_map(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
     names = (NamedPlace("soup", np.array([0.50, -0.15, 0.12])),)
     Workspace(T_world_base=np.eye(4), objects=names).save(tmp_path / "scene.yaml")
