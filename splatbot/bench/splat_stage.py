@@ -28,7 +28,7 @@ from splatbot.mapping.fusion import view_of
 from splatbot.rasterize import rasterize_pixels
 from splatbot.slam import Slam
 from splatbot.tracking.prepare import Level, PreparedFrame, normals_of, prepare, smoothed
-from splatbot.tracking.reference import sampled_pixels
+from splatbot.tracking.reference import sampled_pixels, slopes_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -93,7 +93,8 @@ def align_to_map(
     T_camera_world, least_ms = inverse(T_world_camera), 0.0
     for index, steps in STEPS:
         level = prepared.levels[index]
-        pixels = sampled_pixels(level, normals_of(level.depth, level.camera), config.tracking.n_pixels)
+        normals, slopes = normals_of(level.depth, level.camera), slopes_of(level.gray)
+        pixels = sampled_pixels(level, normals, slopes, config.tracking.n_pixels)
         exposure = np.array([1.0, 0.0])
         for _ in range(steps):
             least_ms += _least_ms(model, level, pixels, T_camera_world)

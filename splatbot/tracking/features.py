@@ -23,6 +23,9 @@ _MAX_REPROJECTION = 3.0  # [px]
 _SCALE_FACTOR = 1.2  # from one level of ORB's pyramid to the next
 _MATCH_RATIO = 0.8  # Lowe's ratio test
 _MIN_SPREAD = 0.05  # standard deviation of matched pixels across their narrowest direction [image width]
+_TILES = 8  # across the image, that keypoints are spread over
+_CROWD = 2.0  # times its share of them that a tile has at most
+_TO_CHOOSE_FROM = 4  # times as many keypoints as are kept
 _PATCH = 31  # [px] that an ORB descriptor looks at on the finest level
 _MATCH_BITS = 64  # descriptors that differ in more of their 256 bits are strangers
 
@@ -75,25 +78,64 @@ def detect(
 ) -> Features:
     """ORB keypoints of an image, with 3-D points where a depth of the same surface lies within two pixels.
 
-    None is nearer to a pixel that ``mask`` (H, W) leaves out than its descriptor reaches.
+    They are spread over the image, see :func:`spread`. None is nearer to a pixel that ``mask`` (H, W) leaves out than
+    its descriptor reaches.
     """
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     usable = None
     if mask is not None:
         gray[~mask] = 128  # coarse levels of ORB's pyramid reach further than the margin: let them see nothing there
         usable = cv2.erode(mask.astype(np.uint8), np.ones((_PATCH, _PATCH), np.uint8))
-    orb = cv2.ORB.create(nfeatures=n_features, scaleFactor=_SCALE_FACTOR, fastThreshold=10)
-    keypoints, descriptors = orb.detectAndCompute(gray, usable)
+    orb = cv2.ORB.create(nfeatures=_TO_CHOOSE_FROM * n_features, scaleFactor=_SCALE_FACTOR, fastThreshold=10)
+    found = orb.detect(gray, usable)
+    if not found:
+        return Features.none()
+    pixels, _ = _pixels(found)
+    known = _native.depth_around(depth, pixels) > 0
+    chosen = spread(pixels, np.array([k.response for k in found]), known, camera.width, n_features)
+    keypoints, descriptors = orb.compute(gray, [found[k] for k in chosen])
     if descriptors is None:
         return Features.none()
-    scales = np.float32(_SCALE_FACTOR) ** np.array([k.octave for k in keypoints], dtype=np.float32)
-    # OpenCV scales a level's coordinates about the corner pixel's centre, the level itself is scaled about its corner.
-    pixels = np.array([k.pt for k in keypoints], dtype=np.float32) + 0.5 * (scales[:, None] - 1)
+    pixels, scales = _pixels(keypoints)
     z = np.asarray(_native.depth_around(depth, pixels))
     rays = np.stack(
         [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(z))], 1
     )
     return Features(pixels, np.asarray(descriptors, dtype=np.uint8), rays * z[:, None], scales)
+
+
+def _pixels(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where keypoints are in the image (N, 2), and the scales (N,) of their levels."""
+    scales = np.float32(_SCALE_FACTOR) ** np.array([k.octave for k in keypoints], dtype=np.float32)
+    # OpenCV scales a level's coordinates about the corner pixel's centre, the level itself is scaled about its corner.
+    corners = np.array(cv2.KeyPoint.convert(keypoints), dtype=np.float32).reshape(-1, 2)
+    return corners + 0.5 * (scales[:, None] - 1), scales
+
+
+def spread(
+    pixels: NDArray[np.float32],
+    strengths: NDArray[np.float64],
+    known: NDArray[np.bool_],
+    width: int,
+    count: int,
+) -> Index:
+    """Indices of at most ``count`` keypoints at pixels (N, 2): the strongest that are not more than a tile's part.
+
+    A tile has at most ``_CROWD`` times its share while others have some left. Those ``known`` (N,), whose depth is,
+    come first: only they anchor a pose.
+
+    The strongest of all are often together on one textured thing. There a turn and a shift of the camera look alike,
+    and so does a shutter that rolls while it moves, which stretches the image: small errors of all of them become
+    centimetres of the pose. Every part of the image together tells these apart (Mur-Artal et al. 2015, sec. V-A).
+    """
+    across, down = (pixels * (_TILES / width)).astype(np.intp).T
+    tile = down * (_TILES + 1) + across
+    crowd = max(1, int(_CROWD * count / max(len(np.unique(tile)), 1)))
+    order = np.lexsort((-strengths, ~known, tile))
+    begins = np.r_[0, np.flatnonzero(np.diff(tile[order])) + 1]
+    rank = np.empty(len(order), np.intp)
+    rank[order] = np.arange(len(order)) - np.repeat(begins, np.diff(np.r_[begins, len(order)]))
+    return np.lexsort((-strengths, np.maximum(rank, crowd - 1), ~known))[:count]
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,11 @@ _INLIER = 3.0  # [σ]
 # A frame of less contrast than this share of the reference's shows nothing: a covered lens, the dark, a lost image. The
 # exposure fit would explain it by a gain near 0, at any pose.
 _MIN_CONTRAST = 0.1
-# On a table, or before a wall, depth agrees wherever the camera slides along it; colour does not.
+# On a table, or before a wall, depth agrees wherever the camera slides along it; colour does not. Nor does most of
+# what has little texture disagree, so what counts is where grey is steep.
 _FEW_PHOTOMETRIC = 0.55
-# With fewer inliers of either kind, another pose may explain the frame better.
+_FEW_EDGES = 0.5
+# With fewer inliers of any kind, another pose may explain the frame better.
 _EXPLAINED = 0.6
 
 
@@ -37,6 +39,7 @@ class Health:
     Args:
         overlap: share of the reference points that the frame sees, by colour or depth.
         photometric_inliers: share of those whose grey agrees within 3 σ.
+        edge_inliers: the same, each point weighed by how steep grey is there; 1 where it is nowhere steep.
         geometric_inliers: share of those with depth whose depth agrees within 3 σ; 1 where none has depth.
         score: mean residual [σ], saturated; smaller is better, comparable between poses of one frame.
         contrast: standard deviation of the frame's grey at those points over that of the reference's; 1 where the
@@ -45,6 +48,7 @@ class Health:
 
     overlap: float
     photometric_inliers: float
+    edge_inliers: float
     geometric_inliers: float
     score: float
     contrast: float
@@ -52,7 +56,7 @@ class Health:
 
 def is_explained(health: Health) -> bool:
     """Whether a pose explains the frame so well that no other need be looked for."""
-    return min(health.photometric_inliers, health.geometric_inliers) >= _EXPLAINED
+    return min(health.photometric_inliers, health.edge_inliers, health.geometric_inliers) >= _EXPLAINED
 
 
 def measure(
@@ -60,20 +64,23 @@ def measure(
 ) -> Health:
     """Score a pose of a frame against references on one level; only exposure is fitted."""
     T_camera_world = inverse(T_world_camera)
-    photo, depth, here, there = [], [], [], []
+    photo, depth, slope, here, there = [], [], [], [], []
     for reference in references:
         points = reference.levels[index]
         found = residuals(level, points, T_camera_world @ reference.T_world_camera, config)
         photo.append(np.abs(found.photometric))
         depth.append(np.abs(found.geometric))
+        slope.append(points.slope)
         seen = np.isfinite(found.photometric)
         there.append(points.gray[seen].astype(np.float64))
         here.append(found.photometric[seen] * config.sigma_gray + found.gain * there[-1] + found.offset)
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)
     seen, ranged = np.isfinite(r_photo), np.isfinite(r_depth)
+    steep = np.concatenate(slope)[seen].astype(np.float64)
     return Health(
         overlap=float(seen.mean()) if len(seen) else 0.0,
         photometric_inliers=float((r_photo[seen] < _INLIER).mean()) if seen.any() else 0.0,
+        edge_inliers=float(steep @ (r_photo[seen] < _INLIER) / steep.sum()) if steep.sum() > 0 else 1.0,
         geometric_inliers=float((r_depth[ranged] < _INLIER).mean()) if ranged.any() else 1.0,
         score=float(np.mean([_saturated(r_photo), _saturated(r_depth)])) if len(seen) else _SATURATION,
         contrast=_contrast(np.concatenate(here), np.concatenate(there)),
@@ -105,6 +112,8 @@ def verdict_of(
         lost.append(f"the image is blank: {health.contrast:.0%} of the reference's contrast")
     if not health.photometric_inliers >= _FEW_PHOTOMETRIC:
         doubts.append(f"only {health.photometric_inliers:.0%} of the colours agree")
+    elif not health.edge_inliers >= _FEW_EDGES:
+        doubts.append(f"only {health.edge_inliers:.0%} of the colours agree where there are edges")
     if not np.isfinite(information).all():
         lost.append("the alignment is not finite")
     elif weak is not None:

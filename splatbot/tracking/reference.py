@@ -10,14 +10,20 @@ from numpy.typing import NDArray
 
 from splatbot.tracking.prepare import Image, Level, normals_of
 
+_SCHARR = 32.0  # what its kernel makes of a slope of 1
+
 
 @dataclass(frozen=True)
 class ReferencePoints:
-    """Sampled pixels of one level: points (N, 3) [m] and normals (N, 3) in the reference camera, grey (N,) in 0..1."""
+    """Sampled pixels of one level: points (N, 3) [m] and normals (N, 3) in the reference camera, grey (N,) in 0..1.
+
+    ``slope`` (N,) is how steep grey is there, see :func:`slopes_of`: what a pixel has to say of where it is.
+    """
 
     points: Image
     normals: Image
     gray: Image
+    slope: Image
 
 
 @dataclass(frozen=True)
@@ -35,21 +41,26 @@ def make_reference(levels: tuple[Level, ...], T_world_camera: NDArray[np.float64
 
 def sample_level(level: Level, n_pixels: int) -> ReferencePoints:
     """About ``n_pixels`` pixels of a level, see :func:`sampled_pixels`."""
-    normals = normals_of(level.depth, level.camera)
-    chosen = sampled_pixels(level, normals, n_pixels)
-    return ReferencePoints(level.camera.backproject(level.depth)[chosen], normals[chosen], level.gray[chosen])
+    normals, slopes = normals_of(level.depth, level.camera), slopes_of(level.gray)
+    chosen = sampled_pixels(level, normals, slopes, n_pixels)
+    points = level.camera.backproject(level.depth)[chosen]
+    return ReferencePoints(points, normals[chosen], level.gray[chosen], slopes[chosen])
 
 
-def sampled_pixels(level: Level, normals: Image, n_pixels: int) -> NDArray[np.bool_]:
+def slopes_of(gray: Image) -> Image:
+    """Length of the gradient (H, W) of grey [1/px] (Scharr); 0 beside pixels that have none."""
+    gx, gy = cv2.Scharr(gray, cv2.CV_32F, 1, 0), cv2.Scharr(gray, cv2.CV_32F, 0, 1)
+    return np.asarray(np.nan_to_num(np.hypot(gx, gy)) / _SCHARR, dtype=np.float32)
+
+
+def sampled_pixels(level: Level, normals: Image, slopes: Image, n_pixels: int) -> NDArray[np.bool_]:
     """Pixels (H, W) on smooth surface: half of them the strongest gradient of each tile, half on a regular grid.
 
     Edges carry the photometric information, the grid the geometric; a pixel needs a normal (H, W, 3), which keeps both
-    off occlusion boundaries, where colour belongs to one surface and depth to another.
+    off occlusion boundaries, where colour belongs to one surface and depth to another. ``slopes`` (H, W) are of grey.
     """
     good = ((normals**2).sum(-1) > 0.25) & np.isfinite(level.gray)
-    gx = cv2.Scharr(level.gray, cv2.CV_32F, 1, 0)
-    gy = cv2.Scharr(level.gray, cv2.CV_32F, 0, 1)
-    strength = np.where(good, np.nan_to_num(np.hypot(gx, gy)), -1.0)  # NaN beside masked pixels
+    strength = np.where(good, slopes, -1.0)
     height, width = level.gray.shape
     tile = max(2, round(float(np.sqrt(2.0 * height * width / n_pixels))))
     rows, columns = height // tile, width // tile

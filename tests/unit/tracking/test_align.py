@@ -222,8 +222,9 @@ def test_marginalising_exposure_gives_the_step_of_the_whole_system(problem: Prob
     level = Level(np.zeros((120, 160), np.float32), problem.depth.astype(np.float32), CAMERA)
     u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
     level = replace(level, gray=problem.gray(u, v).astype(np.float32))
+    gray = problem.reference_gray.astype(np.float32)
     sampled = ReferencePoints(
-        *(a.astype(np.float32) for a in (problem.points, problem.normals, problem.reference_gray))
+        problem.points.astype(np.float32), problem.normals.astype(np.float32), gray, np.ones_like(gray)
     )
     problem.gain, problem.offset = 1.0, 0.0  # where alignment starts
     H, g, *_ = problem.native(True, True)
@@ -361,7 +362,7 @@ def test_images_too_small_to_interpolate_have_no_residuals(size: tuple[int, int]
     image = np.ones((height, width), np.float32)
     points = np.array([[0.0, 0.0, 1.0], [0.1, 0.1, 1.0]], np.float32)
     normals = np.tile(np.array([[0, 0, -1]], np.float32), (2, 1))
-    sampled = ReferencePoints(points, normals, np.ones(2, np.float32))
+    sampled = ReferencePoints(points, normals, np.ones(2, np.float32), np.ones(2, np.float32))
     found = residuals(Level(image, image, tiny), sampled, np.eye(4), CONFIG)
     assert np.isnan(found.photometric[0])
     assert np.isfinite(found.photometric[1]) == (size == (4, 4))  # lands on pixel (1, 1)

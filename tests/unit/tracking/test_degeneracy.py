@@ -34,7 +34,7 @@ def planes(*normals: tuple[float, float, float], distance: float = 2.0) -> Array
 def judged(information: Array, T_world_camera: Array) -> Judged:
     found = Alignment(T_world_camera, information, information, information, 48, 525.0)
     weak = weak_directions(information, 2.0, RATIO)
-    health = Health(1.0, 1.0, 1.0, 0.5, 1.0)
+    health = Health(1.0, 1.0, 1.0, 1.0, 0.5, 1.0)
     return Judged(Candidate("direct", found, []), health, "degraded", (), weak, alignment_covariance(found))
 
 

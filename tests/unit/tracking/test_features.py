@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatbot import _native
 from splatbot.geometry import inverse, se3_exp, transform_points
-from splatbot.tracking.features import MIN_INLIERS, Expectation, FeaturePose, Features, detect, match_pose
+from splatbot.tracking.features import MIN_INLIERS, Expectation, FeaturePose, Features, detect, match_pose, spread
 from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import CAMERA, Array, tabletop
 
@@ -194,3 +194,32 @@ def test_matches_in_one_corner_of_the_image_are_believed_only_when_searched_for_
     assert match_pose(corner, views, camera) is not None
     assert match_pose(corner, views, camera, Expectation(truth, 12.0)) is None
     assert match_pose(current, views, camera, Expectation(truth, 12.0)) is not None
+
+
+def test_keypoints_are_spread_though_one_thing_has_the_strongest_of_all() -> None:
+    rng = np.random.default_rng(0)
+    crowd, others = rng.uniform([80, 80], [159, 159], (2000, 2)), rng.uniform([0, 0], [640, 480], (2000, 2))
+    pixels = np.concatenate([crowd, others]).astype(np.float32)
+    strengths = np.r_[rng.uniform(2, 3, 2000), rng.uniform(0, 1, 2000)]
+    chosen = spread(pixels, strengths, np.ones(4000, np.bool_), 640, 480)
+    assert len(chosen) == len(np.unique(chosen)) == 480
+    tiles = np.unique((pixels[chosen] // 80).astype(int), axis=0, return_counts=True)
+    assert len(tiles[0]) == 48
+    assert tiles[1].max() == 20  # twice a tile's share of 480 in 48; without a limit all 480 would be of one tile
+    weakest = strengths[chosen][(pixels[chosen] // 80 == 1).all(axis=1)].min()
+    left_out = np.setdiff1d(np.flatnonzero((pixels // 80 == 1).all(axis=1)), chosen)
+    assert strengths[left_out].max() <= weakest  # of a tile the strongest are taken
+
+
+def test_keypoints_without_depth_come_after_those_that_have_one() -> None:
+    pixels = np.tile(np.array([[10, 10], [300, 200]], np.float32), (50, 1))
+    known = np.arange(100) % 2 == 1
+    chosen = spread(pixels, np.where(known, 1.0, 9.0), known, 640, 60)
+    assert known[chosen[:50]].all()
+    assert not known[chosen[50:]].any()
+
+
+def test_few_keypoints_are_all_kept() -> None:
+    pixels = np.array([[1, 1], [2, 2], [600, 400]], np.float32)
+    assert set(spread(pixels, np.arange(3.0), np.ones(3, np.bool_), 640, 500)) == {0, 1, 2}
+    assert len(spread(pixels[:0], np.zeros(0), np.zeros(0, np.bool_), 640, 500)) == 0

@@ -17,7 +17,7 @@ from splatbot.tracking.reference import Reference, make_reference
 from tests.rgbd import Array, small_config, tabletop, wall_frame
 
 CONFIG = small_config().tracking
-GOOD = Health(overlap=0.9, photometric_inliers=0.9, geometric_inliers=0.9, score=0.5, contrast=1.0)
+GOOD = Health(overlap=0.9, photometric_inliers=0.9, edge_inliers=0.9, geometric_inliers=0.9, score=0.5, contrast=1.0)
 KNOWN = np.eye(6)
 
 
@@ -131,6 +131,29 @@ def test_a_textured_wall_is_ok() -> None:
     found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
     weak = weak_directions(found.information, 1.0, CONFIG.min_eigen_ratio)
     assert verdict_of(health_at(wall, reference, found.T_world_camera), found.information, weak, CONFIG) == ("ok", ())
+
+
+def test_a_shift_along_a_wall_with_one_poster_is_doubted_though_nearly_all_colours_agree() -> None:
+    wall = wall_frame(np.eye(4), textured=False)
+    rgb = np.full_like(wall.rgb, 128)
+    height, width = rgb.shape[:2]
+    rgb[height // 3 : height // 2, width // 3 : width // 2] = 40
+    frame = replace(wall, rgb=rgb)
+    reference = reference_of(frame, np.eye(4))
+    right, wrong = (health_at(frame, reference, se3_exp([x, x, 0, 0, 0, 0])) for x in (0.0, 0.15))
+    assert right.edge_inliers > 0.9
+    assert verdict_of(right, KNOWN, None, CONFIG) == ("ok", ())
+    assert wrong.photometric_inliers > 0.8  # most of the wall is grey wherever it is taken to be
+    assert wrong.edge_inliers < 0.5
+    verdict, reasons = verdict_of(wrong, KNOWN, None, CONFIG)
+    assert verdict == "degraded"
+    assert "where there are edges" in reasons[0]
+
+
+def test_where_grey_is_nowhere_steep_no_edge_speaks_against_a_pose() -> None:
+    wall = wall_frame(np.eye(4), textured=False)
+    even = replace(wall, rgb=np.full_like(wall.rgb, 128))
+    assert health_at(even, reference_of(even, np.eye(4)), np.eye(4)).edge_inliers == 1.0
 
 
 @pytest.mark.parametrize("name", ["overlap", "photometric_inliers", "geometric_inliers", "contrast"])

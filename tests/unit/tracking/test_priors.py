@@ -22,7 +22,7 @@ SURE = np.diag([1e-6] * 3 + [1e-6] * 3)  # 1 mm, 0.06°
 
 def pose(twist: list[float]) -> Judged:
     found = Alignment(se3_exp(twist), np.eye(6), np.eye(6), np.eye(6), 48, 525.0)
-    return Judged(Candidate("direct", found, []), Health(1, 1, 1, 0.5, 1), "ok", (), None, np.eye(6))
+    return Judged(Candidate("direct", found, []), Health(1, 1, 1, 1, 0.5, 1), "ok", (), None, np.eye(6))
 
 
 def test_fusion_is_the_information_weighted_mean_and_the_parallel_sum_of_covariances() -> None:
