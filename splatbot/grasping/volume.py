@@ -8,8 +8,8 @@ import numpy as np
 
 from splatbot.protocols import Array
 
-MOST = 1200  # points that a volume is told by
-_CELLS = 6000  # of the grid that is filled, at most
+MOST = 800  # points that a volume is told by
+_CELLS = 3000  # of the grid that is filled, at most
 _INSIDE = 0.5  # winding number, from where on a place is within
 _LEAST = 30  # cells that are a volume
 _SMOOTH = 0.006  # [m] over which the density of points is looked at
@@ -59,7 +59,7 @@ def enclosed_volume(points: Array, normals: Array, *, seed: int = 0) -> Volume:
 
     Args:
         points, normals: on the surface [m], unit outwards.
-        seed: of which points are kept where there are more than 1200.
+        seed: of which points are kept where there are more than 800.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     none = Volume((low + high) / 2, 0.0)
