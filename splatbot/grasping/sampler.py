@@ -340,6 +340,7 @@ class _Search:
 
     def _grasp(self, scored: _Scored, k: int, *, rejected: str = "") -> Grasp:
         T, pair = scored.hands.T[k], int(scored.hands.pair[k])
+        terms = {name: float(values[k]) for name, values in scored.terms.items()}
         return Grasp(
             T_world_tcp=T,
             width=float(self.pairs.width[pair]),
@@ -347,11 +348,12 @@ class _Search:
             contacts=self.pairs.contacts[pair],
             normals=self.pairs.normals[pair],
             approach=self._approach(T),
-            terms={name: float(values[k]) for name, values in scored.terms.items()},
+            terms=terms,
             total=float(scored.totals[k]),
             room=float(scored.room[k]),
             T_world_pregrasp=along(T, -self.o.pregrasp),
             rejected=rejected,
+            clear=terms.get("clear", 1.0) > 0.0,
         )
 
     def _approach(self, T: Array) -> str:

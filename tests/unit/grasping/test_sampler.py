@@ -144,6 +144,8 @@ def test_where_something_moved_grasps_that_keep_clear_of_it_come_first_and_the_o
         assert (room - arm.spheres.radii[:, None]).min() > 0.0 or not g.clear
     assert result.grasps[0].clear
     assert not any("clear" in g.terms for g in grasped("box").grasps)
+    alone = GraspSampler(scene(), panda(), moving=moving, hand_only=True).sample(target).grasps
+    assert all(g.clear == bool(g.terms["clear"]) for g in alone)
 
 
 class _Nowhere:
