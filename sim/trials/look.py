@@ -45,6 +45,10 @@ MAPPING = {"stride": 1, "new_depth": 0.01, "rate_means": 0.0, "refine_iterations
 _TABLE = Surface(box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05))
 
 
+class UnseenError(InputError):
+    """No picture that was tracked shows the target: there is nothing to click at."""
+
+
 @dataclass(frozen=True, eq=False)
 class Look:
     """What was seen of a scene.
@@ -95,7 +99,7 @@ def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Confi
         config: of mapping; None: finer than by default, and without moving means (:data:`MAPPING`).
 
     Raises:
-        InputError: the target is in no picture.
+        UnseenError: the target is in no picture.
     """
     log = _log(trial, frames, width)
     true = log.ground_truth.T_world_camera
@@ -186,7 +190,7 @@ def _click(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Arr
         if best is None or shows.sum() > best[1].sum():
             best = k, shows
     if best is None or not best[1].any():
-        raise InputError("is in no picture.", field=trial.target, hint="give another seed")
+        raise UnseenError("is in no picture.", field=trial.target, hint="give another seed")
     k, shows = best
     v, u = np.nonzero(shows)
     nearest = int(np.argmin((v - v.mean()) ** 2 + (u - u.mean()) ** 2))

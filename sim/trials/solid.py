@@ -137,8 +137,8 @@ class SolidWays:
         own[target.rows] = True
         self._beside = world.around(np.flatnonzero(own))
 
-    def to(self, grasp: Grasp, start: Array) -> Way | str:
-        """See :class:`splatbot.grasping.ways.Ways`."""
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
+        """See :class:`splatbot.grasping.ways.Ways`; of what moved nothing is known here."""
         if grasp.q_pregrasp is None:
             return "no posture is known"
         opening = min(grasp.opening, self.s.hand.stroke)

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from splatbot.collision.evidence import gather_evidence
+from splatbot.collision import find_moving, gather_evidence
 from splatbot.grasping.affordance import Target, find_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_types import PickOptions
@@ -69,11 +69,15 @@ class GaussianStack:
         """See :class:`Stack`."""
         begin = time.perf_counter()
         # Flying pixels at edges and ghosts of what moved: more frames saw through them than saw them.
-        solid = np.flatnonzero(~gather_evidence(look.snapshot.model, look.views).seen_through)
+        evidence = gather_evidence(look.snapshot.model, look.views)
+        solid = np.flatnonzero(~evidence.seen_through)
+        moving = find_moving(look.snapshot.model, evidence)
         model = look.snapshot.model.select(torch.from_numpy(solid))
         scene = segment(model, look.T_world_base, cut=False)
         observers = look.observers[solid]
-        sampler = GraspSampler(scene, panda(), observers=observers, views=look.views, min_observations=_OFTEN)
+        sampler = GraspSampler(
+            scene, panda(), observers=observers, views=look.views, min_observations=_OFTEN, moving=moving
+        )
         seconds = look.seconds + time.perf_counter() - begin
         world = model.nbytes + sampler.field.nbytes
         return Knowledge(scene, lambda target: (sampler, MapWays(sampler, target, OPTIONS)), world, seconds)
@@ -116,13 +120,14 @@ class _Remembered:
 
     def __init__(self, ways: Ways) -> None:
         self._ways = ways
-        self._found: dict[int, Way | str] = {}
+        self._found: dict[tuple[int, bool], Way | str] = {}
 
-    def to(self, grasp: Grasp, start: Array) -> Way | str:
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
         """As when it was first asked."""
-        if id(grasp) not in self._found:
-            self._found[id(grasp)] = self._ways.to(grasp, start)
-        return self._found[id(grasp)]
+        key = id(grasp), cautious
+        if key not in self._found:
+            self._found[key] = self._ways.to(grasp, start, cautious=cautious)
+        return self._found[key]
 
     def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
         """Asked anew."""

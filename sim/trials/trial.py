@@ -21,7 +21,7 @@ from splatbot.sim.camera import TwinCamera
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.controller import TwinController
 from splatbot.sim.touch import Touches
-from splatbot.sim.trials.look import Look, look
+from splatbot.sim.trials.look import Look, UnseenError, look
 from splatbot.sim.trials.scenes import TABLE, TrialScene
 from splatbot.sim.trials.shake import Shake
 from splatbot.sim.trials.stacks import OPTIONS, Decision, Knowledge, Stack, decide
@@ -86,8 +86,8 @@ class TrialRow:
         reality: in a held-out twin: other friction, masses, gains and delays, every effect on.
         plan_ms: that the search for the way took; None: there was none.
         grasp_ms: to the ranked list.
-        build_s: to make the stack's world of the frames, mapping included.
-        world_bytes: of that world.
+        build_s: to make the stack's world of the frames, mapping included; None: none was made.
+        world_bytes: of that world; None likewise.
         width_mm: of the grasp; None: there was none.
         frames, pixels: of the scan, and how wide its pictures are [px].
     """
@@ -101,8 +101,8 @@ class TrialRow:
     reality: Attempt
     plan_ms: float | None
     grasp_ms: float | None
-    build_s: float
-    world_bytes: int
+    build_s: float | None
+    world_bytes: int | None
     width_mm: float | None
     frames: int
     pixels: int
@@ -124,7 +124,7 @@ class TrialRow:
 def run_trial(
     trial: TrialScene, stacks: Sequence[Stack], *, frames: int = 32, width: int = 320, videos: Path | None = None
 ) -> list[TrialRow]:
-    """Scan a scene, and let each stack pick its target.
+    """Scan a scene, and let each stack pick its target. One that no picture shows is a failure of each.
 
     Args:
         trial: the scene.
@@ -132,19 +132,23 @@ def run_trial(
         frames, width: of the scan, see :func:`splatbot.sim.trials.look.look`.
         videos: folder for films of picks that failed in reality; None: none are made.
     """
-    seen = look(trial, frames=frames, width=width)
+    try:
+        seen = look(trial, frames=frames, width=width)
+    except UnseenError as error:
+        both = _no_target(error)
+        return [_row(stack, trial, (frames, width), None, None, None, both, both) for stack in stacks]
     return [pick_with(stack, trial, seen, videos=videos) for stack in stacks]
 
 
 def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | None = None) -> TrialRow:
     """One stack's pick of what was seen, in both twins."""
     known = stack.learn(seen)
-    decision: Decision | None = None
+    scan = len(seen.frames), seen.frames[0].camera.width
     try:
         decision = decide(known, seen)
     except AffordanceError as error:
-        both = Attempt(False, Failure.PERCEPTION, "no target", error.message)
-        return _row(stack, trial, seen, known, None, None, both, both)
+        both = _no_target(error)
+        return _row(stack, trial, scan, known, None, None, both, both)
     results = []
     mistaken = _mistaken(known, decision.target, trial)
     for twin in (Twin(trial.scene), _reality(trial)):
@@ -152,7 +156,7 @@ def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | Non
     (ideal, first), (reality, _) = results
     if videos is not None and not reality.success:
         _film(decision, trial, videos / f"{trial.family}-{trial.seed}-{stack.name}.mp4")
-    return _row(stack, trial, seen, known, decision, first, ideal, reality)
+    return _row(stack, trial, scan, known, decision, first, ideal, reality)
 
 
 def attempt(
@@ -255,6 +259,10 @@ def _mistaken(known: Knowledge, target: Target, trial: TrialScene) -> bool:
     return bool(np.linalg.norm(middle - true[:2]) > _TAKEN_FOR)
 
 
+def _no_target(error: SplatbotError) -> Attempt:
+    return Attempt(False, Failure.PERCEPTION, "no target", error.message)
+
+
 def _height(twin: Twin, name: str) -> float:
     return float(twin.data.body(OBJECT + name).xipos[2])
 
@@ -262,8 +270,8 @@ def _height(twin: Twin, name: str) -> float:
 def _row(
     stack: Stack,
     trial: TrialScene,
-    seen: Look,
-    known: Knowledge,
+    scan: tuple[int, int],
+    known: Knowledge | None,
     decision: Decision | None,
     result: PickResult | None,
     ideal: Attempt,
@@ -280,9 +288,9 @@ def _row(
         reality=reality,
         plan_ms=planned,
         grasp_ms=None if decision is None else 1e3 * decision.seconds,
-        build_s=known.seconds,
-        world_bytes=known.world_bytes,
+        build_s=None if known is None else known.seconds,
+        world_bytes=None if known is None else known.world_bytes,
         width_mm=None if result is None or result.grasp is None else 1e3 * result.grasp.width,
-        frames=len(seen.frames),
-        pixels=seen.frames[0].camera.width,
+        frames=scan[0],
+        pixels=scan[1],
     )

@@ -6,6 +6,7 @@ from splatbot.collision.esdf import Esdf, esdf
 from splatbot.collision.evidence import Evidence, gather_evidence
 from splatbot.collision.field import GaussianCollisionField
 from splatbot.collision.margin import SurfaceError, surface_error
+from splatbot.collision.moving import find_moving
 from splatbot.collision.probability import ProbabilityResult, collision_probability
 from splatbot.collision.robot import ArmClearanceResult, ConfigurationResult, EdgeResult, RobotSpheres
 from splatbot.collision.unknown import UnknownSpace, find_unknown
@@ -28,6 +29,7 @@ __all__ = [
     "capsules_in_collision",
     "collision_probability",
     "esdf",
+    "find_moving",
     "find_unknown",
     "gather_evidence",
     "surface_error",

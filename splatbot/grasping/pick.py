@@ -16,6 +16,7 @@ from splatbot.planning.follow import follow
 from splatbot.protocols import Array, Controller, Feedback, Gripper, MotionState
 
 _SETTLE = 6.0  # [s] in which fingers must come to rest
+_NOT_CLEAR = "no way was found that keeps clear of where something moved; this one does not"
 
 
 class _EndedError(Exception):
@@ -88,6 +89,7 @@ class _Pick:
         self.attached: Array | None = None
         self.q: Array | None = None
         self.planned: float | None = None
+        self.notes: list[str] = []
         self._began = time.perf_counter()
 
     def run(self, grasps: GraspResult | None) -> PickResult:
@@ -114,14 +116,23 @@ class _Pick:
         self.stage = PickStage.PLAN
         self.ways = self.p.make_ways(self.target)
         start = self.controller.step().position
+        tried = list(enumerate(found.grasps[: self.o.tries], start=1))
+        asked = [(k, grasp, grasp.clear and self.s.moving is not None) for k, grasp in tried]
+        asked += [(k, grasp, False) for k, grasp, cautious in asked if cautious]
         why: list[str] = []
-        for k, grasp in enumerate(found.grasps[: self.o.tries]):
-            way = self.ways.to(grasp, start)
+        for k, grasp, cautious in asked:
+            way = self.ways.to(grasp, start, cautious=cautious)
             if isinstance(way, Way):
-                self._done(f"grasp {k + 1}, {grasp.approach}; {1e3 * way.room:.1f} mm of room all the way")
+                self._noted(way)
+                self._done(f"grasp {k}, {grasp.approach}; {1e3 * way.room:.1f} mm of room all the way")
                 return way
-            why.append(f"grasp {k + 1}: {way}")
+            why.append(f"grasp {k}: {way}")
         raise _EndedError(PickOutcome.NO_WAY, "; ".join(why))
+
+    def _noted(self, way: Way | Leg) -> None:
+        """Keep in mind that a way is not clear of where something moved."""
+        if not way.clear:
+            self.notes.append(f"{self.stage}: {_NOT_CLEAR}")
 
     def _execute(self, way: Way) -> None:
         self.stage = PickStage.OPEN
@@ -163,6 +174,7 @@ class _Pick:
         leg = self.ways.onwards(way, self.q, JointGoal(self.o.carry_to))
         if not isinstance(leg, Leg):
             raise _EndedError(PickOutcome.NO_WAY, leg)
+        self._noted(leg)
         self._follow(PickStage.CARRY, leg, self.o.slow)
         if not self.gripper.holds():
             self.attached = None
@@ -216,7 +228,7 @@ class _Pick:
     def _result(self, outcome: PickOutcome, reason: str, error: SplatbotError | None = None) -> PickResult:
         return PickResult(
             outcome, self.stage, reason, self.grasp, tuple(self.steps), self.opening, self.attached, self.q, error,
-            self.planned,
+            self.planned, tuple(self.notes),
         )  # fmt: skip
 
 

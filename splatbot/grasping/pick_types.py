@@ -113,6 +113,7 @@ class PickResult:
         q: (J,) where the arm was told to be last; None: it did not move.
         error: of a part that failed.
         planned: seconds that the search for the way to the pre-grasp took; None: there is no way.
+        notes: what else is to be known of the way that was taken, each in a sentence.
     """
 
     outcome: PickOutcome
@@ -125,6 +126,7 @@ class PickResult:
     q: Array | None = None
     error: SplatbotError | None = None
     planned: float | None = None
+    notes: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return self.outcome is PickOutcome.PICKED

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField
 from splatbot.collision.evidence import DepthView
+from splatbot.collision.moving import with_balls
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
@@ -24,6 +25,7 @@ from splatbot.grasping.score import arm_terms, best_apart, hand_terms, totals
 from splatbot.grasping.surface import Surface, target_surface
 from splatbot.grasping.sweep import swept_room, touches
 from splatbot.grasping.types import Grasp, GraspResult
+from splatbot.grasping.volume import enclosed_volume
 from splatbot.planning.cartesian import along
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.segmentation import MapScene
@@ -88,6 +90,8 @@ class GraspSampler:
         min_observations: Gaussians that fewer keyframes support are air; see
             :class:`splatbot.collision.GaussianCollisionField`.
         margin: room to keep from the map [m].
+        moving: balls (V, 4) [m, world] where something was at times; see :func:`splatbot.collision.find_moving`. Grasps
+            for which hand and arm need not go there are better.
 
     Raises:
         InputError: the robot has no fingers, or an argument makes no sense.
@@ -105,6 +109,7 @@ class GraspSampler:
         n_sigma: float = 1.0,
         min_observations: int = 1,
         margin: float = 0.0,
+        moving: Array | None = None,
     ) -> None:
         if observers is not None and observers.shape != (len(scene.model), 3):
             raise InputError(f"is {observers.shape}.", field="observers", hint=f"give ({len(scene.model)}, 3)")
@@ -113,6 +118,7 @@ class GraspSampler:
         self.scene, self.robot, self.observers, self.views = scene, robot, observers, tuple(views)
         self.hand = hand_of(robot)
         self.margin, self.n_sigma = margin, n_sigma
+        self.moving = None if moving is None or not len(moving) else np.asarray(moving, dtype=np.float64)
         self.min_observations = min_observations
         self.field = self.collision_field(scene.model)
         self._make_reach = None if hand_only else make_reach or self._arm_reach
@@ -131,13 +137,22 @@ class GraspSampler:
         """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.surface.target_surface`."""
         return target_surface(self.scene, target.rows, observers=self.observers, views=self.views, seed=seed)
 
-    def collision_field(self, model: GaussianModel) -> GaussianCollisionField:
-        """A part of the map as the hand and the arm avoid it."""
+    def collision_field(self, model: GaussianModel, *, cautious: bool = False) -> GaussianCollisionField:
+        """A part of the map as the hand and the arm avoid it; ``cautious``: and where something moved."""
+        if cautious and self.moving is not None:
+            model = with_balls(model, self.moving, n_sigma=self.n_sigma, observations=self.min_observations)
         return GaussianCollisionField(model, self.n_sigma, min_observations=self.min_observations)
 
     def reach(self, around: GaussianCollisionField) -> Reach | None:
         """Who says whether the arm gets there in the map without the target; None: nobody is asked."""
         return None if self._make_reach is None else self._make_reach(around, self.field)
+
+    def cautious_reach(self, around: GaussianModel) -> Reach | None:
+        """The same, of an arm that keeps clear of where something moved; None: nothing did, or nobody is asked."""
+        if self._make_reach is None or self.moving is None:
+            return None
+        fields = (self.collision_field(model, cautious=True) for model in (around, self.scene.model))
+        return self._make_reach(*fields)
 
     def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> Reach:
         return ArmReach(self.robot, self.scene.T_world_base, around, whole, margin=self.margin)
@@ -152,17 +167,21 @@ class _Search:
 
     def run(self) -> GraspResult:
         self.surface = self.s.surface(self.target, seed=self.o.seed)
+        self.body = enclosed_volume(self.surface.points, self.surface.normals, seed=self.o.seed)
         self.log.stage("surface")
         found = self._contacts()
         self.log.stage("contacts")
         hands = self._placed()
         scored = self._beside_target(hands)
         self.log.stage("hands")
-        around, own = self._split()
+        model, around, own = self._split()
         self.log.stage("fields")
         scored = self._in_map(scored, around)
+        if self.s.moving is not None:
+            scored = self._moving(scored)
         self.log.stage("map")
-        grasps = self._reached(scored, around, own)
+        scored = self._apart(scored, own)
+        grasps = self._reached(scored, self.s.reach(around), self.s.cautious_reach(model))
         self.log.stage("reach")
         return GraspResult(
             self.target,
@@ -172,7 +191,7 @@ class _Search:
             len(hands),
             self.log.seconds,
             self.s.scene.map_version,
-            self._notes(found),
+            self._notes(found, grasps),
         )
 
     def _contacts(self) -> PairSearch:
@@ -202,7 +221,7 @@ class _Search:
         free = clear_palm(hands, self.surface, self.s.hand, retreat=self.o.pregrasp)
         self.log.drop(_IN_TARGET, (~free).sum())
         hands = hands.select(free)
-        aside = np.linalg.norm(self.pairs.contacts.mean(axis=1) - self.surface.center, axis=1)
+        aside = np.linalg.norm(self.pairs.contacts.mean(axis=1) - self.body.center, axis=1)
         good = (self.pairs.closure + self.pairs.seen - aside / 0.1)[hands.pair]
         best = np.sort(np.argsort(-good, kind="stable")[:_HANDS])
         self.log.drop("hands are of worse contacts than others", len(hands) - len(best))
@@ -252,45 +271,68 @@ class _Search:
             self.log.best = self._grasp(tried, k, rejected=why)
         return tried.select(free)
 
-    def _reached(
-        self, scored: _Scored, around: GaussianCollisionField, own: GaussianCollisionField
-    ) -> tuple[Grasp, ...]:
-        """Those of the best that do not touch the target's own ellipsoids and that the arm reaches, best first."""
-        reach = self.s.reach(around)
+    def _moving(self, scored: _Scored) -> _Scored:
+        """With a term for hands that keep clear, on their way, of where something moved."""
+        field = self.s.collision_field(GaussianModel.empty(self.s.scene.model.sh_degree), cautious=True)
+        clear = swept_room(self.s.robot, scored.hands, field, retreat=self.o.pregrasp) > self.s.margin
+        return _Scored(scored.hands, scored.room, {**scored.terms, "clear": clear.astype(np.float64)})
+
+    def _apart(self, scored: _Scored, own: GaussianCollisionField) -> _Scored:
+        """The best of them, best first, those that do not touch the target's own ellipsoids."""
         order = np.argsort(-scored.totals, kind="stable")[:_ASKED] if len(scored.hands) else np.zeros(0, np.int64)
-        inside = touches(own, scored.hands.select(order), self.s.hand, retreat=self.o.pregrasp)
+        scored = scored.select(order)
+        inside = touches(own, scored.hands, self.s.hand, retreat=self.o.pregrasp)
         self.log.drop("hands touch the target's ellipsoids", inside.sum())
+        if inside.any():
+            self.log.best = self._grasp(scored, int(inside.argmax()), rejected="touches the target's ellipsoids")
+        return scored.select(~inside)
+
+    def _reached(self, scored: _Scored, reach: Reach | None, cautious: Reach | None) -> tuple[Grasp, ...]:
+        """Those that the arm reaches, best first; cautiously, where it can and the hand can."""
+        left = [self._grasp(scored, k) for k in range(len(scored.hands))]
         found: list[Grasp] = []
-        for k, hit in zip(order.tolist(), inside.tolist(), strict=True):
-            if len(found) == self.o.wanted:
-                break
-            grasp = self._grasp(scored, k, rejected="touches the target's ellipsoids" if hit else "")
-            if not hit and reach is not None:
-                grasp = self._with_arm(grasp, reach)
-            if not grasp.rejected:
-                found.append(grasp)
-            elif self.log.best is None:
-                self.log.best = grasp
+        if cautious is not None:
+            asked = self._asked([grasp for grasp in left if grasp.terms["clear"]], cautious, self.o.wanted)
+            found = [grasp for grasp, _ in asked if not grasp.rejected]
+            known = {id(grasp.T_world_tcp) for grasp in found}
+            left = [_exposed(grasp) for grasp in left if id(grasp.T_world_tcp) not in known]
+        asked = self._asked(left, reach, self.o.wanted - len(found))
+        blocked = [(grasp, kind) for grasp, kind in asked if grasp.rejected]
+        for _, kind in blocked:
+            self.log.drop(f"hands: {kind}", 1)
+        if blocked:
+            self.log.best = blocked[0][0]
+        found += [grasp for grasp, _ in asked if not grasp.rejected]
         return tuple(sorted(found, key=lambda g: -g.total))
 
-    def _with_arm(self, grasp: Grasp, reach: Reach) -> Grasp:
+    def _asked(self, grasps: Sequence[Grasp], reach: Reach | None, wanted: int) -> list[tuple[Grasp, str]]:
+        """What an arm says of each in turn, until enough are reached: the grasp, and of what kind its rejection is."""
+        asked: list[tuple[Grasp, str]] = []
+        for grasp in grasps:
+            if wanted == 0:
+                break
+            asked.append((grasp, "") if reach is None else self._with_arm(grasp, reach))
+            wanted -= not asked[-1][0].rejected
+        return asked
+
+    def _with_arm(self, grasp: Grasp, reach: Reach) -> tuple[Grasp, str]:
         reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening)
         if reached.q is None or reached.path is None:
-            self.log.drop(f"hands: {reached.kind}", 1)
-            return replace(grasp, rejected=reached.why)
+            return replace(grasp, rejected=reached.why), reached.kind
         terms = dict(grasp.terms) | arm_terms(reached)
         total = float(totals({name: np.array([value]) for name, value in terms.items()})[0])
-        return replace(
-            grasp, terms=terms, total=total, q=reached.q, q_pregrasp=reached.path[0], approach_path=reached.path
-        )
+        q = reached.q
+        found = replace(grasp, terms=terms, total=total, q=q, q_pregrasp=reached.path[0], approach_path=reached.path)
+        return found, ""
 
     def _scored(self, hands: Hands, room: Array) -> _Scored:
         terms = hand_terms(
             hands,
             self.pairs,
-            self.surface,
+            self.body,
             self.s.hand,
             room,
+            friction=self.o.friction,
             up=self.s.scene.up,
             near=self.target.point,
         )
@@ -298,6 +340,7 @@ class _Search:
 
     def _grasp(self, scored: _Scored, k: int, *, rejected: str = "") -> Grasp:
         T, pair = scored.hands.T[k], int(scored.hands.pair[k])
+        terms = {name: float(values[k]) for name, values in scored.terms.items()}
         return Grasp(
             T_world_tcp=T,
             width=float(self.pairs.width[pair]),
@@ -305,11 +348,12 @@ class _Search:
             contacts=self.pairs.contacts[pair],
             normals=self.pairs.normals[pair],
             approach=self._approach(T),
-            terms={name: float(values[k]) for name, values in scored.terms.items()},
+            terms=terms,
             total=float(scored.totals[k]),
             room=float(scored.room[k]),
             T_world_pregrasp=along(T, -self.o.pregrasp),
             rejected=rejected,
+            clear=terms.get("clear", 1.0) > 0.0,
         )
 
     def _approach(self, T: Array) -> str:
@@ -322,14 +366,17 @@ class _Search:
         ahead = ahead - (ahead @ self.s.scene.up) * self.s.scene.up
         return "front" if z @ ahead >= _TOP * np.linalg.norm(ahead) else "side"
 
-    def _split(self) -> tuple[GaussianCollisionField, GaussianCollisionField]:
-        """The map without the target, and the target alone."""
+    def _split(self) -> tuple[GaussianModel, GaussianCollisionField, GaussianCollisionField]:
+        """The map without the target, also as a field, and the target alone."""
         own = self.s.scene.model.select(torch.from_numpy(self.target.rows))
         around = around_target(self.s.scene, self.target.rows)
-        return self.s.collision_field(around), self.s.collision_field(own)
+        return around, self.s.collision_field(around), self.s.collision_field(own)
 
-    def _notes(self, found: PairSearch) -> tuple[str, ...]:
+    def _notes(self, found: PairSearch, grasps: Sequence[Grasp]) -> tuple[str, ...]:
         notes = []
+        if self.s.moving is not None and grasps:
+            clear = sum(grasp.clear for grasp in grasps)
+            notes.append(f"Something moved; {clear} of {len(grasps)} grasps keep clear of where it was seen.")
         implied = float(1.0 - self.surface.seen.mean())
         if implied > 0.05:
             notes.append(f"{implied:.0%} of its surface was not seen and is implied.")
@@ -340,3 +387,8 @@ class _Search:
                 f"opens {1e3 * stroke:.0f} mm."
             )
         return tuple(notes)
+
+
+def _exposed(grasp: Grasp) -> Grasp:
+    """A grasp for which the arm has to go where something moved."""
+    return replace(grasp, terms={**grasp.terms, "clear": 0.0}, clear=False)

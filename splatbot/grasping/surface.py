@@ -14,6 +14,7 @@ from splatbot.collision.evidence import DepthView, evidence_at
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import rotations, shortest_axes
 from splatbot.geometry import inverse, transform_points
+from splatbot.grasping.volume import winding_numbers
 from splatbot.protocols import Array
 from splatbot.segmentation import MapScene
 from splatbot.segmentation.parts import nearest_of
@@ -161,7 +162,7 @@ def _completed(scene: MapScene, seen: Surface, areas: Array, views: Sequence[Dep
     thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
     thin = thin[:: 1 + len(thin) // MOST]
     points, normals = points[thin], normals[thin]
-    outer = _enclosed(points, seen, areas) < _WITHIN
+    outer = winding_numbers(points, seen.points, seen.normals, areas, softened=_ROWS) < _WITHIN
     evidence = evidence_at(points, views)
     outer &= ~(evidence.seen_through & (evidence.passes >= _THROUGH))
     points, normals = points[outer], normals[outer]
@@ -338,20 +339,6 @@ def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
         tops.append(filled[edge][good])
         beyonds.append(beyond[edge][good])
     return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)
-
-
-def _enclosed(points: Array, seen: Surface, areas: Array) -> Array:
-    """How far points (P, 3) are surrounded by what was seen (P,): the winding number (Barill et al. 2018), 1 within."""
-    middle = seen.center
-    p, q = (points - middle).astype(np.float32), (seen.points - middle).astype(np.float32)
-    dipole = (seen.normals * areas[:, None] / (4 * np.pi)).astype(np.float32)
-    own, square = np.einsum("ij,ij->i", dipole, q), (q**2).sum(axis=1)
-    found = np.zeros(len(p))
-    for k in range(0, len(p), 256):
-        a = p[k : k + 256]
-        away = np.maximum((a**2).sum(axis=1)[:, None] - 2 * (a @ q.T) + square, _ROWS**2)
-        found[k : k + 256] = ((own - a @ dipole.T) / (away * np.sqrt(away))).sum(axis=1)
-    return found
 
 
 def _inside(points: Array, normals: Array) -> NDArray[np.bool_]:

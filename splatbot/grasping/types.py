@@ -31,6 +31,8 @@ class Grasp:
         q_pregrasp: (J,) at the start of the straight approach.
         approach_path: (K, J) from there to the grasp, certified free of all but the target.
         rejected: why it will not do; empty: it will.
+        clear: whether hand and arm, at the grasp and on the straight way to it, keep clear of where something moved;
+            True also where nothing did.
     """
 
     T_world_tcp: Array
@@ -47,6 +49,7 @@ class Grasp:
     q_pregrasp: Array | None = None
     approach_path: Array | None = field(default=None, repr=False)
     rejected: str = ""
+    clear: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
-from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.hands import OPENINGS
@@ -36,11 +35,13 @@ class Leg:
         path: of the arm.
         arm: its spheres, with what it holds.
         around: that it is free of, as far as corners may be rounded; None: that was looked at otherwise.
+        clear: whether it keeps clear of where something moved; True also where nothing did.
     """
 
     path: Path
     arm: RobotSpheres
     around: GaussianCollisionField | None
+    clear: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +73,17 @@ class Way:
         """All the way [m]."""
         return min(leg.path.certificate.clearance for leg in (self.there, self.approach, self.lift))
 
+    @property
+    def clear(self) -> bool:
+        """All of it, of where something moved."""
+        return all(leg.clear for leg in (self.there, self.approach, self.free, self.lift))
+
 
 class Ways(Protocol):
     """Finds ways to grasps of one target; words instead of a way say what is in it."""
 
-    def to(self, grasp: Grasp, start: Array) -> Way | str:
-        """From where the arm is (J,) to the grasp and up again."""
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
+        """From where the arm is (J,) to the grasp and up again; ``cautious``: clear of where something moved, too."""
         ...
 
     def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
@@ -85,8 +91,19 @@ class Ways(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class _Obstacles:
+    """What a way keeps clear of: the whole map, the map around the target, and that less the target's own strays."""
+
+    whole: GaussianCollisionField
+    around: GaussianCollisionField
+    beside: GaussianCollisionField
+
+
 class MapWays:
     """Among the Gaussians of the sampler's map, every stretch certified.
+
+    Where something moved while the map was made is one more obstacle of cautious ways; their certificates are of both.
 
     Args:
         sampler: of the grasps; it has the map, the robot and where it stands.
@@ -97,51 +114,69 @@ class MapWays:
     def __init__(self, sampler: GraspSampler, target: Target, options: PickOptions) -> None:
         self.s, self.o = sampler, options
         self._T = sampler.scene.T_world_base
-        around = around_target(sampler.scene, target.rows)
-        self._around = sampler.collision_field(around)
         self._object = target_spheres(sampler, target)
-        self._beside = self._without_strays(around)
+        around = around_target(sampler.scene, target.rows)
+        # What is within the target are its own strays, which segmentation has left out.
+        inside = within(around.means.detach().double().numpy(), self._object)
+        beside = around.select(torch.from_numpy(~inside))
+        field = sampler.collision_field
+        self._static = _Obstacles(sampler.field, field(around), field(beside))
+        self._cautious: _Obstacles | None = None
+        if sampler.moving is not None:
+            models = (sampler.scene.model, around, beside)
+            self._cautious = _Obstacles(*(field(model, cautious=True) for model in models))
 
-    def to(self, grasp: Grasp, start: Array) -> Way | str:
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
         """See :class:`Ways`."""
         if grasp.q_pregrasp is None:
             return "no posture is known"
+        obstacles, clear = self._obstacles(cautious)
         opening = min(float(np.ceil(grasp.opening / OPENINGS - 1e-6)) * OPENINGS, self.s.hand.stroke)
-        planner = self._planner(self.s.field, opening)
+        planner = self._planner(obstacles.whole, opening)
         begin = time.perf_counter()
         plan = planner.plan(start, JointGoal(grasp.q_pregrasp), budget_ms=self.o.budget_ms, seed=self.o.seed)
         planned = time.perf_counter() - begin
         if plan.path is None:
             return plan.reason.rstrip(".")
-        approach = straight_line(planner.arm, self._around, grasp.q_pregrasp, grasp.T_world_tcp)
+        approach = straight_line(planner.arm, obstacles.around, grasp.q_pregrasp, grasp.T_world_tcp)
         if not approach or approach.path is None:
             return f"its approach is blocked: {approach.reason.rstrip('.')}"
         q = approach.path.waypoints[-1]
         closed = self._arm(grasp.width)
         attached = in_hand(closed, q, self._object)
         loaded = self._arm(grasp.width, attached)
-        free = self._up(closed, q, self.o.free)
+        free = self._up(closed, obstacles.beside, q, self.o.free)
         if not free or free.path is None:
             return f"it cannot be lifted: {free.reason.rstrip('.')}"
-        lift = self._up(loaded, free.path.waypoints[-1], self.o.lift - self.o.free)
+        lift = self._up(loaded, obstacles.beside, free.path.waypoints[-1], self.o.lift - self.o.free)
         if not lift or lift.path is None:
             return f"it cannot be lifted: {lift.reason.rstrip('.')}"
         return Way(
             grasp,
             opening,
             attached,
-            Leg(plan.path, planner.arm, self.s.field),
-            Leg(approach.path, planner.arm, self._around),
-            Leg(free.path, closed, self._beside),
-            Leg(lift.path, loaded, self._beside),
+            Leg(plan.path, planner.arm, obstacles.whole, clear),
+            Leg(approach.path, planner.arm, obstacles.around, clear),
+            Leg(free.path, closed, obstacles.beside, clear),
+            Leg(lift.path, loaded, obstacles.beside, clear),
             planned,
         )
 
     def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
-        """Around everything, with what is held."""
-        planner = self._planner(self._beside, way.grasp.width, way.attached)
-        plan = planner.plan(start, goal, budget_ms=self.o.budget_ms, seed=self.o.seed)
-        return plan.reason if plan.path is None else Leg(plan.path, planner.arm, self._beside)
+        """Around everything, with what is held; where it can be, clear of where something moved, too."""
+        for cautious in (True, False) if self._cautious is not None and way.clear else (False,):
+            obstacles, clear = self._obstacles(cautious)
+            planner = self._planner(obstacles.beside, way.grasp.width, way.attached)
+            plan = planner.plan(start, goal, budget_ms=self.o.budget_ms, seed=self.o.seed)
+            if plan.path is not None:
+                return Leg(plan.path, planner.arm, obstacles.beside, clear)
+        return plan.reason
+
+    def _obstacles(self, cautious: bool) -> tuple[_Obstacles, bool]:
+        """Of a way, and whether all that moved is among them."""
+        if cautious and self._cautious is not None:
+            return self._cautious, True
+        return self._static, self._cautious is None
 
     def _planner(
         self, field: GaussianCollisionField, opening: float, attached: ArrayLike | None = None
@@ -155,13 +190,8 @@ class MapWays:
             self.s.robot, T_world_base=self._T, opening=opening, attached=attached, margin=self.s.margin
         )
 
-    def _without_strays(self, around: GaussianModel) -> GaussianCollisionField:
-        """What is around the target, less what is within it: its own strays, which segmentation has left out."""
-        inside = within(around.means.detach().double().numpy(), self._object)
-        return self.s.collision_field(around.select(torch.from_numpy(~inside)))
-
-    def _up(self, arm: RobotSpheres, q: Array, by: float) -> StraightResult:
-        return straight_line(arm, self._beside, q, raised(self.s, arm, q, by))
+    def _up(self, arm: RobotSpheres, beside: GaussianCollisionField, q: Array, by: float) -> StraightResult:
+        return straight_line(arm, beside, q, raised(self.s, arm, q, by))
 
 
 def target_spheres(sampler: GraspSampler, target: Target) -> Array:

@@ -21,7 +21,7 @@ from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_types import PickError, PickOptions, PickOutcome, PickResult, PickStage
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
-from splatbot.grasping.ways import within
+from splatbot.grasping.ways import MapWays, Way, within
 from splatbot.planning import GaussianRRTStar
 from splatbot.protocols import Gripper, MotionState
 from splatbot.robots.controllers import FakeController
@@ -127,6 +127,53 @@ def test_what_is_held_is_carried_around_what_is_in_the_way() -> None:
     longer[:, 2] += panda().tcp(panda().home)[2, 3]
     planner = GaussianRRTStar(sampler().field, panda(), attached=longer)
     assert planner.plan(panda().home, panda().home + 1e-3).path is None
+
+
+def _spheres_on(way: Way) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (P, S, 3) and radii (P, S) of the arm's moving spheres, all along a way."""
+    centers, radii = [], []
+    for leg in (way.there, way.approach, way.free, way.lift):
+        q = leg.path.at(np.linspace(0.0, 1.0, 100))
+        moving = leg.arm.spheres.link > 0
+        centers += list(leg.arm.centers(q)[:, moving])
+        radii += [leg.arm.spheres.radii[moving]] * len(q)
+    return np.concatenate(centers), np.concatenate(radii)
+
+
+def test_a_way_goes_around_where_something_moved_and_its_certificate_is_of_both() -> None:
+    start = panda().home + np.eye(7)[0] * 1.2  # on the other side of what is at half way
+    plain = MapWays(sampler(), target("can"), OPTIONS).to(grasps("can").grasps[0], start)
+    assert isinstance(plain, Way)
+    assert plain.clear
+    middle = plain.there.arm.forward(plain.there.path.at(np.array([0.5])))[0, -1, :3, 3]
+    moving = np.array([[*middle, 0.04]])
+    wary = GraspSampler(scene(), panda(), moving=moving)
+    found = wary.sample(target("can"), OPTIONS.grasp)
+    ways = MapWays(wary, target("can"), replace(OPTIONS, budget_ms=1000.0))
+    grasp = next(g for g in found.grasps if g.clear)
+    cautious, bold = (ways.to(grasp, start, cautious=cautious) for cautious in (True, False))
+    assert isinstance(cautious, Way)
+    assert isinstance(bold, Way)
+    assert cautious.clear
+    assert not bold.clear
+    for way, free in ((cautious, True), (plain, False)):
+        centers, radii = _spheres_on(way)
+        assert (np.linalg.norm(centers - middle, axis=1) - radii > moving[0, 3]).all() == free
+        assert all(leg.path.certificate.certified for leg in (way.there, way.approach, way.free, way.lift))
+
+
+def test_where_no_way_keeps_clear_of_what_moves_it_is_picked_all_the_same_and_says_so() -> None:
+    world = twin()
+    controller = TwinController(world)
+    assert controller.gripper is not None
+    over = np.array([[*NAMES["can"][:2], 0.18, 0.08]])
+    wary = GraspSampler(scene(), panda(), moving=over)
+    result = Picker(wary, controller, controller.gripper, options=OPTIONS).pick(target("can"))
+    assert result, result.reason
+    assert result.grasp is not None
+    assert any("something moved" in note for note in result.notes)
+    clean = with_fake(FakeGripper(width=0.06))
+    assert clean.notes == ()
 
 
 class Scripted:

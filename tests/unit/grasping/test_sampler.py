@@ -62,7 +62,8 @@ def test_things_are_grasped_within_reach_and_ranked(name: str) -> None:
     totals = [g.total for g in result.grasps]
     assert totals == sorted(totals, reverse=True)
     for g in result.grasps:
-        assert set(g.terms) == set(WEIGHTS) - {"near"}
+        assert set(g.terms) == set(WEIGHTS) - {"near", "clear"}
+        assert g.clear
         assert all(0.0 <= value <= 1.0 for value in g.terms.values())
         assert g.width <= g.opening <= 0.08
         assert np.abs(THINGS[name].distance(g.contacts)).max() < 3e-3
@@ -121,6 +122,30 @@ def test_what_is_too_large_is_refused_with_its_width() -> None:
 def test_a_wider_hand_takes_it() -> None:
     found = GraspSampler(scene(), panda_2f140()).sample(target_of(scene(), BIG, "big"))
     assert found.unwrap().width == pytest.approx(BIG.size[0], abs=3e-3)
+
+
+def test_where_something_moved_grasps_that_keep_clear_of_it_come_first_and_the_others_say_so() -> None:
+    target = target_of(scene(), BOX, "box")
+    side = BOX.center + np.array([-np.sin(BOX.yaw), np.cos(BOX.yaw), 0.0]) * 0.11  # beside its wide face
+    moving = np.array([[*side, 0.06], [*side[:2], side[2] + 0.1, 0.06]])
+    wary = GraspSampler(scene(), panda(), moving=moving)
+    result = wary.sample(target, GraspOptions(wanted=30))
+    groups = [[g for g in result.grasps if g.clear is clear] for clear in (True, False)]
+    assert all(groups)
+    assert f"{len(groups[0])} of {len(result.grasps)} grasps keep clear" in " ".join(result.notes)
+    for g in result.grasps:
+        assert g.terms["clear"] == float(g.clear)
+        assert g.approach_path is not None
+        arm = RobotSpheres(panda(), opening=g.opening)
+        between = np.concatenate(
+            [np.linspace(a, b, 5) for a, b in zip(g.approach_path, g.approach_path[1:], strict=False)]
+        )
+        room = np.linalg.norm(arm.centers(between)[:, :, None] - moving[:, :3], axis=-1) - moving[:, 3]
+        assert (room - arm.spheres.radii[:, None]).min() > 0.0 or not g.clear
+    assert result.grasps[0].clear
+    assert not any("clear" in g.terms for g in grasped("box").grasps)
+    alone = GraspSampler(scene(), panda(), moving=moving, hand_only=True).sample(target).grasps
+    assert all(g.clear == bool(g.terms["clear"]) for g in alone)
 
 
 class _Nowhere:

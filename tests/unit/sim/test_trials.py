@@ -15,13 +15,14 @@ from splatbot.logs.raycast import Surface
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.agreement import wilson
 from splatbot.sim.scene import SceneObject
-from splatbot.sim.trials.look import camera_path
+from splatbot.sim.trials.look import UnseenError, camera_path
 from splatbot.sim.trials.run import FILE, TrialsPlan, read_rows, run_trials
 from splatbot.sim.trials.scenes import OBSTACLE, make_trial
 from splatbot.sim.trials.shake import SHARE, Shake
+from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.trials.table import physics, summaries, table_rows
-from splatbot.sim.trials.trial import KEPT, RISE, Attempt, TrialRow
+from splatbot.sim.trials.trial import KEPT, RISE, Attempt, TrialRow, run_trial
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA
 
@@ -149,6 +150,28 @@ def test_what_is_written_is_not_done_again_and_a_line_cut_short_is(tmp_path: Pat
     path.write_text("\n".join([lines[0][:40], lines[1]]) + "\n")
     with pytest.raises(FormatError, match="line 1"):
         read_rows(path)
+
+
+def test_a_target_that_no_picture_shows_is_a_failure_of_that_trial_and_not_the_end_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unseen(*args: object, **options: object) -> None:
+        raise UnseenError("is in no picture.", field="can-1")
+
+    monkeypatch.setattr("splatbot.sim.trials.trial.look", unseen)
+    rows, interrupted = run_trials(TrialsPlan(trials=2, frames=16, width=160), tmp_path)
+    assert not interrupted
+    assert [row.seed for row in rows] == [0, 1]
+    for one in rows:
+        assert (one.ideal.failure, one.reality.failure) == ("perception", "perception")
+        assert "in no picture" in one.reality.reason
+        assert (one.frames, one.pixels) == (16, 160)
+    assert read_rows(tmp_path / FILE) == rows
+    (found,) = summaries([*rows, row(2, "gaussians")])
+    assert (found["successes"], found["failures"]) == (1, {"perception": 2})
+    assert (found["build_s"], found["world_mb"]) == (4.0, 5.0)
+    (one,) = run_trial(make_trial(1, "isolated"), [GaussianStack()])
+    assert not one.ideal.success
 
 
 def test_wrong_plans_are_named() -> None:
