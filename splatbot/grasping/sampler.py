@@ -20,7 +20,7 @@ from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, pla
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ArmReach, Reach, hand_of
-from splatbot.grasping.score import arm_terms, best_apart, hand_terms, totals
+from splatbot.grasping.score import FAR, arm_terms, best_apart, hand_terms, totals
 from splatbot.grasping.surface import Surface, target_surface
 from splatbot.grasping.sweep import swept_room, touches
 from splatbot.grasping.types import Grasp, GraspResult
@@ -172,7 +172,7 @@ class _Search:
             len(hands),
             self.log.seconds,
             self.s.scene.map_version,
-            self._notes(found),
+            self._notes(found, grasps),
         )
 
     def _contacts(self) -> PairSearch:
@@ -328,8 +328,15 @@ class _Search:
         around = around_target(self.s.scene, self.target.rows)
         return self.s.collision_field(around), self.s.collision_field(own)
 
-    def _notes(self, found: PairSearch) -> tuple[str, ...]:
+    def _notes(self, found: PairSearch, grasps: tuple[Grasp, ...]) -> tuple[str, ...]:
         notes = []
+        if grasps and self.target.point is not None:
+            away = float(np.linalg.norm(grasps[0].contacts - self.target.point, axis=1).min())
+            if away > FAR:
+                notes.append(
+                    f"The best grasp is {100 * away:.0f} cm from what was pointed at; if that is another thing, both "
+                    "hang together in the map, and a mask tells them apart."
+                )
         implied = float(1.0 - self.surface.seen.mean())
         if implied > 0.05:
             notes.append(f"{implied:.0%} of its surface was not seen and is implied.")

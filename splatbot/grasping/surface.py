@@ -211,7 +211,7 @@ def _between(points: Array, seen: Surface, face: Array, back: float) -> NDArray[
     heights, low = _picture(own, None)
     inwards = _inwards(heights)
     cell = np.floor((flat[:, :2] - low) / _CELL).astype(int)
-    on = ((cell >= 0) & (cell < heights.shape)).all(axis=1)
+    on = np.asarray(((cell >= 0) & (cell < heights.shape)).all(axis=1))
     cell = np.where(on[:, None], cell, 0)
     behind = on & (inwards[cell[:, 0], cell[:, 1]] > _SEEN + _DISC)
     return np.asarray(behind & (flat[:, 2] > back + _SEEN) & (flat[:, 2] < np.percentile(own[:, 2], 95)))

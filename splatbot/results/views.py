@@ -42,7 +42,7 @@ def thinned_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
         LogError: the log is damaged.
     """
     indices = sorted(run.load_poses())
-    spread = np.unique(np.linspace(0, len(indices) - 1, _KEPT).round().astype(int)) if indices else []
+    spread = np.linspace(0, len(indices) - 1, min(_KEPT, len(indices))).round().astype(int)
     return tuple(thinned(view) for view in _views(run, log, [indices[k] for k in spread]))
 
 

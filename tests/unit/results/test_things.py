@@ -20,7 +20,7 @@ from splatbot.collision.evidence import measured_depths
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.results.folder import FrameRow, RunFolder
-from splatbot.results.things import measured_map, run_of, things_of
+from splatbot.results.things import MeasuredMap, measured_map, run_of, things_of
 from splatbot.results.views import thinned
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime
@@ -118,9 +118,13 @@ def test_a_map_is_measured_once_for_all_questions(run_folder: Path, monkeypatch:
 
     runtime = Runtime(ServiceSettings())
     _add_map(runtime, run_folder)
-    asked = []
-    real = robots_in_maps.measured_map
-    monkeypatch.setattr(robots_in_maps, "measured_map", lambda *given: asked.append(1) or real(*given))
+    asked, real = [], robots_in_maps.measured_map
+
+    def counted(*given: Any) -> MeasuredMap:
+        asked.append(given)
+        return real(*given)
+
+    monkeypatch.setattr(robots_in_maps, "measured_map", counted)
     served = runtime.store.get("default")
     first = robots_in_maps.things_in(served, np.eye(4), as_known=True)
     moved = np.eye(4)
