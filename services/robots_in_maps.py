@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
+from splatbot.results.things import Things, measured_map, things_of
 from splatbot.robots.robot import RobotModel
-from splatbot.segmentation import MapScene, segment
 from splatbot.services.arms import known_robot
 from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap
@@ -37,7 +37,7 @@ def arm_in(
     return model, RobotSpheres(model, T_world_base=base_in(served, base), margin=margin, opening=opening)
 
 
-def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -> MapScene:
+def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -> Things:
     """The things on the table of a map, worked out once for each of its states and bases.
 
     Args:
@@ -45,18 +45,11 @@ def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -
         base: T_world_base (4, 4).
         as_known: the base is the map's own, and so are its box and plane.
     """
-    known = served.workspace
-
-    def make() -> MapScene:
-        return segment(
-            served.ready,
-            base,
-            box=known.box if known is not None and as_known else None,
-            plane=known.support_plane if known is not None and as_known else None,
-            names=known.objects if known is not None else (),
-        )
-
-    return served.derived.get(("things", base.tobytes(), as_known), make)
+    measured = served.derived.get("measured", lambda: measured_map(served.ready, served.run))
+    return served.derived.get(
+        ("things", base.tobytes(), as_known),
+        lambda: things_of(measured, base, served.workspace, as_known=as_known),
+    )
 
 
 def joints_of(model: RobotModel, values: list[float], field: str) -> NDArray[np.float64]:

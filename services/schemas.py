@@ -215,6 +215,7 @@ class GraspsRequest(Request):
     samples: Annotated[int, Field(ge=10, le=5000)] = Field(400, description="places tried: the knob of time")
     wanted: Annotated[int, Field(ge=1, le=100)] = 10
     margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
+    min_observations: Annotated[int, Field(ge=1, le=1000)] = Field(1, description="what fewer keyframes saw is air")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
     @model_validator(mode="after")

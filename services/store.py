@@ -10,6 +10,7 @@ from typing import Literal
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.gaussians import Snapshot
+from splatbot.results.folder import RunFolder
 from splatbot.services.bus import Bus
 from splatbot.services.derived import Derived
 from splatbot.services.frames_first import FramesFirst
@@ -42,6 +43,7 @@ class ServedMap:
         trajectory: of the camera, as far as ``snapshot`` knows it; None where there was none.
         workspace: where the robot stands in it, where that is known.
         awaited: the service counts as ready only once this map has a state.
+        run: the folder of the run that made it; None: none did, or it is not known.
         derived: what has been worked out from the snapshot.
     """
 
@@ -53,6 +55,7 @@ class ServedMap:
     trajectory: Trajectory | None = None
     workspace: Workspace | None = None
     awaited: bool = True
+    run: RunFolder | None = None
     derived: Derived = dataclasses.field(default_factory=Derived, repr=False, compare=False)
 
     @property
@@ -105,6 +108,7 @@ class MapStore:
         trajectory: Trajectory | None = None,
         workspace: Workspace | None = None,
         awaited: bool = True,
+        run: RunFolder | None = None,
     ) -> ServedMap:
         """Serve a map under a new name.
 
@@ -114,7 +118,7 @@ class MapStore:
         with self._lock:
             if map_id in self._maps:
                 raise MapExistsError(f"map {map_id!r} exists.", field="id", hint="delete it, or choose another id")
-            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited)
+            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited, run)
             self._put(served)
         return served
 

@@ -10,7 +10,6 @@ import numpy as np
 from splatbot.grasping.affordance import Hint, NameHint, PointHint, find_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.places import PlaceAffordance
-from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
 from splatbot.grasping.words import WordAffordance
 from splatbot.logs.ros_frames import header, pose_message
@@ -49,9 +48,9 @@ class GraspServices:
 
         def work() -> dict[str, Any]:
             served, robot, base = robot_place(self._store, self._robot)
-            scene = things_in(served, base, as_known=True)
-            target = find_target(_hint(args), scene, [WordAffordance(), PlaceAffordance()])
-            found = GraspSampler(scene, robot).sample(target, GraspOptions())
+            things = things_in(served, base, as_known=True)
+            target = find_target(_hint(args), things.scene, [WordAffordance(), PlaceAffordance()])
+            found = things.told(things.sampler(robot).sample(target, GraspOptions()))
             found.unwrap()
             stamp = served.ready.stamp
             self._store.bus.publish(map_topic(served.id, GRASPS), found)

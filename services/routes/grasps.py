@@ -12,7 +12,6 @@ from splatbot.errors import InputError
 from splatbot.grasping.affordance import BoxHint, Hint, NameHint, PixelHint, PointHint, View, find_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.places import PlaceAffordance
-from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.summary import summary
 from splatbot.grasping.words import WordAffordance
 from splatbot.services.arms import known_robot
@@ -58,9 +57,11 @@ def grasps(
     Words are rules on names, colours, shapes, sizes and places; what fits two things is refused.
     """
     robot, base = known_robot(asked.robot), base_in(served, asked.base)
-    scene = things_in(served, base, as_known=asked.base is None)
-    found = find_target(_hint(asked), scene, [WordAffordance(), PlaceAffordance()])
-    sampler = GraspSampler(scene, robot, hand_only=asked.hand_only, margin=asked.margin)
+    things = things_in(served, base, as_known=asked.base is None)
+    found = find_target(_hint(asked), things.scene, [WordAffordance(), PlaceAffordance()])
+    sampler = things.sampler(
+        robot, hand_only=asked.hand_only, margin=asked.margin, min_observations=asked.min_observations
+    )
     options = GraspOptions(
         friction=asked.friction,
         samples=asked.samples,
@@ -68,7 +69,7 @@ def grasps(
         approach=asked.approach,
         seed=asked.seed,
     )
-    result = sampler.sample(found, options)
+    result = things.told(sampler.sample(found, options))
     result.unwrap()
     service.bus.publish(map_topic(served.id, GRASPS), result)
     return answer(request, summary(result) | {"map_version": served.map_version})

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,11 +14,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.collision.evidence import DepthView
-    from splatbot.gaussians import GaussianModel
     from splatbot.grasping.affordance import Hint, View
     from splatbot.grasping.types import GraspResult
-    from splatbot.segmentation import MapScene
+    from splatbot.results.things import Things
 
 
 def grasp(
@@ -101,7 +97,6 @@ def grasp(
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.places import PlaceAffordance
-    from splatbot.grasping.sampler import GraspSampler
     from splatbot.grasping.summary import summary
     from splatbot.grasping.tags import TagAffordance
     from splatbot.report.grasp_view import grasp_png
@@ -111,22 +106,13 @@ def grasp(
         friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
     )
     arm = load_robot(robot)
-    views, unread = _measured(map)
-    scene, seen_from = _scene(map, base, views)
+    things = _things(map, base)
+    scene = things.scene
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), PlaceAffordance(), TagAffordance()])
-    sampler = GraspSampler(
-        scene,
-        arm,
-        hand_only=hand_only,
-        observers=seen_from,
-        views=views,
-        n_sigma=n_sigma,
-        min_observations=min_observations,
-    )
+    sampler = things.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
     sampler.margin = margin_of(margin, map, sampler.field, scene.T_world_base)
-    result = sampler.sample(found, options)
-    result = replace(result, notes=(*unread, *result.notes))
+    result = things.told(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
@@ -140,60 +126,15 @@ def grasp(
     return 0
 
 
-def _scene(map_: Path, base: Pose | None, views: Sequence[DepthView]) -> tuple[MapScene, NDArray[np.float64] | None]:
-    """What is in the map, but for flying pixels at edges, and where each of its Gaussians was seen from."""
-    import torch
-
-    from splatbot.collision import gather_evidence
-    from splatbot.gaussians import GaussianModel
-    from splatbot.segmentation import segment
+def _things(map_: Path, base: Pose | None) -> Things:
+    from splatbot.gaussians import GaussianModel, Snapshot
+    from splatbot.results.things import measured_map, run_of, things_of
     from splatbot.workspace import find_workspace
 
-    known = find_workspace(map_)
-    model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
-    solid = torch.from_numpy(~gather_evidence(model, views).seen_through).nonzero()[:, 0]
-    model = model.select(solid)
     T = base_pose(base, map_)
-    own = known is not None and base is None  # box and plane belong to the base of the file
-    seen_from = _observers(map_, model)
-    scene = segment(
-        model,
-        T,
-        box=known.box if own and known is not None else None,
-        plane=known.support_plane if own and known is not None else None,
-        names=known.objects if known is not None else (),
-        observers=seen_from,
-    )
-    return scene, seen_from
-
-
-def _observers(map_: Path, model: GaussianModel) -> NDArray[np.float64] | None:
-    if not (map_ / "frames.jsonl").is_file():
-        return None
-    from splatbot.results.folder import RunFolder
-    from splatbot.results.observers import observers
-
-    return observers(RunFolder(map_), model)
-
-
-def _measured(map_: Path) -> tuple[tuple[DepthView, ...], tuple[str, ...]]:
-    """Depth of the run, and a note where its log cannot be read any more.
-
-    What more frames saw through than saw is not there, seen of the thing or not.
-    """
-    if not (map_ / "frames.jsonl").is_file():
-        return (), ()
-    from splatbot.errors import SplatbotError
-    from splatbot.results.folder import RunFolder
-    from splatbot.results.views import depth_views
-    from splatbot.robots.in_view import reopen_log
-
-    run = RunFolder(map_)
-    try:
-        log = reopen_log(run)
-    except SplatbotError as error:
-        return (), (f"What depth saw through was not asked, for the run's log cannot be read: {error}",)
-    return tuple(depth_views(run, log)), ()
+    model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
+    measured = measured_map(Snapshot(model, map_version=0), run_of(map_))
+    return things_of(measured, T, find_workspace(map_), as_known=base is None)
 
 
 def _hint(

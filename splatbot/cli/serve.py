@@ -94,11 +94,19 @@ def serve(
 
 def _add_map(runtime: Runtime, map_: Path) -> None:
     from splatbot.gaussians import GaussianModel, Snapshot
+    from splatbot.results.things import run_of
     from splatbot.workspace import find_workspace
 
     path = map_ / "map.ply" if map_.is_dir() else map_
     snapshot = Snapshot(GaussianModel.load(path), map_version=1)
-    runtime.store.add(MAP_ID, source=path.name, state="static", snapshot=snapshot, workspace=find_workspace(path))
+    runtime.store.add(
+        MAP_ID,
+        source=path.name,
+        state="static",
+        snapshot=snapshot,
+        workspace=find_workspace(path),
+        run=run_of(map_),
+    )
 
 
 def _follow(runtime: Runtime, source: Log | FrameSource) -> None:

@@ -22,11 +22,13 @@ from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapObject, MapScene
 from splatbot.segmentation.objects import FEWEST, LARGEST
-from splatbot.segmentation.parts import find_faces
+from splatbot.segmentation.parts import find_faces, nearest_of
 
 NEAR = 0.02  # [m] around a point within which an object's Gaussian must be
 _CLEAR = 0.6  # share of a mask's objects that one must have
 _WITHIN = "it was pointed at within it, not at its surface"
+_PART = 0.5  # share of what shows of an object; where less of it is marked, what is marked is a thing of its own
+_TOUCHING = "it hangs together with more in the map: what was marked is taken for it"
 _UNSEGMENTED = "it is no object of its own: what was marked of its faces is taken for it"
 
 
@@ -49,7 +51,7 @@ class PlaceAffordance:
         if isinstance(hint, PixelHint):
             return at_point(scene, point_at(scene, hint.view, hint.u, hint.v))
         if isinstance(hint, MaskHint):
-            return _at_mask(scene, hint.view, np.asarray(hint.mask))
+            return _at_mask(scene, hint.view, np.asarray(hint.mask), exact=True)
         if isinstance(hint, BoxHint):
             return _at_mask(scene, hint.view, _rectangle(hint))
         raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a pixel, point, mask or rectangle")
@@ -138,7 +140,8 @@ def _face_at(scene: MapScene, point: Array) -> NDArray[np.int64]:
     return own
 
 
-def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_]) -> Target:
+def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_], *, exact: bool = False) -> Target:
+    """The object that a mask shows; of an ``exact`` one that leaves out most of it, what is marked."""
     c = view.camera
     if mask.shape != (c.height, c.width) or mask.dtype != np.bool_:
         raise InputError(f"is {mask.dtype} {mask.shape}.", field="mask", hint=f"give ({c.height}, {c.width}) booleans")
@@ -160,7 +163,22 @@ def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_]) -> Target:
             f"shows {len(names)} objects about equally.", field="mask", hint="mark one of them", candidates=names
         )
     found = scene.objects[k]
-    return Target(found.rows, None, found.name or f"object {k}", "place", float(votes[k] / votes.sum()), (), k)
+    label, score = found.name or f"object {k}", float(votes[k] / votes.sum())
+    if exact and votes[k] >= FEWEST:
+        shown = _visible(scene, view, np.ones_like(mask))
+        shown = shown[scene.labels[shown] == k]
+        if votes[k] < _PART * len(shown):
+            rows = _nearer(scene.points, found.rows, seeds[labels == k], np.setdiff1d(shown, seeds))
+            return Target(rows, None, f"part of {label}", "place", score, (_TOUCHING,), k)
+    return Target(found.rows, None, label, "place", score, (), k)
+
+
+def _nearer(
+    points: Array, rows: NDArray[np.int64], own: NDArray[np.int64], other: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Those of ``rows`` of points (N, 3) that are nearer to one of the rows ``own`` than to any of ``other``."""
+    away = [nearest_of(points[some], points[rows])[1] for some in (own, other)]
+    return rows[away[0] < away[1]]
 
 
 def _visible(scene: MapScene, view: View, mask: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -21,7 +21,7 @@ from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, pla
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ArmReach, Reach, hand_of
-from splatbot.grasping.score import arm_terms, best_apart, hand_terms, totals
+from splatbot.grasping.score import FAR, arm_terms, best_apart, hand_terms, totals
 from splatbot.grasping.surface import Surface, target_surface
 from splatbot.grasping.sweep import swept_room, touches
 from splatbot.grasping.types import Grasp, GraspResult
@@ -377,6 +377,13 @@ class _Search:
         if self.s.moving is not None and grasps:
             clear = sum(grasp.clear for grasp in grasps)
             notes.append(f"Something moved; {clear} of {len(grasps)} grasps keep clear of where it was seen.")
+        if grasps and self.target.point is not None:
+            away = float(np.linalg.norm(grasps[0].contacts - self.target.point, axis=1).min())
+            if away > FAR:
+                notes.append(
+                    f"The best grasp is {100 * away:.0f} cm from what was pointed at; if that is another thing, both "
+                    "hang together in the map, and a mask tells them apart."
+                )
         implied = float(1.0 - self.surface.seen.mean())
         if implied > 0.05:
             notes.append(f"{implied:.0%} of its surface was not seen and is implied.")

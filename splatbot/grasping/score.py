@@ -31,7 +31,7 @@ WEIGHTS: Mapping[str, float] = {
     "limits": 1.0,  # of the joints
 }
 
-_FAR = 0.05  # [m] from the middle, or from what was pointed at, that is as bad as farther
+FAR = 0.05  # [m] from the middle, or from what was pointed at, that is as bad as farther
 _SPARE = 0.02  # [m] of the stroke left that is as good as more
 _ROOM = 0.02  # [m] of the hand that is as good as more
 _DOUBT = 0.004  # [m] of uncertainty that is as bad as more
@@ -70,7 +70,7 @@ def hand_terms(
     found = {
         "closure": hands.closure,
         "held": hands.held,
-        "centre": 1.0 - aside / _FAR,
+        "centre": 1.0 - aside / FAR,
         "torque": 1.0 - friction_share(body.size * _DENSITY * _PULL, aside, hand, friction),
         "width": (hand.stroke - pairs.width[p]) / _SPARE,
         "room": room / _ROOM,
@@ -79,7 +79,7 @@ def hand_terms(
         "upright": -(hands.T[:, :3, 2] @ up),
     }
     if near is not None:
-        found["near"] = 1.0 - np.linalg.norm(pairs.contacts[p] - near, axis=2).min(axis=1) / _FAR
+        found["near"] = 1.0 - np.linalg.norm(pairs.contacts[p] - near, axis=2).min(axis=1) / FAR
     return {name: np.clip(values, 0.0, 1.0) for name, values in found.items()}
 
 

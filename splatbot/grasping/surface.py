@@ -31,13 +31,19 @@ _STEP = 0.006  # [m] from where on a difference in height is an edge
 _FACING, _TURNED = 0.7, 0.1  # cosines between a direction and the normals of what faces it, and of what it still sees
 _TURNED_AWAY = 0.7  # below it a normal is of another face
 _FEW = 20  # points that are no face
+_FLAT, _MOST_OF_IT = 0.97, 0.4  # cosine between the normals of a flat face; share of the target that it is
+_SLOPE = 0.7  # cosine between up and normals of a side
+_LEANS = 0.17  # [rad] from where on a flat side leans
 _BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
 _SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
 _SPREAD = 1.65  # standard deviations, that 5 % of what is noisy are beyond
-_TUBE = 0.003  # [m] around a line within which it meets a point
+_TUBE = 0.003  # [m] around a line within which it meets a point, where none is left out
 _SEEN = 0.006  # [m] around seen points of a side within which none is added
 _ROWS = 0.003  # [m] between added points
 _THROUGH = 2  # views that must see through a point that nobody saw
+_HOLLOW = 0.03  # share of a face, but for its rim, that was seen through behind, from where on the thing ends
+_RIM = 0.014  # [m] of a face, as far as depth images smear its edges outwards and evidence is in doubt
+_COLUMNS = 300  # places of a face that are asked
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +56,8 @@ class Surface:
         half: (M, 3, 3) principal axes as columns, each as long as its standard deviation [m]; 0 of what is implied.
         spread: (M,) the largest of them [m]; of what is implied, half of the distance between its points.
         seen: (M,) whether it was measured; the others are implied.
-        doubt: (M,) standard deviation of where the point is along its normal [m].
+        doubt: (M,) standard deviation of where the point is along its normal [m]; of a back whose depth is guessed,
+            that of the guess.
         center: (3,) middle of its box [m, world].
     """
 
@@ -149,37 +156,94 @@ def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, Ar
 
 def _completed(scene: MapScene, seen: Surface, areas: Array, views: Sequence[DepthView]) -> Surface:
     """With the sides that go down from its top to the support, and back from the face that was seen in front."""
-    up = scene.up
-    floor = _floor(scene, seen, up)
-    parts = [_sides(seen, up, floor)]
+    up = _along(seen, scene.up)
+    leans = bool(up @ scene.up < np.cos(_LEANS / 2))
+    floor = float(np.percentile(seen.points @ up, 1)) if leans else _floor(scene, seen, up)
+    down = _sides(seen, up, floor)
+    parts = [(*down, np.full(len(down[0]), _ROWS / 2))]
+    fronts = []
     for face in _faces(seen.normals, up):
-        back, mirrored = _back(seen, face, up)
-        parts.append(_sides(seen, face, back, closed=True, mirrored=mirrored))
-    points, normals = (np.concatenate([part[k] for part in parts]) for k in range(2))
+        *part, back = _behind(seen, face, up, views)
+        parts.append((part[0], part[1], part[2]))
+        fronts.append((face, back))
+    points, normals, doubt = (np.concatenate([part[k] for part in parts]) for k in range(3))
     # Sides go down to the floor; so where those of a face that was seen in front end above it, there is no bottom.
-    standing = (normals @ up > -_TURNED_AWAY) | (points @ up < floor + _STEP)
-    points, normals = points[standing], normals[standing]
-    thin = np.unique(np.floor(points / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
-    thin = thin[:: 1 + len(thin) // MOST]
-    points, normals = points[thin], normals[thin]
-    outer = winding_numbers(points, seen.points, seen.normals, areas, softened=_ROWS) < _WITHIN
-    evidence = evidence_at(points, views)
-    outer &= ~(evidence.seen_through & (evidence.passes >= _THROUGH))
-    points, normals = points[outer], normals[outer]
-    outer = ~_inside(points, normals)
-    points, normals, n = points[outer], normals[outer], int(outer.sum())
-    if n == 0:
-        return seen
-    wide = np.full(n, _ROWS / 2)
+    standing = np.flatnonzero((normals @ up > -_TURNED_AWAY) | (points @ up < floor + _STEP))
+    thin = np.unique(np.floor(points[standing] / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
+    every = 1 + len(thin) // MOST
+    kept = standing[thin[::every]]
+    for face, back in fronts:
+        kept = kept[~_between(points[kept], seen, face, back)]
+    outer = winding_numbers(points[kept], seen.points, seen.normals, areas, softened=_ROWS) < _WITHIN
+    evidence = evidence_at(points[kept], views)
+    kept = kept[outer & ~(evidence.seen_through & (evidence.passes >= _THROUGH))]
+    kept = kept[~_inside(points[kept], normals[kept], tube=_TUBE * np.sqrt(every))]
     return Surface(
-        np.concatenate([seen.points, points]),
-        np.concatenate([seen.normals, normals]),
-        np.concatenate([seen.half, np.zeros((n, 3, 3))]),
-        np.concatenate([seen.spread, wide]),
-        np.concatenate([seen.seen, np.zeros(n, np.bool_)]),
-        np.concatenate([seen.doubt, wide]),
+        np.concatenate([seen.points, points[kept]]),
+        np.concatenate([seen.normals, normals[kept]]),
+        np.concatenate([seen.half, np.zeros((len(kept), 3, 3))]),
+        np.concatenate([seen.spread, np.full(len(kept), _ROWS / 2)]),
+        np.concatenate([seen.seen, np.zeros(len(kept), np.bool_)]),
+        np.concatenate([seen.doubt, doubt[kept]]),
         seen.center,
     )
+
+
+def _behind(seen: Surface, face: Array, up: Array, views: Sequence[DepthView]) -> tuple[Array, Array, Array, float]:
+    """Points and normals (K, 3) of the sides behind a face and of the back, their standard deviation (K,) [m], and
+    where the back is along ``face`` [m, world]; infinity: it is curved."""
+    back, mirrored = _back(seen, face, up)
+    guess = _ROWS / 2
+    if not mirrored and back < np.percentile(seen.points @ face, 5):  # nothing of the thing shows how deep it is
+        back = max(back, _seen_behind(seen, face, views))
+        guess = max(guess, float(np.median(seen.points @ face) - back) / np.sqrt(12))  # all in between is as likely
+    points, normals = _sides(seen, face, back, closed=True, mirrored=mirrored)
+    doubt = np.where(normals @ face < -_TURNED_AWAY, guess, _ROWS / 2)
+    return points, normals, doubt, np.inf if mirrored else back
+
+
+def _between(points: Array, seen: Surface, face: Array, back: float) -> NDArray[np.bool_]:
+    """Whether points (P, 3) are between what faces ``face`` and its back, but for its rim (P,): there is no side."""
+    front = seen.points[seen.normals @ face > _FACING]
+    if len(front) < _FEW:
+        return np.zeros(len(points), np.bool_)
+    across = _frame(face)
+    flat, own = points @ across.T, front @ across.T
+    heights, low = _picture(own, None)
+    inwards = _inwards(heights)
+    cell = np.floor((flat[:, :2] - low) / _CELL).astype(int)
+    on = np.asarray(((cell >= 0) & (cell < heights.shape)).all(axis=1))
+    cell = np.where(on[:, None], cell, 0)
+    behind = on & (inwards[cell[:, 0], cell[:, 1]] > _SEEN + _DISC)
+    return np.asarray(behind & (flat[:, 2] > back + _SEEN) & (flat[:, 2] < np.percentile(own[:, 2], 95)))
+
+
+def _inwards(heights: Array) -> Array:
+    """How far each cell of a picture (H, W) of a face is from its rim [m], holes closed; 0 beside it."""
+    known = cv2.morphologyEx(np.isfinite(heights).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_GAP, _GAP), np.uint8))
+    return np.asarray(cv2.distanceTransform(known, cv2.DIST_L2, 5) * _CELL, dtype=np.float64)
+
+
+def _along(seen: Surface, up: Array) -> Array:
+    """The direction (3,) in which the target stands: ``up``, or along the flat face that is most of it and leans.
+
+    What leans, as a book on a wall, has its back parallel to its face, and its sides end where they do in its own
+    frame, not below; what is round, or has several sides, shows no single face that is most of it.
+    """
+    side = seen.normals[np.abs(seen.normals @ up) < _SLOPE]
+    if len(side) < max(_FEW, _MOST_OF_IT * len(seen)):
+        return up
+    close = side @ side[:: max(1, len(side) // 100)].T > _FLAT
+    best = int(close.sum(axis=0).argmax())
+    if close[:, best].sum() < _MOST_OF_IT * len(seen):
+        return up
+    face = side[close[:, best]].mean(axis=0)
+    face /= np.linalg.norm(face)
+    lean = float(face @ up)
+    if abs(lean) < np.sin(_LEANS):
+        return up
+    along = up - lean * face
+    return np.asarray(along / np.linalg.norm(along))
 
 
 def _faces(normals: Array, up: Array) -> list[Array]:
@@ -228,6 +292,29 @@ def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
         return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
     narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
     return near - min(narrow, 2 * _BEHIND), False
+
+
+def _seen_behind(seen: Surface, face: Array, views: Sequence[DepthView]) -> float:
+    """Where along ``face`` [m, world] something behind it was seen through: what is flat in front ends before that.
+
+    Minus infinity: nowhere within the depth that is implied at most. What is behind the rim of a face is not asked.
+    """
+    facing = seen.normals @ face > _FACING
+    if facing.sum() < _FEW or not views:
+        return -np.inf
+    front = seen.points[facing]
+    flat = front @ _frame(face).T
+    heights, low = _picture(flat, None)
+    cells = np.floor((flat[:, :2] - low) / _CELL).astype(int)
+    front = front[_inwards(heights)[cells[:, 0], cells[:, 1]] > _RIM]
+    front = front[:: 1 + len(front) // _COLUMNS]
+    if len(front) < _FEW:
+        return -np.inf
+    deep = np.arange(_ROWS, 2 * _BEHIND, _ROWS)
+    evidence = evidence_at((front[None] - deep[:, None, None] * face).reshape(-1, 3), views)
+    through = (evidence.seen_through & (evidence.passes >= _THROUGH)).reshape(len(deep), len(front))
+    ended = np.logical_or.accumulate(through, axis=0).mean(axis=1) >= _HOLLOW
+    return float(np.median(front @ face) - deep[ended.argmax()]) if ended.any() else -np.inf
 
 
 def _bowl(at: Array, heights: Array) -> tuple[Array, float]:
@@ -341,8 +428,11 @@ def _edges(heights: Array) -> tuple[NDArray[np.int64], Array, Array, Array]:
     return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)
 
 
-def _inside(points: Array, normals: Array) -> NDArray[np.bool_]:
-    """Whether what points (P, 3) face first is another of them from behind (P,): they are within the target."""
+def _inside(points: Array, normals: Array, *, tube: float) -> NDArray[np.bool_]:
+    """Whether what points (P, 3) face first is another of them from behind (P,): they are within the target.
+
+    ``tube``: [m] around where they look, as wide as points are apart, for nobody looks out between them.
+    """
     if not len(points):
         return np.zeros(0, np.bool_)
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
@@ -351,7 +441,7 @@ def _inside(points: Array, normals: Array) -> NDArray[np.bool_]:
         a, d = p[k : k + 256], n[k : k + 256]
         ahead = d @ p.T - np.einsum("ij,ij->i", a, d)[:, None]
         aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + square - ahead**2
-        ahead[(ahead < _SEEN) | (aside > _TUBE**2)] = np.inf
+        ahead[(ahead < _SEEN) | (aside > tube**2)] = np.inf
         first = ahead.argmin(axis=1)
         hit = np.isfinite(ahead[np.arange(len(a)), first])
         found[k : k + 256] = hit & (np.einsum("ij,ij->i", n[first], d) > 0.3)

@@ -268,3 +268,13 @@ def test_options_out_of_range_are_refused(field: str, value: object) -> None:
 def test_a_target_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="ghost"):
         sampler().sample(Target(np.zeros(0, np.int64), None, "ghost", "test", 1.0))
+
+
+def test_a_grasp_far_from_what_was_pointed_at_says_so() -> None:
+    """As where two things hang together in the map, and the hand takes the one that was not meant."""
+    box, can = (target_of(scene(), THINGS[name], name) for name in ("box", "can"))
+    at = np.array([0.50, -0.15, 0.12])
+    far = sampler().sample(Target(box.rows, at, "both", "place", 1.0))
+    assert any("from what was pointed at" in note for note in far.notes)
+    near = sampler().sample(Target(can.rows, at, "can", "place", 1.0))
+    assert not any("from what was pointed at" in note for note in near.notes)
