@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 _RECENT = 40  # runs of a stage that its cost is judged by
+_FORGOTTEN = 60  # frames after which a run says nothing any more: what was too slow once is tried again
 _SHARE = 0.95  # of them it must have cost no more
 _UNKNOWN = 1.5  # times the table's cost is expected of a stage that has not run yet
 
@@ -34,23 +35,33 @@ def table_ms(stage: str, units: float) -> float:
 
 
 class Costs:
-    """What stages have cost lately, against the table; kept from frame to frame."""
+    """What stages have cost lately, against the table; kept from frame to frame.
+
+    The slowest run is not believed by itself, for a machine hiccups, and what is not run cannot get better: a stage
+    is slow when two runs say so, and for as long as they are remembered.
+    """
 
     def __init__(self) -> None:
-        self._ratios: dict[str, list[float]] = {}
+        self._frame = 0
+        self._runs: dict[str, list[tuple[int, float]]] = {}
+
+    def begin_frame(self) -> None:
+        """That the next frame has begun."""
+        self._frame += 1
 
     def record(self, stage: str, units: float, ms: float) -> None:
         """That a stage took so long."""
-        recent = self._ratios.setdefault(stage, [])
-        recent.append(ms / table_ms(stage, units))
+        recent = self._runs.setdefault(stage, [])
+        recent.append((self._frame, ms / table_ms(stage, units)))
         del recent[:-_RECENT]
 
     def p95_ms(self, stage: str, units: float) -> float:
         """What 95 % of recent runs would have cost at most for this work [ms]."""
-        ratios = sorted(self._ratios.get(stage, ()))
-        if not ratios:
-            return _UNKNOWN * table_ms(stage, units)
-        return table_ms(stage, units) * ratios[min(math.ceil(_SHARE * len(ratios)), len(ratios)) - 1]
+        ratios = sorted(ratio for frame, ratio in self._runs.get(stage, ()) if frame > self._frame - _FORGOTTEN)
+        n = len(ratios)
+        if n < 2:
+            return table_ms(stage, units) * min([_UNKNOWN, *ratios])
+        return table_ms(stage, units) * ratios[min(math.ceil(_SHARE * n), n - 1) - 1]
 
 
 class Budget:
@@ -72,6 +83,8 @@ class Budget:
         self._costs = costs
         self._started = started
         self._counted = 0.0
+        if costs is not None:
+            costs.begin_frame()
 
     @property
     def left_ms(self) -> float:

@@ -25,7 +25,7 @@ _MATCH_RATIO = 0.8  # Lowe's ratio test
 _MIN_SPREAD = 0.05  # standard deviation of matched pixels across their narrowest direction [image width]
 _TILES = 8  # across the image, that keypoints are spread over
 _CROWD = 2.0  # times its share of them that a tile has at most
-_TO_CHOOSE_FROM = 4  # times as many keypoints as are kept
+_TO_CHOOSE_FROM = 2  # times as many keypoints as are kept
 _PATCH = 31  # [px] that an ORB descriptor looks at on the finest level
 _MATCH_BITS = 64  # descriptors that differ in more of their 256 bits are strangers
 

@@ -14,34 +14,37 @@ from splatbot.logs import open_log
 WIDTH = 0.008  # [m] that a width may be off
 SHELF_BOX = (228, 333)  # [px] the edges of its front in frame 12
 FRICTION = 0.5
+UNCERTAIN = 0.1  # the term of a side that nobody saw and nothing tells of
 
 
 def check_shelf_box(log: Path, run: Path) -> None:
-    """The tissue box in the shelf, apart from the walls that it touches."""
-    best = _grasped(run, "--box", "350", "262", "445", "385", "--robot", "panda-2f140")
-    _held_and_free(best)
+    """The tissue box in the shelf, apart from the walls that it touches: as wide as in the picture, or by a guess."""
+    grasps = _grasped(run, "--box", "350", "262", "445", "385", "--robot", "panda-2f140")
     frame = open_log(log)[12]  # which looks straight at it
     depth = frame.depth[190:265, 240:320]
     wide = (SHELF_BOX[1] - SHELF_BOX[0]) * float(np.median(depth[depth > 0])) / frame.camera.fx
-    assert abs(best["width_m"] - wide) < WIDTH
+    for grasp in grasps:
+        _held_and_free(grasp)
+        assert grasp["terms"]["certain"] < UNCERTAIN or abs(grasp["width_m"] - wide) < WIDTH
 
 
-def _grasped(run: Path, *words: str) -> dict[str, Any]:
-    """The best grasp, as a user asks for it; drawn too."""
+def _grasped(run: Path, *words: str) -> list[dict[str, Any]]:
+    """The ranked grasps, as a user asks for them; the best is drawn."""
     assert (run / "scene.yaml").is_file() or main(["info", str(run), "--fit-plane"]) == 0
     out = run / "grasp"
     assert main(["grasp", "--map", str(run), "--min-observations", "3", "--out", str(out), *words]) == 0
     assert (out / "grasp.png").stat().st_size > 10_000
-    best: dict[str, Any] = json.loads((out / "grasp.json").read_text())["grasps"][0]
-    return best
+    grasps: list[dict[str, Any]] = json.loads((out / "grasp.json").read_text())["grasps"]
+    assert grasps
+    return grasps
 
 
-def _held_and_free(best: dict[str, Any]) -> None:
+def _held_and_free(grasp: dict[str, Any]) -> None:
     """Both normals are within the friction cone about the line between the contacts, and there is room on the way."""
-    contacts, normals = np.array(best["contacts"]), np.array(best["normals"])
+    contacts, normals = np.array(grasp["contacts"]), np.array(grasp["normals"])
     line = (contacts[1] - contacts[0]) / np.linalg.norm(contacts[1] - contacts[0])
     cosines = np.array([-normals[0] @ line, normals[1] @ line])
     assert np.degrees(np.arccos(cosines)).max() < np.degrees(np.arctan(FRICTION))
-    assert best["room_m"] > 0.0
-    assert best["opening_m"] >= best["width_m"]
-    assert best["approach_path"] is not None
+    assert grasp["room_m"] > 0.0
+    assert grasp["opening_m"] >= grasp["width_m"]
+    assert grasp["approach_path"] is not None
