@@ -17,7 +17,7 @@ FRICTION = 0.5
 
 
 def check_shelf_box(log: Path, run: Path) -> None:
-    """The tissue box in the shelf, apart from the walls that it touches: as wide as in the picture where its sides were seen."""
+    """The tissue box in the shelf, apart from the walls: as wide as in the picture where its sides were seen."""
     grasps = _grasped(run, "--box", "350", "262", "445", "385", "--robot", "panda-2f140")
     frame = open_log(log)[12]  # which looks straight at it
     depth = frame.depth[190:265, 240:320]
