@@ -173,10 +173,10 @@ class Attempt:
         return views, len(features) * sum(len(known) for known, _ in views)
 
     def _keypoints(self) -> int | None:
-        """How many keypoints there is time to find and match, with two alignments to follow."""
+        """How many keypoints there is time to find and match, with an alignment to them to follow."""
         known = sum(len(view.features) for view in self._keyframes) / len(self._keyframes)
         views = min(self.config.match_keyframes + 2, len(self._keyframes))
-        ends = (*self._direct_work(None) * 2, self._health_work, self._health_work)
+        ends = (*self._direct_work(None), self._health_work)
         for share in _FEWER:
             n = round(share * self.config.n_features)
             if self.features is not None:

@@ -20,7 +20,7 @@ _TABLE: dict[str, tuple[float, float]] = {
     "direct": (0.1, 1.5e-5),  # points, times references, levels and steps
     "matches": (0.0, 2.5e-5),  # matched features, times levels and steps
     "health": (0.1, 6.0e-5),  # points, times references
-    "detect": (3.5, 1.8e-3),  # keypoints
+    "detect": (4.1, 3.6e-3),  # keypoints
     "match near": (1.2, 1.3e-6),  # keypoints, times keypoints of a keyframe
     "match all": (0.8, 2.3e-6),  # keypoints, times keypoints of a keyframe
     "vote": (0.0, 0.5),  # keyframes
