@@ -1,0 +1,127 @@
+"""How good a recording's reference is: `python -m splatbot.bench.bundle LOG RUN`, against photogrammetry of its images.
+
+SIFT features of all colour images, matched between all pairs, triangulated and adjusted together with all poses by
+COLMAP (Schoenberger and Frahm 2016; `pip install pycolmap`, which splatbot itself does not need). Depth takes no part,
+nor does anything that tracking computed but the poses it begins from; the scale, which images do not tell, is that of
+the run. What agrees with it is consistent with the images; where a reference is farther from it than a run is, an ATE
+against that reference says more of the reference than of the run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import InputError
+from splatbot.evaluation import absolute_error
+from splatbot.formats.trajectory import load_trajectory
+from splatbot.frame import Frame
+from splatbot.geometry import inverse, rotation_to_quat
+from splatbot.logs import open_log
+from splatbot.results.folder import RunFolder
+from splatbot.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 3  # of triangulation and adjustment
+_LEAST_ANGLE = 0.7  # [deg] between the rays to a point; recordings of a table top move by centimetres
+
+
+def bundle_adjusted(frames: Sequence[Frame], T_world_camera: Array, folder: Path) -> tuple[Array, float]:
+    """Poses (N, 4, 4) of frames by bundle adjustment that begins at given ones, and its reprojection error [px].
+
+    Positions are scaled to those that were given; the frame of reference is free.
+    """
+    colmap = _colmap()
+    images = folder / "images"
+    images.mkdir()
+    names = [f"{k:06d}.png" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        colmap.Bitmap.from_array(frame.rgb).write(str(images / name))
+    c = frames[0].camera
+    reader = colmap.ImageReaderOptions()
+    reader.camera_model, reader.camera_params = "PINHOLE", f"{c.fx},{c.fy},{c.cx + 0.5},{c.cy + 0.5}"
+    database = folder / "database.db"
+    colmap.extract_features(database, images, camera_mode=colmap.CameraMode.SINGLE, reader_options=reader)
+    colmap.match_exhaustive(database)
+    model = _begun(colmap, database, folder, names, T_world_camera)
+    options = colmap.IncrementalPipelineOptions()
+    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = _LEAST_ANGLE
+    fixed = colmap.BundleAdjustmentOptions()
+    fixed.refine_focal_length = fixed.refine_principal_point = fixed.refine_extra_params = False
+    for _ in range(_ROUNDS):
+        model = colmap.triangulate_points(model, database, images, folder, clear_points=True, options=options)
+        colmap.bundle_adjustment(model, fixed)
+    by_name = {image.name: image for image in model.images.values()}
+    found = np.tile(np.eye(4), (len(names), 1, 1))
+    for k, name in enumerate(names):
+        found[k, :3] = by_name[name].cam_from_world().inverse().matrix()
+    found[:, :3, 3] *= _scale(found[:, :3, 3], T_world_camera[:, :3, 3])
+    return found, float(model.compute_mean_reprojection_error())
+
+
+def _colmap() -> Any:
+    try:
+        return importlib.import_module("pycolmap")
+    except ImportError as error:
+        raise InputError("pycolmap is not installed.", field="pycolmap", hint="pip install pycolmap") from error
+
+
+def _begun(colmap: Any, database: Path, folder: Path, names: Sequence[str], T_world_camera: Array) -> Any:
+    """A reconstruction with the poses that are given and no points, through COLMAP's text format."""
+    known = colmap.Database.open(database)
+    ids, camera = {image.name: image.image_id for image in known.read_all_images()}, known.read_all_cameras()[0]
+    known.close()
+    params = " ".join(str(value) for value in camera.params)
+    (folder / "cameras.txt").write_text(f"{camera.camera_id} PINHOLE {camera.width} {camera.height} {params}\n")
+    lines = []
+    for name, T in zip(names, T_world_camera, strict=True):
+        T_camera_world = inverse(T)
+        pose = [*rotation_to_quat(T_camera_world[:3, :3]), *T_camera_world[:3, 3]]
+        numbers = " ".join(str(value) for value in pose)
+        lines.append(f"{ids[name]} {numbers} {camera.camera_id} {name}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("")
+    model = colmap.Reconstruction()
+    model.read_text(str(folder))
+    return model
+
+
+def _scale(positions: Array, like: Array) -> float:
+    """Least-squares scale of positions (N, 3) that makes them like others (N, 3) (Umeyama 1991)."""
+    a, b = positions - positions.mean(axis=0), like - like.mean(axis=0)
+    U, s, Vt = np.linalg.svd(b.T @ a)
+    s[2] *= np.sign(np.linalg.det(U @ Vt))
+    return float(s.sum() / (a**2).sum())
+
+
+def main(argv: Sequence[str]) -> None:
+    """Print how far a run and the log's references are from bundle adjustment, and from each other [mm]."""
+    log, run = open_log(argv[0]), RunFolder(argv[1])
+    track = run.load_trajectory()
+    kept = [k for k in range(len(log)) if np.abs(track.stamps - log[k].stamp).min() < 1e-3]
+    with tempfile.TemporaryDirectory() as folder:
+        poses, pixels = bundle_adjusted([log[k] for k in kept], track.T_world_camera, Path(folder))
+    adjusted = Trajectory(track.stamps, poses)
+    print(f"{len(kept)} images, reprojection {pixels:.2f} px")
+    others = {path.name: load_trajectory(path) for path in sorted(Path(argv[0]).glob("groundtruth*.txt"))}
+    for name, other in others.items():
+        print(f"{name} to bundle adjustment: {_apart(adjusted, other)}")
+        print(f"the run to {name}: {_apart(other, track)}")
+    print(f"the run to bundle adjustment: {_apart(adjusted, track)}")
+
+
+def _apart(reference: Trajectory, estimate: Trajectory) -> str:
+    found = absolute_error(reference, estimate)
+    return f"ATE {1e3 * found.rmse:.1f} mm, median {1e3 * found.median:.1f} mm"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

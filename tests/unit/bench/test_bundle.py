@@ -1,0 +1,39 @@
+"""Bundle adjustment as an oracle of recordings: it finds exact poses from worse ones, and its scale is theirs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.bench.bundle import _scale, bundle_adjusted
+from splatbot.errors import InputError
+from splatbot.evaluation import absolute_error
+from splatbot.geometry import se3_exp
+from splatbot.logs import open_log
+from splatbot.trajectory import Trajectory
+
+
+def test_the_scale_is_that_of_the_poses_it_begins_from(rng: np.random.Generator) -> None:
+    positions = rng.normal(size=(20, 3))
+    turned = positions @ se3_exp([0, 0, 0, 0.3, -0.2, 0.9])[:3, :3].T
+    assert _scale(positions, 2.5 * turned + 4.0) == pytest.approx(2.5)
+
+
+def test_poses_of_rendered_images_are_found_from_worse_ones(tmp_path: Path, rng: np.random.Generator) -> None:
+    pytest.importorskip("pycolmap")
+    log = open_log("synthetic:tabletop?trajectory=arm&frames=12&seed=1")
+    assert log.ground_truth is not None
+    worse = np.array([T @ se3_exp(rng.normal(0, 2e-3, 6)) for T in log.ground_truth.T_world_camera])
+    found, pixels = bundle_adjusted([log[k] for k in range(12)], worse, tmp_path)
+    assert pixels < 1.0
+    before, after = (absolute_error(log.ground_truth, Trajectory(log.ground_truth.stamps, T)) for T in (worse, found))
+    assert after.rmse < 0.5 * before.rmse
+
+
+def test_without_colmap_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(InputError, match="pycolmap"):
+        bundle_adjusted([], np.zeros((0, 4, 4)), tmp_path)
