@@ -69,9 +69,11 @@ def bundle_adjusted(frames: Sequence[Frame], T_world_camera: Array, folder: Path
 
 def _colmap() -> Any:
     try:
-        return importlib.import_module("pycolmap")
+        colmap = importlib.import_module("pycolmap")
     except ImportError as error:
         raise InputError("pycolmap is not installed.", field="pycolmap", hint="pip install pycolmap") from error
+    colmap.logging.minloglevel = colmap.logging.ERROR.value  # a line for each image, and more
+    return colmap
 
 
 def _begun(colmap: Any, database: Path, folder: Path, names: Sequence[str], T_world_camera: Array) -> Any:

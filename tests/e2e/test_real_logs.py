@@ -13,11 +13,12 @@ from splatbot.logs import open_log
 from splatbot.run import map_log
 from tests.e2e.real_grasps import check_shelf_box
 
-# name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 8 to 15 mm and about 3 cm.
+# name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 2 cm and about 3 cm. What the third cannot
+# tell (docs/tracking.md, "Keypoints from all of the image"), held-out views do.
 LOGS = [
     pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48"),
     pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot"),
-    pytest.param("visp_tabletop", 99, 0.020, id="visp_tabletop", marks=pytest.mark.long),
+    pytest.param("visp_tabletop", 99, 0.025, id="visp_tabletop", marks=pytest.mark.long),
     pytest.param("redkitchen_000_199", 200, 0.015, id="redkitchen_000_199", marks=pytest.mark.long),
 ]
 
@@ -63,8 +64,11 @@ def check_twin(log: Path, folder: Path) -> None:
 
 
 def check_views(name: str, metrics: dict[str, Any]) -> None:
-    """Held-out views of the recording that surrounds its scene; the others see parts of theirs only once."""
+    """Held-out views of recordings that see their scenes from all around; the others see parts of theirs only once."""
     assert metrics["held_out"] == metrics["frames"] // 8
+    if name == "visp_tabletop":  # 23.3 dB and 6.9 mm while keypoints were in the middle of the image alone
+        assert metrics["psnr_holdout_db"] >= 23.6
+        assert metrics["depth_median_m"] <= 0.0066
     if name == "redkitchen_000_199":
         assert metrics["psnr_holdout_db"] >= 20.0
         assert metrics["depth_median_m"] <= 0.02
