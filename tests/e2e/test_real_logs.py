@@ -13,8 +13,8 @@ from splatbot.logs import open_log
 from splatbot.run import map_log
 from tests.e2e.real_grasps import check_shelf_box
 
-# name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 2 cm and about 3 cm. What the third cannot
-# tell (docs/tracking.md, "Keypoints from all of the image"), held-out views do.
+# name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 2 cm and about 3 cm. What the third does
+# not tell (docs/tracking.md, "Keypoints from all of the image"), held-out views do.
 LOGS = [
     pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48"),
     pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot"),
