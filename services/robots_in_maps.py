@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
-from splatbot.results.things import Things, measured_map, things_of
 from splatbot.robots.robot import RobotModel
+from splatbot.robots.things import Things, measured_map, things_of
 from splatbot.services.arms import known_robot
 from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from splatbot.grasping.affordance import Hint, View
     from splatbot.grasping.types import GraspResult
-    from splatbot.results.things import Things
+    from splatbot.robots.things import Things
 
 
 def grasp(
@@ -128,7 +128,7 @@ def grasp(
 
 def _things(map_: Path, base: Pose | None) -> Things:
     from splatbot.gaussians import GaussianModel, Snapshot
-    from splatbot.results.things import measured_map, run_of, things_of
+    from splatbot.robots.things import measured_map, run_of, things_of
     from splatbot.workspace import find_workspace
 
     T = base_pose(base, map_)

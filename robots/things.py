@@ -1,4 +1,4 @@
-"""What can be grasped in a map: the things in it, where they were seen from, and what depth saw through."""
+"""What a robot can grasp in a map: the things in it, where they were seen from, and what depth saw through."""
 
 from __future__ import annotations
 
