@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from splatbot.protocols import Array
 
 _REACH, _MOST = 0.012, 24  # [m] and how many neighbours
+_ENOUGH = 6  # of them, itself among them, that a normal is told from; of fewer it is chance
 _COHERENT = 0.9  # length of the mean normal around a point that lies in a face
 _PARALLEL = 0.8  # cosine between normals of one face
 _LEVEL = 0.8  # of a normal along z
@@ -76,12 +77,12 @@ def cut_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
     """Rows of points (P, 3) [m], largest first, in parts that meet at steps only; one part if they do not fall apart.
 
     Faces that meet at an angle are of one thing, unless one rises from the other as from what it stands on; those that
-    meet at a step between parallel ones are not. z is up.
+    meet at a step between parallel ones are not. Points too sparse to have normals are not cut. z is up.
     """
     if len(points) < 2 * fewest:
         return [np.arange(len(points))]
     faces = find_faces(points, fewest=max(fewest, int(_LEAST * len(points))))
-    if len(faces.numbers) < 2:
+    if len(faces.numbers) < 2 or np.median(faces.near.sum(axis=1)) < _ENOUGH:
         return [np.arange(len(points))]
     group = {face: face for face in faces.numbers}
     for i, a in enumerate(faces.numbers):
