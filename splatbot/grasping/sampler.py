@@ -18,11 +18,12 @@ from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, place_hands
+from splatbot.grasping.implied import target_surface
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ArmReach, Reach, hand_of
 from splatbot.grasping.score import FAR, arm_terms, best_apart, hand_terms, totals
-from splatbot.grasping.surface import Surface, target_surface
+from splatbot.grasping.surface import Surface
 from splatbot.grasping.sweep import swept_room, touches
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.grasping.volume import enclosed_volume
@@ -134,7 +135,7 @@ class GraspSampler:
         return _Search(self, target, options or GraspOptions()).run()
 
     def surface(self, target: Target, *, seed: int = 0) -> Surface:
-        """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.surface.target_surface`."""
+        """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.implied.target_surface`."""
         return target_surface(self.scene, target.rows, observers=self.observers, views=self.views, seed=seed)
 
     def collision_field(self, model: GaussianModel, *, cautious: bool = False) -> GaussianCollisionField:
@@ -292,10 +293,11 @@ class _Search:
         left = [self._grasp(scored, k) for k in range(len(scored.hands))]
         found: list[Grasp] = []
         if cautious is not None:
-            asked = self._asked([grasp for grasp in left if grasp.terms["clear"]], cautious, self.o.wanted)
+            clear = [k for k, grasp in enumerate(left) if grasp.clear]
+            asked = self._asked([left[k] for k in clear], cautious, self.o.wanted)
             found = [grasp for grasp, _ in asked if not grasp.rejected]
-            known = {id(grasp.T_world_tcp) for grasp in found}
-            left = [_exposed(grasp) for grasp in left if id(grasp.T_world_tcp) not in known]
+            known = {k for k, (grasp, _) in zip(clear, asked, strict=False) if not grasp.rejected}
+            left = [_exposed(grasp) for k, grasp in enumerate(left) if k not in known]
         asked = self._asked(left, reach, self.o.wanted - len(found))
         blocked = [(grasp, kind) for grasp, kind in asked if grasp.rejected]
         for _, kind in blocked:
@@ -340,7 +342,6 @@ class _Search:
 
     def _grasp(self, scored: _Scored, k: int, *, rejected: str = "") -> Grasp:
         T, pair = scored.hands.T[k], int(scored.hands.pair[k])
-        terms = {name: float(values[k]) for name, values in scored.terms.items()}
         return Grasp(
             T_world_tcp=T,
             width=float(self.pairs.width[pair]),
@@ -348,12 +349,11 @@ class _Search:
             contacts=self.pairs.contacts[pair],
             normals=self.pairs.normals[pair],
             approach=self._approach(T),
-            terms=terms,
+            terms={name: float(values[k]) for name, values in scored.terms.items()},
             total=float(scored.totals[k]),
             room=float(scored.room[k]),
             T_world_pregrasp=along(T, -self.o.pregrasp),
             rejected=rejected,
-            clear=terms.get("clear", 1.0) > 0.0,
         )
 
     def _approach(self, T: Array) -> str:
@@ -398,4 +398,4 @@ class _Search:
 
 def _exposed(grasp: Grasp) -> Grasp:
     """A grasp for which the arm has to go where something moved."""
-    return replace(grasp, terms={**grasp.terms, "clear": 0.0}, clear=False)
+    return replace(grasp, terms={**grasp.terms, "clear": 0.0})

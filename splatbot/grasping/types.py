@@ -31,8 +31,6 @@ class Grasp:
         q_pregrasp: (J,) at the start of the straight approach.
         approach_path: (K, J) from there to the grasp, certified free of all but the target.
         rejected: why it will not do; empty: it will.
-        clear: whether hand and arm, at the grasp and on the straight way to it, keep clear of where something moved;
-            True also where nothing did.
     """
 
     T_world_tcp: Array
@@ -49,7 +47,12 @@ class Grasp:
     q_pregrasp: Array | None = None
     approach_path: Array | None = field(default=None, repr=False)
     rejected: str = ""
-    clear: bool = True
+
+    @property
+    def clear(self) -> bool:
+        """Whether hand and arm, at the grasp and on the straight way to it, keep clear of where something moved; True
+        also where nothing did."""
+        return self.terms.get("clear", 1.0) > 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from splatbot.grasping.antipodal import PairSearch, antipodal_pairs
-from splatbot.grasping.surface import Surface, target_surface
+from splatbot.grasping.implied import target_surface
+from splatbot.grasping.surface import Surface
 from tests.unit.grasping.things import BALL, BIG, BOX, CAN, THINGS, scene, target_of
 
 FRICTION = 0.5

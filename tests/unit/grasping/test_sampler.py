@@ -16,11 +16,11 @@ from splatbot.collision.evidence import DepthView
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.implied import target_surface
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import Reached
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.score import WEIGHTS
-from splatbot.grasping.surface import target_surface
 from splatbot.grasping.types import GraspResult, NoGraspError
 from splatbot.logs.raycast import Scene, Surface
 from splatbot.logs.textures import Texture

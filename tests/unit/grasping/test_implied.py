@@ -11,7 +11,8 @@ from splatbot.camera import Camera
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.geometry import look_at, rotation_to_quat
-from splatbot.grasping.surface import Surface, target_surface
+from splatbot.grasping.implied import target_surface
+from splatbot.grasping.surface import Surface
 from splatbot.segmentation import segment
 from tests.unit.grasping.things import colored
 
