@@ -1,10 +1,10 @@
 """How good a recording's reference is: `python -m splatbot.bench.bundle LOG RUN`, against photogrammetry of its images.
 
 SIFT features of all colour images, matched between all pairs, triangulated and adjusted together with all poses by
-COLMAP (Schoenberger and Frahm 2016; `pip install pycolmap`, which splatbot itself does not need). Depth takes no part,
-nor does anything that tracking computed but the poses it begins from; the scale, which images do not tell, is that of
-the run. What agrees with it is consistent with the images; where a reference is farther from it than a run is, an ATE
-against that reference says more of the reference than of the run.
+COLMAP (Schoenberger and Frahm 2016; pycolmap is of the extra `dev`, splatbot itself does not need it). Depth takes no
+part, nor does anything that tracking computed but the poses it begins from; the scale, which images do not tell, is
+that of the run. What agrees with it is consistent with the images; where a reference is farther from it than a run is,
+an ATE against that reference says more of the reference than of the run.
 """
 
 from __future__ import annotations
@@ -71,7 +71,9 @@ def _colmap() -> Any:
     try:
         colmap = importlib.import_module("pycolmap")
     except ImportError as error:
-        raise InputError("pycolmap is not installed.", field="pycolmap", hint="pip install pycolmap") from error
+        raise InputError(
+            "pycolmap is not installed.", field="pycolmap", hint="pip install pycolmap, or splatbot[dev]"
+        ) from error
     colmap.logging.minloglevel = colmap.logging.ERROR.value  # a line for each image, and more
     return colmap
 
@@ -106,17 +108,18 @@ def _scale(positions: Array, like: Array) -> float:
 
 def main(argv: Sequence[str]) -> None:
     """Print how far a run and the log's references are from bundle adjustment, and from each other [mm]."""
+    if len(argv) != 2:
+        raise SystemExit("usage: python -m splatbot.bench.bundle LOG RUN")
     log, run = open_log(argv[0]), RunFolder(argv[1])
-    track = run.load_trajectory()
-    kept = [k for k in range(len(log)) if np.abs(track.stamps - log[k].stamp).min() < 1e-3]
+    track, indices = run.load_trajectory(), sorted(run.load_poses())
     with tempfile.TemporaryDirectory() as folder:
-        poses, pixels = bundle_adjusted([log[k] for k in kept], track.T_world_camera, Path(folder))
+        poses, pixels = bundle_adjusted([log[k] for k in indices], track.T_world_camera, Path(folder))
     adjusted = Trajectory(track.stamps, poses)
-    print(f"{len(kept)} images, reprojection {pixels:.2f} px")
-    others = {path.name: load_trajectory(path) for path in sorted(Path(argv[0]).glob("groundtruth*.txt"))}
-    for name, other in others.items():
-        print(f"{name} to bundle adjustment: {_apart(adjusted, other)}")
-        print(f"the run to {name}: {_apart(other, track)}")
+    print(f"{len(indices)} images, reprojection {pixels:.2f} px")
+    for path in sorted(Path(argv[0]).glob("groundtruth*.txt")):
+        reference = load_trajectory(path)
+        print(f"{path.name} to bundle adjustment: {_apart(adjusted, reference)}")
+        print(f"the run to {path.name}: {_apart(reference, track)}")
     print(f"the run to bundle adjustment: {_apart(adjusted, track)}")
 
 

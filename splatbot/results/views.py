@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from splatbot.camera import Camera
 from splatbot.collision.evidence import DepthView
 from splatbot.logs import Log
+from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.tracking.prepare import usable_depth
 
@@ -27,8 +28,8 @@ def depth_views(run: RunFolder, log: Log) -> Iterator[DepthView]:
         FormatError: the folder is damaged.
         LogError: the log is damaged.
     """
-    poses = sorted(run.load_poses().items())
-    return _views(run, log, [index for index, _ in poses[:: max(1, len(poses) // _FRAMES)]])
+    poses = run.load_poses()
+    return _views(run, log, poses, sorted(poses)[:: max(1, len(poses) // _FRAMES)])
 
 
 def thinned_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
@@ -41,9 +42,10 @@ def thinned_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
         FormatError: the folder is damaged.
         LogError: the log is damaged.
     """
-    indices = sorted(run.load_poses())
+    poses = run.load_poses()
+    indices = sorted(poses)
     spread = np.linspace(0, len(indices) - 1, min(_KEPT, len(indices))).round().astype(int)
-    return tuple(thinned(view) for view in _views(run, log, [indices[k] for k in spread]))
+    return tuple(thinned(view) for view in _views(run, log, poses, [indices[k] for k in spread]))
 
 
 def thinned(view: DepthView) -> DepthView:
@@ -59,8 +61,8 @@ def thinned(view: DepthView) -> DepthView:
     return kept, small, T
 
 
-def _views(run: RunFolder, log: Log, indices: list[int]) -> Iterator[DepthView]:
-    poses, config = run.load_poses(), run.load_config().tracking
+def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequence[int]) -> Iterator[DepthView]:
+    config = run.load_config().tracking
     for index in indices:
         frame = log[index]
         yield usable_depth(frame, config), frame.camera, poses[index]

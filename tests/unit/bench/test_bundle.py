@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.bundle import _scale, bundle_adjusted
+from splatbot.bench.bundle import _scale, bundle_adjusted, main
 from splatbot.errors import InputError
 from splatbot.evaluation import absolute_error
 from splatbot.geometry import se3_exp
@@ -23,7 +23,6 @@ def test_the_scale_is_that_of_the_poses_it_begins_from(rng: np.random.Generator)
 
 
 def test_poses_of_rendered_images_are_found_from_worse_ones(tmp_path: Path, rng: np.random.Generator) -> None:
-    pytest.importorskip("pycolmap")
     log = open_log("synthetic:tabletop?trajectory=arm&frames=12&seed=1")
     assert log.ground_truth is not None
     worse = np.array([T @ se3_exp(rng.normal(0, 2e-3, 6)) for T in log.ground_truth.T_world_camera])
@@ -37,3 +36,8 @@ def test_without_colmap_the_error_says_what_to_install(tmp_path: Path, monkeypat
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match="pycolmap"):
         bundle_adjusted([], np.zeros((0, 4, 4)), tmp_path)
+
+
+def test_without_a_log_and_a_run_the_usage_is_told() -> None:
+    with pytest.raises(SystemExit, match="LOG RUN"):
+        main(["log"])
