@@ -59,16 +59,25 @@ def test_what_stands_on_a_stool_is_apart_from_it_and_the_stool_is_a_support() ->
     assert found.under(found.points[cups[0].rows]) is found.supports[1]
 
 
-def test_two_boxes_that_touch_are_cut_at_their_step() -> None:
-    """Their tops, as a camera above sees them, 3 cm apart in height."""
+def _steps(count: int) -> np.ndarray:
+    """Two plates of ``count`` points each, one 3 cm above the other, and the step between them."""
     rng = np.random.default_rng(0)
-    low = np.c_[rng.uniform(0.0, 0.1, 600), rng.uniform(0, 0.1, 600), rng.normal(0.05, 3e-4, 600)]
-    high = np.c_[rng.uniform(0.1, 0.2, 600), rng.uniform(0, 0.1, 600), rng.normal(0.08, 3e-4, 600)]
-    edge = np.c_[np.full(60, 0.1), rng.uniform(0, 0.1, 60), rng.uniform(0.05, 0.08, 60)]
-    parts = cut_at_steps(np.concatenate([low, high, edge]), fewest=40)
+    low = np.c_[rng.uniform(0.0, 0.1, count), rng.uniform(0, 0.1, count), rng.normal(0.05, 3e-4, count)]
+    high = np.c_[rng.uniform(0.1, 0.2, count), rng.uniform(0, 0.1, count), rng.normal(0.08, 3e-4, count)]
+    edge = np.c_[np.full(count // 10, 0.1), rng.uniform(0, 0.1, count // 10), rng.uniform(0.05, 0.08, count // 10)]
+    return np.concatenate([low, high, edge])
+
+
+def test_two_boxes_that_touch_are_cut_at_their_step() -> None:
+    parts = cut_at_steps(_steps(600), fewest=40)
     assert len(parts) == 2
     sides = [rows < 600 for rows in parts]
     assert {round(float(side.mean())) for side in sides} == {0, 1}
+
+
+def test_what_is_too_sparse_to_have_normals_is_not_cut() -> None:
+    (whole,) = cut_at_steps(_steps(100), fewest=20)
+    assert len(whole) == 210
 
 
 def test_a_mallet_is_one_thing_where_nothing_is_to_be_cut() -> None:
