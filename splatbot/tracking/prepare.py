@@ -140,14 +140,5 @@ def with_depth(levels: Sequence[Level], depth: Image) -> tuple[Level, ...]:
 
 def normals_of(depth: Image, camera: Camera) -> Image:
     """Unit normals (H, W, 3) towards the camera by central differences; zero where a neighbour is missing or far."""
-    points = camera.backproject(depth)
-    normals = np.zeros_like(points)
-    du = points[1:-1, 2:] - points[1:-1, :-2]
-    dv = points[2:, 1:-1] - points[:-2, 1:-1]
-    n = np.cross(dv, du)
-    length = np.linalg.norm(n, axis=-1)
-    z = depth[1:-1, 1:-1]
-    neighbours = np.stack([depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]])
-    good = (z > 0) & (neighbours.min(0) > 0) & (np.abs(neighbours - z).max(0) < 0.05 * z) & (length > 0)
-    normals[1:-1, 1:-1][good] = n[good] / length[good, None]
-    return normals
+    c = camera
+    return np.asarray(_native.normals_of(np.ascontiguousarray(depth, np.float32), c.fx, c.fy, c.cx, c.cy))

@@ -72,4 +72,15 @@ void define_depth(nb::module_& m) {
       },
       "depth"_a.noconvert(), "gray"_a.noconvert(), "step"_a, "floor"_a, "quad"_a,
       "Grey, NaN where surfaces of different depth meet.");
+  m.def(
+      "normals_of",
+      [](Image depth, double fx, double fy, double cx, double cy) {
+        std::vector<float> out(3 * depth.size());
+        {
+          nb::gil_scoped_release release;
+          splatbot::normals_of(view(depth), {fx, fy, cx, cy}, out);
+        }
+        return owned(std::move(out), {depth.shape(0), depth.shape(1), 3});
+      },
+      "depth"_a.noconvert(), "fx"_a, "fy"_a, "cx"_a, "cy"_a, "Normals by central differences; zero where there is none.");
 }

@@ -9,6 +9,11 @@
 #include <vector>
 
 namespace splatbot {
+namespace {
+
+constexpr float kOneSurface = 0.05F;  // share of its depth by which a pixel differs from those of its surface at most
+
+}  // namespace
 
 void valid_depth(const DepthImage& depth, float near, float far, float step, std::span<float> out) {
   const int width = depth.width, height = depth.height;
@@ -80,28 +85,60 @@ void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, f
                          std::span<float> out) {
   const int width = depth.width, height = depth.height;
   constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
-  std::vector<float> inverse(depth.z.size());  // 0 where nothing is measured
-  for (std::size_t i = 0; i < inverse.size(); ++i) inverse[i] = depth.z[i] > 0.0F ? 1.0F / depth.z[i] : 0.0F;
-  std::copy(gray.begin(), gray.end(), out.begin());
-  const auto bends = [](const float* w, std::ptrdiff_t to, float limit) {
-    const float a = w[-to], b = w[to];
-    return (a > 0.0F) & (b > 0.0F) & (std::abs(a + b - 2.0F * w[0]) > limit);
-  };
+  // Inverse depth, 0 where nothing is measured and around the image.
+  const std::size_t stride = static_cast<std::size_t>(width) + 2;
+  std::vector<float> inverse(stride * (static_cast<std::size_t>(height) + 2), 0.0F);
+  for (int v = 0; v < height; ++v) {
+    const float* from = depth.z.data() + static_cast<std::size_t>(v) * width;
+    float* to = inverse.data() + (static_cast<std::size_t>(v) + 1) * stride + 1;
+    for (int u = 0; u < width; ++u) to[u] = (from[u] > 0.0F ? 1.0F : 0.0F) / (from[u] > 0.0F ? from[u] : 1.0F);
+  }
   for (int v = 0; v < height; ++v) {
     const std::size_t at = static_cast<std::size_t>(v) * width;
-    const bool between = v > 0 && v + 1 < height;
+    const float *z = depth.z.data() + at, *g = gray.data() + at;
+    const float* row = inverse.data() + (static_cast<std::size_t>(v) + 1) * stride + 1;
+    const float *above = row - stride, *below = row + stride;
+    float* to = out.data() + at;
     for (int u = 0; u < width; ++u) {
-      const float* w = inverse.data() + at + u;
-      if (w[0] <= 0.0F) continue;
-      const float z = depth.z[at + u];
-      const float limit = std::max(step * z, floor + quad * z * z) / (z * z);
-      const bool beside = u > 0 && u + 1 < width;
-      bool edge = beside && bends(w, 1, limit);
-      if (between) {
-        edge |= bends(w, width, limit);
-        if (beside) edge |= bends(w, width + 1, limit) | bends(w, width - 1, limit);
-      }
-      if (edge) out[at + u] = kNaN;
+      const float w = row[u], kept = g[u], apart = step * z[u], noise = floor + quad * z[u] * z[u];
+      const float limit = (apart > noise ? apart : noise) / (z[u] * z[u]);
+      const auto bend = [w](float a, float b) {
+        const float bent = std::abs(a + b - 2.0F * w);
+        return (a > 0.0F) & (b > 0.0F) ? bent : 0.0F;
+      };
+      const auto larger = [](float a, float b) { return a > b ? a : b; };
+      const float most = larger(larger(bend(row[u - 1], row[u + 1]), bend(above[u], below[u])),
+                                larger(bend(above[u - 1], below[u + 1]), bend(above[u + 1], below[u - 1])));
+      to[u] = (most > limit) & (w > 0.0F) ? kNaN : kept;
+    }
+  }
+}
+
+void normals_of(const DepthImage& depth, const Pinhole& camera, std::span<float> out) {
+  const int width = depth.width, height = depth.height;
+  std::fill(out.begin(), out.end(), 0.0F);
+  if (width < 3 || height < 3) return;
+  std::vector<float> x(static_cast<std::size_t>(width)), y(static_cast<std::size_t>(height));
+  for (int u = 0; u < width; ++u) x[u] = static_cast<float>((u - camera.cx) / camera.fx);
+  for (int v = 0; v < height; ++v) y[v] = static_cast<float>((v - camera.cy) / camera.fy);
+  for (int v = 1; v + 1 < height; ++v) {
+    const float* row = depth.z.data() + static_cast<std::size_t>(v) * width;
+    const float *above = row - width, *below = row + width;
+    float* to = out.data() + 3 * static_cast<std::size_t>(v) * width;
+    for (int u = 1; u + 1 < width; ++u) {
+      const float z = row[u], left = row[u - 1], right = row[u + 1], up = above[u], down = below[u];
+      const float apart = std::max(std::max(std::abs(left - z), std::abs(right - z)),
+                                   std::max(std::abs(up - z), std::abs(down - z)));
+      const bool whole = (z > 0.0F) & (left > 0.0F) & (right > 0.0F) & (up > 0.0F) & (down > 0.0F);
+      if (!(whole & (apart < kOneSurface * z))) continue;
+      const float ux = right * x[u + 1] - left * x[u - 1], uy = right * y[v] - left * y[v], uz = right - left;
+      const float vx = down * x[u] - up * x[u], vy = down * y[v + 1] - up * y[v - 1], vz = down - up;
+      const float nx = vy * uz - vz * uy, ny = vz * ux - vx * uz, nz = vx * uy - vy * ux;
+      const float length = std::sqrt(nx * nx + ny * ny + nz * nz);
+      if (!(length > 0.0F)) continue;
+      to[3 * u] = nx / length;
+      to[3 * u + 1] = ny / length;
+      to[3 * u + 2] = nz / length;
     }
   }
 }

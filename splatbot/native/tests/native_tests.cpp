@@ -363,6 +363,7 @@ int main() {
   check_pool();
   check_errors();
   check_path_speed();
+  check_depth();
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);

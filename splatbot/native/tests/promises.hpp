@@ -16,3 +16,4 @@ void check_cameras(const std::string& isa);
 void check_planning();
 void check_collision(const std::string& isa);
 void check_path_speed();
+void check_depth();

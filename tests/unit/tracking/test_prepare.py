@@ -136,6 +136,15 @@ def test_there_is_no_normal_where_a_neighbour_is_missing_or_on_another_surface()
         np.testing.assert_allclose(normals[v, u], [0, 0, -1], atol=1e-6)
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (2, 9), (9, 2), (3, 3)])
+def test_a_normal_needs_a_pixel_with_four_measured_neighbours(shape: tuple[int, int]) -> None:
+    camera = replace(CAMERA, width=shape[1], height=shape[0])
+    normals = normals_of(np.ones(shape, np.float32), camera)
+    assert normals.shape == (*shape, 3)
+    assert (normals != 0).any(-1).sum() == max(0, shape[0] - 2) * max(0, shape[1] - 2)
+    assert not normals_of(np.full(shape, np.nan, np.float32), camera).any()
+
+
 def test_the_pyramid_halves_and_starts_at_most_as_wide_as_asked() -> None:
     frames, _ = tabletop()
     config = small_config(tracking__max_width=100, tracking__n_levels=3).tracking

@@ -28,4 +28,12 @@ void depth_around(const DepthImage& depth, std::span<const float> pixels, std::s
 void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, float step, float floor, float quad,
                          std::span<float> out);
 
+struct Pinhole {
+  double fx = 1.0, fy = 1.0, cx = 0.0, cy = 0.0;  // [px]
+};
+
+// out (H, W, 3): unit normals towards the camera by central differences; zero where one of the four neighbours is missing
+// or more than 5 % of the depth away.
+void normals_of(const DepthImage& depth, const Pinhole& camera, std::span<float> out);
+
 }  // namespace splatbot
