@@ -44,7 +44,12 @@ class DepthFusion:
         return points
 
     def mesh(self) -> Any:
-        """The same surface as an ``open3d.geometry.TriangleMesh`` with normals (marching cubes)."""
+        """The same surface as an ``open3d.geometry.TriangleMesh`` with normals (marching cubes).
+
+        Vertices whose triangles have no area, as where a distance is 0 at a voxel, have no normal and are left out.
+        """
         mesh = self._grid.extract_triangle_mesh(SEEN).to_legacy()
         mesh.compute_vertex_normals()
+        lengths = np.linalg.norm(np.asarray(mesh.vertex_normals), axis=1)
+        mesh.remove_vertices_by_mask(~(lengths > 0.5))
         return mesh

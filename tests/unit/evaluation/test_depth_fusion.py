@@ -39,3 +39,16 @@ def test_what_was_measured_twice_only_is_no_surface() -> None:
     for points in (fusion.points(), np.asarray(fusion.mesh().vertices)):
         assert len(points) > 500
         assert points[:, 0].max() < 0.02
+
+
+def test_every_vertex_of_a_surface_of_rough_round_depths_has_a_normal() -> None:
+    """Distances that are 0 at voxels make triangles without area."""
+    fusion = DepthFusion(0.004, 2.0)
+    depth = np.random.default_rng(0).uniform(0.5, 0.7, (CAMERA.height, CAMERA.width)).round(3).astype(np.float32)
+    for _ in range(4):
+        fusion.add(depth, CAMERA, np.eye(4))
+    mesh = fusion.mesh()
+    normals = np.asarray(mesh.vertex_normals)
+    assert len(normals) > 50_000
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-9)
+    assert np.asarray(mesh.triangles).max() < len(normals)
