@@ -219,6 +219,4 @@ class Slam:
         return True
 
     def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
-        features = estimate.features if estimate.features is not None else self._tracker.detect(prepared)
-        self._tracker.remember(features, estimate)
-        self._mapper.insert(prepared, estimate.T_world_camera, features)
+        self._mapper.insert(prepared, estimate.T_world_camera, self._tracker.keypoints(prepared, estimate))

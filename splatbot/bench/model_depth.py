@@ -49,7 +49,7 @@ def biases(uri: str, config: Config) -> dict[str, dict[str, Bias]]:
     T_first_world = inverse(poses[0])
     keyframes = list(range(0, len(log), _EVERY))
     for i in keyframes:
-        mapper.insert(prepare(log[i], config.tracking), T_first_world @ poses[i], Features.none())
+        mapper.insert(prepare(log[i], config.tracking), T_first_world @ poses[i], Features.none)
     views = {"keyframes": keyframes, "between": [i + _EVERY // 2 for i in keyframes[:-1]]}
     found: dict[str, dict[str, list[Bias]]] = {}
     for kind, indices in views.items():

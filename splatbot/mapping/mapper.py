@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import copy
 from dataclasses import dataclass
@@ -42,13 +42,13 @@ class Observation:
     Args:
         prepared: its images.
         T_world_camera: (4, 4).
-        features: of it.
+        features: what finds its keypoints, called once, in the thread that maps.
         anchor: number of the keyframe that frames were near to before.
     """
 
     prepared: PreparedFrame
     T_world_camera: NDArray[np.float64]
-    features: Features
+    features: Callable[[], Features]
     anchor: int | None = None
 
 
@@ -90,8 +90,10 @@ class Mapper:
             return True
         return is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
 
-    def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
-        """Fuse a frame into the map, refine, and make it a reference for tracking.
+    def insert(
+        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Callable[[], Features]
+    ) -> None:
+        """Fuse a frame into the map, refine, and make it a reference for tracking; ``features`` finds its keypoints.
 
         An exception leaves keyframes and map as they were.
         """
@@ -105,7 +107,7 @@ class Mapper:
 
     def look_for_loops(self, observation: Observation, keyframe: Keyframe) -> None:
         """Whether a keyframe shows a place seen before; :meth:`close_loops` acts on it."""
-        view = LoopView(observation.prepared, observation.T_world_camera, observation.features, observation.anchor)
+        view = LoopView(observation.prepared, observation.T_world_camera, keyframe.features, observation.anchor)
         self.loops.add(keyframe, view, self.keyframes)
 
     def close_loops(self) -> dict[int, NDArray[np.float64]]:
@@ -177,7 +179,7 @@ class Mapper:
 
         ``provisional`` gives it a reference of the measured depth, for tracking until :meth:`make_reference`.
         """
-        keyframe = self._make_keyframe(observation.prepared, observation.T_world_camera, observation.features)
+        keyframe = self._make_keyframe(observation.prepared, observation.T_world_camera, observation.features())
         if provisional:
             levels, n_pixels = observation.prepared.levels, self.config.tracking.n_pixels
             keyframe.reference = make_reference(levels, observation.T_world_camera, n_pixels)

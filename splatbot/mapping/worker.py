@@ -74,7 +74,9 @@ class MappingWorker:
         waiting = list(self._waiting)
         return len(waiting) < self._backlog and self._mapper.wants(prepared, T_world_camera, waiting)
 
-    def insert(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features) -> None:
+    def insert(
+        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Callable[[], Features]
+    ) -> None:
         """Hand over a frame and return at once; only the first is made a keyframe here: nothing is tracked before."""
         self._raise_error()
         observation = Observation(prepared, T_world_camera, features, self._mapper.loops.anchor)

@@ -87,12 +87,7 @@ def residuals(level: Level, points: ReferencePoints, T_camera_reference: Array, 
     """How well a pose explains a level; only exposure is fitted."""
     settings = settings_of(config, photometric=True, gate=config.gate)
     arrays = (*_level_arrays(level), *_point_arrays(points), T_camera_reference)
-    exposure = np.array([1.0, 0.0])
-    for _ in range(2):
-        H, g, *_ = _native.linearize_alignment(*arrays, *exposure, settings)
-        exposure -= np.linalg.solve(H[6:, 6:] + 1e2 * np.eye(2), g[6:])
-    _, _, _, _, photometric, geometric = _native.linearize_alignment(*arrays, *exposure, settings)
-    return Residuals(photometric, geometric, *exposure)
+    return Residuals(*_native.align_residuals(*arrays, settings))
 
 
 def align(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -69,9 +69,20 @@ class Tracker:
         """The map was moved where the camera is; the motion goes on from there."""
         self.motion.move(T_new_old)
 
-    def remember(self, features: Features, estimate: PoseEstimate) -> None:
-        """That the frame with these features becomes a keyframe: poses found with it inherit its uncertainty."""
-        self._known[features] = estimate.uncertainty
+    def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
+        """What finds the keypoints of a frame that becomes a keyframe, with depth, in the thread that calls it.
+
+        Poses found with them inherit the frame's uncertainty.
+        """
+        frame, found = prepared.frame, estimate.features
+
+        def find() -> Features:
+            n = self.config.n_features
+            features = detect(frame.rgb, prepared.depth, frame.camera, n, frame.mask) if found is None else found
+            self._known[features] = estimate.uncertainty
+            return features
+
+        return find
 
     def track(self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe]) -> PoseEstimate:
         """The pose of a frame; "lost" when no candidate explains it."""
@@ -101,11 +112,6 @@ class Tracker:
             stage_ms=budget.ms,
             skipped=tuple(budget.skipped),
         )
-
-    def detect(self, prepared: PreparedFrame) -> Features:
-        """Keypoints of a frame, with depth."""
-        frame = prepared.frame
-        return detect(frame.rgb, prepared.depth, frame.camera, self.config.n_features, frame.mask)
 
     def _with_prior(
         self, attempt: Attempt, pose: Judged, told: Prediction, own: Prediction

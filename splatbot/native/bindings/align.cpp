@@ -96,6 +96,25 @@ void define_align(nb::module_& m) {
       "gray_reference"_a.noconvert(), "T_current_reference"_a.noconvert(), "gain"_a, "offset"_a, "settings"_a,
       "Normal equations of one alignment step: (H (8, 8), g (8,), cost, projected, r_photo (N,), r_geo (N,)).");
   m.def(
+      "align_residuals",
+      [](Image gray, Image depth, Intrinsics intrinsics, Rows3 points, Rows3 normals, Vector gray_reference,
+         Pose T_current_reference, const splatbot::AlignSettings& settings) {
+        const splatbot::AlignImage image = image_of(gray, depth, intrinsics);
+        const splatbot::AlignPoints reference = points_of(points, normals, gray_reference);
+        std::vector<float> photometric(gray_reference.size()), geometric(gray_reference.size());
+        std::array<double, 2> exposure;
+        {
+          nb::gil_scoped_release release;
+          exposure = splatbot::align_residuals(image, reference, fixed<16>(T_current_reference), settings, photometric,
+                                               geometric);
+        }
+        return nb::make_tuple(owned(std::move(photometric), {gray_reference.size()}),
+                              owned(std::move(geometric), {gray_reference.size()}), exposure[0], exposure[1]);
+      },
+      "gray"_a.noconvert(), "depth"_a.noconvert(), "intrinsics"_a, "points"_a.noconvert(), "normals"_a.noconvert(),
+      "gray_reference"_a.noconvert(), "T_current_reference"_a.noconvert(), "settings"_a,
+      "Residuals at a pose, with the exposure that fits it: (r_photo (N,), r_geo (N,), gain, offset).");
+  m.def(
       "align",
       [](const std::vector<LevelArrays>& levels, const std::vector<ReferenceArrays>& references,
          const std::optional<MatchArrays>& matches, const std::optional<PriorArrays>& prior, Pose T_camera_world,

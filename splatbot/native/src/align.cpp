@@ -15,6 +15,7 @@ using Mat6 = std::array<double, 36>;
 
 // Exposure is anchored weakly to gain 1 and offset 0, so that a blank image leaves it defined.
 constexpr double kExposurePrior = 1e2;
+constexpr int kExposureSteps = 2;
 constexpr double kStepDone = 1e-5;  // [m] and [rad]
 constexpr double kDamping = 1e-5;   // share of the mean diagonal
 
@@ -457,6 +458,21 @@ AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& refere
   out.photometric = sums.photometric;
   out.geometric = sums.geometric;
   return out;
+}
+
+std::array<double, 2> align_residuals(const AlignImage& image, const AlignPoints& reference,
+                                      std::span<const double, 16> T, const AlignSettings& settings,
+                                      std::span<float> residual_photometric, std::span<float> residual_geometric) {
+  double gain = 1.0, offset = 0.0;
+  for (int step = 0; step < kExposureSteps; ++step) {
+    const AlignSums s = linearize_alignment(image, reference, T, gain, offset, settings, {}, {});
+    const double A00 = s.H[54] + kExposurePrior, A01 = s.H[55], A11 = s.H[63] + kExposurePrior;
+    const double determinant = A00 * A11 - A01 * A01;
+    gain -= (A11 * s.g[6] - A01 * s.g[7]) / determinant;
+    offset -= (A00 * s.g[7] - A01 * s.g[6]) / determinant;
+  }
+  linearize_alignment(image, reference, T, gain, offset, settings, residual_photometric, residual_geometric);
+  return {gain, offset};
 }
 
 AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,

@@ -19,7 +19,7 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from tests.rgbd import CAMERA, Array, small_config, tabletop, wall_frame
 
-NO_FEATURES = Features.none()
+NO_FEATURES = Features.none
 SIDE = se3_exp([0.1, 0, 0, 0, 0, 0])
 
 

@@ -18,7 +18,7 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import prepare
 from tests.rgbd import CAMERA, small_config, wall_frame
 
-NO_FEATURES = Features.none()
+NO_FEATURES = Features.none
 
 
 def with_thing(frame: Frame, u: int, depth: float = 0.6, half: int = 15) -> Frame:

@@ -22,7 +22,7 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import prepare
 from tests.rgbd import Array, small_config, tabletop, wall_frame
 
-NO_FEATURES = Features.none()
+NO_FEATURES = Features.none
 
 
 def at(x: float) -> Array:

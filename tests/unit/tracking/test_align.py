@@ -355,6 +355,18 @@ def test_the_same_call_gives_the_same_bits() -> None:
     assert np.array_equal(aligned(levels, reference, poses[0]), aligned(levels, reference, poses[0]))
 
 
+def test_residuals_are_those_of_the_exposure_that_fits_best() -> None:
+    frames, poses = tabletop()
+    prepared = prepare(frames[0], CONFIG)
+    points = make_reference(prepared.levels, poses[0], 1200).levels[1]
+    level = prepared.levels[1]
+    darker = Level((0.8 * level.gray + 0.05).astype(np.float32), level.depth, level.camera)
+    found = residuals(darker, points, np.eye(4), CONFIG)
+    assert (found.gain, found.offset) == pytest.approx((0.8, 0.05), abs=2e-3)
+    assert np.nanmedian(np.abs(found.photometric)) < 0.05
+    assert np.nanmedian(np.abs(residuals(level, points, np.eye(4), CONFIG).geometric)) < 0.05
+
+
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (4, 4)])
 def test_images_too_small_to_interpolate_have_no_residuals(size: tuple[int, int]) -> None:
     width, height = size

@@ -41,7 +41,7 @@ class Run:
 
     def keyframe(self, prepared: PreparedFrame, T: Array) -> View:
         reference = make_reference(prepared.levels, T, self.config.n_pixels)
-        return View(self.tracker.detect(prepared), reference)
+        return View(self.tracker.keypoints(prepared, PoseEstimate(T, "ok", (), "start"))(), reference)
 
     def track(self, frame: Frame) -> PoseEstimate:
         return self.tracker.track(self.prepare(frame), self.keyframes)

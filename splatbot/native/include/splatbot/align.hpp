@@ -51,6 +51,11 @@ AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& refere
                               const AlignSettings& settings, std::span<float> residual_photometric,
                               std::span<float> residual_geometric);
 
+// Residuals at a pose, as above, with the exposure {gain, offset} that fits it best.
+std::array<double, 2> align_residuals(const AlignImage& image, const AlignPoints& reference,
+                                      std::span<const double, 16> T_current_reference, const AlignSettings& settings,
+                                      std::span<float> residual_photometric, std::span<float> residual_geometric);
+
 // A keyframe to align to: its points on each level, and where it stands.
 struct AlignReference {
   std::array<double, 16> T_world_reference;
