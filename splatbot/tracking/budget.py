@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 _RECENT = 40  # runs of a stage that its cost is judged by
 _FORGOTTEN = 60  # frames after which a run says nothing any more: what was too slow once is tried again
-_SHARE = 0.95  # of them it must have cost no more
+CAREFUL, BOLD = 0.95, 0.5  # shares of them that must have cost no more: to keep a deadline, or to be found again
 _UNKNOWN = 1.5  # times the table's cost is expected of a stage that has not run yet
 
 # Milliseconds of each stage on one idle Zen 4 core: fixed, and per unit of work. Deterministic mode counts by this
@@ -55,13 +55,13 @@ class Costs:
         recent.append((self._frame, ms / table_ms(stage, units)))
         del recent[:-_RECENT]
 
-    def p95_ms(self, stage: str, units: float) -> float:
-        """What 95 % of recent runs would have cost at most for this work [ms]."""
+    def expected_ms(self, stage: str, units: float, share: float = CAREFUL) -> float:
+        """What that share of recent runs would have cost at most for this work [ms]."""
         ratios = sorted(ratio for frame, ratio in self._runs.get(stage, ()) if frame > self._frame - _FORGOTTEN)
         n = len(ratios)
         if n < 2:
             return table_ms(stage, units) * min([_UNKNOWN, *ratios])
-        return table_ms(stage, units) * ratios[min(math.ceil(_SHARE * n), n - 1) - 1]
+        return table_ms(stage, units) * ratios[min(math.ceil(share * n), n - 1) - 1]
 
 
 class Budget:
@@ -72,15 +72,18 @@ class Budget:
         costs: of earlier frames; None counts by the table instead of the clock, so that the same frames get the same
             stages on any machine.
         started: :func:`time.perf_counter` when work on the frame began.
+        share: of a stage's recent runs that must have cost no more than the time left. A camera that is lost has little
+            to lose by being late: without the stages that two slow runs speak against it would stay so.
 
     ``ms`` are wall-clock milliseconds by stage, in either mode; ``skipped`` names what there was no time for.
     """
 
-    def __init__(self, limit_ms: float, costs: Costs | None, started: float) -> None:
+    def __init__(self, limit_ms: float, costs: Costs | None, started: float, share: float = CAREFUL) -> None:
         self.limit_ms = limit_ms
         self.ms: dict[str, float] = {}
         self.skipped: list[str] = []
         self._costs = costs
+        self._share = share
         self._started = started
         self._counted = 0.0
         if costs is not None:
@@ -93,8 +96,8 @@ class Budget:
         return self.limit_ms - spent
 
     def cost_ms(self, stage: str, units: float) -> float:
-        """What to expect of a stage: the 95th percentile, or the table's figure."""
-        return table_ms(stage, units) if self._costs is None else self._costs.p95_ms(stage, units)
+        """What to expect of a stage: a percentile, the 95th unless ``share`` says otherwise, or the table's figure."""
+        return table_ms(stage, units) if self._costs is None else self._costs.expected_ms(stage, units, self._share)
 
     def fits(self, *work: tuple[str, float]) -> bool:
         """Whether stages, each with its units of work, can be done one after the other in the time left."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatbot.config import TrackingConfig
 from splatbot.tracking.attempt import Attempt
-from splatbot.tracking.budget import Budget, Costs
+from splatbot.tracking.budget import BOLD, CAREFUL, Budget, Costs
 from splatbot.tracking.candidate import Judged
 from splatbot.tracking.estimate import PoseEstimate
 from splatbot.tracking.features import Features, detect
@@ -86,7 +86,8 @@ class Tracker:
 
     def track(self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe]) -> PoseEstimate:
         """The pose of a frame; "lost" when no candidate explains it."""
-        frame, budget = prepared.frame, Budget(self.config.budget_ms, self._costs, prepared.started)
+        frame, share = prepared.frame, BOLD if self._lost else CAREFUL
+        budget = Budget(self.config.budget_ms, self._costs, prepared.started, share)
         budget.count("prepare", frame.camera.width * frame.camera.height)
         search = self._search if self._lost else None
         attempt = Attempt(self.config, prepared, keyframes, budget, self._wide, search)
