@@ -38,7 +38,7 @@ def test_frames_are_the_recording_s(make_log: MakeLog) -> None:
 
 
 def test_a_loop_goes_on_with_increasing_stamps(make_log: MakeLog) -> None:
-    camera = ReplayCamera(open_log(make_log(3)), ReplayOptions(speed=20, loop=True))
+    camera = ReplayCamera(open_log(make_log(3)), ReplayOptions(loop=True))
     stamps = [frame.stamp for frame in islice(camera, 7)]
     np.testing.assert_allclose(np.diff(stamps), 1 / 30, atol=1e-5)
 
@@ -51,8 +51,8 @@ def test_a_slow_reader_loses_the_oldest_frames(make_log: MakeLog) -> None:
         while not taken and camera.dropped < 15 and time.monotonic() < end:  # slow to read the first one
             time.sleep(0.01)
         taken.append(frame.index)
-    assert taken == [0, 16, 17, 18, 19]
-    assert camera.dropped == 15
+    assert taken[1:] == [16, 17, 18, 19]
+    assert camera.dropped == 15  # all others, before it had taken the first or while it read that
 
 
 def test_a_stall_delays_what_follows_and_loses_nothing(make_log: MakeLog) -> None:
@@ -64,7 +64,7 @@ def test_a_stall_delays_what_follows_and_loses_nothing(make_log: MakeLog) -> Non
 
 def test_dropped_and_broken_frames_are_the_same_each_time(make_log: MakeLog) -> None:
     log = open_log(make_log(30))
-    played = [list(ReplayCamera(log, ReplayOptions(speed=3, drop=0.3, corrupt=0.3))) for _ in range(2)]
+    played = [list(ReplayCamera(log, ReplayOptions(drop=0.3, corrupt=0.3))) for _ in range(2)]
     indices = [[frame.index for frame in frames] for frames in played]
     assert indices[0] == indices[1]
     assert 10 < len(indices[0]) < 30
