@@ -11,23 +11,41 @@
 namespace splatbot {
 namespace {
 
-constexpr float kOneSurface = 0.05F;  // share of its depth by which a pixel differs from those of its surface at most
+constexpr double kOneSurface = 0.05;  // share of its depth by which a pixel differs from those of its surface at most
+
+// Values of an image's pixels inside a border of zeros: a pixel at the rim has neighbours there, which say nothing.
+class Bordered {
+ public:
+  template <typename ValueOf>
+  Bordered(const DepthImage& depth, ValueOf value_of)
+      : stride_(static_cast<std::size_t>(depth.width) + 2),
+        values_(stride_ * (static_cast<std::size_t>(depth.height) + 2), 0.0F) {
+    for (int v = 0; v < depth.height; ++v) {
+      const float* from = depth.z.data() + static_cast<std::size_t>(v) * depth.width;
+      float* to = values_.data() + offset(v);
+      for (int u = 0; u < depth.width; ++u) to[u] = value_of(from[u]);
+    }
+  }
+
+  // Row v of the image; those above and below it are `stride` away.
+  const float* row(int v) const { return values_.data() + offset(v); }
+  std::size_t stride() const { return stride_; }
+
+ private:
+  std::size_t offset(int v) const { return (static_cast<std::size_t>(v) + 1) * stride_ + 1; }
+
+  std::size_t stride_;
+  std::vector<float> values_;
+};
 
 }  // namespace
 
 void valid_depth(const DepthImage& depth, float near, float far, float step, std::span<float> out) {
   const int width = depth.width, height = depth.height;
-  // Two rows of zeros and a column on each side: a pixel of the border has no neighbour there, which speaks for it.
-  const std::size_t stride = static_cast<std::size_t>(width) + 2;
-  std::vector<float> padded(stride * (static_cast<std::size_t>(height) + 2), 0.0F);
+  const Bordered within(depth, [near, far](float z) { return z >= near && z <= far ? z : 0.0F; });  // 0 for NaN
   for (int v = 0; v < height; ++v) {
-    const float* from = depth.z.data() + static_cast<std::size_t>(v) * width;
-    float* to = padded.data() + (static_cast<std::size_t>(v) + 1) * stride + 1;
-    for (int u = 0; u < width; ++u) to[u] = from[u] >= near && from[u] <= far ? from[u] : 0.0F;  // false for NaN
-  }
-  for (int v = 0; v < height; ++v) {
-    const float* row = padded.data() + (static_cast<std::size_t>(v) + 1) * stride + 1;
-    const float *above = row - stride, *below = row + stride;
+    const float* row = within.row(v);
+    const float *above = row - within.stride(), *below = row + within.stride();
     float* to = out.data() + static_cast<std::size_t>(v) * width;
     for (int u = 0; u < width; ++u) {
       const float z = row[u], jump = step * z;
@@ -42,6 +60,7 @@ void valid_depth(const DepthImage& depth, float near, float far, float step, std
 }
 
 void halve_depth(const DepthImage& depth, std::span<float> out) {
+  constexpr float kAsFar = static_cast<float>(1.0 + kOneSurface);
   const int width = depth.width / 2, height = depth.height / 2;
   for (int v = 0; v < height; ++v) {
     const float* upper = depth.z.data() + static_cast<std::size_t>(2 * v) * depth.width;
@@ -53,7 +72,7 @@ void halve_depth(const DepthImage& depth, std::span<float> out) {
       for (const float d : z) nearest = d > 0.0F ? std::min(nearest, d) : nearest;
       float sum = 0.0F, count = 0.0F;
       for (const float d : z) {
-        const bool same = d > 0.0F && d <= 1.05F * nearest;
+        const bool same = d > 0.0F && d <= kAsFar * nearest;
         sum += same ? d : 0.0F;
         count += same ? 1.0F : 0.0F;
       }
@@ -76,7 +95,7 @@ void depth_around(const DepthImage& depth, std::span<const float> pixels, std::s
     }
     std::sort(window.begin(), window.begin() + n);
     const double median = n == 0 ? 0.0 : 0.5 * (static_cast<double>(window[(n - 1) / 2]) + window[n / 2]);
-    const bool one = n > 0 && static_cast<double>(window[n - 1]) - window[0] <= 0.05 * median;
+    const bool one = n > 0 && static_cast<double>(window[n - 1]) - window[0] <= kOneSurface * median;
     out[i] = one ? median : std::numeric_limits<double>::quiet_NaN();
   }
 }
@@ -85,19 +104,12 @@ void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, f
                          std::span<float> out) {
   const int width = depth.width, height = depth.height;
   constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
-  // Inverse depth, 0 where nothing is measured and around the image.
-  const std::size_t stride = static_cast<std::size_t>(width) + 2;
-  std::vector<float> inverse(stride * (static_cast<std::size_t>(height) + 2), 0.0F);
-  for (int v = 0; v < height; ++v) {
-    const float* from = depth.z.data() + static_cast<std::size_t>(v) * width;
-    float* to = inverse.data() + (static_cast<std::size_t>(v) + 1) * stride + 1;
-    for (int u = 0; u < width; ++u) to[u] = (from[u] > 0.0F ? 1.0F : 0.0F) / (from[u] > 0.0F ? from[u] : 1.0F);
-  }
+  const Bordered inverse(depth, [](float z) { return (z > 0.0F ? 1.0F : 0.0F) / (z > 0.0F ? z : 1.0F); });
   for (int v = 0; v < height; ++v) {
     const std::size_t at = static_cast<std::size_t>(v) * width;
     const float *z = depth.z.data() + at, *g = gray.data() + at;
-    const float* row = inverse.data() + (static_cast<std::size_t>(v) + 1) * stride + 1;
-    const float *above = row - stride, *below = row + stride;
+    const float* row = inverse.row(v);
+    const float *above = row - inverse.stride(), *below = row + inverse.stride();
     float* to = out.data() + at;
     for (int u = 0; u < width; ++u) {
       const float w = row[u], kept = g[u], apart = step * z[u], noise = floor + quad * z[u] * z[u];
@@ -115,6 +127,7 @@ void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, f
 }
 
 void normals_of(const DepthImage& depth, const Pinhole& camera, std::span<float> out) {
+  constexpr float kApart = static_cast<float>(kOneSurface);
   const int width = depth.width, height = depth.height;
   std::fill(out.begin(), out.end(), 0.0F);
   if (width < 3 || height < 3) return;
@@ -130,7 +143,7 @@ void normals_of(const DepthImage& depth, const Pinhole& camera, std::span<float>
       const float apart = std::max(std::max(std::abs(left - z), std::abs(right - z)),
                                    std::max(std::abs(up - z), std::abs(down - z)));
       const bool whole = (z > 0.0F) & (left > 0.0F) & (right > 0.0F) & (up > 0.0F) & (down > 0.0F);
-      if (!(whole & (apart < kOneSurface * z))) continue;
+      if (!(whole & (apart < kApart * z))) continue;
       const float ux = right * x[u + 1] - left * x[u - 1], uy = right * y[v] - left * y[v], uz = right - left;
       const float vx = down * x[u] - up * x[u], vy = down * y[v + 1] - up * y[v - 1], vz = down - up;
       const float nx = vy * uz - vz * uy, ny = vz * ux - vx * uz, nz = vx * uy - vy * ux;
