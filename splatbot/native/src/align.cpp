@@ -4,8 +4,6 @@
 #include <algorithm>
 #include <cmath>
 
-#include "splatbot/kernels.hpp"
-
 namespace splatbot {
 namespace {
 
@@ -13,9 +11,6 @@ using Mat4 = std::array<double, 16>;
 using Vec6 = std::array<double, 6>;
 using Mat6 = std::array<double, 36>;
 
-// Exposure is anchored weakly to gain 1 and offset 0, so that a blank image leaves it defined.
-constexpr double kExposurePrior = 1e2;
-constexpr int kExposureSteps = 2;
 constexpr double kStepDone = 1e-5;  // [m] and [rad]
 constexpr double kDamping = 1e-5;   // share of the mean diagonal
 
@@ -199,9 +194,7 @@ class DenseTerm {
   void add(std::span<const double, 16> T_camera_world, const AlignPlan& plan, double weight, Normal& total) {
     const Mat4 T = multiply(T_camera_world, T_world_reference_);
     const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, plan.settings, {}, {});
-    const double A00 = s.H[54] + kExposurePrior, A01 = s.H[55], A11 = s.H[63] + kExposurePrior;
-    const double det = A00 * A11 - A01 * A01;
-    inverse_ = {A11 / det, -A01 / det, A00 / det};
+    inverse_ = exposure_inverse(s);
     residual_ = {s.g[6] + kExposurePrior * (a_ - 1.0), s.g[7] + kExposurePrior * b_};
     for (int i = 0; i < 6; ++i) {
       coupling_[2 * i] = s.H[8 * i + 6];
@@ -405,75 +398,6 @@ bool is_worth_a_step(std::size_t level, std::span<const AlignReference> referenc
 }
 
 }  // namespace
-
-AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& reference, std::span<const double, 16> T,
-                              double gain, double offset, const AlignSettings& settings,
-                              std::span<float> residual_photometric, std::span<float> residual_geometric) {
-  const auto f = [](double value) { return static_cast<float>(value); };
-  LinearizeSums sums{};
-  LinearizeArgs args{.width = image.width,
-                     .height = image.height,
-                     .fx = f(image.fx),
-                     .fy = f(image.fy),
-                     .cx = f(image.cx),
-                     .cy = f(image.cy),
-                     .gray = image.gray.data(),
-                     .depth = image.depth.data(),
-                     .count = 0,
-                     .points = nullptr,
-                     .normals = nullptr,
-                     .gray_reference = nullptr,
-                     .T = {},
-                     .gain = f(gain),
-                     .offset = f(offset),
-                     .use_photometric = settings.use_photometric,
-                     .use_geometric = settings.use_geometric,
-                     .sigma_gray = f(settings.sigma_gray),
-                     .sigma_depth_floor = f(settings.sigma_depth_floor),
-                     .sigma_depth_quad = f(settings.sigma_depth_quad),
-                     .gate = f(settings.gate),
-                     .nu = f(settings.nu),
-                     .residual_photometric = nullptr,
-                     .residual_geometric = nullptr};
-  std::transform(T.begin(), T.begin() + 12, args.T, f);
-  std::fill(residual_photometric.begin(), residual_photometric.end(), std::nanf(""));
-  std::fill(residual_geometric.begin(), residual_geometric.end(), std::nanf(""));
-  const std::size_t n = reference.gray.size();
-  for (std::size_t first = 0; first < n; first += kLinearizeChunk) {
-    args.count = static_cast<int>(std::min<std::size_t>(kLinearizeChunk, n - first));
-    args.points = reference.points.data() + 3 * first;
-    args.normals = reference.normals.data() + 3 * first;
-    args.gray_reference = reference.gray.data() + first;
-    args.residual_photometric = residual_photometric.empty() ? nullptr : residual_photometric.data() + first;
-    args.residual_geometric = residual_geometric.empty() ? nullptr : residual_geometric.data() + first;
-    kernels().linearize(args, sums);
-  }
-  AlignSums out;
-  for (int i = 0; i < 8; ++i) {
-    for (int j = 0; j < 8; ++j) out.H[8 * i + j] = sums.H[8 * std::min(i, j) + std::max(i, j)];
-    out.g[i] = sums.g[i];
-  }
-  out.cost = sums.cost;
-  out.projected = sums.projected;
-  out.photometric = sums.photometric;
-  out.geometric = sums.geometric;
-  return out;
-}
-
-std::array<double, 2> align_residuals(const AlignImage& image, const AlignPoints& reference,
-                                      std::span<const double, 16> T, const AlignSettings& settings,
-                                      std::span<float> residual_photometric, std::span<float> residual_geometric) {
-  double gain = 1.0, offset = 0.0;
-  for (int step = 0; step < kExposureSteps; ++step) {
-    const AlignSums s = linearize_alignment(image, reference, T, gain, offset, settings, {}, {});
-    const double A00 = s.H[54] + kExposurePrior, A01 = s.H[55], A11 = s.H[63] + kExposurePrior;
-    const double determinant = A00 * A11 - A01 * A01;
-    gain -= (A11 * s.g[6] - A01 * s.g[7]) / determinant;
-    offset -= (A00 * s.g[7] - A01 * s.g[6]) / determinant;
-  }
-  linearize_alignment(image, reference, T, gain, offset, settings, residual_photometric, residual_geometric);
-  return {gain, offset};
-}
 
 AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,
                   const AlignMatches& matches, const AlignPrior* prior, std::span<const double, 16> T_start,

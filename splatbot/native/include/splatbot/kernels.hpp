@@ -115,7 +115,7 @@ struct ContributionArgs {
 
 inline constexpr int kLinearizeChunk = 256;
 
-// One chunk of at most kLinearizeChunk points against one image; see align.hpp for the terms.
+// One chunk of at most kLinearizeChunk points against one image; see align_residuals.hpp for the terms.
 struct LinearizeArgs {
   int width, height;
   float fx, fy, cx, cy;
