@@ -61,7 +61,7 @@ def open_() -> Iterator[Service]:
         yield service
 
 
-@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("key", KEYS, ids=["first", "second"])
 @pytest.mark.parametrize("header", ["Authorization", "X-API-Key"])
 def test_each_key_opens_in_either_header(locked: Service, key: str, header: str) -> None:
     value = f"Bearer {key}" if header == "Authorization" else key
