@@ -16,10 +16,12 @@ Array = NDArray[np.float64]
 # Information that any pose has: it is within some 30 m and turns of where it was looked for.
 _LEAST = 1e-3
 # An image cannot be placed on another more exactly [px]: interpolation and blur shift all of it, which no cell shows.
-_PLACEMENT = 0.02
+_PLACEMENT = 0.025
+# Neighbouring cells err together in part, so the spread says less than there is by this factor.
+_BETWEEN_CELLS = 1.25
 # Calibration of lens and depth is good to this share: such an error is the same in every frame, so along a path it adds
 # up, and does not average out.
-_CALIBRATION = 0.2e-3
+_CALIBRATION = 0.1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,17 +49,19 @@ class Uncertainty:
 def alignment_covariance(found: Alignment) -> Array:
     """Covariance (6, 6) of a pose against its references, twist (t [m], ω [rad]) in the camera's frame.
 
-    Cluster-robust (Huber 1967; Liang and Zeger 1986) over the cells of the image, with the factor for few clusters:
-    C⁻¹ S C⁻¹ n/(n - 6), C the curvature and S the spread, plus the noise model's own H⁻¹, plus a shift of the whole
-    image, taken for a turn sideways and up. Where H says nothing the covariance is large, and finite; NaN where H is.
+    Cluster-robust (Huber 1967; Liang and Zeger 1986) over the n cells of the image, with the factor for few clusters:
+    C⁻¹ S C⁻¹ n/(n - 6), C the curvature and S the spread; plus the noise model's own H⁻¹, whose share (6/n)² is all of
+    it where cells are too few to tell, plus a shift of the whole image, taken for a turn about each axis. Where H says
+    nothing the covariance is large, and finite; NaN where H is.
     """
     if not np.isfinite(found.information).all():
         return np.full((6, 6), np.nan)
-    few = found.cells / max(found.cells - 6, 1)
+    few = _BETWEEN_CELLS * found.cells / max(found.cells - 6, 1)
+    share = min(1.0, (6 / max(found.cells, 1)) ** 2)
     model = np.linalg.inv(found.information + _LEAST * np.eye(6))
     C_inverse = np.linalg.inv(found.curvature + _LEAST * np.eye(6))
-    shift = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) * (_PLACEMENT / found.focal) ** 2
-    return _symmetric(np.asarray(model + few * C_inverse @ found.spread @ C_inverse + shift, dtype=np.float64))
+    shift = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * (_PLACEMENT / found.focal) ** 2
+    return _symmetric(np.asarray(share * model + few * C_inverse @ found.spread @ C_inverse + shift, dtype=np.float64))
 
 
 def world_uncertainty(
