@@ -70,6 +70,15 @@ def test_without_any_information_the_covariance_is_large_and_finite_and_of_nan_i
     assert np.isnan(alignment_covariance(replace(nothing, information=np.full((6, 6), np.nan)))).all()
 
 
+@pytest.mark.parametrize(("cells", "share"), [(0, 1.0), (4, 1.0), (6, 1.0), (12, 0.25), (48, 1 / 64)])
+def test_the_noise_model_counts_in_full_where_cells_are_too_few_to_tell(cells: int, share: float) -> None:
+    H = np.diag([1e6, 2e6, 4e6, 1e6, 2e6, 4e6])
+    agreed = Alignment(np.eye(4), H, H, np.zeros((6, 6)), cells, 525.0)  # no cell pulls anywhere
+    covariance = alignment_covariance(agreed)
+    np.testing.assert_allclose(np.diag(covariance)[:3], share / np.diag(H)[:3], rtol=1e-6)
+    assert (np.diag(covariance)[3:] > share / np.diag(H)[3:]).all()  # nor can an image be placed without error
+
+
 def test_a_blank_wall_is_not_known_along_itself() -> None:
     wall = prepare(wall_frame(np.eye(4), textured=False), CONFIG)
     reference = make_reference(wall.levels, np.eye(4), 1000)
