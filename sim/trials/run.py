@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from splatbot.errors import FormatError, InputError
+from splatbot.errors import FormatError, InputError, SplatbotError
 from splatbot.sim.trials.scenes import FAMILIES, make_trial
 from splatbot.sim.trials.stacks import GaussianStack, Stack
 from splatbot.sim.trials.trial import TrialRow, run_trial
@@ -22,6 +22,10 @@ from splatbot.sim.trials.trial import TrialRow, run_trial
 FILE = "trials.jsonl"
 STACKS = ("gaussians", "mesh", "cloud")
 Tell = Callable[[str, float], None]
+
+
+class TrialError(SplatbotError):
+    """A trial ended by an error of the program, which says nothing of the grasp."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,7 @@ def run_trials(plan: TrialsPlan, folder: Path, *, tell: Tell = lambda what, shar
 
     Raises:
         FormatError: the file in the folder is damaged.
+        TrialError: a trial failed; those before it are written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / FILE
@@ -166,4 +171,8 @@ def _job(job: Any) -> list[TrialRow]:
     plan, folder, seed, names = job
     videos = Path(folder) if plan.videos else None
     stacks = [stack_of(name) for name in names]
-    return run_trial(make_trial(seed, plan.family), stacks, frames=plan.frames, width=plan.width, videos=videos)
+    try:
+        return run_trial(make_trial(seed, plan.family), stacks, frames=plan.frames, width=plan.width, videos=videos)
+    except Exception as error:
+        hint = f"the trials before it are in {folder}; --scenes {plan.family} --first {seed} --trials 1 runs it alone"
+        raise TrialError(f"failed: {error}", field=f"{plan.family}, seed {seed}", hint=hint) from error

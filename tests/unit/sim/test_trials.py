@@ -16,8 +16,8 @@ from splatbot.robots.panda import panda
 from splatbot.sim.compare.agreement import wilson
 from splatbot.sim.scene import SceneObject
 from splatbot.sim.trials.look import UnseenError, camera_path
-from splatbot.sim.trials.run import FILE, TrialsPlan, read_rows, run_trials
-from splatbot.sim.trials.scenes import OBSTACLE, make_trial
+from splatbot.sim.trials.run import FILE, TrialError, TrialsPlan, read_rows, run_trials
+from splatbot.sim.trials.scenes import OBSTACLE, TrialScene, make_trial
 from splatbot.sim.trials.shake import SHARE, Shake
 from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
@@ -172,6 +172,20 @@ def test_a_target_that_no_picture_shows_is_a_failure_of_that_trial_and_not_the_e
     assert (found["build_s"], found["world_mb"]) == (4.0, 5.0)
     (one,) = run_trial(make_trial(1, "isolated"), [GaussianStack()])
     assert not one.ideal.success
+
+
+def test_an_error_ends_the_run_with_the_name_of_its_trial_and_those_before_it_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken_at_four(trial: TrialScene, stacks: list[GaussianStack], **_: object) -> list[TrialRow]:
+        if trial.seed == 4:
+            raise InputError("row 13220 is not finite.", field="quats")
+        return [row(trial.seed, "gaussians")]
+
+    monkeypatch.setattr("splatbot.sim.trials.run.run_trial", broken_at_four)
+    with pytest.raises(TrialError, match=r"tabletop, seed 4.*quats: row 13220.*--scenes tabletop --first 4 --trials 1"):
+        run_trials(TrialsPlan(trials=3, first=2, frames=32, width=320), tmp_path)
+    assert [kept.seed for kept in read_rows(tmp_path / FILE)] == [2, 3]
 
 
 def test_wrong_plans_are_named() -> None:
