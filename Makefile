@@ -38,10 +38,10 @@ serve: $(INSTALL_STAMP) ## HTTP service on a map (MAP=file.ply HOST=127.0.0.1 PO
 	$(BIN)/splatbot serve --map $(MAP) --host $(HOST) --port $(PORT)
 
 .PHONY: test
-# Files of tests run beside each other, one for each core; so each process keeps to one thread.
+# Files of tests run beside each other, one for each core, the long ones (e2e) first; each process keeps to one thread.
 test: export OMP_NUM_THREADS := 1
 test: $(INSTALL_STAMP) ## the test suite without its long part (at most 12 minutes on 2 cores)
-	$(BIN)/python -m pytest -m "not long" --numprocesses auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "not long" --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 .PHONY: test-long
 test-long: $(INSTALL_STAMP) ## the long tests: end-to-end on real logs, browser, load, sanitizers, wheel and sdist (at most 45 minutes)
