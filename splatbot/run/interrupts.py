@@ -15,16 +15,15 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Interrupts:
     """Turns SIGINT and SIGTERM into a request that a long job honours where it is safe.
 
-    While active, a first signal only sets :attr:`requested`; a second one raises KeyboardInterrupt at once. Inside
-    :meth:`held` no signal raises; one that arrived there raises when the block ends. After :meth:`release` the first
-    signal raises too. Outside the main thread Python delivers no signals, and this does nothing.
+    While active, a signal only sets :attr:`requested`, so that what is under way is done and saved whole. Inside
+    :meth:`interruptible`, around work that may be cut short without loss, it raises KeyboardInterrupt. Outside the
+    main thread Python delivers no signals, and this does nothing.
     """
 
     def __init__(self) -> None:
         self.requested: int | None = None
-        self._at_once = False
-        self._holding = False
-        self._pending = False
+        self._count = 0
+        self._raises_after: int | None = None
         self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Interrupts:
@@ -36,26 +35,22 @@ class Interrupts:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
-    def release(self) -> None:
-        """From here on a signal interrupts at once: what matters has been saved."""
-        self._at_once = True
-
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """A block that no signal interrupts: keep it short."""
-        self._holding = True
+    def interruptible(self, *, after: int = 0) -> Iterator[None]:
+        """A block that KeyboardInterrupt ends, or is not even begun, once more than ``after`` signals have come."""
+        self._raises_after = after
         try:
+            self._raise_if_asked()
             yield
         finally:
-            self._holding = False
-        if self._pending:
-            self._pending = False
-            raise KeyboardInterrupt
+            self._raises_after = None
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
-        again = self._at_once or self.requested is not None
+        self._count += 1
         self.requested = self.requested or number
-        if again and self._holding:
-            self._pending = True
-        elif again:
+        self._raise_if_asked()
+
+    def _raise_if_asked(self) -> None:
+        if self._raises_after is not None and self._count > self._raises_after:
+            self._raises_after = None  # at once: the next signal must not cut the cleaning up
             raise KeyboardInterrupt

@@ -79,8 +79,9 @@ class FrameLoop:
                 self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
             if through:
                 self.progress("refining")
-                self.slam.finish()
-        except KeyboardInterrupt:  # the second signal, or one raised by a callback
+                with interrupts.interruptible():
+                    self.slam.finish()
+        except KeyboardInterrupt:  # while refining, or raised by a callback
             interrupts.requested = interrupts.requested or 2
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash
@@ -90,10 +91,17 @@ class FrameLoop:
     def _all_frames(self, interrupts: Interrupts) -> bool:
         """Whether the log ended, rather than a signal or an unreadable frame ending the run."""
         with closing(iter(self.source)) as arrivals:
-            for arrival in arrivals:
-                if interrupts.requested is not None or not self._step(arrival):
+            while interrupts.requested is None:
+                try:
+                    with interrupts.interruptible(after=1):  # a camera may be silent for long
+                        arrival = next(arrivals, None)
+                except KeyboardInterrupt:
                     return False
-        return True
+                if arrival is None:
+                    return True
+                if not self._step(arrival):
+                    return False
+        return False
 
     def _step(self, arrival: Arrival) -> bool:
         """Process one frame; False when the run ends here."""

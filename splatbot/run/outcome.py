@@ -44,13 +44,13 @@ class Outcome:
     map_page: MapPage | None = None
 
     def save(self, folder: RunFolder) -> None:
-        """Save first; then score and report, which a signal may cut short without loss."""
+        """Save first; then score and report, unless a signal beside the one that ended the mapping cuts that short."""
         self.loop.progress("saving")
-        with self.interrupts.held():
-            self.save_files(folder)
-        self.interrupts.release()
+        self.save_files(folder)
+        mapping_cut = self.interrupts.requested is not None
         try:
-            self._score_and_report(folder)
+            with self.interrupts.interruptible(after=int(mapping_cut)):
+                self._score_and_report(folder)
         except KeyboardInterrupt:
             folder.save_metrics(self.metrics())
 

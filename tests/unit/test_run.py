@@ -6,6 +6,7 @@ import gc
 import json
 import os
 import signal
+import threading
 import time
 import weakref
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from splatbot.logs import Log, open_log
 from splatbot.results.folder import RunFolder
 from splatbot.results.rescore import rescore
 from splatbot.run import Progress, map_log
+from splatbot.run.state import SavedRun
 from splatbot.trajectory import Trajectory
 from tests.unit.oracle import OracleSlam
 
@@ -204,6 +206,39 @@ def test_a_second_ctrl_c_at_once_still_saves_what_was_mapped(log: Log, tmp_path:
     assert result.exit_code == 130
     assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 10
     assert len(GaussianModel.load(tmp_path / "run" / "map.ply")) > 0
+
+
+def test_a_second_ctrl_c_gives_up_scoring_and_report_only(log: Log, tmp_path: Path) -> None:
+    map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=interrupt_at(10, times=2))
+    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES - {"report.html"}
+    assert read(tmp_path / "run")["psnr_holdout_db"] is None
+
+
+@pytest.mark.parametrize("phase", ["mapping", "saving"])
+def test_many_ctrl_c_in_a_frame_or_while_saving_lose_no_state(phase: str, log: Log, tmp_path: Path) -> None:
+    def on_progress(progress: Progress) -> None:
+        if progress.phase == phase and progress.done == 5:
+            for _ in range(5):
+                os.kill(os.getpid(), signal.SIGINT)
+
+    limit = None if phase == "mapping" else 5
+    map_log(log, out=tmp_path / "run", on_progress=on_progress, max_frames=limit, save_every=1e9)
+    assert SavedRun.load(tmp_path / "run").place.next_index == 5
+    assert read(tmp_path / "run")["interrupted"] is True
+
+
+def test_ctrl_c_while_refining_ends_that_only(log: Log, tmp_path: Path) -> None:
+    def on_progress(progress: Progress) -> None:
+        if progress.phase == "refining":
+            threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    endless = Config()
+    endless.mapping.final_iterations, endless.mapping.holdout_every = 1_000_000, 2
+    map_log(log, out=tmp_path / "run", config=endless, on_progress=on_progress, max_frames=4)
+    metrics = read(tmp_path / "run")
+    assert metrics["interrupted"] is True
+    assert metrics["psnr_holdout_db"] is not None
+    assert (tmp_path / "run" / "report.html").exists()
 
 
 def test_ctrl_c_while_scoring_keeps_the_map(log: Log, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Interrupts: a request first, an exception second, and never inside a held block."""
+"""Interrupts: a request everywhere, an exception only where work may be cut short."""
 
 from __future__ import annotations
 
@@ -22,41 +22,59 @@ def test_the_first_signal_is_only_a_request(number: int) -> None:
         assert interrupts.requested == number
 
 
-def test_the_second_signal_raises() -> None:
+def test_no_signal_raises_where_nothing_may_be_cut_short() -> None:
     with Interrupts() as interrupts:
-        send()
-        with pytest.raises(KeyboardInterrupt):
-            send()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
+            send(number)
         assert interrupts.requested == signal.SIGINT
 
 
-def test_nothing_raises_inside_a_held_block_but_it_does_right_after() -> None:
+@pytest.mark.parametrize("before", [0, 1])
+def test_an_interruptible_block_ends_at_the_first_signal_beyond_those_allowed(before: int) -> None:
     reached = []
 
     def work(interrupts: Interrupts) -> None:
-        with interrupts.held():
+        with interrupts.interruptible(after=before):
+            reached.append("begun")
             send()
-            send()
-            reached.append("end")
+            reached.append("not cut")
 
-    with Interrupts() as interrupts, pytest.raises(KeyboardInterrupt):
-        work(interrupts)
-    assert reached == ["end"]
-
-
-def test_a_single_signal_inside_a_held_block_is_a_request() -> None:
     with Interrupts() as interrupts:
-        with interrupts.held():
+        for _ in range(before):
             send()
-        assert interrupts.requested == signal.SIGINT
-
-
-def test_after_release_the_first_signal_raises() -> None:
-    with Interrupts() as interrupts:
-        interrupts.release()
         with pytest.raises(KeyboardInterrupt):
-            send()
+            work(interrupts)
         assert interrupts.requested == signal.SIGINT
+    assert reached == ["begun"]
+
+
+@pytest.mark.parametrize("after", [0, 1])
+def test_an_interruptible_block_is_not_begun_after_too_many_signals(after: int) -> None:
+    reached = []
+    with Interrupts() as interrupts:
+        for _ in range(after + 1):
+            send()
+        with pytest.raises(KeyboardInterrupt), interrupts.interruptible(after=after):
+            reached.append("begun")
+    assert not reached
+
+
+def test_after_the_block_and_while_it_is_left_a_signal_is_a_request_again() -> None:
+    reached = []
+
+    def work(interrupts: Interrupts) -> None:
+        with interrupts.interruptible():
+            try:
+                send()
+            finally:
+                send()  # while the first is being answered
+                reached.append("cleaned up")
+
+    with Interrupts() as interrupts:
+        with pytest.raises(KeyboardInterrupt):
+            work(interrupts)
+        send()
+    assert reached == ["cleaned up"]
 
 
 def test_handlers_are_restored_even_after_an_error() -> None:
