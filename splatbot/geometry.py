@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -28,13 +30,20 @@ def so3_exp(omega: ArrayLike) -> Array:
 
 
 def so3_log(R: ArrayLike) -> Array:
-    """Rotation vector (3,) [rad] of a rotation matrix (3, 3), norm in [0, π]. Through the quaternion: exact near π."""
-    w, *xyz = rotation_to_quat(R)
-    v = np.asarray(xyz)
-    n = float(np.linalg.norm(v))
-    if n < _SMALL_ANGLE:
-        return v * (2.0 / w) * (1.0 - (n / w) ** 2 / 3.0)
-    return v * (2.0 * np.arctan2(n, w) / n)
+    """Rotation vector (3,) [rad] of a rotation matrix (3, 3), norm in [0, π].
+
+    Up to a right angle by the skew part, whose length is sin θ; beyond through the quaternion, which is exact near π.
+    """
+    M = np.asarray(R, dtype=np.float64)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = M.tolist()
+    v = 0.5 * np.array([zy - yz, xz - zx, yx - xy])
+    n, cosine = math.hypot(*v.tolist()), 0.5 * (xx + yy + zz - 1.0)
+    if not cosine > 0.0:  # NaN too
+        w, *xyz = rotation_to_quat(M)
+        v = np.asarray(xyz)
+        n = float(np.linalg.norm(v))
+        return v * (2.0 * math.atan2(n, w) / n)
+    return v * (math.atan2(n, cosine) / n) if n > _SMALL_ANGLE else v * (1.0 + n**2 / 6.0)
 
 
 def se3_exp(xi: ArrayLike) -> Array:

@@ -114,6 +114,9 @@ class Slam:
             covariance=estimate.covariance if placed else None,
         )
         self.results.append(result)
+        if estimate.stage_ms:
+            stages = stage_ms["prepare"] + sum(estimate.stage_ms.values())
+            self._tracker.note_rest(1e3 * (time.perf_counter() - start) - stages)
         return result
 
     def finish(self) -> None:

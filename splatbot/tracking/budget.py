@@ -25,6 +25,7 @@ _TABLE: dict[str, tuple[float, float]] = {
     "match all": (0.8, 2.3e-6),  # keypoints, times keypoints of a keyframe
     "vote": (0.0, 0.5),  # keyframes
     "wide": (3.0, 6.0e-3),  # points
+    "rest": (1.0, 0.0),  # what is no stage: the covariance, the hand-over to mapping, the steps in between
 }
 
 
@@ -75,7 +76,8 @@ class Budget:
         share: of a stage's recent runs that must have cost no more than the time left. A camera that is lost has little
             to lose by being late: without the stages that two slow runs speak against it would stay so.
 
-    ``ms`` are wall-clock milliseconds by stage, in either mode; ``skipped`` names what there was no time for.
+    ``ms`` are wall-clock milliseconds by stage, in either mode; ``skipped`` names what there was no time for. What most
+    frames cost beside their stages is kept free.
     """
 
     def __init__(self, limit_ms: float, costs: Costs | None, started: float, share: float = CAREFUL) -> None:
@@ -88,12 +90,13 @@ class Budget:
         self._counted = 0.0
         if costs is not None:
             costs.begin_frame()
+        self._rest_ms = table_ms("rest", 1) if costs is None else costs.expected_ms("rest", 1, BOLD)
 
     @property
     def left_ms(self) -> float:
-        """Milliseconds until the deadline."""
+        """Milliseconds for stages until the deadline."""
         spent = self._counted if self._costs is None else 1e3 * (time.perf_counter() - self._started)
-        return self.limit_ms - spent
+        return self.limit_ms - self._rest_ms - spent
 
     def cost_ms(self, stage: str, units: float) -> float:
         """What to expect of a stage: a percentile, the 95th unless ``share`` says otherwise, or the table's figure."""

@@ -76,11 +76,11 @@ def measure(
         here.append(found.photometric[seen] * config.sigma_gray + found.gain * there[-1] + found.offset)
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)
     seen, ranged = np.isfinite(r_photo), np.isfinite(r_depth)
-    steep = np.concatenate(slope)[seen].astype(np.float64)
+    agree, steep = r_photo[seen] < _INLIER, np.concatenate(slope)[seen].astype(np.float64)
     return Health(
         overlap=float(seen.mean()) if len(seen) else 0.0,
-        photometric_inliers=float((r_photo[seen] < _INLIER).mean()) if seen.any() else 0.0,
-        edge_inliers=float(steep @ (r_photo[seen] < _INLIER) / steep.sum()) if steep.sum() > 0 else 1.0,
+        photometric_inliers=float(agree.mean()) if len(agree) else 0.0,
+        edge_inliers=float(steep @ agree / steep.sum()) if steep.sum() > 0 else 1.0,
         geometric_inliers=float((r_depth[ranged] < _INLIER).mean()) if ranged.any() else 1.0,
         score=float(np.mean([_saturated(r_photo), _saturated(r_depth)])) if len(seen) else _SATURATION,
         contrast=_contrast(np.concatenate(here), np.concatenate(there)),
@@ -88,7 +88,7 @@ def measure(
 
 
 def _saturated(residuals: NDArray[np.floating[Any]]) -> float:
-    return float(np.minimum(np.nan_to_num(residuals, nan=_SATURATION), _SATURATION).mean())
+    return float(np.fmin(residuals, _SATURATION).mean())  # NaN, too, is saturated
 
 
 def _contrast(gray: Array, reference_gray: Array) -> float:

@@ -104,7 +104,8 @@ def usable_depth(frame: Frame, config: TrackingConfig) -> Image:
 
 def valid_share(prepared: PreparedFrame) -> float:
     """Share of the pixels that have a usable depth."""
-    return float((prepared.levels[0].depth > 0).mean())
+    depth = prepared.levels[0].depth
+    return float(np.count_nonzero(depth > 0)) / depth.size
 
 
 def typical_depth(prepared: PreparedFrame) -> float:

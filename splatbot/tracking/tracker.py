@@ -60,6 +60,11 @@ class Tracker:
         """Whether the last frame could not be placed."""
         return self._lost
 
+    def note_rest(self, ms: float) -> None:
+        """What a tracked frame has cost beside its stages [ms], for the budgets of those to come."""
+        if self._costs is not None:
+            self._costs.record("rest", 1, ms)
+
     def forget(self) -> None:
         """The next frame may be anywhere: nothing is known of the motion."""
         self.motion = ConstantVelocity()

@@ -8,7 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatbot.config import TrackingConfig, load_config
+from splatbot.config import Config, TrackingConfig, load_config
+from splatbot.logs import open_log
+from splatbot.mapping.mapper import Mapper
+from splatbot.slam import Slam
 from splatbot.tracking.budget import BOLD, CAREFUL, Budget, Costs, table_ms
 from tests.unit.tracking.test_tracker import Run
 
@@ -71,10 +74,35 @@ def test_time_that_has_passed_is_not_left() -> None:
     assert budget.left_ms <= 5.0
     assert not budget.fits(("detect", 2000))
     counted = Budget(50.0, None, time.perf_counter() - 10.0)
-    assert counted.left_ms == 50.0
+    assert counted.left_ms == 50.0 - table_ms("rest", 1)
     with counted.run("detect", 1000):
         pass
-    assert counted.left_ms == pytest.approx(50.0 - table_ms("detect", 1000))
+    assert counted.left_ms == pytest.approx(50.0 - table_ms("rest", 1) - table_ms("detect", 1000))
+
+
+def test_what_most_frames_cost_beside_their_stages_is_kept_free() -> None:
+    costs = Costs()
+    for ms in (7.0, 3.0, 7.0, 7.0, 60.0):  # the last makes a keyframe of it
+        costs.record("rest", 1, ms)
+    assert Budget(30.0, costs, time.perf_counter()).left_ms == pytest.approx(23.0, abs=0.5)
+
+
+def test_the_slam_tells_its_tracker_what_its_own_work_on_a_frame_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = 0.03
+
+    class SlowMapper(Mapper):
+        @property
+        def size(self) -> int:
+            time.sleep(slow)
+            return super().size
+
+    monkeypatch.setattr("splatbot.slam.Mapper", SlowMapper)
+    config = Config()
+    config.tracking.deterministic = False
+    slam = Slam(config)
+    for frame in open_log("synthetic:tabletop?frames=4&width=160&height=120"):
+        slam.process(frame)
+    assert slam._tracker._costs.expected_ms("rest", 1, BOLD) > 1e3 * slow  # type: ignore[union-attr]
 
 
 def test_without_time_for_features_the_frame_is_tracked_without_and_says_so() -> None:
@@ -89,7 +117,7 @@ def test_without_time_for_features_the_frame_is_tracked_without_and_says_so() ->
 
 
 def test_with_little_time_there_are_fewer_keypoints() -> None:
-    plenty, little = Run(width=320), Run(width=320, tracking__budget_ms=8)
+    plenty, little = Run(width=320), Run(width=320, tracking__budget_ms=9)
     many, few = plenty.track(plenty.frames[1]).features, little.track(little.frames[1]).features
     assert many is not None
     assert few is not None
