@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 from splatbot.errors import InputError
 
+MOST_SAMPLES = 100_000
 _RANGES = {
     "friction": (0.01, 2.0),
-    "samples": (1, 100_000),
+    "samples": (1, MOST_SAMPLES),
     "rolls": (1, 360),
     "depths": (1, 20),
     "pregrasp": (0.01, 0.5),
@@ -23,7 +24,8 @@ class GraspOptions:
 
     Args:
         friction: coefficient between pads and target.
-        samples: seeds on the surface: the knob of time against how much of it is tried.
+        samples: seeds on the surface: the knob of time against how much of it is tried; where that finds nothing,
+            four times as many are tried once.
         rolls: sides around each pair of contacts that the hand comes from.
         depths: how deep between the fingers the contacts may be.
         pregrasp: length of the straight approach [m].

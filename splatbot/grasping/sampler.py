@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -20,7 +21,7 @@ from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, place_hands
 from splatbot.grasping.implied import target_surface
 from splatbot.grasping.obstacles import around_target
-from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.options import MOST_SAMPLES, GraspOptions
 from splatbot.grasping.reach import ArmReach, Reach, hand_of
 from splatbot.grasping.score import FAR, arm_terms, best_apart, hand_terms, totals
 from splatbot.grasping.surface import Surface
@@ -31,6 +32,7 @@ from splatbot.planning.cartesian import along
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.segmentation import MapScene
 
+_MORE = 4  # times the samples for another look
 _HANDS = 2000  # whose room beside the target is looked at
 _TRIED = 200  # hands whose room in the map is looked at
 _ASKED = 60  # of them that an arm is asked for
@@ -127,12 +129,29 @@ class GraspSampler:
     def sample(self, target: Target, options: GraspOptions | None = None) -> GraspResult:
         """Ranked grasps of a target; without any, what the candidates fell to.
 
+        Where few hands are possible it is chance whether one is drawn, so where none is found four times the samples
+        are looked at, and the notes say so.
+
         Raises:
             InputError: the target has no Gaussians.
         """
         if not len(target.rows):
             raise InputError("has no Gaussians.", field=target.label, hint="name another target")
-        return _Search(self, target, options or GraspOptions()).run()
+        options = options or GraspOptions()
+        found = _Search(self, target, options).run()
+        return found if found.grasps else self._look_again(found, options)
+
+    def _look_again(self, before: GraspResult, options: GraspOptions) -> GraspResult:
+        more = replace(options, samples=min(_MORE * options.samples, MOST_SAMPLES))
+        found = _Search(self, before.target, more).run()
+        note = f"Nothing was found with {options.samples} samples, so {more.samples} were looked at."
+        return replace(
+            found,
+            candidates=before.candidates + found.candidates,
+            rejected=dict(Counter(before.rejected) + Counter(found.rejected)),
+            seconds={name: before.seconds[name] + seconds for name, seconds in found.seconds.items()},
+            notes=(note, *found.notes),
+        )
 
     def surface(self, target: Target, *, seed: int = 0) -> Surface:
         """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.implied.target_surface`."""

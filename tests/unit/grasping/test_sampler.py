@@ -16,6 +16,7 @@ from splatbot.collision.evidence import DepthView
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.antipodal import antipodal_pairs
 from splatbot.grasping.implied import target_surface
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import Reached
@@ -162,6 +163,25 @@ def test_without_reach_the_best_is_told_with_its_reason_and_all_are_counted() ->
     assert result.rejected["hands: are too far"] > 0
     with pytest.raises(NoGraspError, match="it is too far"):
         result.unwrap()
+
+
+def test_where_few_samples_find_nothing_four_times_as_many_are_looked_at_and_that_is_told() -> None:
+    target = target_of(scene(), CAN, "can")
+    found = [sampler().sample(target, GraspOptions(samples=2, seed=seed)) for seed in range(6)]
+    assert all(result.grasps for result in found)
+    again = ["Nothing was found with 2 samples, so 8 were looked at." in result.notes for result in found]
+    assert 2 <= sum(again) < 6
+    assert not any("were looked at" in note for note in grasped("can").notes)
+
+
+def test_what_was_looked_at_twice_is_counted_twice() -> None:
+    big = target_of(scene(), BIG, "big")
+    once = antipodal_pairs(
+        sampler().surface(big), stroke=sampler().hand.stroke, friction=0.5, samples=400, up=scene().up, seed=0
+    )
+    assert once.too_wide > 0
+    wide = grasped("big").rejected["pairs of contacts are farther apart than the hand opens"]
+    assert 4 * once.too_wide < wide < 6 * once.too_wide
 
 
 def test_the_counts_of_hands_add_up() -> None:
