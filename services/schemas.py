@@ -212,7 +212,9 @@ class GraspsRequest(Request):
     hand_only: bool = Field(False, description="leave the arm out")
     approach: Literal["any", "top", "side"] = "any"
     friction: Annotated[float, Field(gt=0, le=2)] = 0.5
-    samples: Annotated[int, Field(ge=10, le=5000)] = Field(400, description="places tried: the knob of time")
+    samples: Annotated[int, Field(ge=10, le=5000)] = Field(
+        400, description="places tried, four times as many where that finds nothing: the knob of time"
+    )
     wanted: Annotated[int, Field(ge=1, le=100)] = 10
     margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
     min_observations: Annotated[int, Field(ge=1, le=1000)] = Field(1, description="what fewer keyframes saw is air")

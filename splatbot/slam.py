@@ -18,6 +18,7 @@ from splatbot.gaussians import Snapshot
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.motion import JointMotion
+from splatbot.mapping.refine import Stop, never
 from splatbot.mapping.worker import MappingWorker
 from splatbot.tracking.health import Verdict
 from splatbot.tracking.prepare import PreparedFrame, prepare
@@ -116,13 +117,15 @@ class Slam:
         self.results.append(result)
         if estimate.stage_ms:
             stages = stage_ms["prepare"] + sum(estimate.stage_ms.values())
+            if not self.config.mapping.threaded:  # then tracking does not wait for more than the hand-over
+                stages += stage_ms["mapping"]
             self._tracker.note_rest(1e3 * (time.perf_counter() - start) - stages)
         return result
 
-    def finish(self) -> None:
-        """Spend the last refinement on the map once the stream has ended."""
+    def finish(self, stop: Stop = never) -> None:
+        """Spend the last refinement on the map once the stream has ended, or until ``stop`` says so."""
         if self._growing:
-            self._mapper.finish()
+            self._mapper.finish(stop)
         else:
             self._mapper.close()
 

@@ -88,17 +88,21 @@ class GraspSampler:
         if not len(target.rows):
             raise InputError("has no Gaussians.", field=target.label, hint="name another target")
         options = options or GraspOptions()
-        found = Search(self, target, options).run()
-        return found if found.grasps else self._look_again(found, options)
+        search = Search(self, target, options)
+        found = search.run()
+        more = min(_MORE * options.samples, len(search.surface.points), MOST_SAMPLES)
+        return found if found.grasps or more <= options.samples else self._look_again(found, options, more)
 
-    def _look_again(self, before: GraspResult, options: GraspOptions) -> GraspResult:
-        more = replace(options, samples=min(_MORE * options.samples, MOST_SAMPLES))
-        found = Search(self, before.target, more).run()
-        note = f"Nothing was found with {options.samples} samples, so {more.samples} were looked at."
+    def _look_again(self, before: GraspResult, options: GraspOptions, samples: int) -> GraspResult:
+        found = Search(self, before.target, replace(options, samples=samples)).run()
+        note = f"Nothing was found with {options.samples} samples, so {samples} were looked at."
+        rejected = Counter(before.rejected)
+        rejected.update(found.rejected)
         return replace(
             found,
+            best_rejected=None if found.grasps else found.best_rejected or before.best_rejected,
             candidates=before.candidates + found.candidates,
-            rejected=dict(Counter(before.rejected) + Counter(found.rejected)),
+            rejected=rejected,
             seconds={name: before.seconds[name] + seconds for name, seconds in found.seconds.items()},
             notes=(note, *found.notes),
         )

@@ -26,7 +26,7 @@ from splatbot.mapping.memory import memory_of
 from splatbot.mapping.merge import merge_alike
 from splatbot.mapping.moving import Movers
 from splatbot.mapping.prune import fittest, worth_keeping
-from splatbot.mapping.refine import Refiner
+from splatbot.mapping.refine import Refiner, Stop, never
 from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
 from splatbot.tracking.reference import Reference, make_reference
@@ -153,13 +153,17 @@ class Mapper:
             self.refine(min(self.owed, self.config.mapping.refine_iterations))
             self._version += 1
 
-    def finish(self) -> None:
-        """Refine over all keyframes once no more will come, and densify where their pictures ask for it."""
-        self.refine(self.owed)
+    def finish(self, stop: Stop = never) -> None:
+        """Refine over all keyframes once no more will come, and densify where their pictures ask for it.
+
+        ``stop`` is asked before each step; once it says so there are no more, and nothing is added to the map.
+        """
+        self.refine(self.owed, stop)
         steps, pull = self.config.mapping.final_iterations, Pull(len(self.model))
-        self._refiner.refine_all(self.model, self.keyframes, steps // _BEFORE, pull)
-        self._densify(pull)
-        self._refiner.refine_all(self.model, self.keyframes, steps - steps // _BEFORE)
+        self._refiner.refine_all(self.model, self.keyframes, steps // _BEFORE, pull, stop)
+        if not stop():
+            self._densify(pull)
+            self._refiner.refine_all(self.model, self.keyframes, steps - steps // _BEFORE, stop=stop)
         self._prune()
         self._version += 1
 
@@ -217,13 +221,13 @@ class Mapper:
         self.owed += self.config.mapping.refine_iterations
         self._version += 1
 
-    def refine(self, steps: int) -> None:
+    def refine(self, steps: int, stop: Stop = never) -> None:
         """Spend at most so many of the steps owed, first on the latest keyframe if it has had none."""
         if steps <= 0:
             return
         steps = min(steps, self.owed)
         self.owed -= steps
-        self._refiner.refine(self.model, self.keyframes, steps)
+        self._refiner.refine(self.model, self.keyframes, steps, stop)
         self._prune()  # or what refinement made faint, huge or not finite would be rendered
 
     def make_reference(self, observation: Observation, keyframe: Keyframe) -> None:

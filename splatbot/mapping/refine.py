@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,15 @@ from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
 from splatbot.rasterize import rasterization
 
+Stop = Callable[[], bool]
+"""Asked before each step whether there are to be no more."""
+
 _GONE = 0.1  # where a keyframe is nearer than the map by more, it shows something that has gone [share of depth]
+
+
+def never() -> bool:
+    """Nothing ends it early."""
+    return False
 
 
 class Refiner:
@@ -49,21 +58,26 @@ class Refiner:
         adam, self._random.bit_generator.state, self._latest = state
         self.adam.restore(adam)
 
-    def refine(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int) -> None:
+    def refine(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int, stop: Stop = never) -> None:
         """Spend ``iterations`` steps on the model, in place: on the latest keyframe if it has had none, then at random.
 
         Half of the random draws come from the latest ``config.window`` keyframes, half from all, against forgetting.
         """
-        for _ in range(iterations if len(model) else 0):
+        for _ in takewhile(lambda _: not stop(), range(iterations if len(model) else 0)):
             fresh = keyframes[-1].number > self._latest
             self._latest = keyframes[-1].number
             self.step(model, keyframes[-1] if fresh else self._draw(keyframes))
 
     def refine_all(
-        self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int, pull: Pull | None = None
+        self,
+        model: GaussianModel,
+        keyframes: Sequence[Keyframe],
+        iterations: int,
+        pull: Pull | None = None,
+        stop: Stop = never,
     ) -> None:
         """Spend ``iterations`` steps on all keyframes alike; ``pull`` gathers how hard they pull at the centres."""
-        for _ in range(iterations if len(model) else 0):
+        for _ in takewhile(lambda _: not stop(), range(iterations if len(model) else 0)):
             self.step(model, keyframes[int(self._random.integers(len(keyframes)))], pull)
 
     def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from splatbot.gaussians import Snapshot
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper, Observation
+from splatbot.mapping.refine import Stop, never
 from splatbot.priority import stand_back, switch_quickly
 from splatbot.rasterize.native import native
 from splatbot.tracking.features import Features
@@ -126,11 +127,11 @@ class MappingWorker:
             self._held = moving
             self._news.notify()
 
-    def finish(self) -> None:
-        """End the thread once all observations are in the map, then refine in the calling one."""
+    def finish(self, stop: Stop = never) -> None:
+        """End the thread once all observations are in the map, then refine in this one until ``stop`` says so."""
         self._end()
         self._raise_error()
-        self._mapper.finish()
+        self._mapper.finish(stop)
         self._publish()
 
     @contextmanager

@@ -79,9 +79,8 @@ class FrameLoop:
                 self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
             if through:
                 self.progress("refining")
-                with interrupts.interruptible():
-                    self.slam.finish()
-        except KeyboardInterrupt:  # while refining, or raised by a callback
+                self.slam.finish(stop=lambda: interrupts.requested is not None)
+        except KeyboardInterrupt:  # raised by a callback
             interrupts.requested = interrupts.requested or 2
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash

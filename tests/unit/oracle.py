@@ -9,6 +9,7 @@ from splatbot.config import Config
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, transform_points
+from splatbot.mapping.refine import Stop, never
 from splatbot.slam import FrameResult, Slam, Verdict
 from splatbot.trajectory import Trajectory
 
@@ -83,7 +84,7 @@ class OracleSlam(Slam):
         self.results.append(result)
         return result
 
-    def finish(self) -> None:
+    def finish(self, stop: Stop = never) -> None:
         """Nothing to refine."""
         self.finished = True
 

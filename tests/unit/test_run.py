@@ -227,13 +227,15 @@ def test_many_ctrl_c_in_a_frame_or_while_saving_lose_no_state(phase: str, log: L
     assert read(tmp_path / "run")["interrupted"] is True
 
 
-def test_ctrl_c_while_refining_ends_that_only(log: Log, tmp_path: Path) -> None:
+@pytest.mark.parametrize("threaded", [False, True])
+def test_ctrl_c_while_refining_ends_that_only(threaded: bool, log: Log, tmp_path: Path) -> None:
     def on_progress(progress: Progress) -> None:
         if progress.phase == "refining":
             threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     endless = Config()
     endless.mapping.final_iterations, endless.mapping.holdout_every = 1_000_000, 2
+    endless.mapping.threaded = threaded
     map_log(log, out=tmp_path / "run", config=endless, on_progress=on_progress, max_frames=4)
     metrics = read(tmp_path / "run")
     assert metrics["interrupted"] is True

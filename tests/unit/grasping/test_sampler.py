@@ -174,6 +174,13 @@ def test_where_few_samples_find_nothing_four_times_as_many_are_looked_at_and_tha
     assert not any("were looked at" in note for note in grasped("can").notes)
 
 
+def test_there_is_no_second_look_where_the_first_was_at_all_of_the_surface() -> None:
+    big = target_of(scene(), BIG, "big")
+    everything = sampler().sample(big, GraspOptions(samples=len(sampler().surface(big).points)))
+    assert not everything
+    assert not any("were looked at" in note for note in everything.notes)
+
+
 def test_what_was_looked_at_twice_is_counted_twice() -> None:
     big = target_of(scene(), BIG, "big")
     once = antipodal_pairs(

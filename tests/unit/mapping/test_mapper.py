@@ -69,6 +69,16 @@ def test_every_insertion_and_the_finish_are_a_new_version_with_the_stamp_of_the_
     assert mapper.snapshot().stamp == 2.5
 
 
+def test_a_finish_that_is_stopped_spends_no_more_steps_and_adds_nothing() -> None:
+    mapper, answers = Mapper(small_config()), iter([False] * 5)
+    mapper.config.mapping.final_iterations = 1_000_000
+    insert(mapper, wall_frame(np.eye(4)))
+    before = len(mapper.model)
+    mapper.finish(stop=lambda: next(answers, True))
+    assert not list(answers)
+    assert 0 < len(mapper.snapshot().model) <= before
+
+
 def test_a_snapshot_is_not_changed_by_what_comes_after() -> None:
     mapper = Mapper(small_config())
     insert(mapper, wall_frame(np.eye(4)))
