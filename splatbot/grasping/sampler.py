@@ -80,7 +80,7 @@ class GraspSampler:
         """Ranked grasps of a target; without any, what the candidates fell to.
 
         Where few hands are possible it is chance whether one is drawn, so where none is found four times the samples
-        are looked at, and the notes say so.
+        are looked at, and the notes say so; not of what is too large for the hand.
 
         Raises:
             InputError: the target has no Gaussians.
@@ -91,7 +91,9 @@ class GraspSampler:
         search = Search(self, target, options)
         found = search.run()
         more = min(_MORE * options.samples, len(search.surface.points), MOST_SAMPLES)
-        return found if found.grasps or more <= options.samples else self._look_again(found, options, more)
+        if found.grasps or search.too_large or more <= options.samples:
+            return found
+        return self._look_again(found, options, more)
 
     def _look_again(self, before: GraspResult, options: GraspOptions, samples: int) -> GraspResult:
         found = Search(self, before.target, replace(options, samples=samples)).run()

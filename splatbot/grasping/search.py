@@ -84,6 +84,7 @@ class Search:
         self.body = enclosed_volume(self.surface.points, self.surface.normals, seed=self.o.seed)
         self.log.stage("surface")
         found = self._contacts()
+        self.too_large = not len(self.pairs.width) and found.too_wide > 0
         self.log.stage("contacts")
         hands = self._placed()
         scored = self._beside_target(hands)

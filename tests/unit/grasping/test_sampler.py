@@ -16,7 +16,6 @@ from splatbot.collision.evidence import DepthView
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.antipodal import antipodal_pairs
 from splatbot.grasping.implied import target_surface
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import Reached
@@ -174,21 +173,26 @@ def test_where_few_samples_find_nothing_four_times_as_many_are_looked_at_and_tha
     assert not any("were looked at" in note for note in grasped("can").notes)
 
 
-def test_there_is_no_second_look_where_the_first_was_at_all_of_the_surface() -> None:
-    big = target_of(scene(), BIG, "big")
-    everything = sampler().sample(big, GraspOptions(samples=len(sampler().surface(big).points)))
-    assert not everything
-    assert not any("were looked at" in note for note in everything.notes)
+def test_there_is_no_second_look_where_the_first_was_at_all_of_the_surface_or_it_is_too_large() -> None:
+    nowhere = GraspSampler(scene(), panda(), make_reach=lambda around, whole: _Nowhere())
+    box = target_of(scene(), BOX, "box")
+    for result in (nowhere.sample(box, GraspOptions(samples=len(nowhere.surface(box).points))), grasped("big")):
+        assert not result
+        assert not any("were looked at" in note for note in result.notes)
 
 
 def test_what_was_looked_at_twice_is_counted_twice() -> None:
-    big = target_of(scene(), BIG, "big")
-    once = antipodal_pairs(
-        sampler().surface(big), stroke=sampler().hand.stroke, friction=0.5, samples=400, up=scene().up, seed=0
+    box = target_of(scene(), BOX, "box")
+    hand = GraspSampler(scene(), panda(), hand_only=True)
+    once, more = (hand.sample(box, GraspOptions(samples=samples)) for samples in (100, 400))
+    twice = GraspSampler(scene(), panda(), make_reach=lambda around, whole: _Nowhere()).sample(
+        box, GraspOptions(samples=100)
     )
-    assert once.too_wide > 0
-    wide = grasped("big").rejected["pairs of contacts are farther apart than the hand opens"]
-    assert 4 * once.too_wide < wide < 6 * once.too_wide
+    assert not twice
+    assert twice.candidates == once.candidates + more.candidates
+    touch = "hands touch what is around the target"
+    assert twice.rejected[touch] == once.rejected[touch] + more.rejected[touch]
+    assert set(twice.rejected) >= set(once.rejected)
 
 
 def test_the_counts_of_hands_add_up() -> None:
