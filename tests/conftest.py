@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,16 @@ WIDTH, HEIGHT, DEPTH_SCALE = 64, 48, 5000.0
 INTRINSICS = {"fx": 60.0, "fy": 61.0, "cx": 31.5, "cy": 23.5, "width": WIDTH, "height": HEIGHT, "depth_scale": 5000}
 
 MakeLog = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def logging_as_it_was() -> Iterator[None]:
+    """`serve` logs to a stderr that is gone after its test; a thread of a later test must not write there."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
 
 
 @pytest.fixture(scope="session")
