@@ -36,14 +36,12 @@ def so3_log(R: ArrayLike) -> Array:
     """
     M = np.asarray(R, dtype=np.float64)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = M.tolist()
-    v = 0.5 * np.array([zy - yz, xz - zx, yx - xy])
-    n, cosine = math.hypot(*v.tolist()), 0.5 * (xx + yy + zz - 1.0)
-    if not cosine > 0.0:  # NaN too
-        w, *xyz = rotation_to_quat(M)
-        v = np.asarray(xyz)
-        n = float(np.linalg.norm(v))
-        return v * (2.0 * math.atan2(n, w) / n)
-    return v * (math.atan2(n, cosine) / n) if n > _SMALL_ANGLE else v * (1.0 + n**2 / 6.0)
+    times, cosine, v = 1.0, 0.5 * (xx + yy + zz - 1.0), 0.5 * np.array([zy - yz, xz - zx, yx - xy])
+    if not cosine > 0.0:  # of half the angle; NaN too
+        times, (cosine, *xyz) = 2.0, rotation_to_quat(M)
+        v = np.array(xyz)
+    sine = math.hypot(*v.tolist())
+    return times * v * (math.atan2(sine, cosine) / sine if sine > _SMALL_ANGLE else 1.0 + sine**2 / 6.0)
 
 
 def se3_exp(xi: ArrayLike) -> Array:

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 from splatbot.errors import InputError
 
-MOST_SAMPLES = 100_000
 _RANGES = {
     "friction": (0.01, 2.0),
-    "samples": (1, MOST_SAMPLES),
+    "samples": (1, 100_000),
     "rolls": (1, 360),
     "depths": (1, 20),
     "pregrasp": (0.01, 0.5),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,15 +13,13 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.implied import target_surface
-from splatbot.grasping.options import MOST_SAMPLES, GraspOptions
+from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ArmReach, Reach, hand_of
 from splatbot.grasping.search import Search
 from splatbot.grasping.surface import Surface
 from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.segmentation import MapScene
-
-_MORE = 4  # times the samples for another look
 
 MakeReach = Callable[[GaussianCollisionField, GaussianCollisionField], Reach]
 
@@ -87,27 +83,7 @@ class GraspSampler:
         """
         if not len(target.rows):
             raise InputError("has no Gaussians.", field=target.label, hint="name another target")
-        options = options or GraspOptions()
-        search = Search(self, target, options)
-        found = search.run()
-        more = min(_MORE * options.samples, len(search.surface.points), MOST_SAMPLES)
-        if found.grasps or search.too_large or more <= options.samples:
-            return found
-        return self._look_again(found, options, more)
-
-    def _look_again(self, before: GraspResult, options: GraspOptions, samples: int) -> GraspResult:
-        found = Search(self, before.target, replace(options, samples=samples)).run()
-        note = f"Nothing was found with {options.samples} samples, so {samples} were looked at."
-        rejected = Counter(before.rejected)
-        rejected.update(found.rejected)
-        return replace(
-            found,
-            best_rejected=None if found.grasps else found.best_rejected or before.best_rejected,
-            candidates=before.candidates + found.candidates,
-            rejected=rejected,
-            seconds={name: before.seconds[name] + seconds for name, seconds in found.seconds.items()},
-            notes=(note, *found.notes),
-        )
+        return Search(self, target, options or GraspOptions()).run()
 
     def surface(self, target: Target, *, seed: int = 0) -> Surface:
         """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.implied.target_surface`."""

@@ -29,6 +29,7 @@ from splatbot.protocols import Array
 if TYPE_CHECKING:
     from splatbot.grasping.sampler import GraspSampler
 
+_MORE = 4  # times the samples for another look
 _HANDS = 2000  # whose room beside the target is looked at
 _TRIED = 200  # hands whose room in the map is looked at
 _ASKED = 60  # of them that an arm is asked for
@@ -52,7 +53,7 @@ class _Log:
 
     def stage(self, name: str) -> None:
         now = time.perf_counter()
-        self.seconds[name], self.began = now - self.began, now
+        self.seconds[name], self.began = self.seconds.get(name, 0.0) + now - self.began, now
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,57 +74,67 @@ class _Scored:
 
 
 class Search:
-    """The steps, each of which leaves fewer hands; :meth:`run` is all of them."""
+    """The steps, each of which leaves fewer hands; :meth:`run` is all of them, at most twice."""
 
     def __init__(self, sampler: GraspSampler, target: Target, options: GraspOptions) -> None:
         self.s, self.target, self.o = sampler, target, options
         self.log = _Log()
+        self.candidates = 0
 
     def run(self) -> GraspResult:
         self.surface = self.s.surface(self.target, seed=self.o.seed)
         self.body = enclosed_volume(self.surface.points, self.surface.normals, seed=self.o.seed)
         self.log.stage("surface")
-        found = self._contacts()
-        self.too_large = not len(self.pairs.width) and found.too_wide > 0
-        self.log.stage("contacts")
-        hands = self._placed()
-        scored = self._beside_target(hands)
-        self.log.stage("hands")
-        model, around, own = self._split()
+        self.model, self.around, self.own = self._split()
         self.log.stage("fields")
-        scored = self._in_map(scored, around)
-        if self.s.moving is not None:
-            scored = self._moving(scored)
-        self.log.stage("map")
-        scored = self._apart(scored, own)
-        grasps = self._reached(scored, self.s.reach(around), self.s.cautious_reach(model))
-        self.log.stage("reach")
+        grasps, notes = self._look(self.o.samples), []
+        more = min(_MORE * self.o.samples, len(self.surface.points))
+        too_large = not len(self.pairs.width) and self.found.too_wide > 0
+        if not grasps and not too_large and more > self.o.samples:
+            notes.append(f"Nothing was found with {self.o.samples} samples, so {more} were looked at.")
+            grasps = self._look(more)
         return GraspResult(
             self.target,
             grasps,
             self.log.rejected,
             None if grasps else self.log.best,
-            len(hands),
+            self.candidates,
             self.log.seconds,
             self.s.scene.map_version,
-            self._notes(found, grasps),
+            (*notes, *self._notes(grasps)),
         )
 
-    def _contacts(self) -> PairSearch:
-        found = antipodal_pairs(
+    def _look(self, samples: int) -> tuple[Grasp, ...]:
+        """What so many samples lead to."""
+        self._contacts(samples)
+        self.log.stage("contacts")
+        hands = self._placed()
+        self.candidates += len(hands)
+        scored = self._beside_target(hands)
+        self.log.stage("hands")
+        scored = self._in_map(scored, self.around)
+        if self.s.moving is not None:
+            scored = self._moving(scored)
+        self.log.stage("map")
+        scored = self._apart(scored, self.own)
+        grasps = self._reached(scored, self.s.reach(self.around), self.s.cautious_reach(self.model))
+        self.log.stage("reach")
+        return grasps
+
+    def _contacts(self, samples: int) -> None:
+        self.found: PairSearch = antipodal_pairs(
             self.surface,
             stroke=self.s.hand.stroke,
             friction=self.o.friction,
-            samples=self.o.samples,
+            samples=samples,
             up=self.s.scene.up,
             seed=self.o.seed,
             near=self.target.point,
         )
-        self.log.drop("closing directions meet nothing on the other side", found.alone)
-        self.log.drop("pairs of contacts are farther apart than the hand opens", found.too_wide)
-        self.log.drop("pairs of contacts are outside of the friction cone", found.slipping)
-        self.pairs: Pairs = found.pairs
-        return found
+        self.pairs: Pairs = self.found.pairs
+        self.log.drop("closing directions meet nothing on the other side", self.found.alone)
+        self.log.drop("pairs of contacts are farther apart than the hand opens", self.found.too_wide)
+        self.log.drop("pairs of contacts are outside of the friction cone", self.found.slipping)
 
     def _placed(self) -> Hands:
         up, o = self.s.scene.up, self.o
@@ -286,7 +297,7 @@ class Search:
         around = around_target(self.s.scene, self.target.rows)
         return around, self.s.collision_field(around), self.s.collision_field(own)
 
-    def _notes(self, found: PairSearch, grasps: Sequence[Grasp]) -> tuple[str, ...]:
+    def _notes(self, grasps: Sequence[Grasp]) -> tuple[str, ...]:
         notes = []
         if self.s.moving is not None and grasps:
             clear = sum(grasp.clear for grasp in grasps)
@@ -301,11 +312,11 @@ class Search:
         implied = float(1.0 - self.surface.seen.mean())
         if implied > 0.05:
             notes.append(f"{implied:.0%} of its surface was not seen and is implied.")
-        if np.isfinite(found.narrowest):
-            stroke = self.s.hand.stroke
+        if np.isfinite(self.found.narrowest):
+            narrowest, opens = 1e3 * self.found.narrowest, 1e3 * self.s.hand.stroke
             notes.append(
-                f"The narrowest of its sides that are too wide are {1e3 * found.narrowest:.0f} mm apart, and the hand "
-                f"opens {1e3 * stroke:.0f} mm."
+                f"The narrowest of its sides that are too wide are {narrowest:.0f} mm apart, and the hand opens "
+                f"{opens:.0f} mm."
             )
         return tuple(notes)
 

@@ -61,7 +61,7 @@ class Tracker:
         return self._lost
 
     def note_rest(self, ms: float) -> None:
-        """What a tracked frame has cost beside its stages [ms], for the budgets of those to come."""
+        """What a frame has cost beside its stages [ms], for the budgets of those to come."""
         if self._costs is not None:
             self._costs.record("rest", 1, ms)
 

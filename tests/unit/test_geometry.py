@@ -68,6 +68,11 @@ def test_log_at_exactly_pi_is_one_of_the_two_axes(rng: np.random.Generator) -> N
         np.testing.assert_allclose(so3_exp(omega), R, atol=1e-14)
 
 
+def test_log_of_what_is_no_rotation_answers_without_raising() -> None:
+    assert np.isfinite(so3_log(np.zeros((3, 3)))).all()
+    assert np.isnan(so3_log(np.full((3, 3), np.nan))).all()
+
+
 def test_zero_motion_is_the_identity_exactly() -> None:
     assert np.array_equal(so3_exp(np.zeros(3)), np.eye(3))
     assert np.array_equal(se3_exp(np.zeros(6)), np.eye(4))
