@@ -135,7 +135,7 @@ def _closings(normals: Array, cone: float, up: Array, rng: np.random.Generator) 
 def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tuple[Array, Array]:
     """Where lines (C, 3) leave the surface (C, 3), and how far that is (C,) [m]; infinity: nowhere."""
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
-    tube = np.maximum(0.0025, 1.2 * np.minimum(surface.spread, 0.006)).astype(np.float32) ** 2
+    tube = _tube(surface)
     end, away = np.zeros_like(origin), np.full(len(origin), np.inf)
     for k in range(0, len(origin), _CHUNK):
         o, c = origin[k : k + _CHUNK].astype(np.float32), closing[k : k + _CHUNK].astype(np.float32)
@@ -147,6 +147,11 @@ def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tu
         away[k : k + _CHUNK] = along[np.arange(len(nearest)), nearest]
         end[k : k + _CHUNK] = surface.points[nearest]
     return end, away
+
+
+def _tube(surface: Surface) -> Array32:
+    """Squares of how near lines have to pass by points (M,) to meet the surface [m²]."""
+    return np.asarray(np.maximum(0.0025, 1.2 * np.minimum(surface.spread, 0.006)) ** 2, dtype=np.float32)
 
 
 def _refined(surface: Surface, first: Array, second: Array, cone: float) -> Pairs:
@@ -201,15 +206,20 @@ def _fitted(surface: Surface, first: Array, second: Array, cone: float) -> Pairs
 
 def _plane(surface: Surface, at: Array, out: Array) -> tuple[Array, Array, Array, Array]:
     """Where lines through ``at`` (C, 3) along ``out`` (C, 3) cross the plane of the Gaussians around, its normal,
-    the share of them that was seen, and their doubt; a line that meets none keeps its place and is of no use."""
+    the share of them that was seen, and their doubt; a line that does not meet the surface itself, as beyond the edge
+    of a face, keeps its place and is of no use."""
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
+    tube = _tube(surface)
     trust = np.where(surface.seen, 1.0, _IMPLIED).astype(np.float32)
     values = np.c_[surface.points, surface.normals, surface.seen, surface.doubt]
-    total = np.zeros((len(at), values.shape[1] + 1))
+    total, meets = np.zeros((len(at), values.shape[1] + 1)), np.zeros(len(at), np.bool_)
     for k in range(0, len(at), _CHUNK):
         a, o = at[k : k + _CHUNK].astype(np.float32), out[k : k + _CHUNK].astype(np.float32)
         square = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + (p**2).sum(axis=1)[None]
-        weight = trust * np.exp(np.minimum(-0.5 / PAD**2 * square, 0.0)) * (o @ n.T > 0.3)
+        facing = o @ n.T > 0.3
+        beside = square - (o @ p.T - np.einsum("ij,ij->i", o, a)[:, None]) ** 2
+        meets[k : k + _CHUNK] = (facing & (beside < tube) & (square < (2 * PAD) ** 2)).any(axis=1)
+        weight = trust * np.exp(np.minimum(-0.5 / PAD**2 * square, 0.0)) * facing
         weight[square > (2.5 * PAD) ** 2] = 0.0
         total[k : k + _CHUNK] = np.c_[weight @ values.astype(np.float32), weight.sum(axis=1)]
     count = np.maximum(total[:, -1:], 1e-9)
@@ -217,9 +227,8 @@ def _plane(surface: Surface, at: Array, out: Array) -> tuple[Array, Array, Array
     normal = _unit(mean[:, 3:6])
     tilt = np.einsum("ij,ij->i", normal, out)
     ahead = np.einsum("ij,ij->i", mean[:, :3] - at, normal) / np.maximum(tilt, 0.2)
-    empty = total[:, -1] < _IMPLIED
-    ahead = np.where(empty, 0.0, np.clip(ahead, -2 * PAD, 2 * PAD))
-    normal = np.where(empty[:, None], -out, normal)
+    ahead = np.where(meets, np.clip(ahead, -2 * PAD, 2 * PAD), 0.0)
+    normal = np.where(meets[:, None], normal, -out)
     return at + ahead[:, None] * out, normal, mean[:, 6], mean[:, 7]
 
 

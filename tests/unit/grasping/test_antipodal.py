@@ -100,3 +100,26 @@ def test_a_map_ten_kilometres_from_its_origin_has_the_same_widths() -> None:
     )
     assert len(here) == len(there)
     np.testing.assert_allclose(there.width, here.width, atol=1e-5)
+
+
+def test_contacts_stay_on_what_there_is_of_a_surface() -> None:
+    """A band of a ball above its equator: the diameters that chords are turned to end below the band."""
+    radius, (low, high) = 0.035, np.radians([8.0, 24.0])
+    around = np.linspace(0.0, 2 * np.pi, 100, endpoint=False)
+    turn, height = (a.ravel() for a in np.meshgrid(around, np.linspace(low, high, 6)))
+    normals = np.stack([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)], axis=1)
+    n = len(normals)
+    band = Surface(
+        radius * normals,
+        normals,
+        np.full((n, 3, 3), 5e-4),
+        np.full(n, 1e-3),
+        np.ones(n, np.bool_),
+        np.zeros(n),
+        np.zeros(3),
+    )
+    pairs = antipodal_pairs(band, stroke=0.08, friction=FRICTION, samples=400, up=UP).pairs
+    assert len(pairs) > 100
+    off = np.linalg.norm(pairs.contacts.reshape(-1, 1, 3) - band.points, axis=2).min(axis=1)
+    assert off.max() < 4e-3
+    assert pairs.contacts[..., 2].min() > radius * np.sin(low) - 4e-3
