@@ -10,7 +10,7 @@ from splatbot.bench.tabletop import Block, Can
 from splatbot.camera import Camera
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
-from splatbot.geometry import look_at, rotation_to_quat
+from splatbot.geometry import look_at, quat_multiply, rotation_to_quat
 from splatbot.grasping.implied import target_surface
 from splatbot.grasping.surface import Surface
 from splatbot.segmentation import segment
@@ -45,6 +45,20 @@ def test_a_flat_front_alone_is_taken_to_be_as_deep_as_it_is_narrow_noisy_or_not(
     assert len(back) > 100
     depth = np.median(back[:, 0]) - (BLOCK.center[0] - BLOCK.size[0] / 2)
     assert depth == pytest.approx(BLOCK.size[1], abs=0.012)
+
+
+def test_normals_that_are_all_off_to_one_side_turn_neither_the_sides_nor_the_back() -> None:
+    model, rows = _front(BLOCK, 0.0)
+    off = np.radians(13.0)
+    turn = np.array([np.cos(off / 2), 0.0, 0.0, np.sin(off / 2)])
+    model.quats[rows] = torch.from_numpy(quat_multiply(turn, model.quats[rows].double().numpy())).float()
+    found = _surface(model, rows)
+    implied, normals = found.points[~found.seen], found.normals[~found.seen]
+    back, sides = implied[normals[:, 0] > 0.8], implied[np.abs(normals[:, 1]) > 0.8]
+    assert len(back) > 100
+    assert len(sides) > 100
+    assert abs(np.polyfit(back[:, 1], back[:, 0], 1)[0]) < np.tan(np.radians(3.0))
+    assert np.percentile(np.abs(np.abs(sides[:, 1]) - BLOCK.size[1] / 2), 95) < 5e-3
 
 
 def test_a_round_front_has_its_mirror_image_behind_it() -> None:
