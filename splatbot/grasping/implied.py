@@ -62,7 +62,7 @@ def target_surface(
     floor = float(np.percentile(seen.points @ up, 1)) if leans else _floor(scene, seen, up)
     down = _sides(seen, up, floor)
     parts = [(*down, np.full(len(down[0]), _ROWS / 2))]
-    faces = [_Face(_across(direction, seen, up), seen) for direction in _directions(seen.normals, up)]
+    faces = [_Face(direction, seen) for direction in _directions(seen, up)]
     backs = []
     for face in faces:
         sides, back = _behind(seen, face, up, views)
@@ -164,36 +164,38 @@ def _along(seen: Surface, up: Array) -> Array:
     return np.asarray(along / np.linalg.norm(along))
 
 
-def _directions(normals: Array, up: Array) -> list[Array]:
-    """Level directions that many normals (M, 3) have, 45 degrees apart, unless the opposite side was seen as well."""
-    left = normals[np.abs(normals @ up) < 0.5]
+def _directions(seen: Surface, up: Array) -> list[Array]:
+    """Level directions that many of what was seen face, 45 degrees apart, unless the opposite side was seen as well."""
+    level = np.abs(seen.normals @ up) < 0.5
+    left, points = seen.normals[level], seen.points[level]
     left = left - np.outer(left @ up, up)
     left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
-    few = max(_FEW, 0.05 * len(normals))
+    few = max(_FEW, 0.05 * len(seen))
     found: list[Array] = []
     while len(left) >= few and len(found) < 8:
         close = left @ left[:: max(1, len(left) // 100)].T > 0.9
-        best = int(close.sum(axis=0).argmax())
-        if close[:, best].sum() < few:
+        own = close[:, int(close.sum(axis=0).argmax())]
+        if own.sum() < few:
             break
-        face = left[close[:, best]].mean(axis=0)
-        face /= np.linalg.norm(face)
-        found.append(face)
-        left = left[left @ face < _TURNED_AWAY]
+        found.append(_across(points[own], left[own].mean(axis=0), up))
+        other = left @ found[-1] < _TURNED_AWAY
+        left, points = left[other], points[other]
     return [face for face in found if not any(face @ other < -_FACING for other in found)]
 
 
-def _across(face: Array, seen: Surface, up: Array) -> Array:
-    """The level direction (3,) across the places of what faces ``face``: normals that were seen at a slant are off
-    together, by 10 degrees and more. A regression of depth on width, as sure as its normals where it is narrow."""
-    own = seen.points[seen.normals @ face > 0.9]
+def _across(points: Array, face: Array, up: Array) -> Array:
+    """The level direction (3,) across the places (P, 3) of what looks to ``face``: normals that were seen at a slant
+    are off together, by 10 degrees and more. A regression of depth on width, as sure as normals where it is narrow."""
+    face = face / np.linalg.norm(face)
     aside = np.cross(up, face)
-    width, depth = own @ aside, own @ face
-    slope = 0.0
+    width, depth = points @ aside, points @ face
+    slope, off = 0.0, np.abs(depth - np.median(depth))
     for _ in range(3):  # without what lies beside the plane
-        off = np.abs(depth - slope * width - np.median(depth - slope * width))
         w, d = (values[off <= max(3 * np.median(off), _ROWS)] for values in (width, depth))
         slope = float(np.mean((w - w.mean()) * (d - d.mean())) / (w.var() + _NARROW**2))
+        off = np.abs(depth - slope * width - np.median(depth - slope * width))
+    if np.median(off) > _ROWS:  # steps, or round: no plane
+        return np.asarray(face)
     turned = face - slope * aside
     return np.asarray(turned / np.linalg.norm(turned))
 

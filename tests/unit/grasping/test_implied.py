@@ -61,6 +61,17 @@ def test_normals_that_are_all_off_to_one_side_turn_neither_the_sides_nor_the_bac
     assert np.percentile(np.abs(np.abs(sides[:, 1]) - BLOCK.size[1] / 2), 95) < 5e-3
 
 
+def test_a_step_in_a_front_turns_no_side() -> None:
+    left, right = (Block((0.5 + 0.02 * k, 0.03 * k, 0.06), BLOCK.size) for k in (-1, 1))
+    fronts = [_front(solid, 0.0) for solid in (left, right)]
+    model = GaussianModel.concatenate([fronts[0][0], fronts[1][0].select(torch.from_numpy(fronts[1][1]))])
+    rows = np.flatnonzero(model.means[:, 2].numpy() > 2e-3)
+    found = _surface(model, rows)
+    outer = ~found.seen & (np.abs(found.normals[:, 1]) > 0.8) & (np.abs(found.points[:, 1]) > 0.04)
+    assert outer.sum() > 100
+    np.testing.assert_allclose(np.abs(found.points[outer, 1]), BLOCK.size[1], atol=6e-3)
+
+
 def test_a_round_front_has_its_mirror_image_behind_it() -> None:
     can = Can((0.5, 0.0, 0.0), 0.03, 0.12)
     found = _surface(*_front(can, 0.001))
