@@ -11,6 +11,7 @@ from splatbot.grasping.surface import Surface
 from splatbot.protocols import Array
 
 PAD = 0.006  # [m] around a contact that its plane is fitted to
+_BESIDE = 0.004  # [m] from the surface's points, as far as a contact counts as on it
 _IMPLIED = 0.1  # weight of implied points beside seen ones
 _LEAST = 3e-4  # [m] between two sides
 _LEAN = 0.25  # [rad] that closing directions are varied by
@@ -209,7 +210,7 @@ def _plane(surface: Surface, at: Array, out: Array) -> tuple[Array, Array, Array
     the share of them that was seen, and their doubt; a line that does not meet the surface itself, as beyond the edge
     of a face, keeps its place and is of no use."""
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
-    tube = _tube(surface)
+    tube = np.maximum(_tube(surface), _BESIDE**2)
     trust = np.where(surface.seen, 1.0, _IMPLIED).astype(np.float32)
     values = np.c_[surface.points, surface.normals, surface.seen, surface.doubt]
     total, meets = np.zeros((len(at), values.shape[1] + 1)), np.zeros(len(at), np.bool_)

@@ -22,6 +22,7 @@ _TURNED_AWAY = 0.7  # below it a normal is of another face
 _FEW = 20  # points that are no face
 _FLAT, _MOST_OF_IT = 0.97, 0.4  # cosine between the normals of a flat face; share of the target that it is
 _NARROW = 0.005  # [m] standard deviation of places across a face, below which its normals tell better how it is turned
+_MOST_TURNED = 0.47  # tangent of 25 degrees
 _SLOPE = 0.7  # cosine between up and normals of a side
 _LEANS = 0.17  # [rad] from where on a flat side leans
 _BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
@@ -165,7 +166,7 @@ def _along(seen: Surface, up: Array) -> Array:
 
 
 def _directions(seen: Surface, up: Array) -> list[Array]:
-    """Level directions that many of what was seen face, 45 degrees apart, unless the opposite side was seen as well."""
+    """Level directions that many of what was seen face, unless the opposite side was seen as well."""
     level = np.abs(seen.normals @ up) < 0.5
     left, points = seen.normals[level], seen.points[level]
     left = left - np.outer(left @ up, up)
@@ -177,27 +178,41 @@ def _directions(seen: Surface, up: Array) -> list[Array]:
         own = close[:, int(close.sum(axis=0).argmax())]
         if own.sum() < few:
             break
-        found.append(_across(points[own], left[own].mean(axis=0), up))
-        other = left @ found[-1] < _TURNED_AWAY
+        face = left[own].mean(axis=0)
+        face /= np.linalg.norm(face)
+        found.append(_across(points[own], face, up))
+        other = left @ face < _TURNED_AWAY
         left, points = left[other], points[other]
     return [face for face in found if not any(face @ other < -_FACING for other in found)]
 
 
 def _across(points: Array, face: Array, up: Array) -> Array:
-    """The level direction (3,) across the places (P, 3) of what looks to ``face``: normals that were seen at a slant
-    are off together, by 10 degrees and more. A regression of depth on width, as sure as normals where it is narrow."""
-    face = face / np.linalg.norm(face)
+    """The level direction (3,) across the places (P, 3) of what looks to ``face`` (3,): normals that were seen at a
+    slant are off together, by 10 degrees and more. Both halves of a plane are turned like all of it, those of a step or
+    of what is round are not, and leave the normals' direction."""
     aside = np.cross(up, face)
-    width, depth = points @ aside, points @ face
-    slope, off = 0.0, np.abs(depth - np.median(depth))
-    for _ in range(3):  # without what lies beside the plane
-        w, d = (values[off <= max(3 * np.median(off), _ROWS)] for values in (width, depth))
-        slope = float(np.mean((w - w.mean()) * (d - d.mean())) / (w.var() + _NARROW**2))
-        off = np.abs(depth - slope * width - np.median(depth - slope * width))
-    if np.median(off) > _ROWS:  # steps, or round: no plane
-        return np.asarray(face)
-    turned = face - slope * aside
+    local = points @ np.stack([aside, up, face], axis=1)
+    left = local[:, 0] < np.median(local[:, 0])
+    whole, *halves = (_slope(part) for part in (local, local[left], local[~left]))
+    if abs(whole) > _MOST_TURNED or min(np.sign(whole) * half for half in halves) < 0.5 * abs(whole):
+        return face
+    turned = face - whole * aside
     return np.asarray(turned / np.linalg.norm(turned))
+
+
+def _slope(local: Array) -> float:
+    """Of depth over width in places (P, 3) = (width, height, depth) [m], without what lies beside their plane; the
+    smaller, the narrower they are, for there normals tell better."""
+    kept = np.ones(len(local), np.bool_)
+    slopes = np.zeros(2)
+    for _ in range(3):
+        middle = local[kept] - local[kept].mean(axis=0)
+        A, depth = middle[:, :2], middle[:, 2]
+        slopes = np.linalg.solve(A.T @ A + len(A) * _NARROW**2 * np.eye(2), A.T @ depth)
+        off = local[:, 2] - local[:, :2] @ slopes
+        off = np.abs(off - np.median(off))
+        kept = off <= max(3 * float(np.median(off)), _ROWS)
+    return float(slopes[0])
 
 
 def _floor(scene: MapScene, seen: Surface, up: Array) -> float:

@@ -121,5 +121,5 @@ def test_contacts_stay_on_what_there_is_of_a_surface() -> None:
     pairs = antipodal_pairs(band, stroke=0.08, friction=FRICTION, samples=400, up=UP).pairs
     assert len(pairs) > 100
     off = np.linalg.norm(pairs.contacts.reshape(-1, 1, 3) - band.points, axis=2).min(axis=1)
-    assert off.max() < 4e-3
-    assert pairs.contacts[..., 2].min() > radius * np.sin(low) - 4e-3
+    assert off.max() < 5e-3
+    assert pairs.contacts[..., 2].min() > radius * np.sin(low) - 5e-3
