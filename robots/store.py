@@ -15,10 +15,10 @@ from splatbot.protocols import LinkSpheres
 from splatbot.robots.joints import Joint
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import Inertial, RobotModel
-from splatbot.robots.wide_hand import panda_2f140
+from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
 
 _FORMAT = "splatbot robot 1"
-_BUILT_IN = {"panda": panda, "panda-2f140": panda_2f140}
+_BUILT_IN = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140}
 
 
 def robots_folder() -> Path:

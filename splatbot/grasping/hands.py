@@ -18,6 +18,7 @@ _CHUNK, _SAMPLE = 32, 250  # hands at once; points for a first look
 _GIVE = 0.003  # [m] that implied sides are off by and do not stop a hand
 _TOUCH = 0.003  # [m] between a pad and what it presses
 _SINK = 0.001  # [m] that a pad gives way where it touches
+_END = 0.002  # [m] from the end of flat pads where a contact may be at most
 _LOOK = 0.03  # [m] of room beyond which more is no better
 
 
@@ -71,7 +72,7 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     across = np.cross(y, down)
     turns = np.linspace(0.0, 2 * np.pi, rolls, endpoint=False)
     z = np.cos(turns)[None, :, None] * down[:, None] + np.sin(turns)[None, :, None] * across[:, None]
-    front, back = hand.tip - 0.25 * hand.width, -0.6 * hand.palm
+    front, back = min((hand.tip + hand.pad) / 2, hand.tip - _END), -0.6 * hand.palm
     places = np.linspace(front, back, depths)
     shape = (len(pairs), rolls, depths)
     T = np.zeros((*shape, 4, 4))
@@ -84,7 +85,8 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     steep = -(poses[:, :3, 2] @ up) >= lowest
     poses, pair = poses[steep], pair[steep]
     zero = np.zeros(len(poses))
-    return Hands(poses, pair, pairs.width[pair] + 2 * SLACK, *(zero.copy() for _ in range(4)))
+    opening = np.minimum(np.ceil((pairs.width[pair] + 2 * SLACK) / OPENINGS) * OPENINGS, hand.stroke)
+    return Hands(poses, pair, opening, *(zero.copy() for _ in range(4)))
 
 
 def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:

@@ -46,6 +46,7 @@ def target_surface(
     observers: Array | None = None,
     views: Sequence[DepthView] = (),
     seed: int = 0,
+    sharp: bool = False,
 ) -> Surface:
     """The surface of the Gaussians ``rows`` (M,) of a scene, with the sides that go down from its top to the support,
     and back from the face that was seen in front.
@@ -56,8 +57,9 @@ def target_surface(
         observers: (N, 3) where each Gaussian of the map was seen from [m, world], NaN where that is not known.
         views: depth that was measured; no side is implied where it saw through.
         seed: of which Gaussians are kept where there are more than 1800.
+        sharp: see :func:`splatbot.grasping.surface.measured_surface`.
     """
-    seen, areas = measured_surface(scene, rows, observers=observers, seed=seed)
+    seen, areas = measured_surface(scene, rows, observers=observers, seed=seed, sharp=sharp)
     up = _along(seen, scene.up)
     leans = bool(up @ scene.up < np.cos(_LEANS / 2))
     floor = float(np.percentile(seen.points @ up, 1)) if leans else _floor(scene, seen, up)

@@ -27,7 +27,8 @@ from splatbot.segmentation.parts import find_faces, nearest_of
 NEAR = 0.02  # [m] around a point within which an object's Gaussian must be
 _CLEAR = 0.6  # share of a mask's objects that one must have
 _WITHIN = "it was pointed at within it, not at its surface"
-_PART = 0.5  # share of what shows of an object; where less of it is marked, what is marked is a thing of its own
+_BESIDE, _PART = 0.01, 0.15  # [m] beside what a mask marks; share of what shows of an object and is farther, from
+# where on what is marked is a thing of its own: masks are rough at their rims, but leave out whole neighbours
 _TOUCHING = "it hangs together with more in the map: what was marked is taken for it"
 _UNSEGMENTED = "it is no object of its own: what was marked of its faces is taken for it"
 
@@ -141,7 +142,7 @@ def _face_at(scene: MapScene, point: Array) -> NDArray[np.int64]:
 
 
 def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_], *, exact: bool = False) -> Target:
-    """The object that a mask shows; of an ``exact`` one that leaves out most of it, what is marked."""
+    """The object that a mask shows; of an ``exact`` one that leaves out much of it, what is marked."""
     c = view.camera
     if mask.shape != (c.height, c.width) or mask.dtype != np.bool_:
         raise InputError(f"is {mask.dtype} {mask.shape}.", field="mask", hint=f"give ({c.height}, {c.width}) booleans")
@@ -167,8 +168,10 @@ def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_], *, exact: boo
     if exact and votes[k] >= FEWEST:
         shown = _visible(scene, view, np.ones_like(mask))
         shown = shown[scene.labels[shown] == k]
-        if votes[k] < _PART * len(shown):
-            rows = _nearer(scene.points, found.rows, seeds[labels == k], np.setdiff1d(shown, seeds))
+        own, other = seeds[labels == k], np.setdiff1d(shown, seeds)
+        beside = nearest_of(scene.points[own], scene.points[other])[1] > _BESIDE**2 if len(other) else np.zeros(0)
+        if beside.sum() > _PART * len(shown):
+            rows = _nearer(scene.points, found.rows, own, other)
             return Target(rows, None, f"part of {label}", "place", score, (_TOUCHING,), k)
     return Target(found.rows, None, label, "place", score, (), k)
 

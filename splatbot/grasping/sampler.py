@@ -85,9 +85,11 @@ class GraspSampler:
             raise InputError("has no Gaussians.", field=target.label, hint="name another target")
         return Search(self, target, options or GraspOptions()).run()
 
-    def surface(self, target: Target, *, seed: int = 0) -> Surface:
+    def surface(self, target: Target, *, seed: int = 0, sharp: bool = False) -> Surface:
         """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.implied.target_surface`."""
-        return target_surface(self.scene, target.rows, observers=self.observers, views=self.views, seed=seed)
+        return target_surface(
+            self.scene, target.rows, observers=self.observers, views=self.views, seed=seed, sharp=sharp
+        )
 
     def collision_field(self, model: GaussianModel, *, cautious: bool = False) -> GaussianCollisionField:
         """A part of the map as the hand and the arm avoid it; ``cautious``: and where something moved."""

@@ -20,7 +20,7 @@ from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import Reach
 from splatbot.grasping.score import FAR, arm_terms, best_apart, hand_terms, totals
-from splatbot.grasping.sweep import swept_room, touches
+from splatbot.grasping.sweep import fingers_room, swept_room, touches
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.grasping.volume import enclosed_volume
 from splatbot.planning.cartesian import along
@@ -31,12 +31,14 @@ if TYPE_CHECKING:
 
 _MORE = 4  # times the samples for another look
 _HANDS = 2000  # whose room beside the target is looked at
+_WIDER = 0.003  # [m] that fingers may be in the map before it is known how wide they open
 _TRIED = 200  # hands whose room in the map is looked at
 _ASKED = 60  # of them that an arm is asked for
 _TOP, _LOWEST = np.cos(np.radians(40.0)), -0.26  # cosine between the approach and down: from the top; the least of all
 _LEVEL = 0.5  # of a side approach, at most
 
 _IN_TARGET = "hands are in the target on their way"
+_IN_MAP = "hands touch what is around the target"
 
 
 @dataclass(eq=False)
@@ -82,17 +84,14 @@ class Search:
         self.candidates = 0
 
     def run(self) -> GraspResult:
-        self.surface = self.s.surface(self.target, seed=self.o.seed)
-        self.body = enclosed_volume(self.surface.points, self.surface.normals, seed=self.o.seed)
-        self.log.stage("surface")
         self.model, self.around, self.own = self._split()
         self.log.stage("fields")
         grasps, notes = self._look(self.o.samples), []
-        more = min(_MORE * self.o.samples, len(self.surface.points))
         too_large = not len(self.pairs.width) and self.found.too_wide > 0
-        if not grasps and not too_large and more > self.o.samples:
-            notes.append(f"Nothing was found with {self.o.samples} samples, so {more} were looked at.")
-            grasps = self._look(more)
+        if not grasps and not too_large:
+            few, more = (min(samples, len(self.surface)) for samples in (self.o.samples, _MORE * self.o.samples))
+            notes.append(f"Nothing was found with {few} samples, so {more} were looked at, with sharper rims.")
+            grasps = self._look(more, sharp=True)
         return GraspResult(
             self.target,
             grasps,
@@ -104,8 +103,11 @@ class Search:
             (*notes, *self._notes(grasps)),
         )
 
-    def _look(self, samples: int) -> tuple[Grasp, ...]:
+    def _look(self, samples: int, *, sharp: bool = False) -> tuple[Grasp, ...]:
         """What so many samples lead to."""
+        self.surface = self.s.surface(self.target, seed=self.o.seed, sharp=sharp)
+        self.body = enclosed_volume(self.surface.points, self.surface.normals, seed=self.o.seed)
+        self.log.stage("surface")
         self._contacts(samples)
         self.log.stage("contacts")
         hands = self._placed()
@@ -146,12 +148,23 @@ class Search:
         """At most 2000, those whose palm has room, of the best pairs."""
         free = clear_palm(hands, self.surface, self.s.hand, retreat=self.o.pregrasp)
         self.log.drop(_IN_TARGET, (~free).sum())
-        hands = hands.select(free)
+        hands = self._above(hands.select(free))
         aside = np.linalg.norm(self.pairs.contacts.mean(axis=1) - self.body.center, axis=1)
         good = (self.pairs.closure + self.pairs.seen - aside / 0.1)[hands.pair]
         best = np.sort(np.argsort(-good, kind="stable")[:_HANDS])
         self.log.drop("hands are of worse contacts than others", len(hands) - len(best))
         return hands.select(best)
+
+    def _above(self, hands: Hands) -> Hands:
+        """Those whose fingers are not in the rest of the map: of what is low most others are. Few millimetres are left
+        to what follows, for fingers that have to open wider are elsewhere."""
+        room = fingers_room(self.s.robot, hands, self.around, self.s.hand)
+        free = room > -_WIDER
+        self.log.drop(_IN_MAP, (~free).sum())
+        if len(free) and not free.any():
+            k = int(np.argmax(room))
+            self.log.best = self._grasp(self._scored(hands, room), k, rejected=_deep(room[k]))
+        return hands.select(free)
 
     def _beside_target(self, hands: Hands) -> _Scored:
         """Those that the target lets come, with their scores but for the map."""
@@ -190,11 +203,10 @@ class Search:
         room = swept_room(self.s.robot, tried.hands, around, retreat=self.o.pregrasp) - self.s.margin
         tried = self._scored(tried.hands, room)
         free = room > 0.0
-        self.log.drop("hands touch what is around the target", (~free).sum())
+        self.log.drop(_IN_MAP, (~free).sum())
         if len(free) and not free.any():
             k = int(np.argmax(room))
-            why = f"is {-1e3 * room[k]:.1f} mm deep in what is around the target"
-            self.log.best = self._grasp(tried, k, rejected=why)
+            self.log.best = self._grasp(tried, k, rejected=_deep(room[k]))
         return tried.select(free)
 
     def _moving(self, scored: _Scored) -> _Scored:
@@ -319,6 +331,10 @@ class Search:
                 f"{opens:.0f} mm."
             )
         return tuple(notes)
+
+
+def _deep(room: float) -> str:
+    return f"is {-1e3 * room:.1f} mm deep in what is around the target"
 
 
 def _exposed(grasp: Grasp) -> Grasp:

@@ -17,6 +17,7 @@ from splatbot.segmentation import MapScene
 MOST = 1800  # points that are looked at
 _OFTEN = 0.2  # of the keyframes that the best Gaussians are supported by
 _SMOOTH = 0.006  # [m] over which normals are averaged
+_SAME_SIDE, _ALIKE = 0.3, 0.8  # cosines between normals that are averaged; where rims are to stay sharp
 _LONELY = 4.0  # times the usual area of a point; those with more are strays
 
 
@@ -59,6 +60,7 @@ def measured_surface(
     *,
     observers: Array | None = None,
     seed: int = 0,
+    sharp: bool = False,
 ) -> tuple[Surface, Array]:
     """The Gaussians ``rows`` (M,) of a scene as points, strays left out, and the area each stands for (K,) [m²].
 
@@ -69,6 +71,7 @@ def measured_surface(
         rows: of the target.
         observers: (N, 3) where each Gaussian of the map was seen from [m, world], NaN where that is not known.
         seed: of which Gaussians are kept where there are more than 1800.
+        sharp: average normals with those alike alone: noisier, but the rim of what is low is not rounded by its top.
     """
     rng = np.random.default_rng(seed)
     seen_by = scene.model.observations.numpy()[rows]  # what few keyframes saw is often smeared beyond an edge
@@ -83,7 +86,8 @@ def measured_surface(
         outward = np.where(np.isfinite(observers[chosen]), observers[chosen] - points, outward)
     normals = shortest_axes(model).detach().double().numpy()
     normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
-    normals, areas = _smoothed(points, normals, flatness=1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12))
+    flatness = 1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12)
+    normals, areas = _smoothed(points, normals, flatness, cosine=_ALIKE if sharp else _SAME_SIDE)
     doubt = _doubts(model, scales)
     half = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
     kept = np.flatnonzero(areas < _LONELY * np.median(areas))
@@ -109,8 +113,8 @@ def _middle(scene: MapScene, points: Array) -> Array:
     return transform_points(scene.T_world_base, (low + high) / 2)
 
 
-def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, Array]:
-    """Normals averaged with those of neighbours on the same side, and the area that each point stands for (M,) [m²].
+def _smoothed(points: Array, normals: Array, flatness: Array, *, cosine: float) -> tuple[Array, Array]:
+    """Normals averaged with those of neighbours alike, and the area that each point stands for (M,) [m²].
 
     Round Gaussians have little to say.
     """
@@ -119,7 +123,7 @@ def _smoothed(points: Array, normals: Array, flatness: Array) -> tuple[Array, Ar
     weight = np.maximum(square[:, None] + square[None] - 2 * (p @ p.T), 0.0)
     np.exp(weight * (-0.5 / _SMOOTH**2), out=weight)
     crowd = weight.sum(axis=1)
-    weight *= n @ n.T > 0.3
+    weight *= n @ n.T > cosine
     weight *= np.maximum(flatness, 0.05).astype(np.float32)
     mean = (weight @ n).astype(np.float64)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)

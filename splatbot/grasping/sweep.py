@@ -21,21 +21,39 @@ def swept_room(robot: RobotKinematics, hands: Hands, field: GaussianCollisionFie
     The certificate that nothing is touched between those places is the arm's own, see
     :func:`splatbot.planning.cartesian.straight_line`.
     """
+    return _room(robot, hands, field, back=np.linspace(0.0, retreat, _PLACES), cut=LOOK)
+
+
+def fingers_room(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, hand: HandShape) -> Array:
+    """Of the spheres before the palm alone, where the hand takes hold (K,) [m], at most 1 mm: quick, for many hands."""
+    return _room(robot, hands, field, back=np.zeros(1), cut=_TOLERANCE, ahead=-hand.palm)
+
+
+def _room(
+    robot: RobotKinematics,
+    hands: Hands,
+    field: GaussianCollisionField,
+    *,
+    back: Array,
+    cut: float,
+    ahead: float = -np.inf,
+) -> Array:
+    """(K,) [m], at most ``cut``, at places ``back`` (B,) [m] behind the grasp, of spheres ``ahead`` of a plane [m]."""
     assert isinstance(robot, HasHand)
     T_tcp_link = inverse(robot.T_link_tcp)
-    room = np.full(len(hands), LOOK)
-    back = np.linspace(0.0, retreat, _PLACES)
+    room = np.full(len(hands), cut)
     for opening in np.unique(hands.opening):
         rows = np.flatnonzero(hands.opening == opening)
         spheres = robot.spheres(float(opening))
         own = spheres.link == len(robot.chain)
-        local = transform_points(T_tcp_link, spheres.centers[own])
+        local, radii = transform_points(T_tcp_link, spheres.centers[own]), spheres.radii[own]
+        local, radii = local[local[:, 2] > ahead], radii[local[:, 2] > ahead]
         places = (local[None] - back[:, None, None] * [0.0, 0.0, 1.0]).reshape(-1, 3)
         T = hands.T[rows]
         centers = np.einsum("kij,sj->ksi", T[:, :3, :3], places) + T[:, None, :3, 3]
-        radii = np.broadcast_to(np.tile(spheres.radii[own], _PLACES), centers.shape[:2])
-        away = field.clearance(np.c_[centers.reshape(-1, 3), radii.reshape(-1)], cut=LOOK).distance
-        room[rows] = np.minimum(away.reshape(len(rows), -1).min(axis=1), LOOK)
+        wide = np.broadcast_to(np.tile(radii, len(back)), centers.shape[:2])
+        away = field.clearance(np.c_[centers.reshape(-1, 3), wide.reshape(-1)], cut=cut).distance
+        room[rows] = np.minimum(away.reshape(len(rows), -1).min(axis=1), cut)
     return room
 
 

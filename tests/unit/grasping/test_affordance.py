@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import cv2
 import numpy as np
 import pytest
@@ -102,6 +104,27 @@ def test_a_mask_of_a_part_of_what_hangs_together_means_that_part() -> None:
     u, v = _pixel((0.45, 0.0, 0.06))
     rectangle = find_target(BoxHint(u - 5, v - 5, u + 5, v + 5, VIEW), one, PLACE)
     np.testing.assert_array_equal(rectangle.rows, both.rows)  # drawn by hand, it may be smaller than the thing
+
+
+@pytest.mark.parametrize("rough", [0.0, 0.003, 0.006])
+def test_a_mask_that_leaves_out_a_neighbour_means_the_larger_one_and_a_rough_one_means_all(rough: float) -> None:
+    low, high = Block((0.45, 0.0, 0.03), (0.06, 0.06, 0.06)), Block((0.525, 0.0, 0.03), (0.08, 0.06, 0.06))
+    one = segment(colored({"low": low, "high": high}, 24_000, {}), np.eye(4), apart=0.03, cut=False)
+    (both,) = one.objects
+
+    def marked(x0: float, x1: float) -> MaskHint:
+        ends = (x0 + rough, x1 - rough), (rough - 0.03, 0.03 - rough), (rough, 0.06)
+        corners = np.array([_pixel(corner) for corner in product(*ends)])
+        mask = np.zeros((240, 320), np.uint8)
+        cv2.fillConvexPoly(mask, cv2.convexHull(np.rint(corners).astype(np.int32)), 1)
+        return MaskHint(mask > 0, VIEW)
+
+    part = find_target(marked(0.485, 0.565), one, PLACE)
+    means = one.model.means.double().numpy()
+    assert (np.abs(high.distance(means[part.rows])) < 2e-3).mean() > 0.7  # with what it hides of the other one
+    assert "hangs together" in part.notes[0]
+    whole = find_target(marked(0.42, 0.565), one, PLACE)
+    np.testing.assert_array_equal(whole.rows, both.rows)
 
 
 def test_the_table_is_no_target() -> None:

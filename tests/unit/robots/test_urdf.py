@@ -102,7 +102,7 @@ def test_an_added_robot_is_found_by_its_name_and_is_the_same(
     monkeypatch.setenv("SPLATBOT_ROBOTS", str(tmp_path / "robots"))
     robot = read_urdf(ur5(tmp_path), slack=0.02).robot
     save_robot(robot, tmp_path / "robots" / "ur5.json")
-    assert robot_names() == ["panda", "panda-2f140", "ur5"]
+    assert robot_names() == ["panda", "panda-2f85", "panda-2f140", "ur5"]
     again = load_robot("ur5")
     q = robot.random(20, rng)
     np.testing.assert_array_equal(again.fk(q), robot.fk(q))
@@ -110,7 +110,7 @@ def test_an_added_robot_is_found_by_its_name_and_is_the_same(
     np.testing.assert_array_equal(again.self_collision_pairs, robot.self_collision_pairs)
     for field in ("lower", "upper", "velocity", "acceleration", "jerk", "effort"):
         np.testing.assert_array_equal(getattr(again.chain, field), getattr(robot.chain, field))
-    with pytest.raises(InputError, match="robots: panda, panda-2f140, ur5"):
+    with pytest.raises(InputError, match="robots: panda, panda-2f85, panda-2f140, ur5"):
         load_robot("ur6")
 
 

@@ -10,8 +10,8 @@ from splatbot.protocols import HasHand
 from splatbot.robots.cover import uncovered
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
+from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
 from splatbot.robots.store import load_robot
-from splatbot.robots.wide_hand import panda_2f140
 
 
 def test_the_pandas_hand_is_as_published() -> None:
@@ -24,6 +24,24 @@ def test_the_pandas_hand_is_as_published() -> None:
     assert hand.pad_width == pytest.approx(0.0, abs=1e-6)
     assert hand.palm == pytest.approx(0.1034 - 0.066, abs=5e-4)
     assert hand.palm_size == pytest.approx((0.063, 0.204), abs=6e-3)
+
+
+def test_the_slim_hand_is_as_in_its_data_sheet_and_its_fingers_are_slim_at_their_tips() -> None:
+    robot = load_robot("panda-2f85")
+    assert robot is panda_2f85()
+    hand = robot.hand
+    assert hand is not None
+    assert hand.stroke == 0.085
+    assert 0.145 + hand.tip == pytest.approx(0.163, abs=1e-3)  # from the flange
+    assert hand.width == pytest.approx(0.022, abs=1e-4)
+    assert hand.pad_width == pytest.approx(0.012, abs=1e-4)
+    assert hand.tip - hand.pad == pytest.approx(0.005, abs=1e-4)
+    spheres = robot.spheres(0.04)
+    at = transform_points(inverse(robot.T_link_tcp), spheres.centers[spheres.link == 7])
+    reach = spheres.radii[spheres.link == 7]
+    tips = at[:, 2] > 0.0
+    assert (at[tips, 2] + reach[tips]).max() == pytest.approx(hand.tip, abs=1e-3)  # nothing of them reaches beyond
+    assert (np.abs(at[tips, 1]) + reach[tips]).max() == pytest.approx(0.02 + 0.01 + 0.004, abs=1e-3)
 
 
 def test_the_wide_hand_opens_by_140_mm_along_y_of_the_tool() -> None:
@@ -41,7 +59,7 @@ def test_the_wide_hand_opens_by_140_mm_along_y_of_the_tool() -> None:
         assert gap.min() == pytest.approx(opening / 2, abs=0.005)
 
 
-@pytest.mark.parametrize("robot", [panda(), panda_2f140()], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [panda(), panda_2f85(), panda_2f140()], ids=lambda robot: robot.name)
 def test_its_spheres_cover_its_shapes_and_home_is_free_of_itself(robot: RobotModel) -> None:
     from splatbot.collision import RobotSpheres
 
