@@ -6,14 +6,26 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from splatbot.camera import Camera
 from splatbot.cli import main
+from splatbot.geometry import transform_points
 from splatbot.logs import open_log
+from splatbot.protocols import Array
+from splatbot.results.folder import RunFolder
 
 WIDTH = 0.008  # [m] that a width may be off
 SHELF_BOX = (228, 333)  # [px] the edges of its front in frame 12
 FRICTION = 0.5
+SHOWN = 23  # frame of arm_wrist_48 in which its things are marked by hand
+TAPE_ROLL = ((648, 105), (88, 87), 57)  # [px] middle, half axes and half of its hole
+# [px] corners of its top, whose left and right edges are the short ones; and of the wall behind it, as far as it shows
+BOX_TOP = ((568, 207), (972, 300), (870, 578), (514, 487))
+BOX_WALL = ((597, 180), (690, 185), (705, 178), (755, 190), (775, 220), (840, 255), (905, 240), (945, 260))
+NEAR = 0.003  # [m] that contacts may be off what depth saw
 
 
 def check_shelf_box(log: Path, run: Path) -> None:
@@ -27,9 +39,62 @@ def check_shelf_box(log: Path, run: Path) -> None:
     assert abs(grasps[0]["width_m"] - wide) < WIDTH
 
 
-def _grasped(run: Path, *words: str) -> list[dict[str, Any]]:
+def check_tape_roll(log: Path, run: Path) -> None:
+    """A roll, 16 mm high between two other things, by slim fingers: at its wall, where depth saw it."""
+    middle, half, hole = TAPE_ROLL
+    mask = cv2.ellipse(np.zeros((720, 1280), np.uint8), middle, half, 0, 0, 360, 255, -1)
+    grasps = _marked(run, mask, "--robot", "panda-2f85", "--friction", "0.8")
+    camera, depth, _ = _seen(log, run, SHOWN)
+    wall = (half[0] - hole) * float(np.median(depth[20:60, 620:680][depth[20:60, 620:680] > 0])) / camera.fx
+    for grasp in grasps:
+        _held_and_free(grasp, friction=0.8)
+    assert abs(grasps[0]["width_m"] - wall) < WIDTH
+    points = np.concatenate([_cloud(*_seen(log, run, k)) for k in range(0, 48, 4)])
+    for contact in grasps[0]["contacts"]:
+        assert np.linalg.norm(points - contact, axis=1).min() < NEAR
+
+
+def check_lying_box(log: Path, run: Path) -> None:
+    """A box that roll and ring touch, by the wide hand: as wide as the picture and the plane of its top."""
+    corners = np.array(BOX_TOP)
+    outline = np.array((BOX_TOP[0], *BOX_WALL, *BOX_TOP[1:]))
+    mask = cv2.fillPoly(np.zeros((720, 1280), np.uint8), [outline], 255)
+    grasps = _marked(run, mask, "--robot", "panda-2f140")
+    camera, depth, _ = _seen(log, run, SHOWN)
+    top_face = cv2.fillConvexPoly(np.zeros_like(mask), corners, 255)
+    inner = cv2.erode(top_face, np.ones((61, 61), np.uint8)) > 0
+    rays = np.c_[(corners - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(4)]
+    top = _cloud(camera, np.where(inner, depth, 0.0), np.eye(4))
+    normal = np.linalg.svd(top - top.mean(axis=0), full_matrices=False)[2][2]
+    at = rays * (top.mean(axis=0) @ normal / (rays @ normal))[:, None]
+    wide = np.mean([np.linalg.norm(at[0] - at[3]), np.linalg.norm(at[1] - at[2])])
+    for grasp in grasps:
+        _held_and_free(grasp)
+    assert abs(grasps[0]["width_m"] - wide) < WIDTH
+
+
+def _marked(run: Path, mask: NDArray[Any], *words: str) -> list[dict[str, Any]]:
+    path = run / "mask.png"
+    assert cv2.imwrite(str(path), mask)
+    return _grasped(run, "--mask", str(path), "--index", str(SHOWN), *words, up=("--up", "0", "0", "-1"))
+
+
+def _seen(log: Path, run: Path, index: int) -> tuple[Camera, Array, Array]:
+    """Camera, depth and T_world_camera of a frame, as the run found it."""
+    frame = open_log(log)[index]
+    return frame.camera, np.where(frame.depth < 0.5, frame.depth, 0.0), RunFolder(run).load_poses()[index]
+
+
+def _cloud(camera: Camera, depth: Array, T_world_camera: Array) -> Array:
+    v, u = np.nonzero(depth > 0)
+    z = depth[v, u]
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+    return transform_points(T_world_camera, points)
+
+
+def _grasped(run: Path, *words: str, up: tuple[str, ...] = ()) -> list[dict[str, Any]]:
     """The ranked grasps, as a user asks for them; the best is drawn."""
-    assert (run / "scene.yaml").is_file() or main(["info", str(run), "--fit-plane"]) == 0
+    assert (run / "scene.yaml").is_file() or main(["info", str(run), "--fit-plane", *up]) == 0
     out = run / "grasp"
     assert main(["grasp", "--map", str(run), "--min-observations", "3", "--out", str(out), *words]) == 0
     assert (out / "grasp.png").stat().st_size > 10_000
@@ -38,12 +103,12 @@ def _grasped(run: Path, *words: str) -> list[dict[str, Any]]:
     return grasps
 
 
-def _held_and_free(grasp: dict[str, Any]) -> None:
+def _held_and_free(grasp: dict[str, Any], friction: float = FRICTION) -> None:
     """Both normals are within the friction cone about the line between the contacts, and there is room on the way."""
     contacts, normals = np.array(grasp["contacts"]), np.array(grasp["normals"])
     line = (contacts[1] - contacts[0]) / np.linalg.norm(contacts[1] - contacts[0])
     cosines = np.array([-normals[0] @ line, normals[1] @ line])
-    assert np.degrees(np.arccos(cosines)).max() < np.degrees(np.arctan(FRICTION))
+    assert np.degrees(np.arccos(cosines)).max() < np.degrees(np.arctan(friction))
     assert grasp["room_m"] > 0.0
     assert grasp["opening_m"] >= grasp["width_m"]
     assert grasp["approach_path"] is not None

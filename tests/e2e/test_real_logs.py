@@ -14,7 +14,7 @@ import pytest
 from splatbot.cli import main
 from splatbot.logs import open_log
 from splatbot.run import map_log
-from tests.e2e.real_grasps import check_shelf_box
+from tests.e2e.real_grasps import check_lying_box, check_shelf_box, check_tape_roll
 
 # name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 2 cm and about 3 cm. What the third does
 # not tell (docs/tracking.md, "Keypoints from all of the image"), photogrammetry and held-out views do.
@@ -67,10 +67,10 @@ def check_views(name: str, metrics: dict[str, Any]) -> None:
 
 
 # What one recording alone can tell, of the folders of its log and its run.
-CHECKS: dict[str, Callable[[Path, Path], None]] = {
-    "arm_wrist_48": check_twin,
-    "apc_shelf_robot": check_shelf_box,
-    "visp_tabletop": check_images,
+CHECKS: dict[str, tuple[Callable[[Path, Path], None], ...]] = {
+    "arm_wrist_48": (check_twin, check_tape_roll, check_lying_box),
+    "apc_shelf_robot": (check_shelf_box,),
+    "visp_tabletop": (check_images,),
 }
 
 
@@ -87,5 +87,5 @@ def test_every_frame_is_tracked_within_the_bound(
     assert metrics["ate_rmse_m"] <= ate_m
     assert (tmp_path / name / "report.html").exists()
     check_views(name, metrics)
-    if name in CHECKS:
-        CHECKS[name](data_root / name, tmp_path / name)
+    for check in CHECKS.get(name, ()):
+        check(data_root / name, tmp_path / name)
