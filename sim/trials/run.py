@@ -6,6 +6,7 @@ import importlib.util
 import json
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -150,7 +151,7 @@ def _results(plan: TrialsPlan, folder: Path, wanted: Sequence[tuple[int, tuple[s
         return
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes that begin now, which are as many as was asked for
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(plan.jobs, len(jobs)), mp_context=context, initializer=_alone) as pool:
+    with ProcessPoolExecutor(min(plan.jobs, len(jobs)), mp_context=context, initializer=begin_worker) as pool:
         futures = {pool.submit(_job, job) for job in jobs}
         try:
             while futures:
@@ -162,9 +163,17 @@ def _results(plan: TrialsPlan, folder: Path, wanted: Sequence[tuple[int, tuple[s
             raise
 
 
-def _alone() -> None:
-    """One thread a process."""
+def begin_worker() -> None:
+    """One thread a process, which ends with the one that began it, even if that was killed."""
     torch.set_num_threads(1)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def _follow_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _job(job: Any) -> list[TrialRow]:
