@@ -213,7 +213,7 @@ def test_one_thing_is_seen_picked_and_shaken_whatever_another_scan_gave_and_ctrl
     assert only.ideal.kept > KEPT
     thing = make_trial(1, "isolated").scene.movable[0].shapes[0]
     assert thing.kind == "cylinder"
-    assert only.width_mm == pytest.approx(2e3 * thing.radius, abs=4.0)
+    assert only.width_mm == pytest.approx(2e3 * thing.radius, abs=6.0)  # a scan of 160 pixels; 1 to 5 mm by processor
     assert only.plan_ms is not None
     assert only.plan_ms < 500.0
     assert (only.frames, only.pixels) == (16, 160)
