@@ -1,8 +1,8 @@
 """The Panda with a Robotiq 2F-85 or 2F-140 in place of its hand: slim fingers for what is low or stands close, and a
 hand for things that are wider than 80 mm.
 
-Strokes, forces and lengths from Robotiq's data sheets (85 mm, 20 to 235 N, 163 mm; 140 mm, 10 to 125 N); the shapes are
-coarse ones around the body, the linkage when open, and the fingers.
+Strokes, and the length of the 2F-85, from Robotiq's data sheets (85 mm, 20 to 235 N, 163 mm; 140 mm, 10 to 125 N); the
+2F-85 presses as the Panda's hand does. The shapes are coarse ones around body, open linkage and fingers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ _Along = tuple[tuple[float, float, float], tuple[float, float, float], float]  #
 
 @cache
 def panda_2f85() -> RobotModel:
-    """The arm with the slim fingers, 22 mm wide and, for 38 mm from their tips, 10 mm thick with round edges."""
+    """The arm with the slim fingers, 22 mm wide and, for 38 mm from their tips, 10 mm thick with round edges.
+
+    Against the target itself its fingers count as boxes as thick as they are at their roots, 20 mm.
+    """
     return _with_hand(
         "panda-2f85",
         tcp=0.145,

@@ -28,7 +28,7 @@ NEAR = 0.02  # [m] around a point within which an object's Gaussian must be
 _CLEAR = 0.6  # share of a mask's objects that one must have
 _WITHIN = "it was pointed at within it, not at its surface"
 _BESIDE, _PART = 0.01, 0.15  # [m] beside what a mask marks; share of what shows of an object and is farther, from
-# where on what is marked is a thing of its own: masks are rough at their rims, but leave out whole neighbours
+# where on what is marked is a thing of its own, as where it is less than half: masks are rough at their rims
 _TOUCHING = "it hangs together with more in the map: what was marked is taken for it"
 _UNSEGMENTED = "it is no object of its own: what was marked of its faces is taken for it"
 
@@ -170,7 +170,7 @@ def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_], *, exact: boo
         shown = shown[scene.labels[shown] == k]
         own, other = seeds[labels == k], np.setdiff1d(shown, seeds)
         beside = nearest_of(scene.points[own], scene.points[other])[1] > _BESIDE**2 if len(other) else np.zeros(0)
-        if beside.sum() > _PART * len(shown):
+        if beside.sum() > _PART * len(shown) or 2 * len(own) < len(shown):
             rows = _nearer(scene.points, found.rows, own, other)
             return Target(rows, None, f"part of {label}", "place", score, (_TOUCHING,), k)
     return Target(found.rows, None, label, "place", score, (), k)

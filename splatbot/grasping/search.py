@@ -89,9 +89,10 @@ class Search:
         grasps, notes = self._look(self.o.samples), []
         too_large = not len(self.pairs.width) and self.found.too_wide > 0
         if not grasps and not too_large:
-            few, more = (min(samples, len(self.surface)) for samples in (self.o.samples, _MORE * self.o.samples))
+            few = min(self.o.samples, len(self.surface))
+            grasps = self._look(_MORE * self.o.samples, sharp=True)
+            more = min(_MORE * self.o.samples, len(self.surface))
             notes.append(f"Nothing was found with {few} samples, so {more} were looked at, with sharper rims.")
-            grasps = self._look(more, sharp=True)
         return GraspResult(
             self.target,
             grasps,
@@ -161,7 +162,7 @@ class Search:
         room = fingers_room(self.s.robot, hands, self.around, self.s.hand)
         free = room > -_WIDER
         self.log.drop(_IN_MAP, (~free).sum())
-        if len(free) and not free.any():
+        if len(free) and not free.any() and self.log.best is None:  # in the first look others came farther
             k = int(np.argmax(room))
             self.log.best = self._grasp(self._scored(hands, room), k, rejected=_deep(room[k]))
         return hands.select(free)

@@ -12,6 +12,7 @@ from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
 
 LOOK = 0.03  # [m] of room beyond which nothing is looked for
 _PLACES = 5  # on the way
+_AT_ONCE = 4096  # hands
 _TOLERANCE = 1e-3  # [m]
 
 
@@ -42,9 +43,9 @@ def _room(
     assert isinstance(robot, HasHand)
     T_tcp_link = inverse(robot.T_link_tcp)
     room = np.full(len(hands), cut)
-    for opening in np.unique(hands.opening):
-        rows = np.flatnonzero(hands.opening == opening)
-        spheres = robot.spheres(float(opening))
+    alike = (np.flatnonzero(hands.opening == opening) for opening in np.unique(hands.opening))
+    for rows in (some[k : k + _AT_ONCE] for some in alike for k in range(0, len(some), _AT_ONCE)):
+        spheres = robot.spheres(float(hands.opening[rows[0]]))
         own = spheres.link == len(robot.chain)
         local, radii = transform_points(T_tcp_link, spheres.centers[own]), spheres.radii[own]
         local, radii = local[local[:, 2] > ahead], radii[local[:, 2] > ahead]
@@ -53,7 +54,7 @@ def _room(
         centers = np.einsum("kij,sj->ksi", T[:, :3, :3], places) + T[:, None, :3, 3]
         wide = np.broadcast_to(np.tile(radii, len(back)), centers.shape[:2])
         away = field.clearance(np.c_[centers.reshape(-1, 3), wide.reshape(-1)], cut=cut).distance
-        room[rows] = np.minimum(away.reshape(len(rows), -1).min(axis=1), cut)
+        room[rows] = np.minimum(away.reshape(len(rows), -1).min(axis=1, initial=cut), cut)
     return room
 
 

@@ -248,5 +248,7 @@ def test_workers_end_when_the_process_that_began_them_is_killed(tmp_path: Path) 
 
 def _runs(pid: int) -> bool:
     """Whether a process is there, and no zombie that nobody asks for."""
-    status = Path(f"/proc/{pid}/stat")
-    return status.is_file() and status.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
