@@ -213,7 +213,7 @@ class GraspsRequest(Request):
     approach: Literal["any", "top", "side"] = "any"
     friction: Annotated[float, Field(gt=0, le=2)] = 0.5
     samples: Annotated[int, Field(ge=10, le=5000)] = Field(
-        400, description="places tried, four times as many where that finds nothing: the knob of time"
+        400, description="places tried, four times as many with sharper rims where that finds nothing: the knob of time"
     )
     wanted: Annotated[int, Field(ge=1, le=100)] = 10
     margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")

@@ -74,7 +74,8 @@ def grasp(
         hand_only: leave the arm out: where the hand could be, not whether the arm gets there.
         approach: where the hand may come from.
         friction: coefficient between pads and thing.
-        samples: places on the surface that are tried, four times as many where that finds nothing: the knob of time.
+        samples: places on the surface that are tried, four times as many with sharper rims where that finds nothing:
+            the knob of time.
         wanted: how many grasps.
         pregrasp: length of the straight approach [m].
         margin: room [m] that hand and arm keep from the rest of the map; "auto" as in `splatbot plan`.

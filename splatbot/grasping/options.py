@@ -24,7 +24,7 @@ class GraspOptions:
     Args:
         friction: coefficient between pads and target.
         samples: seeds on the surface: the knob of time against how much of it is tried; where that finds nothing,
-            four times as many are tried once.
+            four times as many are tried once, with sharper rims.
         rolls: sides around each pair of contacts that the hand comes from.
         depths: how deep between the fingers the contacts may be.
         pregrasp: length of the straight approach [m].

@@ -76,7 +76,7 @@ class GraspSampler:
         """Ranked grasps of a target; without any, what the candidates fell to.
 
         Where few hands are possible it is chance whether one is drawn, so where none is found four times the samples
-        are looked at, and the notes say so; not of what is too large for the hand.
+        are looked at, on a surface with sharper rims, and the notes say so; not of what is too large for the hand.
 
         Raises:
             InputError: the target has no Gaussians.

@@ -164,6 +164,7 @@ class Search:
         self.log.drop(_IN_MAP, (~free).sum())
         if len(free) and not free.any() and self.log.best is None:  # in the first look others came farther
             k = int(np.argmax(room))
+            room = room - self.s.margin
             self.log.best = self._grasp(self._scored(hands, room), k, rejected=_deep(room[k]))
         return hands.select(free)
 

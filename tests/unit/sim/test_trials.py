@@ -201,7 +201,7 @@ def test_one_thing_is_seen_picked_and_shaken_whatever_another_scan_gave_and_ctrl
     def stop(what: str, share: float) -> None:
         raise KeyboardInterrupt
 
-    plan = TrialsPlan(family="isolated", trials=2, first=1, frames=16, width=160)
+    plan = TrialsPlan(family="isolated", trials=2, first=1, frames=16, width=240)
     another = replace(row(1, "gaussians", SLIPPED), family="isolated")
     (tmp_path / FILE).write_text(json.dumps(another.to_dict()) + "\n")
     rows, interrupted = run_trials(plan, tmp_path, tell=stop)
@@ -213,10 +213,10 @@ def test_one_thing_is_seen_picked_and_shaken_whatever_another_scan_gave_and_ctrl
     assert only.ideal.kept > KEPT
     thing = make_trial(1, "isolated").scene.movable[0].shapes[0]
     assert thing.kind == "cylinder"
-    assert only.width_mm == pytest.approx(2e3 * thing.radius, abs=6.0)  # a scan of 160 pixels; 1 to 5 mm by processor
+    assert only.width_mm == pytest.approx(2e3 * thing.radius, abs=4.0)  # a scan of 240 pixels
     assert only.plan_ms is not None
     assert only.plan_ms < 500.0
-    assert (only.frames, only.pixels) == (16, 160)
+    assert (only.frames, only.pixels) == (16, 240)
     assert read_rows(tmp_path / FILE) == [another, *rows]
 
 
