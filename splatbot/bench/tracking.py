@@ -17,7 +17,7 @@ from splatbot.bench.stress import run_stress
 from splatbot.bench.timing import memory_peak
 from splatbot.bench.tracking_plot import plot_tracking
 from splatbot.config import Config, TrackingConfig
-from splatbot.evaluation import absolute_error, relative_error
+from splatbot.evaluation import absolute_error, nees, relative_error
 from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.slam import Slam
@@ -26,7 +26,7 @@ from splatbot.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 BUDGETS = (30.0, 100.0, 300.0, 1000.0)  # [ms]
-ATE, RPE, RPE_ROT, TRACKED, LOST = "ATE", "RPE", "RPE, rotation", "tracked", "lost"
+ATE, RPE, RPE_ROT, NEES, TRACKED, LOST = "ATE", "RPE", "RPE, rotation", "NEES / 6", "tracked", "lost"
 PERCENTILES, RESIDENT = (50, 95, 99), "peak resident memory"
 FRAME_MS = "tracking and mapping p50"
 
@@ -66,13 +66,17 @@ class Contender:
 
 @dataclass
 class Outcome:
-    """What a tracker made of a log: milliseconds by frame, the poses it gave, and memory."""
+    """What a tracker made of a log: milliseconds by frame, the poses it gave, how sure it was, and memory.
+
+    Covariances (N, 6, 6) of the trajectory's poses as of :func:`splatbot.evaluation.nees`; None of a tracker without.
+    """
 
     ms: list[float]
     trajectory: Trajectory
     frames: int
     resident: int | None
     with_mapping_ms: list[float]
+    covariances: Array | None
 
 
 class SlamOdometry:
@@ -94,6 +98,12 @@ class SlamOdometry:
         """The trajectory as it is once the log has ended."""
         found = [(r.stamp, r.T_world_camera) for r in self.slam.results if r.T_world_camera is not None]
         return _trajectory([stamp for stamp, _ in found], [T for _, T in found])
+
+    def covariances(self) -> Array | None:
+        """Of these poses (N, 6, 6); None where one is not known."""
+        found = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
+        known = [covariance for covariance in found if covariance is not None]
+        return np.array(known) if len(known) == len(found) > 0 else None
 
 
 def run_tracking(logs: Sequence[Log], plan: TrackingPlan, folder: Path) -> Results:
@@ -139,8 +149,9 @@ def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> Outc
             if T_world_camera is not None:
                 stamps.append(frame.stamp)
                 poses.append(T_world_camera)
-    trajectory = odometry.refined() if isinstance(odometry, SlamOdometry) else _trajectory(stamps, poses)
-    return Outcome(ms, trajectory, count, peak(), whole)
+    if isinstance(odometry, SlamOdometry):
+        return Outcome(ms, odometry.refined(), count, peak(), whole, odometry.covariances())
+    return Outcome(ms, _trajectory(stamps, poses), count, peak(), whole, None)
 
 
 def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome) -> None:
@@ -160,6 +171,8 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome)
         add(ATE, 1e3 * absolute_error(truth, tracked).rmse, "mm", contender.note)
         add(RPE, 1e3 * relative.trans_rmse, "mm")
         add(RPE_ROT, float(np.degrees(relative.rot_rmse)), "°")
+        if outcome.covariances is not None:
+            add(NEES, nees(truth, tracked, outcome.covariances).mean, "")
     add(TRACKED, 100.0 * len(tracked) / outcome.frames, "%")
     add(LOST, outcome.frames - len(tracked), "")
     for p in PERCENTILES:

@@ -29,6 +29,7 @@ def bench_tracking(
     Each log is tracked with each time budget, and by other trackers in the same process: OpenCV's and Open3D's RGB-D
     odometry, small_gicp, and ORB with PnP against keyframes. Errors are ATE (RMSE over all tracked frames, aligned by a
     rigid motion) and RPE; milliseconds are those until the pose is known, without decoding and without mapping.
+    NEES / 6 is 1 where poses err as much as they say they may (error of the reference included).
 
     --stress runs hard synthetic logs with exact truth: flat walls, a corridor, pure rotation, jumps, depth holes, black
     frames, exposure, a hand. Each frame is within a bound or reported degraded or lost, and the map stays true.
@@ -86,12 +87,12 @@ def bench_tracking(
 def _print(results: Results, folder: Path) -> None:
     from splatbot.bench.stress import AFTER, DEGRADED, RECOVERY, SILENT, STRESS, VIEWS, WORST
     from splatbot.bench.stress import LOST as STRESS_LOST
-    from splatbot.bench.tracking import ATE, FRAME_MS, LOST, PERCENTILES, RESIDENT, RPE, RPE_ROT, TRACKED
+    from splatbot.bench.tracking import ATE, FRAME_MS, LOST, NEES, PERCENTILES, RESIDENT, RPE, RPE_ROT, TRACKED
     from splatbot.cli.bench_tables import figure_table, tell_machine, wide_console
 
     console = wide_console()
     tell_machine(console, results.machine)
-    metrics = (ATE, RPE, RPE_ROT, TRACKED, LOST, *(f"p{p}" for p in PERCENTILES), FRAME_MS, RESIDENT)
+    metrics = (ATE, RPE, RPE_ROT, NEES, TRACKED, LOST, *(f"p{p}" for p in PERCENTILES), FRAME_MS, RESIDENT)
     hard = results.select(STRESS)
     if not hard or len(results.rows) > len(hard):
         console.print(figure_table("Tracking", [row for row in results.rows if row not in hard], metrics))

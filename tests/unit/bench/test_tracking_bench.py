@@ -11,7 +11,7 @@ import pytest
 
 from splatbot.bench.odometry import TrackingPeer, tracking_peers
 from splatbot.bench.results import Results
-from splatbot.bench.tracking import ATE, LOST, RESIDENT, RPE, TRACKED, TrackingPlan, run_log, run_tracking
+from splatbot.bench.tracking import ATE, LOST, NEES, RESIDENT, RPE, TRACKED, TrackingPlan, run_log, run_tracking
 from splatbot.cli import main
 from splatbot.config import Config, MappingConfig
 from splatbot.evaluation import absolute_error
@@ -61,6 +61,14 @@ def test_every_contender_has_error_share_times_and_memory(run: tuple[Results, Pa
     ours = [row.value for row in results.rows if row.peer is None and row.metric == ATE]
     assert ours[0] is not None
     assert ours[0] < 2.0
+
+
+def test_only_a_tracker_that_says_how_sure_it_is_has_a_nees(run: tuple[Results, Path]) -> None:
+    results, _ = run
+    (found,) = [row for row in results.rows if row.metric == NEES]
+    assert found.peer is None
+    assert found.value is not None
+    assert 0.05 < found.value < 3.0  # eight frames of 320x240 px share the errors of a keyframe or two
 
 
 def test_files_hold_the_rows_the_machine_and_the_plot(run: tuple[Results, Path]) -> None:
