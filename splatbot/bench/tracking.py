@@ -110,10 +110,10 @@ def run_tracking(logs: Sequence[Log], plan: TrackingPlan, folder: Path) -> Resul
     """Run every contender on every log, score it, and write ``tracking.json``, ``tracking.csv`` and the plot."""
     folder.mkdir(parents=True, exist_ok=True)
     results = Results(describe_machine((1,), peak_ms=20))
-    for log in logs:
+    for name, log in zip(distinct([log.name for log in logs]), logs, strict=True):
         for contender in contenders(plan):
-            plan.say(f"{log.name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
-            add_rows(results, log, contender, run_log(log, contender.make(), plan.max_frames))
+            plan.say(f"{name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
+            add_rows(results, log, contender, run_log(log, contender.make(), plan.max_frames), name)
     if plan.stress:
         config = plan.config or Config()
         run_stress(results, config, frames=plan.stress_frames, width=plan.stress_width, say=plan.say)
@@ -122,6 +122,11 @@ def run_tracking(logs: Sequence[Log], plan: TrackingPlan, folder: Path) -> Resul
     if logs:
         plot_tracking(results, folder)
     return results
+
+
+def distinct(names: Sequence[str]) -> list[str]:
+    """The names, those that occur again numbered: room, room #2."""
+    return [name if (n := names[: k + 1].count(name)) == 1 else f"{name} #{n}" for k, name in enumerate(names)]
 
 
 def contenders(plan: TrackingPlan) -> Iterator[Contender]:
@@ -154,9 +159,9 @@ def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> Outc
     return Outcome(ms, _trajectory(stamps, poses), count, peak(), whole, None)
 
 
-def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome) -> None:
+def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome, name: str) -> None:
     """The figures of one run. ATE is RMSE over all tracked frames, SE(3)-aligned; RPE from frame to frame."""
-    case = f"{log.name}, {contender.setting}" if contender.setting else log.name
+    case = f"{name}, {contender.setting}" if contender.setting else name
 
     def add(metric: str, value: float | None, unit: str, note: str | None = None) -> None:
         results.add(case, metric, value, unit, peer=contender.peer, note=note or None)

@@ -41,7 +41,7 @@ def bench_tracking(
         splatbot bench tracking "synthetic:room?trajectory=loop&frames=90" --budgets 30 100 --json figures.json
 
     Args:
-        logs: recordings with a reference trajectory, as for splatbot map.
+        logs: recordings with a reference trajectory, as for splatbot map; of one name they are numbered as given.
         out: folder for tracking.json, tracking.csv and the plot; by default runs/bench-tracking.
         json: another place for the JSON file.
         csv: another place for the CSV file.

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatbot import _native
 from splatbot.camera import Camera
 from splatbot.config import MappingConfig, TrackingConfig
 from splatbot.frame import Frame
@@ -20,6 +21,8 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import Level, halve, usable_depth
 from splatbot.tracking.reference import Reference
 from splatbot.tracking.tracker import pose_distance
+
+_GATE = 3.7  # σ of depth: three of how far, on a plane, a pixel lies from half-way between two others, which is √1.5 σ
 
 
 class Placed(Protocol):
@@ -67,7 +70,7 @@ class Keyframe:
 def mapping_images(
     frame: Frame, config: MappingConfig, tracking: TrackingConfig
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.float32]]:
-    """Camera, colour and valid, unmasked depth of a frame, halved until at most ``config.max_width`` wide."""
+    """Camera, colour and valid, unmasked, smoothed depth of a frame, halved until at most ``config.max_width`` wide."""
     rgb = frame.rgb
     level = Level(np.zeros(frame.depth.shape, np.float32), usable_depth(frame, tracking), frame.camera)
     while level.camera.width > config.max_width:
@@ -75,7 +78,18 @@ def mapping_images(
         width, height = level.camera.width, level.camera.height
         even = rgb[: 2 * height, : 2 * width]  # as `halve` crops, or an odd size would shift colour against depth
         rgb = np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    return level.camera, rgb, level.depth
+    return level.camera, rgb, smooth_depth(level.depth, config, tracking)
+
+
+def smooth_depth(depth: NDArray[np.float32], config: MappingConfig, tracking: TrackingConfig) -> NDArray[np.float32]:
+    """Depth (H, W) [m], each pixel the mean of those of its 3x3 that are of its surface; 0 stays missing.
+
+    A Gaussian stands for some 3x3 pixels, and all of them measured where it is. Of Gaussians that scatter by a single
+    pixel's noise the nearer ones cover the others, so the blend would lie before the surface, most where it was seen
+    once, and what is aligned to it would be off.
+    """
+    floor, quad = (_GATE * sigma for sigma in (tracking.sigma_depth_floor, tracking.sigma_depth_quad))
+    return np.asarray(_native.smooth_depth(np.ascontiguousarray(depth), config.new_depth, floor, quad))
 
 
 def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Placed], config: MappingConfig) -> bool:

@@ -94,6 +94,13 @@ def test_poses_before_a_wall_are_no_nearer_to_it_than_they_say() -> None:
     assert nees_of(log, seldom_refined, width=640) < 2.0
 
 
+def test_poses_around_a_wall_of_soft_colours_err_no_more_than_they_say() -> None:
+    """What comes into view anew is seen once: where its blend lies before it, all the way round adds up."""
+    seldom_refined = load_config(environ={}, overrides={"mapping.refine_iterations": 2})
+    log = "wall_soft?effects=depth_noise&seed=1&frames=40"
+    assert 0.3 < nees_of(log, seldom_refined, width=640) < 1.5
+
+
 def nees_of(log: str, config: Config, width: int = WIDTH) -> float:
     source = open_log(f"synthetic:{log}&width={width}&height={width * 3 // 4}")
     slam = Slam(config)

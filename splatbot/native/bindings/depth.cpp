@@ -73,6 +73,17 @@ void define_depth(nb::module_& m) {
       "depth"_a.noconvert(), "gray"_a.noconvert(), "step"_a, "floor"_a, "quad"_a,
       "Grey, NaN where surfaces of different depth meet.");
   m.def(
+      "smooth_depth",
+      [](Image depth, float step, float floor, float quad) {
+        std::vector<float> out(depth.size());
+        {
+          nb::gil_scoped_release release;
+          splatbot::smooth_depth(view(depth), step, floor, quad, out);
+        }
+        return owned(std::move(out), {depth.shape(0), depth.shape(1)});
+      },
+      "depth"_a.noconvert(), "step"_a, "floor"_a, "quad"_a, "Depth averaged over the 3x3 pixels of each one's surface.");
+  m.def(
       "normals_of",
       [](Image depth, double fx, double fy, double cx, double cy) {
         std::vector<float> out(3 * depth.size());

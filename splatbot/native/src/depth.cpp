@@ -126,6 +126,30 @@ void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, f
   }
 }
 
+void smooth_depth(const DepthImage& depth, float step, float floor, float quad, std::span<float> out) {
+  const int width = depth.width, height = depth.height;
+  const Bordered measured(depth, [](float z) { return z > 0.0F ? z : 0.0F; });  // 0 for NaN
+  for (int v = 0; v < height; ++v) {
+    const float* row = measured.row(v);
+    const float *above = row - measured.stride(), *below = row + measured.stride();
+    float* to = out.data() + static_cast<std::size_t>(v) * width;
+    for (int u = 0; u < width; ++u) {
+      const float z = row[u], apart = step * z, noise = floor + quad * z * z;
+      float sum = z, count = 1.0F;
+      const auto add = [&, z, apart, noise](float a, float b) {
+        const bool same = (a > 0.0F) & (b > 0.0F) & (std::abs(a - b) < apart) & (std::abs(0.5F * (a + b) - z) < noise);
+        sum += same ? a + b : 0.0F;
+        count += same ? 2.0F : 0.0F;
+      };
+      add(row[u - 1], row[u + 1]);
+      add(above[u], below[u]);
+      add(above[u - 1], below[u + 1]);
+      add(above[u + 1], below[u - 1]);
+      to[u] = z > 0.0F ? sum / count : 0.0F;
+    }
+  }
+}
+
 void normals_of(const DepthImage& depth, const Pinhole& camera, std::span<float> out) {
   constexpr float kApart = static_cast<float>(kOneSurface);
   const int width = depth.width, height = depth.height;

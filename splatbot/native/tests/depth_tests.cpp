@@ -26,11 +26,12 @@ std::vector<float> two_walls(int width, int height) {
 void check_shape(int width, int height) {
   const std::vector<float> z = two_walls(width, height), gray(z.size(), 0.5F);
   const DepthImage depth{width, height, z};
-  std::vector<float> valid(z.size()), kept(z.size()), normals(3 * z.size());
+  std::vector<float> valid(z.size()), kept(z.size()), smooth(z.size()), normals(3 * z.size());
   std::vector<float> half(static_cast<std::size_t>(width / 2) * (height / 2));
   valid_depth(depth, 0.2F, 6.0F, 0.03F, valid);
   halve_depth(depth, half);
   gray_of_one_surface(depth, gray, 0.02F, 0.01F, 0.01F, kept);
+  smooth_depth(depth, 0.04F, 0.01F, 0.01F, smooth);
   normals_of(depth, {100.0, 100.0, 0.5 * width, 0.5 * height}, normals);
   std::vector<float> around(2 * z.size());
   for (std::size_t i = 0; i < around.size(); ++i) around[i] = static_cast<float>(i % 97) - 20.0F;  // also outside
@@ -39,6 +40,7 @@ void check_shape(int width, int height) {
   for (std::size_t i = 0; i < z.size(); ++i) {
     promise(valid[i] == 0.0F || valid[i] == z[i], "depth is valid or 0");
     promise(std::isnan(kept[i]) || kept[i] == 0.5F, "grey is kept or NaN");
+    promise(smooth[i] == (z[i] > 0.0F ? z[i] : 0.0F), "smoothed depth of a wall is its depth");
     const float square = normals[3 * i] * normals[3 * i] + normals[3 * i + 1] * normals[3 * i + 1] +
                          normals[3 * i + 2] * normals[3 * i + 2];
     promise(square == 0.0F || std::abs(square - 1.0F) < 1e-5F, "normals are of length 1 or 0");

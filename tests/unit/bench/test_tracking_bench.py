@@ -71,6 +71,13 @@ def test_only_a_tracker_that_says_how_sure_it_is_has_a_nees(run: tuple[Results, 
     assert 0.05 < found.value < 3.0  # eight frames of 320x240 px share the errors of a keyframe or two
 
 
+def test_logs_of_one_name_have_rows_of_their_own(tmp_path: Path) -> None:
+    logs = [open_log(f"{LOG}&seed={seed}") for seed in (0, 1)]
+    found = run_tracking(logs, TrackingPlan(budgets=(100.0,), peers=False, max_frames=3), tmp_path)
+    cases = [row.case for row in found.rows if row.metric == ATE]
+    assert cases == ["tabletop, 100 ms", "tabletop #2, 100 ms"]
+
+
 def test_files_hold_the_rows_the_machine_and_the_plot(run: tuple[Results, Path]) -> None:
     results, folder = run
     written = json.loads((folder / "tracking.json").read_text())

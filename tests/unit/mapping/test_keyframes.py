@@ -6,15 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, se3_exp
-from splatbot.mapping.keyframes import is_keyframe, mapping_images
-from tests.rgbd import CAMERA, small_config, wall_frame
+from splatbot.mapping.keyframes import is_keyframe, mapping_images, smooth_depth
+from tests.rgbd import CAMERA, small_config, wall_depth, wall_frame
 from tests.unit.mapping.conftest import MakeKeyframe
 
 CONFIG = small_config()
+Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize(
@@ -83,3 +85,48 @@ def test_depth_that_tracking_would_not_believe_is_not_fused() -> None:
     _, _, kept = mapping_images(replace(frame, depth=depth), CONFIG.mapping, CONFIG.tracking)
     assert kept[10, 10] == kept[20, 20] == 0.0
     assert (kept > 0).sum() == kept.size - 2
+
+
+def _smoothed_by_hand(depth: Array) -> Array:
+    """The rule of :func:`smooth_depth` pixel by pixel, in float64."""
+    out = np.zeros_like(depth)
+    padded = np.pad(depth, 1)
+    for v, u in zip(*np.nonzero(depth > 0), strict=True):
+        z, some = depth[v, u], [depth[v, u]]
+        noise = 3.7 * (CONFIG.tracking.sigma_depth_floor + CONFIG.tracking.sigma_depth_quad * z**2)
+        for dv, du in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            a, b = padded[v + 1 + dv, u + 1 + du], padded[v + 1 - dv, u + 1 - du]
+            if min(a, b) > 0 and abs(a - b) < CONFIG.mapping.new_depth * z and abs((a + b) / 2 - z) < noise:
+                some += [a, b]
+        out[v, u] = np.mean(some)
+    return out
+
+
+def test_smoothed_depth_is_the_mean_of_what_is_of_one_surface(rng: np.random.Generator) -> None:
+    depth = np.where(np.arange(40) < 17, 1.0, 1.6) + 0.002 * rng.standard_normal((30, 40))
+    depth[rng.random(depth.shape) < 0.2] = 0.0
+    depth = depth.astype(np.float32).astype(np.float64)
+    expected = _smoothed_by_hand(depth)
+    found = smooth_depth(depth.astype(np.float32), CONFIG.mapping, CONFIG.tracking)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert (expected != depth).mean() > 0.5
+
+
+def test_a_slanted_plane_stays_where_it_is_and_a_third_of_its_noise_is_left(rng: np.random.Generator) -> None:
+    exact = wall_depth(CAMERA, np.eye(4), [0.6, 0.0, 0.8], 1.0)
+    inside = np.s_[1:-1, 1:-1]
+    even = smooth_depth(exact.astype(np.float32), CONFIG.mapping, CONFIG.tracking)
+    np.testing.assert_allclose(even[inside], exact[inside], rtol=1e-3)
+    sigma = CONFIG.tracking.sigma_depth_floor + CONFIG.tracking.sigma_depth_quad * exact**2
+    noisy = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
+    off = ((smooth_depth(noisy, CONFIG.mapping, CONFIG.tracking) - even) / sigma)[inside]
+    assert off.std() < 0.4
+    assert abs(off.mean()) < 0.02
+
+
+def test_pixels_without_depth_stay_without_and_say_nothing() -> None:
+    depth = np.full((5, 5), 1.5, np.float32)
+    depth[2, 2], depth[0, 0] = 0.0, np.nan
+    found = smooth_depth(depth, CONFIG.mapping, CONFIG.tracking)
+    np.testing.assert_array_equal(found, np.where(depth > 0, depth, 0.0))
+    assert smooth_depth(np.zeros((1, 1), np.float32), CONFIG.mapping, CONFIG.tracking).tolist() == [[0.0]]

@@ -28,6 +28,11 @@ void depth_around(const DepthImage& depth, std::span<const float> pixels, std::s
 void gray_of_one_surface(const DepthImage& depth, std::span<const float> gray, float step, float floor, float quad,
                          std::span<float> out);
 
+// out (H, W): the mean of each measured pixel and of those pairs of opposite neighbours, of its 3x3, that are of its surface:
+// both measured, within `step` of its depth z of each other, and half-way between them within floor + quad z^2 [m] of it.
+// By pairs, so that a slanted surface stays where it is; 0 stays 0.
+void smooth_depth(const DepthImage& depth, float step, float floor, float quad, std::span<float> out);
+
 struct Pinhole {
   double fx = 1.0, fy = 1.0, cx = 0.0, cy = 0.0;  // [px]
 };
