@@ -22,6 +22,8 @@ from splatbot.tracking.prepare import Level, halve, usable_depth
 from splatbot.tracking.reference import Reference
 from splatbot.tracking.tracker import pose_distance
 
+_ROWS = 4  # of which one tells the noise
+_MAD = 0.6745  # median of the absolute of a normal variable
 _GATE = 3.7  # σ of depth: three of how far, on a plane, a pixel lies from half-way between two others, which is √1.5 σ
 
 
@@ -86,10 +88,27 @@ def smooth_depth(depth: NDArray[np.float32], config: MappingConfig, tracking: Tr
 
     A Gaussian stands for some 3x3 pixels, and all of them measured where it is. Of Gaussians that scatter by a single
     pixel's noise the nearer ones cover the others, so the blend would lie before the surface, most where it was seen
-    once, and what is aligned to it would be off.
+    once, and what is aligned to it would be off. What bends by more than the image's own noise is shape, and kept.
     """
-    floor, quad = (_GATE * sigma for sigma in (tracking.sigma_depth_floor, tracking.sigma_depth_quad))
+    gate = _GATE * noise_share(depth, tracking)
+    floor, quad = gate * tracking.sigma_depth_floor, gate * tracking.sigma_depth_quad
     return np.asarray(_native.smooth_depth(np.ascontiguousarray(depth), config.new_depth, floor, quad))
+
+
+def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
+    """The noise of depth (H, W) [m] over what tracking allows for, at most 1; 0 of depth that shows none.
+
+    By the median of how far pixels lie from half-way between their neighbours in the row, which is σ √1.5 of a plane.
+    """
+    z = depth[::_ROWS].astype(np.float64)
+    left, z, right = z[:, :-2], z[:, 1:-1], z[:, 2:]
+    known = (left > 0) & (z > 0) & (right > 0)
+    if not known.any():
+        return 0.0
+    bend = np.abs((left + right) / 2 - z)[known] / (
+        tracking.sigma_depth_floor + tracking.sigma_depth_quad * z[known] ** 2
+    )
+    return min(1.0, float(np.median(bend)) / (_MAD * np.sqrt(1.5)))
 
 
 def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Placed], config: MappingConfig) -> bool:

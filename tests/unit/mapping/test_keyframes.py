@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, se3_exp
-from splatbot.mapping.keyframes import is_keyframe, mapping_images, smooth_depth
+from splatbot.mapping.keyframes import is_keyframe, mapping_images, noise_share, smooth_depth
 from tests.rgbd import CAMERA, small_config, wall_depth, wall_frame
 from tests.unit.mapping.conftest import MakeKeyframe
 
@@ -91,9 +91,17 @@ def _smoothed_by_hand(depth: Array) -> Array:
     """The rule of :func:`smooth_depth` pixel by pixel, in float64."""
     out = np.zeros_like(depth)
     padded = np.pad(depth, 1)
+    sigma = CONFIG.tracking.sigma_depth_floor + CONFIG.tracking.sigma_depth_quad * depth**2
+    bends = [
+        abs((depth[v, u - 1] + depth[v, u + 1]) / 2 - depth[v, u]) / sigma[v, u]
+        for v in range(0, depth.shape[0], 4)
+        for u in range(1, depth.shape[1] - 1)
+        if depth[v, u - 1 : u + 2].min() > 0
+    ]
+    share = min(1.0, float(np.median(bends)) / (0.6745 * np.sqrt(1.5)))
     for v, u in zip(*np.nonzero(depth > 0), strict=True):
         z, some = depth[v, u], [depth[v, u]]
-        noise = 3.7 * (CONFIG.tracking.sigma_depth_floor + CONFIG.tracking.sigma_depth_quad * z**2)
+        noise = 3.7 * share * sigma[v, u]
         for dv, du in ((0, 1), (1, 0), (1, 1), (1, -1)):
             a, b = padded[v + 1 + dv, u + 1 + du], padded[v + 1 - dv, u + 1 - du]
             if min(a, b) > 0 and abs(a - b) < CONFIG.mapping.new_depth * z and abs((a + b) / 2 - z) < noise:
@@ -122,6 +130,30 @@ def test_a_slanted_plane_stays_where_it_is_and_a_third_of_its_noise_is_left(rng:
     off = ((smooth_depth(noisy, CONFIG.mapping, CONFIG.tracking) - even) / sigma)[inside]
     assert off.std() < 0.4
     assert abs(off.mean()) < 0.02
+
+
+def test_what_stands_out_by_more_than_an_images_own_noise_is_kept(rng: np.random.Generator) -> None:
+    tracking = CONFIG.tracking
+    sigma = tracking.sigma_depth_floor + tracking.sigma_depth_quad
+    exact = np.where(np.arange(400) % 40 == 20, 1.0 - sigma, 1.0) * np.ones((80, 1))  # ridges, one pixel wide
+    noisy = (exact + 0.1 * sigma * rng.standard_normal(exact.shape)).astype(np.float32)
+    assert noise_share(noisy, tracking) == pytest.approx(0.1, abs=0.03)
+    found = smooth_depth(noisy, CONFIG.mapping, tracking)
+    ridge = found[:, 20::40]
+    assert abs(ridge.mean() - (1.0 - sigma)) < 0.02 * sigma
+    assert (found - exact).std() < 0.6 * (noisy - exact).std()
+
+
+def test_the_noise_of_depth_is_told_by_an_image_of_it(rng: np.random.Generator) -> None:
+    tracking = CONFIG.tracking
+    exact = wall_depth(CAMERA, np.eye(4), [0.6, 0.0, 0.8], 1.0)
+    sigma = tracking.sigma_depth_floor + tracking.sigma_depth_quad * exact**2
+    for share in (0.2, 0.5, 1.0, 2.0):
+        noisy = (exact + share * sigma * rng.standard_normal(exact.shape)).astype(np.float32)
+        noisy[rng.random(noisy.shape) < 0.3] = 0.0
+        assert noise_share(noisy, tracking) == pytest.approx(min(share, 1.0), rel=0.1)
+    assert noise_share(np.zeros((4, 4), np.float32), tracking) == 0.0
+    assert noise_share(np.zeros((1, 1), np.float32), tracking) == 0.0
 
 
 def test_pixels_without_depth_stay_without_and_say_nothing() -> None:
