@@ -61,10 +61,16 @@ def model_depth(view: View, measured: NDArray[np.float32], config: MappingConfig
     # Strictly less: never true where nothing was measured, for the map may hold a guess there.
     agrees = np.abs(depth - measured) < config.new_depth * measured
     solid = (view.alpha.numpy() > config.solid_alpha) & agrees
-    some = np.s_[::4, ::4]  # enough for a median, which takes a while
-    told = solid[some]
-    scale = np.median(measured[some][told] / depth[some][told]) if told.any() else np.float32(1)
+    scale = _middle(measured[solid] / depth[solid]) if solid.any() else 1.0
     return np.where(solid, scale * depth, measured).astype(np.float32)
+
+
+def _middle(values: NDArray[np.float32]) -> float:
+    """Mean of all within three deviations of the median of some: as robust, and far better known than that."""
+    some = values[::16]  # a median takes a while
+    median = np.median(some)
+    spread = 1.4826 * np.median(np.abs(some - median))
+    return float(values[np.abs(values - median) <= 3 * spread].mean(dtype=np.float64))
 
 
 def unexplained(view: View, depth: Tensor, config: MappingConfig) -> Tensor:
