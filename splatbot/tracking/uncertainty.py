@@ -21,7 +21,7 @@ _PLACEMENT = 0.025
 _BETWEEN_CELLS = 1.25
 # Calibration of lens and depth is good to this share: such an error is the same in every frame, so along a path it adds
 # up, and does not average out.
-_CALIBRATION = 0.1e-3
+_CALIBRATION = 0.07e-3
 
 
 @dataclass(frozen=True, eq=False)
