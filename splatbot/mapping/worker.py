@@ -49,7 +49,8 @@ class MappingWorker:
         self._error: BaseException | None = None
         self._published = mapper.snapshot()
         self._thread: threading.Thread | None = None
-        self._working = threading.Lock()
+        self._busy = self._paused = False
+        self._pauses_wanted = 0
 
     def __getstate__(self) -> dict[str, Any]:
         """What is saved of a paused worker: all but the thread and what it waits with."""
@@ -136,12 +137,25 @@ class MappingWorker:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """A block in which the thread does nothing; waits until all observations are in the map."""
+        """A block in which the thread does nothing; waits until all observations are in the map, not for refinement."""
         with self._news:
-            self._news.wait_for(lambda: not self._waiting or self._error is not None)
-        self._raise_error()
-        with self._working:
+            self._pauses_wanted += 1
+            try:
+                self._news.wait_for(self._may_pause)
+                self._raise_error()
+                self._paused = True
+            finally:
+                self._pauses_wanted -= 1
+        try:
             yield
+        finally:
+            with self._news:
+                self._paused = False
+                self._news.notify_all()
+
+    def _may_pause(self) -> bool:
+        drained = not self._waiting or self._error is not None
+        return drained and not self._busy and not self._paused
 
     def close(self) -> None:
         """End the thread once all observations are in the map; what went wrong in it has been or is not raised."""
@@ -175,26 +189,34 @@ class MappingWorker:
         try:
             self._fuse(first)
             while (work := self._next()) is not None:
-                with self._working:
-                    work()
+                work()
         except BaseException as error:  # raised where somebody can act on it
             with self._news:
-                self._error = error
+                self._error, self._busy = error, False
                 self._news.notify_all()
 
     def _next(self) -> Callable[[], None] | None:
         """What is to be done now: new observations first; waits while there is nothing; None: the end."""
         with self._news:
+            self._busy = False
+            self._news.notify_all()
             while True:
-                if self._waiting:
-                    return self._take
-                if self._ending:
+                work = None if self._paused else self._choose()
+                if work is not None:
+                    self._busy = True
+                    return work
+                if self._ending and not self._paused:
                     return None
-                if self._to_look is not None:
-                    return self._look
-                if self._mapper.owed and not self._held:
-                    return self._refine
                 self._news.wait()
+
+    def _choose(self) -> Callable[[], None] | None:
+        if self._waiting:
+            return self._take
+        if self._ending or self._pauses_wanted:  # or whoever wants a pause would wait for all that is owed
+            return None
+        if self._to_look is not None:
+            return self._look
+        return self._refine if self._mapper.owed and not self._held else None
 
     def _take(self) -> None:
         # It leaves the queue after it has become a keyframe: one of the two must keep its like from being wanted.

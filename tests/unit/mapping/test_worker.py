@@ -210,3 +210,29 @@ def test_a_moving_robot_s_map_is_refined_once_it_stands_also_without_a_thread() 
     assert slam._mapper.owed == slam.config.mapping.refine_iterations  # type: ignore[union-attr]
     slam.process(joints(frames[11], 0.5))
     assert slam._mapper.owed == 0  # type: ignore[union-attr]
+
+
+def test_a_pause_waits_for_the_step_under_way_not_for_all_that_is_owed(
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[int] = []
+
+    def refine(count: int) -> None:  # as if there were always more to do
+        steps.append(count)
+        time.sleep(0.01)
+
+    monkeypatch.setattr(mapper, "refine", refine)
+    worker = MappingWorker(mapper)
+    insert(worker, at(0.0))
+    mapper.owed = 10**9
+    for _ in range(5):
+        done = len(steps)
+        wait_until(lambda done=done: len(steps) > done + 2)  # type: ignore[misc]
+        asked = len(steps)
+        with worker.paused():
+            begun = len(steps)
+            time.sleep(0.03)
+            assert len(steps) == begun
+        assert begun - asked <= 2
+    mapper.owed = 0
+    worker.close()
