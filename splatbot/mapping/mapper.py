@@ -110,10 +110,11 @@ class Mapper:
         view = LoopView(observation.prepared, observation.T_world_camera, keyframe.features, observation.anchor)
         self.loops.add(keyframe, view, self.keyframes)
 
-    def close_loops(self) -> dict[int, NDArray[np.float64]]:
+    def close_loops(self, *, refine: bool = True) -> dict[int, NDArray[np.float64]]:
         """Move keyframes and their Gaussians where the pose graph has them; T_new_old (4, 4) by keyframe number.
 
-        Nobody may track or map meanwhile. Empty when no loop waits.
+        Nobody may track or map meanwhile. Empty when no loop waits. ``refine`` spends the steps owed at once; else they
+        stay owed, and nobody waits for them.
         """
         correction = self.loops.correction
         if correction is None:
@@ -122,7 +123,7 @@ class Mapper:
         self.model = move_gaussians(self.model, correction)
         self.loops.moved(correction)
         self.owed += self.config.mapping.refine_iterations
-        self.refine(0 if self._held else self.owed)
+        self.refine(self.owed if refine and not self._held else 0)
         self._version += 1
         return correction
 

@@ -110,9 +110,9 @@ class MappingWorker:
         return self._mapper.has_loop
 
     def close_loops(self) -> dict[int, NDArray[np.float64]]:
-        """As :meth:`Mapper.close_loops`, while paused."""
+        """As :meth:`Mapper.close_loops`, while paused; what is owed is left to the thread."""
         self._to_look = None  # its pose is of the world as it was
-        moved = self._mapper.close_loops()
+        moved = self._mapper.close_loops(refine=False)
         self._publish()
         return moved
 

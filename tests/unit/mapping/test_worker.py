@@ -236,3 +236,26 @@ def test_a_pause_waits_for_the_step_under_way_not_for_all_that_is_owed(
         assert begun - asked <= 2
     mapper.owed = 0
     worker.close()
+
+
+def test_closing_a_loop_leaves_refinement_to_the_thread(mapper: Mapper, monkeypatch: pytest.MonkeyPatch) -> None:
+    by: list[str] = []
+    refine = mapper.refine
+
+    def told(steps: int) -> None:
+        if steps:
+            by.append(threading.current_thread().name)
+        refine(steps)
+
+    monkeypatch.setattr(mapper, "refine", told)
+    worker = MappingWorker(mapper)
+    for x in (0.0, 0.4):
+        insert(worker, at(x))
+    with worker.paused():
+        mapper.loops.correction = {0: np.eye(4), 1: at(0.1)}
+        mapper.owed = 40
+        assert worker.close_loops()
+        assert mapper.owed == 40 + mapper.config.mapping.refine_iterations
+    wait_until(lambda: mapper.owed == 0)
+    assert set(by) == {"mapping"}
+    worker.close()
