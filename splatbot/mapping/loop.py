@@ -51,6 +51,11 @@ class Measured:
     inliers: float
     matches: int
 
+    def agrees(self, T_tracked: Array) -> bool:
+        """Whether it is the motion (4, 4) that was tracked, but for what alignments differ by."""
+        moved, turned = pose_distance(T_tracked, self.T_keyframe_camera)
+        return moved <= _JUMP[0] and turned <= _JUMP[1]
+
 
 @dataclass(frozen=True)
 class View:
@@ -98,12 +103,10 @@ class LoopCloser:
         """A keyframe was made of a view: measure its motion, and look for places seen before."""
         if not self.config.loops.enabled:
             return
-        by_number = {k.number: k for k in keyframes}
         self.graph.poses[keyframe.number] = keyframe.T_world_camera
-        anchor = by_number.get(view.anchor) if view.anchor is not None else None
-        if anchor is None or anchor is keyframe:
-            others = [k for k in keyframes if k is not keyframe]
-            anchor = others[-1] if others else None
+        keyframes = [k for k in keyframes if k.number in self.graph.poses]  # later ones have their turn
+        others = [k for k in keyframes if k is not keyframe]
+        anchor = next((k for k in others if k.number == view.anchor), others[-1] if others else None)
         self.anchor = keyframe.number
         if anchor is None:
             return
@@ -111,6 +114,8 @@ class LoopCloser:
             self.correction[keyframe.number] = self.correction[anchor.number]
         step = self._odometry(anchor, keyframe, view)
         self.graph.edges.append(step)
+        if others[-1] is not anchor and (tie := self._tie(others[-1], keyframe, view)) is not None:
+            self.graph.edges.append(tie)
         T_chain = anchor.T_world_camera @ step.T_first_second
         strangers = self._strangers(anchor, keyframe, keyframes)
         loops = [edge for stranger in strangers if (edge := self._loop(stranger, keyframe, view, T_chain)) is not None]
@@ -132,14 +137,25 @@ class LoopCloser:
             near = pose_distance(np.eye(4), T_tracked)
             known = near[0] < 2 * _NEAR[0] and near[1] < 2 * _NEAR[1]
             return Edge(anchor.number, keyframe.number, T_tracked, _drift(T_tracked) if known else _UNKNOWN)
-        moved, turned = pose_distance(T_tracked, found.T_keyframe_camera)
-        T = found.T_keyframe_camera if moved > _JUMP[0] or turned > _JUMP[1] else T_tracked
+        T = T_tracked if found.agrees(T_tracked) else found.T_keyframe_camera
         return Edge(anchor.number, keyframe.number, T, found.covariance + _drift(T))
+
+    def _tie(self, latest: Keyframe, keyframe: Keyframe, view: View) -> Edge | None:
+        """The motion from the keyframe before, which was not there yet, or is farther, when the frame was tracked.
+
+        Each keyframe with the last but one only would make two chains beside each other, and what they drift apart
+        would be taken for a loop. None where their images say something else, for then one of the motions is wrong.
+        """
+        T_tracked = inverse(latest.T_world_camera) @ keyframe.T_world_camera
+        found = self._measure(latest, view)
+        if found is None or not self._is_good(found) or not found.agrees(T_tracked):
+            return None
+        return Edge(latest.number, keyframe.number, T_tracked, found.covariance + _drift(T_tracked))
 
     def _strangers(self, anchor: Keyframe, keyframe: Keyframe, keyframes: Sequence[Keyframe]) -> list[Keyframe]:
         """Keyframes that may show the same place although no short chain of motions leads there."""
-        known = self.graph.near(anchor.number, _NEIGHBOURS) | {keyframe.number}
-        others = [k for k in keyframes if k.number not in known]
+        known = self.graph.near(anchor.number, _NEIGHBOURS)
+        others = [k for k in keyframes if k.number not in known and abs(k.number - keyframe.number) > _NEIGHBOURS]
         if not others:
             return []
         nearest = others[order_by_distance(others, keyframe.T_world_camera)[0]]

@@ -100,7 +100,7 @@ class Mapper:
         observation = Observation(prepared, T_world_camera, features, self.loops.anchor)
         with self._undone_on_error():
             keyframe = self.add_keyframe(observation)
-            self.fuse(keyframe)
+            self.fuse(observation, keyframe)
             self.refine(0 if self._held else self.owed)
             self.make_reference(observation, keyframe)
         self.look_for_loops(observation, keyframe)
@@ -190,7 +190,6 @@ class Mapper:
             keyframe.reference = make_reference(levels, observation.T_world_camera, n_pixels)
         # A new list: the tracker may be reading the old one.
         self.keyframes = without_redundant([*self.keyframes, keyframe], self.config.mapping.max_keyframes)
-        self._stamp = observation.prepared.frame.stamp
         return keyframe
 
     def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
@@ -210,8 +209,9 @@ class Mapper:
         self._revealed = float(bare.float().mean()) > _REVEALED
         self._version += 1
 
-    def fuse(self, keyframe: Keyframe) -> None:
+    def fuse(self, observation: Observation, keyframe: Keyframe) -> None:
         """Bring a keyframe's evidence and its new surfaces into the map; it calls for refinement."""
+        self._stamp = observation.prepared.frame.stamp
         self._weigh(keyframe.depth, keyframe.camera, keyframe.T_world_camera)
         view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
         keyframe.rgb = in_exposure_of_map(keyframe.rgb, keyframe.depth, view)
@@ -281,7 +281,7 @@ class Mapper:
             keyframe.depth,
             keyframe.camera,
             keyframe.T_world_camera,
-            self.keyframes[:-1],
+            [k for k in self.keyframes if k.number < keyframe.number],
             self._stamp,
         )
         if moving.any():

@@ -42,6 +42,7 @@ class MappingWorker:
         self._mapper = mapper
         self._backlog = backlog
         self._waiting: deque[Observation] = deque()
+        self._unfused: deque[tuple[Observation, Keyframe]] = deque()
         self._news = threading.Condition()
         self._to_look: tuple[PreparedFrame, NDArray[np.float64]] | None = None
         self._held = False
@@ -73,21 +74,21 @@ class MappingWorker:
     def wants(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> bool:
         """As :meth:`Mapper.wants`; False while too many observations wait."""
         self._raise_error()
-        waiting = list(self._waiting)
-        return len(waiting) < self._backlog and self._mapper.wants(prepared, T_world_camera, waiting)
+        with self._news:
+            waiting, full = list(self._waiting), len(self._waiting) + len(self._unfused) >= self._backlog
+        return not full and self._mapper.wants(prepared, T_world_camera, waiting)
 
     def insert(
         self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Callable[[], Features]
     ) -> None:
         """Hand over a frame and return at once; only the first is made a keyframe here: nothing is tracked before."""
         self._raise_error()
-        observation = Observation(prepared, T_world_camera, features, self._mapper.loops.anchor)
-        first = self._mapper.add_keyframe(observation, provisional=True) if self._thread is None else None
+        self._waiting.append(Observation(prepared, T_world_camera, features, self._mapper.loops.anchor))
+        if self._thread is None:
+            self._take()
+            self._start()
         with self._news:
-            self._waiting.append(observation)
             self._news.notify()
-        if first is not None:
-            self._start(first)
 
     @property
     def memory(self) -> dict[str, int]:
@@ -154,7 +155,7 @@ class MappingWorker:
                 self._news.notify_all()
 
     def _may_pause(self) -> bool:
-        drained = not self._waiting or self._error is not None
+        drained = not (self._waiting or self._unfused) or self._error is not None
         return drained and not self._busy and not self._paused
 
     def close(self) -> None:
@@ -168,9 +169,9 @@ class MappingWorker:
     def _publish(self) -> None:
         self._published = replace(self._mapper.snapshot(), map_version=self._published.map_version + 1)
 
-    def _start(self, first: Keyframe) -> None:
+    def _start(self) -> None:
         switch_quickly()  # the tracker waits for the interpreter while mapping holds it
-        self._thread = threading.Thread(target=self._run, args=(first,), name="mapping", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="mapping", daemon=True)
         self._thread.start()
 
     def _end(self) -> None:
@@ -184,10 +185,9 @@ class MappingWorker:
         if self._error is not None:
             raise RuntimeError("mapping has failed in its thread; the map is as it was before") from self._error
 
-    def _run(self, first: Keyframe) -> None:
+    def _run(self) -> None:
         _stand_back()
         try:
-            self._fuse(first)
             while (work := self._next()) is not None:
                 work()
         except BaseException as error:  # raised where somebody can act on it
@@ -196,7 +196,7 @@ class MappingWorker:
                 self._news.notify_all()
 
     def _next(self) -> Callable[[], None] | None:
-        """What is to be done now: new observations first; waits while there is nothing; None: the end."""
+        """What is to be done now; waits while there is nothing; None: the end."""
         with self._news:
             self._busy = False
             self._news.notify_all()
@@ -210,8 +210,11 @@ class MappingWorker:
                 self._news.wait()
 
     def _choose(self) -> Callable[[], None] | None:
+        """What the tracker can use soonest: it follows the latest keyframe, whether that is in the map or not."""
         if self._waiting:
             return self._take
+        if self._unfused:
+            return self._fuse
         if self._ending or self._pauses_wanted:  # or whoever wants a pause would wait for all that is owed
             return None
         if self._to_look is not None:
@@ -220,18 +223,20 @@ class MappingWorker:
 
     def _take(self) -> None:
         # It leaves the queue after it has become a keyframe: one of the two must keep its like from being wanted.
-        keyframe = self._mapper.add_keyframe(self._waiting[0], provisional=True)
-        self._fuse(keyframe)
-
-    def _fuse(self, keyframe: Keyframe) -> None:
         observation = self._waiting[0]
-        self._mapper.fuse(keyframe)
+        keyframe = self._mapper.add_keyframe(observation, provisional=True)
+        with self._news:
+            self._unfused.append((observation, keyframe))
+            self._waiting.popleft()
+
+    def _fuse(self) -> None:
+        observation, keyframe = self._unfused[0]
+        self._mapper.fuse(observation, keyframe)
         self._mapper.make_reference(observation, keyframe)
         self._mapper.look_for_loops(observation, keyframe)
         self._publish()
         with self._news:
-            self._waiting.popleft()
-            self._news.notify_all()
+            self._unfused.popleft()
 
     def _look(self) -> None:
         with self._news:

@@ -14,10 +14,13 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_multiply, quat_to_rotation, se3_exp
 from splatbot.logs import open_log
 from splatbot.mapping.loop import move_gaussians
+from splatbot.mapping.mapper import Mapper, Observation
 from splatbot.mapping.posegraph import Edge, PoseGraph, largest
 from splatbot.slam import Slam
+from splatbot.tracking.features import detect
+from splatbot.tracking.prepare import prepare
 from splatbot.tracking.tracker import pose_distance
-from tests.rgbd import CAMERA, Array, rays_of, small_config, wall_depth
+from tests.rgbd import CAMERA, Array, rays_of, small_config, tabletop, wall_depth
 
 TIGHT = np.diag([1e-3**2] * 6)
 
@@ -179,3 +182,19 @@ def test_a_texture_that_repeats_makes_no_loop() -> None:
     last = slam.results[-1].T_world_camera
     assert last is not None
     assert pose_distance(last, poses[-1])[0] < 0.02
+
+
+def test_keyframes_that_each_follow_the_last_but_one_are_no_loop() -> None:
+    """As with a mapping thread that is late; the two chains are 3 mm apart, as much as tracking may be off."""
+    config = small_config()
+    mapper = Mapper(config)
+    frames, poses = tabletop(frames=60)
+    for number, (frame, T) in enumerate(zip(frames[:48:2], poses[:48:2], strict=True)):
+        prepared = prepare(frame, config.tracking)
+        T = T @ se3_exp([3e-3 * (number % 2), 0, 0, 0, 0, 0])
+        features = detect(frame.rgb, prepared.depth, frame.camera, config.tracking.n_features)
+        observation = Observation(prepared, T, lambda features=features: features, max(number - 2, 0))  # type: ignore[misc]
+        mapper.look_for_loops(observation, mapper.add_keyframe(observation, provisional=True))
+    assert mapper.loop_counts == {"closed": 0, "rejected": 0}
+    ties = [edge for edge in mapper.loops.graph.edges if edge.second - edge.first == 1]
+    assert len(ties) > 20

@@ -15,7 +15,7 @@ from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import se3_exp
 from splatbot.mapping.keyframes import Keyframe
-from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.mapper import Mapper, Observation
 from splatbot.mapping.worker import MappingWorker
 from splatbot.slam import Slam
 from splatbot.tracking.features import Features
@@ -100,9 +100,9 @@ def test_handing_over_does_not_wait_for_fusion(mapper: Mapper, monkeypatch: pyte
     gate = threading.Event()
     fuse = mapper.fuse
 
-    def slow(keyframe: Keyframe) -> None:
+    def slow(observation: Observation, keyframe: Keyframe) -> None:
         gate.wait(10)
-        fuse(keyframe)
+        fuse(observation, keyframe)
 
     monkeypatch.setattr(mapper, "fuse", slow)
     worker = MappingWorker(mapper)
@@ -115,11 +115,45 @@ def test_handing_over_does_not_wait_for_fusion(mapper: Mapper, monkeypatch: pyte
     assert len(worker.snapshot().model) > 300
 
 
+def test_what_waits_can_be_tracked_against_before_what_came_earlier_is_in_the_map(
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, done = threading.Event(), []
+    fuse, add = mapper.fuse, mapper.add_keyframe
+
+    def slow(observation: Observation, keyframe: Keyframe) -> None:
+        gate.wait(10)
+        fuse(observation, keyframe)
+        done.append(f"{keyframe.number} fused")
+
+    def told(observation: Observation, *, provisional: bool = False) -> Keyframe:
+        keyframe = add(observation, provisional=provisional)
+        done.append(f"{keyframe.number} tracked against")
+        return keyframe
+
+    monkeypatch.setattr(mapper, "fuse", slow)
+    monkeypatch.setattr(mapper, "add_keyframe", told)
+    worker = MappingWorker(mapper)
+    for x in (0.0, 0.4, 0.8):
+        insert(worker, at(x))
+    gate.set()
+    worker.finish()
+    assert [k.number for k in worker.keyframes] == [0, 1, 2]
+    assert done == [
+        "0 tracked against",
+        "0 fused",
+        "1 tracked against",
+        "2 tracked against",
+        "1 fused",
+        "2 fused",
+    ]
+
+
 def test_a_view_that_waits_is_not_wanted_again_and_too_many_waiting_are_too_many(
     mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate = threading.Event()
-    monkeypatch.setattr(mapper, "fuse", lambda keyframe: gate.wait(10))
+    monkeypatch.setattr(mapper, "fuse", lambda *_: gate.wait(10))
     worker = MappingWorker(mapper, backlog=3)
     for x in (0.0, 0.4):
         assert wants(worker, at(x))
@@ -151,7 +185,7 @@ def test_what_goes_wrong_in_the_thread_is_told_and_the_last_published_map_stays(
     wait_until(lambda: worker.snapshot().map_version == 2)  # fused, refined
     kept = worker.snapshot()
 
-    def broken(keyframe: Keyframe) -> None:
+    def broken(observation: Observation, keyframe: Keyframe) -> None:
         raise ValueError("broken on purpose")
 
     monkeypatch.setattr(mapper, "fuse", broken)
