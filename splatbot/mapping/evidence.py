@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -55,7 +56,7 @@ class Evidence:
         seen_through: (N,) something farther was measured, at its centre's pixel and all around.
         offset: (N,) [m] from the mean to the measured surface along ``normals``; 0 where not supported.
         variance: (N,) [m²] of that measurement; inf where it says nothing.
-        normals: (N, 3) shortest axes in the world frame.
+        normals: (N, 3) shortest axes in the world frame; zero where nothing was measured.
         measured_normals: (N, 3) of the measured surface there, in the world frame; zero where it says nothing.
     """
 
@@ -81,26 +82,27 @@ def weigh(
     """
     T_camera_world = torch.from_numpy(inverse(T_world_camera)).float()
     points = model.means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    normals = shortest_axes(model)
-    facing = normals @ T_camera_world[:3, :3].T
     rays, row, column, inside = _rays(camera, points)
+    rows = (inside & (depth[row, column] > 0)).nonzero()[:, 0]  # the others are neither borne out nor contradicted
+    points, rays, row, column = points[rows], rays[rows], row[rows], column[rows]
     z, farther = depth[row, column], _nearest_around(depth)[row, column]
-    measured = inside & (z > 0)
+    normals = shortest_axes(model, rows)
+    facing = normals @ T_camera_world[:3, :3].T
     sigma = noise(z)
-    tolerance = torch.maximum(_GATE * (sigma.square() + model.uncertainty.square()).sqrt(), _LEAST_GATE * z)
-    supported = measured & ((points[:, 2] - z).abs() < tolerance)
+    tolerance = torch.maximum(_GATE * (sigma.square() + model.uncertainty[rows].square()).sqrt(), _LEAST_GATE * z)
+    supported = (points[:, 2] - z).abs() < tolerance
     slant = (facing * rays).sum(1)
     offset = (facing * (rays * z[:, None] - points)).sum(1)
     cosine = slant.abs() / rays.norm(dim=1)
     useful = supported & (cosine > _GRAZING) & (offset.abs() < tolerance)
-    around = torch.from_numpy(smooth_normals(depth.numpy(), camera, _REACH)).float()[row, column]
+    around = torch.from_numpy(smooth_normals(depth.numpy(), camera, row.numpy(), column.numpy(), _REACH)).float()
     return Evidence(
-        supported=supported,
-        seen_through=inside & (farther > 0) & (points[:, 2] + tolerance < farther),
-        offset=torch.where(useful, offset, 0.0),
-        variance=torch.where(useful, (sigma * slant).square(), torch.inf),
-        normals=normals,
-        measured_normals=torch.where(useful[:, None], around, 0.0) @ T_camera_world[:3, :3],
+        supported=_of_all(len(model), rows, supported),
+        seen_through=_of_all(len(model), rows, (farther > 0) & (points[:, 2] + tolerance < farther)),
+        offset=_of_all(len(model), rows, torch.where(useful, offset, 0.0)),
+        variance=_of_all(len(model), rows, torch.where(useful, (sigma * slant).square(), torch.inf), torch.inf),
+        normals=_of_all(len(model), rows, normals),
+        measured_normals=_of_all(len(model), rows, torch.where(useful[:, None], around, 0.0) @ T_camera_world[:3, :3]),
     )
 
 
@@ -123,16 +125,15 @@ def fuse_normals(model: GaussianModel, evidence: Evidence) -> GaussianModel:
 
     A disc of 3 cm that is tilted by 10° reaches 5 mm out of its surface; what one look tells of a normal is no better.
     """
-    toward = evidence.measured_normals
-    cosine = (evidence.normals * toward).sum(1)
-    known = cosine.abs() > _SAME_SIDE
-    gain = torch.where(known, (1.0 / (1.0 + model.observations)).clamp_min(_LEAST_TURN), 0.0)
-    target = evidence.normals + gain[:, None] * (cosine.sign()[:, None] * toward - evidence.normals)
-    target = torch.nn.functional.normalize(target, dim=1)
+    cosine = (evidence.normals * evidence.measured_normals).sum(1)
+    rows = (cosine.abs() > _SAME_SIDE).nonzero()[:, 0]
+    normals, toward = evidence.normals[rows], cosine[rows].sign()[:, None] * evidence.measured_normals[rows]
+    gain = (1.0 / (1.0 + model.observations[rows])).clamp_min(_LEAST_TURN)
+    target = torch.nn.functional.normalize(normals + gain[:, None] * (toward - normals), dim=1)
     # The shortest rotation from one unit vector to another: (1 + cos, a x b), of half the angle once normalised.
-    turn = torch.cat([1 + (evidence.normals * target).sum(1, keepdim=True), evidence.normals.cross(target, dim=1)], 1)
-    turned = torch.from_numpy(quat_multiply(torch.nn.functional.normalize(turn, dim=1), model.quats)).float()
-    return replace(model, quats=torch.where(known[:, None], turned, model.quats))
+    turn = torch.cat([1 + (normals * target).sum(1, keepdim=True), normals.cross(target, dim=1)], 1)
+    turned = torch.from_numpy(quat_multiply(torch.nn.functional.normalize(turn, dim=1), model.quats[rows])).float()
+    return replace(model, quats=model.quats.index_copy(0, rows, turned))
 
 
 def count(model: GaussianModel, evidence: Evidence) -> GaussianModel:
@@ -174,4 +175,9 @@ def _rays(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tenso
 
 def _nearest_around(depth: Tensor) -> Tensor:
     """The least depth (H, W) of each pixel's 3x3 neighbours: 0 where one of them is missing."""
-    return -torch.nn.functional.max_pool2d(-depth[None, None], 3, 1, 1)[0, 0]
+    return torch.from_numpy(cv2.erode(depth.numpy(), np.ones((3, 3), np.uint8)))
+
+
+def _of_all(count: int, rows: Tensor, values: Tensor, rest: float = 0.0) -> Tensor:
+    """``values`` (M, ...) of the Gaussians that ``rows`` (M,) name, ``rest`` of the others: (count, ...)."""
+    return values.new_full((count, *values.shape[1:]), rest).index_copy_(0, rows, values)

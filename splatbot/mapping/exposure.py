@@ -49,11 +49,11 @@ def exposure_of(rgb: Tensor, depth: Tensor, view: View) -> Exposure:
     Neutral where the map shows too little of the image, or the fit is absurd.
     """
     seen = rgb.numpy()
-    inside = ((seen > _CLIPPED[0]) & (seen < _CLIPPED[1])).all(-1)
+    inside = cv2.inRange(seen, (_CLIPPED[0] + 1,) * 3, (_CLIPPED[1] - 1,) * 3) > 0
     there = depth.numpy() > 0
     same = np.abs(view.depth.numpy() - depth.numpy()) < _AGREES * depth.numpy()
     used = inside & there & same & (view.alpha.numpy() > _SOLID)
-    of_map, of_image = _blocks(view.rgb.numpy().mean(-1), used), _blocks(seen.mean(-1) / 255.0, used)
+    of_map, of_image = _blocks(_gray(view.rgb.numpy()), used), _blocks(_gray(seen) / 255.0, used)
     full = np.isfinite(of_map)
     if full.sum() < _LEAST_BLOCKS:
         return Exposure()
@@ -75,6 +75,11 @@ def in_exposure_of_map(rgb: Tensor, depth: Tensor, view: View) -> Tensor:
     corrected = np.where(solid & (seen > _CLIPPED[1]), np.maximum(corrected, shown), corrected)
     corrected = np.where(solid & (seen < _CLIPPED[0]), np.minimum(corrected, shown), corrected)
     return torch.from_numpy(np.rint(255.0 * corrected.clip(0, 1)).astype(np.uint8))
+
+
+def _gray(rgb: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Mean (H, W) over the channels."""
+    return np.asarray(cv2.transform(np.asarray(rgb, dtype=np.float32), np.full((1, 3), 1 / 3)), dtype=np.float32)
 
 
 def _blocks(image: NDArray[np.floating], used: NDArray[np.bool_]) -> Image:

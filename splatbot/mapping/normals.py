@@ -15,13 +15,16 @@ _FLAT = 0.01  # RMS distance from its plane [share of depth], above which a wind
 _LEAST = 8  # samples that a plane needs
 
 
-def smooth_normals(depth: NDArray[np.float32], camera: Camera, reach: int) -> NDArray[np.float64]:
-    """Unit normals (H, W, 3) towards the camera; zero where the window holds an edge or too little depth.
+def smooth_normals(
+    depth: NDArray[np.float32], camera: Camera, rows: NDArray[np.int64], columns: NDArray[np.int64], reach: int
+) -> NDArray[np.float64]:
+    """Unit normals (P, 3) at pixels, towards the camera; zero where the window holds an edge or too little depth.
 
     The planes are those of :func:`fitted_normals` over all pixels of the window, by sums over boxes.
 
     Args:
         depth: (H, W) [m], 0 missing.
+        rows, columns: (P,) pixels.
         reach: half the window's side [px].
     """
     side = (2 * reach + 1,) * 2
@@ -32,7 +35,7 @@ def smooth_normals(depth: NDArray[np.float32], camera: Camera, reach: int) -> ND
 
     def total(image: NDArray[np.float64]) -> NDArray[np.float64]:
         summed = cv2.boxFilter(image, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(summed, dtype=np.float64)
+        return np.asarray(summed, dtype=np.float64)[rows, columns]
 
     count = total(known.astype(np.float64))
     n = np.maximum(count, 1)
@@ -41,7 +44,8 @@ def smooth_normals(depth: NDArray[np.float32], camera: Camera, reach: int) -> ND
     moments = total(x * x) - n * mx * mx, total(x * y) - n * mx * my, total(y * y) - n * my * my
     slope = _slope(*moments, xv, yv)
     rms = np.sqrt(np.maximum(vv - slope[..., 0] * xv - slope[..., 1] * yv, 0.0) / n)
-    flat = known & (count > 0.5 * side[0] ** 2) & (rms * depth < _FLAT)
+    at = depth[rows, columns]
+    flat = (at > 0) & (count > 0.5 * side[0] ** 2) & (rms * at < _FLAT)
     normals = _from_inverse_depth(slope, mv - slope[..., 0] * mx - slope[..., 1] * my)
     return np.where(flat[..., None], normals, 0.0)
 

@@ -59,7 +59,8 @@ def sampled_pixels(level: Level, normals: Image, slopes: Image, n_pixels: int) -
     Edges carry the photometric information, the grid the geometric; a pixel needs a normal (H, W, 3), which keeps both
     off occlusion boundaries, where colour belongs to one surface and depth to another. ``slopes`` (H, W) are of grey.
     """
-    good = ((normals**2).sum(-1) > 0.25) & np.isfinite(level.gray)
+    x, y, z = normals[..., 0], normals[..., 1], normals[..., 2]
+    good = (x * x + y * y + z * z > 0.25) & np.isfinite(level.gray)
     strength = np.where(good, slopes, -1.0)
     height, width = level.gray.shape
     tile = max(2, round(float(np.sqrt(2.0 * height * width / n_pixels))))
