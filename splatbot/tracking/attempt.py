@@ -68,6 +68,8 @@ class Attempt:
             if matched is not None:
                 begun = self._start("features", matched.T_world_camera, start)
                 found = self._judge([*candidates, self._direct(begun, matched)])
+            elif not self._looked_anywhere:
+                found = found.doubted("another pose may explain the frame better: no time was left to look for it")
         return found
 
     def _judge(self, candidates: Sequence[Candidate]) -> Judged:
@@ -150,26 +152,32 @@ class Attempt:
         return self._match_anywhere(T_expected) or near
 
     def _match_anywhere(self, T_expected: Array) -> FeaturePose | None:
-        """Match with the same keyframes wherever in the image, if there is time."""
+        """Match with the same keyframes wherever in the image, with fewer if there is no time for all."""
         if self.features is None:
             return None
-        views, units = self._views_to_match(self.features, T_expected)
-        if not self._budget.fits(
-            ("match all", units), *self._direct_work(None) * 2, self._health_work, self._health_work
-        ):
+        ends = (*self._direct_work(None) * 2, self._health_work, self._health_work)
+        for left_out in range(self.config.match_keyframes + 2):
+            views, units = self._views_to_match(self.features, T_expected, left_out)
+            if self._budget.fits(("match all", units), *ends):
+                break
+        else:
             self._budget.skip("features anywhere")
             return None
         self._looked_anywhere = True
         with self._budget.run("match all", units, under="features"):
             return match_pose(self.features, views, self._prepared.frame.camera)
 
-    def _views_to_match(self, features: Features, T_expected: Array) -> tuple[list[tuple[Features, Array]], int]:
-        """The nearest keyframes, the latest and the first, with their poses; how many pairs of keypoints there are."""
-        keyframes = self._keyframes
-        chosen = sorted(
-            {*order_by_distance(keyframes, T_expected)[: self.config.match_keyframes], 0, len(keyframes) - 1}
-        )
-        views = [(keyframes[k].features, keyframes[k].reference.T_world_camera) for k in chosen]
+    def _views_to_match(
+        self, features: Features, T_expected: Array, left_out: int = 0
+    ) -> tuple[list[tuple[Features, Array]], int]:
+        """The nearest keyframes, the latest and the first, with their poses; how many pairs of keypoints there are.
+
+        So many are ``left_out``: of those that are not nearest, then the farthest.
+        """
+        near = order_by_distance(self._keyframes, T_expected)[: self.config.match_keyframes]
+        chosen = list(dict.fromkeys([*near, len(self._keyframes) - 1, 0]))
+        chosen = sorted(chosen[: max(1, len(chosen) - left_out)])
+        views = [(self._keyframes[k].features, self._keyframes[k].reference.T_world_camera) for k in chosen]
         return views, len(features) * sum(len(known) for known, _ in views)
 
     def _keypoints(self) -> int | None:

@@ -69,6 +69,10 @@ class Judged:
         """The same with more reasons."""
         return replace(self, reasons=self.reasons + reasons)
 
+    def doubted(self, reason: str) -> Judged:
+        """The same, "degraded" at best, for a reason."""
+        return replace(self.noted(reason), verdict="degraded" if self.verdict == "ok" else self.verdict)
+
 
 def score(prepared: PreparedFrame, candidate: Candidate, config: TrackingConfig) -> Health:
     """How well a candidate explains the frame, on the second finest level."""

@@ -2,43 +2,99 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
 
 from splatbot.geometry import inverse, se3_exp, transform_points
-from splatbot.slam import Slam
+from splatbot.slam import FrameResult, Slam
 from splatbot.tracking import attempt
+from splatbot.tracking.budget import Budget
 from splatbot.tracking.features import FeaturePose, match_pose
 from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import small_config, tabletop
 
 
-def test_a_wrong_pose_that_nearby_features_agree_on_is_replaced_by_what_all_features_say(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frames, poses = tabletop()
-    slam = Slam(small_config())
-    for frame in frames[:4]:
-        slam.process(frame)
-    wrong = poses[4] @ se3_exp(np.array([0.12, -0.05, 0.03, 0.05, 0.12, -0.05]))
-    looked = []
+@dataclass
+class Astray:
+    """A run whose next frame is led to a wrong pose, by the first stage and by the features near to it."""
 
-    def astray(current: Any, keyframes: Any, camera: Any, expected: Any = None) -> FeaturePose | None:
+    slam: Slam
+    views: list[tuple[str, int]] = field(default_factory=list)
+    """Where features were looked for, and in how many keyframes."""
+
+    def result(self) -> FrameResult:
+        return self.slam.process(tabletop()[0][NEXT])
+
+
+NEXT = 4
+TRUE = tabletop()[1][NEXT]
+
+
+@pytest.fixture
+def astray(monkeypatch: pytest.MonkeyPatch) -> Astray:
+    slam = Slam(small_config(mapping__keyframe_translation=1e-3))  # several keyframes
+    for frame in tabletop()[0][:NEXT]:
+        slam.process(frame)
+    assert len(slam.keyframes) > 2
+    wrong = TRUE @ se3_exp(np.array([0.12, -0.05, 0.03, 0.05, 0.12, -0.05]))
+    run = Astray(slam)
+
+    def matched(current: Any, keyframes: Any, camera: Any, expected: Any = None) -> FeaturePose | None:
         found = match_pose(current, keyframes, camera)
-        looked.append("anywhere" if expected is None else "near")
+        run.views.append(("anywhere" if expected is None else "near", len(keyframes)))
         if expected is None or found is None:
             return found
         pixels = camera.project(transform_points(inverse(wrong), found.points))
         return FeaturePose(wrong, found.points, pixels, 0.01 * found.sigmas, found.matches)
 
-    monkeypatch.setattr(attempt, "match_pose", astray)
+    monkeypatch.setattr(attempt, "match_pose", matched)
     monkeypatch.setattr(attempt.Attempt, "_geometric", started_at(wrong, attempt.Attempt._geometric))
-    result = slam.process(frames[4])
-    assert looked == ["near", "anywhere"]
+    return run
+
+
+def leave_time_for(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a share of all keyframes where features are looked for anywhere; for all other stages there is time."""
+    asked: list[float] = []
+
+    def fits(budget: Budget, *work: tuple[str, float]) -> bool:
+        asked.extend(units for stage, units in work if stage == "match all")
+        return work[0][0] != "match all" or asked[-1] <= share * asked[0]
+
+    monkeypatch.setattr(Budget, "fits", fits)
+
+
+def test_a_wrong_pose_that_nearby_features_agree_on_is_replaced_by_what_all_features_say(astray: Astray) -> None:
+    result = astray.result()
+    assert [where for where, _ in astray.views] == ["near", "anywhere"]
     assert result.T_world_camera is not None
-    assert pose_distance(poses[4], result.T_world_camera)[0] < 2e-3
+    assert result.verdict == "ok"
+    assert pose_distance(TRUE, result.T_world_camera)[0] < 2e-3
+
+
+def test_without_time_for_all_keyframes_features_are_looked_for_in_the_nearest(
+    astray: Astray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_time_for(0.6, monkeypatch)
+    result = astray.result()
+    (_, all_), (_, some) = astray.views
+    assert 1 <= some < all_
+    assert result.T_world_camera is not None
+    assert result.skipped == ()
+    assert pose_distance(TRUE, result.T_world_camera)[0] < 2e-3
+
+
+def test_a_pose_that_explains_little_is_doubted_when_there_is_no_time_to_look_further(
+    astray: Astray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_time_for(0, monkeypatch)
+    result = astray.result()
+    assert [where for where, _ in astray.views] == ["near"]
+    assert result.skipped == ("features anywhere",)
+    assert result.verdict != "ok"
+    assert any("no time was left" in reason for reason in result.reasons)
 
 
 def started_at(T_world_camera: Any, geometric: Any) -> Any:
