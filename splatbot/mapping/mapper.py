@@ -77,18 +77,18 @@ class Mapper:
         return len(self.model)
 
     def wants(
-        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], waiting: Sequence[Placed] = ()
+        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], to_come: Sequence[Placed] = ()
     ) -> bool:
         """Whether a frame at this pose would be a keyframe: a new view, with depth for later frames to align to.
 
-        ``waiting`` are views that will be keyframes, but are not yet.
+        ``to_come`` are views that will be in the map, but are not yet.
         """
         if valid_share(prepared) < self.config.tracking.min_valid:
             return False
         bridge = self.loops.is_bridge(T_world_camera, self.keyframes)
-        if bridge or (self._revealed and not waiting):
+        if bridge or (self._revealed and not to_come):
             return True
-        return is_keyframe(T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
+        return is_keyframe(T_world_camera, [*self.keyframes, *to_come], self.config.mapping)
 
     def insert(
         self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Callable[[], Features]

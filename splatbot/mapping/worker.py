@@ -75,8 +75,8 @@ class MappingWorker:
         """As :meth:`Mapper.wants`; False while too many observations wait."""
         self._raise_error()
         with self._news:
-            waiting, full = list(self._waiting), len(self._waiting) + len(self._unfused) >= self._backlog
-        return not full and self._mapper.wants(prepared, T_world_camera, waiting)
+            to_come = [*self._waiting, *(observation for observation, _ in self._unfused)]
+        return len(to_come) < self._backlog and self._mapper.wants(prepared, T_world_camera, to_come)
 
     def insert(
         self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Callable[[], Features]

@@ -167,6 +167,21 @@ def test_a_view_that_waits_is_not_wanted_again_and_too_many_waiting_are_too_many
     worker.close()
 
 
+def test_what_a_look_has_revealed_is_wanted_once(mapper: Mapper, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = threading.Event()
+    worker = MappingWorker(mapper)
+    insert(worker, at(0.0))
+    with worker.paused():
+        mapper._revealed = True  # as a look at what the map has nothing of leaves it
+        monkeypatch.setattr(mapper, "fuse", lambda *_: gate.wait(10))
+    assert wants(worker, at(0.01))
+    insert(worker, at(0.01))
+    wait_until(lambda: len(worker.keyframes) == 2)
+    assert not wants(worker, at(0.02))
+    gate.set()
+    worker.close()
+
+
 def test_the_keyframes_that_a_reader_holds_do_not_change_under_it(mapper: Mapper) -> None:
     worker = MappingWorker(mapper)
     insert(worker, at(0.0))
