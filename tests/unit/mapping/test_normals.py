@@ -68,7 +68,7 @@ def test_smooth_normals_are_those_of_the_fit_to_all_pixels_and_none_at_a_step() 
     normal = unit(0.4, 0.1, 1)
     depth = plane(normal, 1.2)
     depth[:, CAMERA.width // 2 :] += 0.5
-    rows, columns = np.indices(depth.shape)
+    rows, columns = np.meshgrid(*map(np.arange, depth.shape), indexing="ij")
     found = smooth_normals(depth, CAMERA, rows, columns, 4)
     middle = CAMERA.width // 2
     np.testing.assert_allclose(found[:, 10 : middle - 4], np.broadcast_to(-normal, (120, middle - 14, 3)), atol=1e-4)
