@@ -22,7 +22,7 @@ from splatbot.rasterize.native import native
 from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame
 
-_NICENESS = 5  # of the thread: where cores are short, the tracker goes first
+_NICENESS = 10  # of the thread: where cores are short, the tracker goes first
 _CHUNK = 1  # refinement steps between two looks at what has arrived
 
 

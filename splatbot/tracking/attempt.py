@@ -22,7 +22,7 @@ from splatbot.tracking.wide import WideStage
 Array = NDArray[np.float64]
 Work = tuple[str, float]
 
-_FEWER = (1.0, 0.5, 0.25)  # shares of the keypoints, the largest that there is time for
+_FEWER = (1.0, 0.5, 0.25)  # shares of keypoints, and of steps of alignment: the largest that there is time for
 
 
 class Attempt:
@@ -61,13 +61,17 @@ class Attempt:
                 starts.append(self._start("features", matched.T_world_camera, start))
         if doubtful and matched is None and self.config.wide == "needed":
             starts += self._register(start)
-        candidates = [self._direct(begun, matched) for begun in starts if begun is start or self._fits_one_more()]
+        candidates: list[Candidate] = []
+        for begun in starts:
+            if begun is start or self._budget.fits(*self._to_judge(len(candidates) + 1)):
+                candidates.append(self._direct(begun, matched, len(candidates) + 1))
         found = self._judge(candidates)
         if matched is not None and not self._looked_anywhere and not is_explained(found.health):
             matched = self._match_anywhere(found.T_world_camera)
             if matched is not None:
                 begun = self._start("features", matched.T_world_camera, start)
-                found = self._judge([*candidates, self._direct(begun, matched)])
+                candidates.append(self._direct(begun, matched, len(candidates) + 1))
+                found = self._judge(candidates)
             elif not self._looked_anywhere:
                 found = found.doubted("another pose may explain the frame better: no time was left to look for it")
         return found
@@ -95,17 +99,26 @@ class Attempt:
             )
         return Candidate("geometric", found, views)
 
-    def _direct(self, start: Candidate, matched: FeaturePose | None) -> Candidate:
-        """Photometric, depth and feature residuals together, down to the finest level."""
-        if not self._budget.fits(*self._direct_work(matched), self._health_work):
-            self._budget.skip("direct")
+    def _direct(self, start: Candidate, matched: FeaturePose | None, judged: int) -> Candidate:
+        """Photometric, depth and feature residuals together, down to the finest level; in fewer steps if time is short.
+
+        Where the coarse levels alone have led is centimetres off at times; a step or two take out most of it. There
+        has to be time to judge so many candidates after it.
+        """
+        ends = self._to_judge(judged)
+        share = next((n for n in _FEWER if self._budget.fits(*self._direct_work(matched, n), *ends)), 0.0)
+        if share < 1:
+            self._budget.skip("direct" if share == 0 else "direct steps")
+        if share == 0:
             return start
-        with self._budget.run("direct", self._steps(0)):
+        iterations = max(1, round(share * self.config.iterations))
+        work, of_matches = self._direct_work(matched, iterations / self.config.iterations)
+        with self._budget.run(*work):
             found = align(
                 self._prepared.levels,
                 start.references,
                 start.T_world_camera,
-                self.config,
+                self.config.model_copy(update={"iterations": iterations}),
                 photometric=True,
                 finest=0,
                 gate=self.config.gate,
@@ -113,7 +126,7 @@ class Attempt:
                 camera=self._prepared.frame.camera,
             )
         if matched is not None:
-            self._budget.count("matches", self._direct_work(matched)[1][1])
+            self._budget.count(*of_matches)
         return Candidate(f"{start.stage}+direct", found, start.views)
 
     def _is_doubtful(self, start: Candidate, T_predicted: Array, T_before: Array) -> bool:
@@ -211,8 +224,8 @@ class Attempt:
     def _nearest(self, T_world_camera: Array) -> list[TrackedKeyframe]:
         return nearest(self._keyframes, T_world_camera, self.config.reference_keyframes)
 
-    def _fits_one_more(self) -> bool:
-        return self._budget.fits(*self._direct_work(None), self._health_work, self._health_work)
+    def _to_judge(self, candidates: int) -> list[Work]:
+        return [self._health_work] * candidates
 
     @property
     def _n_steps(self) -> int:
@@ -223,9 +236,10 @@ class Attempt:
         references = min(self.config.reference_keyframes, len(self._keyframes))
         return self.config.n_pixels * references * self.config.iterations * (len(self._prepared.levels) - finest)
 
-    def _direct_work(self, matched: FeaturePose | None) -> tuple[Work, Work]:
+    def _direct_work(self, matched: FeaturePose | None, share: float = 1.0) -> tuple[Work, Work]:
+        """Of the direct stage, with all its steps or a share of them."""
         matches = 0 if matched is None else len(matched.points)
-        return ("direct", self._steps(0)), ("matches", float(matches * self._n_steps))
+        return ("direct", share * self._steps(0)), ("matches", share * matches * self._n_steps)
 
     @property
     def _health_units(self) -> float:

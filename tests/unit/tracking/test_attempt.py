@@ -55,13 +55,16 @@ def astray(monkeypatch: pytest.MonkeyPatch) -> Astray:
     return run
 
 
-def leave_time_for(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For a share of all keyframes where features are looked for anywhere; for all other stages there is time."""
+def leave_time_for(share: float, monkeypatch: pytest.MonkeyPatch, of: str = "match all") -> None:
+    """For a share of the work that a stage asks for first (all of it); for all other stages there is time."""
     asked: list[float] = []
 
     def fits(budget: Budget, *work: tuple[str, float]) -> bool:
-        asked.extend(units for stage, units in work if stage == "match all")
-        return work[0][0] != "match all" or asked[-1] <= share * asked[0]
+        stage, units = work[0]
+        if stage != of:
+            return True
+        asked.append(units)
+        return units <= share * asked[0]
 
     monkeypatch.setattr(Budget, "fits", fits)
 
@@ -95,6 +98,27 @@ def test_a_pose_that_explains_little_is_doubted_when_there_is_no_time_to_look_fu
     assert result.skipped == ("features anywhere",)
     assert result.verdict != "ok"
     assert any("no time was left" in reason for reason in result.reasons)
+
+
+def test_with_little_time_the_direct_stage_takes_fewer_steps_which_is_better_than_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    apart = np.array([0.015, -0.006, 0.004, 0.006, 0.015, -0.006])  # from where the coarse levels led to
+    monkeypatch.setattr(attempt.Attempt, "_geometric", started_at(TRUE @ se3_exp(apart), attempt.Attempt._geometric))
+    errors, skipped = [], []
+    for share in 0.0, 0.25, 1.0:
+        slam = Slam(small_config(tracking__features="needed", tracking__wide="never"))
+        with monkeypatch.context() as patched:
+            leave_time_for(share, patched, of="direct")
+            slam.process(tabletop()[0][0])
+            result = slam.process(tabletop()[0][NEXT])
+        assert result.T_world_camera is not None
+        errors.append(pose_distance(TRUE, result.T_world_camera)[0])
+        skipped.append(result.skipped)
+    none, some, all_ = errors
+    assert skipped == [("direct",), ("direct steps",), ()]
+    assert all_ < 2e-3
+    assert some < 0.5 * none
 
 
 def started_at(T_world_camera: Any, geometric: Any) -> Any:
