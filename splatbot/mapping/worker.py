@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -24,6 +26,7 @@ from splatbot.tracking.prepare import PreparedFrame
 
 _NICENESS = 10  # of the thread: where cores are short, the tracker goes first
 _CHUNK = 1  # refinement steps between two looks at what has arrived
+_begun: WeakSet[MappingWorker] = WeakSet()
 
 
 class MappingWorker:
@@ -173,6 +176,7 @@ class MappingWorker:
         switch_quickly()  # the tracker waits for the interpreter while mapping holds it
         self._thread = threading.Thread(target=self._run, name="mapping", daemon=True)
         self._thread.start()
+        _begun.add(self)
 
     def _end(self) -> None:
         with self._news:
@@ -255,3 +259,10 @@ def _stand_back() -> None:
     native().keep_to_this_thread(True)
     torch.set_num_threads(1)
     stand_back(_NICENESS)
+
+
+@atexit.register
+def _end_all() -> None:
+    """End the threads that nobody has ended: the interpreter, once it is being taken down, would abort for one."""
+    for worker in list(_begun):
+        worker.close()

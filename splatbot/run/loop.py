@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -81,7 +82,7 @@ class FrameLoop:
                 self.progress("refining")
                 self.slam.finish(stop=lambda: interrupts.requested is not None)
         except KeyboardInterrupt:  # raised by a callback
-            interrupts.requested = interrupts.requested or 2
+            interrupts.requested = interrupts.requested or signal.SIGINT
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash
         finally:
@@ -89,17 +90,17 @@ class FrameLoop:
 
     def _all_frames(self, interrupts: Interrupts) -> bool:
         """Whether the log ended, rather than a signal or an unreadable frame ending the run."""
-        with closing(iter(self.source)) as arrivals:
-            while interrupts.requested is None:
-                try:
+        try:
+            with closing(iter(self.source)) as arrivals:
+                while interrupts.requested is None:
                     with interrupts.interruptible(after=1):  # a camera may be silent for long
                         arrival = next(arrivals, None)
-                except KeyboardInterrupt:
-                    return False
-                if arrival is None:
-                    return True
-                if not self._step(arrival):
-                    return False
+                    if arrival is None:
+                        return True
+                    if not self._step(arrival):
+                        return False
+        except KeyboardInterrupt:  # of a signal, or raised by a callback
+            interrupts.requested = interrupts.requested or signal.SIGINT
         return False
 
     def _step(self, arrival: Arrival) -> bool:

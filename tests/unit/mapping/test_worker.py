@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -308,3 +311,16 @@ def test_closing_a_loop_leaves_refinement_to_the_thread(mapper: Mapper, monkeypa
     wait_until(lambda: mapper.owed == 0)
     assert set(by) == {"mapping"}
     worker.close()
+
+
+def test_a_program_that_breaks_while_mapping_goes_on_ends_with_its_own_error() -> None:
+    program = """
+from splatbot.slam import Slam
+from tests.rgbd import small_config, tabletop
+Slam(small_config(mapping__threaded=True, mapping__refine_iterations=10**6)).process(tabletop()[0][0])
+raise RuntimeError("on purpose")
+"""
+    root = Path(__file__).parents[3]
+    ended = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, timeout=120)
+    assert ended.stderr.rstrip().endswith("RuntimeError: on purpose")
+    assert ended.returncode == 1

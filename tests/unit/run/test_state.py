@@ -86,6 +86,21 @@ def test_saving_does_not_change_the_run(whole: Path, tmp_path: Path) -> None:
     assert (tmp_path / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
 
 
+@pytest.mark.parametrize("rate", [None, 6.0])
+def test_a_run_that_a_callback_interrupts_is_saved(rate: float | None, tmp_path: Path) -> None:
+    def interrupt(progress: Progress) -> None:
+        if progress.phase == "mapping" and progress.done >= 5:
+            raise KeyboardInterrupt
+
+    log, run = open_log(LOG), tmp_path / "run"
+    result = map_log(log, out=run, config=small_config(), rate=rate, save_every=1e9, on_progress=interrupt)
+    assert result.metrics["interrupted"]
+    saved = SavedRun.load(run)
+    assert saved.place.next_index == len((run / "frames.jsonl").read_text().splitlines()) >= 5
+    resumed = map_log(log, out=run, resume=saved, max_frames=9)
+    assert resumed.metrics["frames"] + resumed.metrics["dropped"] == 9
+
+
 def test_images_are_written_once(tmp_path: Path) -> None:
     sizes: list[tuple[int, int]] = []
 
