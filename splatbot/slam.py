@@ -123,8 +123,9 @@ class Slam:
         return result
 
     def finish(self, stop: Stop = never) -> None:
-        """Spend the last refinement on the map once the stream has ended, or until ``stop`` says so."""
+        """Close the last loop and spend the last refinement once the stream has ended, or until ``stop`` says so."""
         if self._growing:
+            self._close_loops()
             self._mapper.finish(stop)
         else:
             self._mapper.close()
@@ -139,6 +140,8 @@ class Slam:
         """
         if not self._mapper.keyframes:
             raise InputError("the map has no keyframes.", field="map", hint="map a log first")
+        if self._growing:
+            self._close_loops()
         self._growing = False
         self._size = None
         self.results = []

@@ -75,11 +75,11 @@ class MappingWorker:
         return self._mapper.size
 
     def wants(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> bool:
-        """As :meth:`Mapper.wants`; False while too many observations wait."""
+        """As :meth:`Mapper.wants`; False while too many observations wait, or a loop waits for those that do."""
         self._raise_error()
-        with self._news:
-            to_come = [*self._waiting, *(observation for observation, _ in self._unfused)]
-        return len(to_come) < self._backlog and self._mapper.wants(prepared, T_world_camera, to_come)
+        to_come = self._to_come()
+        room = len(to_come) < self._backlog and not self._mapper.has_loop
+        return room and self._mapper.wants(prepared, T_world_camera, to_come)
 
     def insert(
         self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Callable[[], Features]
@@ -110,8 +110,8 @@ class MappingWorker:
 
     @property
     def has_loop(self) -> bool:
-        """As :meth:`Mapper.has_loop`."""
-        return self._mapper.has_loop
+        """As :meth:`Mapper.has_loop`; not while observations wait, for whoever closes it would wait for them."""
+        return self._mapper.has_loop and not self._to_come()
 
     def close_loops(self) -> dict[int, NDArray[np.float64]]:
         """As :meth:`Mapper.close_loops`, while paused; what is owed is left to the thread."""
@@ -156,6 +156,11 @@ class MappingWorker:
             with self._news:
                 self._paused = False
                 self._news.notify_all()
+
+    def _to_come(self) -> list[Observation]:
+        """What is not in the map yet."""
+        with self._news:
+            return [*self._waiting, *(observation for observation, _ in self._unfused)]
 
     def _may_pause(self) -> bool:
         drained = not (self._waiting or self._unfused) or self._error is not None

@@ -99,6 +99,32 @@ def test_a_keyframe_that_comes_before_a_loop_is_closed_moves_with_its_neighbour(
     worker.close()
 
 
+def test_a_loop_waits_for_the_keyframes_that_wait_and_no_frame_waits_for_either(
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may_fuse, fuse = threading.Event(), mapper.fuse
+
+    def slow(observation: Observation, keyframe: Keyframe) -> None:
+        assert may_fuse.wait(20)
+        fuse(observation, keyframe)
+
+    worker = MappingWorker(mapper)
+    for x in (0.0, 0.4):
+        insert(worker, at(x))
+    with worker.paused():
+        monkeypatch.setattr(mapper, "fuse", slow)
+        mapper.loops.correction = {0: np.eye(4), 1: at(0.1)}
+    insert(worker, at(0.8))
+    assert not worker.has_loop
+    assert not wants(worker, at(1.2))
+    may_fuse.set()
+    wait_until(lambda: worker.has_loop)
+    with worker.paused():
+        assert len(worker.close_loops()) == 3
+    assert wants(worker, at(1.2))
+    worker.close()
+
+
 def test_handing_over_does_not_wait_for_fusion(mapper: Mapper, monkeypatch: pytest.MonkeyPatch) -> None:
     gate = threading.Event()
     fuse = mapper.fuse
