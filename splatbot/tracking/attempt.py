@@ -74,6 +74,8 @@ class Attempt:
                 found = self._judge(candidates)
             elif not self._looked_anywhere:
                 found = found.doubted("another pose may explain the frame better: no time was left to look for it")
+        if not found.candidate.stage.endswith("+direct"):
+            found = found.doubted("aligned on coarse levels only: no time was left for the fine ones")
         return found
 
     def _judge(self, candidates: Sequence[Candidate]) -> Judged:
