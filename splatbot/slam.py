@@ -85,8 +85,8 @@ class Slam:
         """
         self._check_size(frame)
         start = time.perf_counter()
-        if self._growing and self._mapper.has_loop:
-            self._close_loops()
+        if self._mapper.has_loop:
+            self.close_loops()
         prepared = prepare(frame, self.config.tracking)
         prepared_at = time.perf_counter()
         estimate = self._track(prepared, hold_out)
@@ -125,7 +125,7 @@ class Slam:
     def finish(self, stop: Stop = never) -> None:
         """Close the last loop and spend the last refinement once the stream has ended, or until ``stop`` says so."""
         if self._growing:
-            self._close_loops()
+            self.close_loops()
             self._mapper.finish(stop)
         else:
             self._mapper.close()
@@ -140,12 +140,29 @@ class Slam:
         """
         if not self._mapper.keyframes:
             raise InputError("the map has no keyframes.", field="map", hint="map a log first")
-        if self._growing:
-            self._close_loops()
+        self.close_loops()
         self._growing = False
         self._size = None
         self.results = []
         self._tracker.forget()
+
+    def close_loops(self) -> None:
+        """Move the map's pieces where the loops want them, and with them the poses found so far and the tracker.
+
+        Frames that are processed do so; it is for the end of a stream that is not to be finished.
+        """
+        if not self._growing:
+            return
+        with self._mapper.paused():
+            correction = self._mapper.close_loops()
+        number, moved = -1, []
+        for result in self.results:
+            number += result.keyframe
+            T, known = result.T_world_camera, correction.get(number)
+            moved.append(result if T is None or known is None else replace(result, T_world_camera=known @ T))
+        self.results = moved
+        if number in correction:
+            self._tracker.move(correction[number])
 
     def close(self) -> None:
         """End the mapping thread, if there is one, once what has been handed to it is in the map."""
@@ -206,19 +223,6 @@ class Slam:
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
-
-    def _close_loops(self) -> None:
-        """Move the map's pieces where the loops want them, and with them the poses found so far and the tracker."""
-        with self._mapper.paused():
-            correction = self._mapper.close_loops()
-        number, moved = -1, []
-        for result in self.results:
-            number += result.keyframe
-            T, known = result.T_world_camera, correction.get(number)
-            moved.append(result if T is None or known is None else replace(result, T_world_camera=known @ T))
-        self.results = moved
-        if number in correction:
-            self._tracker.move(correction[number])
 
     def _looks(self, stamp: float) -> bool:
         """Whether it is time to look at a frame that is no keyframe."""

@@ -45,6 +45,14 @@ class Interrupts:
         finally:
             self._raises_after = None
 
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """A block that KeyboardInterrupt ends as well, whoever raised it, and which makes a request of it."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.requested = self.requested or signal.SIGINT
+
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1
         self.requested = self.requested or number

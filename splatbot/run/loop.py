@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -73,34 +72,39 @@ class FrameLoop:
 
     def run(self, interrupts: Interrupts) -> None:
         """Process the frames until they end, ``error``, ``crash`` or a signal; raises nothing."""
+        through = False
         try:
-            through = self._all_frames(interrupts)
+            with interrupts.noted():
+                through = self._all_frames(interrupts)
             if self.saver is not None:
-                self.progress("saving")
+                with interrupts.noted():
+                    self.progress("saving")
                 self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
             if through:
-                self.progress("refining")
+                with interrupts.noted():
+                    self.progress("refining")
                 self.slam.finish(stop=lambda: interrupts.requested is not None)
-        except KeyboardInterrupt:  # raised by a callback
-            interrupts.requested = interrupts.requested or signal.SIGINT
+            else:
+                self.slam.close_loops()
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash
         finally:
             self.slam.close()
 
     def _all_frames(self, interrupts: Interrupts) -> bool:
-        """Whether the log ended, rather than a signal or an unreadable frame ending the run."""
-        try:
-            with closing(iter(self.source)) as arrivals:
-                while interrupts.requested is None:
-                    with interrupts.interruptible(after=1):  # a camera may be silent for long
-                        arrival = next(arrivals, None)
-                    if arrival is None:
-                        return True
-                    if not self._step(arrival):
-                        return False
-        except KeyboardInterrupt:  # of a signal, or raised by a callback
-            interrupts.requested = interrupts.requested or signal.SIGINT
+        """Whether the log ended, rather than a signal or an unreadable frame ending the run.
+
+        Raises:
+            KeyboardInterrupt: of a signal while a frame is waited for, or of a callback.
+        """
+        with closing(iter(self.source)) as arrivals:
+            while interrupts.requested is None:
+                with interrupts.interruptible(after=1):  # a camera may be silent for long
+                    arrival = next(arrivals, None)
+                if arrival is None:
+                    return True
+                if not self._step(arrival):
+                    return False
         return False
 
     def _step(self, arrival: Arrival) -> bool:
@@ -121,9 +125,9 @@ class FrameLoop:
             return True
         self.keyframes += result.keyframe
         self.lost += result.verdict == "lost"
-        self.progress("mapping", done=index + 1, result=result)
         if self.saver is not None:
             self.saver.processed(self, arrival.frame, index)
+        self.progress("mapping", done=index + 1, result=result)
         return True
 
     def _process(self, frame: Frame, index: int) -> FrameResult:

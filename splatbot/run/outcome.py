@@ -45,7 +45,8 @@ class Outcome:
 
     def save(self, folder: RunFolder) -> None:
         """Save first; then score and report, unless a signal beside the one that ended the mapping cuts that short."""
-        self.loop.progress("saving")
+        with self.interrupts.noted():
+            self.loop.progress("saving")
         self.save_files(folder)
         mapping_cut = self.interrupts.requested is not None
         try:

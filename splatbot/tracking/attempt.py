@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Work = tuple[str, float]
 
 _FEWER = (1.0, 0.5, 0.25)  # shares of keypoints, and of steps of alignment: the largest that there is time for
+_BEFORE_STEPS = 3  # what an alignment costs beside its steps, in steps
 
 
 class Attempt:
@@ -63,17 +64,19 @@ class Attempt:
             starts += self._register(start)
         candidates: list[Candidate] = []
         for begun in starts:
-            if begun is start or self._budget.fits(*self._to_judge(len(candidates) + 1)):
-                candidates.append(self._direct(begun, matched, len(candidates) + 1))
+            steps = self._steps_in_time(matched, len(candidates) + 1)
+            if begun is start or steps:
+                candidates.append(self._direct(begun, matched, steps))
         found = self._judge(candidates)
         if matched is not None and not self._looked_anywhere and not is_explained(found.health):
             matched = self._match_anywhere(found.T_world_camera)
-            if matched is not None:
+            steps = self._steps_in_time(matched, len(candidates) + 1)
+            if matched is not None and steps:
                 begun = self._start("features", matched.T_world_camera, start)
-                candidates.append(self._direct(begun, matched, len(candidates) + 1))
+                candidates.append(self._direct(begun, matched, steps))
                 found = self._judge(candidates)
-            elif not self._looked_anywhere:
-                found = found.doubted("another pose may explain the frame better: no time was left to look for it")
+            elif matched is not None or not self._looked_anywhere:
+                found = found.doubted("another pose may explain the frame better: no time was left for it")
         if not found.candidate.stage.endswith("+direct"):
             found = found.doubted("aligned on coarse levels only: no time was left for the fine ones")
         return found
@@ -101,21 +104,17 @@ class Attempt:
             )
         return Candidate("geometric", found, views)
 
-    def _direct(self, start: Candidate, matched: FeaturePose | None, judged: int) -> Candidate:
-        """Photometric, depth and feature residuals together, down to the finest level; in fewer steps if time is short.
+    def _direct(self, start: Candidate, matched: FeaturePose | None, iterations: int) -> Candidate:
+        """Photometric, depth and feature residuals together, down to the finest level, in so many steps on each.
 
-        Where the coarse levels alone have led is centimetres off at times; a step or two take out most of it. There
-        has to be time to judge so many candidates after it.
+        Where the coarse levels alone have led is centimetres off at times; a step or two take out most of it.
         """
-        ends = self._to_judge(judged)
-        share = next((n for n in _FEWER if self._budget.fits(*self._direct_work(matched, n), *ends)), 0.0)
-        if share < 1:
-            self._budget.skip("direct" if share == 0 else "direct steps")
-        if share == 0:
+        if iterations < self.config.iterations:
+            self._budget.skip("direct steps" if iterations else "direct")
+        if not iterations:
             return start
-        iterations = max(1, round(share * self.config.iterations))
-        work, of_matches = self._direct_work(matched, iterations / self.config.iterations)
-        with self._budget.run(*work):
+        work, of_matches = self._direct_work(matched, iterations)
+        with self._budget.run(*work, under="direct"):
             found = align(
                 self._prepared.levels,
                 start.references,
@@ -130,6 +129,15 @@ class Attempt:
         if matched is not None:
             self._budget.count(*of_matches)
         return Candidate(f"{start.stage}+direct", found, start.views)
+
+    def _steps_in_time(self, matched: FeaturePose | None, judged: int) -> int:
+        """Of direct alignment on each level: all, fewer or none, with time to judge so many candidates after it."""
+        ends = [self._health_work] * judged
+        for share in _FEWER:
+            iterations = max(1, round(share * self.config.iterations))
+            if self._budget.fits(*self._direct_work(matched, iterations), *ends):
+                return iterations
+        return 0
 
     def _is_doubtful(self, start: Candidate, T_predicted: Array, T_before: Array) -> bool:
         """Whether the geometric stage may have been led astray: lost, fast, or not explained by where it led."""
@@ -226,9 +234,6 @@ class Attempt:
     def _nearest(self, T_world_camera: Array) -> list[TrackedKeyframe]:
         return nearest(self._keyframes, T_world_camera, self.config.reference_keyframes)
 
-    def _to_judge(self, candidates: int) -> list[Work]:
-        return [self._health_work] * candidates
-
     @property
     def _n_steps(self) -> int:
         return self.config.iterations * len(self._prepared.levels)
@@ -238,10 +243,15 @@ class Attempt:
         references = min(self.config.reference_keyframes, len(self._keyframes))
         return self.config.n_pixels * references * self.config.iterations * (len(self._prepared.levels) - finest)
 
-    def _direct_work(self, matched: FeaturePose | None, share: float = 1.0) -> tuple[Work, Work]:
-        """Of the direct stage, with all its steps or a share of them."""
-        matches = 0 if matched is None else len(matched.points)
-        return ("direct", share * self._steps(0)), ("matches", share * matches * self._n_steps)
+    def _direct_work(self, matched: FeaturePose | None, iterations: int | None = None) -> tuple[Work, Work]:
+        """Of the direct stage, with all its steps or so many on each level."""
+        whole = self.config.iterations
+        steps = whole if iterations is None else iterations
+        matches = 0 if matched is None else len(matched.points) * self._n_steps * steps / whole
+        if steps == whole:
+            return ("direct", self._steps(0)), ("matches", matches)
+        share = (_BEFORE_STEPS + steps) / (_BEFORE_STEPS + whole)
+        return ("direct steps", share * self._steps(0)), ("matches", matches)
 
     @property
     def _health_units(self) -> float:

@@ -18,6 +18,7 @@ _TABLE: dict[str, tuple[float, float]] = {
     "prepare": (0.2, 5.0e-6),  # pixels of the frame
     "geometric": (0.1, 1.0e-5),  # points, times references, levels and steps
     "direct": (0.1, 1.5e-5),  # points, times references, levels and steps
+    "direct steps": (0.1, 1.5e-5),  # the same in fewer steps, which costs more than their share
     "matches": (0.0, 2.5e-5),  # matched features, times levels and steps
     "health": (0.1, 6.0e-5),  # points, times references
     "detect": (4.1, 3.6e-3),  # keypoints

@@ -36,6 +36,7 @@ class OracleSlam(Slam):
         self.results: list[FrameResult] = []
         self.seen: list[tuple[int, bool]] = []
         self.finished = False
+        self.loops_closed = False
         self._reference, self._lost, self._degraded, self._crash_at = reference, lost, degraded, crash_at
         self._points: list[NDArray[np.float64]] = []
         self._colors: list[NDArray[np.float64]] = []
@@ -87,6 +88,10 @@ class OracleSlam(Slam):
     def finish(self, stop: Stop = never) -> None:
         """Nothing to refine."""
         self.finished = True
+
+    def close_loops(self) -> None:
+        """That it has been asked to."""
+        self.loops_closed = True
 
     def close(self) -> None:
         """No thread to end."""

@@ -190,8 +190,11 @@ def test_a_damaged_reference_is_found_before_the_run_not_after(make_log: MakeLog
 
 def test_ctrl_c_finishes_the_frame_and_saves_a_whole_run(log: Log, tmp_path: Path) -> None:
     handler = signal.getsignal(signal.SIGINT)
-    result = map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=interrupt_at(10))
+    slam = oracle(log)
+    result = map_log(log, out=tmp_path / "run", slam=slam, on_progress=interrupt_at(10))
     assert result.exit_code == 130
+    assert slam.loops_closed
+    assert not slam.finished
     assert {p.name for p in (tmp_path / "run").iterdir()} == FILES
     metrics = read(tmp_path / "run")
     assert metrics["interrupted"] is True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -158,12 +158,13 @@ def test_a_circuit_that_drifts_closes_without_a_gap() -> None:
     assert gap(closed, truth) < 0.6 * gap(open_, truth)
 
 
-def test_a_loop_that_the_last_frame_has_found_is_closed_at_the_end() -> None:
+@pytest.mark.parametrize("end", [Slam.finish, Slam.close_loops])
+def test_a_loop_that_the_last_frame_has_found_is_closed_at_the_end(end: Callable[[Slam], None]) -> None:
     frames, truth = through_a_wrong_lens()
     slam = drifting_slam(True)
     closed = next(frame.index for frame in frames if slam.process(frame) and slam.loop_counts["closed"])
     before = gap(slam, truth, closed)
-    slam.finish()
+    end(slam)
     assert before > 0.08
     assert gap(slam, truth, closed) < 0.6 * before
 

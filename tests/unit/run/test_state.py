@@ -87,16 +87,19 @@ def test_saving_does_not_change_the_run(whole: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rate", [None, 6.0])
-def test_a_run_that_a_callback_interrupts_is_saved(rate: float | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("after", "always"), [(1, False), (5, False), (5, True)])
+def test_a_run_that_a_callback_interrupts_is_saved(
+    rate: float | None, after: int, always: bool, tmp_path: Path
+) -> None:
     def interrupt(progress: Progress) -> None:
-        if progress.phase == "mapping" and progress.done >= 5:
+        if progress.done >= after and (always or progress.phase == "mapping"):
             raise KeyboardInterrupt
 
     log, run = open_log(LOG), tmp_path / "run"
     result = map_log(log, out=run, config=small_config(), rate=rate, save_every=1e9, on_progress=interrupt)
     assert result.metrics["interrupted"]
     saved = SavedRun.load(run)
-    assert saved.place.next_index == len((run / "frames.jsonl").read_text().splitlines()) >= 5
+    assert saved.place.next_index == len((run / "frames.jsonl").read_text().splitlines()) >= after
     resumed = map_log(log, out=run, resume=saved, max_frames=9)
     assert resumed.metrics["frames"] + resumed.metrics["dropped"] == 9
 
