@@ -65,20 +65,20 @@ class Attempt:
         candidates: list[Candidate] = []
         for begun in starts:
             steps = self._steps_in_time(matched, len(candidates) + 1)
-            if begun is start or steps:
+            if begun is start or steps or self._budget.fits(*[self._health_work] * (len(candidates) + 1)):
                 candidates.append(self._direct(begun, matched, steps))
         found = self._judge(candidates)
         if matched is not None and not self._looked_anywhere and not is_explained(found.health):
             matched = self._match_anywhere(found.T_world_camera)
-            steps = self._steps_in_time(matched, len(candidates) + 1)
-            if matched is not None and steps:
+            if matched is not None:
                 begun = self._start("features", matched.T_world_camera, start)
+                steps = self._steps_in_time(matched, len(candidates) + 1)
                 candidates.append(self._direct(begun, matched, steps))
                 found = self._judge(candidates)
-            elif matched is not None or not self._looked_anywhere:
+            elif not self._looked_anywhere:
                 found = found.doubted("another pose may explain the frame better: no time was left for it")
         if not found.candidate.stage.endswith("+direct"):
-            found = found.doubted("aligned on coarse levels only: no time was left for the fine ones")
+            found = found.doubted("not aligned on fine levels: no time was left for them")
         return found
 
     def _judge(self, candidates: Sequence[Candidate]) -> Judged:
