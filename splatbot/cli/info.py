@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from splatbot.logs import Log
 
 _N_SAMPLES = 10  # frames that are decoded to describe a log
+_MUCH = 0.004  # of the width: sensors widen near things by less
 
 
 def info(
@@ -22,7 +23,8 @@ def info(
 ) -> int:
     """Say what is in a map, a log or a run.
 
-    A log's depth is described from ten frames spread over it.
+    A log's depth is described from ten frames spread over it. Its shift tells whether it is registered: by how many
+    pixels right and down its edges would have to move to lie on those of colour.
 
     Examples:
         splatbot info recordings/desk
@@ -125,13 +127,14 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
     """
     import numpy as np
 
+    from splatbot.evaluation import depth_offset
     from splatbot.results.units import NONE, metres, percent
 
     n = len(log)
     picks = sorted({round(i) for i in np.linspace(0, n - 1, min(n, _N_SAMPLES))})
-    frames = [(frame.stamp, frame.depth) for frame in (log[i] for i in picks)]
-    duration = frames[-1][0] - frames[0][0]
-    depths = np.concatenate([depth[depth > 0] for _, depth in frames])
+    frames = [log[i] for i in picks]
+    duration = frames[-1].stamp - frames[0].stamp
+    depths = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     near, middle, far = (float(v) for v in np.percentile(depths, (2, 50, 98))) if depths.size else (None,) * 3
     c, truth = log.camera, log.ground_truth
     length = float(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).sum()) if truth is not None else None
@@ -142,7 +145,16 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
         ("image", f"{c.width}x{c.height}"),
         ("fx, fy, cx, cy", f"{c.fx:.2f}, {c.fy:.2f}, {c.cx:.2f}, {c.cy:.2f}"),
         ("depth p2, p50, p98", f"{metres(near)}, {metres(middle)}, {metres(far)}"),
-        ("valid depth", percent(depths.size / sum(depth.size for _, depth in frames))),
+        ("valid depth", percent(depths.size / sum(frame.depth.size for frame in frames))),
+        ("shift of depth onto colour", shift_text(depth_offset(frames), c.width)),
         ("reference poses", f"{len(truth)}, path {metres(length)}" if truth is not None else "none"),
         *(("simulated effect", f"{effect['name']} ({effect['why']})") for effect in log.effects),
     ]
+
+
+def shift_text(shift: tuple[int, int] | None, width: int) -> str:
+    """How well depth is registered to colour ``width`` [px] wide, in words; None: not known."""
+    if shift is None:
+        return "not known: few edges, or none that depth and colour share clearly"
+    text = f"{shift[0]}, {shift[1]} px"
+    return f"{text}: not well registered" if max(map(abs, shift)) > _MUCH * width else text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ import numpy as np
 import pytest
 
 from splatbot.cli import checks
+from splatbot.evaluation import depth_offset
+from splatbot.logs import open_log
+from splatbot.logs.record import record
 from splatbot.trajectory import Trajectory
 from tests.unit.cli.conftest import RunCommand
 
@@ -134,6 +138,16 @@ def test_info_describes_a_log(run: RunCommand, log_folder: Path) -> None:
     assert "64x48" in lines["image"]
     assert "16, path 15.00 cm" in lines["reference poses"]
     assert "99 %" in lines["valid depth"]  # 16 of 3072 pixels are a hole
+    assert "not known" in lines["shift of depth onto colour"]
+
+
+def test_info_tells_by_how_much_depth_lies_off_its_colour(run: RunCommand, tmp_path: Path) -> None:
+    log = open_log("synthetic:room?frames=4")
+    assert "0, 0 px" in run("info", "synthetic:room?frames=4").out
+    off = [replace(frame, depth=np.roll(frame.depth, (-5, 4), (0, 1))) for frame in log]
+    assert depth_offset(off) == (-4, 5)
+    record(off, tmp_path / "off")
+    assert "-4, 5 px: not well registered" in run("info", tmp_path / "off").out
 
 
 def test_info_describes_a_map_and_a_run_by_its_map(run: RunCommand, run_folder: Path) -> None:
