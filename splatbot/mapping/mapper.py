@@ -31,7 +31,7 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
 from splatbot.tracking.reference import Reference, make_reference
 
-_FAST, _SLOW = 2.0, 0.2  # learning rates of the last steps begin and end at so many times the usual
+_FAST, _SLOW = 1.5, 0.15  # learning rates of the last steps begin and end at so many times the usual
 _BEFORE = 3  # of the last steps, the share of one in so many goes before densifying: it tells where
 _REVEALED = 0.03  # share of a frame that the map has nothing of, from which on the frame is wanted
 
