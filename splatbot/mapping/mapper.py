@@ -31,7 +31,6 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
 from splatbot.tracking.reference import Reference, make_reference
 
-_FAST, _SLOW = 1.5, 0.15  # learning rates of the last steps begin and end at so many times the usual
 _BEFORE = 3  # of the last steps, the share of one in so many goes before densifying: it tells where
 _REVEALED = 0.03  # share of a frame that the map has nothing of, from which on the frame is wanted
 
@@ -162,14 +161,10 @@ class Mapper:
         """
         self.refine(self.owed, stop)
         steps, pull = self.config.mapping.final_iterations, Pull(len(self.model))
-        self._refiner.refine_all(
-            self.model, self.keyframes, steps // _BEFORE, rates=(_FAST, _FAST), pull=pull, stop=stop
-        )
+        self._refiner.refine_all(self.model, self.keyframes, steps // _BEFORE, pull, stop)
         if not stop():
             self._densify(pull)
-            self._refiner.refine_all(
-                self.model, self.keyframes, steps - steps // _BEFORE, rates=(_FAST, _SLOW), stop=stop
-            )
+            self._refiner.refine_all(self.model, self.keyframes, steps - steps // _BEFORE, stop=stop)
         self._prune()
         self._version += 1
 

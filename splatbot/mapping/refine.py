@@ -73,38 +73,30 @@ class Refiner:
         model: GaussianModel,
         keyframes: Sequence[Keyframe],
         iterations: int,
-        *,
-        rates: tuple[float, float],
         pull: Pull | None = None,
         stop: Stop = never,
     ) -> None:
-        """Spend ``iterations`` steps on all keyframes alike: each in turn, in a random order, then all again.
-
-        Learning rates go from the first to the second of ``rates`` times the usual; ``pull`` gathers how hard the steps
-        pull at the centres.
-        """
-        turns: list[int] = []
-        for rate in takewhile(lambda _: not stop(), np.linspace(*rates, iterations if len(model) and keyframes else 0)):
-            turns = turns or self._random.permutation(len(keyframes)).tolist()
-            self.step(model, keyframes[turns.pop()], pull, float(rate))
+        """Spend ``iterations`` steps on all keyframes alike; ``pull`` gathers how hard they pull at the centres."""
+        for _ in takewhile(lambda _: not stop(), range(iterations if len(model) else 0)):
+            self.step(model, keyframes[int(self._random.integers(len(keyframes)))], pull)
 
     def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
         pool = keyframes[-self.config.window :] if self._random.random() < 0.5 else keyframes
         return pool[int(self._random.integers(len(pool)))]
 
-    def step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None = None, rate: float = 1.0) -> float:
-        """One step on one keyframe, at ``rate`` times the usual learning rates; returns the loss before it.
+    def step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None = None) -> float:
+        """One step on one keyframe; returns the loss before it.
 
         Torch's threads spin after each operation and so starve the rasterizer's; one is several times faster here.
         """
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            return self._step(model, keyframe, pull, rate)
+            return self._step(model, keyframe, pull)
         finally:
             torch.set_num_threads(threads)
 
-    def _step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None, rate: float) -> float:
+    def _step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None) -> float:
         parameters = {name: getattr(model, name).detach().requires_grad_(True) for name in PARAMETERS}
         renders, alphas, meta = rasterization(
             parameters["means"],
@@ -128,7 +120,7 @@ class Refiner:
         visible = torch.zeros(len(model), dtype=torch.bool)
         visible[rows] = True
         means, normals = model.means.index_select(0, rows), shortest_axes(model, rows)
-        self.adam.step(model, dict(zip(PARAMETERS, grads[: len(PARAMETERS)], strict=True)), visible, rate)
+        self.adam.step(model, dict(zip(PARAMETERS, grads[: len(PARAMETERS)], strict=True)), visible)
         self._keep_on_surface(model, rows, means, normals)
         self._keep_flat(model, keyframe, rows)
         return float(loss.detach())

@@ -57,10 +57,8 @@ class GaussianAdam:
         self.steps, self.first, self.second = state[0], dict(state[1]), dict(state[2])
 
     @torch.no_grad()
-    def step(self, model: GaussianModel, grads: Mapping[str, Tensor], visible: Tensor, rate: float = 1.0) -> None:
+    def step(self, model: GaussianModel, grads: Mapping[str, Tensor], visible: Tensor) -> None:
         """One step in place, of the rows that ``visible`` (N,) marks; the others keep their bits.
-
-        ``rate`` times the learning rates are taken.
 
         Raises:
             InputError: ``visible`` or a gradient does not fit the model, or rows came without :meth:`extend`.
@@ -76,7 +74,7 @@ class GaussianAdam:
             self.second,
             self.steps,
             visible,
-            {name: rate * usual for name, usual in self.rates.items()},
+            self.rates,
             betas=self.betas,
             eps=self.eps,
         )

@@ -100,38 +100,9 @@ def test_an_empty_map_is_left_alone(make_keyframe: MakeKeyframe) -> None:
     model = GaussianModel.empty()
     refiner = refiner_for(model)
     refiner.refine(model, [make_keyframe()], 5)
-    refiner.refine_all(model, [make_keyframe()], 5, rates=(1.0, 1.0))
-    refiner.refine_all(model, [], 5, rates=(1.0, 1.0))
+    refiner.refine_all(model, [make_keyframe()], 5)
+    refiner.refine_all(model, [], 5)
     assert len(model) == 0
-
-
-def test_without_keyframes_the_map_is_left_alone(make_keyframe: MakeKeyframe) -> None:
-    model = disturbed(make_keyframe())
-    before = snapshot(model)
-    refiner_for(model).refine_all(model, [], 5, rates=(1.0, 1.0))
-    for name in PARAMETERS:
-        assert torch.equal(getattr(model, name), before[name])
-
-
-def test_at_the_end_all_keyframes_take_turns_and_rates_go_from_the_one_to_the_other(
-    make_keyframe: MakeKeyframe, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    keyframes = [make_keyframe() for _ in range(7)]
-    refiner = refiner_for(disturbed(keyframes[0]))
-    turns: list[int] = []
-    rates: list[float] = []
-
-    def step(model: GaussianModel, keyframe: Keyframe, pull: object, rate: float) -> None:
-        turns.append(next(i for i, other in enumerate(keyframes) if other is keyframe))
-        rates.append(rate)
-
-    monkeypatch.setattr(refiner, "step", step)
-    refiner.refine_all(disturbed(keyframes[0]), keyframes, 31, rates=(2.0, 0.5))
-    rounds = [turns[i : i + 7] for i in range(0, 31, 7)]
-    assert all(sorted(one) == list(range(7)) for one in rounds[:-1])
-    assert len(set(rounds[-1])) == 3
-    assert len({tuple(one) for one in rounds[:-1]}) > 1  # not always in the same order
-    assert rates == pytest.approx(2.0 - 0.05 * np.arange(31))
 
 
 def test_a_keyframe_without_depth_refines_colour_and_stays_finite(make_keyframe: MakeKeyframe) -> None:

@@ -127,23 +127,6 @@ def test_the_first_step_is_the_rate_whatever_the_size_of_the_gradient(rng: np.ra
         torch.testing.assert_close(moved, torch.full_like(moved, rate), rtol=1e-3, atol=1e-6)
 
 
-def test_a_rate_scales_the_step_and_leaves_the_moments_as_they_would_be(rng: np.random.Generator) -> None:
-    usual = model_of(5, rng)
-    start, faster, grads, visible = usual.clone(), usual.clone(), gradients(usual, rng), torch.ones(5, dtype=torch.bool)
-    one, other = GaussianAdam(RATES), GaussianAdam(RATES)
-    one.extend(usual)
-    other.extend(faster)
-    one.step(usual, grads, visible)
-    other.step(faster, grads, visible, 3.0)
-    for name in PARAMETERS:
-        before = getattr(start, name)
-        torch.testing.assert_close(
-            getattr(faster, name) - before, 3 * (getattr(usual, name) - before), atol=1e-6, rtol=1e-3
-        )
-        assert torch.equal(one.first[name], other.first[name])
-        assert torch.equal(one.second[name], other.second[name])
-
-
 @pytest.mark.parametrize("size", [0.0, 1e-30])
 def test_gradients_of_zero_or_next_to_it_move_nothing(size: float, rng: np.random.Generator) -> None:
     model, adam, _ = started(4, rng)
