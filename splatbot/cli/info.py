@@ -155,6 +155,6 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
 def shift_text(shift: tuple[int, int] | None, width: int) -> str:
     """How well depth is registered to colour ``width`` [px] wide, in words; None: not known."""
     if shift is None:
-        return "not known: few edges, or none that depth and colour share clearly"
+        return "not known: few frames or edges, or none that depth and colour share clearly"
     text = f"{shift[0]}, {shift[1]} px"
     return f"{text}: not well registered" if max(map(abs, shift)) > _MUCH * width else text

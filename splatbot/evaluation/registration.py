@@ -15,6 +15,7 @@ _JUMP = 0.06  # share of its depth by which what is behind an edge is farther
 _STRONG = 8.0  # [grey value/px]: stronger edges of grey count alike, or a few would decide
 _NEAR = 0.4  # of the range: what is as near to the highest peak belongs to it
 _LEAST_EDGES = 500  # [px] of all frames
+_AGREE = 2  # [px] between what all frames find and what every second one does
 _CLEAR = 1.25  # times any other offset; textures that repeat, and depth without edges in its colour, give no such peak
 
 
@@ -26,21 +27,32 @@ def depth_offset(frames: Iterable[Frame]) -> tuple[int, int] | None:
     camera matrix or an extrinsic that is off; sensors widen near things by a pixel or two.
 
     Returns:
-        None where it can not be told: few edges, or no offset is clearly better than all others.
+        None where it can not be told: few edges, no offset clearly better than all others, or every second frame
+        finds another than the rest.
     """
-    total, edges, reach = None, 0, 0
-    for frame in frames:
-        reach = reach or max(2, round(_RANGE * frame.camera.width))
+    reach, edges, halves = 0, 0, [np.zeros(0), np.zeros(0)]
+    for k, frame in enumerate(frames):
+        reach = reach or _reach(frame)
         near = _near_sides(frame, reach)
         edges += int(near.sum())
         part = _correlation(near, _steepness(frame.rgb), reach)
-        total = part if total is None else total + part
-    if total is None or edges < _LEAST_EDGES:
+        halves[k % 2] = halves[k % 2] + part if k > 1 else part
+    if edges < _LEAST_EDGES or not halves[1].size:
         return None
-    v, u = (int(i) for i in np.unravel_index(total.argmax(), total.shape))
+    total = halves[0] + halves[1]
+    peak, first, second = (np.array(np.unravel_index(values.argmax(), values.shape)) for values in (total, *halves))
+    if np.abs([first - peak, second - peak]).max() > _AGREE:
+        return None
     rows, columns = np.indices(total.shape)
-    others = total[np.hypot(rows - v, columns - u) > _NEAR * reach]
-    return (u - reach, v - reach) if total[v, u] > _CLEAR * max(float(others.max()), 0.0) else None
+    others = total[np.hypot(rows - peak[0], columns - peak[1]) > _NEAR * reach]
+    v, u = (peak - reach).tolist()
+    return (u, v) if total.max() > _CLEAR * max(float(others.max()), 0.0) else None
+
+
+def _reach(frame: Frame) -> int:
+    """How far is searched [px]; no farther than the image is, however low."""
+    height, width = frame.depth.shape
+    return min(max(2, round(_RANGE * width)), (min(height, width) - 1) // 2)
 
 
 def _near_sides(frame: Frame, margin: int) -> NDArray[np.bool_]:

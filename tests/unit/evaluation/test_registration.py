@@ -13,12 +13,12 @@ SIZE = (240, 320)
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, SIZE[1], SIZE[0])
 
 
-def frame(shift: tuple[int, int] = (0, 0), *, textured: bool = True, steps: bool = True) -> Frame:
+def frame(shift: tuple[int, int] = (0, 0), *, things: int = 12, textured: bool = True, steps: bool = True) -> Frame:
     """Things of one grey before a darker wall, 1 and 2 m away; depth lies ``shift`` (u, v) off its colour."""
     rng = np.random.default_rng(0)
     gray = np.full(SIZE, 60, np.uint8)
     depth = np.full(SIZE, 2.0, np.float32)
-    for _ in range(12):
+    for _ in range(things):
         v, u, size = rng.integers(20, 190), rng.integers(20, 270), rng.integers(15, 40)
         thing = np.s_[v : v + size, u : u + size]
         gray[thing] = rng.integers(90, 220) if textured else 60
@@ -29,38 +29,53 @@ def frame(shift: tuple[int, int] = (0, 0), *, textured: bool = True, steps: bool
 
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2), (-5, 4), (0, 6)])
 def test_a_shift_of_depth_is_found_and_taken_back_by_the_answer(shift: tuple[int, int]) -> None:
-    u, v = depth_offset([frame(shift)]) or (99, 99)
+    u, v = depth_offset([frame(shift)] * 2) or (99, 99)
     # The near side of an edge is a pixel inside the thing: grey is steepest on both sides of it alike.
     assert abs(u + shift[0]) <= 1
     assert abs(v + shift[1]) <= 1
 
 
-def test_frames_are_judged_together() -> None:
-    assert depth_offset([frame((4, 0))] * 3) == depth_offset([frame((4, 0))])
+def test_frames_that_tell_too_little_each_tell_it_together() -> None:
+    sparse = frame((4, 0), things=2)
+    assert depth_offset([sparse] * 2) is None
+    u, v = depth_offset([sparse] * 6) or (99, 99)
+    assert abs(u + 4) <= 1
+    assert abs(v) <= 1
 
 
 def test_without_steps_in_depth_nothing_is_said() -> None:
-    assert depth_offset([frame(steps=False)]) is None
+    assert depth_offset([frame(steps=False)] * 2) is None
 
 
 def test_without_edges_in_colour_nothing_is_said() -> None:
-    assert depth_offset([frame(textured=False)]) is None
+    assert depth_offset([frame(textured=False)] * 2) is None
 
 
 def test_a_pattern_that_repeats_has_no_clear_offset() -> None:
     columns = np.arange(SIZE[1]) // 2 % 2
     gray = np.broadcast_to((60 + 120 * columns).astype(np.uint8), SIZE)
-    stripes = frame()
-    assert depth_offset([Frame(0.0, np.repeat(gray[..., None], 3, 2), stripes.depth, CAMERA)]) is None
+    striped = Frame(0.0, np.repeat(gray[..., None], 3, 2), frame().depth, CAMERA)
+    assert depth_offset([striped] * 2) is None
 
 
 def test_what_a_mask_leaves_out_has_no_edges() -> None:
     whole = frame((3, 0))
     masked = Frame(0.0, whole.rgb, whole.depth, CAMERA, mask=np.zeros(SIZE, bool))
-    assert depth_offset([masked]) is None
+    assert depth_offset([masked] * 2) is None
 
 
-def test_no_frames_and_frames_too_small_to_search_say_nothing() -> None:
-    small = Frame(0.0, np.zeros((4, 5, 3), np.uint8), np.ones((4, 5), np.float32), Camera(5, 5, 2, 1.5, 5, 4))
+def test_frames_that_contradict_each_other_say_nothing() -> None:
+    assert depth_offset([frame((4, 0)), frame((4, 0))]) is not None
+    assert depth_offset([frame((4, 0)), frame((-2, 0))]) is None
+
+
+def test_no_frames_and_one_that_no_other_confirms_say_nothing() -> None:
     assert depth_offset([]) is None
-    assert depth_offset([small]) is None
+    assert depth_offset([frame()]) is None
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (4, 5), (5, 400), (400, 5)])
+def test_frames_too_small_to_search_say_nothing(size: tuple[int, int]) -> None:
+    camera = Camera(300.0, 300.0, size[1] / 2, size[0] / 2, size[1], size[0])
+    small = Frame(0.0, np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), camera)
+    assert depth_offset([small] * 2) is None
