@@ -100,13 +100,13 @@ def mishaps(progress: Progress) -> str:
 @contextmanager
 def _live() -> Iterator[Callable[[Progress], None]]:
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
     bars = Bars(
         TextColumn("[bold]{task.fields[phase]}"),
         BarColumn(bar_width=24),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        MofNCompleteColumn(),
         TextColumn("{task.fields[numbers]}"),
         TextColumn("[{task.fields[colour]}]{task.fields[verdict]}"),
         TimeRemainingColumn(),
