@@ -10,7 +10,7 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.geometry import rotation_to_quat
 from splatbot.protocols import Array
-from splatbot.robots.robot import Gripper, RobotModel
+from splatbot.robots.robot import GripperGeometry, RobotModel
 from splatbot.robots.shapes import Box, Capsule, Shape
 
 DAMPING = 1.0  # [Nm s/rad] of arm joints; an estimate
@@ -97,7 +97,7 @@ def _geom(shape: Shape) -> dict[str, str]:
 
 
 def _add_gripper(
-    root: ElementTree.Element, actuators: ElementTree.Element, hand: ElementTree.Element, gripper: Gripper
+    root: ElementTree.Element, actuators: ElementTree.Element, hand: ElementTree.Element, gripper: GripperGeometry
 ) -> None:
     """Two sliding fingers on one servo; an equality keeps them symmetric. The force is the gripper's own."""
     names = [f"finger{i + 1}" for i in range(2)]

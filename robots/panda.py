@@ -13,7 +13,7 @@ import numpy as np
 
 from splatbot.protocols import Array
 from splatbot.robots.joints import Joint
-from splatbot.robots.robot import Gripper, Inertial, RobotModel
+from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
 from splatbot.robots.shapes import Capsule
 
 # Modified DH (Craig): a [m], d [m], alpha [rad] of the frame of each joint in that before it.
@@ -72,7 +72,7 @@ def panda() -> RobotModel:
         T_link_tcp=T_link_hand @ _turned(0.0, _TCP),
         home=np.array(_HOME),
         inertials=tuple(Inertial(m, c, _symmetric(i)) for m, c, i in _INERTIALS),
-        gripper=Gripper(
+        gripper=GripperGeometry(
             np.stack([T_link_hand @ _turned(yaw, _FINGERS) for yaw in (0.0, np.pi)]),
             0.04,
             (Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.0413), 0.0125),),

@@ -31,7 +31,7 @@ class Inertial:
 
 
 @dataclass(frozen=True, eq=False)
-class Gripper:
+class GripperGeometry:
     """Two fingers on the last link that open symmetrically.
 
     Args:
@@ -76,7 +76,7 @@ class RobotModel:
     T_link_tcp: Array = field(repr=False)
     home: Array
     inertials: tuple[Inertial, ...] = field(default=(), repr=False)
-    gripper: Gripper | None = field(default=None, repr=False)
+    gripper: GripperGeometry | None = field(default=None, repr=False)
     slack: float = SLACK
     allowed: tuple[tuple[int, int], ...] = ()
     covering: LinkSpheres | None = field(default=None, repr=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
-from splatbot.robots.robot import Gripper, RobotModel
+from splatbot.robots.robot import GripperGeometry, RobotModel
 from splatbot.robots.shapes import Capsule
 
 _FLANGE = 0.107  # [m] of the last link
@@ -72,7 +72,7 @@ def _with_hand(
         name=name,
         shapes=(*own, *flange, *(Capsule(7, _at(*a), _at(*b), radius) for a, b, radius in body)),
         T_link_tcp=T_link_flange @ _along_z(tcp),
-        gripper=Gripper(
+        gripper=GripperGeometry(
             np.stack([T_link_flange @ _along_z(root) @ turn for turn in (np.eye(4), turned)]),
             stroke,
             tuple(Capsule(0, *along) for along in finger),

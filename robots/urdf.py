@@ -48,10 +48,10 @@ def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = SLACK)
         ) from error
     if root.tag != "robot":
         raise FormatError(f"its root is <{root.tag}>.", file=file, hint="give a URDF file, whose root is <robot>")
-    return _Reader(file, root, slack).read(tip)
+    return _UrdfReader(file, root, slack).read(tip)
 
 
-class _Reader:
+class _UrdfReader:
     def __init__(self, file: Path, root: ElementTree.Element, slack: float) -> None:
         self.file, self.root, self.slack = file, root, slack
         self.links = {self._name(e): e for e in root.findall("link")}

@@ -10,9 +10,10 @@ from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
 import splatbot
-from splatbot.priority import stand_back, switch_quickly
+from splatbot.priority import lower_priority, switch_quickly
 from splatbot.services.codecs import describe_bodies
 from splatbot.services.guard import Guard
+from splatbot.services.integrations import Integrations
 from splatbot.services.limits import BodyLimit
 from splatbot.services.problems import install_problem_handlers
 from splatbot.services.requests import HEADER, RequestLog
@@ -33,7 +34,6 @@ from splatbot.services.routes import (
     views,
 )
 from splatbot.services.runtime import Runtime
-from splatbot.services.sides import Sides
 
 _DESCRIPTION = """
 Questions about maps of 3D Gaussians. Lengths are metres in the map's world frame, angles radians, quaternions wxyz,
@@ -45,21 +45,21 @@ camera axes OpenCV's (x right, y down, z forward). Every answer names the `map_v
 def create_app(runtime: Runtime) -> FastAPI:
     """The service on ``runtime``, which begins with the application and ends with it."""
     settings = runtime.settings
-    sides = Sides(settings, runtime.store, runtime.arms, on_frame=runtime.take)
+    integrations = Integrations(settings, runtime.store, runtime.arms, on_frame=runtime.take)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        stand_back(settings.niceness)  # this thread starts all those that answer
+        lower_priority(settings.niceness)  # this thread starts all those that answer
         switch_quickly()
-        await run_in_threadpool(sides.start)
+        await run_in_threadpool(integrations.start)
         await run_in_threadpool(runtime.start)
         yield
-        await run_in_threadpool(sides.stop)
+        await run_in_threadpool(integrations.stop)
         await run_in_threadpool(runtime.close)
 
     app = FastAPI(title="splatbot", version=splatbot.__version__, description=_DESCRIPTION, lifespan=lifespan)
     app.state.runtime = runtime
-    app.state.ros = sides.ros
+    app.state.ros = integrations.ros
     # The last one added is the first to see a request.
     uploads = {"/upload": settings.max_upload_bytes}
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, larger=uploads)

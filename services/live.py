@@ -20,7 +20,7 @@ from splatbot.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 
 
-class Mapper(Protocol):
+class LiveMapper(Protocol):
     """What mapping needs of :class:`splatbot.slam.Slam`."""
 
     def process(self, frame: Frame) -> FrameResult:
@@ -63,7 +63,7 @@ class LiveMapping:
         store: MapStore,
         map_id: str,
         source: Iterable[Frame],
-        mapper: Mapper,
+        mapper: LiveMapper,
         *,
         on_result: Callable[[FrameResult], None] | None = None,
     ) -> None:

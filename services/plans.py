@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from uuid import uuid4
 
 from splatbot.errors import InputError
-from splatbot.planning import PlanResult, Trajectory
+from splatbot.planning import JointTrajectory, PlanResult
 
 _KEPT = 256
 
@@ -35,7 +35,7 @@ class Plan:
     map_id: str
     robot: str
     result: PlanResult
-    trajectory: Trajectory
+    trajectory: JointTrajectory
 
 
 class Plans:
@@ -45,7 +45,7 @@ class Plans:
         self._lock = threading.Lock()
         self._plans: OrderedDict[str, Plan] = OrderedDict()
 
-    def add(self, map_id: str, robot: str, result: PlanResult, trajectory: Trajectory) -> Plan:
+    def add(self, map_id: str, robot: str, result: PlanResult, trajectory: JointTrajectory) -> Plan:
         """Keep a plan."""
         plan = Plan(uuid4().hex[:16], map_id, robot, result, trajectory)
         with self._lock:

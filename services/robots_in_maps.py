@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
+from splatbot.robots.graspable_objects import GraspableObjects, measured_map, things_of
 from splatbot.robots.robot import RobotModel
-from splatbot.robots.things import Things, measured_map, things_of
 from splatbot.services.arms import known_robot
 from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap
@@ -37,7 +37,7 @@ def arm_in(
     return model, RobotSpheres(model, T_world_base=base_in(served, base), margin=margin, opening=opening)
 
 
-def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -> Things:
+def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -> GraspableObjects:
     """The things on the table of a map, worked out once for each of its states and bases.
 
     Args:

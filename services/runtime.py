@@ -15,7 +15,7 @@ from splatbot.rasterize.native import native
 from splatbot.services.arms import Arms
 from splatbot.services.jobs import Jobs
 from splatbot.services.library import MapLibrary
-from splatbot.services.live import LiveMapping, Mapper
+from splatbot.services.live import LiveMapper, LiveMapping
 from splatbot.services.metrics import Metrics
 from splatbot.services.plans import Plans
 from splatbot.services.pushed import PushedFrames, StreamEndedError
@@ -79,7 +79,7 @@ class Runtime:
         for mapping in waiting:
             self._begin(mapping)
 
-    def follow(self, map_id: str, source: Iterable[Frame], mapper: Mapper) -> None:
+    def follow(self, map_id: str, source: Iterable[Frame], mapper: LiveMapper) -> None:
         """Map frames in a thread of their own, once the service has begun; ``map_id`` is in the store."""
         mapping = LiveMapping(self.store, map_id, source, mapper)
         with self._lock:

@@ -43,7 +43,7 @@ class Pose(Request):
             raise InputError(f"{error}.", field=field, hint="no rotation is quat_wxyz (1, 0, 0, 0)") from error
 
 
-class Health(BaseModel):
+class HealthResponse(BaseModel):
     """Whether the process lives, or is ready to answer."""
 
     status: Literal["ok", "ready"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import NativeError
 from splatbot.protocols import Array
-from splatbot.sim.view import View
+from splatbot.sim.view import TwinView
 from splatbot.sim.world import MAP_GROUP, World
 
 FINER = 2  # samples along a pixel's side
@@ -50,7 +50,7 @@ class BodiesView:
                 f"MuJoCo cannot draw here: {error}.", field="camera", hint="install libegl1 and set MUJOCO_GL=egl"
             ) from error
 
-    def view(self, data: Any, T_world_camera: Array) -> View:
+    def view(self, data: Any, T_world_camera: Array) -> TwinView:
         """What is seen of the bodies from a pose (4, 4)."""
         self._aim(data, T_world_camera)
         self._renderer.disable_depth_rendering()
@@ -60,7 +60,7 @@ class BodiesView:
         hit = depth < self._far
         alpha = _pixels(hit.astype(np.float32)).mean(axis=-1)
         shown = np.stack([_pixels(color[..., k] * hit).mean(axis=-1) for k in range(3)], axis=-1)
-        return View(shown, alpha, _nearest(_pixels(np.where(hit, depth, np.float32(np.inf)))), alpha)
+        return TwinView(shown, alpha, _nearest(_pixels(np.where(hit, depth, np.float32(np.inf)))), alpha)
 
     def robot(self, data: Any, T_world_camera: Array) -> NDArray[np.float32]:
         """Share (H, W) of each pixel in which the robot is foremost of what is drawn from a pose (4, 4)."""

@@ -16,7 +16,7 @@ from splatbot.sim.effects.registry import make_effects
 from splatbot.sim.effects.sensors import sensor_specs
 from splatbot.sim.map_view import MapView
 from splatbot.sim.scene import CameraSection
-from splatbot.sim.view import View, composite
+from splatbot.sim.view import TwinView, composite
 from splatbot.sim.world import World, robot_joints
 from splatbot.trajectory import Trajectory
 
@@ -52,7 +52,7 @@ class TwinCamera:
         self._map = MapView(world, self.camera) if splats and world.parts is not None else None
         self._bodies = BodiesView(world, self.camera, map_too=self._map is None)
 
-    def view(self, data: Any, T_world_camera: Array | None = None) -> View:
+    def view(self, data: Any, T_world_camera: Array | None = None) -> TwinView:
         """What an ideal camera would see now, from the scene's place or from another pose (4, 4)."""
         T = self.T_world_camera if T_world_camera is None else T_world_camera
         bodies = self._bodies.view(data, T)

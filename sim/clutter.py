@@ -15,7 +15,7 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_to_rotation, transform_points
 from splatbot.protocols import Array
-from splatbot.segmentation import MapScene, Support, fit, segment
+from splatbot.segmentation import SegmentedMap, Support, fit, segment
 from splatbot.segmentation.objects import FEWEST, OPAQUE, solid_rows
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge, surface_points
 from splatbot.sim.scene import Clutter, Scene, SceneObject
@@ -158,7 +158,7 @@ def _table(support: Support, on: Array) -> SceneObject:
 
 
 def _add_objects(
-    scene: MapScene,
+    scene: SegmentedMap,
     means: Array,
     used: np.ndarray,
     clutter: Clutter,
@@ -182,7 +182,7 @@ def _add_objects(
         _gather_strays(means[used], used, scene.support, labels)
 
 
-def _floor(scene: MapScene, points: Array) -> float:
+def _floor(scene: SegmentedMap, points: Array) -> float:
     """Height of what things stand on [m], under their middle."""
     under = scene.under(points) or scene.support
     assert under is not None

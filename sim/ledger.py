@@ -13,7 +13,7 @@ from splatbot.sim.twin import Twin, TwinResult
 
 
 @dataclass(frozen=True)
-class Entry:
+class LedgerEntry:
     """One effect in a run.
 
     Args:
@@ -43,7 +43,7 @@ def ledger(
     *,
     costs: bool = True,
     sensor: Sequence[Mapping[str, Any]] = (),
-) -> list[Entry]:
+) -> list[LedgerEntry]:
     """An entry for every effect; physics that is on is measured by running the motion again without it.
 
     Args:
@@ -64,7 +64,7 @@ def ledger(
             ms = drawn.get(decision.name)
         each = None if ms is None else 1e3 * ms / max(1, result.steps)
         observable = _observable(decision.name) if physical or decision.on else ""
-        found.append(Entry(decision.name, decision.on, decision.why, decision.by, observable, ms, each))
+        found.append(LedgerEntry(decision.name, decision.on, decision.why, decision.by, observable, ms, each))
     return found
 
 

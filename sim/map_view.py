@@ -14,7 +14,7 @@ from splatbot.geometry import inverse, pose_from_quat, quat_multiply, rotation_t
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_rgbd
 from splatbot.sim.solids import pose_at
-from splatbot.sim.view import View
+from splatbot.sim.view import TwinView
 from splatbot.sim.world import OBJECT, World
 
 _FAINT = 1.0 / 255.0  # opacity that no pixel shows
@@ -45,12 +45,12 @@ class MapView:
             for body, _ in self._loose
         }
 
-    def view(self, data: Any, T_world_camera: Array) -> View:
+    def view(self, data: Any, T_world_camera: Array) -> TwinView:
         """What is seen of the map from a pose (4, 4)."""
         T_map_camera = inverse(self._T_world_map) @ T_world_camera
         rgb, alpha, depth = render_rgbd(self._placed(data), self.camera, T_map_camera, sh_degree=self._sh_degree)
         seen = np.where(alpha > _FAINT, depth, np.float32(np.inf))
-        return View(rgb, alpha, seen, np.zeros_like(alpha))
+        return TwinView(rgb, alpha, seen, np.zeros_like(alpha))
 
     def _placed(self, data: Any) -> GaussianModel:
         """The map with the Gaussians of each movable body where the body is; harmonics are not turned."""

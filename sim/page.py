@@ -9,9 +9,9 @@ import numpy as np
 
 from splatbot.protocols import Array
 from splatbot.report.moving_page import bytes_of, moving_page, packed, thinned
-from splatbot.sim.recording import Recording
+from splatbot.sim.contact_monitor import FAR
+from splatbot.sim.recording import TwinRecording
 from splatbot.sim.solids import rotation_of
-from splatbot.sim.touch import FAR
 from splatbot.sim.twin import TwinResult
 from splatbot.sim.world import MAP_GROUP, World
 
@@ -22,7 +22,7 @@ _FLOOR = 0.8  # [m] to each side that is shown of a plane
 _SIZE = 0.006  # [m] of a point
 
 
-def twin_html(recording: Recording, result: TwinResult) -> str:
+def twin_html(recording: TwinRecording, result: TwinResult) -> str:
     """The page: robot, things and map as points, places where the arm touches, and its room as a curve over time.
 
     Args:

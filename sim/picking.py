@@ -11,7 +11,7 @@ from splatbot.grasping.affordance import Affordance, NameHint, Target, find_targ
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_types import PickOptions, PickResult, PickStep
 from splatbot.grasping.sampler import GraspSampler
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from splatbot.sim.controller import TwinController
 from splatbot.sim.motion import base_of
 from splatbot.sim.scan import scan
@@ -100,7 +100,7 @@ def pick_in_twin(
     return TwinPick(result, found, {name: height - before[name] for name, height in _heights(twin).items()})
 
 
-def scanned(twin: Twin, views: int, seed: int) -> MapScene:
+def scanned(twin: Twin, views: int, seed: int) -> SegmentedMap:
     """What a scan tells, with the names of the scene's objects."""
     movable = [thing.name for thing in twin.scene.objects if thing.movable]
     names = [NamedPlace(name, twin.data.body(f"object/{name}").xipos.copy()) for name in movable]

@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 
 from splatbot.protocols import Array
-from splatbot.sim.touch import FAR, Near, Room
+from splatbot.sim.contact_monitor import FAR, Near, Room
 from splatbot.sim.world import World
 
 RATE = 30.0  # moments a second
 _FORCE = 0.05  # [N]; a touch that is fainter is not shown
 
 
-class Recording:
+class TwinRecording:
     """Takes note of a run; handed to :meth:`splatbot.sim.twin.Twin.follow` as ``watch``.
 
     ``times`` (T,) [s], ``poses`` (T, B, 3, 4) of all of MuJoCo's bodies, ``rooms`` (T,) [m] around the arm, ``touches``

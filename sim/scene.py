@@ -141,14 +141,14 @@ class Move(Section):
         return self
 
 
-class Task(Section):
+class SceneTask(Section):
     """What matters: a kind that says which physics it takes, and the arm's moves."""
 
     kind: Literal["none", "reach", "push", "grasp", "hang", "wipe", "avoid", "squeeze"] = "none"
     moves: tuple[Move, ...] = ()
 
     @model_validator(mode="after")
-    def _ordered(self) -> Task:
+    def _ordered(self) -> SceneTask:
         times = [move.t for move in self.moves]
         if any(b <= a for a, b in pairwise(times)):
             raise ValueError("the times of moves must increase")
@@ -192,7 +192,7 @@ class Scene(Section):
     medium: Medium | None = None
     lights: tuple[Light, ...] = ()
     camera: CameraSection | None = None
-    task: Task = Task()
+    task: SceneTask = SceneTask()
     effects: Choice = Choice()
     timestep: float = Field(default=0.002, gt=0, le=0.05, description="longest step [s]: accuracy for time")
     gravity: Vec3 = (0.0, 0.0, -9.81)

@@ -17,7 +17,7 @@ Vec3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 
 
-class _Solid(BaseModel):
+class _Geom(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     at: Vec3 = Field(default=(0.0, 0.0, 0.0), description="in the object's frame [m]")
@@ -32,7 +32,7 @@ class _Solid(BaseModel):
         raise NotImplementedError
 
 
-class Plane(_Solid):
+class PlaneGeom(_Geom):
     """An endless plane; its normal is z."""
 
     kind: Literal["plane"]
@@ -41,7 +41,7 @@ class Plane(_Solid):
         return mujoco.mjtGeom.mjGEOM_PLANE, [0.0, 0.0, 0.01]
 
 
-class Box(_Solid):
+class BoxGeom(_Geom):
     """A box; ``size`` is its length, width and height [m]."""
 
     kind: Literal["box"]
@@ -51,7 +51,7 @@ class Box(_Solid):
         return mujoco.mjtGeom.mjGEOM_BOX, [s / 2 for s in self.size]
 
 
-class Sphere(_Solid):
+class SphereGeom(_Geom):
     """A ball."""
 
     kind: Literal["sphere"]
@@ -61,7 +61,7 @@ class Sphere(_Solid):
         return mujoco.mjtGeom.mjGEOM_SPHERE, [self.radius]
 
 
-class Cylinder(_Solid):
+class CylinderGeom(_Geom):
     """A cylinder along z about its middle."""
 
     kind: Literal["cylinder"]
@@ -72,7 +72,7 @@ class Cylinder(_Solid):
         return mujoco.mjtGeom.mjGEOM_CYLINDER, [self.radius, self.height / 2]
 
 
-class Capsule(_Solid):
+class CapsuleGeom(_Geom):
     """A capsule along z about its middle; ``height`` without the caps."""
 
     kind: Literal["capsule"]
@@ -83,7 +83,7 @@ class Capsule(_Solid):
         return mujoco.mjtGeom.mjGEOM_CAPSULE, [self.radius, self.height / 2]
 
 
-class Ellipsoid(_Solid):
+class EllipsoidGeom(_Geom):
     """An ellipsoid of three half-axes [m]."""
 
     kind: Literal["ellipsoid"]
@@ -93,7 +93,7 @@ class Ellipsoid(_Solid):
         return mujoco.mjtGeom.mjGEOM_ELLIPSOID, list(self.axes)
 
 
-class Mesh(_Solid):
+class MeshGeom(_Geom):
     """The convex hull of a mesh file (OBJ, STL), or of points (P, 3) [m]."""
 
     kind: Literal["mesh"]
@@ -119,7 +119,7 @@ class Mesh(_Solid):
         return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name, **pose}
 
 
-class Soft(_Solid):
+class SoftGeom(_Geom):
     """A box of elastic material.
 
     Args:
@@ -142,7 +142,7 @@ class Soft(_Solid):
 
 
 Shape = Annotated[
-    Plane | Box | Sphere | Cylinder | Capsule | Ellipsoid | Mesh | Soft,
+    PlaneGeom | BoxGeom | SphereGeom | CylinderGeom | CapsuleGeom | EllipsoidGeom | MeshGeom | SoftGeom,
     Field(discriminator="kind"),
 ]
 

@@ -15,13 +15,13 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.effects.decisions import Decision
+from splatbot.sim.contact_monitor import ContactMonitor, Near, Room, Touch
+from splatbot.sim.effects.decisions import EffectDecision
 from splatbot.sim.effects.physics import Hook
 from splatbot.sim.following import Follower, targets_of
 from splatbot.sim.motion import JointMotion, home_of, motion_of
+from splatbot.sim.object_monitor import ObjectMonitor
 from splatbot.sim.scene import Scene
-from splatbot.sim.things import Things
-from splatbot.sim.touch import Near, Room, Touch, Touches
 from splatbot.sim.world import World, build_world
 
 _ROOM_EVERY = 0.02  # [s] between looks at the room around the arm
@@ -85,7 +85,7 @@ class TwinResult:
     dropped: tuple[str, ...]
     moved: dict[str, float]
     figures: dict[str, float]
-    decisions: tuple[Decision, ...]
+    decisions: tuple[EffectDecision, ...]
     warnings: tuple[str, ...]
     stopped: float | None
     digest: str
@@ -97,12 +97,12 @@ class TwinResult:
 
 
 @dataclass
-class _Log:
+class _TwinLog:
     """What a run gathers."""
 
-    touches: Touches
+    touches: ContactMonitor
     room: Room
-    things: Things
+    things: ObjectMonitor
     errors: list[Array] = field(default_factory=list)
     digest: Any = field(default_factory=hashlib.sha256)
     overload: float = 0.0
@@ -216,7 +216,9 @@ class Twin:
         self._stop = False
         self.reset(motion.position[0] if self.follower is not None else None)
         count = max(1, round(motion.duration * self.rate))
-        log = _Log(Touches(self.world), Room(self.world), Things(self.world, self.data, 1.0 / self.rate))
+        log = _TwinLog(
+            ContactMonitor(self.world), Room(self.world), ObjectMonitor(self.world, self.data, 1.0 / self.rate)
+        )
         begin = clock.perf_counter()
         done = self._run(motion, count, log, progress, watch, until_touch)
         return self._result(motion, done, count, log, clock.perf_counter() - begin)
@@ -225,7 +227,7 @@ class Twin:
         self,
         motion: JointMotion,
         count: int,
-        log: _Log,
+        log: _TwinLog,
         progress: Callable[[float], None] | None,
         watch: Callable[[Any, float], None] | None,
         until_touch: bool,
@@ -258,7 +260,7 @@ class Twin:
                 return k + 1
         return count
 
-    def _result(self, motion: JointMotion, done: int, count: int, log: _Log, seconds: float) -> TwinResult:
+    def _result(self, motion: JointMotion, done: int, count: int, log: _TwinLog, seconds: float) -> TwinResult:
         simulated = done / self.rate
         tracking = self._tracking(motion, log, done) if self.follower is not None else None
         figures = {
@@ -297,7 +299,7 @@ class Twin:
             notes=self.world.notes,
         )
 
-    def _tracking(self, motion: JointMotion, log: _Log, done: int) -> Tracking | None:
+    def _tracking(self, motion: JointMotion, log: _TwinLog, done: int) -> Tracking | None:
         assert self.world.robot is not None
         errors = np.array(log.errors)
         if not len(errors):
@@ -315,7 +317,7 @@ class Twin:
         """Whether MuJoCo met values that are not finite or beyond all bounds, and began anew or went on with them."""
         return any(self.data.warning[kind].number for kind in _BAD) or not np.isfinite(self.data.qpos).all()
 
-    def _warnings(self, log: _Log) -> tuple[str, ...]:
+    def _warnings(self, log: _TwinLog) -> tuple[str, ...]:
         found = []
         if self._broken():
             found.append(f"physics became unstable and was stopped: take steps below {1e3 * self.timestep:g} ms")

@@ -13,7 +13,7 @@ Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TwinView:
     """What a camera sees of a part of the world; behind it is nothing.
 
     Args:
@@ -38,7 +38,7 @@ class View:
         return np.where(seen, self.depth, np.float32(0))
 
 
-def composite(a: View, b: View) -> View:
+def composite(a: TwinView, b: TwinView) -> TwinView:
     """Both, in each pixel the nearer over the farther (Porter and Duff 1984): soft edges stay soft."""
     first = a.depth <= b.depth
 
@@ -51,7 +51,7 @@ def composite(a: View, b: View) -> View:
     color, color_under = pick(a.color, b.color)
     bodies, bodies_under = pick(a.bodies, b.bodies)
     depth, depth_under = pick(a.depth, b.depth)
-    return View(
+    return TwinView(
         color + rest[..., None] * color_under,
         alpha + rest * under,
         np.where((alpha >= MIN_ALPHA) | (under < MIN_ALPHA), depth, depth_under),

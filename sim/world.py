@@ -16,7 +16,7 @@ from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot
 from splatbot.sim.clutter import MapParts, add_ellipsoids, load_parts
-from splatbot.sim.effects.decisions import Decision
+from splatbot.sim.effects.decisions import EffectDecision
 from splatbot.sim.effects.physics import PHYSICS, Hook, effects_for, physics_effect
 from splatbot.sim.scene import CameraSection, Scene, SceneObject
 from splatbot.sim.solids import quat_of
@@ -71,7 +71,7 @@ class World:
     robot: RobotModel | None
     spec: Any
     model: Any
-    decisions: tuple[Decision, ...]
+    decisions: tuple[EffectDecision, ...]
     hooks: tuple[Hook, ...]
     owner: tuple[str, ...]
     of_robot: NDArray[np.bool_]

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from splatbot.camera import Camera
 from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
-from splatbot.logs.raycast import Moving, Scene, Surface
-from splatbot.logs.shapes import Mesh, lathe
+from splatbot.logs.raycast import Moving, RaycastScene, RaycastSurface
+from splatbot.logs.shapes import TriangleMesh, lathe
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
@@ -48,7 +48,7 @@ class WristLog(LogBase):
         self,
         robot: RobotModel,
         joints: Array,
-        surfaces: list[Surface],
+        surfaces: list[RaycastSurface],
         *,
         T_scene_base: Array,
         T_link_camera: Array = T_PANDA_CAMERA,
@@ -64,7 +64,7 @@ class WristLog(LogBase):
         stamps = np.arange(len(joints)) / rate
         self.ground_truth = Trajectory(stamps, T[:, -1] @ T_link_camera)
         links = {f"link {k}": Moving(found, _pose_of(stamps, T[:, k])) for k, found in _seen_links(robot).items()}
-        self.scene = Scene(surfaces, links | dict(moving or {}))
+        self.scene = RaycastScene(surfaces, links | dict(moving or {}))
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -84,14 +84,14 @@ def _pose_of(stamps: Array, poses: Array) -> Callable[[float], Array]:
     return lambda t: np.asarray(poses[int(np.argmin(np.abs(stamps - t)))])
 
 
-def _seen_links(robot: RobotModel) -> dict[int, list[Surface]]:
+def _seen_links(robot: RobotModel) -> dict[int, list[RaycastSurface]]:
     """Capsules of each link that has any; the fingers open on the last one."""
-    found: dict[int, list[Surface]] = {}
+    found: dict[int, list[RaycastSurface]] = {}
     for number, shape in enumerate(robot.shapes):
         if isinstance(shape, Capsule):
             texture = Texture((0.9, 0.9, 0.92), (0.35, 0.4, 0.5), 0.02, seed=number)
             found.setdefault(shape.link, []).append(
-                Surface(capsule_mesh(shape.start, shape.end, shape.radius), texture)
+                RaycastSurface(capsule_mesh(shape.start, shape.end, shape.radius), texture)
             )
     if robot.gripper is not None:
         opened = np.array([0.0, robot.gripper.stroke, 0.0])
@@ -101,12 +101,12 @@ def _seen_links(robot: RobotModel) -> dict[int, list[Surface]]:
                     ends = [T[:3, :3] @ (np.array(p) + opened) + T[:3, 3] for p in (shape.start, shape.end)]
                     mesh = capsule_mesh(ends[0], ends[1], shape.radius)
                     found.setdefault(len(robot), []).append(
-                        Surface(mesh, Texture((0.3, 0.3, 0.3), (0.7, 0.6, 0.2), 0.01))
+                        RaycastSurface(mesh, Texture((0.3, 0.3, 0.3), (0.7, 0.6, 0.2), 0.01))
                     )
     return found
 
 
-def capsule_mesh(start: ArrayLike, end: ArrayLike, radius: float) -> Mesh:
+def capsule_mesh(start: ArrayLike, end: ArrayLike, radius: float) -> TriangleMesh:
     """A capsule between two points (3,) [m]."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(b - a))
@@ -116,4 +116,4 @@ def capsule_mesh(start: ArrayLike, end: ArrayLike, radius: float) -> Mesh:
     z = (b - a) / length if length > 0 else np.array([0.0, 0.0, 1.0])
     x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
     x /= np.linalg.norm(x)
-    return Mesh(mesh.vertices @ np.stack([x, np.cross(z, x), z]) + a, mesh.triangles)
+    return TriangleMesh(mesh.vertices @ np.stack([x, np.cross(z, x), z]) + a, mesh.triangles)

@@ -85,7 +85,7 @@ class Collisions:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class TrackedFrame:
     """What became of a pushed frame.
 
     Args:
@@ -166,7 +166,7 @@ class Client:
         """Forget a map."""
         self.request("DELETE", f"/v1/maps/{quote(map_id, safe='')}")
 
-    def push(self, map_id: str, frame: Frame) -> Placed:
+    def push(self, map_id: str, frame: Frame) -> TrackedFrame:
         """Have a frame tracked and mapped; waits while the service has too many frames in work."""
         c = frame.camera
         body = {
@@ -177,7 +177,7 @@ class Client:
             "joints": None if frame.joints is None else frame.joints.tolist(),
         }
         told = self._packed("POST", f"/v1/maps/{quote(map_id, safe='')}/frames", body)
-        return Placed(
+        return TrackedFrame(
             T_world_camera=told["T_world_camera"],
             verdict=told["verdict"],
             keyframe=told["keyframe"],

@@ -52,7 +52,7 @@ class TrackingConfig(_Section):
     sigma_gray: float = Field(default=0.02, gt=0, description="noise of a grey value in 0..1")
     sigma_depth_floor: float = Field(default=1e-3, gt=0, description="σ_z = floor + quad z² [m]")
     sigma_depth_quad: float = Field(default=2e-3, ge=0, description="σ_z = floor + quad z² [1/m]")
-    depth_doubt: float = Field(
+    depth_sigma_scale: float = Field(
         default=10.0,
         ge=1,
         description="beside colour, depth counts as if its σ were so many times as large: filters, calibration and "
@@ -171,7 +171,7 @@ class MappingConfig(_Section):
         default=6.0, gt=0, description="standard deviations grow no larger in refinement [px of the keyframe]"
     )
     max_scale: float = Field(default=0.5, gt=0, description="larger Gaussians are pruned [m]")
-    look_every: float = Field(
+    observe_interval_s: float = Field(
         default=0.2, ge=0, description="between keyframes, a frame as old as this tells what has gone or moves [s]"
     )
     settle: float = Field(default=1.0, ge=0, description="what appeared and has stayed for so long is mapped [s]")

@@ -10,7 +10,7 @@ from contextlib import suppress
 _SWITCH_S = 5e-4  # a tenth of Python's own
 
 
-def stand_back(niceness: int) -> None:
+def lower_priority(niceness: int) -> None:
     """Give the calling thread, and those that it will start, a lower priority than the process began with.
 
     Without the privilege nothing gives it back. Elsewhere than on Linux a priority is not a thread's own: nothing

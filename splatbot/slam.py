@@ -15,9 +15,9 @@ from splatbot.config import Config
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
+from splatbot.mapping.joint_motion import JointMotionMonitor
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
-from splatbot.mapping.motion import JointMotion
 from splatbot.mapping.refine import Stop, never
 from splatbot.mapping.worker import MappingWorker
 from splatbot.tracking.health import Verdict
@@ -73,7 +73,7 @@ class Slam:
         self._looked = -math.inf
         self._size: tuple[int, int] | None = None
         self._growing = True
-        self._motion = JointMotion(self.config.mapping.still)
+        self._motion = JointMotionMonitor(self.config.mapping.still)
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """Track ``frame`` and, unless ``hold_out``, fuse it. Never raises for a frame that cannot be tracked.
@@ -226,7 +226,7 @@ class Slam:
 
     def _looks(self, stamp: float) -> bool:
         """Whether it is time to look at a frame that is no keyframe."""
-        if 0 <= stamp - self._looked < self.config.mapping.look_every:
+        if 0 <= stamp - self._looked < self.config.mapping.observe_interval_s:
             return False
         self._looked = stamp
         return True

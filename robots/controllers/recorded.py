@@ -14,7 +14,7 @@ from splatbot.robots.controllers.base import FOLLOWING, SteppedController
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class JointRecording:
     """Joint positions over time.
 
     Args:
@@ -40,7 +40,7 @@ class Recording:
             raise LogError(f"row {row} is not after the one before.", file=self.source, field="time")
 
     @classmethod
-    def load(cls, path: str | Path) -> Recording:
+    def load(cls, path: str | Path) -> JointRecording:
         """From CSV: a column ``time`` [s] and one ``position.NAME`` for each joint, as ``Trajectory.to_csv`` has it.
 
         Raises:
@@ -75,7 +75,7 @@ class RecordedController(SteppedController):
         following: see :class:`SteppedController`.
     """
 
-    def __init__(self, recording: Recording, *, period: float = 1e-3, following: float = FOLLOWING) -> None:
+    def __init__(self, recording: JointRecording, *, period: float = 1e-3, following: float = FOLLOWING) -> None:
         super().__init__(recording.positions[0], period=period, following=following)
         self._recording = recording
 

@@ -14,7 +14,7 @@ from types import TracebackType
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.robots.grippers.modbus import EXCEPTION, READ, READ_INPUT, WRITE, FrameError, framed, unframed
+from splatbot.robots.grippers.modbus import EXCEPTION, READ, READ_INPUT, WRITE, FramingError, framed, unframed
 from splatbot.robots.grippers.registers import COMMAND, REGISTERS, STATUS, Activation, Command, Fingers, Status
 from splatbot.robots.grippers.robotiq import MODELS
 
@@ -120,7 +120,7 @@ class FakeRobotiq:
     def _take(self, data: bytes) -> None:
         try:
             body = unframed(data)
-        except FrameError:
+        except FramingError:
             return
         if body[0] != self._device:
             return

@@ -37,7 +37,7 @@ class RefusedError(GripperError):
     """The device understood, and refused."""
 
 
-class FrameError(Exception):
+class FramingError(Exception):
     """Bytes that are no frame; the exchange is worth another try."""
 
 
@@ -63,7 +63,7 @@ def unframed(frame: bytes) -> bytes:
         FrameError: the checksum is wrong, or there is none.
     """
     if len(frame) < 4 or framed(frame[:-2]) != frame:
-        raise FrameError(f"a wrong checksum in {frame.hex(' ')}")
+        raise FramingError(f"a wrong checksum in {frame.hex(' ')}")
     return frame[:-2]
 
 
@@ -129,9 +129,9 @@ class ModbusClient:
                 with self._lock:
                     answer = self._once(framed(body), length + 2)
                 if answer[:2] != body[:2] or not fits(answer):
-                    raise FrameError(f"an answer to something else, {answer.hex(' ')}")
+                    raise FramingError(f"an answer to something else, {answer.hex(' ')}")
                 return answer
-            except FrameError as error:
+            except FramingError as error:
                 why = str(error)
                 self.repeated += k + 1 < tries
                 _log.info("try %d of %d got %s", k + 1, tries, why)
@@ -147,11 +147,11 @@ class ModbusClient:
             refused = len(answer) == 2 and answer[1] & EXCEPTION
             answer += self._line.read((5 if refused else length) - len(answer)) if len(answer) == 2 else b""
         except serial.SerialTimeoutException as error:
-            raise FrameError("a line that takes no bytes") from error
+            raise FramingError("a line that takes no bytes") from error
         except _GONE as error:
             raise self._gone(error) from error
         if len(answer) < (5 if refused else length):
-            raise FrameError(f"{len(answer)} of {length} bytes")
+            raise FramingError(f"{len(answer)} of {length} bytes")
         good = unframed(answer)
         if refused and good[:2] == bytes([self._device, frame[1] | EXCEPTION]):
             text = _REFUSALS.get(good[2], f"exception {good[2]}")

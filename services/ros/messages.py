@@ -17,7 +17,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.grasping.types import Grasp
 from splatbot.logs.ros_frames import header, joint_state_message, pose_message, time_of
 from splatbot.logs.ros_types import Message, build
-from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.services.topics import JointState
 from splatbot.slam import FrameResult
@@ -138,7 +138,7 @@ def joints_of(message: Message) -> JointState:
     return JointState(seconds, tuple(message.name), q, velocity if len(velocity) == len(q) else None)
 
 
-def joint_trajectory_message(trajectory: RobotTrajectory, *, frame_id: str = "") -> Message:
+def joint_trajectory_message(trajectory: JointTrajectory, *, frame_id: str = "") -> Message:
     """trajectory_msgs/JointTrajectory, a point every 10 ms."""
     return build("trajectory_msgs/msg/JointTrajectory", trajectory.to_ros(frame_id=frame_id))
 

@@ -135,7 +135,7 @@ class MoveItServices:
         if frame in ("base_link", f"{self._name}_link0"):
             return True
         hint = f"use {MAP_FRAME}, world, base_link or {self._name}_link0"
-        raise FrameError(f"{frame[:40]!r} is unknown.", field=path, hint=hint)
+        raise UnknownFrameError(f"{frame[:40]!r} is unknown.", field=path, hint=hint)
 
     def _goal(self, request: Any, robot: RobotModel, base: NDArray[np.float64]) -> JointGoal | PoseGoal:
         goals = entries(request, "goal_constraints")
@@ -164,7 +164,7 @@ class MoveItServices:
         return PoseGoal(T, position=half, angle=tolerance)
 
 
-class FrameError(InputError):
+class UnknownFrameError(InputError):
     """A frame is unknown (FRAME_TRANSFORM_FAILURE)."""
 
     code = _FRAME_TRANSFORM_FAILURE
@@ -193,7 +193,7 @@ def robot_place(store: MapStore, robot: str) -> tuple[ServedMap, RobotModel, NDA
     known = served.workspace.T_world_base if served.workspace is not None else None
     if known is None:
         hint = "keep a scene.yaml beside the map: splatbot info MAP --fit-plane estimates one"
-        raise FrameError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
+        raise UnknownFrameError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
     return served, known_robot(robot), known
 
 

@@ -10,11 +10,11 @@ from splatbot.services.arms import Arms
 from splatbot.services.ros.follow import FollowJointTrajectory
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.grasping import GraspServices
-from splatbot.services.ros.inlets import RosInlets
 from splatbot.services.ros.moveit import MoveItServices
 from splatbot.services.ros.nvblox import NvbloxServices
-from splatbot.services.ros.outlets import RosOutlets
+from splatbot.services.ros.publishers import RosPublishers
 from splatbot.services.ros.rosapi import RosApi
+from splatbot.services.ros.subscribers import RosSubscribers
 from splatbot.services.store import MapStore
 
 
@@ -42,8 +42,8 @@ class RosNode:
         NvbloxServices(self.graph, store)
         GraspServices(self.graph, store, robot=robot)
         self._follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
-        self._outlets = RosOutlets(store.bus, self.graph)
-        self._inlets = RosInlets(self.graph, store.bus, robot=robot, on_frame=on_frame)
+        self._outlets = RosPublishers(store.bus, self.graph)
+        self._inlets = RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame)
 
     def start(self) -> None:
         """Begin."""

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Request, Response
 
 from splatbot.camera import Camera
 from splatbot.errors import InputError
-from splatbot.grasping.affordance import BoxHint, Hint, NameHint, PixelHint, PointHint, View, find_target
+from splatbot.grasping.affordance import BoxHint, Hint, NameHint, ObservedView, PixelHint, PointHint, find_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.places import PlaceAffordance
 from splatbot.grasping.summary import summary
@@ -83,7 +83,7 @@ def _hint(asked: GraspsRequest) -> Hint:
     if asked.picture is None:
         raise InputError("is missing.", field="target", hint="give one of target, point and picture")
     picture = asked.picture
-    view = View(Camera(**picture.camera.model_dump()), picture.pose.matrix("picture.pose"))
+    view = ObservedView(Camera(**picture.camera.model_dump()), picture.pose.matrix("picture.pose"))
     if picture.pixel is not None:
         return PixelHint(*picture.pixel, view)
     assert picture.box is not None

@@ -10,22 +10,22 @@ import splatbot
 from splatbot.errors import NativeError
 from splatbot.services.dependencies import Service, Store, example, problems
 from splatbot.services.problems import MapNotReadyError, NotReadyError
-from splatbot.services.schemas import Health
+from splatbot.services.schemas import HealthResponse
 
 router = APIRouter(tags=["health"])
 
 
 @router.get("/healthz", responses=example({"status": "ok", "version": "0.1.0", "maps": {"default": 3}}))
-def healthz(store: Store) -> Health:
+def healthz(store: Store) -> HealthResponse:
     """Alive: the process answers."""
-    return Health(status="ok", version=splatbot.__version__, maps=_versions(store))
+    return HealthResponse(status="ok", version=splatbot.__version__, maps=_versions(store))
 
 
 @router.get(
     "/readyz",
     responses=example({"status": "ready", "version": "0.1.0", "maps": {"default": 3}}) | problems(503),
 )
-def readyz(service: Service) -> Health:
+def readyz(service: Service) -> HealthResponse:
     """Ready: the native module loads, the maps that it was started with have a state, and it is not about to end."""
     try:
         importlib.import_module("splatbot._native")
@@ -38,7 +38,7 @@ def readyz(service: Service) -> Health:
     waiting = [m.id for m in service.store.list() if m.awaited and m.snapshot is None]
     if waiting:
         raise MapNotReadyError(f"No state yet: {', '.join(waiting)}.", hint="GET /v1/maps tells how far mapping is")
-    return Health(status="ready", version=splatbot.__version__, maps=_versions(service.store))
+    return HealthResponse(status="ready", version=splatbot.__version__, maps=_versions(service.store))
 
 
 @router.get(

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Response
 
 from splatbot.errors import InputError
-from splatbot.planning import Trajectory
+from splatbot.planning import JointTrajectory
 from splatbot.services.codecs import body_of, plain, takes
 from splatbot.services.dependencies import IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobHandle
@@ -71,7 +71,7 @@ def _shipped(name: str) -> Scene:
 
 
 def _trial(
-    scene: Scene, trajectory: Trajectory | None, asked: TrialsRequest, number: int, handle: JobHandle
+    scene: Scene, trajectory: JointTrajectory | None, asked: TrialsRequest, number: int, handle: JobHandle
 ) -> dict[str, Any]:
     from splatbot.sim.twin import Twin
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
-from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.planning import JointTrajectory
 from splatbot.robots.store import load_robot
-from splatbot.services.viewer.scene import MapScene, close_server, open_server
+from splatbot.services.viewer.scene import ViewerScene, close_server, open_server
 from splatbot.services.viewer.splats import Coloring
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
@@ -21,7 +21,7 @@ def map_page(
     trajectory: Trajectory | None = None,
     workspace: Workspace | None = None,
     robot: str = "panda",
-    plan: RobotTrajectory | None = None,
+    plan: JointTrajectory | None = None,
 ) -> str:
     """The page's text; about 1 MB and 43 bytes a Gaussian.
 
@@ -35,7 +35,7 @@ def map_page(
     """
     server = open_server("127.0.0.1", 0)
     try:
-        scene = MapScene(server)
+        scene = ViewerScene(server)
         scene.look_at_all(model)
         scene.show_map(model, coloring)
         if trajectory is not None:

@@ -18,7 +18,7 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import rotation_to_quat
 from splatbot.grasping.types import Grasp
-from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import default_view
 from splatbot.services.viewer.splats import Coloring, pieces
@@ -50,7 +50,7 @@ def close_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-class MapScene:
+class ViewerScene:
     """Draws one map into a viser server; each call shows what it is given and sends only what has changed.
 
     Args:
@@ -134,7 +134,7 @@ class MapScene:
         handle = self._balls[name]
         handle.batched_positions, handle.batched_colors = centers.astype(np.float32), rgb
 
-    def show_plan(self, arm: RobotSpheres, plan: RobotTrajectory) -> None:
+    def show_plan(self, arm: RobotSpheres, plan: JointTrajectory) -> None:
         """The way of the tool along a planned motion."""
         q = plan.at(np.linspace(0.0, plan.duration, _PATH_POINTS)).position
         last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])

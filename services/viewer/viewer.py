@@ -14,13 +14,13 @@ from splatbot.camera import Camera
 from splatbot.collision import RobotSpheres
 from splatbot.frame import Frame
 from splatbot.grasping.types import GraspResult
-from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
-from splatbot.services.viewer.scene import MapScene, close_server, open_server
+from splatbot.services.viewer.scene import ViewerScene, close_server, open_server
 from splatbot.services.viewer.splats import COLORINGS, Coloring
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
@@ -38,7 +38,7 @@ class _News:
     served: ServedMap | None = None
     result: FrameResult | None = None
     trajectory: Trajectory | None = None
-    plan: RobotTrajectory | None = None
+    plan: JointTrajectory | None = None
     grasps: GraspResult | None = None
     joints: JointState | None = None
     camera: Camera | None = None
@@ -69,12 +69,12 @@ class Viewer:
         self._store, self._map_id, self._robot_name = store, map_id, robot
         self.server = open_server(host, port)
         self._host, self.port = host, self.server.get_port()
-        self._scene = MapScene(self.server)
+        self._scene = ViewerScene(self.server)
         self._news, self._lock = _News(), threading.Lock()
         self._served: ServedMap | None = None
         self._pose: Array | None = None
         self._arm: RobotSpheres | None = None
-        self._plan: RobotTrajectory | None = None
+        self._plan: JointTrajectory | None = None
         self._camera: Camera | None = None
         self._coloring: Coloring = "rgb"
         self._stale = False

@@ -143,7 +143,7 @@ def compare_log(
     poses = by_arm or {i: np.asarray(inverse(base.T_world_base) @ T) for i, T in tracked.items() if i < len(log)}
     around = surroundings(model, run.map, base.T_world_base, robot, place.support_plane)
     gaps = {i: pose_gap(base.T_world_base @ T, tracked[i]) for i, T in poses.items() if i in tracked}
-    looks = _Looks(log, poses, gaps, {row.index for row in run.load_frames() if row.held_out})
+    looks = _LogLooks(log, poses, gaps, {row.index for row in run.load_frames() if row.held_out})
     notes = [] if around.support is not None else ["no level plane within the arm's reach: nothing stands on anything"]
     done: Replay | None = None
     interrupted = False
@@ -173,7 +173,7 @@ def compare_log(
 
 
 @dataclass
-class _Looks:
+class _LogLooks:
     """Frames beside the twin's images, as far as they were looked at.
 
     Args:

@@ -10,10 +10,10 @@ import numpy as np
 from splatbot.protocols import Array
 from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.compare.trials import Attempt
+from splatbot.sim.compare.trials import PolicyAction
 from splatbot.sim.motion import minimum_jerk, motion_from_samples
 from splatbot.sim.scene import SceneObject
-from splatbot.sim.solids import Capsule, Cylinder, Shape, Sphere, rotation_of
+from splatbot.sim.solids import CapsuleGeom, CylinderGeom, Shape, SphereGeom, rotation_of
 from splatbot.sim.twin import Twin, TwinResult
 from splatbot.sim.world import OBJECT
 
@@ -49,7 +49,7 @@ class PushCase:
 
 
 @dataclass(frozen=True, eq=False)
-class Push:
+class PushTask:
     """The task: the thing ends upright within 3 cm of its goal, counted from where it stands in each twin.
 
     Args:
@@ -105,7 +105,7 @@ class Pusher:
     speed: float
     aside: float = 0.0
 
-    def act(self, case: PushCase) -> Attempt | None:
+    def act(self, case: PushCase) -> PolicyAction | None:
         """The motion; None if the map lacks the thing, or the arm does not get there."""
         if case.believed is None:
             return None
@@ -119,7 +119,7 @@ class Pusher:
         y_tool = np.array([d[1], -d[0], 0.0])  # as at home: the other way round the wrist is near its limits
         return self._motion(above, begin, end, np.stack([np.cross(y_tool, z_tool), y_tool, z_tool], axis=1))
 
-    def _motion(self, above: Array, begin: Array, end: Array, R: Array) -> Attempt | None:
+    def _motion(self, above: Array, begin: Array, end: Array, R: Array) -> PolicyAction | None:
         """The first of several postures above the thing from which the whole way is within the joints' limits."""
         stretch = max(float(np.linalg.norm(end - begin)) / self.speed, 2 / _RATE)
         times, places = _way([(above, begin, _DOWN), (begin, end, stretch), (end, end, _REST)])
@@ -129,7 +129,7 @@ class Pusher:
                 t = np.arange(0.0, _APPROACH, 1 / _RATE)
                 approach = minimum_jerk(t, np.array([0.0, _APPROACH]), np.stack([self.robot.home, first]), 0)
                 motion = motion_from_samples(np.append(t, _APPROACH + times), np.concatenate([approach, q]))
-                return Attempt(replace(motion, opening=np.zeros(len(motion.time))))
+                return PolicyAction(replace(motion, opening=np.zeros(len(motion.time))))
         return None
 
     def _along(self, first: Array, places: Array, R: Array) -> Array | None:
@@ -185,10 +185,10 @@ def _support(shape: Shape, direction: Array) -> float:
     away = float(np.asarray(shape.at) @ direction)
     if shape.kind == "box" or shape.kind == "soft":
         return away + float(np.abs(n) @ np.asarray(shape.size)) / 2
-    if isinstance(shape, Sphere):
+    if isinstance(shape, SphereGeom):
         return away + shape.radius
-    if isinstance(shape, Cylinder | Capsule):
-        side = shape.radius * (float(np.hypot(n[0], n[1])) if isinstance(shape, Cylinder) else 1.0)
+    if isinstance(shape, CylinderGeom | CapsuleGeom):
+        side = shape.radius * (float(np.hypot(n[0], n[1])) if isinstance(shape, CylinderGeom) else 1.0)
         return away + side + abs(float(n[2])) * shape.height / 2
     if shape.kind == "ellipsoid":
         return away + float(np.linalg.norm(n * np.asarray(shape.axes)))

@@ -11,7 +11,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.planning import Certificate, GaussianRRTStar, Path, time_path
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.compare.trials import Attempt
+from splatbot.sim.compare.trials import PolicyAction
 from splatbot.sim.motion import motion_from_trajectory
 from splatbot.sim.twin import Twin, TwinResult
 
@@ -30,7 +30,7 @@ class ReachCase:
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
+class ReachTask:
     """The task: at the goal in the end, and nothing touched on the way.
 
     Args:
@@ -75,7 +75,7 @@ class Planned:
     speed: float = 1.0
     iterations: int = 1500
 
-    def act(self, case: ReachCase) -> Attempt | None:
+    def act(self, case: ReachCase) -> PolicyAction | None:
         """The best path found, or none."""
         path = _path(self.planner, case, self.iterations)
         return None if path is None else _timed(self.planner, path, self.speed, certified=True)
@@ -97,7 +97,7 @@ class Shortcut:
     samples: int
     iterations: int = 1500
 
-    def act(self, case: ReachCase) -> Attempt | None:
+    def act(self, case: ReachCase) -> PolicyAction | None:
         """A path whose edges are free where they were looked at."""
         path = _path(self.planner, case, self.iterations)
         if path is None:
@@ -135,7 +135,7 @@ class Direct:
     planner: GaussianRRTStar
     via: Array | None = None
 
-    def act(self, case: ReachCase) -> Attempt | None:
+    def act(self, case: ReachCase) -> PolicyAction | None:
         """Always something."""
         stops = [case.start, case.goal] if self.via is None else [case.start, self.via, case.goal]
         return _timed(self.planner, _uncertified(np.array(stops)), 1.0, certified=False)
@@ -175,7 +175,7 @@ def _uncertified(waypoints: Array) -> Path:
     return Path(waypoints, length, Certificate(False, 1e-3, 0.0, 0.0, -1))
 
 
-def _timed(planner: GaussianRRTStar, path: Path, speed: float, *, certified: bool) -> Attempt:
+def _timed(planner: GaussianRRTStar, path: Path, speed: float, *, certified: bool) -> PolicyAction:
     """With the map's certificate, or, of a path that was never certified, without asking the map."""
     arm: RobotSpheres = planner.arm
     field = planner.field if certified else None
@@ -183,4 +183,4 @@ def _timed(planner: GaussianRRTStar, path: Path, speed: float, *, certified: boo
     promised = (
         trajectory.certificate.clearance + planner.margin if certified and trajectory.certificate.certified else None
     )
-    return Attempt(motion_from_trajectory(trajectory), promised)
+    return PolicyAction(motion_from_trajectory(trajectory), promised)

@@ -12,8 +12,8 @@ from splatbot.protocols import Array
 from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
 from splatbot.sim.compare.recorded import ArmRecord, pose_gap
+from splatbot.sim.contact_monitor import Touch
 from splatbot.sim.motion import JointMotion, minimum_jerk, motion_from_samples
-from splatbot.sim.touch import Touch
 from splatbot.sim.twin import Twin
 
 BY_IK = "joints by IK, not recorded"

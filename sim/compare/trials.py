@@ -22,7 +22,7 @@ CaseIn = TypeVar("CaseIn", contravariant=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Attempt:
+class PolicyAction:
     """What a policy does.
 
     Args:
@@ -42,12 +42,12 @@ class Policy(Protocol[CaseIn]):
         """As tables have it."""
         ...
 
-    def act(self, case: CaseIn) -> Attempt | None:
+    def act(self, case: CaseIn) -> PolicyAction | None:
         """The motion for a case; None: the policy refuses."""
         ...
 
 
-class Task(Protocol[Case]):
+class PolicyTask(Protocol[Case]):
     """What is to be done, in cases that differ, and whether it was."""
 
     @property
@@ -153,7 +153,7 @@ class TrialResults:
 
 
 def run_trials(
-    task: Task[Case],
+    task: PolicyTask[Case],
     policies: Sequence[Policy[Case]],
     *,
     seed: int = 0,
@@ -179,7 +179,9 @@ def run_trials(
     return TrialResults(task.name, names, tuple(done), interrupted, seed)
 
 
-def _trial(task: Task[Case], policy: Policy[Case], case: Case, number: int, in_map: Twin, held_out: Twin) -> Trial:
+def _trial(
+    task: PolicyTask[Case], policy: Policy[Case], case: Case, number: int, in_map: Twin, held_out: Twin
+) -> Trial:
     attempt = policy.act(case)
     if attempt is None:
         return Trial(policy.name, number, True, False, False, why_map="refused", why_held_out="refused")

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Decision:
+class EffectDecision:
     """Whether an effect is on, why, and who said so: the scene's content, or `forced`, `forbidden`."""
 
     name: str
@@ -19,10 +19,10 @@ class Decision:
     by: str = "scene"
 
 
-def decide(name: str, scene: Scene, called_for: str, not_called_for: str) -> Decision:
+def decide(name: str, scene: Scene, called_for: str, not_called_for: str) -> EffectDecision:
     """What becomes of an effect that the scene calls for, or does not (empty), each with its reason."""
     if name in scene.effects.forbid:
-        return Decision(name, False, f"forbidden by the scene; {called_for or not_called_for}", "forbidden")
+        return EffectDecision(name, False, f"forbidden by the scene; {called_for or not_called_for}", "forbidden")
     if name in scene.effects.force and not called_for:
-        return Decision(name, True, f"forced by the scene; {not_called_for}", "forced")
-    return Decision(name, bool(called_for), called_for or not_called_for)
+        return EffectDecision(name, True, f"forced by the scene; {not_called_for}", "forced")
+    return EffectDecision(name, bool(called_for), called_for or not_called_for)

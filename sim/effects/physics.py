@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from splatbot.protocols import Array
-from splatbot.sim.effects.decisions import Decision, decide
+from splatbot.sim.effects.decisions import EffectDecision, decide
 from splatbot.sim.effects.sensors import sensor_effects_for
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def physics_effect(name: str) -> PhysicsEffect:
     return effect
 
 
-def effects_for(scene: Scene) -> tuple[Decision, ...]:
+def effects_for(scene: Scene) -> tuple[EffectDecision, ...]:
     """A decision on every effect: physics in the order of :data:`PHYSICS`, then the camera's sensor."""
     physics = (physics_effect(name) for name in PHYSICS)
     decided = (decide(e.name, scene, e.called_for(scene), e.not_called_for(scene)) for e in physics)

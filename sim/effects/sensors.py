@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from splatbot.sim.effects.decisions import Decision, decide
+from splatbot.sim.effects.decisions import EffectDecision, decide
 from splatbot.sim.effects.registry import EFFECTS
 
 if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
 
 
-def sensor_effects_for(scene: Scene) -> tuple[Decision, ...]:
+def sensor_effects_for(scene: Scene) -> tuple[EffectDecision, ...]:
     """A decision on every sensor effect, in the order of :data:`EFFECTS`."""
     named = {_name(spec): spec for spec in (scene.camera.sensor if scene.camera is not None else ())}
     absent = "no camera looks" if scene.camera is None else "the camera's sensor does not name it"

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from splatbot.sim.effects.physics import PhysicsEffect, names_of
-from splatbot.sim.solids import Soft, quat_of
+from splatbot.sim.solids import SoftGeom, quat_of
 
 if TYPE_CHECKING:
     from splatbot.sim.scene import Scene, SceneObject
@@ -42,7 +42,7 @@ class SoftBodies(PhysicsEffect):
 
 def _attach(draft: Draft, thing: SceneObject) -> None:
     shape = thing.shapes[0]
-    assert isinstance(shape, Soft)
+    assert isinstance(shape, SoftGeom)
     size, cells = np.array(shape.size), np.array(shape.cells)
     radius = float(0.1 * (size / (cells - 1)).min())
     spacing = (size - 2 * radius) / (cells - 1)

@@ -10,14 +10,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.collision.evidence import DepthView
+from splatbot.collision.visibility import DepthView
 from splatbot.config import Config
 from splatbot.errors import InputError
 from splatbot.frame import Frame, PosePrior
 from splatbot.gaussians import Snapshot
 from splatbot.geometry import inverse, look_at, se3_exp, transform_points
 from splatbot.grasping.affordance import PointHint
-from splatbot.logs.raycast import Moving, Surface
+from splatbot.logs.raycast import Moving, RaycastSurface
 from splatbot.logs.shapes import box
 from splatbot.logs.textures import Texture
 from splatbot.mapping.selfmask import SelfMask
@@ -42,7 +42,9 @@ _LOOKED = 4  # of the frames, one is looked at for a click
 _KNOWN = (5e-4, 5e-4)  # [m], [rad] standard deviation of the camera's pose by the arm's joints
 # Fine Gaussians, left where depth put them: refinement for pictures moves means by millimetres, too much for grasps.
 MAPPING = {"stride": 1, "new_depth": 0.01, "rate_means": 0.0, "refine_iterations": 0, "final_iterations": 0}
-_TABLE = Surface(box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05))
+_TABLE = RaycastSurface(
+    box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05)
+)
 
 
 class UnseenError(InputError):

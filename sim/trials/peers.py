@@ -9,18 +9,18 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from splatbot.collision.evidence import measured_depths
 from splatbot.collision.fcl_models import fcl_mesh, fcl_octree, octomap_bytes
+from splatbot.collision.visibility import measured_depths
 from splatbot.evaluation.depth_fusion import DepthFusion
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.pick_planner import PickPlanner
 from splatbot.grasping.sampler import GraspSampler
-from splatbot.grasping.ways import Ways
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
 from splatbot.sim.scan import discs
 from splatbot.sim.trials.look import FARTHEST, Look, usable_depth
-from splatbot.sim.trials.solid import SolidReach, SolidWays, SolidWorld
+from splatbot.sim.trials.solid import SolidPickPlanner, SolidReach, SolidWorld
 from splatbot.sim.trials.stacks import OPTIONS, Knowledge
 
 VOXEL = 0.004  # [m] of the mesh's distances and of the cloud
@@ -87,13 +87,13 @@ def _known(
     scene = segment(discs(points, normals, colors, VOXEL), look.T_world_base, cut=False)
     robot = panda()
 
-    def towards(target: Target) -> tuple[GraspSampler, Ways]:
+    def towards(target: Target) -> tuple[GraspSampler, PickPlanner]:
         reach = SolidReach(robot, scene.T_world_base, world, target.rows)
         observers = points + _OUT * normals
         sampler = GraspSampler(
             scene, robot, observers=observers, views=look.views, make_reach=lambda around, whole: reach
         )
-        return sampler, SolidWays(sampler, target, OPTIONS, world)
+        return sampler, SolidPickPlanner(sampler, target, OPTIONS, world)
 
     return Knowledge(scene, towards, size, time.perf_counter() - begin)
 

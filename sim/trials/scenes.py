@@ -53,7 +53,7 @@ class TrialScene:
 
 
 @dataclass(frozen=True)
-class _Thing:
+class _TrialObject:
     """Something that may stand on the table: its shapes about its origin, the origin's height as it stands, how far it
     reaches from there sideways [m], and whether the hand goes around it."""
 
@@ -94,48 +94,48 @@ def make_trial(seed: int, family: str = "tabletop") -> TrialScene:
     return TrialScene(_settled(scene), str(values[k]["name"]), placed[k][0].kind, seed, family, moving)
 
 
-def _table_top(rng: np.random.Generator) -> list[_Thing]:
+def _table_top(rng: np.random.Generator) -> list[_TrialObject]:
     things = [_cup(rng), _tool(rng), _can(rng), _box(rng)]
-    more: list[Callable[[np.random.Generator], _Thing]] = [_cup, _tool, _ball, _book, _box, _lying]
+    more: list[Callable[[np.random.Generator], _TrialObject]] = [_cup, _tool, _ball, _book, _box, _lying]
     chosen = rng.choice(len(more), int(rng.integers(1, 4)), replace=False)
     return things + [more[k](rng) for k in chosen]
 
 
-def _box(rng: np.random.Generator) -> _Thing:
+def _box(rng: np.random.Generator) -> _TrialObject:
     narrow, wide, high = (float(rng.uniform(*r)) for r in ((0.03, 0.062), (0.045, 0.11), (0.04, 0.12)))
     size = (wide, narrow, high)
     shape = {"kind": "box", "size": size}
-    return _Thing("box", (shape,), high / 2, float(np.hypot(wide, narrow)) / 2)
+    return _TrialObject("box", (shape,), high / 2, float(np.hypot(wide, narrow)) / 2)
 
 
-def _can(rng: np.random.Generator) -> _Thing:
+def _can(rng: np.random.Generator) -> _TrialObject:
     r, h = float(rng.uniform(0.018, 0.033)), float(rng.uniform(0.06, 0.14))
-    return _Thing("can", ({"kind": "cylinder", "radius": r, "height": h},), h / 2, r)
+    return _TrialObject("can", ({"kind": "cylinder", "radius": r, "height": h},), h / 2, r)
 
 
-def _lying(rng: np.random.Generator) -> _Thing:
+def _lying(rng: np.random.Generator) -> _TrialObject:
     r, h = float(rng.uniform(0.02, 0.032)), float(rng.uniform(0.09, 0.14))
     shape = {"kind": "cylinder", "radius": r, "height": h, "rpy": [np.pi / 2, 0.0, 0.0]}
-    return _Thing("lying can", (shape,), r, float(np.hypot(r, h / 2)))
+    return _TrialObject("lying can", (shape,), r, float(np.hypot(r, h / 2)))
 
 
-def _ball(rng: np.random.Generator) -> _Thing:
+def _ball(rng: np.random.Generator) -> _TrialObject:
     r = float(rng.uniform(0.022, 0.034))
-    return _Thing("ball", ({"kind": "sphere", "radius": r},), r, r)
+    return _TrialObject("ball", ({"kind": "sphere", "radius": r},), r, r)
 
 
-def _egg(rng: np.random.Generator) -> _Thing:
+def _egg(rng: np.random.Generator) -> _TrialObject:
     a, b, c = float(rng.uniform(0.03, 0.045)), float(rng.uniform(0.022, 0.032)), float(rng.uniform(0.022, 0.032))
-    return _Thing("egg", ({"kind": "ellipsoid", "axes": [a, b, c]},), c, a)
+    return _TrialObject("egg", ({"kind": "ellipsoid", "axes": [a, b, c]},), c, a)
 
 
-def _book(rng: np.random.Generator) -> _Thing:
+def _book(rng: np.random.Generator) -> _TrialObject:
     size = (float(rng.uniform(0.15, 0.20)), float(rng.uniform(0.11, 0.14)), float(rng.uniform(0.02, 0.035)))
     around = float(np.hypot(*size[:2])) / 2
-    return _Thing("book", ({"kind": "box", "size": size},), size[2] / 2, around, False)
+    return _TrialObject("book", ({"kind": "box", "size": size},), size[2] / 2, around, False)
 
 
-def _cup(rng: np.random.Generator) -> _Thing:
+def _cup(rng: np.random.Generator) -> _TrialObject:
     """Hollow and open at the top: staves around a bottom."""
     r, h, wall, staves = float(rng.uniform(0.028, 0.035)), float(rng.uniform(0.07, 0.11)), 0.004, 16
     middle = r - wall / 2
@@ -146,10 +146,10 @@ def _cup(rng: np.random.Generator) -> _Thing:
     for turn in np.arange(staves) * 2 * np.pi / staves:
         at = [middle * float(np.cos(turn)), middle * float(np.sin(turn)), 0.0]
         shapes.append({"kind": "box", "size": [wall, wide, h], "at": at, "rpy": [0.0, 0.0, float(turn)]})
-    return _Thing("cup", tuple(shapes), h / 2, r)
+    return _TrialObject("cup", tuple(shapes), h / 2, r)
 
 
-def _tool(rng: np.random.Generator) -> _Thing:
+def _tool(rng: np.random.Generator) -> _TrialObject:
     """A mallet that lies: a handle between a head and a knob, which keep it off the table."""
     r, length, head = float(rng.uniform(0.011, 0.015)), float(rng.uniform(0.13, 0.18)), float(rng.uniform(0.04, 0.05))
     shapes: tuple[dict[str, Any], ...] = (
@@ -157,16 +157,16 @@ def _tool(rng: np.random.Generator) -> _Thing:
         {"kind": "box", "size": [0.035, 0.07, head], "at": [length / 2, 0.0, 0.0]},
         {"kind": "box", "size": [0.02, head, head], "at": [-length / 2, 0.0, 0.0]},
     )
-    return _Thing("mallet", shapes, head / 2, length / 2 + 0.03)
+    return _TrialObject("mallet", shapes, head / 2, length / 2 + 0.03)
 
 
-_CONVEX: tuple[Callable[[np.random.Generator], _Thing], ...] = (_box, _can, _ball, _lying, _box, _egg)
+_CONVEX: tuple[Callable[[np.random.Generator], _TrialObject], ...] = (_box, _can, _ball, _lying, _box, _egg)
 
 
-def _placed(things: list[_Thing], rng: np.random.Generator) -> list[tuple[_Thing, dict[str, Any]]]:
+def _placed(things: list[_TrialObject], rng: np.random.Generator) -> list[tuple[_TrialObject, dict[str, Any]]]:
     """Scene objects at places that are drawn until they keep clear of each other; what finds none is left out."""
     taken: list[tuple[Array, float]] = []
-    found: list[tuple[_Thing, dict[str, Any]]] = []
+    found: list[tuple[_TrialObject, dict[str, Any]]] = []
     colors = rng.permutation(len(_COLORS))
     for k, thing in enumerate(things):
         apart = float(rng.uniform(*_BETWEEN))

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.geometry import inverse
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.pick_planner import PickPlan, Segment, in_hand, raised, target_spheres, within
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.reach import Reached
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
-from splatbot.grasping.ways import Leg, Way, in_hand, raised, target_spheres, within
 from splatbot.planning import JointGoal, Path
 from splatbot.planning.cartesian import straight_line
 from splatbot.planning.problem import Certificate
@@ -117,8 +117,8 @@ class SolidReach:
         return Reached(None, None, 0.0, 0.0, "its approach is blocked", "have a blocked approach")
 
 
-class SolidWays:
-    """Ways to grasps; see :class:`splatbot.grasping.ways.Ways`.
+class SolidPickPlanner:
+    """Ways to grasps; see :class:`splatbot.grasping.pick_planner.Ways`.
 
     Args:
         sampler: of the grasps.
@@ -137,8 +137,8 @@ class SolidWays:
         own[target.rows] = True
         self._beside = world.around(np.flatnonzero(own))
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
-        """See :class:`splatbot.grasping.ways.Ways`; of what moved nothing is known here."""
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
+        """See :class:`splatbot.grasping.pick_planner.Ways`; of what moved nothing is known here."""
         if grasp.q_pregrasp is None:
             return "no posture is known"
         opening = min(grasp.opening, self.s.hand.stroke)
@@ -163,7 +163,7 @@ class SolidWays:
         lift = straight(loaded, loaded.free, free[-1], top)
         if lift is None:
             return "it cannot be lifted"
-        return Way(
+        return PickPlan(
             grasp,
             opening,
             attached,
@@ -174,8 +174,8 @@ class SolidWays:
             planned,
         )
 
-    def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
-        """See :class:`splatbot.grasping.ways.Ways`."""
+    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
+        """See :class:`splatbot.grasping.pick_planner.Ways`."""
         loaded = SolidArm(self.robot, self._T, way.grasp.width, self._beside, way.attached)
         path = self._connect(loaded, start, np.asarray(goal.q, dtype=np.float64))
         return "no path was found" if path is None else _leg(path, loaded)
@@ -196,7 +196,7 @@ def straight(arm: SolidArm, free: Free, start: Array, T_world_end: Array) -> Arr
     return line.path.waypoints if free(line.path.waypoints).all() else None
 
 
-def _leg(path: Array, arm: SolidArm) -> Leg:
+def _leg(path: Array, arm: SolidArm) -> Segment:
     """Close waypoints, so that corners are hardly rounded: how far that may go nobody knows here."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     parts = [
@@ -204,7 +204,7 @@ def _leg(path: Array, arm: SolidArm) -> Leg:
         for a, b, length in zip(path[:-1], path[1:], steps, strict=True)
     ]
     dense = np.concatenate([*parts, path[-1:]])
-    return Leg(Path(dense, float(steps.sum()), Certificate(False, RESOLUTION, 0.0, 0.0, -1)), arm.spheres, None)
+    return Segment(Path(dense, float(steps.sum()), Certificate(False, RESOLUTION, 0.0, 0.0, -1)), arm.spheres, None)
 
 
 def _capsules(fcl: Any, robot: RobotModel, opening: float) -> list[tuple[int, Array, Any]]:

@@ -13,15 +13,15 @@ import torch
 from splatbot.collision import find_moving, gather_evidence
 from splatbot.grasping.affordance import Target, find_target
 from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.places import PlaceAffordance
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp, GraspResult
-from splatbot.grasping.ways import Leg, MapWays, Way, Ways
 from splatbot.planning import JointGoal
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from splatbot.sim.trials.look import Look
 
 LIFT = 0.18  # [m]; 15 cm are asked for
@@ -41,8 +41,8 @@ class Knowledge:
         seconds: that building it took.
     """
 
-    scene: MapScene
-    towards: Callable[[Target], tuple[GraspSampler, Ways]]
+    scene: SegmentedMap
+    towards: Callable[[Target], tuple[GraspSampler, PickPlanner]]
     world_bytes: int
     seconds: float
 
@@ -80,11 +80,11 @@ class GaussianStack:
         )
         seconds = look.seconds + time.perf_counter() - begin
         world = model.nbytes + sampler.field.nbytes
-        return Knowledge(scene, lambda target: (sampler, MapWays(sampler, target, OPTIONS)), world, seconds)
+        return Knowledge(scene, lambda target: (sampler, MapPickPlanner(sampler, target, OPTIONS)), world, seconds)
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class StackDecision:
     """A target, grasps of it, and the way to one.
 
     Args:
@@ -98,11 +98,11 @@ class Decision:
     target: Target
     sampler: GraspSampler
     grasps: GraspResult
-    ways: Ways
+    ways: PickPlanner
     seconds: float
 
 
-def decide(known: Knowledge, look: Look) -> Decision:
+def decide(known: Knowledge, look: Look) -> StackDecision:
     """Find what was clicked at, and grasps of it.
 
     Raises:
@@ -112,23 +112,23 @@ def decide(known: Knowledge, look: Look) -> Decision:
     sampler, ways = known.towards(target)
     begin = time.perf_counter()
     grasps = sampler.sample(target, OPTIONS.grasp)
-    return Decision(target, sampler, grasps, _Remembered(ways), time.perf_counter() - begin)
+    return StackDecision(target, sampler, grasps, _Remembered(ways), time.perf_counter() - begin)
 
 
 class _Remembered:
     """Ways that are found once, so that two twins follow the same."""
 
-    def __init__(self, ways: Ways) -> None:
+    def __init__(self, ways: PickPlanner) -> None:
         self._ways = ways
-        self._found: dict[tuple[int, bool], Way | str] = {}
+        self._found: dict[tuple[int, bool], PickPlan | str] = {}
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
         """As when it was first asked."""
         key = id(grasp), cautious
         if key not in self._found:
             self._found[key] = self._ways.to(grasp, start, cautious=cautious)
         return self._found[key]
 
-    def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
+    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
         """Asked anew."""
         return self._ways.onwards(way, start, goal)

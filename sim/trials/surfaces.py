@@ -6,18 +6,18 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.geometry import transform_points
-from splatbot.logs.raycast import Surface
-from splatbot.logs.shapes import Mesh, box, cylinder, sphere
+from splatbot.logs.raycast import RaycastSurface
+from splatbot.logs.shapes import TriangleMesh, box, cylinder, sphere
 from splatbot.logs.textures import Texture
 from splatbot.sim.scene import SceneObject
-from splatbot.sim.solids import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, pose_at
+from splatbot.sim.solids import BoxGeom, CapsuleGeom, CylinderGeom, EllipsoidGeom, Shape, SphereGeom, pose_at
 from splatbot.sim.wrist import capsule_mesh
 
 _DARK = 0.7  # of the second colour
 _PERIOD = 0.03  # [m] of the pattern
 
 
-def surfaces_of(thing: SceneObject, *, placed: bool = True, seed: int = 0) -> list[Surface]:
+def surfaces_of(thing: SceneObject, *, placed: bool = True, seed: int = 0) -> list[RaycastSurface]:
     """Meshes of an object's shapes, where the scene puts it, or in its own frame; mottled in its colour.
 
     Raises:
@@ -30,21 +30,21 @@ def surfaces_of(thing: SceneObject, *, placed: bool = True, seed: int = 0) -> li
     for shape in thing.shapes:
         mesh = _mesh(shape, thing.name)
         vertices = transform_points(T @ pose_at(shape.at, shape.rpy), mesh.vertices)
-        found.append(Surface(Mesh(vertices, mesh.triangles), texture))
+        found.append(RaycastSurface(TriangleMesh(vertices, mesh.triangles), texture))
     return found
 
 
-def _mesh(shape: Shape, name: str) -> Mesh:
+def _mesh(shape: Shape, name: str) -> TriangleMesh:
     """About the shape's middle."""
-    if isinstance(shape, Box):
+    if isinstance(shape, BoxGeom):
         return box(shape.size).placed([0.0, 0.0, -shape.size[2] / 2])
-    if isinstance(shape, Cylinder):
+    if isinstance(shape, CylinderGeom):
         return cylinder(shape.radius, shape.height).placed([0.0, 0.0, -shape.height / 2])
-    if isinstance(shape, Sphere):
+    if isinstance(shape, SphereGeom):
         return sphere(shape.radius).placed([0.0, 0.0, -shape.radius])
-    if isinstance(shape, Ellipsoid):
+    if isinstance(shape, EllipsoidGeom):
         ball = sphere(1.0).placed([0.0, 0.0, -1.0])
-        return Mesh(ball.vertices * np.asarray(shape.axes), ball.triangles)
-    if isinstance(shape, Capsule):
+        return TriangleMesh(ball.vertices * np.asarray(shape.axes), ball.triangles)
+    if isinstance(shape, CapsuleGeom):
         return capsule_mesh([0.0, 0.0, -shape.height / 2], [0.0, 0.0, shape.height / 2], shape.radius)
     raise InputError(f"is a {shape.kind}.", field=name, hint="give boxes, cylinders, balls, ellipsoids or capsules")

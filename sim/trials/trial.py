@@ -19,12 +19,12 @@ from splatbot.planning.follow import follow
 from splatbot.protocols import Array
 from splatbot.sim.camera import TwinCamera
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
+from splatbot.sim.contact_monitor import ContactMonitor
 from splatbot.sim.controller import TwinController
-from splatbot.sim.touch import Touches
 from splatbot.sim.trials.look import Look, UnseenError, look
 from splatbot.sim.trials.scenes import TABLE, TrialScene
 from splatbot.sim.trials.shake import Shake
-from splatbot.sim.trials.stacks import OPTIONS, Decision, Knowledge, Stack, decide
+from splatbot.sim.trials.stacks import OPTIONS, Knowledge, Stack, StackDecision, decide
 from splatbot.sim.twin import Twin
 from splatbot.sim.video import Video
 from splatbot.sim.world import OBJECT
@@ -51,7 +51,7 @@ class Failure(StrEnum):
 
 
 @dataclass(frozen=True)
-class Attempt:
+class TwinPickResult:
     """A pick in one twin.
 
     Args:
@@ -97,8 +97,8 @@ class TrialRow:
     stack: str
     kind: str
     moving: bool
-    ideal: Attempt
-    reality: Attempt
+    ideal: TwinPickResult
+    reality: TwinPickResult
     plan_ms: float | None
     grasp_ms: float | None
     build_s: float | None
@@ -115,7 +115,7 @@ class TrialRow:
     def from_dict(cls, values: dict[str, Any]) -> TrialRow:
         """The other way round of :meth:`to_dict`."""
         twins = {
-            name: Attempt(**{**values[name], "touched": tuple(values[name]["touched"])})
+            name: TwinPickResult(**{**values[name], "touched": tuple(values[name]["touched"])})
             for name in ("ideal", "reality")
         }
         return cls(**{**values, **twins})
@@ -160,8 +160,8 @@ def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | Non
 
 
 def attempt(
-    decision: Decision, trial: TrialScene, twin: Twin, *, mistaken: bool = False, watch: Watch | None = None
-) -> tuple[Attempt, PickResult]:
+    decision: StackDecision, trial: TrialScene, twin: Twin, *, mistaken: bool = False, watch: Watch | None = None
+) -> tuple[TwinPickResult, PickResult]:
     """The pick in a twin, then the shaking.
 
     Args:
@@ -195,14 +195,14 @@ def attempt(
         reason = shaken or f"rose {1e3 * rose:.0f} mm, {1e3 * kept:.0f} mm after it was shaken"
     failure = "" if success else _failure(result, early, mistaken)
     touched = controller.touched(trial.target)
-    return Attempt(success, failure, outcome, reason, rose, kept, touched, result.opening), result
+    return TwinPickResult(success, failure, outcome, reason, rose, kept, touched, result.opening), result
 
 
 class _Watched(TwinController):
     """A twin's controller that takes note of what its arm touches."""
 
     def __init__(self, twin: Twin, watch: Watch | None) -> None:
-        self._touches, self._periods, self._watch = Touches(twin.world), 0, watch
+        self._touches, self._periods, self._watch = ContactMonitor(twin.world), 0, watch
         super().__init__(twin)
 
     def _advance(self, q: Array, velocity: Array, acceleration: Array) -> None:
@@ -223,7 +223,7 @@ def _reality(trial: TrialScene) -> HeldOutTwin:
     return HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
 
 
-def _film(decision: Decision, trial: TrialScene, path: Path) -> None:
+def _film(decision: StackDecision, trial: TrialScene, path: Path) -> None:
     """The pick in reality once more, with a camera."""
     twin = _reality(trial)
     video = Video(path, TwinCamera(twin.world, seed=trial.seed))
@@ -259,8 +259,8 @@ def _mistaken(known: Knowledge, target: Target, trial: TrialScene) -> bool:
     return bool(np.linalg.norm(middle - true[:2]) > _TAKEN_FOR)
 
 
-def _no_target(error: SplatbotError) -> Attempt:
-    return Attempt(False, Failure.PERCEPTION, "no target", error.message)
+def _no_target(error: SplatbotError) -> TwinPickResult:
+    return TwinPickResult(False, Failure.PERCEPTION, "no target", error.message)
 
 
 def _height(twin: Twin, name: str) -> float:
@@ -272,10 +272,10 @@ def _row(
     trial: TrialScene,
     scan: tuple[int, int],
     known: Knowledge | None,
-    decision: Decision | None,
+    decision: StackDecision | None,
     result: PickResult | None,
-    ideal: Attempt,
-    reality: Attempt,
+    ideal: TwinPickResult,
+    reality: TwinPickResult,
 ) -> TrialRow:
     planned = None if result is None or result.planned is None else 1e3 * result.planned
     return TrialRow(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatbot.bench.results import Results
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_error
-from splatbot.collision.evidence import measured_depths
+from splatbot.collision.visibility import measured_depths
 from splatbot.gaussians import Snapshot
 from splatbot.geometry import transform_points
 from splatbot.logs import open_log

@@ -20,8 +20,8 @@ from splatbot.evaluation.geometry import depth_error
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
-from splatbot.logs.raycast import Scene, Surface
-from splatbot.logs.shapes import Mesh
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
+from splatbot.logs.shapes import TriangleMesh
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
@@ -76,8 +76,8 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
         for share in (50, 90, 95):
             results.add(case, f"{metric}, {share} %", 1e3 * float(np.percentile(np.abs(error), share)), "mm")
     fused_mesh = fusion.mesh()
-    mesh = Mesh(np.asarray(fused_mesh.vertices), np.asarray(fused_mesh.triangles).astype(np.uint32))
-    seen = Scene([Surface(mesh, Texture(_GREY, _GREY, 1.0))])
+    mesh = TriangleMesh(np.asarray(fused_mesh.vertices), np.asarray(fused_mesh.triangles).astype(np.uint32))
+    seen = RaycastScene([RaycastSurface(mesh, Texture(_GREY, _GREY, 1.0))])
     frames = [(log[index], poses[index]) for index in sorted(held_out & poses.keys())]
     errors = [depth_error(seen.render(frame.camera, T)[1], frame.depth).l1 for frame, T in frames]
     _add_mean(results, f"{name}, held-out views", "depth error, mean, fused depth", errors)

@@ -18,7 +18,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.collision.fcl_models import fcl_mesh, fcl_octree
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_to_rotation
-from splatbot.logs.shapes import Mesh, box, cylinder, sphere
+from splatbot.logs.shapes import TriangleMesh, box, cylinder, sphere
 from splatbot.protocols import Array
 
 Say = Callable[[str], None]
@@ -227,7 +227,7 @@ def mesh_of(scene: Tabletop) -> tuple[Array, Array]:
     return np.concatenate(vertices), np.concatenate(triangles)
 
 
-def solid_mesh(solid: object) -> Mesh:
+def solid_mesh(solid: object) -> TriangleMesh:
     """The triangles of a block, can or ball."""
     if isinstance(solid, Block):
         x, y, z = solid.center

@@ -21,34 +21,34 @@ Arguments = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Effect:
+class RasterOption:
     """An option; ``change`` returns the arguments of a call with it from those without."""
 
     name: str
     change: Callable[[Arguments], Arguments]
 
 
-def all_effects() -> list[Effect]:
+def all_effects() -> list[RasterOption]:
     """In the order they are reported."""
     return [
-        Effect("depth (RGB+ED)", lambda a: a | {"render_mode": "RGB+ED"}),
-        Effect("plane depth", lambda a: a | {"render_mode": "RGB+ED", "depth_mode": "plane"}),
-        Effect("background", lambda a: a | {"backgrounds": torch.ones(1, 3)}),
-        *(Effect(f"harmonics of degree {d}", partial(with_harmonics, degree=d)) for d in range(5)),
-        Effect("antialiased", lambda a: a | {"rasterize_mode": "antialiased"}),
-        Effect("covariances given", _covariances),
-        Effect("absolute gradients", lambda a: a | {"absgrad": True}),
-        Effect("packed", lambda a: a | {"packed": True}),
-        Effect("unscented transform", lambda a: a | {"with_ut": True}),
-        Effect(
+        RasterOption("depth (RGB+ED)", lambda a: a | {"render_mode": "RGB+ED"}),
+        RasterOption("plane depth", lambda a: a | {"render_mode": "RGB+ED", "depth_mode": "plane"}),
+        RasterOption("background", lambda a: a | {"backgrounds": torch.ones(1, 3)}),
+        *(RasterOption(f"harmonics of degree {d}", partial(with_harmonics, degree=d)) for d in range(5)),
+        RasterOption("antialiased", lambda a: a | {"rasterize_mode": "antialiased"}),
+        RasterOption("covariances given", _covariances),
+        RasterOption("absolute gradients", lambda a: a | {"absgrad": True}),
+        RasterOption("packed", lambda a: a | {"packed": True}),
+        RasterOption("unscented transform", lambda a: a | {"with_ut": True}),
+        RasterOption(
             "lens distortion",
             lambda a: a | {"with_ut": True, "radial_coeffs": torch.tensor([[0.02, -0.01, 0.0, 0.0, 0.0, 0.0]])},
         ),
-        Effect("orthographic camera", lambda a: a | {"camera_model": "ortho"}),
-        Effect("fisheye camera", lambda a: a | {"camera_model": "fisheye"}),
-        Effect("normals", lambda a: a | {"return_normals": True}),
-        Effect("pose gradient", lambda a: a | {"viewmats": a["viewmats"].clone().requires_grad_()}),
-        Effect("intrinsics' gradient", lambda a: a | {"Ks": a["Ks"].clone().requires_grad_()}),
+        RasterOption("orthographic camera", lambda a: a | {"camera_model": "ortho"}),
+        RasterOption("fisheye camera", lambda a: a | {"camera_model": "fisheye"}),
+        RasterOption("normals", lambda a: a | {"return_normals": True}),
+        RasterOption("pose gradient", lambda a: a | {"viewmats": a["viewmats"].clone().requires_grad_()}),
+        RasterOption("intrinsics' gradient", lambda a: a | {"Ks": a["Ks"].clone().requires_grad_()}),
     ]
 
 

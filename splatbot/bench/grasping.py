@@ -19,7 +19,7 @@ from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 
 Say = Callable[[str], None]
 DEFAULT_SAMPLES = GraspOptions().samples
@@ -49,7 +49,7 @@ class GraspingPlan:
 
 
 @dataclass(frozen=True, eq=False)
-class _Thing:
+class _BenchObject:
     """A thing of the table top that the map shows, and its exact shape."""
 
     target: Target
@@ -85,7 +85,7 @@ def _run_map(results: Results, top: Tabletop, count: int, samples: int, case: st
     sampler = GraspSampler(scene, panda())
     options = GraspOptions(samples=samples)
     sampler.sample(things[0].target, options)  # warms up
-    found: list[tuple[_Thing, GraspResult, float]] = []
+    found: list[tuple[_BenchObject, GraspResult, float]] = []
     for thing in things:
         start = time.perf_counter()
         result = sampler.sample(thing.target, options)
@@ -103,7 +103,7 @@ def _run_map(results: Results, top: Tabletop, count: int, samples: int, case: st
     _audit(results, case, found)
 
 
-def _things(scene: MapScene, top: Tabletop) -> list[_Thing]:
+def _things(scene: SegmentedMap, top: Tabletop) -> list[_BenchObject]:
     """The segmented objects whose shape is known, without the shelf."""
     points = scene.model.means.double().numpy()
     things = []
@@ -112,7 +112,7 @@ def _things(scene: MapScene, top: Tabletop) -> list[_Thing]:
         k = int(np.argmin(away))
         if away[k] < 2e-3:
             things.append(
-                _Thing(Target(thing.rows, None, f"thing {k}", "bench", 1.0, (), thing.number), top.solids[5 + k])
+                _BenchObject(Target(thing.rows, None, f"thing {k}", "bench", 1.0, (), thing.number), top.solids[5 + k])
             )
     return things
 
@@ -123,7 +123,7 @@ def _narrow(solid: Solid) -> bool:
     return (min(size[:2]) if size is not None else 2 * solid.radius) < 0.074  # type: ignore[attr-defined]
 
 
-def _audit(results: Results, case: str, found: list[tuple[_Thing, GraspResult, float]]) -> None:
+def _audit(results: Results, case: str, found: list[tuple[_BenchObject, GraspResult, float]]) -> None:
     """Contacts off the true surface, and the true normals off the line between them."""
     off: list[float] = []
     angle: list[float] = []

@@ -19,7 +19,7 @@ from splatbot.config import Config
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse
 from splatbot.logs.synthetic import PREFIX, SyntheticLog
-from splatbot.mapping.fusion import model_depth, view_of
+from splatbot.mapping.insertion import model_depth, view_of
 from splatbot.mapping.mapper import Mapper
 from splatbot.rasterize import rasterization
 from splatbot.tracking.features import Features

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from splatbot.bench.collision_peers import solid_mesh
 from splatbot.bench.tabletop import Tabletop
 from splatbot.camera import Camera
-from splatbot.collision.evidence import measured_depths
+from splatbot.collision.visibility import measured_depths
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
 from splatbot.geometry import look_at, transform_points
 from splatbot.logs.effects import make_effects
-from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.shapes import box
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
@@ -29,7 +29,9 @@ MIDDLE, SWING = 0.70, 0.15  # [m] height over the table top
 ARC = np.radians(75.0)  # to both sides of where the robot stands
 WHOLE = 120  # frames; fewer end on the way
 RATE = 30.0  # [Hz]
-_FLOOR = Surface(box([8.0, 8.0, 0.02]).placed([0.5, 0.0, -0.8]), Texture((0.60, 0.58, 0.55), (0.30, 0.30, 0.33), 0.30))
+_FLOOR = RaycastSurface(
+    box([8.0, 8.0, 0.02]).placed([0.5, 0.0, -0.8]), Texture((0.60, 0.58, 0.55), (0.30, 0.30, 0.33), 0.30)
+)
 _COLORS = ((0.80, 0.62, 0.42), (0.85, 0.85, 0.80), (0.20, 0.70, 0.35), (0.95, 0.55, 0.15), (0.15, 0.40, 0.60))
 
 
@@ -91,10 +93,10 @@ def shoot(scene: Tabletop, frames: int, width: int, seed: int = 0) -> Film:
     The robot is not there. What faces down or away from it stays unseen.
     """
     solids = [
-        Surface(solid_mesh(solid), Texture(_COLORS[i % 5], _COLORS[(i + 2) % 5], 0.04, seed=i))
+        RaycastSurface(solid_mesh(solid), Texture(_COLORS[i % 5], _COLORS[(i + 2) % 5], 0.04, seed=i))
         for i, solid in enumerate(scene.solids)
     ]
-    stage = Scene([_FLOOR, *solids])
+    stage = RaycastScene([_FLOOR, *solids])
     f, height = 525.0 * width / 640.0, width * 3 // 4
     camera = Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
     poses = np.array([_pose(i / WHOLE) for i in range(frames)])

@@ -27,7 +27,7 @@ _SOUGHT = (PlanStatus.SUCCESS, PlanStatus.TIMED_OUT, PlanStatus.PLANNING_FAILED)
 
 
 @dataclass(frozen=True, eq=False)
-class Touches:
+class TrueClearances:
     """What exact distances say of paths.
 
     Args:
@@ -92,7 +92,7 @@ def audit_mapped(
             _add_touches(results, case, touches(paths, bare, truth, mapped.film))
 
 
-def touches(paths: Sequence[Array], arm: RobotSpheres, truth: Truth, film: Film) -> Touches:
+def touches(paths: Sequence[Array], arm: RobotSpheres, truth: Truth, film: Film) -> TrueClearances:
     """How the configurations of paths, every 1/256 rad, lie to the true shapes in whose frame the arm stands."""
     shapes = _shapes(truth)
     moving = arm.spheres.link > 0
@@ -107,7 +107,7 @@ def touches(paths: Sequence[Array], arm: RobotSpheres, truth: Truth, film: Film)
             radii = np.tile(arm.spheres.radii[moving], int((room <= 0).sum()))
             inside = centers[truth.scene.distance(centers) <= radii]
         seen.append(bool(film.seen(_closest(shapes, inside)).any()) if len(inside) else False)
-    return Touches(np.array(rooms), np.array(seen, np.bool_))
+    return TrueClearances(np.array(rooms), np.array(seen, np.bool_))
 
 
 def _add_success(results: Results, case: str, runs: Sequence[PlanResult], mean_ms: float) -> None:
@@ -133,7 +133,7 @@ def _add_cost(results: Results, case: str, costs: Array, reference: Array) -> No
         results.add(case, "cost against margin 0 where both solved, mean", ratio, "x")
 
 
-def _add_touches(results: Results, case: str, found: Touches) -> None:
+def _add_touches(results: Results, case: str, found: TrueClearances) -> None:
     touch = found.rooms <= 0
     count = f"of {len(touch)}"
     results.add(case, "touch the truth", float(touch.sum()), count)

@@ -21,8 +21,8 @@ from splatbot.protocols import Array
 from splatbot.results.margin import REACH, SHARE
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
-from splatbot.sim.compare.push import Push, PushCase, push_policies
-from splatbot.sim.compare.reach import Reach, ReachCase, reach_policies
+from splatbot.sim.compare.push import PushCase, PushTask, push_policies
+from splatbot.sim.compare.reach import ReachCase, ReachTask, reach_policies
 from splatbot.sim.compare.trials import TrialResults, join, run_trials
 from splatbot.sim.scene import Scene, SceneObject, make_scene
 from splatbot.sim.solids import rpy_of
@@ -142,7 +142,9 @@ def _reach(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
     wanted = problems(robot, RobotSpheres(robot), ideal, truth, plan.trials, place.seed, _ROOM)
     cases = [ReachCase(problem.start, problem.goal, place.seed + k) for k, problem in enumerate(wanted)]
     true = truth_scene(place.table)
-    task = Reach(cases, Twin(place.map_scene(movable=False)), lambda case: HeldOutTwin(true, draw(Spread(), case.seed)))
+    task = ReachTask(
+        cases, Twin(place.map_scene(movable=False)), lambda case: HeldOutTwin(true, draw(Spread(), case.seed))
+    )
     policies = reach_policies(field, robot, place.mapped.T_map_scene, place.own_margin(field))
     return run_trials(task, policies, seed=plan.seed, tell=tell)
 
@@ -158,7 +160,7 @@ def _push(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
         direction = _free_direction(place.table, index, rng)
         match = _believed(believed, middle_of(place.table.solids[index]))
         cases.append(PushCase(match, f"thing{index}", direction, DISTANCE, place.seed + k))
-    task = Push(cases, map_twin, lambda case: HeldOutTwin(true, draw(Spread(), case.seed)))
+    task = PushTask(cases, map_twin, lambda case: HeldOutTwin(true, draw(Spread(), case.seed)))
     return run_trials(task, push_policies(panda()), seed=plan.seed, tell=tell)
 
 

@@ -24,7 +24,7 @@ from splatbot.config import Config, load_config
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.logs.synthetic import SyntheticLog
-from splatbot.mapping.fusion import view_of
+from splatbot.mapping.insertion import view_of
 from splatbot.rasterize import rasterize_pixels
 from splatbot.slam import Slam
 from splatbot.tracking.prepare import Level, PreparedFrame, normals_of, prepare, smoothed
@@ -47,7 +47,7 @@ _NU = 4.0  # of the Student-t weights, as in the direct stage
 
 
 @dataclass(frozen=True)
-class Rendered:
+class SplatRender:
     """Grey, depth [m] and alpha of the map at chosen pixels (N,)."""
 
     gray: Array
@@ -106,10 +106,10 @@ def align_to_map(
     return inverse(T_camera_world), least_ms
 
 
-def _render(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> Rendered:
+def _render(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> SplatRender:
     view = view_of(model, level.camera, inverse(T_camera_world))
     gray = smoothed((view.rgb @ torch.tensor([0.299, 0.587, 0.114])).numpy())
-    return Rendered(*(image[pixels].astype(np.float64) for image in (gray, view.depth.numpy(), view.alpha.numpy())))
+    return SplatRender(*(image[pixels].astype(np.float64) for image in (gray, view.depth.numpy(), view.alpha.numpy())))
 
 
 def _least_ms(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> float:
@@ -125,15 +125,15 @@ def _least_ms(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: 
 def _solve(
     level: Level,
     pixels: Mask,
-    shown: Rendered,
-    moved: Sequence[Rendered],
+    shown: SplatRender,
+    moved: Sequence[SplatRender],
     exposure: Array,
     config: Config,
 ) -> Array:
     """The step (8,): twist (t, ω) that left-multiplies T_camera_world, gain and offset."""
     c = config.tracking
     depth = level.depth[pixels].astype(np.float64)
-    sigma_depth = c.depth_doubt * (c.sigma_depth_floor + c.sigma_depth_quad * depth**2)
+    sigma_depth = c.depth_sigma_scale * (c.sigma_depth_floor + c.sigma_depth_quad * depth**2)
     r_gray = (exposure[0] * shown.gray + exposure[1] - level.gray[pixels]) / c.sigma_gray
     r_depth = (shown.depth - depth) / sigma_depth
     J_gray = np.stack([exposure[0] * (m.gray - shown.gray) / _DIFFERENCE for m in moved], 1) / c.sigma_gray

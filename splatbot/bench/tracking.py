@@ -65,7 +65,7 @@ class Contender:
 
 
 @dataclass
-class Outcome:
+class TrackingOutcome:
     """What a tracker made of a log: milliseconds by frame, the poses it gave, how sure it was, and memory.
 
     Covariances (N, 6, 6) of the trajectory's poses as of :func:`splatbot.evaluation.nees`; None of a tracker without.
@@ -140,7 +140,7 @@ def contenders(plan: TrackingPlan) -> Iterator[Contender]:
         yield Contender(peer.name, "", peer.note, peer.make)
 
 
-def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> Outcome:
+def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> TrackingOutcome:
     """Track the frames of a log; decoding is not timed."""
     count = len(log) if max_frames is None else min(len(log), max_frames)
     ms, whole, stamps, poses = [], [], [], []
@@ -155,11 +155,11 @@ def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> Outc
                 stamps.append(frame.stamp)
                 poses.append(T_world_camera)
     if isinstance(odometry, SlamOdometry):
-        return Outcome(ms, odometry.refined(), count, peak(), whole, odometry.covariances())
-    return Outcome(ms, _trajectory(stamps, poses), count, peak(), whole, None)
+        return TrackingOutcome(ms, odometry.refined(), count, peak(), whole, odometry.covariances())
+    return TrackingOutcome(ms, _trajectory(stamps, poses), count, peak(), whole, None)
 
 
-def add_rows(results: Results, log: Log, contender: Contender, outcome: Outcome, name: str) -> None:
+def add_rows(results: Results, log: Log, contender: Contender, outcome: TrackingOutcome, name: str) -> None:
     """The figures of one run. ATE is RMSE over all tracked frames, SE(3)-aligned; RPE from frame to frame."""
     case = f"{name}, {contender.setting}" if contender.setting else name
 

@@ -25,7 +25,7 @@ from splatbot.sim.camera import TwinCamera
 from splatbot.sim.scene import make_scene
 from splatbot.sim.solids import rpy_of
 from splatbot.sim.twin import Twin
-from splatbot.sim.view import View
+from splatbot.sim.view import TwinView
 
 HELD_OUT = 5  # every so many frames of the film are not mapped
 _REACH = 0.35  # of each joint's range, to both sides of home
@@ -118,7 +118,7 @@ def _agreement(shown: NDArray[np.bool_], truth: NDArray[np.bool_]) -> tuple[floa
 
 
 def _likeness(
-    model: GaussianModel, camera: Camera, T_map_camera: Array, seen: View, image: NDArray[np.uint8] | None
+    model: GaussianModel, camera: Camera, T_map_camera: Array, seen: TwinView, image: NDArray[np.uint8] | None
 ) -> tuple[float, float]:
     """PSNR [dB] of the plain and of the composite picture where no body is; NaN without a frame."""
     if image is None:

@@ -43,7 +43,7 @@ VARIANTS = (
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredVariant:
     """Of one build: milliseconds of the surface map at 320x240, RGB and expected depth.
 
     Args:
@@ -72,7 +72,7 @@ def run_variants(results: Results, *, threads: int, say: Callable[[str], None]) 
         results.add(case, "largest error", measured.largest_error, "")
 
 
-def _build_and_measure(variant: Variant, threads: int) -> Measured:
+def _build_and_measure(variant: Variant, threads: int) -> MeasuredVariant:
     with tempfile.TemporaryDirectory(prefix="splatbot-variant-") as folder:
         build, out = Path(folder) / "build", Path(folder) / "out"
         _run(
@@ -83,7 +83,7 @@ def _build_and_measure(variant: Variant, threads: int) -> Measured:
         _run("cmake", "--build", str(build), "--parallel", "2")
         [module] = out.glob("_native*")
         text = _run(sys.executable, "-m", "splatbot.bench.variants", str(module), str(threads))
-        return Measured(**json.loads(text))
+        return MeasuredVariant(**json.loads(text))
 
 
 def _run(*command: str) -> str:
@@ -97,7 +97,7 @@ def _run(*command: str) -> str:
     return done.stdout
 
 
-def measure_module(path: Path, threads: int) -> Measured:
+def measure_module(path: Path, threads: int) -> MeasuredVariant:
     """Measure an extension module in place of the installed one; for a process of its own."""
     spec = importlib.util.spec_from_file_location("splatbot._native", path)
     if spec is None or spec.loader is None:
@@ -115,7 +115,9 @@ def measure_module(path: Path, threads: int) -> Measured:
         passes = Passes(surface_map(), (320, 240))
         forward = measure(passes.forward, runs=60)
         both = measure(passes.forward_backward, runs=60)
-        return Measured(forward.least_ms, both.least_ms, passes.best_work(20).blend_ms, error_against_reference())
+        return MeasuredVariant(
+            forward.least_ms, both.least_ms, passes.best_work(20).blend_ms, error_against_reference()
+        )
 
 
 if __name__ == "__main__":

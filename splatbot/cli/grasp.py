@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.grasping.affordance import Hint, View
+    from splatbot.grasping.affordance import Hint, ObservedView
     from splatbot.grasping.types import GraspResult
-    from splatbot.robots.things import Things
+    from splatbot.robots.graspable_objects import GraspableObjects
 
 
 def grasp(
@@ -127,9 +127,9 @@ def grasp(
     return 0
 
 
-def _things(map_: Path, base: Pose | None) -> Things:
+def _things(map_: Path, base: Pose | None) -> GraspableObjects:
     from splatbot.gaussians import GaussianModel, Snapshot
-    from splatbot.robots.things import measured_map, run_of, things_of
+    from splatbot.robots.graspable_objects import measured_map, run_of, things_of
     from splatbot.workspace import find_workspace
 
     T = base_pose(base, map_)
@@ -180,11 +180,11 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
     return np.asarray(picture.reshape(*picture.shape[:2], -1).any(axis=2))
 
 
-def _view(map_: Path, index: int) -> View:
+def _view(map_: Path, index: int) -> ObservedView:
     from dataclasses import replace
 
     from splatbot.errors import InputError
-    from splatbot.grasping.affordance import View
+    from splatbot.grasping.affordance import ObservedView
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
 
@@ -197,7 +197,7 @@ def _view(map_: Path, index: int) -> View:
         raise InputError(
             f"is {index}, which has no pose.", field="--index", hint=f"one of {min(poses)}..{max(poses)} that has"
         )
-    return View(replace(log.camera, distortion=()), poses[index], log[index].rgb)
+    return ObservedView(replace(log.camera, distortion=()), poses[index], log[index].rgb)
 
 
 def _print(result: GraspResult, folder: Path) -> None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.planning import PlanResult, Trajectory
+    from splatbot.planning import JointTrajectory, PlanResult
     from splatbot.robots.robot import RobotModel
 
 
@@ -118,7 +118,7 @@ def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.
     return values
 
 
-def _summary(result: PlanResult, trajectory: Trajectory) -> dict[str, Any]:
+def _summary(result: PlanResult, trajectory: JointTrajectory) -> dict[str, Any]:
     assert result.path is not None
     c = trajectory.certificate
     return {
@@ -136,7 +136,7 @@ def _summary(result: PlanResult, trajectory: Trajectory) -> dict[str, Any]:
     }
 
 
-def _print(result: PlanResult, trajectory: Trajectory, folder: Path) -> None:
+def _print(result: PlanResult, trajectory: JointTrajectory, folder: Path) -> None:
     from splatbot.cli.tables import print_table
 
     assert result.path is not None

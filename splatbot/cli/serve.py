@@ -94,7 +94,7 @@ def serve(
 
 def _add_map(runtime: Runtime, map_: Path) -> None:
     from splatbot.gaussians import GaussianModel, Snapshot
-    from splatbot.robots.things import run_of
+    from splatbot.robots.graspable_objects import run_of
     from splatbot.workspace import find_workspace
 
     path = map_ / "map.ply" if map_.is_dir() else map_

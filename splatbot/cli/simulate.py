@@ -13,7 +13,7 @@ import tyro
 
 if TYPE_CHECKING:
     from splatbot.frame import Frame
-    from splatbot.logs.synthetic import Options, SyntheticLog
+    from splatbot.logs.synthetic import SyntheticLog, SyntheticOptions
 
 _PLAIN_EVERY_S = 2.0
 
@@ -73,9 +73,9 @@ def simulate(
         raise InputError("is missing.", field="--out", hint="name the folder to write: --out DIR")
     width, height = _parse_size(size)
 
-    from splatbot.logs.synthetic import Options, SyntheticLog, synthetic_uri
+    from splatbot.logs.synthetic import SyntheticLog, SyntheticOptions, synthetic_uri
 
-    wanted = Options(trajectory or "", frames, width, height, fps, arc, event, seed, ";".join(effects))
+    wanted = SyntheticOptions(trajectory or "", frames, width, height, fps, arc, event, seed, ";".join(effects))
     log = SyntheticLog(synthetic_uri(scene, wanted))
     _record(log, out, quiet=quiet)
     if not quiet:
@@ -145,7 +145,7 @@ def _plain_lines(total: int) -> Callable[[int], None]:
     return show
 
 
-def _print_summary(log: SyntheticLog, out: Path, wanted: Options) -> None:
+def _print_summary(log: SyntheticLog, out: Path, wanted: SyntheticOptions) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import milliseconds
 

@@ -13,8 +13,8 @@ import tyro
 from splatbot.cli.drawing import draw_offscreen
 
 if TYPE_CHECKING:
-    from splatbot.sim.ledger import Entry
-    from splatbot.sim.recording import Recording
+    from splatbot.sim.ledger import LedgerEntry
+    from splatbot.sim.recording import TwinRecording
     from splatbot.sim.scene import Scene
     from splatbot.sim.twin import TwinResult
 
@@ -69,7 +69,7 @@ def twin(
         return 0
     from splatbot.sim.ledger import ledger
     from splatbot.sim.motion import load_motion
-    from splatbot.sim.recording import Recording
+    from splatbot.sim.recording import TwinRecording
     from splatbot.sim.twin import Twin
 
     chosen = _scene(scene, map, with_camera=video is not None).with_effects(force=force, forbid=forbid)
@@ -78,7 +78,7 @@ def twin(
     if trajectory is not None and it.world.robot is not None:
         motion = load_motion(trajectory, it.world.robot)
     with _film(video, it.world, seed) as film, _progress(quiet) as show:
-        recording = Recording(it.world) if html is not None else None
+        recording = TwinRecording(it.world) if html is not None else None
         result = it.follow(motion, progress=show, watch=_watchers(film, recording))
         sensor = film.report() if film is not None else []
     entries = ledger(it, result, motion, costs=not no_costs, sensor=sensor)
@@ -147,7 +147,7 @@ def _watchers(*watchers: Callable[[Any, float], None] | None) -> Callable[[Any, 
     return watch_all
 
 
-def _write_page(path: Path, recording: Recording, result: TwinResult) -> None:
+def _write_page(path: Path, recording: TwinRecording, result: TwinResult) -> None:
     from splatbot.atomic import atomic_write
     from splatbot.sim.page import twin_html
 
@@ -168,7 +168,7 @@ def _progress(quiet: bool) -> Iterator[Callable[[float], None] | None]:
         yield lambda share: bars.update(task, completed=share)
 
 
-def _write(path: Path, result: TwinResult, entries: list[Entry], sensor: list[dict[str, Any]]) -> None:
+def _write(path: Path, result: TwinResult, entries: list[LedgerEntry], sensor: list[dict[str, Any]]) -> None:
     import json as text
     from dataclasses import asdict
 
@@ -181,7 +181,7 @@ def _write(path: Path, result: TwinResult, entries: list[Entry], sensor: list[di
         file.write(text.dumps(values, indent=1).encode() + b"\n")
 
 
-def _print(result: TwinResult, entries: list[Entry], written: list[Path]) -> None:
+def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) -> None:
     from rich.console import Console
     from rich.table import Table
 

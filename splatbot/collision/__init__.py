@@ -3,13 +3,13 @@
 from splatbot.collision.answers import ClearanceResult, MahalanobisResult, NeighboursResult
 from splatbot.collision.bodies import boxes_in_collision, capsules_in_collision
 from splatbot.collision.esdf import Esdf, esdf
-from splatbot.collision.evidence import Evidence, gather_evidence
 from splatbot.collision.field import GaussianCollisionField
 from splatbot.collision.margin import SurfaceError, surface_error
 from splatbot.collision.moving import find_moving
 from splatbot.collision.probability import ProbabilityResult, collision_probability
 from splatbot.collision.robot import ArmClearanceResult, ConfigurationResult, EdgeResult, RobotSpheres
 from splatbot.collision.unknown import UnknownSpace, find_unknown
+from splatbot.collision.visibility import VisibilityEvidence, gather_evidence
 
 __all__ = [
     "ArmClearanceResult",
@@ -17,7 +17,6 @@ __all__ = [
     "ConfigurationResult",
     "EdgeResult",
     "Esdf",
-    "Evidence",
     "GaussianCollisionField",
     "MahalanobisResult",
     "NeighboursResult",
@@ -25,6 +24,7 @@ __all__ = [
     "RobotSpheres",
     "SurfaceError",
     "UnknownSpace",
+    "VisibilityEvidence",
     "boxes_in_collision",
     "capsules_in_collision",
     "collision_probability",

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from splatbot.collision.answers import ClearanceResult, MahalanobisResult, NeighboursResult
-from splatbot.collision.evidence import Evidence
+from splatbot.collision.gaussian_ids import GaussianIdMap
 from splatbot.collision.inputs import rows, spheres
-from splatbot.collision.names import Names
 from splatbot.collision.solids import MIN_OPACITY, SCALE_FLOOR, SolidGate, check_opacities, solid_arrays
+from splatbot.collision.visibility import VisibilityEvidence
 from splatbot.errors import InputError, NativeError
 from splatbot.gaussians import GaussianModel, Snapshot
 
@@ -64,7 +64,7 @@ class GaussianCollisionField:
         *,
         min_opacity: float = MIN_OPACITY,
         min_observations: int = 1,
-        evidence: Evidence | None = None,
+        evidence: VisibilityEvidence | None = None,
         packed: bool = False,
     ) -> None:
         if not 1e-3 <= n_sigma <= 1e3:
@@ -75,7 +75,7 @@ class GaussianCollisionField:
         self.gate = SolidGate(min_opacity, min_observations)
         check_opacities(model)
         self.packed = packed
-        self._names = Names(len(model))
+        self._names = GaussianIdMap(len(model))
         solid = np.flatnonzero(self.gate.solid(model, evidence))
         s = solid_arrays(model, solid, self._names.of(solid))
         self.native = CollisionField(
@@ -95,7 +95,7 @@ class GaussianCollisionField:
         changed: ArrayLike | Tensor,
         *,
         previous: ArrayLike | Tensor | None = None,
-        evidence: Evidence | None = None,
+        evidence: VisibilityEvidence | None = None,
     ) -> GaussianCollisionField:
         """The field of a later state of the map, which shares what did not change; this one stays as it is.
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatbot.collision.evidence import Evidence
+from splatbot.collision.visibility import VisibilityEvidence
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.protocols import Array
@@ -18,7 +18,7 @@ AROUND = 0.02  # [m] added to a cell: only the thing's front was seen, and not w
 _SOLID = 4.0  # logit of an opacity of 0.98
 
 
-def find_moving(model: GaussianModel, evidence: Evidence, *, around: float = AROUND) -> Array:
+def find_moving(model: GaussianModel, evidence: VisibilityEvidence, *, around: float = AROUND) -> Array:
     """Balls (V, 4) = (x, y, z, radius) [m, world] that cover where something was at times; V is 0 if nothing moved.
 
     A Gaussian whose place was measured, and was seen through more often than that, is of a thing that was there for

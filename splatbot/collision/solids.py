@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatbot.collision.evidence import Evidence
+from splatbot.collision.visibility import VisibilityEvidence
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 
@@ -43,7 +43,7 @@ class SolidGate:
         if self.min_observations < 0:
             raise InputError(f"is {self.min_observations}.", field="min_observations", hint="give 0 or more keyframes")
 
-    def solid(self, model: GaussianModel, evidence: Evidence | None = None) -> NDArray[np.bool_]:
+    def solid(self, model: GaussianModel, evidence: VisibilityEvidence | None = None) -> NDArray[np.bool_]:
         """Whether each Gaussian (N,) is solid; one that was seen through more often than hit is not.
 
         Raises:

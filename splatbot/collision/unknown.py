@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.camera import Camera
-from splatbot.collision.evidence import measured_depths
 from splatbot.collision.inputs import rows
+from splatbot.collision.visibility import measured_depths
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.protocols import Array

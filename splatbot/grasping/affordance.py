@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import SplatbotError
 from splatbot.protocols import Array
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ObservedView:
     """A camera that looks at the map.
 
     Args:
@@ -43,7 +43,7 @@ class PixelHint:
 
     u: float
     v: float
-    view: View
+    view: ObservedView
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class MaskHint:
     """Pixels (H, W) bool of a view."""
 
     mask: NDArray[np.bool_]
-    view: View
+    view: ObservedView
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class BoxHint:
     v0: float
     u1: float
     v1: float
-    view: View
+    view: ObservedView
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class TagHint:
     """
 
     number: int
-    views: tuple[View, ...]
+    views: tuple[ObservedView, ...]
     family: str = "36h11"
 
 
@@ -147,7 +147,7 @@ class Affordance(Protocol):
         """Whether it is worth asking."""
         ...
 
-    def locate(self, hint: Hint, scene: MapScene) -> Target:
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         """The target.
 
         Raises:
@@ -157,7 +157,7 @@ class Affordance(Protocol):
         ...
 
 
-def find_target(hint: Hint, scene: MapScene, backends: Sequence[Affordance]) -> Target:
+def find_target(hint: Hint, scene: SegmentedMap, backends: Sequence[Affordance]) -> Target:
     """The answer of the first backend that has one; what those before it said is among its notes.
 
     Raises:

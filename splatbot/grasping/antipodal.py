@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.grasping.surface import Surface
+from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array
 
 PAD = 0.006  # [m] around a contact that its plane is fitted to
@@ -76,7 +76,7 @@ class PairSearch:
 
 
 def antipodal_pairs(
-    surface: Surface,
+    surface: GraspSurface,
     *,
     stroke: float,
     friction: float,
@@ -133,7 +133,7 @@ def _closings(normals: Array, cone: float, up: Array, rng: np.random.Generator) 
     return _unit(closing), np.concatenate([every, every, slanted])
 
 
-def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tuple[Array, Array]:
+def _exits(surface: GraspSurface, origin: Array, closing: Array, cosine: float) -> tuple[Array, Array]:
     """Where lines (C, 3) leave the surface (C, 3), and how far that is (C,) [m]; infinity: nowhere."""
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
     tube = _tube(surface)
@@ -150,12 +150,12 @@ def _exits(surface: Surface, origin: Array, closing: Array, cosine: float) -> tu
     return end, away
 
 
-def _tube(surface: Surface) -> Array32:
+def _tube(surface: GraspSurface) -> Array32:
     """Squares of how near lines have to pass by points (M,) to meet the surface [m²]."""
     return np.asarray(np.maximum(0.0025, 1.2 * np.minimum(surface.spread, 0.006)) ** 2, dtype=np.float32)
 
 
-def _refined(surface: Surface, first: Array, second: Array, cone: float) -> Pairs:
+def _refined(surface: GraspSurface, first: Array, second: Array, cone: float) -> Pairs:
     """Contacts on planes fitted at both ends, the line moved and turned to both normals as far as that is better.
 
     What is not gets a smaller step in the next round. Better contacts where less was seen are not better.
@@ -194,7 +194,7 @@ def _between(pairs: Pairs) -> Array:
     return np.asarray(middle + np.linalg.solve(across.sum(axis=1) + _TO_MIDDLE * np.eye(3), aside[..., None])[..., 0])
 
 
-def _fitted(surface: Surface, first: Array, second: Array, cone: float) -> Pairs:
+def _fitted(surface: GraspSurface, first: Array, second: Array, cone: float) -> Pairs:
     line = _unit(second - first)
     ends = [_plane(surface, at, out) for at, out in ((first, -line), (second, line))]
     contacts, normals = (np.stack([end[k] for end in ends], axis=1) for k in range(2))
@@ -205,7 +205,7 @@ def _fitted(surface: Surface, first: Array, second: Array, cone: float) -> Pairs
     return Pairs(contacts, normals, closure, seen, doubt)
 
 
-def _plane(surface: Surface, at: Array, out: Array) -> tuple[Array, Array, Array, Array]:
+def _plane(surface: GraspSurface, at: Array, out: Array) -> tuple[Array, Array, Array, Array]:
     """Where lines through ``at`` (C, 3) along ``out`` (C, 3) cross the plane of the Gaussians around, its normal,
     the share of them that was seen, and their doubt; a line that does not meet the surface itself, as beyond the edge
     of a face, keeps its place and is of no use."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.grasping.antipodal import Pairs
-from splatbot.grasping.surface import Surface
+from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array, HandShape
 
 FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
@@ -89,7 +89,7 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     return Hands(poses, pair, opening, *(zero.copy() for _ in range(4)))
 
 
-def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
+def clear_palm(hands: Hands, surface: GraspSurface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
     """Whether the palm has nothing of a sample of the target before it (K,): quick, to be followed by more."""
     step = max(1, len(surface) // _SAMPLE)
     p = (surface.points[::step] - surface.center).astype(np.float32)
@@ -104,7 +104,14 @@ def clear_palm(hands: Hands, surface: Surface, hand: HandShape, *, retreat: floa
 
 
 def beside_target(
-    hands: Hands, pairs: Pairs, surface: Surface, hand: HandShape, *, retreat: float, n_sigma: float, friction: float
+    hands: Hands,
+    pairs: Pairs,
+    surface: GraspSurface,
+    hand: HandShape,
+    *,
+    retreat: float,
+    n_sigma: float,
+    friction: float,
 ) -> Hands:
     """The hands with their opening, their room to the target on a straight way of ``retreat`` [m], and what they hold.
 

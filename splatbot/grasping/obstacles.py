@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import rotation_to_quat
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
 _THICK = 1e-3  # [m] of a support
 
 
-def around_target(scene: MapScene, rows: NDArray[np.int64]) -> GaussianModel:
+def around_target(scene: SegmentedMap, rows: NDArray[np.int64]) -> GaussianModel:
     """The map without the target's ``rows`` (M,), its supports as flat as they were found to be.
 
     A support is a plane that hundreds of Gaussians agree on, to less than a millimetre in its mean; one by one they are

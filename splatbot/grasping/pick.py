@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 from splatbot.errors import GripperError, InputError, SplatbotError
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
 from splatbot.grasping.pick_types import PickOptions, PickOutcome, PickResult, PickStage, PickStep
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp, GraspResult, NoGraspError
-from splatbot.grasping.ways import Leg, MapWays, Way, Ways
 from splatbot.planning import JointGoal, time_path
 from splatbot.planning.follow import follow
 from splatbot.protocols import Array, Controller, Feedback, Gripper, MotionState
@@ -42,7 +42,7 @@ class Picker:
         stop: asked all the time; True ends the pick.
         on_step: told of each stage that is done.
         make_ways: gives, for a target, who finds the ways to its grasps; by default
-            :class:`splatbot.grasping.ways.MapWays`.
+            :class:`splatbot.grasping.pick_planner.MapPickPlanner`.
 
     Raises:
         InputError: the gripper opens less than the robot's hand.
@@ -57,7 +57,7 @@ class Picker:
         options: PickOptions | None = None,
         stop: Callable[[], bool] | None = None,
         on_step: Callable[[PickStep], None] | None = None,
-        make_ways: Callable[[Target], Ways] | None = None,
+        make_ways: Callable[[Target], PickPlanner] | None = None,
     ) -> None:
         if gripper.stroke < sampler.hand.stroke - 1e-6:
             text = f"opens {gripper.stroke:g} m, the hand of the robot {sampler.hand.stroke:g} m."
@@ -65,7 +65,7 @@ class Picker:
         self.sampler, self.controller, self.gripper = sampler, controller, gripper
         self.options = options or PickOptions()
         self._stop, self._on_step = stop, on_step
-        self.make_ways = make_ways or (lambda target: MapWays(sampler, target, self.options))
+        self.make_ways = make_ways or (lambda target: MapPickPlanner(sampler, target, self.options))
 
     def pick(self, target: Target, *, grasps: GraspResult | None = None) -> PickResult:
         """Take a target and lift it; ``grasps``: those that are known already.
@@ -111,7 +111,7 @@ class _Pick:
             return self._ended(_EndedError(PickOutcome.NOT_FOLLOWED, error.message, error))
         return self._result(PickOutcome.PICKED, "")
 
-    def _way(self, found: GraspResult) -> Way:
+    def _way(self, found: GraspResult) -> PickPlan:
         """Of the best grasp that has one."""
         self.stage = PickStage.PLAN
         self.ways = self.p.make_ways(self.target)
@@ -122,19 +122,19 @@ class _Pick:
         why: list[str] = []
         for k, grasp, cautious in asked:
             way = self.ways.to(grasp, start, cautious=cautious)
-            if isinstance(way, Way):
+            if isinstance(way, PickPlan):
                 self._noted(way)
                 self._done(f"grasp {k}, {grasp.approach}; {1e3 * way.room:.1f} mm of room all the way")
                 return way
             why.append(f"grasp {k}: {way}")
         raise _EndedError(PickOutcome.NO_WAY, "; ".join(why))
 
-    def _noted(self, way: Way | Leg) -> None:
+    def _noted(self, way: PickPlan | Segment) -> None:
         """Keep in mind that a way is not clear of where something moved."""
         if not way.clear:
             self.notes.append(f"{self.stage}: {_NOT_CLEAR}")
 
-    def _execute(self, way: Way) -> None:
+    def _execute(self, way: PickPlan) -> None:
         self.stage = PickStage.OPEN
         self.gripper.move(way.opening)
         self._settle()
@@ -148,7 +148,7 @@ class _Pick:
         if self.o.carry_to is not None:
             self._carry(way)
 
-    def _close(self, way: Way) -> None:
+    def _close(self, way: PickPlan) -> None:
         self.stage = PickStage.CLOSE
         self.gripper.move(0.0, force=self.o.force)
         self._settle()
@@ -166,13 +166,13 @@ class _Pick:
             raise _EndedError(PickOutcome.LOST, "nothing is between the fingers any more")
         self._done(f"{1e3 * self.gripper.opening():.1f} mm between the fingers")
 
-    def _carry(self, way: Way) -> None:
+    def _carry(self, way: PickPlan) -> None:
         """To where it was asked for, around everything with what is held."""
         self.stage = PickStage.CARRY
         assert self.o.carry_to is not None
         assert self.q is not None
         leg = self.ways.onwards(way, self.q, JointGoal(self.o.carry_to))
-        if not isinstance(leg, Leg):
+        if not isinstance(leg, Segment):
             raise _EndedError(PickOutcome.NO_WAY, leg)
         self._noted(leg)
         self._follow(PickStage.CARRY, leg, self.o.slow)
@@ -180,7 +180,7 @@ class _Pick:
             self.attached = None
             raise _EndedError(PickOutcome.LOST, "nothing is between the fingers any more")
 
-    def _follow(self, stage: PickStage, leg: Leg, share: float) -> None:
+    def _follow(self, stage: PickStage, leg: Segment, share: float) -> None:
         self.stage = stage
         speed = self.o.speed * share
         trajectory = time_path(leg.path, leg.arm, leg.around, velocity_scale=speed, acceleration_scale=speed)

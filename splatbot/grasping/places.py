@@ -13,14 +13,14 @@ from splatbot.grasping.affordance import (
     BoxHint,
     Hint,
     MaskHint,
+    ObservedView,
     PixelHint,
     PointHint,
     Target,
-    View,
 )
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
-from splatbot.segmentation import MapObject, MapScene
+from splatbot.segmentation import MapObject, SegmentedMap
 from splatbot.segmentation.objects import FEWEST, LARGEST
 from splatbot.segmentation.parts import find_faces, nearest_of
 
@@ -45,7 +45,7 @@ class PlaceAffordance:
         """Pixels, points, masks and rectangles."""
         return isinstance(hint, PixelHint | PointHint | MaskHint | BoxHint)
 
-    def locate(self, hint: Hint, scene: MapScene) -> Target:
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         """See :class:`splatbot.grasping.affordance.Affordance`."""
         if isinstance(hint, PointHint):
             return at_point(scene, _checked_point(hint.point))
@@ -58,7 +58,7 @@ class PlaceAffordance:
         raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a pixel, point, mask or rectangle")
 
 
-def point_at(scene: MapScene, view: View, u: float, v: float) -> Array:
+def point_at(scene: SegmentedMap, view: ObservedView, u: float, v: float) -> Array:
     """What the pixel (u, v) of a view shows of the map (3,) [m, world].
 
     Raises:
@@ -81,7 +81,7 @@ def point_at(scene: MapScene, view: View, u: float, v: float) -> Array:
     return transform_points(view.T_world_camera, z * ray)
 
 
-def at_point(scene: MapScene, point: Array, *, backend: str = "place", label: str = "") -> Target:
+def at_point(scene: SegmentedMap, point: Array, *, backend: str = "place", label: str = "") -> Target:
     """The object whose Gaussian is nearest to a point (3,) [m, world], or the face of what was not segmented there.
 
     Raises:
@@ -114,7 +114,7 @@ def at_point(scene: MapScene, point: Array, *, backend: str = "place", label: st
     raise AffordanceError(f"at ({where}) there is no object{nearest}.", field="target", hint="point at an object")
 
 
-def _around(scene: MapScene, point: Array) -> MapObject | None:
+def _around(scene: SegmentedMap, point: Array) -> MapObject | None:
     """The smallest object in whose box a point is, as within a cup of which only the rim was mapped."""
     local = transform_points(inverse(scene.T_world_base), point)
     found = []
@@ -125,7 +125,7 @@ def _around(scene: MapScene, point: Array) -> MapObject | None:
     return scene.objects[min(found)[1]] if found else None
 
 
-def _face_at(scene: MapScene, point: Array) -> NDArray[np.int64]:
+def _face_at(scene: SegmentedMap, point: Array) -> NDArray[np.int64]:
     """The Gaussians around a point, if they are a face of their own, as that of a book in a shelf."""
     local = transform_points(inverse(scene.T_world_base), point)
     rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < LARGEST / 2).all(axis=1))
@@ -141,7 +141,7 @@ def _face_at(scene: MapScene, point: Array) -> NDArray[np.int64]:
     return own
 
 
-def _at_mask(scene: MapScene, view: View, mask: NDArray[np.bool_], *, exact: bool = False) -> Target:
+def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *, exact: bool = False) -> Target:
     """The object that a mask shows; of an ``exact`` one that leaves out much of it, what is marked."""
     c = view.camera
     if mask.shape != (c.height, c.width) or mask.dtype != np.bool_:
@@ -184,7 +184,7 @@ def _nearer(
     return rows[away[0] < away[1]]
 
 
-def _visible(scene: MapScene, view: View, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _visible(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Rows of the solid Gaussians that show in the marked pixels."""
     c = view.camera
     depth = render_view(scene.model, c, view.T_world_camera, "depth")

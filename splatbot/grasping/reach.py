@@ -42,7 +42,7 @@ class Reached:
     kind: str = ""
 
 
-class Reach(Protocol):
+class ReachabilityCheck(Protocol):
     """Who says whether a grasp can be reached."""
 
     def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
@@ -109,7 +109,7 @@ class ArmReach:
         return self._arm(int(np.ceil(opening / OPENINGS - 1e-6)))
 
     def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
-        """See :class:`Reach`."""
+        """See :class:`ReachabilityCheck`."""
         arm = self.arm(opening)
         goals = goal_configurations(
             arm,

@@ -7,21 +7,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from splatbot.collision import GaussianCollisionField
-from splatbot.collision.evidence import DepthView
 from splatbot.collision.moving import with_balls
+from splatbot.collision.visibility import DepthView
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.implied import target_surface
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.reach import ArmReach, Reach, hand_of
+from splatbot.grasping.reach import ArmReach, ReachabilityCheck, hand_of
 from splatbot.grasping.search import Search
-from splatbot.grasping.surface import Surface
+from splatbot.grasping.shape_completion import target_surface
+from splatbot.grasping.surface import GraspSurface
 from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array, RobotKinematics
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
-MakeReach = Callable[[GaussianCollisionField, GaussianCollisionField], Reach]
+MakeReach = Callable[[GaussianCollisionField, GaussianCollisionField], ReachabilityCheck]
 
 
 class GraspSampler:
@@ -48,7 +48,7 @@ class GraspSampler:
 
     def __init__(
         self,
-        scene: MapScene,
+        scene: SegmentedMap,
         robot: RobotKinematics,
         *,
         hand_only: bool = False,
@@ -85,8 +85,8 @@ class GraspSampler:
             raise InputError("has no Gaussians.", field=target.label, hint="name another target")
         return Search(self, target, options or GraspOptions()).run()
 
-    def surface(self, target: Target, *, seed: int = 0, sharp: bool = False) -> Surface:
-        """Of a target, with the sides that nobody saw; see :func:`splatbot.grasping.implied.target_surface`."""
+    def surface(self, target: Target, *, seed: int = 0, sharp: bool = False) -> GraspSurface:
+        """Of a target, with unseen sides; see :func:`splatbot.grasping.shape_completion.target_surface`."""
         return target_surface(
             self.scene, target.rows, observers=self.observers, views=self.views, seed=seed, sharp=sharp
         )
@@ -97,16 +97,16 @@ class GraspSampler:
             model = with_balls(model, self.moving, n_sigma=self.n_sigma, observations=self.min_observations)
         return GaussianCollisionField(model, self.n_sigma, min_observations=self.min_observations)
 
-    def reach(self, around: GaussianCollisionField) -> Reach | None:
+    def reach(self, around: GaussianCollisionField) -> ReachabilityCheck | None:
         """Who says whether the arm gets there in the map without the target; None: nobody is asked."""
         return None if self._make_reach is None else self._make_reach(around, self.field)
 
-    def cautious_reach(self, around: GaussianModel) -> Reach | None:
+    def cautious_reach(self, around: GaussianModel) -> ReachabilityCheck | None:
         """The same, of an arm that keeps clear of where something moved; None: nothing did, or nobody is asked."""
         if self._make_reach is None or self.moving is None:
             return None
         fields = (self.collision_field(model, cautious=True) for model in (around, self.scene.model))
         return self._make_reach(*fields)
 
-    def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> Reach:
+    def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> ReachabilityCheck:
         return ArmReach(self.robot, self.scene.T_world_base, around, whole, margin=self.margin)

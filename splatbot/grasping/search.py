@@ -18,7 +18,7 @@ from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, place_hands
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.reach import Reach
+from splatbot.grasping.reach import ReachabilityCheck
 from splatbot.grasping.score import FAR, arm_terms, best_apart, hand_terms, totals
 from splatbot.grasping.sweep import fingers_room, swept_room, touches
 from splatbot.grasping.types import Grasp, GraspResult
@@ -42,7 +42,7 @@ _IN_MAP = "hands touch what is around the target"
 
 
 @dataclass(eq=False)
-class _Log:
+class _SearchLog:
     """What was rejected and why, the best of it, and seconds by stage."""
 
     rejected: dict[str, int] = field(default_factory=dict)
@@ -80,7 +80,7 @@ class Search:
 
     def __init__(self, sampler: GraspSampler, target: Target, options: GraspOptions) -> None:
         self.s, self.target, self.o = sampler, target, options
-        self.log = _Log()
+        self.log = _SearchLog()
         self.candidates = 0
 
     def run(self) -> GraspResult:
@@ -227,7 +227,9 @@ class Search:
             self.log.best = self._grasp(scored, int(inside.argmax()), rejected="touches the target's ellipsoids")
         return scored.select(~inside)
 
-    def _reached(self, scored: _Scored, reach: Reach | None, cautious: Reach | None) -> tuple[Grasp, ...]:
+    def _reached(
+        self, scored: _Scored, reach: ReachabilityCheck | None, cautious: ReachabilityCheck | None
+    ) -> tuple[Grasp, ...]:
         """Those that the arm reaches, best first; cautiously, where it can and the hand can."""
         left = [self._grasp(scored, k) for k in range(len(scored.hands))]
         found: list[Grasp] = []
@@ -246,7 +248,7 @@ class Search:
         found += [grasp for grasp, _ in asked if not grasp.rejected]
         return tuple(sorted(found, key=lambda g: -g.total))
 
-    def _asked(self, grasps: Sequence[Grasp], reach: Reach | None, wanted: int) -> list[tuple[Grasp, str]]:
+    def _asked(self, grasps: Sequence[Grasp], reach: ReachabilityCheck | None, wanted: int) -> list[tuple[Grasp, str]]:
         """What an arm says of each in turn, until enough are reached: the grasp, and of what kind its rejection is."""
         asked: list[tuple[Grasp, str]] = []
         for grasp in grasps:
@@ -256,7 +258,7 @@ class Search:
             wanted -= not asked[-1][0].rejected
         return asked
 
-    def _with_arm(self, grasp: Grasp, reach: Reach) -> tuple[Grasp, str]:
+    def _with_arm(self, grasp: Grasp, reach: ReachabilityCheck) -> tuple[Grasp, str]:
         reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening)
         if reached.q is None or reached.path is None:
             return replace(grasp, rejected=reached.why), reached.kind

@@ -12,7 +12,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import rotations, shortest_axes
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
 MOST = 1800  # points that are looked at
 _OFTEN = 0.2  # of the keyframes that the best Gaussians are supported by
@@ -22,7 +22,7 @@ _LONELY = 4.0  # times the usual area of a point; those with more are strays
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class GraspSurface:
     """M oriented points on a target.
 
     Args:
@@ -47,21 +47,21 @@ class Surface:
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, chosen: NDArray[np.int64]) -> Surface:
+    def select(self, chosen: NDArray[np.int64]) -> GraspSurface:
         """The points that are named, about the same centre."""
         columns = (self.points, self.normals, self.half, self.spread)
         points, normals, half, spread = (column[chosen] for column in columns)
-        return Surface(points, normals, half, spread, self.seen[chosen], self.doubt[chosen], self.center)
+        return GraspSurface(points, normals, half, spread, self.seen[chosen], self.doubt[chosen], self.center)
 
 
 def measured_surface(
-    scene: MapScene,
+    scene: SegmentedMap,
     rows: NDArray[np.int64],
     *,
     observers: Array | None = None,
     seed: int = 0,
     sharp: bool = False,
-) -> tuple[Surface, Array]:
+) -> tuple[GraspSurface, Array]:
     """The Gaussians ``rows`` (M,) of a scene as points, strays left out, and the area each stands for (K,) [m²].
 
     Normals are the Gaussians' flat axes, averaged over 6 mm, turned to who saw them, or else away from the middle.
@@ -93,7 +93,7 @@ def measured_surface(
     kept = np.flatnonzero(areas < _LONELY * np.median(areas))
     apart = np.sqrt(areas)
     spread = np.where(apart > 2 * scales[:, 2], 1.2 * apart, scales[:, 2])  # where only some of many are looked at
-    seen = Surface(points, normals, half, spread, np.ones(len(points), np.bool_), doubt, center)
+    seen = GraspSurface(points, normals, half, spread, np.ones(len(points), np.bool_), doubt, center)
     return seen.select(kept), areas[kept]
 
 
@@ -103,7 +103,7 @@ def _doubts(model: GaussianModel, scales: Array) -> Array:
     return np.where(fused > 0, fused, scales[:, 0])
 
 
-def _middle(scene: MapScene, points: Array) -> Array:
+def _middle(scene: SegmentedMap, points: Array) -> Array:
     """Half way between the highest point and what the target stands on."""
     local = transform_points(inverse(scene.T_world_base), points)
     low, high = np.percentile(local, [1, 99], axis=0)

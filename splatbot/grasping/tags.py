@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.grasping.affordance import AffordanceError, Hint, TagHint, Target, View
+from splatbot.grasping.affordance import AffordanceError, Hint, ObservedView, TagHint, Target
 from splatbot.grasping.places import at_point, point_at
 from splatbot.protocols import Array
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
 FAMILIES = {
     "16h5": cv2.aruco.DICT_APRILTAG_16h5,
@@ -31,7 +31,7 @@ class TagAffordance:
         """Tags."""
         return isinstance(hint, TagHint)
 
-    def locate(self, hint: Hint, scene: MapScene) -> Target:
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         """See :class:`splatbot.grasping.affordance.Affordance`."""
         if not isinstance(hint, TagHint):
             raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a tag")
@@ -52,7 +52,7 @@ class TagAffordance:
         )
 
 
-def find_tags(view: View, family: str = "36h11") -> dict[int, Array]:
+def find_tags(view: ObservedView, family: str = "36h11") -> dict[int, Array]:
     """Corners (4, 2) [px] of the tags in a view's picture, by number.
 
     Raises:

@@ -15,7 +15,7 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import AffordanceError, Hint, NameHint, Target
 from splatbot.grasping.places import at_point
 from splatbot.protocols import Array
-from splatbot.segmentation import MapObject, MapScene, primitive_fits
+from splatbot.segmentation import MapObject, SegmentedMap, primitive_fits
 
 COLORS = {
     "red": (0.75, 0.12, 0.12),
@@ -62,14 +62,14 @@ _LEAST, _TIE = 0.3, 0.75  # score of what is found at all; share of the best tha
 
 
 @dataclass(frozen=True, eq=False)
-class _Looks:
+class _ObjectLooks:
     """What rules can say of the objects of a scene, each (K,) or by name."""
 
-    scene: MapScene
+    scene: SegmentedMap
     centers: Array
 
     @classmethod
-    def of(cls, scene: MapScene) -> _Looks:
+    def of(cls, scene: SegmentedMap) -> _ObjectLooks:
         centers = np.array([o.center for o in scene.objects]).reshape(-1, 3)
         return cls(scene, transform_points(inverse(scene.T_world_base), centers))
 
@@ -86,7 +86,7 @@ class WordAffordance:
         """Words."""
         return isinstance(hint, NameHint)
 
-    def locate(self, hint: Hint, scene: MapScene) -> Target:
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         """See :class:`splatbot.grasping.affordance.Affordance`."""
         if not isinstance(hint, NameHint):
             raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give words")
@@ -98,11 +98,11 @@ class WordAffordance:
             return named
         if not scene.objects:
             raise AffordanceError("is not there: no object stands out of the map.", field=text, hint="point at a place")
-        scores, notes = _scores(_Looks.of(scene), text)
+        scores, notes = _scores(_ObjectLooks.of(scene), text)
         return _decided(scene, text, scores, notes)
 
 
-def _named(scene: MapScene, text: str) -> Target | None:
+def _named(scene: SegmentedMap, text: str) -> Target | None:
     """What a scene file calls so; None if it calls nothing so."""
     plain = " ".join(word for word in text.split() if word not in _SKIPPED)
     for place in scene.names:
@@ -114,7 +114,7 @@ def _named(scene: MapScene, text: str) -> Target | None:
     return None
 
 
-def _decided(scene: MapScene, text: str, scores: Array, notes: tuple[str, ...]) -> Target:
+def _decided(scene: SegmentedMap, text: str, scores: Array, notes: tuple[str, ...]) -> Target:
     order = np.argsort(-scores, kind="stable")
     best = int(order[0])
     told = [f"{_told(scene.objects[k])}: {scores[k]:.2f}" for k in order[:4]]
@@ -146,7 +146,7 @@ def _told(thing: MapObject) -> str:
     return f"{thing.name or f'object {thing.number}'} ({color}, {size} cm)"
 
 
-def _scores(looks: _Looks, text: str) -> tuple[Array, tuple[str, ...]]:
+def _scores(looks: _ObjectLooks, text: str) -> tuple[Array, tuple[str, ...]]:
     """How well the words fit each object (K,), 0..1, and which rules were used."""
     scores = np.ones(len(looks.scene.objects))
     notes: list[str] = []
@@ -180,7 +180,7 @@ def _scores(looks: _Looks, text: str) -> tuple[Array, tuple[str, ...]]:
     return scores, (f"rules: {', '.join(notes) or 'any'}",)
 
 
-def _rule(word: str) -> Callable[[_Looks], Array] | None:
+def _rule(word: str) -> Callable[[_ObjectLooks], Array] | None:
     if word in COLORS:
         return lambda looks: _colored(looks, word)
     for kind, words in SHAPES.items():
@@ -191,7 +191,7 @@ def _rule(word: str) -> Callable[[_Looks], Array] | None:
     return None
 
 
-def _colored(looks: _Looks, word: str) -> Array:
+def _colored(looks: _ObjectLooks, word: str) -> Array:
     away = np.linalg.norm(
         _lab(np.array([o.color for o in looks.scene.objects])) - _lab(np.array([COLORS[word]])), axis=1
     )
@@ -204,7 +204,7 @@ def _lab(rgb: Array) -> Array:
     return lab * [0.5, 1.0, 1.0]
 
 
-def _shaped(scene: MapScene, thing: MapObject, kind: str) -> float:
+def _shaped(scene: SegmentedMap, thing: MapObject, kind: str) -> float:
     points = scene.points[thing.rows]
     support = scene.under(points)
     fits = {
@@ -213,20 +213,20 @@ def _shaped(scene: MapScene, thing: MapObject, kind: str) -> float:
     return float(np.exp(-(fits[kind] - min(fits.values())) / _BEND))
 
 
-def _sized(looks: _Looks, word: str) -> Array:
+def _sized(looks: _ObjectLooks, word: str) -> Array:
     values = _measure(looks, {"large": "largest", "small": "smallest", "tall": "tallest", "flat": "lowest"}[word])
     middle = np.median(values)
     return np.asarray(1.0 / (1.0 + np.exp(-4.0 * (values - middle) / max(abs(middle), 1e-6))))
 
 
-def _ranked(looks: _Looks, word: str, among: NDArray[np.bool_]) -> Array:
+def _ranked(looks: _ObjectLooks, word: str, among: NDArray[np.bool_]) -> Array:
     """1 for the first of those that still count, less by how far others are behind."""
     values = _measure(looks, word)
     best = values[among].max() if among.any() else 0.0
     return np.asarray(np.exp(-(best - values) / (0.2 * max(abs(best), 1e-6))))
 
 
-def _measure(looks: _Looks, word: str) -> Array:
+def _measure(looks: _ObjectLooks, word: str) -> Array:
     sizes = np.array([o.size for o in looks.scene.objects])
     away = np.linalg.norm(looks.centers[:, :2], axis=1)
     volume = np.cbrt(np.maximum(sizes, 1e-3).prod(axis=1))
@@ -244,7 +244,7 @@ def _measure(looks: _Looks, word: str) -> Array:
     }[word]
 
 
-def _placed(looks: _Looks, place: str, other: str) -> Array:
+def _placed(looks: _ObjectLooks, place: str, other: str) -> Array:
     """As the robot sees it: x is ahead, y to its left."""
     named = _named(looks.scene, other)
     if named is None:

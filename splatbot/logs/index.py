@@ -13,7 +13,7 @@ from splatbot.errors import LogError
 
 
 @dataclass(frozen=True)
-class Entry:
+class IndexEntry:
     """One image of a list: stamp [s], path relative to the log, line number."""
 
     stamp: float
@@ -21,7 +21,7 @@ class Entry:
     line: int
 
 
-def read_index(path: Path) -> list[Entry]:
+def read_index(path: Path) -> list[IndexEntry]:
     """The entries of a list file in their order; ``#`` starts a comment.
 
     The whole file is checked at once: a slip in it is mended in seconds now, after an hour of mapping it is a loss.
@@ -35,7 +35,7 @@ def read_index(path: Path) -> list[Entry]:
         raise LogError(
             f"cannot be read ({error.strerror}).", file=path, hint="write it: one line `stamp path` an image"
         ) from error
-    entries: list[Entry] = []
+    entries: list[IndexEntry] = []
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -55,7 +55,7 @@ def read_index(path: Path) -> list[Entry]:
     return entries
 
 
-def _parse(path: Path, number: int, line: str) -> Entry:
+def _parse(path: Path, number: int, line: str) -> IndexEntry:
     words = line.strip().split(maxsplit=1)
     try:
         stamp = float(words[0])
@@ -68,7 +68,7 @@ def _parse(path: Path, number: int, line: str) -> Entry:
             field=f"line {number}",
             hint="write `stamp path` (seconds, then the image's path inside the log) or remove the line",
         )
-    return Entry(stamp, words[1], number)
+    return IndexEntry(stamp, words[1], number)
 
 
 def associate(a: NDArray[np.float64], b: NDArray[np.float64], max_difference: float) -> list[tuple[int, int]]:

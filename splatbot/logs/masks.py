@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatbot.errors import LogError
 from splatbot.logs.images import read_mask
-from splatbot.logs.index import Entry, read_index
+from splatbot.logs.index import IndexEntry, read_index
 
 Mask = NDArray[np.bool_]
 
@@ -60,7 +60,7 @@ class ListedMasks:
             )
         return read_mask(self._path.parent / entry.path)
 
-    def _nearest(self, stamp: float) -> Entry:
+    def _nearest(self, stamp: float) -> IndexEntry:
         return self._entries[int(np.abs(self._stamps - stamp).argmin())]
 
 

@@ -11,7 +11,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.logs.shapes import Mesh
+from splatbot.logs.shapes import TriangleMesh
 from splatbot.logs.textures import Texture
 
 Array = NDArray[np.float64]
@@ -21,10 +21,10 @@ _AMBIENT = 0.45
 
 
 @dataclass(frozen=True)
-class Surface:
+class RaycastSurface:
     """A mesh and its colour."""
 
-    mesh: Mesh
+    mesh: TriangleMesh
     texture: Texture
 
 
@@ -37,19 +37,19 @@ class Moving:
         pose: T_world_object (4, 4) at a time [s]; None while the object is not there.
     """
 
-    surfaces: Sequence[Surface]
+    surfaces: Sequence[RaycastSurface]
     pose: Callable[[float], Array | None]
 
 
-class Scene:
+class RaycastScene:
     """Surfaces in the world frame, and moving objects by name, under one distant light (Lambert, no shadows)."""
 
-    def __init__(self, surfaces: Sequence[Surface], moving: Mapping[str, Moving] | None = None) -> None:
+    def __init__(self, surfaces: Sequence[RaycastSurface], moving: Mapping[str, Moving] | None = None) -> None:
         self._still = _Body(surfaces)
         self._moving = {name: (thing.pose, _Body(thing.surfaces)) for name, thing in (moving or {}).items()}
 
     @property
-    def surfaces(self) -> list[Surface]:
+    def surfaces(self) -> list[RaycastSurface]:
         """What does not move."""
         return self._still.surfaces
 
@@ -97,7 +97,7 @@ class Scene:
 class _Body:
     """Surfaces that move as one. Open3D says which triangle a ray hits, the place is then found in float64."""
 
-    def __init__(self, surfaces: Sequence[Surface]) -> None:
+    def __init__(self, surfaces: Sequence[RaycastSurface]) -> None:
         self.surfaces = list(surfaces)
         self._caster = o3d.t.geometry.RaycastingScene()
         normals, offsets = [], []

@@ -15,15 +15,15 @@ _AROUND = 72  # facets of a full turn
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class TriangleMesh:
     """Vertices (V, 3) [m] and triangles (T, 3) of their indices."""
 
     vertices: NDArray[np.float64]
     triangles: NDArray[np.uint32]
 
-    def placed(self, at: ArrayLike, yaw: float = 0.0) -> Mesh:
+    def placed(self, at: ArrayLike, yaw: float = 0.0) -> TriangleMesh:
         """Turned about z by ``yaw`` [rad], then moved by ``at`` (3,) [m]."""
-        return Mesh(self.vertices @ so3_exp([0.0, 0.0, yaw]).T + np.asarray(at), self.triangles)
+        return TriangleMesh(self.vertices @ so3_exp([0.0, 0.0, yaw]).T + np.asarray(at), self.triangles)
 
     def normals(self) -> NDArray[np.float64]:
         """Unit normals (T, 3) of the triangles; 0 for one without area."""
@@ -32,31 +32,31 @@ class Mesh:
         return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
-def box(size: ArrayLike) -> Mesh:
+def box(size: ArrayLike) -> TriangleMesh:
     """Box of ``size`` (3,) [m]; standing on z = 0, centred in x and y."""
     corners = np.array(list(product((-0.5, 0.5), (-0.5, 0.5), (0.0, 1.0)))) * np.asarray(size)
     triangles = [t for a, b, c, d in _QUADS for t in ((a, b, c), (a, c, d))]
-    return Mesh(corners, np.array(triangles, np.uint32))
+    return TriangleMesh(corners, np.array(triangles, np.uint32))
 
 
-def cylinder(radius: float, height: float) -> Mesh:
+def cylinder(radius: float, height: float) -> TriangleMesh:
     """Closed cylinder standing on z = 0."""
     return lathe([(0, 0), (radius, 0), (radius, height), (0, height)])
 
 
-def sphere(radius: float) -> Mesh:
+def sphere(radius: float) -> TriangleMesh:
     """Sphere that touches z = 0."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, _AROUND // 2)
     return lathe(np.column_stack([np.cos(angles), 1.0 + np.sin(angles)]) * radius)
 
 
-def cup(radius: float, height: float, wall: float) -> Mesh:
+def cup(radius: float, height: float, wall: float) -> TriangleMesh:
     """Cylinder that is open at the top and hollow."""
     inner = radius - wall
     return lathe([(0, 0), (radius, 0), (radius, height), (inner, height), (inner, wall), (0, wall)])
 
 
-def handle(radius: float, tube: float) -> Mesh:
+def handle(radius: float, tube: float) -> TriangleMesh:
     """Half a ring in the xz plane, open towards -x, its centre at the origin; ``tube`` is its thickness' radius."""
     along, across = np.linspace(-np.pi / 2, np.pi / 2, _AROUND // 2), np.linspace(0, 2 * np.pi, _AROUND // 3)
     r = radius + tube * np.cos(across)
@@ -64,7 +64,7 @@ def handle(radius: float, tube: float) -> Mesh:
     return _sheet(np.stack([np.outer(np.cos(along), r), y, np.outer(np.sin(along), r)], axis=-1))
 
 
-def lathe(profile: ArrayLike) -> Mesh:
+def lathe(profile: ArrayLike) -> TriangleMesh:
     """Surface of revolution about z of a profile (P, 2) of (radius, z) [m]."""
     r, z = np.asarray(profile, dtype=np.float64).T
     turn = np.linspace(0.0, 2 * np.pi, _AROUND + 1)
@@ -72,10 +72,10 @@ def lathe(profile: ArrayLike) -> Mesh:
     return _sheet(np.stack([np.outer(r, np.cos(turn)), np.outer(r, np.sin(turn)), heights], axis=-1))
 
 
-def _sheet(points: NDArray[np.float64]) -> Mesh:
+def _sheet(points: NDArray[np.float64]) -> TriangleMesh:
     """The surface through a grid of points (A, B, 3)."""
     rows, columns = points.shape[:2]
     i = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]
     triangles = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
-    return Mesh(points.reshape(-1, 3), triangles.astype(np.uint32))
+    return TriangleMesh(points.reshape(-1, 3), triangles.astype(np.uint32))

@@ -14,7 +14,7 @@ from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
 from splatbot.logs.effects import Account, FrameEffects, make_effects
-from splatbot.logs.scenes import SCENES, Scene, SceneKind
+from splatbot.logs.scenes import SCENES, RaycastScene, SceneKind
 from splatbot.logs.trajectories import Shooting, make_path
 from splatbot.trajectory import Trajectory
 
@@ -22,7 +22,7 @@ PREFIX = "synthetic:"
 
 
 @dataclass(frozen=True)
-class Options:
+class SyntheticOptions:
     """What the query of a synthetic log may set.
 
     Args:
@@ -104,7 +104,7 @@ class SyntheticLog(LogBase):
         return self._effects is not None and self._effects.blanks_depth
 
     @cached_property
-    def scene(self) -> Scene:
+    def scene(self) -> RaycastScene:
         """What is filmed."""
         return self.kind.build(self.options.event)
 
@@ -157,23 +157,23 @@ class SyntheticLog(LogBase):
         return make_effects(specs, seed=self.options.seed).along(self.ground_truth)
 
 
-def synthetic_uri(scene: str, options: Options) -> str:
+def synthetic_uri(scene: str, options: SyntheticOptions) -> str:
     """What opens a scene with ``options``; those at their defaults are left out."""
-    plain = asdict(Options())
+    plain = asdict(SyntheticOptions())
     query = [
         f"{key}={quote(str(value), safe=':;,=. ')}" for key, value in asdict(options).items() if value != plain[key]
     ]
     return PREFIX + scene + ("?" + "&".join(query) if query else "")
 
 
-def _parse(uri: str, query: str) -> Options:
-    kinds = {name: type(value) for name, value in asdict(Options()).items()}
+def _parse(uri: str, query: str) -> SyntheticOptions:
+    kinds = {name: type(value) for name, value in asdict(SyntheticOptions()).items()}
     values: dict[str, float | str] = {}
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key not in kinds:
             raise LogError("is unknown.", file=uri, field=key, hint=f"options: {', '.join(kinds)}")
         values[key] = _number(uri, key, text, kinds[key]) if key in _BOUNDS else text
-    return Options(**values)  # type: ignore[arg-type]
+    return SyntheticOptions(**values)  # type: ignore[arg-type]
 
 
 def _number(uri: str, key: str, text: str, kind: type) -> float:

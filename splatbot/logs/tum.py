@@ -16,7 +16,7 @@ from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration, read_calibration
 from splatbot.logs.effects import read_account
-from splatbot.logs.index import Entry, associate, read_index
+from splatbot.logs.index import IndexEntry, associate, read_index
 from splatbot.logs.joints import find_joints
 from splatbot.logs.masks import find_masks
 from splatbot.logs.presets import PRESETS, find_calibration
@@ -63,7 +63,7 @@ class TumLog(LogBase):
             lockstep = all(abs(colors[i].stamp - depth.stamp) < _LOCKSTEP for i, depth in pairs.items())
             missing = "error" if lockstep else "skip"
         kept = [i for i in range(len(colors)) if i in pairs or missing == "error"]
-        self._frames: list[tuple[Entry, Entry | None]] = [(colors[i], pairs.get(i)) for i in kept]
+        self._frames: list[tuple[IndexEntry, IndexEntry | None]] = [(colors[i], pairs.get(i)) for i in kept]
         self._masks = find_masks(self.folder)
         self._joints = find_joints(self.folder)
         self._effects, blanks_depth = read_account(self.folder)
@@ -106,7 +106,7 @@ class TumLog(LogBase):
         frame = self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path, mask)
         return frame if self._joints is None else replace(frame, joints=self._joints.at(color.stamp))
 
-    def _pair(self, colors: list[Entry]) -> dict[int, Entry]:
+    def _pair(self, colors: list[IndexEntry]) -> dict[int, IndexEntry]:
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))
         pairs = {i: self._depths[j] for i, j in associate(a, b, MAX_DIFFERENCE)}
         if not pairs:
@@ -119,7 +119,7 @@ class TumLog(LogBase):
             )
         return pairs
 
-    def _no_partner(self, color: Entry) -> LogError:
+    def _no_partner(self, color: IndexEntry) -> LogError:
         before = [entry.line for entry in self._depths if entry.stamp < color.stamp]
         return LogError(
             f"no depth image within {MAX_DIFFERENCE} s of stamp {color.stamp:.6f} ({color.path}, line {color.line} "

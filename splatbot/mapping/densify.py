@@ -13,7 +13,7 @@ from splatbot.gaussians.shape import rotations
 _OFF = 0.75  # of σ along the longest axis, by which each half's centre is off the whole's
 
 
-class Pull:
+class PositionGradients:
     """Mean length of the loss's gradient by each centre in the picture, over steps (Kerbl et al. 2023, §5.2).
 
     It is of coordinates in which a picture is 2 wide, as theirs is, so that its size does not matter.

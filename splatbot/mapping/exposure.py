@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatbot.mapping.fusion import View
+from splatbot.mapping.insertion import ModelView
 
 Image = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ _JUMP = 0.2
 
 
 @dataclass(frozen=True)
-class Exposure:
+class ExposureFit:
     """Colours of an image, 0..1, as ``gain`` times the map's plus ``offset`` (Engel, Koltun, Cremers 2018, 2.1)."""
 
     gain: float = 1.0
@@ -38,7 +38,7 @@ class Exposure:
         return max(abs(self.offset), abs(self.gain + self.offset - 1.0)) > _JUMP
 
 
-def exposure_of(rgb: Tensor, depth: Tensor, view: View) -> Exposure:
+def exposure_of(rgb: Tensor, depth: Tensor, view: ModelView) -> ExposureFit:
     """How an image is exposed against the map.
 
     Args:
@@ -56,12 +56,12 @@ def exposure_of(rgb: Tensor, depth: Tensor, view: View) -> Exposure:
     of_map, of_image = _blocks(_gray(view.rgb.numpy()), used), _blocks(_gray(seen) / 255.0, used)
     full = np.isfinite(of_map)
     if full.sum() < _LEAST_BLOCKS:
-        return Exposure()
+        return ExposureFit()
     gain, offset = _robust_line(of_map[full], of_image[full])
-    return Exposure(gain, offset) if 0.1 < gain < 10 else Exposure()
+    return ExposureFit(gain, offset) if 0.1 < gain < 10 else ExposureFit()
 
 
-def in_exposure_of_map(rgb: Tensor, depth: Tensor, view: View) -> Tensor:
+def in_exposure_of_map(rgb: Tensor, depth: Tensor, view: ModelView) -> Tensor:
     """The image (H, W, 3) uint8 as it would be in the map's exposure; itself where they differ by no jump.
 
     What was clipped is as bright, or as dark, as the map has it, if the map goes further.

@@ -27,7 +27,7 @@ _MAD = 0.6745  # median of the absolute of a normal variable
 _GATE = 3.7  # σ of depth: three of how far, on a plane, a pixel lies from half-way between two others, which is √1.5 σ
 
 
-class Placed(Protocol):
+class HasPose(Protocol):
     """What has a pose."""
 
     @property
@@ -111,7 +111,7 @@ def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
     return min(1.0, float(np.median(bend)) / (_MAD * np.sqrt(1.5)))
 
 
-def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[Placed], config: MappingConfig) -> bool:
+def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[HasPose], config: MappingConfig) -> bool:
     """Whether a view is new: farther or turned further from every keyframe than the configuration says."""
     for keyframe in reversed(keyframes):
         moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)

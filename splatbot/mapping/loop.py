@@ -17,10 +17,10 @@ from splatbot.mapping.posegraph import Edge, PoseGraph, largest
 from splatbot.tracking.align import align
 from splatbot.tracking.features import Features, match_pose
 from splatbot.tracking.health import measure
-from splatbot.tracking.places import votes
+from splatbot.tracking.nearby_keyframes import order_by_distance, pose_distance
+from splatbot.tracking.place_recognition import votes
 from splatbot.tracking.prepare import PreparedFrame
 from splatbot.tracking.uncertainty import alignment_covariance
-from splatbot.tracking.views import order_by_distance, pose_distance
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ _JUMP = 5e-3, 5e-3  # [m], [rad]: a keyframe was moved so far by its other neigh
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredMotion:
     """The motion from a keyframe to a view by the images of these two alone.
 
     Args:
@@ -58,7 +58,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class View:
+class LoopView:
     """A frame at T_world_camera (4, 4), with its features, and the keyframe that it was tracked by before."""
 
     prepared: PreparedFrame
@@ -99,7 +99,7 @@ class LoopCloser:
             self.anchor = nearest
         return False
 
-    def add(self, keyframe: Keyframe, view: View, keyframes: Sequence[Keyframe]) -> None:
+    def add(self, keyframe: Keyframe, view: LoopView, keyframes: Sequence[Keyframe]) -> None:
         """A keyframe was made of a view: measure its motion, and look for places seen before."""
         if not self.config.loops.enabled:
             return
@@ -129,7 +129,7 @@ class LoopCloser:
         self.graph.poses = {number: correction[number] @ T for number, T in self.graph.poses.items()}
         self.correction = None
 
-    def _odometry(self, anchor: Keyframe, keyframe: Keyframe, view: View) -> Edge:
+    def _odometry(self, anchor: Keyframe, keyframe: Keyframe, view: LoopView) -> Edge:
         """The motion from the last neighbour: as tracked, unless the tracker was drawn away by other keyframes."""
         T_tracked = inverse(anchor.T_world_camera) @ keyframe.T_world_camera
         found = self._measure(anchor, view)
@@ -140,7 +140,7 @@ class LoopCloser:
         T = T_tracked if found.agrees(T_tracked) else found.T_keyframe_camera
         return Edge(anchor.number, keyframe.number, T, found.covariance + _drift(T))
 
-    def _tie(self, latest: Keyframe, keyframe: Keyframe, view: View) -> Edge | None:
+    def _tie(self, latest: Keyframe, keyframe: Keyframe, view: LoopView) -> Edge | None:
         """The motion from the keyframe before, which was not there yet, or is farther, when the frame was tracked.
 
         Each keyframe with the last but one only would make two chains beside each other, and what they drift apart
@@ -167,7 +167,7 @@ class LoopCloser:
                 found.append(others[index])
         return found
 
-    def _loop(self, stranger: Keyframe, keyframe: Keyframe, view: View, T_chain: Array) -> Edge | None:
+    def _loop(self, stranger: Keyframe, keyframe: Keyframe, view: LoopView, T_chain: Array) -> Edge | None:
         """The motion from a place seen before, if the images bear it out and the drift since then is possible.
 
         ``T_chain`` (4, 4) is where the keyframe is by its last neighbour alone.
@@ -218,7 +218,7 @@ class LoopCloser:
         self.closed += 1
         self.correction = {number: poses[number] @ inverse(T) for number, T in self.graph.poses.items()}
 
-    def _measure(self, keyframe: Keyframe, view: View) -> Measured | None:
+    def _measure(self, keyframe: Keyframe, view: LoopView) -> MeasuredMotion | None:
         """Align a view to one keyframe; None where there is nothing to start from."""
         config, levels = self.config.tracking, view.prepared.levels
         camera = view.prepared.frame.camera
@@ -245,7 +245,7 @@ class LoopCloser:
         covariance = alignment_covariance(found)
         if not np.isfinite(covariance).all() or not np.isfinite(found.T_world_camera).all():
             return None
-        return Measured(
+        return MeasuredMotion(
             T_keyframe_camera=inverse(T_world_keyframe) @ found.T_world_camera,
             covariance=covariance,
             overlap=health.overlap,
@@ -253,7 +253,7 @@ class LoopCloser:
             matches=0 if matched is None else len(matched.points),
         )
 
-    def _is_good(self, found: Measured) -> bool:
+    def _is_good(self, found: MeasuredMotion) -> bool:
         return found.overlap >= self.config.loops.min_overlap and found.inliers >= self.config.loops.min_inliers
 
 

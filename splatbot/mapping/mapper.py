@@ -15,16 +15,15 @@ from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
-from splatbot.mapping.densify import Pull, split
-from splatbot.mapping.evidence import DepthNoise, count, first_uncertainty, fuse_depth, fuse_normals, weigh
+from splatbot.mapping.densify import PositionGradients, split
+from splatbot.mapping.depth_fusion import DepthNoiseModel, count, first_uncertainty, fuse_depth, fuse_normals, weigh
+from splatbot.mapping.dynamic_objects import DynamicObjectFilter
 from splatbot.mapping.exposure import in_exposure_of_map
-from splatbot.mapping.fusion import View, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
-from splatbot.mapping.keyframes import Keyframe, Placed, is_keyframe, mapping_images, resized
-from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
-from splatbot.mapping.loop import View as LoopView
+from splatbot.mapping.insertion import ModelView, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
+from splatbot.mapping.keyframes import HasPose, Keyframe, is_keyframe, mapping_images, resized
+from splatbot.mapping.loop import LoopCloser, LoopView, move_gaussians, move_keyframe
 from splatbot.mapping.memory import memory_of
 from splatbot.mapping.merge import merge_alike
-from splatbot.mapping.moving import Movers
 from splatbot.mapping.prune import fittest, worth_keeping
 from splatbot.mapping.refine import Refiner, Stop, never
 from splatbot.tracking.features import Features
@@ -64,9 +63,9 @@ class Mapper:
         self.loops = LoopCloser(config)
         self._refiner = Refiner(config.mapping, config.seed)
         self._refiner.adam.extend(self.model)
-        self._movers = Movers(config.mapping.settle)
+        self._movers = DynamicObjectFilter(config.mapping.settle)
         self._revealed = False
-        self._noise = DepthNoise.of(config.tracking)
+        self._noise = DepthNoiseModel.of(config.tracking)
         self._held = False
         self._version = 0
         self._stamp = 0.0
@@ -77,7 +76,7 @@ class Mapper:
         return len(self.model)
 
     def wants(
-        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], to_come: Sequence[Placed] = ()
+        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], to_come: Sequence[HasPose] = ()
     ) -> bool:
         """Whether a frame at this pose would be a keyframe: a new view, with depth for later frames to align to.
 
@@ -160,7 +159,7 @@ class Mapper:
         ``stop`` is asked before each step; once it says so there are no more, and nothing is added to the map.
         """
         self.refine(self.owed, stop)
-        steps, pull = self.config.mapping.final_iterations, Pull(len(self.model))
+        steps, pull = self.config.mapping.final_iterations, PositionGradients(len(self.model))
         self._refiner.refine_all(self.model, self.keyframes, steps // _BEFORE, pull, stop)
         if not stop():
             self._densify(pull)
@@ -274,7 +273,7 @@ class Mapper:
         evidence = weigh(self.model, depth, camera, T_world_camera, self._noise)
         self.model = count(fuse_normals(fuse_depth(self.model, evidence), evidence), evidence)
 
-    def _leave_out_what_moves(self, keyframe: Keyframe, view: View) -> None:
+    def _leave_out_what_moves(self, keyframe: Keyframe, view: ModelView) -> None:
         moving = self._movers.find(
             view,
             keyframe.rgb,
@@ -288,7 +287,7 @@ class Mapper:
             keyframe.still = ~moving if keyframe.still is None else keyframe.still & ~moving
             keyframe.depth = torch.where(moving, 0.0, keyframe.depth)
 
-    def _add(self, keyframe: Keyframe, view: View) -> None:
+    def _add(self, keyframe: Keyframe, view: ModelView) -> None:
         measured = new_gaussians(keyframe, unexplained(view, keyframe.depth, self.config.mapping), self.config.mapping)
         guessed = guessed_gaussians(view, keyframe, self.config.mapping)
         for new in (measured, guessed):
@@ -296,7 +295,7 @@ class Mapper:
         self.model = GaussianModel.concatenate([self.model, measured, guessed])
         self._refiner.adam.extend(self.model)
 
-    def _densify(self, pull: Pull) -> None:
+    def _densify(self, pull: PositionGradients) -> None:
         room = self.config.mapping.max_gaussians - len(self.model)
         self.model = split(self.model, pull.strongest(self.config.mapping.densify_gradient, room))
         self._refiner.adam.extend(self.model)

@@ -15,7 +15,7 @@ from splatbot.config import MappingConfig
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.harmonics import sh_to_rgb
 from splatbot.gaussians.shape import shortest_axes
-from splatbot.mapping.densify import Pull
+from splatbot.mapping.densify import PositionGradients
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
@@ -73,7 +73,7 @@ class Refiner:
         model: GaussianModel,
         keyframes: Sequence[Keyframe],
         iterations: int,
-        pull: Pull | None = None,
+        pull: PositionGradients | None = None,
         stop: Stop = never,
     ) -> None:
         """Spend ``iterations`` steps on all keyframes alike; ``pull`` gathers how hard they pull at the centres."""
@@ -84,7 +84,7 @@ class Refiner:
         pool = keyframes[-self.config.window :] if self._random.random() < 0.5 else keyframes
         return pool[int(self._random.integers(len(pool)))]
 
-    def step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None = None) -> float:
+    def step(self, model: GaussianModel, keyframe: Keyframe, pull: PositionGradients | None = None) -> float:
         """One step on one keyframe; returns the loss before it.
 
         Torch's threads spin after each operation and so starve the rasterizer's; one is several times faster here.
@@ -96,7 +96,7 @@ class Refiner:
         finally:
             torch.set_num_threads(threads)
 
-    def _step(self, model: GaussianModel, keyframe: Keyframe, pull: Pull | None) -> float:
+    def _step(self, model: GaussianModel, keyframe: Keyframe, pull: PositionGradients | None) -> float:
         parameters = {name: getattr(model, name).detach().requires_grad_(True) for name in PARAMETERS}
         renders, alphas, meta = rasterization(
             parameters["means"],

@@ -19,7 +19,7 @@ from splatbot.gaussians import Snapshot
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper, Observation
 from splatbot.mapping.refine import Stop, never
-from splatbot.priority import stand_back, switch_quickly
+from splatbot.priority import lower_priority, switch_quickly
 from splatbot.rasterize.native import native
 from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame
@@ -195,7 +195,7 @@ class MappingWorker:
             raise RuntimeError("mapping has failed in its thread; the map is as it was before") from self._error
 
     def _run(self) -> None:
-        _stand_back()
+        _lower_priority()
         try:
             while (work := self._next()) is not None:
                 work()
@@ -259,11 +259,11 @@ class MappingWorker:
             self._publish()
 
 
-def _stand_back() -> None:
+def _lower_priority() -> None:
     """Leave cores and interpreter to the tracker: one native thread, one of torch, and a lower priority."""
     native().keep_to_this_thread(True)
     torch.set_num_threads(1)
-    stand_back(_NICENESS)
+    lower_priority(_NICENESS)
 
 
 @atexit.register

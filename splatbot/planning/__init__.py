@@ -17,7 +17,7 @@ from splatbot.planning.problem import (
 from splatbot.planning.replan import Replanner, Update
 from splatbot.planning.rrt_star import GaussianRRTStar
 from splatbot.planning.timing import time_path
-from splatbot.planning.trajectory import State, Trajectory
+from splatbot.planning.trajectory import JointTrajectory, State
 
 __all__ = [
     "Cause",
@@ -26,6 +26,7 @@ __all__ = [
     "Goal",
     "GoalError",
     "JointGoal",
+    "JointTrajectory",
     "Path",
     "PlanResult",
     "PlanStatus",
@@ -35,7 +36,6 @@ __all__ = [
     "Replanner",
     "StartError",
     "State",
-    "Trajectory",
     "Update",
     "time_path",
 ]

@@ -13,7 +13,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning.blends import Curve, blend_chords, rounded
 from splatbot.planning.problem import Certificate, Path
-from splatbot.planning.trajectory import Trajectory
+from splatbot.planning.trajectory import JointTrajectory
 from splatbot.protocols import Array, KinematicChain
 
 SAME = 1e-4  # [rad or m]; waypoints nearer than this are one
@@ -34,7 +34,7 @@ def time_path(
     *,
     velocity_scale: float = 1.0,
     acceleration_scale: float = 1.0,
-) -> Trajectory:
+) -> JointTrajectory:
     """The path as a trajectory within the arm's limits of velocity, acceleration and jerk.
 
     Corners are rounded as far as the arm stays free; speeds come from reachability analysis, are averaged where jerk
@@ -97,14 +97,14 @@ class _Timed:
 
     def trajectory(
         self, chain: KinematicChain, eps: float, arm: RobotSpheres, field: GaussianCollisionField | None, free: bool
-    ) -> Trajectory:
+    ) -> JointTrajectory:
         """With its certificate, and slowed down by what is left above a limit."""
         nothing = Certificate(False, eps, 0.0, arm.margin, -1)
-        found = Trajectory(chain.names, self.control, self.step, nothing)
+        found = JointTrajectory(chain.names, self.control, self.step, nothing)
         v, a, j = found.load(chain)
         over = max(v, np.sqrt(a), np.cbrt(j), 1.0)
         step = self.step * float(over) * (1.0 + 1e-9)
-        return Trajectory(chain.names, self.control, step, _certificate(eps, arm, field, found, free))
+        return JointTrajectory(chain.names, self.control, step, _certificate(eps, arm, field, found, free))
 
 
 def _timed(waypoints: Array, reach: Array, chain: KinematicChain) -> _Timed:
@@ -240,7 +240,7 @@ def _parallel(a: Array, b: Array) -> NDArray[np.bool_]:
 
 
 def _certificate(
-    eps: float, arm: RobotSpheres, field: GaussianCollisionField | None, trajectory: Trajectory, free: bool
+    eps: float, arm: RobotSpheres, field: GaussianCollisionField | None, trajectory: JointTrajectory, free: bool
 ) -> Certificate:
     if field is None:
         return Certificate(free, eps, 0.0, arm.margin, -1)
@@ -259,7 +259,7 @@ def least_room(arm: RobotSpheres, field: GaussianCollisionField, control: Array)
     way = np.concatenate([[0.0], np.cumsum(most.max(axis=1))])  # of the fastest sphere, up to each knot
     spans = len(control) - 3
     middle, half = np.arange(0, spans, _COARSE) + _COARSE / 2, np.full(-(-spans // _COARSE), _COARSE / 2)
-    spline = Trajectory(arm.robot.chain.names, control, 1.0, Certificate(False, 0.0, 0.0, 0.0, -1))
+    spline = JointTrajectory(arm.robot.chain.names, control, 1.0, Certificate(False, 0.0, 0.0, 0.0, -1))
     low, best = np.inf, CLEARANCE_CUT
     while len(middle):
         at = np.interp(np.stack([middle - half, middle, middle + half]), np.arange(spans + 1), way)

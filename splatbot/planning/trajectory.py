@@ -20,7 +20,7 @@ _CUBIC = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) 
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class JointTrajectory:
     """A uniform cubic B-spline in time, at rest at both ends.
 
     Velocity, acceleration and jerk are bounded by the first, second and third differences of the control points, over
@@ -101,11 +101,11 @@ class Trajectory:
             shares.append(float((most / limit).max()))
         return shares[0], shares[1], shares[2]
 
-    def slowed(self, factor: float) -> Trajectory:
+    def slowed(self, factor: float) -> JointTrajectory:
         """The same curve in ``factor`` times the time; the certificate stays, for it speaks of the curve alone."""
         if not 0.0 < factor < np.inf:
             raise InputError(f"is {factor}.", field="factor", hint="give a number above 0, 2 for half the speed")
-        return Trajectory(self.names, self.control, self.step * factor, self.certificate)
+        return JointTrajectory(self.names, self.control, self.step * factor, self.certificate)
 
     def to_ros(self, *, rate: float = 100.0, frame_id: str = "") -> dict[str, Any]:
         """``trajectory_msgs/JointTrajectory`` as a dictionary, as rosbridge takes it."""

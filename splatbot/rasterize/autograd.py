@@ -10,14 +10,14 @@ from torch.autograd.function import once_differentiable
 
 from splatbot.rasterize.centers import Centers
 from splatbot.rasterize.inputs import Inputs, Layout
-from splatbot.rasterize.options import Options
+from splatbot.rasterize.options import RasterOptions
 from splatbot.rasterize.passes import Rendered, Wanted, run_backward
 
 _SPARSE = 4  # of the inputs, the first so many may have sparse gradients: means, quats, scales, covars
 
 
 def attach(
-    inputs: Inputs, options: Options, rendered: Rendered, centers: Centers, means2d: Tensor
+    inputs: Inputs, options: RasterOptions, rendered: Rendered, centers: Centers, means2d: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The rendered images as functions of the inputs and of the projected centres."""
     renders, alphas = _Rasterize.apply(*inputs.tensors(), means2d, inputs.layout, options, rendered, centers)

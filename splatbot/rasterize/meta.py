@@ -11,7 +11,7 @@ from torch import Tensor
 from splatbot.rasterize.centers import Centers
 from splatbot.rasterize.inputs import Layout
 from splatbot.rasterize.intersections import isect_offset_encode, isect_tiles
-from splatbot.rasterize.options import Options
+from splatbot.rasterize.options import RasterOptions
 
 _PROJECTED = ("depths", "conics", "radii", "opacities")
 _PAIRS = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
@@ -53,7 +53,7 @@ class RenderMeta(MutableMapping[str, Any]):
         self,
         states: tuple[Any, ...],
         layout: Layout,
-        options: Options,
+        options: RasterOptions,
         opacities: Tensor,
         centers: Centers,
         means2d: Tensor,

@@ -38,7 +38,7 @@ _ABSENT: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Options:
+class RasterOptions:
     """Checked options; lengths in the units of :func:`splatbot.rasterize.rasterization`."""
 
     width: int

@@ -11,7 +11,7 @@ from torch import Tensor
 from splatbot.errors import InputError
 from splatbot.rasterize.inputs import Inputs
 from splatbot.rasterize.native import native
-from splatbot.rasterize.options import Options
+from splatbot.rasterize.options import RasterOptions
 
 _GEOMETRY = 5  # of the inputs, the first so many: means, quats, scales, covars, opacities
 
@@ -38,7 +38,7 @@ def _geometry(inputs: Inputs, b: int) -> list[Tensor | None]:
     return [None if t is None else inputs.layout.scene(t, b) for t in inputs.tensors()[:_GEOMETRY]]
 
 
-def run_forward(inputs: Inputs, options: Options) -> Rendered:
+def run_forward(inputs: Inputs, options: RasterOptions) -> Rendered:
     """Render every view.
 
     Raises:
@@ -96,7 +96,7 @@ class Gradients:
 
 def run_backward(
     inputs: Inputs,
-    options: Options,
+    options: RasterOptions,
     states: tuple[Any, ...],
     grad_renders: Tensor | None,
     grad_alphas: Tensor | None,

@@ -26,7 +26,7 @@ from splatbot.rasterize.normals import facing_axes
 from splatbot.rasterize.options import (
     DEFAULT_TILE_SIZE,
     TRANSMITTANCE_MIN,
-    Options,
+    RasterOptions,
     check_choice,
     parse_mode,
     refuse_absent,
@@ -225,7 +225,7 @@ def _check_camera_goes_with(settings: CameraSettings, covars: Tensor | None, dep
         raise InputError("have no axes for the unscented transform.", field="covars", hint="give quats and scales")
 
 
-def _with_median(inputs: Inputs, options: Options, colors: Tensor | None, meta: RenderMeta) -> Tensor:
+def _with_median(inputs: Inputs, options: RasterOptions, colors: Tensor | None, meta: RenderMeta) -> Tensor:
     layout = inputs.layout
     ids = median_ids(meta.states, options.height, options.width)
     means = inputs.means.reshape(layout.n_batches, layout.n_gaussians, 3)
@@ -234,7 +234,7 @@ def _with_median(inputs: Inputs, options: Options, colors: Tensor | None, meta: 
     return depth if colors is None else torch.cat([colors, depth], -1)
 
 
-def _render_normals(inputs: Inputs, options: Options, *, parallel: bool) -> Tensor:
+def _render_normals(inputs: Inputs, options: RasterOptions, *, parallel: bool) -> Tensor:
     if inputs.quats is None or inputs.scales is None:
         raise InputError("have no axes to be normals.", field="covars", hint="give quats and scales")
     layout = inputs.layout
@@ -246,7 +246,7 @@ def _render_normals(inputs: Inputs, options: Options, *, parallel: bool) -> Tens
     return _render(inputs, options)[0]
 
 
-def _render(inputs: Inputs, options: Options) -> tuple[Tensor, Tensor, RenderMeta]:
+def _render(inputs: Inputs, options: RasterOptions) -> tuple[Tensor, Tensor, RenderMeta]:
     layout = inputs.layout
     rendered = run_forward(inputs, options)
     centers = Centers(
@@ -260,7 +260,7 @@ def _render(inputs: Inputs, options: Options) -> tuple[Tensor, Tensor, RenderMet
     return renders, alphas, meta
 
 
-def _check_options(given: dict[str, Any]) -> Options:
+def _check_options(given: dict[str, Any]) -> RasterOptions:
     """An option that would change the result is refused, never ignored."""
     refuse_absent({**given["absent"], "distributed": given["distributed"]})
     check_choice("rasterize_mode", given["rasterize_mode"], ("classic", "antialiased"))
@@ -273,7 +273,7 @@ def _check_options(given: dict[str, Any]) -> Options:
         raise InputError("'plane' is not for median depth.", field="depth_mode", hint="use 'center'")
     wants_color, depth = parse_mode(given["render_mode"])
     sh_degree = given["sh_degree"] if wants_color else None
-    return Options(
+    return RasterOptions(
         width=given["width"],
         height=given["height"],
         near_plane=float(given["near_plane"]),

@@ -14,7 +14,7 @@ from splatbot.grasping.types import Grasp
 from splatbot.protocols import Array, HasHand, RobotKinematics
 from splatbot.rasterize.views import render_view, to_png
 from splatbot.report.balls import balls
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
 _HAND, _BEFORE = np.array([0.15, 0.45, 0.9]), np.array([0.6, 0.75, 0.95])
 _CONTACT, _TARGET = np.array([0.1, 0.9, 0.2]), np.array([0.95, 0.5, 0.1])
@@ -24,7 +24,7 @@ _SIDES = (np.array([-0.8, 0.35, 0.6]), np.array([-0.25, -0.9, 0.45]))  # where f
 
 
 def grasp_png(
-    scene: MapScene,
+    scene: SegmentedMap,
     rows: NDArray[np.int64],
     robot: RobotKinematics,
     grasp: Grasp,

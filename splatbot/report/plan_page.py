@@ -9,7 +9,7 @@ from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, transform_points
-from splatbot.planning import Trajectory
+from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view, to_png
 from splatbot.report.balls import balls
@@ -23,7 +23,7 @@ _EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # of the 
 
 
 def plan_html(
-    model: GaussianModel, arm: RobotSpheres, field: GaussianCollisionField, trajectory: Trajectory, *, title: str
+    model: GaussianModel, arm: RobotSpheres, field: GaussianCollisionField, trajectory: JointTrajectory, *, title: str
 ) -> str:
     """The page: the map's Gaussians as points around the arm's spheres, with a slider for time.
 
@@ -63,7 +63,7 @@ def plan_html(
     return moving_page(title, facts, document, "plan_view.js")
 
 
-def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: Trajectory, *, width: int = 960) -> bytes:
+def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: JointTrajectory, *, width: int = 960) -> bytes:
     """The map with the arm at the start (blue), at the end (orange) and between, rendered as Gaussians."""
     times = np.linspace(0.0, trajectory.duration, _GHOSTS)
     centers = arm.centers(trajectory.at(times).position)

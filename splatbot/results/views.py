@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from splatbot.camera import Camera
-from splatbot.collision.evidence import DepthView
+from splatbot.collision.visibility import DepthView
 from splatbot.logs import Log
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder

@@ -15,8 +15,8 @@ from splatbot.results.metrics import cost_metrics
 from splatbot.results.scoring import score_trajectory
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.loop import FrameLoop
-from splatbot.run.outcome import MapPage, Outcome
-from splatbot.run.pacing import FrameSource, PacedSource
+from splatbot.run.outcome import MapPage, RunOutcome
+from splatbot.run.pacing import LogFrames, PacedSource
 from splatbot.run.progress import Progress
 from splatbot.run.saving import Saver, resume_loop
 from splatbot.run.state import Checkpoint, SavedRun
@@ -108,14 +108,14 @@ def map_log(
     if total == 0:
         raise LogError("has no frames.", file=log.name, hint="record the log again, or name another one")
     truth = log.ground_truth  # now: a damaged file must not cost the user a whole run
-    frames = PacedSource(log, total, rate) if realtime else FrameSource(log, total)
+    frames = PacedSource(log, total, rate) if realtime else LogFrames(log, total)
     loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, on_progress or (lambda _: None))
     if resume is not None:
         resume_loop(loop, resume)
     with Interrupts() as interrupts:
 
-        def outcome() -> Outcome:
-            return Outcome(
+        def outcome() -> RunOutcome:
+            return RunOutcome(
                 loop=loop,
                 source=source or {},
                 map_page=map_page,

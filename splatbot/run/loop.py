@@ -16,7 +16,7 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.results.folder import FrameRow
 from splatbot.run.interrupts import Interrupts
-from splatbot.run.pacing import Arrival, FrameSource
+from splatbot.run.pacing import Arrival, LogFrames
 from splatbot.run.progress import Phase, Progress
 from splatbot.slam import FrameResult, Slam
 
@@ -54,7 +54,7 @@ class FrameLoop:
         saver: saves the run while it goes on.
     """
 
-    source: FrameSource
+    source: LogFrames
     slam: Slam
     config: Config
     on_bad_frame: str

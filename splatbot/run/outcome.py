@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass
-class Outcome:
+class RunOutcome:
     """All that is known of a run once its frames are through."""
 
     loop: FrameLoop

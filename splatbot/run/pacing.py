@@ -24,7 +24,7 @@ class Arrival:
     frame: Frame | InputError
 
 
-class FrameSource:
+class LogFrames:
     """The first ``total`` frames of a log, each when it is asked for.
 
     Args:
@@ -49,7 +49,7 @@ class FrameSource:
         return (read(self.log, index) for index in range(self.first, self.total))
 
 
-class PacedSource(FrameSource):
+class PacedSource(LogFrames):
     """The frames at the times of their stamps, or at ``rate`` [Hz]; the newest arrived is given, older ones drop out.
 
     A thread decodes ahead. While the log itself cannot keep up (ray-casting a scene takes longer than a frame), the
@@ -66,7 +66,7 @@ class PacedSource(FrameSource):
         return "by stamps" if self.rate is None else f"{self.rate:g} Hz"
 
     def __iter__(self) -> Generator[Arrival, None, None]:
-        reader, clock = _Reader(self.log, self.first, self.total), _Schedule(self.rate)
+        reader, clock = _FrameReader(self.log, self.first, self.total), _Schedule(self.rate)
         try:
             while (arrival := reader.take(clock)) is not None:
                 clock.sleep_until(arrival)
@@ -80,7 +80,7 @@ class PacedSource(FrameSource):
             reader.stop()
 
     @staticmethod
-    def _superseded(reader: _Reader, clock: _Schedule) -> bool:
+    def _superseded(reader: _FrameReader, clock: _Schedule) -> bool:
         """Whether a newer frame has arrived."""
         newer = reader.peek()
         if newer is None or not isinstance(newer.frame, Frame):  # what cannot be read takes nobody's place
@@ -134,7 +134,7 @@ class _Schedule:
         time.sleep(max(0.0, self._latest - time.perf_counter()))
 
 
-class _Reader:
+class _FrameReader:
     """Decodes ahead, in a thread of its own."""
 
     def __init__(self, log: Log, first: int, total: int) -> None:

@@ -2,13 +2,13 @@
 
 from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.fits import Fit, fit, primitive_fits
-from splatbot.segmentation.objects import MapObject, MapScene, segment
+from splatbot.segmentation.objects import MapObject, SegmentedMap, segment
 from splatbot.segmentation.plane import Support, find_support, given_support
 
 __all__ = [
     "Fit",
     "MapObject",
-    "MapScene",
+    "SegmentedMap",
     "Support",
     "clusters",
     "find_support",

@@ -58,7 +58,7 @@ class MapObject:
 
 
 @dataclass(frozen=True, eq=False)
-class MapScene:
+class SegmentedMap:
     """One state of the map and what is in it.
 
     Args:
@@ -131,7 +131,7 @@ def segment(
     apart: float = _APART,
     cut: bool = True,
     observers: Array | None = None,
-) -> MapScene:
+) -> SegmentedMap:
     """Remove the support of a map and gather what stands on it.
 
     Args:
@@ -178,7 +178,7 @@ def segment(
     objects = _with_faint(objects, labels, points, used)
     named = _with_names(tuple(objects), points, T, names)
     version = source.map_version if isinstance(source, Snapshot) else 0
-    return MapScene(model, T, support, named, labels, tuple(supports), tuple(names), version)
+    return SegmentedMap(model, T, support, named, labels, tuple(supports), tuple(names), version)
 
 
 def _known(plane: ArrayLike, T_world_base: Array, points: Array) -> Support:

@@ -20,7 +20,7 @@ _MEET = 5  # points of a face that are near to another
 
 
 @dataclass(frozen=True, eq=False)
-class _Face:
+class _RoomFace:
     """Points that hang together in a plane normal · p = offset; the normal points to who saw them."""
 
     rows: NDArray[np.int64]
@@ -66,7 +66,7 @@ def cut_in_room(points: Array, observers: Array, *, apart: float, fewest: int) -
     return sorted((rows for rows in found if len(rows) >= fewest), key=lambda rows: (-len(rows), int(rows[0])))
 
 
-def _faces(points: Array, observers: Array, *, apart: float, fewest: int) -> list[_Face]:
+def _faces(points: Array, observers: Array, *, apart: float, fewest: int) -> list[_RoomFace]:
     """Planes one after the other, then each point in the nearest of them."""
     normals = local_normals(points)
     rng = np.random.default_rng(0)
@@ -93,13 +93,13 @@ def _faces(points: Array, observers: Array, *, apart: float, fewest: int) -> lis
     return found
 
 
-def _turned(points: Array, observers: Array, rows: NDArray[np.int64], normal: Array) -> _Face:
+def _turned(points: Array, observers: Array, rows: NDArray[np.int64], normal: Array) -> _RoomFace:
     toward = (observers[rows] - points[rows]) @ normal
     toward = toward[np.isfinite(toward)]
     if not len(toward):
-        return _Face(rows, np.full(3, np.nan), np.nan)
+        return _RoomFace(rows, np.full(3, np.nan), np.nan)
     normal = normal * (-1.0 if np.median(toward) < 0 else 1.0)
-    return _Face(rows, normal, float(np.median(points[rows] @ normal)))
+    return _RoomFace(rows, normal, float(np.median(points[rows] @ normal)))
 
 
 def _largest(points: Array, normals: Array, rng: np.random.Generator) -> tuple[Array, float]:
@@ -123,7 +123,7 @@ def _on(plane: tuple[Array, float], points: Array, normals: Array) -> NDArray[np
     return np.asarray((np.abs(points @ normal - offset) < _THICK) & (np.abs(normals @ normal) > _ALONG))
 
 
-def _of_one(points: Array, a: _Face, b: _Face, apart: float) -> bool:
+def _of_one(points: Array, a: _RoomFace, b: _RoomFace, apart: float) -> bool:
     """Whether two faces meet and none is before the other."""
     p, q = points[a.rows], points[b.rows]
     if not (a.before(q) < _BEFORE and b.before(p) < _BEFORE):  # NaN: not known

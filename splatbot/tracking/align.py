@@ -109,7 +109,7 @@ def align(
     earlier), so they count ``config.dense_weight`` each, against reprojected features (``features`` with the
     ``camera`` of their pixels), which count one over their variance [px²]. More pixels measure the same better; they
     bring no more that is independent, so together they weigh as 4800 do. Beside colour, depth is taken for
-    ``config.depth_doubt`` times as uncertain as its pixels' noise.
+    ``config.depth_sigma_scale`` times as uncertain as its pixels' noise.
     """
     matches = None
     if features is not None and camera is not None:
@@ -120,7 +120,7 @@ def align(
         matches,
         None if prior is None else (inverse(prior.T_world_camera), prior.information),
         inverse(T_world_camera),
-        settings_of(config, photometric=photometric, gate=gate, doubt=config.depth_doubt if photometric else 1.0),
+        settings_of(config, photometric=photometric, gate=gate, doubt=config.depth_sigma_scale if photometric else 1.0),
         config.dense_weight * _FULL_PIXELS / config.n_pixels,
         config.iterations,
         finest,

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.geometry import inverse, se3_exp, se3_log
-from splatbot.tracking.candidate import Judged
-from splatbot.tracking.predict import Prediction
+from splatbot.tracking.hypothesis import ScoredHypothesis
+from splatbot.tracking.motion_model import Prediction
 from splatbot.tracking.uncertainty import alignment_covariance
 
 Array = NDArray[np.float64]
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 _GATE = 27.86
 
 
-def fill_weak_directions(pose: Judged, prediction: Prediction) -> Judged:
+def fill_weak_directions(pose: ScoredHypothesis, prediction: Prediction) -> ScoredHypothesis:
     """In directions that the frame says nothing of, the prediction and its covariance; elsewhere the pose as it is.
 
     Solution remapping (Zhang, Kaess and Singh 2016), with the covariance that follows from it.
@@ -31,7 +31,7 @@ def fill_weak_directions(pose: Judged, prediction: Prediction) -> Judged:
     return pose.corrected(pose.T_world_camera @ se3_exp(weak @ off), covariance)
 
 
-def sigmas_off(pose: Judged, told: Prediction, covariance: Array) -> float:
+def sigmas_off(pose: ScoredHypothesis, told: Prediction, covariance: Array) -> float:
     """Mahalanobis distance of a prior from a pose with a covariance (6, 6)."""
     off = se3_log(inverse(pose.T_world_camera) @ told.T_world_camera)
     return float(np.sqrt(off @ np.linalg.solve(covariance + told.covariance, off)))
@@ -42,7 +42,7 @@ def is_believable(sigmas: float) -> bool:
     return sigmas**2 <= _GATE
 
 
-def fuse(pose: Judged, told: Prediction, covariance: Array) -> tuple[Array, Array]:
+def fuse(pose: ScoredHypothesis, told: Prediction, covariance: Array) -> tuple[Array, Array]:
     """T_world_camera (4, 4) and covariance (6, 6) of a pose with a covariance (6, 6) and a prior together.
 
     One Gauss-Newton step from the pose with the prior as a factor: the pose is where the alignment's own gradient is 0.

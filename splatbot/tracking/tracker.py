@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.config import TrackingConfig
-from splatbot.tracking.attempt import Attempt
 from splatbot.tracking.budget import BOLD, CAREFUL, Budget, Costs
-from splatbot.tracking.candidate import Judged
 from splatbot.tracking.estimate import PoseEstimate
 from splatbot.tracking.features import Features, detect
-from splatbot.tracking.predict import ConstantVelocity, Prediction
+from splatbot.tracking.gicp import GicpStage
+from splatbot.tracking.hypothesis import ScoredHypothesis
+from splatbot.tracking.motion_model import ConstantVelocity, Prediction
+from splatbot.tracking.nearby_keyframes import TrackedKeyframe, order_by_distance, pose_distance
 from splatbot.tracking.prepare import PreparedFrame, valid_share
 from splatbot.tracking.priors import fill_weak_directions, fuse, is_believable, sigmas_off
-from splatbot.tracking.recover import KeyframeSearch, Sighting, is_sure
+from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidate, is_sure
+from splatbot.tracking.stages import TrackingStages
 from splatbot.tracking.uncertainty import Uncertainty, world_uncertainty
-from splatbot.tracking.views import TrackedKeyframe, order_by_distance, pose_distance
-from splatbot.tracking.wide import WideStage
 
 __all__ = ["PoseEstimate", "TrackedKeyframe", "Tracker", "order_by_distance", "pose_distance"]
 
@@ -41,9 +41,9 @@ class Tracker:
         self._known: WeakKeyDictionary[Features, Uncertainty] = WeakKeyDictionary()
         self._last_covariance: Array = np.zeros((6, 6))  # of the last pose against its keyframes
         self._costs = None if config.deterministic else Costs()
-        self._wide = WideStage(config)
-        self._search = KeyframeSearch()
-        self._sighting: Sighting | None = None
+        self._wide = GicpStage(config)
+        self._search = PlaceSearch()
+        self._sighting: RelocalizationCandidate | None = None
 
     def start(self, prepared: PreparedFrame) -> PoseEstimate:
         """The pose of the first frame, which defines the world; "lost" when it has too little depth or is blank."""
@@ -95,7 +95,7 @@ class Tracker:
         budget = Budget(self.config.budget_ms, self._costs, prepared.started, share)
         budget.count("prepare", frame.camera.width * frame.camera.height)
         search = self._search if self._lost else None
-        attempt = Attempt(self.config, prepared, keyframes, budget, self._wide, search)
+        attempt = TrackingStages(self.config, prepared, keyframes, budget, self._wide, search)
         own = self.motion.prediction(frame.stamp, self._last_covariance)
         if self._sighting is not None:
             own = replace(own, T_world_camera=self._sighting.T_world_camera)
@@ -120,8 +120,8 @@ class Tracker:
         )
 
     def _with_prior(
-        self, attempt: Attempt, pose: Judged, told: Prediction, own: Prediction
-    ) -> tuple[Judged, Uncertainty]:
+        self, attempt: TrackingStages, pose: ScoredHypothesis, told: Prediction, own: Prediction
+    ) -> tuple[ScoredHypothesis, Uncertainty]:
         """The pose and a prior together; without a prior that what is seen speaks against."""
         against = self._uncertainty(pose).covariance if told.absolute else pose.covariance
         off = sigmas_off(pose, told, against) if pose.verdict != "lost" else np.inf
@@ -144,13 +144,13 @@ class Tracker:
         pose = pose.corrected(*fuse(pose, told, pose.covariance))
         return pose, self._uncertainty(pose)
 
-    def _uncertainty(self, pose: Judged) -> Uncertainty:
+    def _uncertainty(self, pose: ScoredHypothesis) -> Uncertainty:
         """Of a pose in the world: its own and that of its keyframes."""
         nothing = Uncertainty()
         known = [(v.reference.T_world_camera, self._known.get(v.features, nothing)) for v in pose.candidate.views]
         return world_uncertainty(pose.T_world_camera, pose.covariance, known)
 
-    def _conclude(self, stamp: float, pose: Judged, told: Prediction | None) -> Judged:
+    def _conclude(self, stamp: float, pose: ScoredHypothesis, told: Prediction | None) -> ScoredHypothesis:
         """Remember the pose; once lost, only when the next frame agrees with it."""
         if self._lost:
             pose = self._confirmed(stamp, pose)
@@ -163,7 +163,7 @@ class Tracker:
             self._last_covariance = pose.covariance
         return pose
 
-    def _confirmed(self, stamp: float, pose: Judged) -> Judged:
+    def _confirmed(self, stamp: float, pose: ScoredHypothesis) -> ScoredHypothesis:
         """A pose found while lost, if the frame before was found near to it; else it is a sighting, and still lost."""
         before, self._sighting = self._sighting, None
         if pose.verdict == "lost":
@@ -171,6 +171,6 @@ class Tracker:
         if is_sure(pose):
             if before is not None and before.agrees(stamp, pose.T_world_camera):
                 return pose
-            self._sighting = Sighting(stamp, pose.T_world_camera)
+            self._sighting = RelocalizationCandidate(stamp, pose.T_world_camera)
             return replace(pose, verdict="lost", reasons=("found again, the next frame must confirm it",))
         return replace(pose, verdict="lost", reasons=(*pose.reasons, "not explained well enough to begin anew"))

@@ -14,13 +14,13 @@ from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, look_at, pose_from_quat, transform_points
-from splatbot.planning import Certificate, Trajectory
+from splatbot.planning import Certificate, JointTrajectory
 from splatbot.rasterize.views import render_view
 from splatbot.robots.store import load_robot
 from splatbot.services.store import MapStore
 from splatbot.services.topics import PLAN, RESULT, map_topic
 from splatbot.services.viewer.page import map_page
-from splatbot.services.viewer.scene import MapScene, close_server, open_server
+from splatbot.services.viewer.scene import ViewerScene, close_server, open_server
 from splatbot.services.viewer.viewer import Viewer
 from splatbot.slam import FrameResult
 from splatbot.workspace import Workspace
@@ -79,9 +79,9 @@ def _shot(browser: Chromium, sought: NDArray[np.float64], colour: NDArray[np.flo
     return image
 
 
-def _plan(robot_home: NDArray[np.float64], names: tuple[str, ...]) -> Trajectory:
+def _plan(robot_home: NDArray[np.float64], names: tuple[str, ...]) -> JointTrajectory:
     turn = np.linspace(0.0, 0.9, 14)[:, None] * np.eye(7)[0]
-    return Trajectory(names, robot_home + turn, 0.1, Certificate(False, 1e-3, 0.0, 0.0, 1))
+    return JointTrajectory(names, robot_home + turn, 0.1, Certificate(False, 1e-3, 0.0, 0.0, 1))
 
 
 def test_the_viewer_draws_the_splats_as_the_rasterizer_does_and_the_robot_and_its_path(browser: Chromium) -> None:
@@ -141,7 +141,7 @@ def test_the_page_needs_nothing_else_and_shows_the_same_colours(browser: Chromiu
 def test_a_scene_sends_again_only_what_has_changed() -> None:
     server = open_server("127.0.0.1", 0)
     try:
-        scene, model = MapScene(server), _wall()
+        scene, model = ViewerScene(server), _wall()
         everything = scene.show_map(model)
         assert everything > 5
         assert scene.show_map(model) == 0

@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 from splatbot.logs.ros_types import definition, to_cdr
 from splatbot.services.ros.messages import point_cloud_message, points_of
-from splatbot.services.ros.outlets import POINTS
+from splatbot.services.ros.publishers import POINTS
 from tests.contracts.clients.foxglove_client import FoxgloveClient
 from tests.contracts.conftest import Service, wall
 

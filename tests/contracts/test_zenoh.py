@@ -17,7 +17,7 @@ from splatbot.logs.ros_frames import camera_info_message, image_message
 from splatbot.logs.ros_types import build, from_cdr, to_cdr, type_of, typestore
 from splatbot.services.ros.messages import points_of
 from splatbot.services.ros.node import RosNode
-from splatbot.services.ros.outlets import POINTS
+from splatbot.services.ros.publishers import POINTS
 from splatbot.services.ros.zenoh_bridge import ZenohBridge
 from splatbot.services.store import MapStore
 from tests.contracts.conftest import wall

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from splatbot.priority import stand_back, switch_quickly
+from splatbot.priority import lower_priority, switch_quickly
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="a priority is a thread's own on Linux alone")
 
@@ -28,7 +28,7 @@ def test_a_thread_that_stands_back_and_those_it_starts_have_a_lower_priority_and
         seen.append(os.getpriority(os.PRIO_PROCESS, 0))
 
     def work() -> None:
-        stand_back(19)
+        lower_priority(19)
         look()
         _in_thread(look)
 

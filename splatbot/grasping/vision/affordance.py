@@ -9,13 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.grasping.affordance import Affordance, AffordanceError, Hint, NameHint, Target, View
+from splatbot.grasping.affordance import Affordance, AffordanceError, Hint, NameHint, ObservedView, Target
 from splatbot.grasping.places import at_point, point_at
 from splatbot.grasping.vision.answers import Answer, question_for, read_answers
 from splatbot.grasping.vision.models import Picture, VisionError, VisionModel
 from splatbot.grasping.vision.views import empty_picture, picture_of, scene_views
 from splatbot.protocols import Array
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
 LEAST_CONFIDENCE = 0.5
 _NAME = re.compile(r"[\w ,.'()/-]{1,80}")  # letters, digits and what names are written with: no quotes, no lines
@@ -45,7 +45,7 @@ class VisionAffordance:
         self,
         model: VisionModel,
         *,
-        views: Sequence[View] | None = None,
+        views: Sequence[ObservedView] | None = None,
         rules: Affordance | None = None,
         attempts: int = 2,
     ) -> None:
@@ -63,7 +63,7 @@ class VisionAffordance:
         """Names."""
         return isinstance(hint, NameHint)
 
-    def locate(self, hint: Hint, scene: MapScene) -> Target:
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         """See :class:`splatbot.grasping.affordance.Affordance`.
 
         Raises:
@@ -96,7 +96,7 @@ class VisionAffordance:
                 complaint = error.message
         raise AssertionError("the last attempt returns or raises")
 
-    def _judged(self, name: str, scene: MapScene, views: Sequence[View], answers: list[Answer]) -> Target:
+    def _judged(self, name: str, scene: SegmentedMap, views: Sequence[ObservedView], answers: list[Answer]) -> Target:
         if not answers:
             raise AffordanceError(f"sees no {name!r}.", field=self.name, hint="say it in other words, or point at it")
         notes: list[str] = []
@@ -127,7 +127,7 @@ class VisionAffordance:
         point = np.mean([at for _, at in won], axis=0)
         return Target(scene.objects[winner].rows, point, _called(scene, winner), self.name, score, tuple(notes), winner)
 
-    def _agrees(self, name: str, scene: MapScene, number: int) -> None:
+    def _agrees(self, name: str, scene: SegmentedMap, number: int) -> None:
         """Rules that know the name must mean the same object."""
         if self.rules is None:
             return
@@ -145,7 +145,7 @@ class VisionAffordance:
             )
 
 
-def _called(scene: MapScene, number: int) -> str:
+def _called(scene: SegmentedMap, number: int) -> str:
     return scene.objects[number].name or f"object {number}"
 
 

@@ -10,10 +10,10 @@ from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, transform_points
-from splatbot.grasping.affordance import View
+from splatbot.grasping.affordance import ObservedView
 from splatbot.grasping.vision.models import Picture
 from splatbot.rasterize.views import colorize, render_view
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 
 _STEEP = np.radians(50.0)  # of the cameras over the support
 _FIELD = np.radians(50.0)  # horizontal
@@ -21,7 +21,9 @@ _SPREAD = np.radians(35.0)  # between neighbouring cameras, around the up axis
 _ROOM = 1.35  # times the objects' extent that a picture shows
 
 
-def scene_views(scene: MapScene, count: int = 3, *, width: int = 640, height: int = 480) -> tuple[View, ...]:
+def scene_views(
+    scene: SegmentedMap, count: int = 3, *, width: int = 640, height: int = 480
+) -> tuple[ObservedView, ...]:
     """Cameras around the objects of a scene, from the base's side, that show all of them.
 
     Raises:
@@ -41,20 +43,20 @@ def scene_views(scene: MapScene, count: int = 3, *, width: int = 640, height: in
     for k in range(count):
         turn = behind + (k - (count - 1) / 2) * _SPREAD
         side = np.array([np.cos(turn) * np.cos(_STEEP), np.sin(turn) * np.cos(_STEEP), np.sin(_STEEP)])
-        views.append(View(camera, scene.T_world_base @ look_at(center + away * side, center)))
+        views.append(ObservedView(camera, scene.T_world_base @ look_at(center + away * side, center)))
     return tuple(views)
 
 
-def picture_of(scene: MapScene, view: View) -> Picture:
+def picture_of(scene: SegmentedMap, view: ObservedView) -> Picture:
     """What a view saw, or how the map renders from there."""
     return view.rgb if view.rgb is not None else _rendered(scene.model, view)
 
 
-def empty_picture(scene: MapScene, view: View) -> Picture:
+def empty_picture(scene: SegmentedMap, view: ObservedView) -> Picture:
     """The map from a view, with all of its objects taken away: who still sees one is guessing."""
     return _rendered(scene.model.select(torch.from_numpy(scene.labels < 0)), view)
 
 
-def _rendered(model: GaussianModel, view: View) -> Picture:
+def _rendered(model: GaussianModel, view: ObservedView) -> Picture:
     picture: NDArray[np.uint8] = colorize(render_view(model, view.camera, view.T_world_camera), "rgb")
     return picture

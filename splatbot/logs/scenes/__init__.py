@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.scenes.corridor import CORRIDOR_STAGE, corridor
 from splatbot.logs.scenes.room import ROOM_STAGE, room
 from splatbot.logs.scenes.tabletop import TABLETOP_STAGE, tabletop, tabletop_crossing, tabletop_removed
 from splatbot.logs.scenes.wall import WALL_STAGE, wall, wall_blank, wall_soft
 from splatbot.logs.trajectories import Stage
 
-__all__ = ["SCENES", "Scene", "SceneKind", "Surface"]
+__all__ = ["SCENES", "RaycastScene", "RaycastSurface", "SceneKind"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class SceneKind:
         about: a line on what the scene is for.
     """
 
-    build: Callable[[float], Scene]
+    build: Callable[[float], RaycastScene]
     stage: Stage
     trajectory: str
     about: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.shapes import box
 from splatbot.logs.textures import Texture
 from splatbot.logs.trajectories import Stage
@@ -14,24 +14,25 @@ CORRIDOR_STAGE = Stage(
 _LENGTH, _WIDTH, _HEIGHT, _THICK = 10.0, 1.8, 2.5, 0.1
 
 
-def corridor() -> Scene:
+def corridor() -> RaycastScene:
     """Flat walls: only colour, and the end walls from near, tell how far along the camera is."""
     plaster = Texture((0.86, 0.85, 0.80), (0.52, 0.56, 0.60), 0.15, seed=21)
     carpet = Texture((0.45, 0.45, 0.50), (0.25, 0.27, 0.32), 0.10, seed=22)
     ceiling = Texture((0.90, 0.90, 0.90), (0.74, 0.74, 0.72), 0.60, "checker")
     door = Texture((0.62, 0.44, 0.28), (0.42, 0.28, 0.16), 0.12, seed=23)
     sides = [
-        Surface(box([_THICK, _LENGTH, _HEIGHT]).placed([x * (_WIDTH + _THICK) / 2, _LENGTH / 2, 0.0]), plaster)
+        RaycastSurface(box([_THICK, _LENGTH, _HEIGHT]).placed([x * (_WIDTH + _THICK) / 2, _LENGTH / 2, 0.0]), plaster)
         for x in (-1, 1)
     ]
     ends = [
-        Surface(box([_WIDTH, _THICK, _HEIGHT]).placed([0.0, y, 0.0]), door) for y in (-_THICK / 2, _LENGTH + _THICK / 2)
+        RaycastSurface(box([_WIDTH, _THICK, _HEIGHT]).placed([0.0, y, 0.0]), door)
+        for y in (-_THICK / 2, _LENGTH + _THICK / 2)
     ]
-    return Scene(
+    return RaycastScene(
         [
             *sides,
             *ends,
-            Surface(box([_WIDTH, _LENGTH, _THICK]).placed([0.0, _LENGTH / 2, -_THICK]), carpet),
-            Surface(box([_WIDTH, _LENGTH, _THICK]).placed([0.0, _LENGTH / 2, _HEIGHT]), ceiling),
+            RaycastSurface(box([_WIDTH, _LENGTH, _THICK]).placed([0.0, _LENGTH / 2, -_THICK]), carpet),
+            RaycastSurface(box([_WIDTH, _LENGTH, _THICK]).placed([0.0, _LENGTH / 2, _HEIGHT]), ceiling),
         ]
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.shapes import box, cylinder, sphere
 from splatbot.logs.textures import Texture
 from splatbot.logs.trajectories import Stage
@@ -14,77 +14,77 @@ ROOM_STAGE = Stage(
 _X, _Y, _Z, _THICK = 5.0, 4.0, 2.6, 0.1
 
 
-def room() -> Scene:
+def room() -> RaycastScene:
     """Every direction has texture and relief; the middle, 1.1 m around, is free."""
-    return Scene([*_shell(), *_sofa(), *_desk(), *_shelf(), *_cabinet()])
+    return RaycastScene([*_shell(), *_sofa(), *_desk(), *_shelf(), *_cabinet()])
 
 
-def _shell() -> list[Surface]:
+def _shell() -> list[RaycastSurface]:
     paper = Texture((0.86, 0.84, 0.76), (0.45, 0.54, 0.50), 0.07, seed=31)
     boards = Texture((0.66, 0.50, 0.34), (0.42, 0.30, 0.20), 0.16, seed=32)
     ceiling = Texture((0.92, 0.92, 0.90), (0.78, 0.78, 0.76), 0.50, "checker")
     return [
-        Surface(box([_X, _Y, _THICK]).placed([0, 0, -_THICK]), boards),
-        Surface(box([_X, _Y, _THICK]).placed([0, 0, _Z]), ceiling),
-        *(Surface(box([_X, _THICK, _Z]).placed([0, y * (_Y + _THICK) / 2, 0]), paper) for y in (-1, 1)),
-        *(Surface(box([_THICK, _Y, _Z]).placed([x * (_X + _THICK) / 2, 0, 0]), paper) for x in (-1, 1)),
+        RaycastSurface(box([_X, _Y, _THICK]).placed([0, 0, -_THICK]), boards),
+        RaycastSurface(box([_X, _Y, _THICK]).placed([0, 0, _Z]), ceiling),
+        *(RaycastSurface(box([_X, _THICK, _Z]).placed([0, y * (_Y + _THICK) / 2, 0]), paper) for y in (-1, 1)),
+        *(RaycastSurface(box([_THICK, _Y, _Z]).placed([x * (_X + _THICK) / 2, 0, 0]), paper) for x in (-1, 1)),
     ]
 
 
-def _sofa() -> list[Surface]:
+def _sofa() -> list[RaycastSurface]:
     """At +y, with a picture above it."""
     cloth = Texture((0.30, 0.42, 0.58), (0.18, 0.24, 0.38), 0.05, seed=33)
     cushion = Texture((0.85, 0.60, 0.25), (0.65, 0.30, 0.18), 0.06, "checker", seed=34)
     picture = Texture((0.92, 0.88, 0.70), (0.20, 0.45, 0.42), 0.09, seed=35)
     return [
-        Surface(box([1.8, 0.70, 0.42]).placed([-0.2, 1.60, 0]), cloth),
-        Surface(box([1.8, 0.18, 0.45]).placed([-0.2, 1.90, 0.42]), cloth),
-        *(Surface(box([0.16, 0.70, 0.25]).placed([-0.2 + x, 1.60, 0.42]), cloth) for x in (-0.82, 0.82)),
-        Surface(box([0.40, 0.15, 0.36]).placed([-0.65, 1.70, 0.42], 0.3), cushion),
-        Surface(sphere(0.14).placed([0.25, 1.55, 0.42]), cushion),
-        Surface(box([0.9, 0.04, 0.6]).placed([-0.1, 1.98, 1.35]), picture),
+        RaycastSurface(box([1.8, 0.70, 0.42]).placed([-0.2, 1.60, 0]), cloth),
+        RaycastSurface(box([1.8, 0.18, 0.45]).placed([-0.2, 1.90, 0.42]), cloth),
+        *(RaycastSurface(box([0.16, 0.70, 0.25]).placed([-0.2 + x, 1.60, 0.42]), cloth) for x in (-0.82, 0.82)),
+        RaycastSurface(box([0.40, 0.15, 0.36]).placed([-0.65, 1.70, 0.42], 0.3), cushion),
+        RaycastSurface(sphere(0.14).placed([0.25, 1.55, 0.42]), cushion),
+        RaycastSurface(box([0.9, 0.04, 0.6]).placed([-0.1, 1.98, 1.35]), picture),
     ]
 
 
-def _desk() -> list[Surface]:
+def _desk() -> list[RaycastSurface]:
     """At +x, with a screen, books and a lamp."""
     wood = Texture((0.80, 0.62, 0.42), (0.52, 0.36, 0.22), 0.08, seed=36)
     screen = Texture((0.15, 0.30, 0.55), (0.05, 0.06, 0.10), 0.10, "checker", seed=37)
     books = Texture((0.80, 0.25, 0.22), (0.90, 0.88, 0.80), 0.05, seed=38)
     lamp = Texture((0.90, 0.80, 0.30), (0.55, 0.40, 0.10), 0.06, seed=39)
     return [
-        Surface(box([0.70, 1.50, 0.04]).placed([2.10, 0.1, 0.70]), wood),
-        *(Surface(box([0.60, 0.04, 0.70]).placed([2.10, 0.1 + y, 0]), wood) for y in (-0.70, 0.70)),
-        Surface(box([0.05, 0.60, 0.36]).placed([2.20, 0.2, 0.84], 0.15), screen),
-        Surface(cylinder(0.03, 0.12).placed([2.22, 0.2, 0.74]), screen),
-        Surface(box([0.22, 0.30, 0.16]).placed([2.05, -0.40, 0.74], 0.4), books),
-        Surface(cylinder(0.02, 0.40).placed([2.25, 0.70, 0.74]), lamp),
-        Surface(sphere(0.11).placed([2.25, 0.70, 1.10]), lamp),
+        RaycastSurface(box([0.70, 1.50, 0.04]).placed([2.10, 0.1, 0.70]), wood),
+        *(RaycastSurface(box([0.60, 0.04, 0.70]).placed([2.10, 0.1 + y, 0]), wood) for y in (-0.70, 0.70)),
+        RaycastSurface(box([0.05, 0.60, 0.36]).placed([2.20, 0.2, 0.84], 0.15), screen),
+        RaycastSurface(cylinder(0.03, 0.12).placed([2.22, 0.2, 0.74]), screen),
+        RaycastSurface(box([0.22, 0.30, 0.16]).placed([2.05, -0.40, 0.74], 0.4), books),
+        RaycastSurface(cylinder(0.02, 0.40).placed([2.25, 0.70, 0.74]), lamp),
+        RaycastSurface(sphere(0.11).placed([2.25, 0.70, 1.10]), lamp),
     ]
 
 
-def _shelf() -> list[Surface]:
+def _shelf() -> list[RaycastSurface]:
     """At -x: three boards with boxes and balls."""
     board = Texture((0.72, 0.70, 0.66), (0.50, 0.46, 0.42), 0.09, seed=40)
     boxes = Texture((0.70, 0.78, 0.30), (0.30, 0.34, 0.16), 0.06, seed=41)
     balls = Texture((0.90, 0.45, 0.55), (0.45, 0.15, 0.30), 0.06, seed=42)
-    parts = [Surface(box([0.34, 1.60, 0.03]).placed([-2.30, 0.0, z]), board) for z in (0.40, 0.95, 1.50)]
-    parts += [Surface(box([0.34, 0.03, 1.90]).placed([-2.30, y, 0]), board) for y in (-0.80, 0.0, 0.80)]
+    parts = [RaycastSurface(box([0.34, 1.60, 0.03]).placed([-2.30, 0.0, z]), board) for z in (0.40, 0.95, 1.50)]
+    parts += [RaycastSurface(box([0.34, 0.03, 1.90]).placed([-2.30, y, 0]), board) for y in (-0.80, 0.0, 0.80)]
     for i, z in enumerate((0.43, 0.98, 1.53)):
-        parts.append(Surface(box([0.20, 0.26, 0.20]).placed([-2.28, -0.45 + 0.1 * i, z], 0.2 * i), boxes))
-        parts.append(Surface(sphere(0.10).placed([-2.25, 0.30 + 0.12 * i, z]), balls))
+        parts.append(RaycastSurface(box([0.20, 0.26, 0.20]).placed([-2.28, -0.45 + 0.1 * i, z], 0.2 * i), boxes))
+        parts.append(RaycastSurface(sphere(0.10).placed([-2.25, 0.30 + 0.12 * i, z]), balls))
     return parts
 
 
-def _cabinet() -> list[Surface]:
+def _cabinet() -> list[RaycastSurface]:
     """At -y, with a plant beside it."""
     paint = Texture((0.78, 0.84, 0.86), (0.44, 0.54, 0.60), 0.06, seed=43)
     pot = Texture((0.74, 0.42, 0.28), (0.50, 0.26, 0.18), 0.06, seed=44)
     leaves = Texture((0.35, 0.65, 0.28), (0.12, 0.30, 0.12), 0.05, seed=45)
     return [
-        Surface(box([1.30, 0.45, 0.90]).placed([0.5, -1.75, 0]), paint),
-        Surface(box([0.35, 0.25, 0.25]).placed([0.2, -1.75, 0.90], 0.35), pot),
-        Surface(cylinder(0.09, 0.30).placed([0.8, -1.75, 0.90]), leaves),
-        Surface(cylinder(0.17, 0.35).placed([-1.5, -1.6, 0]), pot),
-        Surface(sphere(0.32).placed([-1.5, -1.6, 0.40]), leaves),
+        RaycastSurface(box([1.30, 0.45, 0.90]).placed([0.5, -1.75, 0]), paint),
+        RaycastSurface(box([0.35, 0.25, 0.25]).placed([0.2, -1.75, 0.90], 0.35), pot),
+        RaycastSurface(cylinder(0.09, 0.30).placed([0.8, -1.75, 0.90]), leaves),
+        RaycastSurface(cylinder(0.17, 0.35).placed([-1.5, -1.6, 0]), pot),
+        RaycastSurface(sphere(0.32).placed([-1.5, -1.6, 0.40]), leaves),
     ]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatbot.camera import Camera
-from splatbot.collision import Evidence, GaussianCollisionField, find_moving, gather_evidence
+from splatbot.collision import GaussianCollisionField, VisibilityEvidence, find_moving, gather_evidence
 from splatbot.collision.moving import with_balls
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
@@ -40,7 +40,7 @@ def _model(points: np.ndarray) -> GaussianModel:
     )  # fmt: skip
 
 
-def _mapped(where: list[np.ndarray], flying: float = 0.0) -> tuple[GaussianModel, Evidence]:
+def _mapped(where: list[np.ndarray], flying: float = 0.0) -> tuple[GaussianModel, VisibilityEvidence]:
     """What each image shows as Gaussians, every other pixel, and the evidence of all images.
 
     ``flying``: share of pixels at the still ball's edge that are somewhere behind it.
@@ -80,13 +80,13 @@ def test_where_nothing_moved_there_is_nothing_though_pixels_fly_at_edges() -> No
 
 def test_what_left_and_was_never_looked_at_again_is_not_said_to_move() -> None:
     model, evidence = _mapped([np.array([-0.20 + 0.05 * k, -0.10, 0.10]) for k in range(len(EYES))])
-    blind = Evidence(evidence.hits, np.zeros_like(evidence.passes))
+    blind = VisibilityEvidence(evidence.hits, np.zeros_like(evidence.passes))
     assert not len(find_moving(model, blind))
 
 
 def test_evidence_of_another_map_and_negative_room_are_refused() -> None:
     model = _model(np.zeros((3, 3)))
-    none = Evidence(np.zeros(2, np.int32), np.zeros(2, np.int32))
+    none = VisibilityEvidence(np.zeros(2, np.int32), np.zeros(2, np.int32))
     with pytest.raises(InputError, match="evidence"):
         find_moving(model, none)
     with pytest.raises(InputError, match="around"):

@@ -18,19 +18,19 @@ from splatbot.grasping.affordance import (
     Hint,
     MaskHint,
     NameHint,
+    ObservedView,
     PixelHint,
     PointHint,
     Target,
-    View,
     find_target,
 )
 from splatbot.grasping.places import PlaceAffordance, point_at
 from splatbot.grasping.words import WordAffordance
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from tests.unit.grasping.things import BALL, BIG, BOX, CAN, colored, scene, target_of
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
-VIEW = View(CAMERA, look_at(np.array([0.0, -0.4, 0.6]), np.array([0.5, 0.0, 0.0])))
+VIEW = ObservedView(CAMERA, look_at(np.array([0.0, -0.4, 0.6]), np.array([0.5, 0.0, 0.0])))
 PLACE = [PlaceAffordance()]
 
 
@@ -148,7 +148,7 @@ def test_hints_that_make_no_sense_are_refused(hint: Hint, message: str) -> None:
 
 
 def test_a_pixel_that_shows_nothing_is_said() -> None:
-    up = View(CAMERA, look_at(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 3.0])))
+    up = ObservedView(CAMERA, look_at(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 3.0])))
     with pytest.raises(AffordanceError, match="shows nothing of the map"):
         find_target(PixelHint(10.0, 10.0, up), scene(), PLACE)
 
@@ -159,7 +159,7 @@ class _Unsure:
     def understands(self, hint: Hint) -> bool:
         return True
 
-    def locate(self, hint: Hint, scene: MapScene) -> Target:
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         raise AffordanceError("cannot tell.", field="target")
 
 

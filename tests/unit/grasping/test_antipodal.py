@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from splatbot.grasping.antipodal import PairSearch, antipodal_pairs
-from splatbot.grasping.implied import target_surface
-from splatbot.grasping.surface import Surface
+from splatbot.grasping.shape_completion import target_surface
+from splatbot.grasping.surface import GraspSurface
 from tests.unit.grasping.things import BALL, BIG, BOX, CAN, THINGS, scene, target_of
 
 FRICTION = 0.5
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def _surface(name: str) -> Surface:
+def _surface(name: str) -> GraspSurface:
     return target_surface(scene(), target_of(scene(), THINGS[name], name).rows)
 
 
@@ -109,7 +109,7 @@ def test_contacts_stay_on_what_there_is_of_a_surface() -> None:
     turn, height = (a.ravel() for a in np.meshgrid(around, np.linspace(low, high, 6)))
     normals = np.stack([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)], axis=1)
     n = len(normals)
-    band = Surface(
+    band = GraspSurface(
         radius * normals,
         normals,
         np.full((n, 3, 3), 5e-4),

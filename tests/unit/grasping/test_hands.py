@@ -9,10 +9,10 @@ import pytest
 
 from splatbot.grasping.antipodal import Pairs
 from splatbot.grasping.hands import Hands, beside_target, place_hands
-from splatbot.grasping.surface import Surface
+from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array, HandShape
 from splatbot.robots.panda import panda
-from splatbot.robots.robot import Gripper
+from splatbot.robots.robot import GripperGeometry
 from splatbot.robots.shapes import Box
 
 FRICTION = 0.5
@@ -26,14 +26,14 @@ def _hand() -> HandShape:
     return hand
 
 
-def _ball(count: int = 1500) -> Surface:
+def _ball(count: int = 1500) -> GraspSurface:
     """Evenly spread points (Fibonacci) about the origin."""
     k = np.arange(count) + 0.5
     z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
     n = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
     spread = np.full(count, 2e-3)
     none = np.zeros((count, 3, 3))
-    return Surface(RADIUS * n, n, none, spread, np.ones(count, np.bool_), np.full(count, 3e-4), np.zeros(3))
+    return GraspSurface(RADIUS * n, n, none, spread, np.ones(count, np.bool_), np.full(count, 3e-4), np.zeros(3))
 
 
 def _pairs(line: Array) -> Pairs:
@@ -83,7 +83,7 @@ def test_places_that_are_not_opposite_are_outside_of_the_cone() -> None:
     normals = np.repeat([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]], x.size, axis=0)
     none, seen = np.zeros((count, 3, 3)), np.ones(count, np.bool_)
     points, spread, doubt = np.concatenate(sides), np.full(count, 1e-3), np.full(count, 3e-4)
-    surface = Surface(points, normals, none, spread, seen, doubt, np.zeros(3))
+    surface = GraspSurface(points, normals, none, spread, seen, doubt, np.zeros(3))
     contacts = 0.015 * np.array([[[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]]])
     pairs = Pairs(contacts, contacts / 0.015, np.ones(1), np.ones(1), np.zeros(1))
     hands = place_hands(pairs, hand, rolls=1, depths=1, up=UP, lowest=0.9)
@@ -97,7 +97,7 @@ def test_a_finger_that_is_a_box_is_flat_to_its_tip() -> None:
     robot, T = panda(), np.eye(4)
     T[:3, 3] = [0.0, 0.006, 0.027]
     assert robot.gripper is not None
-    gripper = Gripper(robot.gripper.T_link_finger, 0.04, (Box(0, T, (0.02, 0.012, 0.054)),))
+    gripper = GripperGeometry(robot.gripper.T_link_finger, 0.04, (Box(0, T, (0.02, 0.012, 0.054)),))
     hand = replace(robot, gripper=gripper).hand
     assert hand is not None
     assert hand.pad == hand.tip

@@ -18,16 +18,16 @@ from splatbot.grasping.affordance import Target
 from splatbot.grasping.held import covering_spheres
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick import Picker
+from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, within
 from splatbot.grasping.pick_types import PickError, PickOptions, PickOutcome, PickResult, PickStage
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
-from splatbot.grasping.ways import MapWays, Way, within
 from splatbot.planning import GaussianRRTStar
 from splatbot.protocols import Gripper, MotionState
 from splatbot.robots.controllers import FakeController
 from splatbot.robots.grippers import FakeGripper, FakeRobotiq, RobotiqGripper
 from splatbot.robots.panda import panda
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from splatbot.sim.controller import TwinController
 from splatbot.sim.scene import make_scene
 from splatbot.sim.twin import Twin
@@ -43,7 +43,7 @@ NAMES = {"carton": CARTON.center, "can": (0.50, -0.20, 0.06), "ball": BALL.cente
 
 
 @cache
-def scene() -> MapScene:
+def scene() -> SegmentedMap:
     found = segment(Tabletop((TABLE, CARTON, CAN, BALL)).gaussians(20_000), np.eye(4))
     assert len(found.objects) == 3
     return found
@@ -129,7 +129,7 @@ def test_what_is_held_is_carried_around_what_is_in_the_way() -> None:
     assert planner.plan(panda().home, panda().home + 1e-3).path is None
 
 
-def _spheres_on(way: Way) -> tuple[np.ndarray, np.ndarray]:
+def _spheres_on(way: PickPlan) -> tuple[np.ndarray, np.ndarray]:
     """Centres (P, S, 3) and radii (P, S) of the arm's moving spheres, all along a way."""
     centers, radii = [], []
     for leg in (way.there, way.approach, way.free, way.lift):
@@ -142,18 +142,18 @@ def _spheres_on(way: Way) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_way_goes_around_where_something_moved_and_its_certificate_is_of_both() -> None:
     start = panda().home + np.eye(7)[0] * 1.2  # on the other side of what is at half way
-    plain = MapWays(sampler(), target("can"), OPTIONS).to(grasps("can").grasps[0], start)
-    assert isinstance(plain, Way)
+    plain = MapPickPlanner(sampler(), target("can"), OPTIONS).to(grasps("can").grasps[0], start)
+    assert isinstance(plain, PickPlan)
     assert plain.clear
     middle = plain.there.arm.forward(plain.there.path.at(np.array([0.5])))[0, -1, :3, 3]
     moving = np.array([[*middle, 0.04]])
     wary = GraspSampler(scene(), panda(), moving=moving)
     found = wary.sample(target("can"), OPTIONS.grasp)
-    ways = MapWays(wary, target("can"), replace(OPTIONS, budget_ms=1000.0))
+    ways = MapPickPlanner(wary, target("can"), replace(OPTIONS, budget_ms=1000.0))
     grasp = next(g for g in found.grasps if g.clear)
     cautious, bold = (ways.to(grasp, start, cautious=cautious) for cautious in (True, False))
-    assert isinstance(cautious, Way)
-    assert isinstance(bold, Way)
+    assert isinstance(cautious, PickPlan)
+    assert isinstance(bold, PickPlan)
     assert cautious.clear
     assert not bold.clear
     for way, free in ((cautious, True), (plain, False)):

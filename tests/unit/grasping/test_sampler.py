@@ -12,25 +12,24 @@ from splatbot.bench.collision_peers import solid_mesh
 from splatbot.bench.tabletop import Block, Solid, Tabletop
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres
-from splatbot.collision.evidence import DepthView
+from splatbot.collision.visibility import DepthView
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, rotation_to_quat, transform_points
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.implied import target_surface
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import Reached
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.score import WEIGHTS
-from splatbot.grasping.surface import Surface as MapSurface
-from splatbot.grasping.surface import measured_surface
+from splatbot.grasping.shape_completion import target_surface
+from splatbot.grasping.surface import GraspSurface, measured_surface
 from splatbot.grasping.types import GraspResult, NoGraspError
-from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from tests.unit.grasping.things import (
     BALL,
     BIG,
@@ -184,7 +183,7 @@ def test_there_is_no_second_look_at_what_is_too_large() -> None:
 class _Sharp(GraspSampler):
     """One whose first look is at sharp rims, as the second of any other."""
 
-    def surface(self, target: Target, *, seed: int = 0, sharp: bool = True) -> MapSurface:
+    def surface(self, target: Target, *, seed: int = 0, sharp: bool = True) -> GraspSurface:
         return super().surface(target, seed=seed, sharp=True)
 
 
@@ -207,7 +206,7 @@ def test_what_was_looked_at_twice_is_counted_twice() -> None:
 INNER, OUTER, HIGH, RIM = 0.021, 0.0325, 0.016, 0.0055  # [m] of a low ring
 
 
-def _low_ring() -> MapScene:
+def _low_ring() -> SegmentedMap:
     """A roll of tape on the table as depth sees it, 16 mm high: its rim rounded, few Gaussians on its walls."""
     rng = np.random.default_rng(0)
     out = np.where(rng.random(2600) < 0.5, 1.0, -1.0)
@@ -322,7 +321,7 @@ def test_no_side_is_implied_where_depth_saw_through() -> None:
     camera = Camera(220.0, 220.0, 159.5, 119.5, 320, 240)
 
     def views(*solids: Solid) -> list[DepthView]:
-        stage = Scene([Surface(solid_mesh(solid), Texture((0.5,) * 3, (0.5,) * 3)) for solid in solids])
+        stage = RaycastScene([RaycastSurface(solid_mesh(solid), Texture((0.5,) * 3, (0.5,) * 3)) for solid in solids])
         poses = [
             look_at(np.array([0.45 + 0.4 * np.cos(turn), 0.1 + 0.4 * np.sin(turn), 0.35]), np.array([0.45, 0.1, 0.05]))
             for turn in np.arange(8) * np.pi / 4

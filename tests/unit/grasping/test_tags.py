@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from splatbot.errors import InputError
-from splatbot.grasping.affordance import AffordanceError, TagHint, View
+from splatbot.grasping.affordance import AffordanceError, ObservedView, TagHint
 from splatbot.grasping.tags import FAMILIES, TagAffordance, find_tags
 from tests.unit.grasping.test_affordance import VIEW, _pixel
 from tests.unit.grasping.things import CAN, scene, target_of
 
 
-def _picture(number: int, at: tuple[float, float]) -> View:
+def _picture(number: int, at: tuple[float, float]) -> ObservedView:
     """Grey, with a tag of 24 pixels."""
     rgb = np.full((240, 320, 3), 160, np.uint8)
     tag = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(FAMILIES["36h11"]), number, 24)

@@ -20,7 +20,7 @@ from splatbot.grasping.affordance import Affordance, AffordanceError, Hint, Name
 from splatbot.grasping.vision import EndpointModel, VisionAffordance, VisionError, VisionTimeoutError
 from splatbot.grasping.vision.answers import read_answers
 from splatbot.grasping.vision.views import empty_picture, picture_of, scene_views
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from tests.unit.grasping.fake_endpoint import (
     FakeEndpoint,
     Pictures,
@@ -44,7 +44,7 @@ RED, GREEN, BLUE = COLORS
 
 
 @cache
-def scene() -> MapScene:
+def scene() -> SegmentedMap:
     plain = segment(Tabletop((TABLE, *THINGS)).gaussians(12_000), np.eye(4))
     assert len(plain.objects) == 3
     for thing in plain.objects:
@@ -84,7 +84,7 @@ class Rules:
     def understands(self, hint: Hint) -> bool:
         return isinstance(hint, NameHint)
 
-    def locate(self, hint: Hint, scene: MapScene) -> Target:
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         found = scene.objects[self.number]
         return Target(found.rows, None, "the one of the rules", self.name, 1.0, (), self.number)
 

@@ -11,7 +11,7 @@ from splatbot.bench.tabletop import Ball, Block, Can, Solid, Tabletop
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.grasping.affordance import Target
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from splatbot.workspace import NamedPlace
 
 TABLE = Block((0.5, 0.0, -0.02), (0.7, 0.9, 0.04))
@@ -42,7 +42,7 @@ def model() -> GaussianModel:
 
 
 @cache
-def scene() -> MapScene:
+def scene() -> SegmentedMap:
     """With the can named."""
     return segment(model(), np.eye(4), names=(NamedPlace("soup", np.array([0.50, -0.15, 0.12]), ("tin of soup",)),))
 
@@ -53,7 +53,7 @@ def seen_from_above(full: GaussianModel) -> GaussianModel:
     return full.select(torch.from_numpy(np.flatnonzero(up & (full.means[:, 2].numpy() > -0.01))))
 
 
-def target_of(found: MapScene, solid: Solid, name: str) -> Target:
+def target_of(found: SegmentedMap, solid: Solid, name: str) -> Target:
     """The object whose Gaussians are on the solid."""
     points = found.model.means.double().numpy()
     off = [float(np.median(np.abs(solid.distance(points[o.rows])))) for o in found.objects]

@@ -12,7 +12,7 @@ import pytest
 from splatbot.errors import LogError
 from splatbot.logs import open_log
 from splatbot.logs.effects import read_account, write_account
-from splatbot.logs.synthetic import Options, SyntheticLog, synthetic_uri
+from splatbot.logs.synthetic import SyntheticLog, SyntheticOptions, synthetic_uri
 
 SMALL = "synthetic:tabletop?frames=12&width=80&height=60"
 HARD = f"{SMALL}&effects=motion_blur;exposure:step=2,at=6;depth_noise;depth_holes:share=0.3"
@@ -68,11 +68,11 @@ def test_a_wrong_address_is_named(query: str, field: str) -> None:
 
 
 def test_an_address_made_of_options_opens_a_log_with_those_options() -> None:
-    options = Options("arm", 33, 64, 48, 15.0, 20.0, 0.5, 7, "exposure:step=2,at=40;depth_noise")
+    options = SyntheticOptions("arm", 33, 64, 48, 15.0, 20.0, 0.5, 7, "exposure:step=2,at=40;depth_noise")
     log = open_log(synthetic_uri("tabletop", options))
     assert isinstance(log, SyntheticLog)
     assert log.options == options
-    assert synthetic_uri("room", Options()) == "synthetic:room"
+    assert synthetic_uri("room", SyntheticOptions()) == "synthetic:room"
 
 
 def test_the_account_of_a_recording_is_read_back(make_log: Callable[..., Path]) -> None:

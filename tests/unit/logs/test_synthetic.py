@@ -8,8 +8,8 @@ import pytest
 from splatbot.errors import LogError
 from splatbot.geometry import inverse, transform_points
 from splatbot.logs import open_log
-from splatbot.logs.scenes import Scene, Surface
-from splatbot.logs.shapes import Mesh, box, cup, cylinder, handle, sphere
+from splatbot.logs.scenes import RaycastScene, RaycastSurface
+from splatbot.logs.shapes import TriangleMesh, box, cup, cylinder, handle, sphere
 from splatbot.logs.textures import Texture, value_noise
 
 SMALL = "synthetic:tabletop?width=160&height=120"
@@ -97,7 +97,7 @@ def test_a_synthetic_log_takes_no_other_camera() -> None:
         open_log(SMALL, camera="tum_fr1")
 
 
-def volume(mesh: Mesh) -> float:
+def volume(mesh: TriangleMesh) -> float:
     a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
     return abs(float(np.sum(a * np.cross(b, c)) / 6))
 
@@ -112,13 +112,13 @@ def volume(mesh: Mesh) -> float:
         (handle(0.03, 0.005), np.pi * 0.03 * np.pi * 0.005**2),
     ],
 )
-def test_shapes_are_closed_and_have_their_volume(mesh: Mesh, expected: float) -> None:
+def test_shapes_are_closed_and_have_their_volume(mesh: TriangleMesh, expected: float) -> None:
     assert volume(mesh) == pytest.approx(expected, rel=0.02)
 
 
 def test_a_ray_cast_sphere_has_the_depth_of_the_closed_form() -> None:
     log = open_log(SMALL)
-    scene = Scene([Surface(sphere(0.3).placed([0, 0, -0.3]), Texture((1, 1, 1), (0, 0, 0)))])
+    scene = RaycastScene([RaycastSurface(sphere(0.3).placed([0, 0, -0.3]), Texture((1, 1, 1), (0, 0, 0)))])
     T = np.eye(4)
     T[:3, 3] = [0, 0, -2.0]
     rgb, depth = scene.render(log.camera, T)

@@ -11,7 +11,7 @@ from splatbot.evaluation.image import psnr
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import covariances
 from splatbot.logs import open_log
-from splatbot.mapping.densify import Pull, split
+from splatbot.mapping.densify import PositionGradients, split
 from splatbot.rasterize.views import render_rgbd
 from splatbot.slam import Slam
 
@@ -50,7 +50,7 @@ def test_two_halves_have_the_mean_and_covariance_of_the_whole_and_all_else_of_it
 
 
 def test_the_hardest_pulled_beyond_the_limit_are_chosen_as_far_as_there_is_room_whatever_a_pictures_size() -> None:
-    pull = Pull(5)
+    pull = PositionGradients(5)
     assert len(pull.strongest(0.0, 9)) == 0
     for width in (100, 400):
         gradients = torch.tensor([[3.0, 4.0], [0.0, 2.0], [6.0, 8.0], [float("nan"), 1.0]]) / width

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from splatbot.frame import Frame
-from splatbot.mapping.exposure import Exposure, exposure_of, in_exposure_of_map
-from splatbot.mapping.fusion import View
+from splatbot.mapping.exposure import ExposureFit, exposure_of, in_exposure_of_map
+from splatbot.mapping.insertion import ModelView
 from splatbot.slam import Slam
 from tests.rgbd import small_config, tabletop
 
@@ -20,11 +20,11 @@ def exposed(rgb: NDArray[np.uint8], gain: float, offset: float = 0.0) -> NDArray
     return np.clip(np.rint(gain * rgb.astype(float) + offset), 0, 255).astype(np.uint8)
 
 
-def scene() -> tuple[View, NDArray[np.uint8], torch.Tensor]:
+def scene() -> tuple[ModelView, NDArray[np.uint8], torch.Tensor]:
     """The map as exact as can be, a frame's colours and its depth."""
     frame = tabletop()[0][0]
     rgb, depth = torch.from_numpy(frame.rgb.copy()), torch.from_numpy(frame.depth.copy())
-    return View(rgb.float() / 255, depth, (depth > 0).float()), frame.rgb, depth
+    return ModelView(rgb.float() / 255, depth, (depth > 0).float()), frame.rgb, depth
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.3, 0.0), (0.5, 0.0), (0.8, 20.0), (1.0, -12.0), (2.0, 0.0)])
@@ -46,14 +46,14 @@ def test_the_blur_of_a_map_is_no_change_of_exposure() -> None:
     view, rgb, depth = scene()
     smooth = torch.nn.functional.avg_pool2d(view.rgb.permute(2, 0, 1)[None], 5, 1, 2)[0].permute(1, 2, 0)
     frame = torch.from_numpy(rgb.copy())
-    assert in_exposure_of_map(frame, depth, View(smooth, view.depth, view.alpha)) is frame
+    assert in_exposure_of_map(frame, depth, ModelView(smooth, view.depth, view.alpha)) is frame
 
 
 def test_a_map_that_shows_nothing_of_the_image_leaves_it_alone() -> None:
     view, rgb, depth = scene()
     bright = torch.from_numpy(exposed(rgb, 2.0))
     for unseen in (replace(view, alpha=torch.zeros_like(depth)), replace(view, depth=depth + 1)):
-        assert exposure_of(bright, depth, unseen) == Exposure()
+        assert exposure_of(bright, depth, unseen) == ExposureFit()
         assert in_exposure_of_map(bright, depth, unseen) is bright
     black = torch.zeros_like(bright)
     assert in_exposure_of_map(black, depth, view) is black

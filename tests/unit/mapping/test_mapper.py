@@ -13,7 +13,7 @@ import torch
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, se3_exp, transform_points
-from splatbot.mapping.fusion import view_of
+from splatbot.mapping.insertion import view_of
 from splatbot.mapping.mapper import Mapper
 from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import PreparedFrame, prepare

@@ -7,7 +7,7 @@ import torch
 
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import covariances
-from splatbot.mapping.fusion import new_gaussians, view_of
+from splatbot.mapping.insertion import new_gaussians, view_of
 from splatbot.mapping.merge import merge_alike
 from splatbot.mapping.prune import fittest
 from tests.rgbd import CAMERA, small_config

@@ -12,7 +12,7 @@ import torch
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import rotations
 from splatbot.geometry import se3_exp
-from splatbot.mapping.fusion import new_gaussians, view_of
+from splatbot.mapping.insertion import new_gaussians, view_of
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.refine import Refiner
 from splatbot.optimize.adam import PARAMETERS

@@ -9,7 +9,7 @@ from splatbot._native import fastest_speeds
 from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
-from splatbot.planning import Certificate, Path, Trajectory, time_path
+from splatbot.planning import Certificate, JointTrajectory, Path, time_path
 from splatbot.planning.blends import rounded
 from splatbot.planning.timing import chords, least_room, without_duplicates
 from splatbot.protocols import Array
@@ -53,7 +53,7 @@ def free_paths(arm: RobotSpheres, field: GaussianCollisionField, count: int, see
     return found
 
 
-def _within_limits(trajectory: Trajectory) -> None:
+def _within_limits(trajectory: JointTrajectory) -> None:
     states = trajectory.sampled(1000.0)
     assert (np.abs(states.velocity) <= CHAIN.velocity * (1 + 1e-9)).all()
     assert (np.abs(states.acceleration) <= CHAIN.acceleration * (1 + 1e-9)).all()
@@ -205,7 +205,7 @@ def test_the_least_room_is_never_above_what_dense_samples_see(arm: RobotSpheres,
     rng = np.random.default_rng(7)
     for _ in range(5):
         control = panda().home + np.cumsum(rng.normal(0, 0.02, (60, 7)), axis=0)
-        dense = Trajectory(CHAIN.names, control, 1.0, Certificate(False, 0, 0, 0, -1)).at(np.linspace(0, 57, 4000))
+        dense = JointTrajectory(CHAIN.names, control, 1.0, Certificate(False, 0, 0, 0, -1)).at(np.linspace(0, 57, 4000))
         seen = min(0.05, float(arm.clearance(field, dense.position, cut=0.05).distance.min()))
         room = least_room(arm, field, control)
         assert room <= seen + 1e-9

@@ -11,15 +11,15 @@ import pytest
 from scipy.interpolate import BSpline
 
 from splatbot.errors import InputError
-from splatbot.planning import Certificate, Trajectory
+from splatbot.planning import Certificate, JointTrajectory
 
 NOTHING = Certificate(False, 1e-3, 0.0, 0.0, -1)
 
 
-def trajectory(seed: int = 0, count: int = 20) -> Trajectory:
+def trajectory(seed: int = 0, count: int = 20) -> JointTrajectory:
     control = np.cumsum(np.random.default_rng(seed).normal(0, 0.1, (count, 2)), axis=0)
     control[:3], control[-3:] = control[2], control[-3]
-    return Trajectory(("a", "b"), control, 0.05, NOTHING)
+    return JointTrajectory(("a", "b"), control, 0.05, NOTHING)
 
 
 def test_states_are_those_of_scipys_spline() -> None:
@@ -86,4 +86,4 @@ def test_as_csv_it_has_a_line_a_millisecond() -> None:
 )
 def test_what_is_no_trajectory_is_refused(control: np.ndarray, step: float) -> None:
     with pytest.raises(InputError):
-        Trajectory(("a", "b"), control, step, NOTHING)
+        JointTrajectory(("a", "b"), control, step, NOTHING)

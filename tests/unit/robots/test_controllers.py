@@ -9,21 +9,21 @@ import pytest
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import ControllerError, InputError, LogError
-from splatbot.planning import Trajectory, time_path
+from splatbot.planning import JointTrajectory, time_path
 from splatbot.planning.follow import follow
 from splatbot.protocols import Controller, Gripper, MotionState
-from splatbot.robots.controllers import FakeController, RecordedController, Recording
+from splatbot.robots.controllers import FakeController, JointRecording, RecordedController
 from splatbot.robots.grippers import FakeGripper
 from splatbot.robots.panda import panda
 from tests.unit.planning.test_timing import path_of
 
 
 @pytest.fixture(scope="module")
-def trajectory() -> Trajectory:
+def trajectory() -> JointTrajectory:
     return time_path(path_of(np.stack([panda().home, panda().home + 0.3])), RobotSpheres(panda()), None)
 
 
-def test_an_arm_without_lag_is_where_the_trajectory_has_it_and_arrives(trajectory: Trajectory) -> None:
+def test_an_arm_without_lag_is_where_the_trajectory_has_it_and_arrives(trajectory: JointTrajectory) -> None:
     controller = FakeController(panda().home)
     assert isinstance(controller, Controller)
     done = follow(controller, trajectory)
@@ -33,7 +33,7 @@ def test_an_arm_without_lag_is_where_the_trajectory_has_it_and_arrives(trajector
     assert done.time[-1] == pytest.approx(trajectory.duration, abs=2e-3)
 
 
-def test_a_lag_is_reported_as_the_error_that_it_is(trajectory: Trajectory) -> None:
+def test_a_lag_is_reported_as_the_error_that_it_is(trajectory: JointTrajectory) -> None:
     done = follow(FakeController(panda().home, lag=0.01), trajectory)
     assert done
     states = trajectory.sampled(1000.0)
@@ -41,7 +41,7 @@ def test_a_lag_is_reported_as_the_error_that_it_is(trajectory: Trajectory) -> No
     np.testing.assert_allclose(done.position[-1], trajectory.end, atol=0.011)
 
 
-def test_too_large_an_error_is_a_fault_that_ends_the_motion_until_it_is_reset(trajectory: Trajectory) -> None:
+def test_too_large_an_error_is_a_fault_that_ends_the_motion_until_it_is_reset(trajectory: JointTrajectory) -> None:
     controller = FakeController(panda().home, lag=0.5)
     done = follow(controller, trajectory)
     assert done.state is MotionState.FAULT
@@ -56,7 +56,7 @@ def test_too_large_an_error_is_a_fault_that_ends_the_motion_until_it_is_reset(tr
     assert controller.step().state is MotionState.IDLE
 
 
-def test_told_to_stop_the_arm_rests_within_one_period(trajectory: Trajectory) -> None:
+def test_told_to_stop_the_arm_rests_within_one_period(trajectory: JointTrajectory) -> None:
     controller = FakeController(panda().home)
     half = 0.5 * trajectory.duration
     done = follow(controller, trajectory, stop=lambda feedback: feedback.time >= half)
@@ -70,7 +70,7 @@ def test_told_to_stop_the_arm_rests_within_one_period(trajectory: Trajectory) ->
     np.testing.assert_array_equal(feedback.position, at)
 
 
-def test_a_trajectory_from_elsewhere_or_for_another_arm_is_not_followed(trajectory: Trajectory) -> None:
+def test_a_trajectory_from_elsewhere_or_for_another_arm_is_not_followed(trajectory: JointTrajectory) -> None:
     with pytest.raises(ControllerError, match="from where the arm is"):
         FakeController(panda().home + 0.1).send(trajectory)
     with pytest.raises(ControllerError, match="7 joints"):
@@ -81,17 +81,17 @@ def test_a_trajectory_from_elsewhere_or_for_another_arm_is_not_followed(trajecto
         controller.send(trajectory)
 
 
-def test_a_recording_is_replayed_with_its_errors(trajectory: Trajectory, tmp_path: Path) -> None:
+def test_a_recording_is_replayed_with_its_errors(trajectory: JointTrajectory, tmp_path: Path) -> None:
     path = tmp_path / "joints.csv"
     path.write_text(trajectory.to_csv(rate=200.0))
-    recording = Recording.load(path)
+    recording = JointRecording.load(path)
     done = follow(RecordedController(recording), trajectory)
     assert done
     assert done.error.max() < 1e-4  # interpolated between samples 5 ms apart
-    late = Recording(recording.stamps + np.linspace(0, 0.02, len(recording.stamps)), recording.positions)
+    late = JointRecording(recording.stamps + np.linspace(0, 0.02, len(recording.stamps)), recording.positions)
     off = follow(RecordedController(late), trajectory)
     assert 1e-3 < off.error.max() < 0.05
-    stuck = Recording(recording.stamps, np.repeat(recording.positions[:1], len(recording.stamps), axis=0))
+    stuck = JointRecording(recording.stamps, np.repeat(recording.positions[:1], len(recording.stamps), axis=0))
     assert follow(RecordedController(stuck), trajectory).state is MotionState.FAULT
 
 
@@ -110,7 +110,7 @@ def test_a_damaged_recording_is_named(text: str, message: str, tmp_path: Path) -
     path = tmp_path / "joints.csv"
     path.write_text(text)
     with pytest.raises(LogError, match=message):
-        Recording.load(path)
+        JointRecording.load(path)
 
 
 def test_a_gripper_closes_on_what_it_holds() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from splatbot.errors import GripperError
-from splatbot.robots.grippers.modbus import FrameError, crc16, framed, unframed
+from splatbot.robots.grippers.modbus import FramingError, crc16, framed, unframed
 from splatbot.robots.grippers.registers import Activation, Command, Fingers, Status
 from splatbot.robots.grippers.robotiq import MODELS
 
@@ -35,7 +35,7 @@ def test_every_single_wrong_bit_is_seen() -> None:
     for bit in range(8 * len(frame)):
         wrong = bytearray(frame)
         wrong[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(FrameError, match="checksum"):
+        with pytest.raises(FramingError, match="checksum"):
             unframed(bytes(wrong))
 
 

@@ -16,12 +16,12 @@ from splatbot.bench.tabletop import Tabletop
 from splatbot.camera import Camera
 from splatbot.cli import main
 from splatbot.cli.serve import _add_map
-from splatbot.collision.evidence import measured_depths
+from splatbot.collision.visibility import measured_depths
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.results.folder import FrameRow, RunFolder
 from splatbot.results.views import thinned
-from splatbot.robots.things import MeasuredMap, measured_map, run_of, things_of
+from splatbot.robots.graspable_objects import MeasuredMap, measured_map, run_of, things_of
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
@@ -55,8 +55,8 @@ def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     rows = [FrameRow(k, float(k), "ok", keyframe=True) for k in range(len(VIEWS))]
     run.save(config=Config(), rows=rows, trajectory=Trajectory(stamps, poses), model=full, metrics={})
     Workspace(T_world_base=np.eye(4)).save(run.path / "scene.yaml")
-    monkeypatch.setattr("splatbot.robots.things.reopen_log", lambda run: None)
-    monkeypatch.setattr("splatbot.robots.things.thinned_views", lambda run, log: VIEWS)
+    monkeypatch.setattr("splatbot.robots.graspable_objects.reopen_log", lambda run: None)
+    monkeypatch.setattr("splatbot.robots.graspable_objects.thinned_views", lambda run, log: VIEWS)
     return run.path
 
 

@@ -12,7 +12,7 @@ import pytest
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
-from splatbot.run.pacing import FrameSource, PacedSource
+from splatbot.run.pacing import LogFrames, PacedSource
 from tests.rgbd import CAMERA
 
 PERIOD = 0.05
@@ -39,8 +39,8 @@ class Stream(LogBase):
         return Frame(100.0 + PERIOD * index, rgb, depth, CAMERA, index)
 
 
-def source(log: Any, *, paced: bool = True, rate: float | None = None) -> FrameSource:
-    return PacedSource(log, len(log), rate) if paced else FrameSource(log, len(log))
+def source(log: Any, *, paced: bool = True, rate: float | None = None) -> LogFrames:
+    return PacedSource(log, len(log), rate) if paced else LogFrames(log, len(log))
 
 
 def test_without_pacing_every_frame_comes_when_asked_for_and_errors_in_their_place() -> None:

@@ -24,7 +24,7 @@ from splatbot.run.state.journal import Journal, read_entry
 from splatbot.run.state.pixels import pack, unpack
 from splatbot.run.state.tree import Decoder, Encoder
 from splatbot.slam import Slam
-from splatbot.tracking.places import likeliest, votes
+from splatbot.tracking.place_recognition import likeliest, votes
 from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import small_config
 

@@ -22,7 +22,7 @@ from splatbot.sim.clutter import MapParts, map_parts
 from splatbot.sim.maps.ellipsoids import merge
 from splatbot.sim.motion import hold
 from splatbot.sim.scene import Clutter, make_scene
-from splatbot.sim.solids import Box
+from splatbot.sim.solids import BoxGeom
 from splatbot.sim.twin import Twin
 
 pytest.importorskip("mujoco")
@@ -47,7 +47,7 @@ def parts() -> MapParts:
 def test_the_table_is_found_to_a_tenth_of_a_millimetre_and_level() -> None:
     (table,) = (t for t in parts().objects if t.name == "map-table")
     (shape,) = table.shapes
-    assert isinstance(shape, Box)
+    assert isinstance(shape, BoxGeom)
     assert abs(table.at[2] + shape.size[2] / 2) < 1e-3  # the table's top is at 0
     assert np.abs(table.rpy[:2]).max() < 2e-3
 
@@ -56,7 +56,7 @@ def test_the_table_ends_where_it_was_seen_to_end() -> None:
     """An arm that reaches past its edge and lower touches nothing; on an endless plane it would."""
     (table,) = (t for t in parts().objects if t.name == "map-table")
     (shape,) = table.shapes
-    assert isinstance(shape, Box)
+    assert isinstance(shape, BoxGeom)
     assert sorted(shape.size[:2]) == pytest.approx([0.8, 1.0], abs=0.02)
     np.testing.assert_allclose(table.at[:2], TABLE.center[:2], atol=0.01)
 

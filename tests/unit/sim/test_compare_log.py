@@ -16,7 +16,7 @@ from splatbot.camera import Camera
 from splatbot.errors import FormatError, InputError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, look_at, pose_from_quat, quat_multiply, rotation_to_quat, se3_exp
-from splatbot.logs.raycast import Scene, Surface
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
@@ -24,7 +24,7 @@ from splatbot.sim.compare.recorded import ArmRecord, base_in_map, pose_gap, read
 from splatbot.sim.compare.replay import BY_IK, RECORDED, find_knots, replay
 from splatbot.sim.compare.views import Surroundings, TwinViews, overlap, surroundings
 from splatbot.sim.scene import make_scene
-from splatbot.sim.solids import Box, rotation_of, rpy_of
+from splatbot.sim.solids import BoxGeom, rotation_of, rpy_of
 from splatbot.sim.twin import Twin
 from splatbot.trajectory import Trajectory
 
@@ -39,9 +39,9 @@ EYE = look_at(np.array([0.0, 0.5, 0.5]), np.array([0.5, 0.0, 0.05]))  # T_base_c
 
 @cache
 def frame() -> Frame:
-    stage = Scene(
+    stage = RaycastScene(
         [
-            Surface(solid_mesh(solid), Texture((0.8, 0.6, 0.4), (0.2, 0.3, 0.4), seed=i))
+            RaycastSurface(solid_mesh(solid), Texture((0.8, 0.6, 0.4), (0.2, 0.3, 0.4), seed=i))
             for i, solid in enumerate((TABLE, *THINGS))
         ]
     )
@@ -131,7 +131,7 @@ def test_a_plane_that_the_log_names_counts_in_the_maps_frame(tmp_path: Path) -> 
     assert given.support.offset == pytest.approx(0.02)
     table = next(thing for thing in TwinViews(given).world.scene.objects if thing.name == "map-table")
     (shape,) = table.shapes
-    assert isinstance(shape, Box)
+    assert isinstance(shape, BoxGeom)
     assert table.at[2] + shape.size[2] / 2 == pytest.approx(0.02)
 
 

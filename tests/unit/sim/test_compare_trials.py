@@ -21,9 +21,9 @@ from splatbot.errors import InputError
 from splatbot.planning import GaussianRRTStar
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw, held_out_scene
-from splatbot.sim.compare.push import Push, PushCase, Pusher, extents
-from splatbot.sim.compare.reach import Direct, Planned, Reach, ReachCase, Shortcut
-from splatbot.sim.compare.trials import Attempt, Trial, TrialResults, join, run_trials
+from splatbot.sim.compare.push import PushCase, Pusher, PushTask, extents
+from splatbot.sim.compare.reach import Direct, Planned, ReachCase, ReachTask, Shortcut
+from splatbot.sim.compare.trials import PolicyAction, Trial, TrialResults, join, run_trials
 from splatbot.sim.effects.physics import PHYSICS
 from splatbot.sim.motion import JointMotion, hold, motion_from_samples
 from splatbot.sim.scene import Scene, SceneObject, make_scene
@@ -104,7 +104,7 @@ def test_each_kind_of_bad_drive_costs_tracking(change: dict[str, Any], least: fl
 def test_a_planned_path_arrives_and_the_straight_line_hits_the_wall() -> None:
     case = ReachCase(START, GOAL, 1)
     twin = Twin(truth_scene(table()))
-    task = Reach([case], twin, lambda case: HeldOutTwin(truth_scene(table()), draw(Spread(), case.seed)))
+    task = ReachTask([case], twin, lambda case: HeldOutTwin(truth_scene(table()), draw(Spread(), case.seed)))
     policies = (Planned("planned", planner(), iterations=300), Direct("straight", planner()))
     found = run_trials(task, policies)
     planned, straight = found.trials
@@ -156,7 +156,7 @@ def _can(height: float, friction: float = 0.5) -> Scene:
 def test_a_low_slow_push_brings_a_can_to_its_goal_and_an_aimless_one_does_not() -> None:
     scene = _can(0.10)
     case = PushCase(scene.objects[1], "can", np.array([1.0, 0.0]), 0.10)
-    task = Push([case], Twin(scene), lambda case: HeldOutTwin(scene, draw(EXACT, 0)))
+    task = PushTask([case], Twin(scene), lambda case: HeldOutTwin(scene, draw(EXACT, 0)))
     policies = (Pusher("good", panda(), 0.35, 0.08), Pusher("aside", panda(), 0.35, 0.08, 0.09))
     good, aside = run_trials(task, policies).trials
     assert (good.in_map, good.in_held_out) == (True, True), good
@@ -223,8 +223,8 @@ class _Waits:
     name: str
     refuses: bool = False
 
-    def act(self, case: int) -> Attempt | None:
-        return None if self.refuses else Attempt(hold(panda().home, 0.01), 0.02)
+    def act(self, case: int) -> PolicyAction | None:
+        return None if self.refuses else PolicyAction(hold(panda().home, 0.01), 0.02)
 
 
 def test_every_policy_is_tried_in_every_case_and_the_result_is_json() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from splatbot.errors import FormatError, InputError
 from splatbot.planning.problem import Certificate
-from splatbot.planning.trajectory import Trajectory
+from splatbot.planning.trajectory import JointTrajectory
 from splatbot.robots.panda import panda
 from splatbot.sim.motion import (
     hold,
@@ -106,7 +106,7 @@ def test_a_planners_trajectory_is_the_same_motion_directly_as_json_and_as_csv(tm
     ease = np.array([0.0, 0.0, 0.0, 0.1, 0.4, 0.7, 0.9, 1.0, 1.0, 1.0])[:, None]
     control = panda().home + ease * np.linspace(-0.4, 0.5, 7)
     certificate = Certificate(True, 1e-3, 0.05, 0.0, 1)
-    trajectory = Trajectory(panda().chain.names, control, 0.2, certificate)
+    trajectory = JointTrajectory(panda().chain.names, control, 0.2, certificate)
     (tmp_path / "a.json").write_text(trajectory.to_json(rate=500.0))
     (tmp_path / "a.csv").write_text(trajectory.to_csv())
     t = np.linspace(0.0, trajectory.duration, 333)

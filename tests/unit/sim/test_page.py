@@ -17,7 +17,7 @@ import pytest
 
 from splatbot.bench.tabletop import Block, Tabletop
 from splatbot.sim.page import surface_points, twin_html
-from splatbot.sim.recording import RATE, Recording
+from splatbot.sim.recording import RATE, TwinRecording
 from splatbot.sim.scene import load_scene, make_scene
 from splatbot.sim.twin import Twin, TwinResult
 
@@ -31,9 +31,9 @@ _SHAPES: list[dict[str, Any]] = [
 
 
 @cache
-def recorded(scene: str = "mug_hanging") -> tuple[Recording, TwinResult]:
+def recorded(scene: str = "mug_hanging") -> tuple[TwinRecording, TwinResult]:
     twin = Twin(load_scene(scene))
-    recording = Recording(twin.world)
+    recording = TwinRecording(twin.world)
     return recording, twin.follow(watch=recording)
 
 
@@ -99,7 +99,7 @@ def test_a_map_is_shown_by_its_gaussians_less_those_that_move(tmp_path: Path) ->
     shown, file = {}, str(tmp_path / "map.ply")
     for movable in (False, True):
         twin = Twin(make_scene({"name": "x", "map": {"file": file, "movable": movable, "support": [0, 0, 1, 0]}}))
-        recording = Recording(twin.world)
+        recording = TwinRecording(twin.world)
         values = document(twin_html(recording, twin.follow(watch=recording)))
         points = unpacked(values["points"], np.float32).reshape(-1, 3)
         on_top = (np.abs(points - [0.5, 0.15, 0.12]) < [0.05, 0.035, 0.003]).all(axis=1)

@@ -14,7 +14,7 @@ from splatbot.geometry import inverse, quat_multiply, rotation_to_quat, se3_exp,
 from splatbot.protocols import Array
 from splatbot.sim.maps.placed import placed_scene
 from splatbot.sim.scene import SceneObject, make_scene
-from splatbot.sim.solids import Box, rotation_of
+from splatbot.sim.solids import BoxGeom, rotation_of
 from splatbot.sim.twin import Twin
 from splatbot.workspace import Workspace
 
@@ -66,7 +66,7 @@ def test_a_plane_that_is_given_counts_more_than_one_that_would_be_found(run: Pat
 def _top(table: SceneObject) -> Array:
     """The middle of a table's upper face (3,) [m]."""
     (shape,) = table.shapes
-    assert isinstance(shape, Box)
+    assert isinstance(shape, BoxGeom)
     return np.asarray(table.at) + rotation_of(table.rpy)[:, 2] * shape.size[2] / 2
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from splatbot.errors import FormatError, InputError
-from splatbot.logs.raycast import Surface
+from splatbot.logs.raycast import RaycastSurface
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.agreement import wilson
 from splatbot.sim.scene import SceneObject
@@ -25,17 +25,17 @@ from splatbot.sim.trials.shake import SHARE, Shake
 from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.trials.table import physics, summaries, table_rows
-from splatbot.sim.trials.trial import KEPT, RISE, Attempt, TrialRow, run_trial
+from splatbot.sim.trials.trial import KEPT, RISE, TrialRow, TwinPickResult, run_trial
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA
 
 pytest.importorskip("mujoco")
 
-HELD = Attempt(True, "", "picked", "", 0.18, 0.175)
-SLIPPED = Attempt(False, "slip", "lost", "nothing is between the fingers any more", 0.02, 0.0, ("table",))
+HELD = TwinPickResult(True, "", "picked", "", 0.18, 0.175)
+SLIPPED = TwinPickResult(False, "slip", "lost", "nothing is between the fingers any more", 0.02, 0.0, ("table",))
 
 
-def row(seed: int, stack: str, ideal: Attempt = HELD, reality: Attempt = HELD) -> TrialRow:
+def row(seed: int, stack: str, ideal: TwinPickResult = HELD, reality: TwinPickResult = HELD) -> TrialRow:
     return TrialRow(
         seed, "tabletop", stack, "can", False, ideal, reality, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0, 32, 320
     )
@@ -78,7 +78,7 @@ def test_what_the_camera_is_shown_is_what_physics_computes_with() -> None:
             lambda p: 0.02 * (np.linalg.norm(p / [0.04, 0.03, 0.02], axis=1) - 1),
         ),
     ):
-        found: list[Surface] = surfaces_of(SceneObject.model_validate({"name": "it", "shapes": [shape]}))
+        found: list[RaycastSurface] = surfaces_of(SceneObject.model_validate({"name": "it", "shapes": [shape]}))
         assert np.abs(away(found[0].mesh.vertices)).max() < 1e-9
     with pytest.raises(InputError, match="plane"):
         surfaces_of(SceneObject.model_validate({"name": "table", "shapes": [{"kind": "plane"}]}))

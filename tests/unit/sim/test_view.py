@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatbot.sim.view import View, composite
+from splatbot.sim.view import TwinView, composite
 
 
-def _flat(alpha: float, depth: float, color: float, bodies: float) -> View:
+def _flat(alpha: float, depth: float, color: float, bodies: float) -> TwinView:
     full = np.ones((2, 3), np.float32)
-    return View(np.full((2, 3, 3), alpha * color, np.float32), alpha * full, depth * full, bodies * full)
+    return TwinView(np.full((2, 3, 3), alpha * color, np.float32), alpha * full, depth * full, bodies * full)
 
 
 def test_what_is_nearer_covers_what_is_farther_whichever_is_given_first() -> None:

@@ -232,7 +232,7 @@ def test_marginalising_exposure_gives_the_step_of_the_whole_system(problem: Prob
     whole[6:, 6:] += 100 * np.eye(2)  # the weak anchor of exposure; its gradient vanishes at gain 1, offset 0
     marginal = whole[:6, :6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], whole[6:, :6])
     gradient = g[:6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], g[6:])
-    plain = {"iterations": 1, "dense_weight": 1.0, "n_pixels": 4800, "dense_share": 0.0, "depth_doubt": 1.0}
+    plain = {"iterations": 1, "dense_weight": 1.0, "n_pixels": 4800, "dense_share": 0.0, "depth_sigma_scale": 1.0}
     config = CONFIG.model_copy(update=plain)
     reference = Reference(np.eye(4), (sampled,))
     found = align([level], [reference], inverse(problem.T), config, photometric=True, finest=0, gate=GATE)

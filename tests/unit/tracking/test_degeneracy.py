@@ -6,10 +6,10 @@ import numpy as np
 
 from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.tracking.align import Alignment
-from splatbot.tracking.candidate import Candidate, Judged
 from splatbot.tracking.degeneracy import weak_directions
 from splatbot.tracking.health import Health
-from splatbot.tracking.predict import Prediction
+from splatbot.tracking.hypothesis import Candidate, ScoredHypothesis
+from splatbot.tracking.motion_model import Prediction
 from splatbot.tracking.priors import fill_weak_directions
 from splatbot.tracking.uncertainty import alignment_covariance
 from tests.rgbd import Array
@@ -31,11 +31,11 @@ def planes(*normals: tuple[float, float, float], distance: float = 2.0) -> Array
     return H
 
 
-def judged(information: Array, T_world_camera: Array) -> Judged:
+def judged(information: Array, T_world_camera: Array) -> ScoredHypothesis:
     found = Alignment(T_world_camera, information, information, information, 48, 525.0)
     weak = weak_directions(information, 2.0, RATIO)
     health = Health(1.0, 1.0, 1.0, 1.0, 0.5, 1.0)
-    return Judged(Candidate("direct", found, []), health, "degraded", (), weak, alignment_covariance(found))
+    return ScoredHypothesis(Candidate("direct", found, []), health, "degraded", (), weak, alignment_covariance(found))
 
 
 def test_a_corridor_is_weak_along_itself_and_says_so() -> None:

@@ -10,9 +10,9 @@ import pytest
 from splatbot.frame import PosePrior
 from splatbot.geometry import inverse, se3_exp
 from splatbot.tracking.align import Alignment
-from splatbot.tracking.candidate import Candidate, Judged
 from splatbot.tracking.health import Health
-from splatbot.tracking.predict import ConstantVelocity, Prediction
+from splatbot.tracking.hypothesis import Candidate, ScoredHypothesis
+from splatbot.tracking.motion_model import ConstantVelocity, Prediction
 from splatbot.tracking.priors import fuse, is_believable, sigmas_off
 from tests.rgbd import wall_frame
 from tests.unit.tracking.test_tracker import Run
@@ -20,9 +20,9 @@ from tests.unit.tracking.test_tracker import Run
 SURE = np.diag([1e-6] * 3 + [1e-6] * 3)  # 1 mm, 0.06°
 
 
-def pose(twist: list[float]) -> Judged:
+def pose(twist: list[float]) -> ScoredHypothesis:
     found = Alignment(se3_exp(twist), np.eye(6), np.eye(6), np.eye(6), 48, 525.0)
-    return Judged(Candidate("direct", found, []), Health(1, 1, 1, 1, 0.5, 1), "ok", (), None, np.eye(6))
+    return ScoredHypothesis(Candidate("direct", found, []), Health(1, 1, 1, 1, 0.5, 1), "ok", (), None, np.eye(6))
 
 
 def test_fusion_is_the_information_weighted_mean_and_the_parallel_sum_of_covariances() -> None:

@@ -32,7 +32,7 @@ def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: f
 
 def test_the_spread_of_the_residuals_tells_the_error_whatever_the_noise_model_says() -> None:
     """White noise of other strengths than configured: C⁻¹ S C⁻¹ alone has a NEES / 6 near 1."""
-    config = CONFIG.model_copy(update={"depth_doubt": 1.0})  # all the noise there is is the pixels' own
+    config = CONFIG.model_copy(update={"depth_sigma_scale": 1.0})  # all the noise there is is the pixels' own
     rng, T = np.random.default_rng(1), se3_exp([0.004, -0.003, 0.005, 0.004, -0.003, 0.002])
     for gray_noise, depth_noise in ((0.01, 0.002), (0.04, 0.0005)):
         values = []

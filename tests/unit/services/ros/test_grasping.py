@@ -14,7 +14,7 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import rotation_to_quat
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.grasping import GRASP_SERVICE, GraspServices
-from splatbot.services.ros.outlets import GRASP_MARKERS, RosOutlets
+from splatbot.services.ros.publishers import GRASP_MARKERS, RosPublishers
 from splatbot.services.ros.wire import to_json
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
@@ -62,7 +62,7 @@ def graph() -> Iterator[RosGraph]:
     snapshot = Snapshot(_block_on_a_table(), 1, 2.0)
     store.add("desk", source="a", state="static", snapshot=snapshot, workspace=workspace)
     GraspServices(graph, store)
-    outlets = RosOutlets(store.bus, graph)
+    outlets = RosPublishers(store.bus, graph)
     outlets.start()
     yield graph
     outlets.stop()

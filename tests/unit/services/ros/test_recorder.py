@@ -14,7 +14,7 @@ from splatbot.logs import open_log
 from splatbot.logs.mcap import McapFile
 from splatbot.logs.ros_types import Message, build
 from splatbot.services.ros.graph import RosGraph
-from splatbot.services.ros.outlets import RosOutlets
+from splatbot.services.ros.publishers import RosPublishers
 from splatbot.services.ros.recorder import McapRecorder
 from splatbot.services.store import MapStore
 from splatbot.services.topics import FRAME, map_topic
@@ -42,7 +42,7 @@ def test_all_topics_are_recorded_with_those_that_come_later_and_the_latched(tmp_
 
 def test_a_service_s_recording_is_a_log_of_the_frames_it_was_given(make_log: MakeLog, tmp_path: Path) -> None:
     store, graph, log = MapStore(), RosGraph(), open_log(make_log())
-    outlets = RosOutlets(store.bus, graph)
+    outlets = RosPublishers(store.bus, graph)
     outlets.start()
     recorder = McapRecorder(
         graph,

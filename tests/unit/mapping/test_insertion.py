@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, se3_exp, transform_points
-from splatbot.mapping.fusion import (
-    View,
+from splatbot.mapping.insertion import (
+    ModelView,
     guess_depth,
     guessed_gaussians,
     model_depth,
@@ -160,7 +160,7 @@ def test_something_in_front_of_the_map_is_unexplained_and_something_behind_it_is
 
 def test_a_difference_within_the_tolerance_is_the_same_surface(make_keyframe: MakeKeyframe) -> None:
     keyframe = make_keyframe()
-    view = View(torch.zeros(120, 160, 3), torch.full((120, 160), 1.0), torch.ones(120, 160))
+    view = ModelView(torch.zeros(120, 160, 3), torch.full((120, 160), 1.0), torch.ones(120, 160))
     for nearer, new in ((0.97, False), (0.95, True)):
         lacking = unexplained(view, torch.full_like(keyframe.depth, nearer), CONFIG)
         assert bool(lacking.all()) is new
@@ -171,7 +171,7 @@ def test_model_depth_is_the_measured_one_where_the_map_is_not_solid_or_contradic
     depth = torch.tensor([[1.0, 1.01, 1.2, 1.0, 0.0]])
     alpha = torch.tensor([[0.95, 0.5, 0.95, 0.95, 0.0]])
     measured = np.array([[1.0, 1.0, 1.0, 0.0, 1.0]], np.float32)
-    merged = model_depth(View(torch.zeros(1, 5, 3), depth, alpha), measured, CONFIG)
+    merged = model_depth(ModelView(torch.zeros(1, 5, 3), depth, alpha), measured, CONFIG)
     np.testing.assert_allclose(merged, [[1.0, 1.0, 1.0, 0.0, 1.0]])
     assert merged.dtype == np.float32
 
@@ -183,7 +183,7 @@ def test_model_depth_has_the_detail_of_the_map_at_the_measured_distance() -> Non
     shown = torch.from_numpy(0.998 * surface).float()  # all of it too near, as a blend of many layers is
     measured = np.asarray(surface + 0.003 * rng.standard_normal(surface.shape), np.float32)
     measured[100:140, 50:90] = 0
-    view = View(torch.zeros(240, 320, 3), shown, torch.ones(240, 320))
+    view = ModelView(torch.zeros(240, 320, 3), shown, torch.ones(240, 320))
     error = (model_depth(view, measured, CONFIG) - surface)[measured > 0]
     assert np.abs(error).max() < 3e-5
 
@@ -191,7 +191,7 @@ def test_model_depth_has_the_detail_of_the_map_at_the_measured_distance() -> Non
 def test_strays_within_the_gate_do_not_move_model_depth() -> None:
     measured = np.full((60, 80), 1.5, np.float32)
     measured[:, :20] = 1.54  # what a quarter shows lies 4 cm behind the rest
-    view = View(torch.zeros(60, 80, 3), torch.full((60, 80), 1.49), torch.ones(60, 80))
+    view = ModelView(torch.zeros(60, 80, 3), torch.full((60, 80), 1.49), torch.ones(60, 80))
     found = model_depth(view, measured, CONFIG)
     np.testing.assert_allclose(found, 1.5, atol=1e-6)
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from splatbot.config import TrackingConfig
 from splatbot.geometry import inverse
 from splatbot.tracking.features import Features
+from splatbot.tracking.nearby_keyframes import TrackedKeyframe
 from splatbot.tracking.prepare import Level, PreparedFrame
-from splatbot.tracking.views import TrackedKeyframe
 
 Array = NDArray[np.float64]
 Cloud = tuple[small_gicp.PointCloud, small_gicp.KdTree]
@@ -24,7 +24,7 @@ _MOST_STEPS = 20
 _LEAST_PAIRS = 0.3  # of the points; with fewer there is no overlap to speak of
 
 
-class WideStage:
+class GicpStage:
     """Registers frames with keyframes, one thread; remembers the keyframes' clouds."""
 
     def __init__(self, config: TrackingConfig) -> None:

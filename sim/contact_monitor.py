@@ -52,7 +52,7 @@ class Near:
     other: str = ""
 
 
-class Touches:
+class ContactMonitor:
     """Gathers contacts of the arm."""
 
     def __init__(self, world: World) -> None:

@@ -12,10 +12,10 @@ from splatbot.config import TrackingConfig
 from splatbot.tracking.align import Alignment
 from splatbot.tracking.degeneracy import WeakDirections, weak_directions
 from splatbot.tracking.health import Health, Verdict, measure, verdict_of
+from splatbot.tracking.nearby_keyframes import TrackedKeyframe
 from splatbot.tracking.prepare import PreparedFrame, typical_depth
 from splatbot.tracking.reference import Reference
 from splatbot.tracking.uncertainty import alignment_covariance
-from splatbot.tracking.views import TrackedKeyframe
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class ScoredHypothesis:
     """A candidate after the health check.
 
     Args:
@@ -60,16 +60,16 @@ class Judged:
         """(4, 4)."""
         return self.candidate.T_world_camera
 
-    def corrected(self, T_world_camera: Array, covariance: Array) -> Judged:
+    def corrected(self, T_world_camera: Array, covariance: Array) -> ScoredHypothesis:
         """The same with a pose and covariance that more than the frame speaks for."""
         candidate = replace(self.candidate, found=self.candidate.found.at(T_world_camera))
         return replace(self, candidate=candidate, covariance=covariance)
 
-    def noted(self, *reasons: str) -> Judged:
+    def noted(self, *reasons: str) -> ScoredHypothesis:
         """The same with more reasons."""
         return replace(self, reasons=self.reasons + reasons)
 
-    def doubted(self, reason: str) -> Judged:
+    def doubted(self, reason: str) -> ScoredHypothesis:
         """The same, "degraded" at best, for a reason."""
         return replace(self.noted(reason), verdict="degraded" if self.verdict == "ok" else self.verdict)
 
@@ -80,7 +80,7 @@ def score(prepared: PreparedFrame, candidate: Candidate, config: TrackingConfig)
     return measure(prepared.levels[index], index, candidate.references, candidate.T_world_camera, config)
 
 
-def judge(prepared: PreparedFrame, candidates: Sequence[Candidate], config: TrackingConfig) -> Judged:
+def judge(prepared: PreparedFrame, candidates: Sequence[Candidate], config: TrackingConfig) -> ScoredHypothesis:
     """The candidate that explains the frame best, with its verdict and covariance."""
     scored = [(candidate, score(prepared, candidate, config)) for candidate in candidates]
     best, health = min(scored, key=lambda pair: pair[1].score)
@@ -88,4 +88,4 @@ def judge(prepared: PreparedFrame, candidates: Sequence[Candidate], config: Trac
     if np.isfinite(best.found.information).all():
         weak = weak_directions(best.found.information, typical_depth(prepared), config.min_eigen_ratio)
     verdict, reasons = verdict_of(health, best.found.information, weak, config)
-    return Judged(best, health, verdict, reasons, weak, alignment_covariance(best.found))
+    return ScoredHypothesis(best, health, verdict, reasons, weak, alignment_covariance(best.found))

@@ -12,7 +12,7 @@ from splatbot.sim.world import OBJECT, World
 _FALL = 0.7  # [m/s]; what is set down is slower, what falls 2.5 cm is faster
 
 
-class Things:
+class ObjectMonitor:
     """Follows movable, carried and soft objects."""
 
     def __init__(self, world: World, data: Any, period: float) -> None:

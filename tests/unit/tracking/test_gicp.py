@@ -9,15 +9,15 @@ import pytest
 
 from splatbot.config import TrackingConfig
 from splatbot.geometry import se3_exp
+from splatbot.tracking.gicp import GicpStage, cloud_of, points_of
 from splatbot.tracking.tracker import pose_distance
-from splatbot.tracking.wide import WideStage, cloud_of, points_of
 from tests.unit.tracking.test_tracker import Run
 
 
 @pytest.mark.parametrize("twist", [[0.08, 0, 0, 0, 0.087, 0], [0.0, 0.1, 0.05, 0.1, 0, 0], [0.1, 0, 0, 0, 0, 0.15]])
 def test_a_start_10_cm_and_8_degrees_off_is_brought_to_a_centimetre(twist: list[float]) -> None:
     run = Run(width=320)
-    stage = WideStage(TrackingConfig(wide_points=3000))
+    stage = GicpStage(TrackingConfig(wide_points=3000))
     found = stage.register(run.prepare(run.frames[2]), run.keyframes[0], run.poses[2] @ se3_exp(twist))
     assert found is not None
     moved, turned = pose_distance(run.poses[2], found)
@@ -28,13 +28,13 @@ def test_a_start_10_cm_and_8_degrees_off_is_brought_to_a_centimetre(twist: list[
 def test_a_frame_without_depth_has_no_pose_from_registration() -> None:
     run = Run()
     empty = run.prepare(replace(run.frames[1], depth=np.zeros_like(run.frames[1].depth)))
-    assert WideStage(TrackingConfig()).register(empty, run.keyframes[0], np.eye(4)) is None
+    assert GicpStage(TrackingConfig()).register(empty, run.keyframes[0], np.eye(4)) is None
 
 
 def test_clouds_too_far_apart_to_touch_have_none_either() -> None:
     run = Run()
     away = se3_exp([30.0, 0, 0, 0, 0, 0])
-    assert WideStage(TrackingConfig()).register(run.prepare(run.frames[1]), run.keyframes[0], away) is None
+    assert GicpStage(TrackingConfig()).register(run.prepare(run.frames[1]), run.keyframes[0], away) is None
 
 
 def test_points_are_about_as_many_as_asked_for_and_too_few_make_no_cloud() -> None:

@@ -19,7 +19,7 @@ from splatbot.services.bus import Bus
 from splatbot.services.problems import BusyError
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import joints_of
-from splatbot.services.ros.outlets import FROM_ROS
+from splatbot.services.ros.publishers import FROM_ROS
 from splatbot.services.ros.wire import RosMessage
 from splatbot.services.topics import JOINTS as ROBOT_JOINTS
 from splatbot.services.topics import robot_topic
@@ -29,7 +29,7 @@ _WAITING = 16
 _log = logging.getLogger(__name__)
 
 
-class RosInlets:
+class RosSubscribers:
     """A thread that makes frames of the images that clients publish, and tells the bus of their joint states.
 
     A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. What cannot

@@ -9,7 +9,7 @@ import pytest
 
 from splatbot.frame import Frame
 from splatbot.geometry import se3_exp
-from splatbot.tracking.recover import Sighting
+from splatbot.tracking.relocalization import RelocalizationCandidate
 from tests.unit.tracking.test_tracker import Run
 
 
@@ -50,5 +50,5 @@ def test_two_frames_that_cannot_both_be_right_are_not_believed() -> None:
 
 @pytest.mark.parametrize(("moved", "dt", "agrees"), [(0.05, 1 / 30, True), (0.3, 1 / 30, False), (0.3, 0.5, True)])
 def test_a_camera_moves_at_the_speed_of_an_arm_or_a_hand(moved: float, dt: float, agrees: bool) -> None:
-    sighting = Sighting(1.0, np.eye(4))
+    sighting = RelocalizationCandidate(1.0, np.eye(4))
     assert sighting.agrees(1.0 + dt, se3_exp([moved, 0, 0, 0, 0, 0])) is agrees

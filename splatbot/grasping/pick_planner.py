@@ -28,7 +28,7 @@ _SIDES = 5  # on which the object must be around a stray within it; the sixth ma
 
 
 @dataclass(frozen=True, eq=False)
-class Leg:
+class Segment:
     """A part of the way.
 
     Args:
@@ -45,7 +45,7 @@ class Leg:
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class PickPlan:
     """To one grasp and up again.
 
     Args:
@@ -62,10 +62,10 @@ class Way:
     grasp: Grasp
     opening: float
     attached: Array
-    there: Leg
-    approach: Leg
-    free: Leg
-    lift: Leg
+    there: Segment
+    approach: Segment
+    free: Segment
+    lift: Segment
     planned: float
 
     @property
@@ -79,14 +79,14 @@ class Way:
         return all(leg.clear for leg in (self.there, self.approach, self.free, self.lift))
 
 
-class Ways(Protocol):
+class PickPlanner(Protocol):
     """Finds ways to grasps of one target; words instead of a way say what is in it."""
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
         """From where the arm is (J,) to the grasp and up again; ``cautious``: clear of where something moved, too."""
         ...
 
-    def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
+    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
         """From where the way ended, with the object, to another place."""
         ...
 
@@ -100,7 +100,7 @@ class _Obstacles:
     beside: GaussianCollisionField
 
 
-class MapWays:
+class MapPickPlanner:
     """Among the Gaussians of the sampler's map, every stretch certified.
 
     Where something moved while the map was made is one more obstacle of cautious ways; their certificates are of both.
@@ -126,8 +126,8 @@ class MapWays:
             models = (sampler.scene.model, around, beside)
             self._cautious = _Obstacles(*(field(model, cautious=True) for model in models))
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> Way | str:
-        """See :class:`Ways`."""
+    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
+        """See :class:`PickPlanner`."""
         if grasp.q_pregrasp is None:
             return "no posture is known"
         obstacles, clear = self._obstacles(cautious)
@@ -151,25 +151,25 @@ class MapWays:
         lift = self._up(loaded, obstacles.beside, free.path.waypoints[-1], self.o.lift - self.o.free)
         if not lift or lift.path is None:
             return f"it cannot be lifted: {lift.reason.rstrip('.')}"
-        return Way(
+        return PickPlan(
             grasp,
             opening,
             attached,
-            Leg(plan.path, planner.arm, obstacles.whole, clear),
-            Leg(approach.path, planner.arm, obstacles.around, clear),
-            Leg(free.path, closed, obstacles.beside, clear),
-            Leg(lift.path, loaded, obstacles.beside, clear),
+            Segment(plan.path, planner.arm, obstacles.whole, clear),
+            Segment(approach.path, planner.arm, obstacles.around, clear),
+            Segment(free.path, closed, obstacles.beside, clear),
+            Segment(lift.path, loaded, obstacles.beside, clear),
             planned,
         )
 
-    def onwards(self, way: Way, start: Array, goal: JointGoal) -> Leg | str:
+    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
         """Around everything, with what is held; where it can be, clear of where something moved, too."""
         for cautious in (True, False) if self._cautious is not None and way.clear else (False,):
             obstacles, clear = self._obstacles(cautious)
             planner = self._planner(obstacles.beside, way.grasp.width, way.attached)
             plan = planner.plan(start, goal, budget_ms=self.o.budget_ms, seed=self.o.seed)
             if plan.path is not None:
-                return Leg(plan.path, planner.arm, obstacles.beside, clear)
+                return Segment(plan.path, planner.arm, obstacles.beside, clear)
         return plan.reason
 
     def _obstacles(self, cautious: bool) -> tuple[_Obstacles, bool]:

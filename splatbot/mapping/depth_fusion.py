@@ -31,14 +31,14 @@ _GONE, _GONE_UNSTABLE = 3, 2  # looks through it, net of support, after which a 
 
 
 @dataclass(frozen=True)
-class DepthNoise:
+class DepthNoiseModel:
     """σ_z = floor + quad z² [m]."""
 
     floor: float
     quad: float
 
     @classmethod
-    def of(cls, config: TrackingConfig) -> DepthNoise:
+    def of(cls, config: TrackingConfig) -> DepthNoiseModel:
         """The sensor's, as tracking has it."""
         return cls(config.sigma_depth_floor, config.sigma_depth_quad)
 
@@ -48,7 +48,7 @@ class DepthNoise:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class DepthComparison:
     """What a depth image says of each Gaussian.
 
     Args:
@@ -70,8 +70,8 @@ class Evidence:
 
 @torch.no_grad()
 def weigh(
-    model: GaussianModel, depth: Tensor, camera: Camera, T_world_camera: NDArray[np.float64], noise: DepthNoise
-) -> Evidence:
+    model: GaussianModel, depth: Tensor, camera: Camera, T_world_camera: NDArray[np.float64], noise: DepthNoiseModel
+) -> DepthComparison:
     """Compare every Gaussian with what was measured along its centre's ray.
 
     Depth and Gaussian are of one surface up to 3 σ of both, or 1.2 % of the depth. The distance is taken from the
@@ -96,7 +96,7 @@ def weigh(
     cosine = slant.abs() / rays.norm(dim=1)
     useful = supported & (cosine > _GRAZING) & (offset.abs() < tolerance)
     around = torch.from_numpy(smooth_normals(depth.numpy(), camera, row.numpy(), column.numpy(), _REACH)).float()
-    return Evidence(
+    return DepthComparison(
         supported=_of_all(len(model), rows, supported),
         seen_through=_of_all(len(model), rows, (farther > 0) & (points[:, 2] + tolerance < farther)),
         offset=_of_all(len(model), rows, torch.where(useful, offset, 0.0)),
@@ -106,7 +106,7 @@ def weigh(
     )
 
 
-def fuse_depth(model: GaussianModel, evidence: Evidence) -> GaussianModel:
+def fuse_depth(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
     """The model with means moved along their normals by a Kalman filter, and with what that leaves uncertain.
 
     With P the variance of the mean and R that of the measurement, the mean moves by P / (P + R) of the offset and P
@@ -120,7 +120,7 @@ def fuse_depth(model: GaussianModel, evidence: Evidence) -> GaussianModel:
     return replace(model, means=means, uncertainty=torch.minimum(fused, P).sqrt())
 
 
-def fuse_normals(model: GaussianModel, evidence: Evidence) -> GaussianModel:
+def fuse_normals(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
     """The model with shortest axes turned towards the measured normals, so that they become the mean of all looks.
 
     A disc of 3 cm that is tilted by 10° reaches 5 mm out of its surface; what one look tells of a normal is no better.
@@ -136,7 +136,7 @@ def fuse_normals(model: GaussianModel, evidence: Evidence) -> GaussianModel:
     return replace(model, quats=model.quats.index_copy(0, rows, turned))
 
 
-def count(model: GaussianModel, evidence: Evidence) -> GaussianModel:
+def count(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
     """The model with the evidence counted: what is seen through is doubted, and its opacity taken back by as much.
 
     A guess that is seen through was wrong, and one that is not :func:`stable` goes a look earlier.
@@ -155,7 +155,7 @@ def stable(model: GaussianModel) -> Tensor:
     return (model.observations >= _STABLE_LOOKS) & (model.uncertainty < _STABLE_WIDTH * width)
 
 
-def first_uncertainty(model: GaussianModel, T_world_camera: NDArray[np.float64], noise: DepthNoise) -> Tensor:
+def first_uncertainty(model: GaussianModel, T_world_camera: NDArray[np.float64], noise: DepthNoiseModel) -> Tensor:
     """σ (N,) [m] of Gaussians just made from a view: the sensor's, or a share of the depth where it was guessed."""
     T_camera_world = torch.from_numpy(inverse(T_world_camera)).float()
     z = model.means @ T_camera_world[2, :3] + T_camera_world[2, 3]

@@ -12,7 +12,7 @@ from splatbot.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
-class Names:
+class GaussianIdMap:
     """Which Gaussian has which name.
 
     As long as rows keep their places a name is the row, and there are no tables.
@@ -46,7 +46,7 @@ class Names:
 
     def carried(
         self, count: int, previous: ArrayLike | Tensor | None
-    ) -> tuple[Names, NDArray[np.int64], NDArray[np.int32]]:
+    ) -> tuple[GaussianIdMap, NDArray[np.int64], NDArray[np.int32]]:
         """Those of a later model of ``count`` rows, its rows that are new, and the names that nobody has any more.
 
         Args:
@@ -58,7 +58,7 @@ class Names:
         """
         if previous is None and self.by_row is None:
             new = np.arange(min(count, self.count), count)
-            return Names(count), new, np.arange(count, max(self.count, count), dtype=np.int32)
+            return GaussianIdMap(count), new, np.arange(count, max(self.count, count), dtype=np.int32)
         before = np.arange(count) if previous is None else self._checked(count, previous)
         before = np.where(before < self.count, before, -1)
         known, fresh = before >= 0, np.flatnonzero(before < 0)
@@ -69,7 +69,7 @@ class Names:
         names[fresh] = taken + np.arange(len(fresh), dtype=np.int32)
         table = np.full(taken + len(fresh), -1, np.int32)
         table[names] = np.arange(count, dtype=np.int32)
-        return Names(count, names, table), fresh, owned[table[owned] < 0]
+        return GaussianIdMap(count, names, table), fresh, owned[table[owned] < 0]
 
     def _checked(self, count: int, previous: ArrayLike | Tensor) -> NDArray[np.int64]:
         before = np.asarray(previous).astype(np.int64)

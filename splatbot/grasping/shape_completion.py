@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.collision.evidence import DepthView, evidence_at
+from splatbot.collision.visibility import DepthView, evidence_at
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.relief import CELL, DISC, STEP, Relief, frame_along
-from splatbot.grasping.surface import MOST, Surface, measured_surface
+from splatbot.grasping.surface import MOST, GraspSurface, measured_surface
 from splatbot.grasping.volume import winding_numbers
 from splatbot.protocols import Array
-from splatbot.segmentation import MapScene
+from splatbot.segmentation import SegmentedMap
 from splatbot.segmentation.parts import nearest_of
 
 _WITHIN = 0.45  # winding number, from where on a point is within what was seen
@@ -40,14 +40,14 @@ _Points = tuple[Array, Array, Array]
 
 
 def target_surface(
-    scene: MapScene,
+    scene: SegmentedMap,
     rows: NDArray[np.int64],
     *,
     observers: Array | None = None,
     views: Sequence[DepthView] = (),
     seed: int = 0,
     sharp: bool = False,
-) -> Surface:
+) -> GraspSurface:
     """The surface of the Gaussians ``rows`` (M,) of a scene, with the sides that go down from its top to the support,
     and back from the face that was seen in front.
 
@@ -65,7 +65,7 @@ def target_surface(
     floor = float(np.percentile(seen.points @ up, 1)) if leans else _floor(scene, seen, up)
     down = _sides(seen, up, floor)
     parts = [(*down, np.full(len(down[0]), _ROWS / 2))]
-    faces = [_Face(direction, seen) for direction in _directions(seen, up)]
+    faces = [_ImpliedFace(direction, seen) for direction in _directions(seen, up)]
     backs = []
     for face in faces:
         sides, back = _behind(seen, face, up, views)
@@ -83,7 +83,7 @@ def target_surface(
     evidence = evidence_at(points[kept], views)
     kept = kept[outer & ~(evidence.seen_through & (evidence.passes >= _THROUGH))]
     kept = kept[~_inside(points[kept], normals[kept], tube=_TUBE * np.sqrt(every))]
-    return Surface(
+    return GraspSurface(
         np.concatenate([seen.points, points[kept]]),
         np.concatenate([seen.normals, normals[kept]]),
         np.concatenate([seen.half, np.zeros((len(kept), 3, 3))]),
@@ -94,10 +94,10 @@ def target_surface(
     )
 
 
-class _Face:
+class _ImpliedFace:
     """What of a target faces a direction (3,)."""
 
-    def __init__(self, direction: Array, seen: Surface) -> None:
+    def __init__(self, direction: Array, seen: GraspSurface) -> None:
         self.direction = direction
         self.points = seen.points[seen.normals @ direction > _FACING]
         self.across = frame_along(direction)
@@ -131,7 +131,7 @@ class _Face:
         return float(np.median(front @ self.direction) - deep[ended.argmax()]) if ended.any() else -np.inf
 
 
-def _behind(seen: Surface, face: _Face, up: Array, views: Sequence[DepthView]) -> tuple[_Points, float]:
+def _behind(seen: GraspSurface, face: _ImpliedFace, up: Array, views: Sequence[DepthView]) -> tuple[_Points, float]:
     """Of the sides behind a face and of the back: points and normals (K, 3), their standard deviation (K,) [m]; and
     where the back is along the face's direction [m, world]; infinity: it is curved."""
     back, mirrored = _back(seen, face.direction, up)
@@ -145,7 +145,7 @@ def _behind(seen: Surface, face: _Face, up: Array, views: Sequence[DepthView]) -
     return (points, normals, doubt), np.inf if mirrored else back
 
 
-def _along(seen: Surface, up: Array) -> Array:
+def _along(seen: GraspSurface, up: Array) -> Array:
     """The direction (3,) in which the target stands: ``up``, or along the flat face that is most of it and leans.
 
     What leans, as a book on a wall, has its back parallel to its face, and its sides end where they do in its own
@@ -167,7 +167,7 @@ def _along(seen: Surface, up: Array) -> Array:
     return np.asarray(along / np.linalg.norm(along))
 
 
-def _directions(seen: Surface, up: Array) -> list[Array]:
+def _directions(seen: GraspSurface, up: Array) -> list[Array]:
     """Level directions that many of what was seen face, unless the opposite side was seen as well."""
     level = np.abs(seen.normals @ up) < 0.5
     left, points = seen.normals[level], seen.points[level]
@@ -217,7 +217,7 @@ def _slope(local: Array) -> float:
     return float(slopes[0])
 
 
-def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
+def _floor(scene: SegmentedMap, seen: GraspSurface, up: Array) -> float:
     """Height along ``up`` [m, world] where the target stands."""
     low = float(np.percentile(seen.points @ up, 1))
     local = transform_points(inverse(scene.T_world_base), seen.points)
@@ -228,7 +228,7 @@ def _floor(scene: MapScene, seen: Surface, up: Array) -> float:
     return low - under if 0.0 <= under < 0.03 else low - 0.01
 
 
-def _back(seen: Surface, face: Array, up: Array) -> tuple[float, bool]:
+def _back(seen: GraspSurface, face: Array, up: Array) -> tuple[float, bool]:
     """Where along ``face`` [m, world] the target ends behind, and whether its back is the mirror image of its front.
 
     A flat front is that of a box, as deep as its other sides show; a round one turns away half way to its back. Where
@@ -255,7 +255,7 @@ def _bowl(at: Array, heights: Array) -> tuple[Array, float]:
 
 
 def _sides(
-    seen: Surface, direction: Array, floor: float, *, closed: bool = False, mirrored: bool = False
+    seen: GraspSurface, direction: Array, floor: float, *, closed: bool = False, mirrored: bool = False
 ) -> tuple[Array, Array]:
     """Points and normals (K, 3) of the sides behind the edges of what faces ``direction``, where none was seen.
 
@@ -311,7 +311,7 @@ def _inside(points: Array, normals: Array, *, tube: float) -> NDArray[np.bool_]:
     return found
 
 
-def _unseen(points: Array, normals: Array, seen: Surface) -> NDArray[np.bool_]:
+def _unseen(points: Array, normals: Array, seen: GraspSurface) -> NDArray[np.bool_]:
     """Whether nothing that was seen within 6 mm of each of points (P, 3) faces the same way (P,)."""
     new = np.ones(len(points), np.bool_)
     reach = max(_SEEN, 2.0 * float(np.median(seen.spread)))

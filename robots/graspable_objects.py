@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 
-from splatbot.collision.evidence import DepthView, gather_evidence
+from splatbot.collision.visibility import DepthView, gather_evidence
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.grasping.sampler import GraspSampler
@@ -19,7 +19,7 @@ from splatbot.results.folder import RunFolder
 from splatbot.results.observers import observers
 from splatbot.results.views import thinned_views
 from splatbot.robots.in_view import reopen_log
-from splatbot.segmentation import MapScene, segment
+from splatbot.segmentation import SegmentedMap, segment
 from splatbot.workspace import Workspace
 
 
@@ -41,11 +41,11 @@ class MeasuredMap:
 
 
 @dataclass(frozen=True, eq=False)
-class Things:
+class GraspableObjects:
     """The things in a map, as commands and service alike ask for grasps of them."""
 
     measured: MeasuredMap
-    scene: MapScene
+    scene: SegmentedMap
 
     def sampler(self, robot: RobotKinematics, **options: Any) -> GraspSampler:
         """Of grasps of them; ``options`` as of :class:`splatbot.grasping.sampler.GraspSampler`."""
@@ -86,7 +86,9 @@ def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
     return MeasuredMap(replace(state, model=model), observers(run, model), views, notes)
 
 
-def things_of(measured: MeasuredMap, T_world_base: ArrayLike, workspace: Workspace | None, *, as_known: bool) -> Things:
+def things_of(
+    measured: MeasuredMap, T_world_base: ArrayLike, workspace: Workspace | None, *, as_known: bool
+) -> GraspableObjects:
     """The things in a map.
 
     Args:
@@ -107,7 +109,7 @@ def things_of(measured: MeasuredMap, T_world_base: ArrayLike, workspace: Workspa
         names=workspace.objects if workspace is not None else (),
         observers=measured.observers,
     )
-    return Things(measured, scene)
+    return GraspableObjects(measured, scene)
 
 
 def _solid(model: GaussianModel, views: tuple[DepthView, ...]) -> GaussianModel:

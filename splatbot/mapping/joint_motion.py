@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class JointMotion:
+class JointMotionMonitor:
     """Compares joint positions of one frame with the next.
 
     Args:

@@ -22,7 +22,7 @@ DepthView = tuple[NDArray[np.float32], Camera, Array]  # depth (H, W) [m, 0: non
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class VisibilityEvidence:
     """Counts (N,) over depth images, by the pixel on which each Gaussian's mean falls.
 
     Args:
@@ -38,12 +38,12 @@ class Evidence:
         """More often than hit: no ray would pass through a surface."""
         return self.passes > self.hits
 
-    def select(self, rows: NDArray[np.int64]) -> Evidence:
+    def select(self, rows: NDArray[np.int64]) -> VisibilityEvidence:
         """The counts of some rows."""
-        return Evidence(self.hits[rows], self.passes[rows])
+        return VisibilityEvidence(self.hits[rows], self.passes[rows])
 
 
-def gather_evidence(model: GaussianModel, views: Iterable[DepthView]) -> Evidence:
+def gather_evidence(model: GaussianModel, views: Iterable[DepthView]) -> VisibilityEvidence:
     """Count over views, each a depth image (H, W) [m, 0 or NaN: none], its camera and T_world_camera (4, 4).
 
     Raises:
@@ -52,7 +52,7 @@ def gather_evidence(model: GaussianModel, views: Iterable[DepthView]) -> Evidenc
     return evidence_at(model.means.detach().numpy().astype(np.float64), views)
 
 
-def evidence_at(points: Array, views: Iterable[DepthView]) -> Evidence:
+def evidence_at(points: Array, views: Iterable[DepthView]) -> VisibilityEvidence:
     """The same of points (P, 3) [m, world].
 
     Raises:
@@ -66,7 +66,7 @@ def evidence_at(points: Array, views: Iterable[DepthView]) -> Evidence:
         tolerance = TOLERANCE + TOLERANCE_PER_Z2 * z**2
         hits[rows[np.abs(measured - z) <= tolerance]] += 1
         passes[rows[measured - z > tolerance]] += 1
-    return Evidence(hits, passes)
+    return VisibilityEvidence(hits, passes)
 
 
 def measured_depths(

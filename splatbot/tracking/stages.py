@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from splatbot.config import TrackingConfig
 from splatbot.tracking.align import SoftPrior, align
 from splatbot.tracking.budget import Budget
-from splatbot.tracking.candidate import Candidate, Judged, judge, score
 from splatbot.tracking.features import Expectation, FeaturePose, Features, detect, match_pose
+from splatbot.tracking.gicp import GicpStage
 from splatbot.tracking.health import is_explained, verdict_of
-from splatbot.tracking.predict import Prediction
+from splatbot.tracking.hypothesis import Candidate, ScoredHypothesis, judge, score
+from splatbot.tracking.motion_model import Prediction
+from splatbot.tracking.nearby_keyframes import TrackedKeyframe, nearest, order_by_distance, pose_distance
 from splatbot.tracking.prepare import PreparedFrame
-from splatbot.tracking.recover import KeyframeSearch
-from splatbot.tracking.views import TrackedKeyframe, nearest, order_by_distance, pose_distance
-from splatbot.tracking.wide import WideStage
+from splatbot.tracking.relocalization import PlaceSearch
 
 Array = NDArray[np.float64]
 Work = tuple[str, float]
@@ -26,7 +26,7 @@ _FEWER = (1.0, 0.5, 0.25)  # shares of keypoints, and of steps of alignment: the
 _BEFORE_STEPS = 3  # what an alignment costs beside its steps, in steps
 
 
-class Attempt:
+class TrackingStages:
     """Runs the stages on a frame, from one prediction or another.
 
     Args:
@@ -39,8 +39,8 @@ class Attempt:
         prepared: PreparedFrame,
         keyframes: Sequence[TrackedKeyframe],
         budget: Budget,
-        wide: WideStage,
-        search: KeyframeSearch | None,
+        wide: GicpStage,
+        search: PlaceSearch | None,
     ) -> None:
         self.config = config
         self.features: Features | None = None
@@ -51,7 +51,7 @@ class Attempt:
         self._search = search  # given while lost
         self._looked_anywhere = search is not None
 
-    def run(self, prediction: Prediction, T_before: Array) -> Judged:
+    def run(self, prediction: Prediction, T_before: Array) -> ScoredHypothesis:
         """The best pose from a prediction; ``T_before`` is where the camera was last."""
         start = self._geometric(prediction)
         starts, matched = [start], None
@@ -81,7 +81,7 @@ class Attempt:
             found = found.doubted("not aligned on fine levels: no time was left for them")
         return found
 
-    def _judge(self, candidates: Sequence[Candidate]) -> Judged:
+    def _judge(self, candidates: Sequence[Candidate]) -> ScoredHypothesis:
         with self._budget.run("health", self._health_units * len(candidates)):
             return judge(self._prepared, candidates, self.config)
 

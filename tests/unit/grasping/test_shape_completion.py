@@ -11,8 +11,8 @@ from splatbot.camera import Camera
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.geometry import look_at, quat_multiply, rotation_to_quat
-from splatbot.grasping.implied import target_surface
-from splatbot.grasping.surface import Surface
+from splatbot.grasping.shape_completion import target_surface
+from splatbot.grasping.surface import GraspSurface
 from splatbot.segmentation import segment
 from tests.unit.grasping.things import colored
 
@@ -33,7 +33,7 @@ def _front(solid: Block | Can, noise: float) -> tuple[GaussianModel, np.ndarray]
     return model, rows
 
 
-def _surface(model: GaussianModel, rows: np.ndarray, **options: object) -> Surface:
+def _surface(model: GaussianModel, rows: np.ndarray, **options: object) -> GraspSurface:
     scene = segment(model, np.eye(4))
     return target_surface(scene, rows, observers=np.tile(EYE, (len(model), 1)), **options)  # type: ignore[arg-type]
 

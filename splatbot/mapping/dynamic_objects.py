@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatbot.camera import Camera
 from splatbot.geometry import inverse, transform_points
-from splatbot.mapping.fusion import View
+from splatbot.mapping.insertion import ModelView
 from splatbot.mapping.keyframes import Keyframe
 
 Mask = NDArray[np.bool_]
@@ -27,7 +27,7 @@ _CELL = 0.03  # [m] within which a thing that stays is the same
 _FORGET = 0.6  # places not seen for longer begin anew [s]
 
 
-class Movers:
+class DynamicObjectFilter:
     """Tells what moves from what is new, and accepts what has stayed.
 
     Args:
@@ -42,7 +42,7 @@ class Movers:
 
     def find(
         self,
-        view: View,
+        view: ModelView,
         rgb: Tensor,
         depth: Tensor,
         camera: Camera,
@@ -91,7 +91,7 @@ class Movers:
         return np.asarray((stamp - since >= self.settle)[place])
 
 
-def _disagreeing(view: View, rgb: Tensor, depth: Tensor) -> Mask:
+def _disagreeing(view: ModelView, rgb: Tensor, depth: Tensor) -> Mask:
     """Pixels that are nearer than the map and of another colour, where the map is solid."""
     nearer = (depth > 0) & (depth < (1 - _DEPTH) * view.depth)
     other = (view.rgb - rgb.float() / 255.0).abs().mean(-1) > _COLOUR

@@ -12,7 +12,7 @@ from splatbot.grasping.types import GraspResult
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_frames import camera_info_message, image_message
 from splatbot.logs.ros_types import Message
-from splatbot.planning import Trajectory as RobotTrajectory
+from splatbot.planning import JointTrajectory
 from splatbot.services.bus import Bus
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import (
@@ -65,7 +65,7 @@ _WAITING = 64  # news that may wait for conversion
 _log = logging.getLogger(__name__)
 
 
-class RosOutlets:
+class RosPublishers:
     """A thread that turns the bus's news into ROS messages; what is slow here delays nobody else.
 
     The map "default", or else the first one that the bus tells of, has the plain names; another map's begin with
@@ -147,7 +147,7 @@ class RosOutlets:
         self._tell(prefix, PATH, lambda: path_message(trajectory), latched=True)
         self._tell(prefix, MARKERS, lambda: camera_way_message(trajectory), latched=True)
 
-    def _plan(self, prefix: str, plan: RobotTrajectory) -> None:
+    def _plan(self, prefix: str, plan: JointTrajectory) -> None:
         self._tell(prefix, PLANNED, lambda: joint_trajectory_message(plan, frame_id=MAP_FRAME), latched=True)
 
     def _grasps(self, prefix: str, found: GraspResult) -> None:

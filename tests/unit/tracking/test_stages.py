@@ -10,7 +10,6 @@ import pytest
 
 from splatbot.geometry import inverse, se3_exp, transform_points
 from splatbot.slam import FrameResult, Slam
-from splatbot.tracking import attempt
 from splatbot.tracking.budget import Budget
 from splatbot.tracking.features import FeaturePose, match_pose
 from splatbot.tracking.tracker import pose_distance
@@ -50,8 +49,8 @@ def astray(monkeypatch: pytest.MonkeyPatch) -> Astray:
         pixels = camera.project(transform_points(inverse(wrong), found.points))
         return FeaturePose(wrong, found.points, pixels, 0.01 * found.sigmas, found.matches)
 
-    monkeypatch.setattr(attempt, "match_pose", matched)
-    monkeypatch.setattr(attempt.Attempt, "_geometric", started_at(wrong, attempt.Attempt._geometric))
+    monkeypatch.setattr(stages, "match_pose", matched)
+    monkeypatch.setattr(stages.TrackingStages, "_geometric", started_at(wrong, stages.TrackingStages._geometric))
     return run
 
 
@@ -104,7 +103,9 @@ def test_with_little_time_the_direct_stage_takes_fewer_steps_and_a_pose_with_non
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     apart = np.array([0.015, -0.006, 0.004, 0.006, 0.015, -0.006])  # from where the coarse levels led to
-    monkeypatch.setattr(attempt.Attempt, "_geometric", started_at(TRUE @ se3_exp(apart), attempt.Attempt._geometric))
+    monkeypatch.setattr(
+        stages.TrackingStages, "_geometric", started_at(TRUE @ se3_exp(apart), stages.TrackingStages._geometric)
+    )
     errors, skipped = [], []
     for share in 0.0, 0.5, 1.0:  # half of the time is enough for a quarter of the steps
         slam = Slam(small_config(tracking__features="needed", tracking__wide="never"))

@@ -11,7 +11,7 @@ from splatbot.frame import Frame
 from splatbot.geometry import inverse
 from splatbot.logs import open_log
 from splatbot.logs.synthetic import SyntheticLog
-from splatbot.mapping.fusion import view_of
+from splatbot.mapping.insertion import view_of
 from splatbot.mapping.mapper import Mapper
 from splatbot.slam import Slam
 from splatbot.tracking.features import Features

@@ -20,7 +20,7 @@ from splatbot.rasterize import rasterization
 
 
 @dataclass(frozen=True)
-class View:
+class ModelView:
     """The map seen from a pose: colour (H, W, 3), depth (H, W) [m], alpha (H, W)."""
 
     rgb: Tensor
@@ -29,11 +29,11 @@ class View:
 
 
 @torch.no_grad()
-def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.float64]) -> View:
+def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.float64]) -> ModelView:
     """Render the map; depth is that of the Gaussians' planes, which spares slanted surfaces the blend's bias."""
     if len(model) == 0:
         blank = torch.zeros(camera.height, camera.width)
-        return View(blank[..., None].repeat(1, 1, 3), blank, blank.clone())
+        return ModelView(blank[..., None].repeat(1, 1, 3), blank, blank.clone())
     renders, alphas, _ = rasterization(
         model.means,
         model.quats,
@@ -47,10 +47,10 @@ def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.flo
         render_mode="RGB+ED",
         depth_mode="plane",
     )
-    return View(renders[0, ..., :3], renders[0, ..., 3], alphas[0, ..., 0])
+    return ModelView(renders[0, ..., :3], renders[0, ..., 3], alphas[0, ..., 0])
 
 
-def model_depth(view: View, measured: NDArray[np.float32], config: MappingConfig) -> NDArray[np.float32]:
+def model_depth(view: ModelView, measured: NDArray[np.float32], config: MappingConfig) -> NDArray[np.float32]:
     """Depth (H, W) [m] to track against: the map's where it is solid and does not contradict the measured one.
 
     There, all of it is scaled to where it was measured: of Gaussians that scatter about a surface the nearer ones cover
@@ -73,7 +73,7 @@ def _middle(values: NDArray[np.float32]) -> float:
     return float(values[np.abs(values - median) <= 3 * spread].mean(dtype=np.float64))
 
 
-def unexplained(view: View, depth: Tensor, config: MappingConfig) -> Tensor:
+def unexplained(view: ModelView, depth: Tensor, config: MappingConfig) -> Tensor:
     """Pixels (H, W) whose measured depth the map does not account for: nothing there, or something farther."""
     measured = depth > 0
     empty = view.alpha < config.new_alpha
@@ -94,7 +94,7 @@ def guess_depth(depth: Tensor) -> Tensor:
     return torch.from_numpy(np.where(missing, nearest[labels], 0).astype(np.float32))
 
 
-def guessed_gaussians(view: View, keyframe: Keyframe, config: MappingConfig) -> GaussianModel:
+def guessed_gaussians(view: ModelView, keyframe: Keyframe, config: MappingConfig) -> GaussianModel:
     """Gaussians that only carry colour where the sensor measured no depth and the map shows nothing.
 
     Their depth is a guess, so they have no observation and count as air for collision until a keyframe supports them.

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.tracking.budget import Budget
-from splatbot.tracking.candidate import Judged
 from splatbot.tracking.features import FeaturePose, Features, match_pose
-from splatbot.tracking.places import votes
-from splatbot.tracking.views import TrackedKeyframe, pose_distance
+from splatbot.tracking.hypothesis import ScoredHypothesis
+from splatbot.tracking.nearby_keyframes import TrackedKeyframe, pose_distance
+from splatbot.tracking.place_recognition import votes
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ _TURN_SLACK, _TURN_SPEED = 0.05, 4.0  # [rad], [rad/s]
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class RelocalizationCandidate:
     """A pose found while lost, which the next frame has to confirm."""
 
     stamp: float
@@ -38,13 +38,13 @@ class Sighting:
         return moved <= _SLACK + _SPEED * dt and turned <= _TURN_SLACK + _TURN_SPEED * dt
 
 
-def is_sure(pose: Judged) -> bool:
+def is_sure(pose: ScoredHypothesis) -> bool:
     """Whether residuals and what the map shows from there agree well enough to begin anew."""
     health = pose.health
     return pose.verdict != "lost" and min(health.photometric_inliers, health.geometric_inliers) >= _LEAST_INLIERS
 
 
-class KeyframeSearch:
+class PlaceSearch:
     """Compares a frame with all keyframes, over several frames where there is no time for all of them in one."""
 
     def __init__(self) -> None:

@@ -11,9 +11,9 @@ import torch
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.geometry import inverse, quat_multiply, se3_exp, transform_points
-from splatbot.mapping.evidence import (
-    DepthNoise,
-    Evidence,
+from splatbot.mapping.depth_fusion import (
+    DepthComparison,
+    DepthNoiseModel,
     count,
     first_uncertainty,
     fuse_depth,
@@ -25,7 +25,7 @@ from splatbot.mapping.keyframes import Keyframe
 from tests.rgbd import CAMERA, Array
 from tests.unit.mapping.conftest import MakeKeyframe
 
-NOISE = DepthNoise(1e-3, 2e-3)
+NOISE = DepthNoiseModel(1e-3, 2e-3)
 POSE = se3_exp([0.1, -0.2, 0.15, 0.1, -0.2, 0.3])
 SLANTED = (0.2, 0.1, 0.97)
 
@@ -45,7 +45,7 @@ def flat(means: Array, normal_axis: int = 2, sigma: float = 0.0) -> GaussianMode
     return model
 
 
-def weighed(model: GaussianModel, keyframe: Keyframe) -> Evidence:
+def weighed(model: GaussianModel, keyframe: Keyframe) -> DepthComparison:
     return weigh(model, keyframe.depth, keyframe.camera, keyframe.T_world_camera, NOISE)
 
 
@@ -118,7 +118,7 @@ def test_a_grazing_look_does_not_move_a_gaussian(make_keyframe: MakeKeyframe) ->
 
 def test_fusing_adds_information_and_moves_the_mean_by_its_share() -> None:
     model = flat(np.array([[0.0, 0.0, 1.0]]), sigma=4e-3)
-    evidence = Evidence(
+    evidence = DepthComparison(
         torch.tensor([True]),
         torch.tensor([False]),
         torch.tensor([0.005]),
@@ -188,7 +188,7 @@ def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> N
     nothing = (torch.zeros(3), torch.full((3,), torch.inf), torch.zeros(3, 3), torch.zeros(3, 3))
     looks = [([0, 0, 1], [1, 1, 0])] * 2 + [([0, 1, 1], [1, 0, 0])]
     for supported, through in looks:
-        model = count(model, Evidence(torch.tensor(supported) > 0, torch.tensor(through) > 0, *nothing))
+        model = count(model, DepthComparison(torch.tensor(supported) > 0, torch.tensor(through) > 0, *nothing))
     assert model.misses.tolist() == [3, 1, 0]
     assert model.opacities[0] < 1e-3
     assert model.opacities[1] > 0.3
@@ -200,7 +200,7 @@ def test_what_is_hardly_known_goes_a_look_earlier_than_what_is_stable() -> None:
     model.observations[:] = torch.tensor([3, 2, 3])
     model.uncertainty[2] = 6e-3  # of a disc of 1 cm
     assert stable(model).tolist() == [True, False, False]
-    away = Evidence(
+    away = DepthComparison(
         torch.zeros(3) > 0,
         torch.ones(3) > 0,
         torch.zeros(3),

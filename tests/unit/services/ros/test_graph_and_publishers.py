@@ -22,7 +22,6 @@ from splatbot.logs.ros_frames import camera_info_message, image_message, pose_of
 from splatbot.logs.ros_types import build, from_cdr, to_cdr, to_plain
 from splatbot.services.bus import Bus
 from splatbot.services.ros.graph import RosGraph
-from splatbot.services.ros.inlets import FramePairs, RosInlets
 from splatbot.services.ros.messages import (
     joint_trajectory_message,
     odometry_message,
@@ -30,7 +29,8 @@ from splatbot.services.ros.messages import (
     points_of,
     waypoints_of,
 )
-from splatbot.services.ros.outlets import FROM_ROS, ODOMETRY, POINTS, ROSOUT, TF, RosOutlets
+from splatbot.services.ros.publishers import FROM_ROS, ODOMETRY, POINTS, ROSOUT, TF, RosPublishers
+from splatbot.services.ros.subscribers import FramePairs, RosSubscribers
 from splatbot.services.store import MapStore
 from splatbot.services.topics import FRAME, RESULT, JointState, arm_topic, map_topic, robot_topic
 from splatbot.slam import FrameResult
@@ -59,7 +59,7 @@ def _until(found: Callable[[], Any]) -> Any:
 def told() -> Iterator[tuple[MapStore, RosGraph]]:
     """A store whose news come out on a graph."""
     store, graph = MapStore(), RosGraph()
-    outlets = RosOutlets(store.bus, graph)
+    outlets = RosPublishers(store.bus, graph)
     outlets.start()
     yield store, graph
     outlets.stop()
@@ -161,7 +161,7 @@ def test_nobody_pays_for_messages_that_nobody_reads(told: tuple[MapStore, RosGra
 def test_images_of_a_client_become_frames_and_joints_reach_the_bus(make_log: MakeLog) -> None:
     graph, bus = RosGraph(), Bus()
     frames: list[Frame] = []
-    inlets = RosInlets(graph, bus, on_frame=frames.append)
+    inlets = RosSubscribers(graph, bus, on_frame=frames.append)
     inlets.start()
     log = open_log(make_log())
     for frame in log:

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from splatbot.geometry import skew
-from splatbot.tracking.predict import ConstantVelocity
+from splatbot.tracking.motion_model import ConstantVelocity
 
 TWIST = np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6])  # per second: (m, rad)
 START = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]])

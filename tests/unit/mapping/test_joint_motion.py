@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatbot.mapping.motion import JointMotion
+from splatbot.mapping.joint_motion import JointMotionMonitor
 
 
 def test_one_joint_that_moves_faster_than_the_bound_is_motion() -> None:
-    motion = JointMotion(0.05)
+    motion = JointMotionMonitor(0.05)
     assert not motion.update(0.0, np.zeros(3))
     assert motion.update(0.1, np.array([0.0, -0.006, 0.0]))
     assert not motion.update(0.2, np.array([0.004, -0.006, 0.0]))
 
 
 def test_without_joints_or_with_a_clock_that_stands_nothing_is_known() -> None:
-    motion = JointMotion(0.05)
+    motion = JointMotionMonitor(0.05)
     assert not motion.update(0.0, None)
     assert not motion.update(0.1, np.ones(3))
     assert not motion.update(0.1, np.zeros(3))
@@ -25,7 +25,7 @@ def test_without_joints_or_with_a_clock_that_stands_nothing_is_known() -> None:
 
 
 def test_the_caller_may_reuse_its_array() -> None:
-    motion, joints = JointMotion(0.05), np.zeros(2)
+    motion, joints = JointMotionMonitor(0.05), np.zeros(2)
     motion.update(0.0, joints)
     joints += 1.0
     assert motion.update(0.1, joints)

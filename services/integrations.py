@@ -15,7 +15,7 @@ from splatbot.services.store import MapStore
 from splatbot.services.viewer.viewer import Viewer
 
 
-class Sides:
+class Integrations:
     """Begins and ends with the application.
 
     Args:
