@@ -10,6 +10,7 @@ import pytest
 
 from splatbot.geometry import inverse, se3_exp, transform_points
 from splatbot.slam import FrameResult, Slam
+from splatbot.tracking import stages
 from splatbot.tracking.budget import Budget
 from splatbot.tracking.features import FeaturePose, match_pose
 from splatbot.tracking.tracker import pose_distance
