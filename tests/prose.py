@@ -185,10 +185,10 @@ def python(path: Path) -> Iterator[Finding]:
                     yield from check(path, first.lineno + offset, text)
                 yield from _first_word(path, node, first.lineno, doc)
     for node in ast.walk(tree):
-        text = node.value if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) else None
-        if text is not None and isinstance(text.value, str) and id(text) not in documented:
-            yield from check(path, text.lineno, text.value)
-            documented.add(id(text))
+        literal = node.value if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) else None
+        if literal is not None and isinstance(literal.value, str) and id(literal) not in documented:
+            yield from check(path, literal.lineno, literal.value)
+            documented.add(id(literal))
     if "tests" not in path.relative_to(ROOT).parts:
         yield from _messages(path, tree, documented)
     yield from _comments(path, source)
