@@ -88,3 +88,7 @@ class NativeError(SplatbotError):
     """The native module is missing or cannot run on this machine."""
 
     http_status = 503
+
+
+class DeprecatedNameWarning(FutureWarning):
+    """A name of an earlier version is in use; it still holds, and the message gives the present name."""

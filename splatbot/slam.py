@@ -73,7 +73,7 @@ class Slam:
         self._looked = -math.inf
         self._size: tuple[int, int] | None = None
         self._growing = True
-        self._motion = JointMotionMonitor(self.config.mapping.still)
+        self._motion = JointMotionMonitor(self.config.mapping.still_joint_speed)
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """Track ``frame`` and, unless ``hold_out``, fuse it. Never raises for a frame that cannot be tracked.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.camera import Camera
-from splatbot.config import Config, load_config
+from splatbot.config import Config
 from splatbot.frame import Frame
 from splatbot.geometry import inverse
 from splatbot.logs import open_log
@@ -20,15 +20,15 @@ CAMERA = Camera(130.0, 131.0, 79.0, 60.0, 160, 120)
 
 
 def small_config(**overrides: Any) -> Config:
-    """The defaults with less of everything, for images of 160x120; a key is ``section__name``."""
-    values = {
-        "tracking.n_pixels": 1200,
-        "tracking.n_features": 600,
-        "mapping.refine_iterations": 2,
-        "mapping.final_iterations": 3,
+    """Return the defaults with less of everything, for images of 160x120; a key is ``section__name``."""
+    values: dict[str, Any] = {
+        "tracking": {"n_pixels": 1200, "n_features": 600},
+        "mapping": {"refine_iterations": 2, "final_iterations": 3},
     }
-    values |= {key.replace("__", "."): value for key, value in overrides.items()}
-    return load_config(environ={}, overrides=values)
+    for key, value in overrides.items():
+        section, _, name = key.partition("__")
+        values[section] = values.get(section, {}) | {name: value} if name else value
+    return Config.model_validate(values)
 
 
 @cache

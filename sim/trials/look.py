@@ -41,7 +41,7 @@ _RATE = 4.0  # [Hz]
 _LOOKED = 4  # of the frames, one is looked at for a click
 _KNOWN = (5e-4, 5e-4)  # [m], [rad] standard deviation of the camera's pose by the arm's joints
 # Fine Gaussians, left where depth put them: refinement for pictures moves means by millimetres, too much for grasps.
-MAPPING = {"stride": 1, "new_depth": 0.01, "rate_means": 0.0, "refine_iterations": 0, "final_iterations": 0}
+MAPPING = {"stride": 1, "surface_depth_tolerance": 0.01, "means_lr": 0.0, "refine_iterations": 0, "final_iterations": 0}
 _TABLE = RaycastSurface(
     box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05)
 )
@@ -115,7 +115,7 @@ def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Confi
     )
     shot = tuple(effects(mask(log[k])) for k in range(frames))
     begin = time.perf_counter()
-    slam = Slam(config or Config.model_validate({"mapping": MAPPING, "tracking": {"max_depth": FARTHEST}}))
+    slam = Slam(config or Config.model_validate({"mapping": MAPPING, "sensor": {"max_depth": FARTHEST}}))
     for frame, T in zip(shot, told, strict=True):
         prior = PosePrior(np.diag(2 * sigma**2), T_world_camera=inverse(told[0]) @ T)
         slam.process(replace(frame, prior=prior))

@@ -133,14 +133,14 @@ def _solve(
     """The step (8,): twist (t, ω) that left-multiplies T_camera_world, gain and offset."""
     c = config.tracking
     depth = level.depth[pixels].astype(np.float64)
-    sigma_depth = c.depth_sigma_scale * (c.sigma_depth_floor + c.sigma_depth_quad * depth**2)
-    r_gray = (exposure[0] * shown.gray + exposure[1] - level.gray[pixels]) / c.sigma_gray
+    sigma_depth = c.sensor.depth_sigma_scale * (c.sensor.sigma_depth_floor + c.sensor.sigma_depth_quad * depth**2)
+    r_gray = (exposure[0] * shown.gray + exposure[1] - level.gray[pixels]) / c.sensor.sigma_gray
     r_depth = (shown.depth - depth) / sigma_depth
-    J_gray = np.stack([exposure[0] * (m.gray - shown.gray) / _DIFFERENCE for m in moved], 1) / c.sigma_gray
+    J_gray = np.stack([exposure[0] * (m.gray - shown.gray) / _DIFFERENCE for m in moved], 1) / c.sensor.sigma_gray
     J_depth = np.stack([(m.depth - shown.depth) / _DIFFERENCE for m in moved], 1) / sigma_depth[:, None]
     solid = shown.alpha > _SOLID
-    near = solid & (depth > 0) & (np.abs(shown.depth - depth) < c.gate)
-    of_exposure = np.stack([shown.gray, np.ones_like(depth)], 1) / c.sigma_gray
+    near = solid & (depth > 0) & (np.abs(shown.depth - depth) < c.sensor.max_depth_difference)
+    of_exposure = np.stack([shown.gray, np.ones_like(depth)], 1) / c.sensor.sigma_gray
     J = np.concatenate([np.hstack([J_gray, of_exposure])[solid], np.hstack([J_depth, 0 * of_exposure])[near]])
     r = np.concatenate([r_gray[solid], r_depth[near]])
     weight = (_NU + 1) / (_NU + r**2)

@@ -7,8 +7,9 @@ import inspect
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 
 class _Command(NamedTuple):
@@ -86,6 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. Errors of :mod:`splatbot.errors` become one line on stderr."""
     from splatbot.errors import SplatbotError
 
+    warnings.showwarning = _print_warning
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or os.environ.get("SPLATBOT_DEBUG", "") not in ("", "0")
     words = [word for word in words if word != "--debug"]
@@ -107,6 +109,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `splatbot info ... | head` is no error; Python must not flush to the dead pipe again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _print_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print warnings about the user's input as one line; those for developers keep their place in the code."""
+    place = "" if category.__module__.startswith("splatbot") else f"{filename}:{lineno}: "
+    print(f"warning: {place}{message}", file=file or sys.stderr)
 
 
 def _dispatch(words: list[str]) -> Any:

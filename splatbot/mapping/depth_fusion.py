@@ -40,7 +40,7 @@ class DepthNoiseModel:
     @classmethod
     def of(cls, config: TrackingConfig) -> DepthNoiseModel:
         """The sensor's, as tracking has it."""
-        return cls(config.sigma_depth_floor, config.sigma_depth_quad)
+        return cls(config.sensor.sigma_depth_floor, config.sensor.sigma_depth_quad)
 
     def __call__(self, depth: Tensor) -> Tensor:
         """Standard deviation [m] of measured depths [m]."""

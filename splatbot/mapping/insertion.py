@@ -59,8 +59,8 @@ def model_depth(view: ModelView, measured: NDArray[np.float32], config: MappingC
     """
     depth = view.depth.numpy()
     # Strictly less: never true where nothing was measured, for the map may hold a guess there.
-    agrees = np.abs(depth - measured) < config.new_depth * measured
-    solid = (view.alpha.numpy() > config.solid_alpha) & agrees
+    agrees = np.abs(depth - measured) < config.surface_depth_tolerance * measured
+    solid = (view.alpha.numpy() > config.reference_alpha) & agrees
     scale = _middle(measured[solid] / depth[solid]) if solid.any() else 1.0
     return np.where(solid, scale * depth, measured).astype(np.float32)
 
@@ -76,8 +76,8 @@ def _middle(values: NDArray[np.float32]) -> float:
 def unexplained(view: ModelView, depth: Tensor, config: MappingConfig) -> Tensor:
     """Pixels (H, W) whose measured depth the map does not account for: nothing there, or something farther."""
     measured = depth > 0
-    empty = view.alpha < config.new_alpha
-    in_front = depth < view.depth - config.new_depth * depth
+    empty = view.alpha < config.unexplained_alpha
+    in_front = depth < view.depth - config.surface_depth_tolerance * depth
     return measured & (empty | in_front)
 
 
@@ -100,7 +100,7 @@ def guessed_gaussians(view: ModelView, keyframe: Keyframe, config: MappingConfig
     Their depth is a guess, so they have no observation and count as air for collision until a keyframe supports them.
     """
     guess = guess_depth(keyframe.depth)
-    where = (guess > 0) & (view.alpha < config.new_alpha)
+    where = (guess > 0) & (view.alpha < config.unexplained_alpha)
     if keyframe.still is not None:
         where &= keyframe.still
     model = new_gaussians(replace(keyframe, depth=guess), where, config)
@@ -134,7 +134,7 @@ def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> G
             means=points @ R_world_camera.T + keyframe.T_world_camera[:3, 3],
             quats=_disc_quats(normals, toward, R_world_camera),
             scales=scales,
-            opacities=np.full(len(points), config.new_opacity),
+            opacities=np.full(len(points), config.initial_opacity),
             colors=keyframe.rgb.numpy()[chosen] / 255.0,
         ),
         keyframe.number,

@@ -91,8 +91,8 @@ def smooth_depth(depth: NDArray[np.float32], config: MappingConfig, tracking: Tr
     once, and what is aligned to it would be off. What bends by more than the image's own noise is shape, and kept.
     """
     gate = _GATE * noise_share(depth, tracking)
-    floor, quad = gate * tracking.sigma_depth_floor, gate * tracking.sigma_depth_quad
-    return np.asarray(_native.smooth_depth(np.ascontiguousarray(depth), config.new_depth, floor, quad))
+    floor, quad = gate * tracking.sensor.sigma_depth_floor, gate * tracking.sensor.sigma_depth_quad
+    return np.asarray(_native.smooth_depth(np.ascontiguousarray(depth), config.surface_depth_tolerance, floor, quad))
 
 
 def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
@@ -106,7 +106,7 @@ def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
     if not known.any():
         return 0.0
     bend = np.abs((left + right) / 2 - z)[known] / (
-        tracking.sigma_depth_floor + tracking.sigma_depth_quad * z[known] ** 2
+        tracking.sensor.sigma_depth_floor + tracking.sensor.sigma_depth_quad * z[known] ** 2
     )
     return min(1.0, float(np.median(bend)) / (_MAD * np.sqrt(1.5)))
 

@@ -203,15 +203,15 @@ class LoopCloser:
         """Solve the graph with new loops; keep them if everything that was measured still holds."""
         self.graph.edges += loops
         limits = self.config.loops
-        if largest(edge.residual(self.graph.poses) for edge in self.graph.edges)[0] < limits.min_shift and (
-            largest(edge.residual(self.graph.poses) for edge in self.graph.edges)[1] < limits.min_turn
+        if largest(edge.residual(self.graph.poses) for edge in self.graph.edges)[0] < limits.min_translation and (
+            largest(edge.residual(self.graph.poses) for edge in self.graph.edges)[1] < limits.min_rotation
         ):
             self.closed += 1
             return
         poses = self.graph.optimised()
         moved, turned = largest(edge.residual(poses) for edge in loops)
         strained = max(_strain(edge, poses) for edge in self.graph.edges if not edge.loop)
-        if moved > _OPEN[0] or turned > _OPEN[1] or strained > limits.max_strain:
+        if moved > _OPEN[0] or turned > _OPEN[1] or strained > limits.max_edge_sigma:
             self.graph.edges = [edge for edge in self.graph.edges if all(edge is not loop for loop in loops)]
             self.rejected += len(loops)
             return
@@ -225,9 +225,16 @@ class LoopCloser:
         T_world_keyframe = keyframe.reference.T_world_camera
         matched = match_pose(view.features, [(keyframe.features, T_world_keyframe)], camera)
         start = matched.T_world_camera if matched is not None else view.T_world_camera
+        gate = config.sensor.max_depth_difference
         reference = [keyframe.reference]
         coarse = align(
-            levels, reference, start, config, photometric=False, finest=min(1, len(levels) - 1), gate=2 * config.gate
+            levels,
+            reference,
+            start,
+            config,
+            photometric=False,
+            finest=min(1, len(levels) - 1),
+            gate=2 * gate,
         )
         found = align(
             levels,
@@ -236,7 +243,7 @@ class LoopCloser:
             config,
             photometric=True,
             finest=0,
-            gate=config.gate,
+            gate=gate,
             features=matched,
             camera=camera,
         )

@@ -63,7 +63,7 @@ class Mapper:
         self.loops = LoopCloser(config)
         self._refiner = Refiner(config.mapping, config.seed)
         self._refiner.adam.extend(self.model)
-        self._movers = DynamicObjectFilter(config.mapping.settle)
+        self._movers = DynamicObjectFilter(config.mapping.dynamic_timeout_s)
         self._revealed = False
         self._noise = DepthNoiseModel.of(config.tracking)
         self._held = False
@@ -82,7 +82,7 @@ class Mapper:
 
         ``to_come`` are views that will be in the map, but are not yet.
         """
-        if valid_share(prepared) < self.config.tracking.min_valid:
+        if valid_share(prepared) < self.config.tracking.min_depth_coverage:
             return False
         bridge = self.loops.is_bridge(T_world_camera, self.keyframes)
         if bridge or (self._revealed and not to_come):
@@ -204,7 +204,7 @@ class Mapper:
         colors = in_exposure_of_map(torch.from_numpy(np.ascontiguousarray(rgb)), depths, view)
         stamp = prepared.frame.stamp
         self._movers.find(view, colors, depths, camera, T_world_camera, self.keyframes, stamp)
-        bare = (depths > 0) & (view.alpha < self.config.mapping.new_alpha)
+        bare = (depths > 0) & (view.alpha < self.config.mapping.unexplained_alpha)
         self._revealed = float(bare.float().mean()) > _REVEALED
         self._version += 1
 

@@ -39,11 +39,11 @@ class Refiner:
         self.config = config
         self.adam = GaussianAdam(
             {
-                "means": config.rate_means,
-                "quats": config.rate_quats,
-                "log_scales": config.rate_scales,
-                "opacity_logits": config.rate_opacities,
-                "sh": config.rate_sh,
+                "means": config.means_lr,
+                "quats": config.quats_lr,
+                "log_scales": config.scales_lr,
+                "opacity_logits": config.opacities_lr,
+                "sh": config.sh_lr,
             }
         )
         self._random = np.random.default_rng(seed)
@@ -136,7 +136,7 @@ class Refiner:
         """
         after = model.means.index_select(0, rows)
         along = ((after - means) * normals).sum(1, keepdim=True)
-        model.means.index_copy_(0, rows, after.addcmul_(along, normals, value=self.config.normal_share - 1))
+        model.means.index_copy_(0, rows, after.addcmul_(along, normals, value=self.config.normal_step_scale - 1))
 
     def _keep_flat(self, model: GaussianModel, keyframe: Keyframe, rows: Tensor) -> None:
         """Gaussians in view stay discs: thin, and no larger than ``config.max_pixels`` of this keyframe.

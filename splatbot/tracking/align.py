@@ -66,9 +66,9 @@ def settings_of(config: TrackingConfig, *, photometric: bool, gate: float, doubt
     return _native.AlignSettings(
         photometric=photometric,
         geometric=True,
-        sigma_gray=config.sigma_gray,
-        sigma_depth_floor=doubt * config.sigma_depth_floor,
-        sigma_depth_quad=doubt * config.sigma_depth_quad,
+        sigma_gray=config.sensor.sigma_gray,
+        sigma_depth_floor=doubt * config.sensor.sigma_depth_floor,
+        sigma_depth_quad=doubt * config.sensor.sigma_depth_quad,
         gate=gate,
     )
 
@@ -85,7 +85,7 @@ class Residuals:
 
 def residuals(level: Level, points: ReferencePoints, T_camera_reference: Array, config: TrackingConfig) -> Residuals:
     """How well a pose explains a level; only exposure is fitted."""
-    settings = settings_of(config, photometric=True, gate=config.gate)
+    settings = settings_of(config, photometric=True, gate=config.sensor.max_depth_difference)
     arrays = (*_level_arrays(level), *_point_arrays(points), T_camera_reference)
     return Residuals(*_native.align_residuals(*arrays, settings))
 
@@ -109,18 +109,19 @@ def align(
     earlier), so they count ``config.dense_weight`` each, against reprojected features (``features`` with the
     ``camera`` of their pixels), which count one over their variance [px²]. More pixels measure the same better; they
     bring no more that is independent, so together they weigh as 4800 do. Beside colour, depth is taken for
-    ``config.depth_sigma_scale`` times as uncertain as its pixels' noise.
+    ``config.sensor.depth_sigma_scale`` times as uncertain as its pixels' noise.
     """
     matches = None
     if features is not None and camera is not None:
         matches = (features.points, features.pixels, features.sigmas, _intrinsics(camera))
+    doubt = config.sensor.depth_sigma_scale if photometric else 1.0
     T_camera_world, information, curvature, spread, cells, *_ = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
         matches,
         None if prior is None else (inverse(prior.T_world_camera), prior.information),
         inverse(T_world_camera),
-        settings_of(config, photometric=photometric, gate=gate, doubt=config.depth_sigma_scale if photometric else 1.0),
+        settings_of(config, photometric=photometric, gate=gate, doubt=doubt),
         config.dense_weight * _FULL_PIXELS / config.n_pixels,
         config.iterations,
         finest,

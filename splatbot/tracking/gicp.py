@@ -40,7 +40,7 @@ class GicpStage:
 
         What it returns is a proposal: the solver calls wrong results converged, so that the health check has to judge.
         """
-        frame = cloud_of(points_of(prepared, self.config.wide_points))
+        frame = cloud_of(points_of(prepared, self.config.gicp_points))
         keyframe = self._keyframe_cloud(view)
         if frame is None or keyframe is None:
             return None

@@ -73,7 +73,7 @@ def measure(
         slope.append(points.slope)
         seen = np.isfinite(found.photometric)
         there.append(points.gray[seen].astype(np.float64))
-        here.append(found.photometric[seen] * config.sigma_gray + found.gain * there[-1] + found.offset)
+        here.append(found.photometric[seen] * config.sensor.sigma_gray + found.gain * there[-1] + found.offset)
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)
     seen, ranged = np.isfinite(r_photo), np.isfinite(r_depth)
     agree, steep = r_photo[seen] < _INLIER, np.concatenate(slope)[seen].astype(np.float64)

@@ -78,7 +78,7 @@ def gray_of_one_surface(level: Level, config: TrackingConfig) -> Image:
     Smoothing and interpolation mix the grey of two surfaces there, and from elsewhere others meet. The errors of such
     pixels do not average out: a few per cent of all, they would pull the pose along with the parallax.
     """
-    floor, quad = (_JUMP_SIGMAS * sigma for sigma in (config.sigma_depth_floor, config.sigma_depth_quad))
+    floor, quad = (_JUMP_SIGMAS * sigma for sigma in (config.sensor.sigma_depth_floor, config.sensor.sigma_depth_quad))
     return np.asarray(_native.gray_of_one_surface(level.depth, level.gray, _JUMP_STEP, floor, quad))
 
 
@@ -98,7 +98,7 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
 
 def usable_depth(frame: Frame, config: TrackingConfig) -> Image:
     """Depth (H, W) [m] of a frame with 0 where it is implausible (see :func:`valid_depth`) or masked."""
-    depth = valid_depth(frame.depth, config.min_depth, config.max_depth)
+    depth = valid_depth(frame.depth, config.sensor.min_depth, config.sensor.max_depth)
     return depth if frame.mask is None else np.where(frame.mask, depth, np.float32(0))
 
 

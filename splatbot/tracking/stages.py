@@ -60,7 +60,7 @@ class TrackingStages:
             matched = self._match(start.T_world_camera)
             if matched is not None:
                 starts.append(self._start("features", matched.T_world_camera, start))
-        if doubtful and matched is None and self.config.wide == "needed":
+        if doubtful and matched is None and self.config.gicp == "needed":
             starts += self._register(start)
         candidates: list[Candidate] = []
         for begun in starts:
@@ -97,7 +97,7 @@ class TrackingStages:
                 self.config,
                 photometric=False,
                 finest=finest,
-                gate=2 * self.config.gate,
+                gate=2 * self.config.sensor.max_depth_difference,
                 prior=SoftPrior(
                     prediction.T_world_camera, np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
                 ),
@@ -122,7 +122,7 @@ class TrackingStages:
                 self.config.model_copy(update={"iterations": iterations}),
                 photometric=True,
                 finest=0,
-                gate=self.config.gate,
+                gate=self.config.sensor.max_depth_difference,
                 features=matched,
                 camera=self._prepared.frame.camera,
             )
@@ -170,7 +170,7 @@ class TrackingStages:
         camera = self._prepared.frame.camera
         with self._budget.run("match near", units, under="features"):
             near = match_pose(features, views, camera, Expectation(T_expected, self.config.match_radius * camera.width))
-        if near is not None and len(near.points) >= self.config.match_enough:
+        if near is not None and len(near.points) >= self.config.min_local_matches:
             return near
         return self._match_anywhere(T_expected) or near
 
@@ -221,10 +221,10 @@ class TrackingStages:
 
     def _register(self, start: Candidate) -> list[Candidate]:
         """Poses by registration with the nearest keyframe, if there is time."""
-        if not self._budget.fits(("wide", self.config.wide_points), *self._direct_work(None) * 2, self._health_work):
+        if not self._budget.fits(("wide", self.config.gicp_points), *self._direct_work(None) * 2, self._health_work):
             self._budget.skip("wide")
             return []
-        with self._budget.run("wide", self.config.wide_points):
+        with self._budget.run("wide", self.config.gicp_points):
             T = self._wide.register(self._prepared, start.views[0], start.T_world_camera)
         return [] if T is None else [self._start("wide", T, start)]
 

@@ -48,7 +48,7 @@ class Tracker:
     def start(self, prepared: PreparedFrame) -> PoseEstimate:
         """The pose of the first frame, which defines the world; "lost" when it has too little depth or is blank."""
         share = valid_share(prepared)
-        if share < self.config.min_valid:
+        if share < self.config.min_depth_coverage:
             return PoseEstimate(np.eye(4), "lost", (f"only {share:.1%} of the pixels have a usable depth",), "start")
         if not float(np.nanstd(prepared.levels[0].gray)) >= _BLANK:
             return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")

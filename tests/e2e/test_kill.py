@@ -23,7 +23,7 @@ SMALL = [
     "--set",
     "mapping.refine_iterations=2",
     "--set",
-    "tracking.n_features=600",
+    "expert.tracking.n_features=600",
     "--set",
     "mapping.final_iterations=3",
 ]

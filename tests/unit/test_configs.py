@@ -28,8 +28,8 @@ def test_there_are_configurations_for_the_layouts_of_logs() -> None:
 
 def test_default_yaml_is_the_defaults_in_full() -> None:
     text = (CONFIGS / "default.yaml").read_text(encoding="utf-8")
-    hint = "write it anew: splatbot map LOG --dump-config > configs/default.yaml"
-    assert yaml.safe_load(text) == Config().model_dump(mode="json"), hint
+    hint = "write it again: splatbot map LOG --dump-config > configs/default.yaml"
+    assert text == Config().to_yaml(), hint
 
 
 def test_service_yaml_is_the_service_defaults_in_full(monkeypatch: pytest.MonkeyPatch) -> None:

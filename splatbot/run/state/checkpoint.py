@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from splatbot import __version__
-from splatbot.config import Config
-from splatbot.errors import FormatError, LogError
+from splatbot.config import Config, config_from_yaml
+from splatbot.errors import ConfigError, FormatError, LogError
 from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.run.state.container import read_container, write_container
@@ -165,12 +163,12 @@ class SavedRun:
         path = folder / FOLDER / FILE
         header, arrays = read_container(path)
         try:
-            config = Config.model_validate(yaml.safe_load(header["config"]))
+            config = config_from_yaml(header["config"])
             place = LogPlace(**header["log"])
             kept = partial(read_entry, path.parent / header["images"])
             values = Decoder(config, arrays, kept).decode(header["tree"])
             slam, loop = values["slam"], values["loop"]
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError, ValidationError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, ConfigError) as error:
             why = f"does not fit this version of splatbot ({error})."
             by = header.get("splatbot", "another version")
             hint = f"open it with splatbot {by}, or map the log again"
@@ -198,7 +196,7 @@ def _differences(fresh: object, saved: object, path: str = "slam") -> Iterator[s
     """Attributes of a fresh object, and of the plain objects in it, that a saved one lacks."""
     if not type(fresh).__module__.startswith("splatbot.") or not hasattr(fresh, "__dict__"):
         return
-    if is_dataclass(fresh) or type(fresh).__module__ == "splatbot.config":
+    if is_dataclass(fresh) or type(fresh).__module__.startswith("splatbot.config"):
         return
     for name, value in vars(fresh).items():
         if not hasattr(saved, name):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatbot.config import load_config
+from splatbot.config import Config, MappingConfig
 from splatbot.evaluation.image import psnr
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import covariances
@@ -68,7 +68,7 @@ def test_a_finished_map_is_denser_where_its_pictures_are_not_met_and_under_its_c
     fidelity, size = [], []
     for limit in (1e9, 3e-4):
         keys = {"densify_gradient": limit, "final_iterations": 90, "max_gaussians": cap}
-        slam = Slam(load_config(None, overrides={f"mapping.{key}": value for key, value in keys.items()}))
+        slam = Slam(Config(mapping=MappingConfig(**keys)))
         poses = [slam.process(frame).T_world_camera for frame in log]
         slam.finish()
         model = slam.snapshot().model

@@ -115,7 +115,7 @@ def test_they_carry_the_colour_the_opacity_and_the_number_of_their_keyframe(make
     s = CONFIG.stride
     colors = keyframe.rgb[s // 2 :: s, s // 2 :: s].reshape(-1, 3).float() / 255
     torch.testing.assert_close(model.colors, colors, atol=1e-6, rtol=0)
-    torch.testing.assert_close(model.opacities, torch.full((len(model),), CONFIG.new_opacity))
+    torch.testing.assert_close(model.opacities, torch.full((len(model),), CONFIG.initial_opacity))
     assert (model.anchors == 7).all()
     assert (model.observations == 1).all()
 

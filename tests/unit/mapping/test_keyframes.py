@@ -91,7 +91,7 @@ def _smoothed_by_hand(depth: Array) -> Array:
     """The rule of :func:`smooth_depth` pixel by pixel, in float64."""
     out = np.zeros_like(depth)
     padded = np.pad(depth, 1)
-    sigma = CONFIG.tracking.sigma_depth_floor + CONFIG.tracking.sigma_depth_quad * depth**2
+    sigma = CONFIG.tracking.sensor.sigma_depth_floor + CONFIG.tracking.sensor.sigma_depth_quad * depth**2
     bends = [
         abs((depth[v, u - 1] + depth[v, u + 1]) / 2 - depth[v, u]) / sigma[v, u]
         for v in range(0, depth.shape[0], 4)
@@ -104,7 +104,11 @@ def _smoothed_by_hand(depth: Array) -> Array:
         noise = 3.7 * share * sigma[v, u]
         for dv, du in ((0, 1), (1, 0), (1, 1), (1, -1)):
             a, b = padded[v + 1 + dv, u + 1 + du], padded[v + 1 - dv, u + 1 - du]
-            if min(a, b) > 0 and abs(a - b) < CONFIG.mapping.new_depth * z and abs((a + b) / 2 - z) < noise:
+            if (
+                min(a, b) > 0
+                and abs(a - b) < CONFIG.mapping.surface_depth_tolerance * z
+                and abs((a + b) / 2 - z) < noise
+            ):
                 some += [a, b]
         out[v, u] = np.mean(some)
     return out
@@ -125,7 +129,7 @@ def test_a_slanted_plane_stays_where_it_is_and_a_third_of_its_noise_is_left(rng:
     inside = np.s_[1:-1, 1:-1]
     even = smooth_depth(exact.astype(np.float32), CONFIG.mapping, CONFIG.tracking)
     np.testing.assert_allclose(even[inside], exact[inside], rtol=1e-3)
-    sigma = CONFIG.tracking.sigma_depth_floor + CONFIG.tracking.sigma_depth_quad * exact**2
+    sigma = CONFIG.tracking.sensor.sigma_depth_floor + CONFIG.tracking.sensor.sigma_depth_quad * exact**2
     noisy = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
     off = ((smooth_depth(noisy, CONFIG.mapping, CONFIG.tracking) - even) / sigma)[inside]
     assert off.std() < 0.4
@@ -134,7 +138,7 @@ def test_a_slanted_plane_stays_where_it_is_and_a_third_of_its_noise_is_left(rng:
 
 def test_what_stands_out_by_more_than_an_images_own_noise_is_kept(rng: np.random.Generator) -> None:
     tracking = CONFIG.tracking
-    sigma = tracking.sigma_depth_floor + tracking.sigma_depth_quad
+    sigma = tracking.sensor.sigma_depth_floor + tracking.sensor.sigma_depth_quad
     exact = np.where(np.arange(400) % 40 == 20, 1.0 - sigma, 1.0) * np.ones((80, 1))  # ridges, one pixel wide
     noisy = (exact + 0.1 * sigma * rng.standard_normal(exact.shape)).astype(np.float32)
     assert noise_share(noisy, tracking) == pytest.approx(0.1, abs=0.03)
@@ -147,7 +151,7 @@ def test_what_stands_out_by_more_than_an_images_own_noise_is_kept(rng: np.random
 def test_the_noise_of_depth_is_told_by_an_image_of_it(rng: np.random.Generator) -> None:
     tracking = CONFIG.tracking
     exact = wall_depth(CAMERA, np.eye(4), [0.6, 0.0, 0.8], 1.0)
-    sigma = tracking.sigma_depth_floor + tracking.sigma_depth_quad * exact**2
+    sigma = tracking.sensor.sigma_depth_floor + tracking.sensor.sigma_depth_quad * exact**2
     for share in (0.2, 0.5, 1.0, 2.0):
         noisy = (exact + share * sigma * rng.standard_normal(exact.shape)).astype(np.float32)
         noisy[rng.random(noisy.shape) < 0.3] = 0.0

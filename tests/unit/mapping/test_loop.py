@@ -126,7 +126,7 @@ def through_a_wrong_lens() -> tuple[Iterator[Frame], list[Array]]:
 
 def drifting_slam(enabled: bool) -> Slam:
     """Depth as much believed as its noise allows: a wrong lens then drifts by 11 cm, more than a loop is off."""
-    return Slam(small_config(loops__enabled=enabled, mapping__refine_iterations=1, tracking__depth_doubt=1.0))
+    return Slam(small_config(loops__enabled=enabled, mapping__refine_iterations=1, sensor__depth_sigma_scale=1.0))
 
 
 @cache

@@ -195,7 +195,7 @@ def test_a_blob_becomes_a_disc_of_the_same_extent(make_keyframe: MakeKeyframe) -
     keyframe = make_keyframe()
     model = disturbed(keyframe)
     model.log_scales[:] = np.log(0.004)
-    refiner_for(model, mapping__rate_scales=0.0).step(model, keyframe)
+    refiner_for(model, mapping__scales_lr=0.0).step(model, keyframe)
     sizes = model.scales.double().sort(1).values
     changed = sizes[:, 0] < 0.0039
     assert float(changed.double().mean()) > 0.9
@@ -211,7 +211,7 @@ def test_a_step_moves_means_along_their_normals_by_the_stated_share_and_along_th
     for one in (1.0, share):
         model = disturbed(keyframe)
         before, normals = model.means.clone(), rotations(model)[:, :, 2]  # of a new Gaussian, z is the normal
-        refiner_for(model, mapping__normal_share=one).step(model, keyframe)
+        refiner_for(model, mapping__normal_step_scale=one).step(model, keyframe)
         moves.append(model.means - before)
     along, across = [], []
     for move in moves:

@@ -232,7 +232,8 @@ def test_marginalising_exposure_gives_the_step_of_the_whole_system(problem: Prob
     whole[6:, 6:] += 100 * np.eye(2)  # the weak anchor of exposure; its gradient vanishes at gain 1, offset 0
     marginal = whole[:6, :6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], whole[6:, :6])
     gradient = g[:6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], g[6:])
-    plain = {"iterations": 1, "dense_weight": 1.0, "n_pixels": 4800, "dense_share": 0.0, "depth_sigma_scale": 1.0}
+    sensor = CONFIG.sensor.model_copy(update={"depth_sigma_scale": 1.0})
+    plain = {"iterations": 1, "dense_weight": 1.0, "n_pixels": 4800, "dense_share": 0.0, "sensor": sensor}
     config = CONFIG.model_copy(update=plain)
     reference = Reference(np.eye(4), (sampled,))
     found = align([level], [reference], inverse(problem.T), config, photometric=True, finest=0, gate=GATE)
@@ -299,7 +300,13 @@ def test_occluding_edges_do_not_pull_the_pose_along_with_the_parallax() -> None:
         before, after = prepare(log[k], config), prepare(log[k + 1], config)
         reference = make_reference(before.levels, truth[k], config.n_pixels)
         T = align(
-            after.levels, [reference], truth[k + 1], config, photometric=True, finest=0, gate=config.gate
+            after.levels,
+            [reference],
+            truth[k + 1],
+            config,
+            photometric=True,
+            finest=0,
+            gate=GATE,
         ).T_world_camera
         errors.append(se3_log(inverse(truth[k + 1]) @ T)[:3])
     assert np.linalg.norm(errors, axis=1).max() < 0.25e-3  # up to 0.6 mm with the grey of edges

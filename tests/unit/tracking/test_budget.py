@@ -25,9 +25,9 @@ def test_a_budget_buys_pixels_steps_and_keypoints_by_one_table() -> None:
 
 
 def test_what_is_given_is_not_changed_by_the_budget_and_null_leaves_it_to_it() -> None:
-    given = load_config(environ={}, overrides={"tracking.budget_ms": 30, "tracking.n_pixels": 777})
+    given = load_config(environ={}, overrides={"tracking.budget_ms": 30, "expert.tracking.n_pixels": 777})
     assert (given.tracking.n_pixels, given.tracking.n_features) == (777, TrackingConfig(budget_ms=30).n_features)
-    left = load_config(environ={}, overrides={"tracking.budget_ms": 300, "tracking.n_pixels": None})
+    left = load_config(environ={}, overrides={"tracking.budget_ms": 300, "expert.tracking.n_pixels": None})
     assert left.tracking.n_pixels == TrackingConfig(budget_ms=300).n_pixels
 
 

@@ -17,7 +17,7 @@ from tests.unit.tracking.test_tracker import Run
 @pytest.mark.parametrize("twist", [[0.08, 0, 0, 0, 0.087, 0], [0.0, 0.1, 0.05, 0.1, 0, 0], [0.1, 0, 0, 0, 0, 0.15]])
 def test_a_start_10_cm_and_8_degrees_off_is_brought_to_a_centimetre(twist: list[float]) -> None:
     run = Run(width=320)
-    stage = GicpStage(TrackingConfig(wide_points=3000))
+    stage = GicpStage(TrackingConfig(gicp_points=3000))
     found = stage.register(run.prepare(run.frames[2]), run.keyframes[0], run.poses[2] @ se3_exp(twist))
     assert found is not None
     moved, turned = pose_distance(run.poses[2], found)

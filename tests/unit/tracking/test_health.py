@@ -17,6 +17,7 @@ from splatbot.tracking.reference import Reference, make_reference
 from tests.rgbd import Array, small_config, tabletop, wall_frame
 
 CONFIG = small_config().tracking
+GATE = CONFIG.sensor.max_depth_difference
 GOOD = Health(overlap=0.9, photometric_inliers=0.9, edge_inliers=0.9, geometric_inliers=0.9, score=0.5, contrast=1.0)
 KNOWN = np.eye(6)
 
@@ -118,7 +119,7 @@ def test_without_depth_colour_alone_decides() -> None:
 def test_a_bare_wall_is_degraded_for_its_translation_is_hardly_constrained() -> None:
     bare = wall_frame(np.eye(4), textured=False)
     reference, levels = reference_of(bare, np.eye(4)), prepare(bare, CONFIG).levels
-    found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+    found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=GATE)
     weak = weak_directions(found.information, 1.0, CONFIG.min_eigen_ratio)
     verdict, reasons = verdict_of(health_at(bare, reference, found.T_world_camera), found.information, weak, CONFIG)
     assert verdict == "degraded"
@@ -128,7 +129,7 @@ def test_a_bare_wall_is_degraded_for_its_translation_is_hardly_constrained() -> 
 def test_a_textured_wall_is_ok() -> None:
     wall = wall_frame(np.eye(4))
     reference, levels = reference_of(wall, np.eye(4)), prepare(wall, CONFIG).levels
-    found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+    found = align(levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=GATE)
     weak = weak_directions(found.information, 1.0, CONFIG.min_eigen_ratio)
     assert verdict_of(health_at(wall, reference, found.T_world_camera), found.information, weak, CONFIG) == ("ok", ())
 

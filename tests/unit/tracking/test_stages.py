@@ -109,7 +109,7 @@ def test_with_little_time_the_direct_stage_takes_fewer_steps_and_a_pose_with_non
     )
     errors, skipped = [], []
     for share in 0.0, 0.5, 1.0:  # half of the time is enough for a quarter of the steps
-        slam = Slam(small_config(tracking__features="needed", tracking__wide="never"))
+        slam = Slam(small_config(tracking__features="needed", tracking__gicp="never"))
         with monkeypatch.context() as patched:
             leave_time_for(share, patched, of="direct")
             slam.process(tabletop()[0][0])

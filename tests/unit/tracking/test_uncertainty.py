@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatbot.config import TrackingConfig
+from splatbot.config import SensorConfig, TrackingConfig
 from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.tracking.align import Alignment, align
 from splatbot.tracking.prepare import Level, prepare
@@ -16,6 +16,7 @@ from splatbot.tracking.uncertainty import Uncertainty, alignment_covariance, wor
 from tests.rgbd import CAMERA, Array, rays_of, tabletop, wall_depth, wall_frame
 
 CONFIG = TrackingConfig(n_pixels=2000)
+GATE = CONFIG.sensor.max_depth_difference
 
 
 def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: float, depth_noise: float) -> Level:
@@ -32,14 +33,16 @@ def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: f
 
 def test_the_spread_of_the_residuals_tells_the_error_whatever_the_noise_model_says() -> None:
     """White noise of other strengths than configured: C⁻¹ S C⁻¹ alone has a NEES / 6 near 1."""
-    config = CONFIG.model_copy(update={"depth_sigma_scale": 1.0})  # all the noise there is is the pixels' own
+    config = TrackingConfig(
+        n_pixels=2000, sensor=SensorConfig(depth_sigma_scale=1.0)
+    )  # all the noise there is is the pixels' own
     rng, T = np.random.default_rng(1), se3_exp([0.004, -0.003, 0.005, 0.004, -0.003, 0.002])
     for gray_noise, depth_noise in ((0.01, 0.002), (0.04, 0.0005)):
         values = []
         for _ in range(40):
             reference = make_reference((corner_levels(np.eye(4), rng, 0.0, 0.0),), np.eye(4), CONFIG.n_pixels)
             level = corner_levels(T, rng, gray_noise, depth_noise)
-            found = align([level], [reference], T, config, photometric=True, finest=0, gate=CONFIG.gate)
+            found = align([level], [reference], T, config, photometric=True, finest=0, gate=GATE)
             C = np.linalg.inv(found.curvature)
             off = se3_log(inverse(found.T_world_camera) @ T)
             robust = C @ found.spread @ C * found.cells / (found.cells - 6)
@@ -54,7 +57,7 @@ def test_the_covariance_is_symmetric_positive_and_grows_as_pixels_go() -> None:
     sizes = []
     for n in (4000, 1000, 250):
         reference = make_reference(prepare(frames[0], CONFIG).levels, poses[0], n)
-        found = align(levels, [reference], poses[1], CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+        found = align(levels, [reference], poses[1], CONFIG, photometric=True, finest=0, gate=GATE)
         covariance = alignment_covariance(found)
         np.testing.assert_array_equal(covariance, covariance.T)
         assert np.linalg.eigvalsh(covariance)[0] > 0
@@ -82,7 +85,7 @@ def test_the_noise_model_counts_in_full_where_cells_are_too_few_to_tell(cells: i
 def test_a_blank_wall_is_not_known_along_itself() -> None:
     wall = prepare(wall_frame(np.eye(4), textured=False), CONFIG)
     reference = make_reference(wall.levels, np.eye(4), 1000)
-    found = align(wall.levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=CONFIG.gate)
+    found = align(wall.levels, [reference], np.eye(4), CONFIG, photometric=True, finest=0, gate=GATE)
     deviations = np.sqrt(np.diag(alignment_covariance(found)))
     assert deviations[2] < 5e-3
     assert deviations[:2].min() > 1.0
