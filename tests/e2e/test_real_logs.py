@@ -47,7 +47,7 @@ def check_twin(log: Path, run: Path) -> None:
 
 def check_images(log: Path, run: Path) -> None:
     """The recording whose reference errs by 2 cm: against photogrammetry of its images, as a user asks for it."""
-    words = [sys.executable, "-m", "splatbot.bench.bundle", str(log), str(run)]
+    words = [sys.executable, "-m", "experiments.bundle", str(log), str(run)]
     told = subprocess.run(words, capture_output=True, text=True, timeout=900, check=True).stdout
     lines = [line.split(": ") for line in told.splitlines() if "ATE" in line]
     ate = {name: float(text.split("ATE ")[1].split(" mm")[0]) for name, text in lines}

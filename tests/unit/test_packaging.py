@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 LINKED = ("services", "robots", "sim", "configs")
-FOLDERS = ("splatbot", *LINKED, "tests")
+FOLDERS = ("splatbot", *LINKED, "tests", "experiments")
 
 
 def _imports(path: Path) -> set[str]:

@@ -1,7 +1,7 @@
-"""How far the depths that a map can be asked for lie from the truth: `python -m splatbot.bench.model_depth [URI]`.
+"""Measure the bias of the depth that a map renders: `python -m experiments.model_depth [URI]`.
 
-Frames of a synthetic log are mapped at their exact poses; the map's depths are then compared with the exact ones at the
-keyframes' own views and at views half-way between them. Signed, because a bias is what tracking inherits.
+Frames of a synthetic log are mapped at their exact poses. The rendered depths are compared with the exact ones, at the
+views of the keyframes and at views half-way between them. Errors are signed, because tracking inherits a bias.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from splatbot.tracking.prepare import prepare
 Depth = NDArray[np.float32]
 
 URI = "synthetic:tabletop?frames=120&effects=depth_noise"
-_EVERY = 10  # frames from one keyframe to the next
+_KEYFRAME_PERIOD = 10  # [frames]
 
 
 @dataclass(frozen=True)
 class Bias:
-    """Errors of a depth image [m]: median and mean of the signed, mean of the absolute; share of pixels compared."""
+    """Median, mean and mean absolute error of a depth image [m], and the share of pixels compared."""
 
     median: float
     mean: float
@@ -42,15 +42,15 @@ class Bias:
 
 
 def biases(uri: str, config: Config) -> dict[str, dict[str, Bias]]:
-    """By kind of view and kind of depth."""
+    """Compute the errors by kind of view and kind of depth."""
     log = SyntheticLog(uri)
     exact = SyntheticLog(uri.split("&effects=")[0].split("?effects=")[0])
     mapper, poses = Mapper(config), log.ground_truth.T_world_camera
     T_first_world = inverse(poses[0])
-    keyframes = list(range(0, len(log), _EVERY))
+    keyframes = list(range(0, len(log), _KEYFRAME_PERIOD))
     for i in keyframes:
         mapper.insert(prepare(log[i], config.tracking), T_first_world @ poses[i], Features.none)
-    views = {"keyframes": keyframes, "between": [i + _EVERY // 2 for i in keyframes[:-1]]}
+    views = {"keyframes": keyframes, "between": [i + _KEYFRAME_PERIOD // 2 for i in keyframes[:-1]]}
     found: dict[str, dict[str, list[Bias]]] = {}
     for kind, indices in views.items():
         for i in indices:
@@ -97,10 +97,10 @@ def _mean(rows: list[Bias]) -> Bias:
 
 
 def main(argv: list[str]) -> None:
-    """Print the table for an address, by default a tabletop with a depth camera's noise."""
+    """Print the table for a log URI; the default is a tabletop with noise of a depth camera."""
     uri = argv[0] if argv else URI
     if not uri.startswith(PREFIX):
-        raise SystemExit(f"{uri}: needs exact truth; give synthetic:SCENE?...")
+        raise SystemExit(f"{uri} has no exact depth; give synthetic:SCENE?...")
     print(f"{uri}\n{'views':10} {'depth':22} {'median':>9} {'mean':>9} {'L1':>8}  pixels")
     for kind, table in biases(uri, Config()).items():
         for name, b in table.items():

@@ -1,4 +1,4 @@
-"""Bundle adjustment as an oracle of recordings: it finds exact poses from worse ones, and its scale is theirs."""
+"""Bundle adjustment recovers exact poses from perturbed ones and keeps their scale."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.bundle import _scale, bundle_adjusted, main
+from experiments.bundle import bundle_adjusted, main, umeyama_scale
 from splatbot.errors import InputError
 from splatbot.evaluation import absolute_error
 from splatbot.geometry import se3_exp
@@ -16,10 +16,10 @@ from splatbot.logs import open_log
 from splatbot.trajectory import Trajectory
 
 
-def test_the_scale_is_that_of_the_poses_it_begins_from(rng: np.random.Generator) -> None:
+def test_the_scale_is_that_of_the_initial_poses(rng: np.random.Generator) -> None:
     positions = rng.normal(size=(20, 3))
     turned = positions @ se3_exp([0, 0, 0, 0.3, -0.2, 0.9])[:3, :3].T
-    assert _scale(positions, 2.5 * turned + 4.0) == pytest.approx(2.5)
+    assert umeyama_scale(positions, 2.5 * turned + 4.0) == pytest.approx(2.5)
 
 
 def test_poses_of_rendered_images_are_found_from_worse_ones(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -38,6 +38,6 @@ def test_without_colmap_the_error_says_what_to_install(tmp_path: Path, monkeypat
         bundle_adjusted([], np.zeros((0, 4, 4)), tmp_path)
 
 
-def test_without_a_log_and_a_run_the_usage_is_told() -> None:
+def test_without_a_log_and_a_run_the_usage_is_printed() -> None:
     with pytest.raises(SystemExit, match="LOG RUN"):
         main(["log"])

@@ -1,11 +1,11 @@
-"""Poses from the alpha blend itself against the direct stage's: `python -m splatbot.bench.splat_stage [URI ...]`.
+"""Compare poses from the alpha blend with those of the direct stage: `python -m experiments.splat_stage [URI ...]`.
 
-Each frame of a synthetic log is tracked and mapped as always; then its pose is sought once more from there, by
-Gauss-Newton on pixels of the map's own rendering (colour, depth, and their derivatives with respect to the pose through
-the blend, by differences). Nothing of it goes back into the map: both poses are of the same frames in the same map.
+Each frame of a synthetic log is tracked and mapped as usual. Gauss-Newton then refines its pose on pixels of the
+rendered map: colour, depth, and their numerical derivatives with respect to the pose. The refined pose does not enter
+the map, so both poses belong to the same frames in the same map.
 
-What a native stage would cost is bounded from below by what it cannot do without: per step, the map projected, and
-blended once at the pixels in question; derivatives and sums are not counted.
+The reported time is a lower bound of a native stage: per step, one projection of the map and one blend of the chosen
+pixels. Derivatives and sums are not counted.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ URIS = (
     "synthetic:wall_soft?frames=30&seed=8&effects=depth_noise",
 )
 STEPS = ((1, 2), (0, 3))  # levels of the pyramid, and Gauss-Newton steps on each
-_DIFFERENCE = 2e-4  # [m] and [rad]: a tenth of a pixel
-_SOLID = 0.9  # least alpha of a pixel that counts
-_NU = 4.0  # of the Student-t weights, as in the direct stage
+_DIFFERENCE = 2e-4  # [m] and [rad] of the numerical derivatives: a tenth of a pixel
+_MIN_ALPHA = 0.9  # of a pixel that contributes a residual
+_NU = 4.0  # degrees of freedom of the Student-t weights, as in the direct stage
 
 
 @dataclass(frozen=True)
 class SplatRender:
-    """Grey, depth [m] and alpha of the map at chosen pixels (N,)."""
+    """Grey value, depth [m] and alpha of the map at chosen pixels, each (N,)."""
 
     gray: Array
     depth: Array
@@ -57,17 +57,17 @@ class SplatRender:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of the translation, RMS over the frames [m], and milliseconds of a frame."""
+    """RMS error of the translation over the frames [m], and the median time of a frame [ms]."""
 
     frames: int
     direct_m: float
     splat_m: float
     direct_ms: float
-    splat_least_ms: float
+    splat_min_ms: float
 
 
 def compare(uri: str, config: Config) -> Comparison:
-    """Direct poses and splat poses of a log's frames, each in the map as it was when the frame came."""
+    """Compare the poses of both stages for the frames of a log, each in the map at the time of the frame."""
     log = SyntheticLog(uri)
     truth = log.ground_truth.T_world_camera
     slam, errors, ms = Slam(config), [], []
@@ -78,10 +78,10 @@ def compare(uri: str, config: Config) -> Comparison:
         if index == 0 or result.T_world_camera is None:
             continue
         prepared = prepare(frame, config.tracking)
-        T, least_ms = align_to_map(model, prepared, result.T_world_camera, config)
+        T, min_ms = align_to_map(model, prepared, result.T_world_camera, config)
         T_true = inverse(truth[0]) @ truth[index]
-        errors.append([_off(T_true, result.T_world_camera), _off(T_true, T)])
-        ms.append([result.stage_ms["direct"], least_ms])
+        errors.append([_translation_error(T_true, result.T_world_camera), _translation_error(T_true, T)])
+        ms.append([result.stage_ms["direct"], min_ms])
     direct_m, splat_m = np.sqrt(np.mean(np.square(errors), axis=0))
     return Comparison(len(errors), float(direct_m), float(splat_m), *(float(t) for t in np.median(ms, axis=0)))
 
@@ -89,21 +89,31 @@ def compare(uri: str, config: Config) -> Comparison:
 def align_to_map(
     model: GaussianModel, prepared: PreparedFrame, T_world_camera: Array, config: Config
 ) -> tuple[Array, float]:
-    """T_world_camera (4, 4) that the map's rendering explains best from a start, and the least it can cost [ms]."""
-    T_camera_world, least_ms = inverse(T_world_camera), 0.0
+    """Refine a pose by Gauss-Newton on the rendered map.
+
+    Args:
+        model: the map.
+        prepared: the image pyramid of the frame.
+        T_world_camera: (4, 4), initial pose.
+        config: settings of tracking.
+
+    Returns:
+        The refined T_world_camera (4, 4), and a lower bound of the time [ms].
+    """
+    T_camera_world, min_ms = inverse(T_world_camera), 0.0
     for index, steps in STEPS:
         level = prepared.levels[index]
         normals, slopes = normals_of(level.depth, level.camera), slopes_of(level.gray)
         pixels = sampled_pixels(level, normals, slopes, config.tracking.n_pixels)
         exposure = np.array([1.0, 0.0])
         for _ in range(steps):
-            least_ms += _least_ms(model, level, pixels, T_camera_world)
+            min_ms += _min_ms(model, level, pixels, T_camera_world)
             shown = _render(model, level, pixels, T_camera_world)
             moved = [_render(model, level, pixels, se3_exp(_DIFFERENCE * axis) @ T_camera_world) for axis in np.eye(6)]
             step = _solve(level, pixels, shown, moved, exposure, config)
             T_camera_world = se3_exp(step[:6]) @ T_camera_world
             exposure += step[6:]
-    return inverse(T_camera_world), least_ms
+    return inverse(T_camera_world), min_ms
 
 
 def _render(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> SplatRender:
@@ -112,8 +122,8 @@ def _render(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Ar
     return SplatRender(*(image[pixels].astype(np.float64) for image in (gray, view.depth.numpy(), view.alpha.numpy())))
 
 
-def _least_ms(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> float:
-    """Milliseconds of the map's Gaussians projected, and blended where a chosen pixel lies."""
+def _min_ms(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> float:
+    """Measure the time [ms] of one projection of the map and one blend of the chosen pixels."""
     arguments = model.means, model.quats, model.scales, model.opacities, model.colors
     camera, at = level.camera, torch.from_numpy(np.argwhere(pixels)[:, ::-1].copy())
     viewmat, K = torch.from_numpy(T_camera_world)[None], torch.from_numpy(camera.K_corner)[None]
@@ -130,7 +140,10 @@ def _solve(
     exposure: Array,
     config: Config,
 ) -> Array:
-    """The step (8,): twist (t, ω) that left-multiplies T_camera_world, gain and offset."""
+    """Solve the Gauss-Newton step H δ = -Jᵀ W r with Student-t weights W.
+
+    δ (8,) is the twist (t, ω) that left-multiplies T_camera_world, then gain and offset of the exposure.
+    """
     c = config.tracking
     depth = level.depth[pixels].astype(np.float64)
     sigma_depth = c.sensor.depth_sigma_scale * (c.sensor.sigma_depth_floor + c.sensor.sigma_depth_quad * depth**2)
@@ -138,29 +151,29 @@ def _solve(
     r_depth = (shown.depth - depth) / sigma_depth
     J_gray = np.stack([exposure[0] * (m.gray - shown.gray) / _DIFFERENCE for m in moved], 1) / c.sensor.sigma_gray
     J_depth = np.stack([(m.depth - shown.depth) / _DIFFERENCE for m in moved], 1) / sigma_depth[:, None]
-    solid = shown.alpha > _SOLID
-    near = solid & (depth > 0) & (np.abs(shown.depth - depth) < c.sensor.max_depth_difference)
-    of_exposure = np.stack([shown.gray, np.ones_like(depth)], 1) / c.sensor.sigma_gray
-    J = np.concatenate([np.hstack([J_gray, of_exposure])[solid], np.hstack([J_depth, 0 * of_exposure])[near]])
-    r = np.concatenate([r_gray[solid], r_depth[near]])
+    opaque = shown.alpha > _MIN_ALPHA
+    near = opaque & (depth > 0) & (np.abs(shown.depth - depth) < c.sensor.max_depth_difference)
+    J_exposure = np.stack([shown.gray, np.ones_like(depth)], 1) / c.sensor.sigma_gray
+    J = np.concatenate([np.hstack([J_gray, J_exposure])[opaque], np.hstack([J_depth, 0 * J_exposure])[near]])
+    r = np.concatenate([r_gray[opaque], r_depth[near]])
     weight = (_NU + 1) / (_NU + r**2)
     H = (J * weight[:, None]).T @ J
     H += np.diag([*[1e-5 * np.trace(H[:6, :6]) / 6] * 6, 1e2, 1e2])
     return np.linalg.solve(H, -(J * weight[:, None]).T @ r)
 
 
-def _off(T_true: Array, T: Array) -> float:
+def _translation_error(T_true: Array, T: Array) -> float:
     return float(np.linalg.norm(se3_log(inverse(T) @ T_true)[:3]))
 
 
 def main(argv: Sequence[str]) -> None:
-    """Print the comparison for addresses of synthetic logs, by default five."""
-    print("errors of the translation, RMS over the frames, and the median time of a frame")
+    """Print the comparison for URIs of synthetic logs; five are the default."""
+    print("RMS error of the translation over the frames, and the median time of a frame")
     with threads(1):
         for uri in argv or URIS:
             found = compare(uri, load_config(environ={}))
             direct = f"direct {1e3 * found.direct_m:.2f} mm, {found.direct_ms:.1f} ms"
-            print(f"{uri}\n    {direct}; splat {1e3 * found.splat_m:.2f} mm, over {found.splat_least_ms:.0f} ms")
+            print(f"{uri}\n    {direct}; splat {1e3 * found.splat_m:.2f} mm, more than {found.splat_min_ms:.0f} ms")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""How good a recording's reference is: `python -m splatbot.bench.bundle LOG RUN`, against photogrammetry of its images.
+"""Assess the reference trajectory of a recording by bundle adjustment: `python -m experiments.bundle LOG RUN`.
 
-SIFT features of all colour images, matched between all pairs, triangulated and adjusted together with all poses by
-COLMAP (Schoenberger and Frahm 2016; pycolmap is of the extra `dev`, splatbot itself does not need it). Depth takes no
-part, nor does anything that tracking computed but the poses it begins from; the scale, which images do not tell, is
-that of the run. What agrees with it is consistent with the images; where a reference is farther from it than a run is,
-an ATE against that reference says more of the reference than of the run.
+COLMAP (Schoenberger and Frahm 2016; pycolmap is in the extra `dev`) extracts SIFT features of all colour images and
+matches them between all pairs. It then triangulates points and adjusts them together with all poses. Depth images are
+not used; the run supplies the initial poses and the scale, which images alone cannot determine.
+
+A trajectory that agrees with the result is consistent with the images. If the reference deviates more from the result
+than the run does, the ATE against that reference measures the reference rather than the run.
 """
 
 from __future__ import annotations
@@ -30,14 +31,23 @@ from splatbot.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-_ROUNDS = 3  # of triangulation and adjustment
-_LEAST_ANGLE = 0.7  # [deg] between the rays to a point; recordings of a table top move by centimetres
+_ROUNDS = 3  # each triangulates and adjusts
+_MIN_ANGLE = 0.7  # [deg] between the rays to a point; the camera at a table top moves by centimetres
 
 
 def bundle_adjusted(frames: Sequence[Frame], T_world_camera: Array, folder: Path) -> tuple[Array, float]:
-    """Poses (N, 4, 4) of frames by bundle adjustment that begins at given ones, and its reprojection error [px].
+    """Adjust poses of frames by bundle adjustment.
 
-    Positions are scaled to those that were given; the frame of reference is free.
+    Args:
+        frames: N frames of one camera.
+        T_world_camera: (N, 4, 4), initial poses; they determine the scale of the result.
+        folder: empty folder for the database of COLMAP.
+
+    Returns:
+        Poses (N, 4, 4) in an arbitrary world frame, and the mean reprojection error [px].
+
+    Raises:
+        InputError: pycolmap is not installed.
     """
     colmap = _colmap()
     images = folder / "images"
@@ -51,9 +61,9 @@ def bundle_adjusted(frames: Sequence[Frame], T_world_camera: Array, folder: Path
     database = folder / "database.db"
     colmap.extract_features(database, images, camera_mode=colmap.CameraMode.SINGLE, reader_options=reader)
     colmap.match_exhaustive(database)
-    model = _begun(colmap, database, folder, names, T_world_camera)
+    model = _initial_model(colmap, database, folder, names, T_world_camera)
     options = colmap.IncrementalPipelineOptions()
-    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = _LEAST_ANGLE
+    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = _MIN_ANGLE
     fixed = colmap.BundleAdjustmentOptions()
     fixed.refine_focal_length = fixed.refine_principal_point = fixed.refine_extra_params = False
     for _ in range(_ROUNDS):
@@ -63,7 +73,7 @@ def bundle_adjusted(frames: Sequence[Frame], T_world_camera: Array, folder: Path
     found = np.tile(np.eye(4), (len(names), 1, 1))
     for k, name in enumerate(names):
         found[k, :3] = by_name[name].cam_from_world().inverse().matrix()
-    found[:, :3, 3] *= _scale(found[:, :3, 3], T_world_camera[:, :3, 3])
+    found[:, :3, 3] *= umeyama_scale(found[:, :3, 3], T_world_camera[:, :3, 3])
     return found, float(model.compute_mean_reprojection_error())
 
 
@@ -74,12 +84,12 @@ def _colmap() -> Any:
         raise InputError(
             "pycolmap is not installed.", field="pycolmap", hint="pip install pycolmap, or splatbot[dev]"
         ) from error
-    colmap.logging.minloglevel = colmap.logging.ERROR.value  # a line for each image, and more
+    colmap.logging.minloglevel = colmap.logging.ERROR.value  # INFO prints a line per image
     return colmap
 
 
-def _begun(colmap: Any, database: Path, folder: Path, names: Sequence[str], T_world_camera: Array) -> Any:
-    """A reconstruction with the poses that are given and no points, through COLMAP's text format."""
+def _initial_model(colmap: Any, database: Path, folder: Path, names: Sequence[str], T_world_camera: Array) -> Any:
+    """Build a reconstruction with the given poses and no points, through the text format of COLMAP."""
     known = colmap.Database.open(database)
     ids, camera = {image.name: image.image_id for image in known.read_all_images()}, known.read_all_cameras()[0]
     known.close()
@@ -98,18 +108,18 @@ def _begun(colmap: Any, database: Path, folder: Path, names: Sequence[str], T_wo
     return model
 
 
-def _scale(positions: Array, like: Array) -> float:
-    """Least-squares scale of positions (N, 3) that makes them like others (N, 3) (Umeyama 1991)."""
-    a, b = positions - positions.mean(axis=0), like - like.mean(axis=0)
+def umeyama_scale(positions: Array, target: Array) -> float:
+    """Return the least-squares scale that aligns positions (N, 3) with target (N, 3) (Umeyama 1991, eq. 42)."""
+    a, b = positions - positions.mean(axis=0), target - target.mean(axis=0)
     U, s, Vt = np.linalg.svd(b.T @ a)
     s[2] *= np.sign(np.linalg.det(U @ Vt))
     return float(s.sum() / (a**2).sum())
 
 
 def main(argv: Sequence[str]) -> None:
-    """Print how far a run and the log's references are from bundle adjustment, and from each other [mm]."""
+    """Print the ATE [mm] between a run, the references of its log, and bundle adjustment."""
     if len(argv) != 2:
-        raise SystemExit("usage: python -m splatbot.bench.bundle LOG RUN")
+        raise SystemExit("usage: python -m experiments.bundle LOG RUN")
     log, run = open_log(argv[0]), RunFolder(argv[1])
     track, indices = run.load_trajectory(), sorted(run.load_poses())
     with tempfile.TemporaryDirectory() as folder:
@@ -118,12 +128,12 @@ def main(argv: Sequence[str]) -> None:
     print(f"{len(indices)} images, reprojection {pixels:.2f} px")
     for path in sorted(Path(argv[0]).glob("groundtruth*.txt")):
         reference = load_trajectory(path)
-        print(f"{path.name} to bundle adjustment: {_apart(adjusted, reference)}")
-        print(f"the run to {path.name}: {_apart(reference, track)}")
-    print(f"the run to bundle adjustment: {_apart(adjusted, track)}")
+        print(f"{path.name} to bundle adjustment: {_ate(adjusted, reference)}")
+        print(f"the run to {path.name}: {_ate(reference, track)}")
+    print(f"the run to bundle adjustment: {_ate(adjusted, track)}")
 
 
-def _apart(reference: Trajectory, estimate: Trajectory) -> str:
+def _ate(reference: Trajectory, estimate: Trajectory) -> str:
     found = absolute_error(reference, estimate)
     return f"ATE {1e3 * found.rmse:.1f} mm, median {1e3 * found.median:.1f} mm"
 

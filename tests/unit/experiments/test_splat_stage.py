@@ -1,4 +1,4 @@
-"""The splat stage that the direct one is compared with finds the pose at which the map shows the frame."""
+"""The splat stage converges to the pose at which the map renders the frame."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatbot.bench.splat_stage import align_to_map, compare
+from experiments.splat_stage import align_to_map, compare
 from splatbot.geometry import se3_exp
 from splatbot.rasterize.views import render_view
 from splatbot.slam import Slam
@@ -35,4 +35,4 @@ def test_both_stages_are_scored_on_the_same_frames() -> None:
     assert found.frames == 3
     assert 0 < found.direct_m < 2e-3
     assert 0 < found.splat_m < 1e-2
-    assert min(found.direct_ms, found.splat_least_ms) > 0
+    assert min(found.direct_ms, found.splat_min_ms) > 0
