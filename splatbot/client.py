@@ -1,4 +1,4 @@
-"""A client of the HTTP service; needs nothing of the service's side.
+"""Client of the HTTP service; it imports no part of the service.
 
 >>> from splatbot.client import Client
 >>> robot = Client("http://127.0.0.1:8000")
@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import http.client
 import io
 import json
 import ssl
@@ -18,6 +17,7 @@ from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote, urlsplit
 
+import httpx
 import msgpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,12 +31,12 @@ _ENDED = ("succeeded", "failed", "cancelled")
 
 
 class ServiceError(SplatbotError):
-    """The service refused, or could not be reached.
+    """The service refused a request, or did not answer.
 
     Args:
-        message: the problem's detail.
-        status: of HTTP; 0: no answer came.
-        problem: the whole problem document.
+        message: detail of the problem document.
+        status: HTTP status; 0 if no answer arrived.
+        problem: the whole problem document (RFC 9457).
     """
 
     def __init__(self, message: str, *, status: int = 0, problem: Mapping[str, Any] | None = None) -> None:
@@ -48,13 +48,13 @@ class ServiceError(SplatbotError):
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """How far P points are from the map.
+    """Mahalanobis distances of P points to the map.
 
     Args:
-        distance: (P,) float32, in standard deviations of the nearest Gaussian; infinity: the map is empty.
-        index: (P,) that Gaussian's row; -1: the map is empty.
-        inside: (P,) bool.
-        map_version: the state that was asked.
+        distance: (P,) float32, in standard deviations of the nearest Gaussian; infinity in an empty map.
+        index: (P,) row of that Gaussian; -1 in an empty map.
+        inside: (P,) bool, whether the distance is below ``n_sigma``.
+        map_version: version of the map that answered.
     """
 
     distance: NDArray[np.float32]
@@ -65,15 +65,15 @@ class Distances:
 
 @dataclass(frozen=True, eq=False)
 class Collisions:
-    """Verdicts on C configurations.
+    """Collision verdicts of C configurations.
 
     Args:
-        in_collision: (C,) bool; False is certain.
-        link: (C,) the link that touches, -1: none.
-        other: (C,) the link that it touches, -1: the map.
+        in_collision: (C,) bool; False is certified.
+        link: (C,) link in collision; -1 if the configuration is free.
+        other: (C,) link that it collides with; -1 is the map.
         clearance: (C,) [m].
-        gradient: (C, J) of the clearance; None unless asked for.
-        map_version: the state that was asked.
+        gradient: (C, J) of the clearance; None unless it was requested.
+        map_version: version of the map that answered.
     """
 
     in_collision: NDArray[np.bool_]
@@ -86,15 +86,15 @@ class Collisions:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """What became of a pushed frame.
+    """Result of a pushed frame.
 
     Args:
-        T_world_camera: (4, 4); None: lost.
+        T_world_camera: (4, 4); None if the frame is lost.
         verdict: "ok", "degraded" or "lost".
-        keyframe: whether it entered the map.
-        gaussians: in the map afterwards.
-        map_version: the latest state.
-        stage_ms: what each stage of tracking and mapping took [ms].
+        keyframe: whether the frame entered the map.
+        gaussians: size of the map afterwards.
+        map_version: latest version of the map.
+        stage_ms: time of each stage of tracking and mapping [ms].
     """
 
     T_world_camera: NDArray[np.float64] | None
@@ -106,17 +106,17 @@ class TrackedFrame:
 
 
 class Client:
-    """One connection to a service; for use by one thread at a time.
+    """Connection to a service, for use by one thread at a time.
 
     Args:
-        url: of the service, "http://host:port" or "https://...".
-        key: API key, where the service wants one.
-        timeout_s: how long an answer may take [s].
-        retries: how often it asks again when it is told "later" (429, 503).
-        tls: for https; None trusts what the system trusts.
+        url: "http://host:port" or "https://...".
+        key: API key, if the service requires one.
+        timeout_s: longest wait for an answer [s].
+        retries: number of repetitions after the statuses 429 and 503.
+        tls: context for https. If None, the certificates of the system are trusted.
 
     Raises:
-        InputError: the URL is none.
+        InputError: the URL is not one of HTTP.
     """
 
     def __init__(
@@ -131,43 +131,42 @@ class Client:
         parts = urlsplit(url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise InputError(f"is {url!r}.", field="url", hint="give http://host:port")
-        self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._retries = retries
-        self._connection: http.client.HTTPConnection
-        if parts.scheme == "https":
-            self._connection = http.client.HTTPSConnection(
-                parts.hostname, parts.port, timeout=timeout_s, context=tls or ssl.create_default_context()
-            )
-        else:
-            self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=timeout_s)
+        self._http = httpx.Client(
+            base_url=f"{parts.scheme}://{parts.netloc}",
+            headers={"Authorization": f"Bearer {key}"} if key else {},
+            timeout=timeout_s,
+            verify=(tls or ssl.create_default_context()) if parts.scheme == "https" else False,
+            trust_env=False,  # the proxies of the environment are for other hosts than a robot's
+        )
 
     def maps(self) -> list[dict[str, Any]]:
-        """All maps."""
+        """List all maps."""
         found: list[dict[str, Any]] = self._json("GET", "/v1/maps")["maps"]
         return found
 
     def map(self, map_id: str) -> dict[str, Any]:
-        """One map: id, map_version, state, gaussians, bounds, ..."""
-        return self._json("GET", f"/v1/maps/{quote(map_id, safe='')}")
+        """Return the description of a map: id, map_version, state, gaussians, bounds, ..."""
+        return self._json("GET", _map_path(map_id))
 
     def create_map(self, map_id: str, log: str | None = None, *, key: str | None = None, **more: Any) -> dict[str, Any]:
-        """A map of a recording: its job; or, without ``log``, an empty one for :meth:`push`: its description.
+        """Create a map of a recording and return its job; without ``log``, an empty map for :meth:`push`.
 
         Args:
-            map_id: its name.
+            map_id: name of the map.
             log: synthetic:SCENE?..., or a folder under the service's log roots.
-            key: Idempotency-Key: asked again with it, the same job is returned.
+            key: Idempotency-Key; a repeated request with the same key returns the same job.
             more: camera, max_frames, robot_base.
         """
         body = {"id": map_id, **({"log": log} if log is not None else {}), **more}
-        return self._json("POST", "/v1/maps", body, {"Idempotency-Key": key} if key else {})
+        return self._json("POST", "/v1/maps", body, _idempotency(key))
 
     def delete_map(self, map_id: str) -> None:
-        """Forget a map."""
-        self.request("DELETE", f"/v1/maps/{quote(map_id, safe='')}")
+        """Delete a map."""
+        self.request("DELETE", _map_path(map_id))
 
     def push(self, map_id: str, frame: Frame) -> TrackedFrame:
-        """Have a frame tracked and mapped; waits while the service has too many frames in work."""
+        """Send a frame for tracking and mapping; wait while too many frames are in progress."""
         c = frame.camera
         body = {
             "stamp": frame.stamp,
@@ -176,107 +175,103 @@ class Client:
             "depth": frame.depth,
             "joints": None if frame.joints is None else frame.joints.tolist(),
         }
-        told = self._packed("POST", f"/v1/maps/{quote(map_id, safe='')}/frames", body)
+        answer = self._packed("POST", _map_path(map_id, "frames"), body)
         return TrackedFrame(
-            T_world_camera=told["T_world_camera"],
-            verdict=told["verdict"],
-            keyframe=told["keyframe"],
-            gaussians=told["gaussians"],
-            map_version=told["map_version"],
-            stage_ms=told["stage_ms"],
+            T_world_camera=answer["T_world_camera"],
+            verdict=answer["verdict"],
+            keyframe=answer["keyframe"],
+            gaussians=answer["gaussians"],
+            map_version=answer["map_version"],
+            stage_ms=answer["stage_ms"],
         )
 
     def end(self, map_id: str) -> None:
-        """No more frames will be pushed."""
-        self.request("POST", f"/v1/maps/{quote(map_id, safe='')}/end")
+        """End the stream of pushed frames."""
+        self.request("POST", _map_path(map_id, "end"))
 
     def distance(self, map_id: str, points: ArrayLike, *, n_sigma: float = 2.0) -> Distances:
-        """How far points (P, 3) [m] are from the map."""
+        """Query the Mahalanobis distance of points (P, 3) [m] to the map."""
         body = {"points": np.asarray(points, dtype=np.float64).reshape(-1, 3), "n_sigma": n_sigma}
-        told = self._packed("POST", f"/v1/maps/{quote(map_id, safe='')}/distance", body)
-        return Distances(told["distance"], told["index"], told["inside"], told["map_version"])
+        answer = self._packed("POST", _map_path(map_id, "distance"), body)
+        return Distances(answer["distance"], answer["index"], answer["inside"], answer["map_version"])
 
     def distance_npy(self, map_id: str, points: ArrayLike) -> NDArray[np.float32]:
-        """The distances (P,) alone, of points (P, 3) [m]: the least that can be sent either way."""
+        """Query the distances (P,) of points (P, 3) [m] alone, with the smallest bodies in both directions."""
         sent = io.BytesIO()
         np.save(sent, np.asarray(points), allow_pickle=False)
-        path = f"/v1/maps/{quote(map_id, safe='')}/distance"
-        data, _ = self.request("POST", path, sent.getvalue(), {"Content-Type": _NPY, "Accept": _NPY})
+        headers = {"Content-Type": _NPY, "Accept": _NPY}
+        data, _ = self.request("POST", _map_path(map_id, "distance"), sent.getvalue(), headers)
         return np.asarray(np.load(io.BytesIO(data), allow_pickle=False), dtype=np.float32)
 
     def collisions(self, map_id: str, q: ArrayLike, *, gradient: bool = False, **more: Any) -> Collisions:
-        """Whether configurations (C, J) touch the map or the arm itself, and how much room they have.
+        """Check configurations (C, J) against the map and the arm itself, and return their clearance.
 
         Args:
-            map_id: the map.
+            map_id: name of the map.
             q: (C, J) [rad or m].
-            gradient: also the clearance's.
+            gradient: whether to return the gradient of the clearance.
             more: robot, base, margin, opening.
         """
         body = {"q": np.atleast_2d(np.asarray(q, dtype=np.float64)), "gradient": gradient, **more}
-        told = self._packed("POST", f"/v1/maps/{quote(map_id, safe='')}/collisions", body)
+        answer = self._packed("POST", _map_path(map_id, "collisions"), body)
         return Collisions(
-            in_collision=told["in_collision"],
-            link=told["link"],
-            other=told["other"],
-            clearance=told["clearance"],
-            gradient=told.get("gradient"),
-            map_version=told["map_version"],
+            in_collision=answer["in_collision"],
+            link=answer["link"],
+            other=answer["other"],
+            clearance=answer["clearance"],
+            gradient=answer.get("gradient"),
+            map_version=answer["map_version"],
         )
 
     def views(
         self, map_id: str, views: Sequence[Mapping[str, Any]], modes: Sequence[str] = ("rgb",)
     ) -> list[dict[str, NDArray[Any]]]:
-        """Images by mode for each of ``views`` ({"camera": {...}, "pose": {...}}): rgb uint8, depth float32 [m]."""
-        body = {"views": list(views), "modes": list(modes)}
-        drawn: list[dict[str, NDArray[Any]]] = self._packed("POST", f"/v1/maps/{quote(map_id, safe='')}/views", body)[
-            "views"
-        ]
-        return drawn
+        """Render ``views`` ({"camera": {...}, "pose": {...}}); images by mode: rgb uint8, depth float32 [m]."""
+        answer = self._packed("POST", _map_path(map_id, "views"), {"views": list(views), "modes": list(modes)})
+        rendered: list[dict[str, NDArray[Any]]] = answer["views"]
+        return rendered
 
-    def plan(self, map_id: str, **asked: Any) -> dict[str, Any]:
-        """A certified motion; see POST /v1/maps/{map_id}/plans for what may be asked. No motion is an error."""
-        return self._json("POST", f"/v1/maps/{quote(map_id, safe='')}/plans", asked)
+    def plan(self, map_id: str, **request: Any) -> dict[str, Any]:
+        """Plan a certified motion; POST /v1/maps/{map_id}/plans defines the fields. A failed plan is an error."""
+        return self._json("POST", _map_path(map_id, "plans"), request)
 
-    def grasps(self, map_id: str, **asked: Any) -> dict[str, Any]:
-        """Ranked grasps of a thing; see POST /v1/maps/{map_id}/grasps for how it is named. No grasp is an error."""
-        return self._json("POST", f"/v1/maps/{quote(map_id, safe='')}/grasps", asked)
+    def grasps(self, map_id: str, **request: Any) -> dict[str, Any]:
+        """Rank grasps of an object; POST /v1/maps/{map_id}/grasps defines the fields. No grasp is an error."""
+        return self._json("POST", _map_path(map_id, "grasps"), request)
 
     def pick(self, scene: str, target: str, *, key: str | None = None, **more: Any) -> dict[str, Any]:
-        """Pick a thing in the twin of a shipped scene: the job, to be watched by :meth:`wait` or :meth:`events`.
+        """Pick an object in the twin of a shipped scene; return the job for :meth:`wait` or :meth:`events`.
 
         Args:
-            scene: its name.
-            target: a name of the scene, or words.
-            key: Idempotency-Key: asked again with it, the same job is returned.
+            scene: name of the scene.
+            target: name of an object in the scene, or a description in words.
+            key: Idempotency-Key; a repeated request with the same key returns the same job.
             more: views, lift, force, tries, budget_ms, margin, home, seed.
         """
-        headers = {"Idempotency-Key": key} if key else {}
-        return self._json("POST", "/v1/picks", {"scene": scene, "target": target, **more}, headers)
+        return self._json("POST", "/v1/picks", {"scene": scene, "target": target, **more}, _idempotency(key))
 
     def cancel(self, job_id: str) -> dict[str, Any]:
-        """Cancel a job; as it stands then."""
+        """Cancel a job and return its state."""
         return self._json("DELETE", f"/v1/jobs/{quote(job_id, safe='')}")
 
     def ik(self, pose: Mapping[str, Any], **more: Any) -> NDArray[np.float64]:
-        """Configurations (K, J) that bring the tool to a pose."""
+        """Solve the inverse kinematics; return configurations (K, J) that place the tool at a pose."""
         found: NDArray[np.float64] = self._packed("POST", "/v1/ik", {"pose": dict(pose), **more})["q"]
         return found
 
     def send(self, plan_id: str, *, arm: str = "fake", key: str | None = None) -> dict[str, Any]:
-        """Let an arm follow a plan; the motion, to be watched by :meth:`wait` under "/v1/trajectories"."""
-        headers = {"Idempotency-Key": key} if key else {}
-        return self._json("POST", "/v1/trajectories", {"plan": plan_id, "arm": arm}, headers)
+        """Send a plan to an arm; return the motion for :meth:`wait` with ``under="/v1/trajectories"``."""
+        return self._json("POST", "/v1/trajectories", {"plan": plan_id, "arm": arm}, _idempotency(key))
 
     def stop(self, motion_id: str) -> dict[str, Any]:
-        """Stop an arm's motion."""
+        """Stop the motion of an arm."""
         return self._json("DELETE", f"/v1/trajectories/{quote(motion_id, safe='')}")
 
     def wait(self, job_id: str, *, under: str = "/v1/jobs", timeout_s: float = 600.0) -> dict[str, Any]:
-        """The job once it has ended.
+        """Wait for a job and return it once it has ended.
 
         Raises:
-            ServiceError: it has not ended in time.
+            ServiceError: the job has not ended in time.
         """
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
@@ -287,49 +282,44 @@ class Client:
         raise ServiceError(f"job {job_id} has not ended within {timeout_s:g} s.")
 
     def events(self, path: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Name and data of each server-sent event of e.g. "/v1/jobs/ID/events", to the end of the stream."""
-        self._connection.request("GET", path, headers=self._headers | {"Accept": "text/event-stream"})
-        response = self._connection.getresponse()
-        if response.status != 200:
-            raise _refused(response.status, response.read())
-        name, data = "message", ""
-        while line := response.readline():
-            text = line.decode().rstrip("\r\n")
-            if text.startswith("event:"):
-                name = text[6:].strip()
-            elif text.startswith("data:"):
-                data += text[5:].strip()
-            elif not text and data:
-                yield name, json.loads(data)
-                name, data = "message", ""
+        """Yield name and data of each server-sent event of a path such as "/v1/jobs/ID/events"."""
+        with self._http.stream("GET", path, headers={"Accept": "text/event-stream"}) as response:
+            if response.status_code != 200:
+                raise _refused(response.status_code, response.read())
+            name, data = "message", ""
+            for text in response.iter_lines():
+                if text.startswith("event:"):
+                    name = text[6:].strip()
+                elif text.startswith("data:"):
+                    data += text[5:].strip()
+                elif not text and data:
+                    yield name, json.loads(data)
+                    name, data = "message", ""
 
     def request(
         self, method: str, path: str, body: bytes | None = None, headers: Mapping[str, str] | None = None
     ) -> tuple[bytes, Mapping[str, str]]:
-        """One request; the answer's body and headers. What is answered "later" (429, 503) is asked again in a while.
+        """Send a request and return body and headers of the answer; repeat it after the statuses 429 and 503.
 
         Raises:
-            ServiceError: it was refused, or no answer came.
+            ServiceError: the service refused the request, or did not answer.
         """
         for attempt in range(self._retries + 1):
             try:
-                self._connection.request(method, path, body, self._headers | dict(headers or {}))
-                response = self._connection.getresponse()
-                data = response.read()
-            except (OSError, http.client.HTTPException) as error:
-                self._connection.close()
+                response = self._http.request(method, path, content=body, headers=dict(headers or {}))
+            except httpx.HTTPError as error:
                 raise ServiceError(f"no answer ({error or type(error).__name__}).") from error
-            told = {name.lower(): value for name, value in response.getheaders()}
-            if response.status < 400:
-                return data, told
-            if attempt == self._retries or response.status not in (429, 503) or "retry-after" not in told:
-                raise _refused(response.status, data)
-            time.sleep(min(10.0, float(told["retry-after"])))
+            if response.status_code < 400:
+                return response.content, response.headers
+            wait_s = response.headers.get("retry-after")
+            if attempt == self._retries or response.status_code not in (429, 503) or wait_s is None:
+                raise _refused(response.status_code, response.content)
+            time.sleep(min(10.0, float(wait_s)))
         raise AssertionError("the last attempt returns or raises")
 
     def close(self) -> None:
-        """End the connection."""
-        self._connection.close()
+        """Close the connection."""
+        self._http.close()
 
     def __enter__(self) -> Self:
         return self
@@ -355,6 +345,14 @@ class Client:
         return found
 
 
+def _map_path(map_id: str, *rest: str) -> str:
+    return "/".join(("/v1/maps", quote(map_id, safe=""), *rest))
+
+
+def _idempotency(key: str | None) -> dict[str, str]:
+    return {"Idempotency-Key": key} if key else {}
+
+
 def _refused(status: int, data: bytes) -> ServiceError:
     try:
         problem = json.loads(data)
@@ -364,7 +362,7 @@ def _refused(status: int, data: bytes) -> ServiceError:
 
 
 def pack_array(value: Any) -> Any:
-    """How msgpack carries an array: {dtype, shape, data}; numpy's numbers become Python's."""
+    """Convert an array to {dtype, shape, data} for msgpack, and a number of numpy to one of Python."""
     if isinstance(value, np.ndarray):
         return {"dtype": value.dtype.str, "shape": list(value.shape), "data": np.ascontiguousarray(value).tobytes()}
     if isinstance(value, np.generic):
