@@ -43,7 +43,7 @@ camera axes OpenCV's (x right, y down, z forward). Every answer names the `map_v
 
 
 def create_app(runtime: Runtime) -> FastAPI:
-    """The service on ``runtime``, which begins with the application and ends with it."""
+    """Create the service on ``runtime``, which starts and stops with the application."""
     settings = runtime.settings
     integrations = Integrations(settings, runtime.store, runtime.arms, on_frame=runtime.take)
 

@@ -20,15 +20,15 @@ from splatbot.services.bus import Bus
 from splatbot.services.jobs import Job, JobCancelled, JobHandle, Jobs
 from splatbot.services.topics import JOINTS, JointState, arm_topic, motion_topic, robot_topic
 
-_TOLD_EVERY_S = 0.02
+_FEEDBACK_PERIOD_S = 0.02
 
 
 @lru_cache(maxsize=8)
 def known_robot(name: str) -> RobotModel:
-    """A robot by name, built once; unlike :func:`splatbot.robots.store.load_robot` it takes no path.
+    """Return a robot by name, built once; unlike :func:`splatbot.robots.store.load_robot` it takes no path.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: the name is unknown.
     """
     if name not in robot_names():
         raise InputError(f"is {name[:80]!r}.", field="robot", hint=f"robots: {', '.join(robot_names())}")
@@ -36,12 +36,12 @@ def known_robot(name: str) -> RobotModel:
 
 
 def fake_arm(robot: RobotModel) -> Controller:
-    """An arm that moves exactly as told, from its home."""
+    """Return an arm that follows its commands exactly, from its home."""
     return FakeController(robot.home, period=0.005)
 
 
 def twin_arm(robot: RobotModel) -> Controller:
-    """The arm of a twin in an empty scene; needs MuJoCo."""
+    """Return the arm of a twin in an empty scene; needs MuJoCo."""
     from splatbot.sim.controller import TwinController
     from splatbot.sim.scene import load_scene
     from splatbot.sim.twin import Twin
@@ -67,7 +67,7 @@ class Arm:
     feedback: Feedback | None = None
 
     def ready(self) -> Controller:
-        """The controller, made by the first call."""
+        """Return the controller, which the first call creates."""
         if self.controller is None:
             self.controller = self.make(self.robot)
             self.feedback = self.controller.step()
@@ -75,16 +75,16 @@ class Arm:
 
     @property
     def busy(self) -> bool:
-        """Whether a motion is under way."""
+        """True while a motion is in progress."""
         return self.lock.locked()
 
 
 class Arms:
-    """The service's arms; what they do goes to the bus.
+    """The service's arms; their joints and feedback are published on the bus.
 
     Args:
-        bus: told of joints and feedback, 50 times a second of motion.
-        makers: what makes each arm's controller.
+        bus: receives joints and feedback at 50 Hz while an arm moves.
+        makers: factory of each arm's controller.
         robot: name of their model.
     """
 
@@ -105,14 +105,14 @@ class Arms:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the arms."""
+        """Names of the arms."""
         return tuple(self._makers)
 
     def get(self, name: str) -> Arm:
-        """The arm, its controller ready.
+        """Return an arm whose controller is ready.
 
         Raises:
-            InputError: there is none of that name.
+            InputError: the name is unknown.
         """
         with self._lock:
             if name not in self._makers:
@@ -131,7 +131,7 @@ class Arms:
         """
         known = self.motions.known(key, request)
         if known is not None:
-            return known  # asked again: the arm must not move twice
+            return known  # a repeated request: the arm must not move twice
         arm = self.get(name)
         if not arm.lock.acquire(blocking=False):
             raise ControllerError("is moving.", field=f"arm {name}", hint="stop it, or wait until it has arrived")
@@ -149,7 +149,7 @@ class Arms:
 
     def _follow(self, arm: Arm, trajectory: TimedPath, handle: JobHandle) -> dict[str, Any]:
         controller = arm.ready()
-        told, largest = 0.0, 0.0
+        published_at, largest = 0.0, 0.0
         begin, steps = time.perf_counter(), 0
         try:
             while True:
@@ -160,9 +160,9 @@ class Arms:
                 largest = max(largest, feedback.error)
                 now = time.perf_counter()
                 ended = feedback.state is not MotionState.MOVING
-                if ended or now - told >= _TOLD_EVERY_S:
-                    told = now
-                    self._tell(arm, handle, feedback, trajectory.duration)
+                if ended or now - published_at >= _FEEDBACK_PERIOD_S:
+                    published_at = now
+                    self._publish_feedback(arm, handle, feedback, trajectory.duration)
                 if ended:
                     break
                 time.sleep(max(0.0, begin + steps * controller.period - time.perf_counter()))
@@ -175,11 +175,11 @@ class Arms:
             raise ControllerError(f"{feedback.fault}.", field=f"arm {arm.name}", hint="plan from where it is")
         return {"seconds": feedback.time, "largest_error": largest, "position": feedback.position.tolist()}
 
-    def _tell(self, arm: Arm, handle: JobHandle, feedback: Feedback, duration: float) -> None:
+    def _publish_feedback(self, arm: Arm, handle: JobHandle, feedback: Feedback, duration: float) -> None:
         names = arm.robot.chain.names
         joints = JointState(time.time(), names, feedback.position, np.asarray(feedback.velocity))
         self._bus.publish(robot_topic(arm.robot.name, JOINTS), joints)
         self._bus.publish(arm_topic(arm.name, JOINTS), joints)
         self._bus.publish(motion_topic(handle.id), feedback)
         if not handle.cancelled.is_set():
-            handle.tell(feedback.time / duration if duration > 0 else 1.0)
+            handle.report(feedback.time / duration if duration > 0 else 1.0)

@@ -30,8 +30,8 @@ class Rows:
         if isinstance(value, np.ndarray):
             if value.ndim != 2 or (self.columns is not None and value.shape[1] != self.columns):
                 wanted = self.columns if self.columns is not None else "columns"
-                told = {"got": str(value.shape), "wanted": wanted}
-                raise PydanticCustomError("array", "is {got}, must be (rows, {wanted})", told)
+                context = {"got": str(value.shape), "wanted": wanted}
+                raise PydanticCustomError("array", "is {got}, must be (rows, {wanted})", context)
             return value.astype(np.float64)
         rows = listed(value)
         if len({len(row) for row in rows}) > 1:

@@ -19,8 +19,8 @@ class Message:
 
     Args:
         topic: e.g. "maps/default/result"; :mod:`splatbot.services.topics` lists them.
-        value: immutable, whoever holds it.
-        number: of this topic's messages, from 1; a gap tells a reader that it has missed some.
+        value: immutable.
+        number: number of the message in its topic, from 1; a gap shows a reader that it has missed messages.
         time: when it was published, Unix time [s].
     """
 
@@ -31,7 +31,7 @@ class Message:
 
 
 class Subscription:
-    """What a reader has yet to read, oldest first; when full, the oldest message makes room and is counted.
+    """Queue of unread messages, oldest first; when it is full, the oldest is dropped and counted.
 
     Read from a thread (:meth:`get`, iteration) or from asyncio (:meth:`receive`, ``async for``); closing ends both.
     """
@@ -52,17 +52,17 @@ class Subscription:
             return dict(self._dropped)
 
     def wants(self, topic: str) -> bool:
-        """Whether a topic is subscribed to."""
+        """Return True if a topic is subscribed to."""
         return any(fnmatchcase(topic, pattern) for pattern in self._patterns)
 
     def get(self, timeout_s: float | None = None) -> Message | None:
-        """The next message; None once closed or after ``timeout_s`` [s]. Blocks the calling thread."""
+        """Return the next message, or None once closed or after ``timeout_s`` [s]. Block the calling thread."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._closed, timeout_s)
             return self._take()
 
     async def receive(self) -> Message | None:
-        """The next message; None once closed. Waits without blocking the event loop."""
+        """Return the next message, or None once closed. Wait without blocking the event loop."""
         while True:
             news = asyncio.Event()
             waiter = asyncio.get_running_loop(), news
@@ -78,7 +78,7 @@ class Subscription:
                         self._waiting.remove(waiter)
 
     def close(self) -> None:
-        """Leave the bus; whoever waits gets None."""
+        """Leave the bus; waiting readers receive None."""
         self._bus._leave(self)
         with self._changed:
             self._closed = True
@@ -123,7 +123,7 @@ class Subscription:
 
 
 class Bus:
-    """Topics of one process. Publishing takes microseconds whoever reads, however slowly."""
+    """Topics of one process. Publishing takes microseconds and does not depend on the readers."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -143,12 +143,12 @@ class Bus:
                     self._dropped[lost] = self._dropped.get(lost, 0) + 1
 
     def latest(self, topic: str) -> Message | None:
-        """The topic's latest message; None when there was none."""
+        """Return the topic's latest message, or None before the first."""
         with self._lock:
             return self._latest.get(topic)
 
     def topics(self) -> tuple[str, ...]:
-        """Topics that have a latest message, in the order of their first."""
+        """Return the topics that have a message, in the order of their first."""
         with self._lock:
             return tuple(self._latest)
 
@@ -195,7 +195,7 @@ class Bus:
             return len(self._readers)
 
     def close(self) -> None:
-        """End every subscription, those to come as well; publishing goes on to nobody."""
+        """End every subscription, present and future; later messages have no readers."""
         with self._lock:
             self._closed = True
             readers = list(self._readers)

@@ -1,4 +1,4 @@
-"""Bodies in JSON, msgpack or npy: what a request says it sends, and what it says it takes."""
+"""Bodies in JSON, msgpack or npy, by the Content-Type and Accept headers of a request."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _BODIES: dict[str, type[BaseModel]] = {}
 
 
 def body_of(model: type[_M], *, array: str | None = None) -> Callable[[Request], Coroutine[Any, Any, _M]]:
-    """A dependency that reads a ``model`` from a body of any of the three kinds.
+    """Return a dependency that reads a ``model`` from a body of any of the three kinds.
 
     Args:
         model: of the body.
-        array: the field that a bare npy array stands for; None: npy is not taken.
+        array: the field that a bare npy array fills. If None, npy is refused.
     """
     _BODIES[model.__name__] = model
 
@@ -58,7 +58,7 @@ def body_of(model: type[_M], *, array: str | None = None) -> Callable[[Request],
 
 
 def takes(model: type[BaseModel], examples: Mapping[str, Any], *, npy: str = "") -> dict[str, Any]:
-    """The OpenAPI entry of a request's body; ``npy`` says what a bare array would hold."""
+    """Return the OpenAPI entry of a request's body; ``npy`` describes a bare array."""
     schema = {"$ref": f"#/components/schemas/{model.__name__}"}
     content: dict[str, Any] = {
         JSON: {"schema": schema, "examples": {name: {"value": dict(value)} for name, value in examples.items()}},
@@ -70,7 +70,7 @@ def takes(model: type[BaseModel], examples: Mapping[str, Any], *, npy: str = "")
 
 
 def gives(example: Mapping[str, Any], *, npy: str = "") -> dict[int | str, dict[str, Any]]:
-    """The OpenAPI entry of an answer; ``npy`` says what a bare array holds."""
+    """Return the OpenAPI entry of an answer; ``npy`` describes a bare array."""
     content: dict[str, Any] = {
         JSON: {"example": dict(example)},
         MSGPACK: {"schema": {"type": "string", "format": "binary", "description": "arrays as {dtype, shape, data}"}},
@@ -83,24 +83,24 @@ def gives(example: Mapping[str, Any], *, npy: str = "") -> dict[int | str, dict[
 def answer(
     request: Request, body: Mapping[str, Any], *, array: str | None = None, headers: Mapping[str, str] | None = None
 ) -> Response:
-    """``body`` in the kind that the request accepts; JSON has no infinity and no NaN, they become null.
+    """Encode ``body`` in the kind that the request accepts; infinity and NaN become null in JSON.
 
     Args:
         array: the entry that is sent alone where npy is accepted.
     """
     accepted = request.headers.get("accept", "")
-    told = dict(headers or {})
+    all_headers = dict(headers or {})
     if "map_version" in body:
-        told["X-Map-Version"] = str(body["map_version"])
+        all_headers["X-Map-Version"] = str(body["map_version"])
     if array is not None and NPY in accepted:
-        return Response(encode_npy(body[array]), media_type=NPY, headers=told)
+        return Response(encode_npy(body[array]), media_type=NPY, headers=all_headers)
     if MSGPACK in accepted:
-        return Response(msgpack.packb(body, default=pack_array), media_type=MSGPACK, headers=told)
-    return Response(json.dumps(plain(body), allow_nan=False), media_type=JSON, headers=told)
+        return Response(msgpack.packb(body, default=pack_array), media_type=MSGPACK, headers=all_headers)
+    return Response(json.dumps(plain(body), allow_nan=False), media_type=JSON, headers=all_headers)
 
 
 def decode_npy(body: bytes) -> NDArray[Any]:
-    """The array of an npy file; objects, and so pickles, are refused.
+    """Decode an npy file; arrays of objects, which need pickle, are refused.
 
     Raises:
         InputError: it is no npy file, of another kind of number, or shorter or longer than it says.
@@ -113,22 +113,22 @@ def decode_npy(body: bytes) -> NDArray[Any]:
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(stream)
     except Exception as error:  # numpy reads the header with Python's own tokenizer, which raises as it likes
-        raise InputError("is no npy array.", field="body", hint="send what numpy.save writes") from error
+        raise InputError("is no npy array.", field="body", hint="send the output of numpy.save") from error
     return _array(body[stream.tell() :], dtype, shape, "F" if fortran else "C")
 
 
 def encode_npy(array: NDArray[Any]) -> bytes:
-    """An npy file."""
+    """Encode an array as an npy file."""
     stream = io.BytesIO()
     np.save(stream, array, allow_pickle=False)
     return stream.getvalue()
 
 
 def decode_msgpack(body: bytes) -> Any:
-    """What a msgpack body holds, with its arrays.
+    """Decode a msgpack body with its arrays.
 
     Raises:
-        InputError: it is none, or an array is not what it says.
+        InputError: the body is not msgpack, or an array does not match its header.
     """
     try:
         return msgpack.unpackb(body, object_hook=_unpacked, strict_map_key=True, max_ext_len=0)
@@ -139,12 +139,12 @@ def decode_msgpack(body: bytes) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """As JSON can say it."""
+    """Convert a value to one that JSON can hold."""
     if isinstance(value, np.ndarray):
         if value.dtype.kind == "f" and not np.isfinite(value).all():
-            told = value.astype(object)
-            told[~np.isfinite(value)] = None
-            return told.tolist()
+            values = value.astype(object)
+            values[~np.isfinite(value)] = None
+            return values.tolist()
         return value.tolist()
     if isinstance(value, np.generic):
         return plain(np.asarray(value))

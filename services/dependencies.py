@@ -1,4 +1,4 @@
-"""What routes ask of the application: settings, the store, and the map that the URL names."""
+"""Dependencies of routes: settings, the store, and the map that the URL names."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _served_map(
     return served
 
 
-def _asked_map(
+def _map_after_frames(
     request: Request,
     store: Annotated[MapStore, Depends(_store)],
     map_id: Annotated[str, Path(description="as GET /v1/maps lists it", examples=["default"])],
@@ -53,15 +53,15 @@ Service = Annotated[Runtime, Depends(_runtime)]
 Store = Annotated[MapStore, Depends(_store)]
 Settings = Annotated[ServiceSettings, Depends(_settings)]
 Served = Annotated[ServedMap, Depends(_served_map)]
-Asked = Annotated[ServedMap, Depends(_asked_map)]
-"""The same for what takes a while to answer: frames that are being mapped go first."""
+PatientMap = Annotated[ServedMap, Depends(_map_after_frames)]
+"""The same for expensive requests: frames that are being mapped have priority."""
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries of the problem documents that a route may answer with."""
+    """Return OpenAPI entries of the problem documents that a route may answer with."""
     what = {
         404: "nothing of that name",
-        409: "does not fit what is there: the name is taken, the arm moves, the key was used",
+        409: "conflicts with the present state: the name is taken, the arm moves, the key was used",
         413: "more than one request may ask",
         415: "the body is of a kind that is not taken",
         422: "the request makes no sense; `detail` names the field and `hint` the fix",
@@ -76,23 +76,23 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def example(body: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
-    """The OpenAPI entry of a JSON answer with an example."""
+    """Return the OpenAPI entry of a JSON answer with an example."""
     return {200: {"content": {"application/json": {"example": body}}}}
 
 
 def etag(served: ServedMap, what: str = "") -> str:
-    """Names what is shown of one state of a map."""
+    """Return the entity tag of a representation of one map version."""
     key = f"{_PROCESS} {served.id} {served.map_version} {served.state} {what}"
     return f'"{hashlib.sha256(key.encode()).hexdigest()[:20]}"'
 
 
 def version_headers(served: ServedMap, tag: str) -> dict[str, str]:
-    """What goes with an answer that may be kept until the map changes."""
+    """Return the headers of an answer that a client may cache until the map changes."""
     return {"X-Map-Version": str(served.map_version), "ETag": tag, "Cache-Control": "no-cache"}
 
 
 def unchanged(request: Request, served: ServedMap, tag: str) -> Response | None:
-    """304 for a client that has this already."""
+    """Return True if the client's cached copy is current (status 304)."""
     if tag in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=version_headers(served, tag))
     return None
@@ -104,12 +104,12 @@ def idempotency_key(
         Header(
             alias="Idempotency-Key",
             max_length=200,
-            description="asked again with the same key, the same job is returned",
+            description="a repeated request with the same key returns the same job",
             examples=["0f2c"],
         ),
     ] = None,
 ) -> str | None:
-    """The request's Idempotency-Key."""
+    """Return the request's Idempotency-Key."""
     return key
 
 

@@ -1,4 +1,4 @@
-"""What is worked out from one state of a map, once for all who ask."""
+"""Cache of results that are computed once from one version of a map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _T = TypeVar("_T")
 
 
 class Derived:
-    """The latest results by key. The first who asks works one out, others who want it meanwhile wait for that.
+    """The latest results by key. The first request computes a result; concurrent requests for it wait.
 
     Args:
         capacity: results that are kept.
@@ -24,7 +24,7 @@ class Derived:
         self._results: OrderedDict[Hashable, Future[Any]] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], _T]) -> _T:
-        """The result of ``make()`` for ``key``. What it raises is raised for all who wait, and not kept."""
+        """Return the result of ``make()`` for ``key``. An exception reaches all waiting callers and is not cached."""
         with self._lock:
             known = self._results.pop(key, None)
             result: Future[_T] = Future() if known is None else known

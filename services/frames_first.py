@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class FramesFirst:
-    """Who maps says so, who answers waits; nobody waits longer than ``patience_s`` [s], however many frames come."""
+    """Gives mapping priority over queries: a query waits for frames in progress, at most ``patience_s`` [s]."""
 
     def __init__(self, patience_s: float = 0.1) -> None:
         self.patience_s = patience_s
@@ -17,7 +17,7 @@ class FramesFirst:
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
-        """A frame is being mapped."""
+        """Enter while a frame is being mapped."""
         with self._changed:
             self._mapped += 1
         try:

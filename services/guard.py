@@ -1,4 +1,4 @@
-"""Who may ask, how often, and how many at once: ASGI middleware for HTTP and WebSockets alike."""
+"""Access control: API keys, request rate and concurrency, as ASGI middleware for HTTP and WebSockets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatbot.services.keys import known_key
 from splatbot.services.problems import problem
 from splatbot.services.settings import ServiceSettings
 
-OPEN = frozenset({"/healthz", "/readyz"})  # for probes: they tell nothing but versions, and must answer under load
+OPEN = frozenset({"/healthz", "/readyz"})  # for probes: they reveal only versions, and must answer under load
 _CLIENTS = 10_000  # whose rates are remembered
 _BURST_S = 2.0  # of requests at the full rate that may come at once
 
@@ -59,7 +59,7 @@ class Guard:
             self._running[kind] -= 1
 
     def _client(self, scope: Scope) -> str | None:
-        """Who asks, for counting; None: a stranger."""
+        """Return the client's identity for rate limits, or None without a valid key."""
         if not self._settings.api_keys:
             return str((scope.get("client") or ("local",))[0])
         headers = {name: value.decode("latin-1") for name, value in scope["headers"]}
@@ -70,7 +70,7 @@ class Guard:
         return known_key(key, self._settings.api_keys)
 
     def _wait(self, client: str) -> float:
-        """How long [s] the client must wait; 0: not at all (token bucket)."""
+        """Return the time [s] that the client must wait, 0 if it need not (token bucket)."""
         rate = self._settings.requests_per_s
         now = time.monotonic()
         level, then = self._buckets.pop(client, (rate * _BURST_S, now))

@@ -1,4 +1,4 @@
-"""What stands beside the HTTP service: topics and services of ROS, Zenoh, a recording, the viewer."""
+"""Integrations that run next to the HTTP service: ROS topics and services, Zenoh, a recorder, the viewer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Integrations:
     Args:
         settings: which of them there are.
         store: the maps.
-        arms: what follows the motions that ROS clients send.
+        arms: executes the motions that ROS clients send.
         on_frame: called with each frame that ROS clients publish.
 
     Raises:
@@ -37,7 +37,7 @@ class Integrations:
         self._zenoh = ZenohBridge(self.ros.graph, router, domain=settings.ros_domain) if router is not None else None
         self._record = settings.record
         self._recorder: McapRecorder | None = None
-        # The viewer knows no keys: whoever is elsewhere comes through a tunnel.
+        # The viewer checks no keys: remote users need a tunnel.
         port = settings.viewer_port
         self.viewer = Viewer(store, host="127.0.0.1", port=port) if port is not None else None
 

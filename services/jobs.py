@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 ENDED: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
 
-_KEPT = 200  # ended jobs that can still be asked about
+_KEPT = 200  # ended jobs that are kept for queries
 
 
 class JobNotFoundError(InputError):
@@ -46,11 +46,11 @@ class Job:
 
     Args:
         id: its name in URLs.
-        kind: what is done, e.g. "map".
-        state: where it stands; the last three are for ever.
+        kind: kind of work, e.g. "map".
+        state: state; the last three are final.
         progress: 0..1.
-        detail: what is being done, or why it failed.
-        result: what came of it.
+        detail: present activity, or the reason of a failure.
+        result: result of the job.
         created, started, ended: Unix time [s].
     """
 
@@ -66,18 +66,18 @@ class Job:
 
 
 class JobHandle:
-    """What the work of a job knows of it."""
+    """Interface of a job to the function that does its work."""
 
     def __init__(self, jobs: Jobs, job_id: str) -> None:
         self._jobs = jobs
         self.id = job_id
         self.cancelled = threading.Event()
 
-    def tell(self, progress: float, detail: str | None = None) -> None:
-        """Say how far it is (0..1), and what is being done.
+    def report(self, progress: float, detail: str | None = None) -> None:
+        """Report the progress (0..1) and the present activity.
 
         Raises:
-            JobCancelled: nobody wants it any more.
+            JobCancelled: the job was cancelled.
         """
         if self.cancelled.is_set():
             raise JobCancelled
@@ -91,7 +91,7 @@ class Jobs:
     """A queue of jobs and the threads that work on it; every change of a job goes to the bus (``jobs/{id}``).
 
     Args:
-        bus: told of each change.
+        bus: receives each change.
         workers: jobs that run at once.
         capacity: jobs that may wait.
     """
@@ -122,10 +122,10 @@ class Jobs:
         """Queue work; the job and whether it is new.
 
         Args:
-            kind: what is done.
+            kind: kind of work.
             work: runs in a thread and returns the result; its SplatbotErrors become the job's detail.
-            key: of the request (Idempotency-Key): asked again with it, the same job is returned.
-            request: what the key stands for; another request under the same key is refused.
+            key: of the request (Idempotency-Key): a repeated request with it returns the same job.
+            request: content of the request; another request with the same key is refused.
             abandoned: called instead of ``work`` when the job is cancelled before it begins.
 
         Raises:
@@ -145,7 +145,7 @@ class Jobs:
             self._jobs[job.id], self._handles[job.id] = job, handle
             if key is not None:
                 self._keys[key] = job.id, request
-            self._tell(job)
+            self._publish(job)
             self._waiting.put((handle, work))
             if abandoned is not None:
                 self._abandoned[job.id] = abandoned
@@ -153,7 +153,7 @@ class Jobs:
         return job, True
 
     def known(self, key: str | None, request: str) -> Job | None:
-        """The job that a request with this key was given before, if there was one.
+        """Return the job that an earlier request with this key created, if any.
 
         Raises:
             IdempotencyError: the key belongs to another request.
@@ -162,24 +162,24 @@ class Jobs:
             return self._known(key, request)
 
     def get(self, job_id: str) -> Job:
-        """The job as it stands.
+        """Return the present state of a job.
 
         Raises:
-            JobNotFoundError: there is none of that id.
+            JobNotFoundError: the id is unknown.
         """
         with self._lock:
             return self._find(job_id)
 
     def list(self) -> tuple[Job, ...]:
-        """All jobs, the oldest first."""
+        """List all jobs, oldest first."""
         with self._lock:
             return tuple(self._jobs.values())
 
     def cancel(self, job_id: str) -> Job:
-        """Ask a job to end: one that waits ends now, one that runs when its work looks. One that has ended stays so.
+        """Request the end of a job. A waiting job ends now, a running one at its next progress report.
 
         Raises:
-            JobNotFoundError: there is none of that id.
+            JobNotFoundError: the id is unknown.
         """
         with self._lock:
             job = self._find(job_id)
@@ -223,12 +223,12 @@ class Jobs:
         except JobCancelled:
             self._change(handle.id, state="cancelled", ended=time.time())
         except SplatbotError as error:
-            told = f"{error.field}: {error.message}" if error.field else error.message
-            self._change(handle.id, state="failed", detail=told, ended=time.time())
+            detail = f"{error.field}: {error.message}" if error.field else error.message
+            self._change(handle.id, state="failed", detail=detail, ended=time.time())
         except Exception:
             _log.exception("job %s failed", handle.id)
-            told = "unexpected error; the service's log says more"
-            self._change(handle.id, state="failed", detail=told, ended=time.time())
+            detail = "unexpected error; the service's log says more"
+            self._change(handle.id, state="failed", detail=detail, ended=time.time())
 
     def _change(self, job_id: str, **changes: Any) -> None:
         with self._lock:
@@ -236,10 +236,10 @@ class Jobs:
 
     def _put(self, job: Job) -> Job:
         self._jobs[job.id] = job
-        self._tell(job)
+        self._publish(job)
         return job
 
-    def _tell(self, job: Job) -> None:
+    def _publish(self, job: Job) -> None:
         self._bus.publish(job_topic(job.id), job)
 
     def _known(self, key: str | None, request: str) -> Job | None:

@@ -12,7 +12,7 @@ _PREFIX = "sha256:"
 
 
 def new_key() -> str:
-    """A key of 256 random bits.
+    """Create a key of 256 random bits.
 
     Keys are as hard to guess as their hashes, so that a fast hash keeps them (no password is ever one).
     """
@@ -20,18 +20,18 @@ def new_key() -> str:
 
 
 def hash_key(key: str) -> str:
-    """What the service keeps of a key."""
+    """Return the hash of a key; the service stores nothing else of it."""
     return _PREFIX + hashlib.sha256(key.encode()).hexdigest()
 
 
 def check_hash(text: str) -> None:
-    """Raises ValueError unless ``text`` is what :func:`hash_key` returns."""
+    """Check that ``text`` has the form that :func:`hash_key` returns; raise ValueError if not."""
     if not re.fullmatch(r"sha256:[0-9a-f]{64}", text):
         raise ValueError("no hash of a key; `splatbot serve --new-key` prints a key and its hash")
 
 
 def known_key(key: str, hashes: Sequence[str]) -> str | None:
-    """The hash that ``key`` belongs to, or None; how long that takes tells nothing of the hashes."""
+    """Return the hash of ``key`` if it is known, else None, in time that does not depend on the hashes."""
     given, found = hash_key(key), None
     for known in hashes:
         if hmac.compare_digest(given, known):

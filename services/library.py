@@ -1,4 +1,4 @@
-"""Maps on disk: each saved state is whole or not there, and the latest whole one is what a restart serves."""
+"""Maps on disk: a saved version is complete or absent, and a restart serves the latest complete one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
 def check_id(map_id: str) -> str:
-    """``map_id``, if it may name a map (and a folder).
+    """Return ``map_id`` if it is a valid name of a map and of a folder.
 
     Raises:
         InputError: it may not.
@@ -42,10 +42,10 @@ class SaveError(SplatbotError):
 
 
 class MapLibrary:
-    """A folder with a folder for each map, in which ``current`` names the state that counts.
+    """A folder with a folder for each map, in which ``current`` names the state in force.
 
-    A state's folder is written under another name first and ``current`` is replaced last, so that whoever is killed in
-    between leaves the state before in force.
+    A state's folder is first written under another name. ``current`` is replaced last, so that a
+    process killed in between leaves the earlier state in force.
 
     Args:
         folder: made if need be.
@@ -90,11 +90,11 @@ class MapLibrary:
     def remove(self, map_id: str) -> None:
         """Forget a map; one that was never saved is no error."""
         home = self.folder / check_id(map_id)
-        (home / "current").unlink(missing_ok=True)  # first: from here on it is gone, whatever happens
+        (home / "current").unlink(missing_ok=True)  # first: from here on the map is deleted
         shutil.rmtree(home, ignore_errors=True)
 
     def load_all(self, store: MapStore) -> list[str]:
-        """Serve what was saved; the ids. What cannot be read is left out, and logged."""
+        """Serve the saved maps and return their ids; unreadable ones are skipped and logged."""
         loaded = []
         for home in sorted(self.folder.iterdir()):
             name = self._current(home.name) if _ID.fullmatch(home.name) else None
@@ -114,23 +114,23 @@ class MapLibrary:
             served.trajectory.save(folder / "trajectory.tum")
         if served.workspace is not None:
             served.workspace.save(folder / WORKSPACE)
-        told = {"source": served.source, "map_version": snapshot.map_version, "stamp": snapshot.stamp}
-        (folder / "map.json").write_text(json.dumps(told))
+        saved = {"source": served.source, "map_version": snapshot.map_version, "stamp": snapshot.stamp}
+        (folder / "map.json").write_text(json.dumps(saved))
 
     def _load(self, store: MapStore, map_id: str, folder: Path) -> None:
-        told = _read_json(folder / "map.json")
+        saved = _read_json(folder / "map.json")
         path = folder / "trajectory.tum"
         store.add(
             map_id,
-            source=str(told["source"]),
+            source=str(saved["source"]),
             state="ended",
-            snapshot=Snapshot(load_ply(folder / "map.ply"), int(told["map_version"]), float(told["stamp"])),
+            snapshot=Snapshot(load_ply(folder / "map.ply"), int(saved["map_version"]), float(saved["stamp"])),
             trajectory=Trajectory.load(path) if path.is_file() else None,
             workspace=find_workspace(folder),
         )
 
     def _current(self, map_id: str) -> str | None:
-        """The folder of the state that counts."""
+        """Return the folder of the version in force."""
         try:
             name = (self.folder / map_id / "current").read_text()
         except (OSError, UnicodeDecodeError):
@@ -139,7 +139,7 @@ class MapLibrary:
 
     @staticmethod
     def _sweep(home: Path, *, keep: str) -> None:
-        """Remove older states and what a killed process left."""
+        """Remove older versions and the remains of a killed process."""
         for old in home.iterdir():
             if old.is_dir() and old.name != keep:
                 shutil.rmtree(old, ignore_errors=True)
@@ -147,7 +147,7 @@ class MapLibrary:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        told: dict[str, Any] = json.loads(path.read_text())
-        return {"source": told["source"], "map_version": told["map_version"], "stamp": told["stamp"]}
+        saved: dict[str, Any] = json.loads(path.read_text())
+        return {"source": saved["source"], "map_version": saved["map_version"], "stamp": saved["stamp"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FormatError(f"is damaged ({error}).", file=path, hint="delete the map's folder") from error

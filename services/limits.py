@@ -1,4 +1,4 @@
-"""A bound on the size of a request's body, also where it comes in chunks and tells no length."""
+"""A limit on the size of a request's body, also of one sent in chunks without a length."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class BodyLimit:
             await self.app(scope, receive, send)
             return
         most = next((n for end, n in self.larger.items() if scope["path"].endswith(end)), self.max_bytes)
-        told = dict(scope["headers"]).get(b"content-length", b"")
+        declared = dict(scope["headers"]).get(b"content-length", b"")
         detail = f"The body has more than {most} bytes."
-        if told.isdigit() and int(told) > most:
+        if declared.isdigit() and int(declared) > most:
             # The body is not read, so the connection cannot serve another request.
             refusal = problem(413, detail, headers={"Connection": "close"})
             await refusal(scope, receive, send)

@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class LiveMapper(Protocol):
-    """What mapping needs of :class:`splatbot.slam.Slam`."""
+    """The part that live mapping uses of :class:`splatbot.slam.Slam`."""
 
     def process(self, frame: Frame) -> FrameResult:
         """Track and fuse a frame."""
@@ -32,28 +32,28 @@ class LiveMapper(Protocol):
         ...
 
     def snapshot(self) -> Snapshot:
-        """The map as it is now."""
+        """Return the present map."""
         ...
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses so far."""
+        """Return the poses so far."""
         ...
 
     def close(self) -> None:
-        """End what it runs in the background."""
+        """End the background threads."""
         ...
 
 
 class LiveMapping:
-    """Feeds frames to a mapper, tells the bus of each, and publishes a snapshot at every keyframe.
+    """Feeds frames to a mapper, publishes each result on the bus, and a snapshot at every keyframe.
 
-    The map stays in the store whatever becomes of the frames: its state turns to "ended", or to "failed" with the
-    reason. :meth:`start` does so in a thread of its own, :meth:`run` in the caller's.
+    The map stays in the store when the frames end or fail: its state becomes "ended", or "failed" with the reason.
+    :meth:`start` does so in a thread of its own, :meth:`run` in the caller's.
 
     Args:
         store: where ``map_id`` has been added.
-        source: frames in their order: a log, a camera, or what clients push.
+        source: frames in their order: a log, a camera, or the frames that clients push.
         mapper: only the mapping thread touches it once started.
         on_result: called in the mapping thread after each frame.
     """
@@ -127,7 +127,7 @@ class LiveMapping:
             self._mapper.finish()
             self._publish()
         elif shown >= 0:
-            self._publish()  # without the last refinement: whoever stops it wants it to end
+            self._publish()  # without the final refinement: a stop request wants a quick end
 
     def _publish(self) -> None:
         self._store.publish(self._map_id, self._mapper.snapshot(), self._mapper.trajectory)

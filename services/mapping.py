@@ -18,7 +18,7 @@ from splatbot.workspace import Workspace, find_workspace
 
 
 def check_length(log: Log, settings_max: int, wanted: int | None) -> int:
-    """How many frames of a log are mapped.
+    """Return the number of frames of a log to map.
 
     Raises:
         InputError: more than the service maps.
@@ -31,17 +31,17 @@ def check_length(log: Log, settings_max: int, wanted: int | None) -> int:
 
 
 def map_recording(runtime: Runtime, map_id: str, log: Log, total: int) -> Work:
-    """The work of a job that maps the first ``total`` frames of a log into ``map_id``, which is in the store."""
+    """Return the work of a job that maps the first ``total`` frames of a log into ``map_id``, which is in the store."""
     return lambda handle: _map(runtime, map_id, log, total, runtime.config, handle)
 
 
 def map_upload(runtime: Runtime, map_id: str, archive: Path) -> Work:
-    """The work of a job that unpacks an uploaded recording, maps it, and removes both archive and recording."""
+    """Return the work of a job that unpacks an uploaded recording, maps it, and removes both files."""
 
     def work(handle: JobHandle) -> dict[str, Any]:
         settings = runtime.settings
         try:
-            handle.tell(0.0, "unpacking")
+            handle.report(0.0, "unpacking")
             folder = archive.with_suffix("")
             home = unpack(archive, folder, max_bytes=settings.max_unpacked_bytes, max_pixels=settings.max_pixels)
             log = open_allowed(str(home), [str(folder)])
@@ -57,7 +57,7 @@ def map_upload(runtime: Runtime, map_id: str, archive: Path) -> Work:
 
 
 def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
-    """Where the robot stands: as told, else as the recording's scene.yaml says."""
+    """Return the robot's base: that of the request, else that of the recording's scene.yaml."""
     if robot_base is not None:
         return Workspace(T_world_base=robot_base)
     return None if uri.startswith("synthetic:") else find_workspace(uri)
@@ -69,15 +69,15 @@ def _map(runtime: Runtime, map_id: str, log: Log, total: int, config: Config, ha
     frames = (log.read(i) for i in range(total))
     tracked = 0
 
-    def told(result: FrameResult) -> None:
+    def on_result(result: FrameResult) -> None:
         nonlocal tracked
         tracked += result.verdict != "lost"
         if handle.cancelled.is_set():
             mapping.stop()
         else:
-            handle.tell((result.index + 1) / total, f"frame {result.index + 1} of {total}")
+            handle.report((result.index + 1) / total, f"frame {result.index + 1} of {total}")
 
-    mapping = LiveMapping(runtime.store, map_id, frames, Slam(config), on_result=told)
+    mapping = LiveMapping(runtime.store, map_id, frames, Slam(config), on_result=on_result)
     mapping.run()
     served = runtime.store.get(map_id)
     runtime.save(map_id)

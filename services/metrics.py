@@ -1,4 +1,4 @@
-"""What Prometheus is told: requests, mapping stages, lost frames, sizes of maps, queues and jobs."""
+"""Prometheus metrics: requests, mapping stages, lost frames, sizes of maps, queues and jobs."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _WAITING = 4096  # results that may wait to be counted
 
 
 class Metrics:
-    """One registry, fed by the bus (a thread counts frame results), by requests, and by a look at the rest when asked.
+    """One registry: counters of frame results and requests, and gauges that are read on collection.
 
     Args:
-        store: whose maps are told, and whose bus is listened to.
+        store: source of the maps, and of the bus that is subscribed to.
         jobs: that are counted.
     """
 
@@ -39,18 +39,18 @@ class Metrics:
         self._stages = Histogram(
             "splatbot_frame_stage_seconds", "Stages of the frames", ["stage"], buckets=_STAGE_S, registry=r
         )
-        self._frames = Counter("splatbot_frames", "Frames by what became of them", ["map", "verdict"], registry=r)
+        self._frames = Counter("splatbot_frames", "Frames by verdict", ["map", "verdict"], registry=r)
         r.register(_Present(store, jobs))
         self._results = store.bus.subscribe(map_topic("*", RESULT), capacity=_WAITING, latched=False)
         self._thread = threading.Thread(target=self._count_frames, name="metrics", daemon=True)
         self._thread.start()
 
     def count(self, method: str, route: str, status: int, seconds: float) -> None:
-        """One request was answered."""
+        """Count an answered request."""
         self._requests.labels(method, route, str(status)).observe(seconds)
 
     def text(self) -> bytes:
-        """In Prometheus' text format."""
+        """Return all metrics in Prometheus' text format."""
         return generate_latest(self.registry)
 
     def close(self) -> None:
@@ -67,21 +67,21 @@ class Metrics:
 
 
 class _Present(Collector):
-    """What is read off at the moment of asking."""
+    """Gauges that are read when Prometheus collects them."""
 
     def __init__(self, store: MapStore, jobs: Jobs) -> None:
         self._store, self._bus, self._jobs = store, store.bus, jobs
 
     def collect(self) -> Iterator[Metric]:
-        """The families."""
+        """Collect the metric families."""
         maps = self._store.list()
-        told = {
+        families = {
             "gaussians": ("Gaussians in the map", lambda m: len(m.snapshot.model) if m.snapshot else 0),
             "bytes": ("Size of the map", lambda m: m.snapshot.model.nbytes if m.snapshot else 0),
             "version": ("Published states", lambda m: m.map_version),
         }
-        for name, (what, value) in told.items():
-            family = GaugeMetricFamily(f"splatbot_map_{name}", what, labels=["map"])
+        for name, (help_text, value) in families.items():
+            family = GaugeMetricFamily(f"splatbot_map_{name}", help_text, labels=["map"])
             for served in maps:
                 family.add_metric([served.id], value(served))
             yield family

@@ -1,4 +1,4 @@
-"""The latest plans, so that a motion can be asked for by a plan's id."""
+"""The latest plans, so that a motion request can name a plan by its id."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class Plans:
         return plan
 
     def get(self, plan_id: str) -> Plan:
-        """The plan.
+        """Return a plan.
 
         Raises:
-            PlanNotFoundError: there is none of that id.
+            PlanNotFoundError: the id is unknown.
         """
         with self._lock:
             if plan_id not in self._plans:

@@ -17,11 +17,11 @@ from starlette.requests import ClientDisconnect
 from splatbot.errors import InputError, SplatbotError
 
 MEDIA_TYPE = "application/problem+json"
-_MAX_ERRORS = 10  # of a request with a hundred thousand wrong points, ten tell enough
+_MAX_ERRORS = 10  # a request with a hundred thousand wrong points names the first ten
 
 
 class TooLargeError(InputError):
-    """A request asks for more than one answer may cost."""
+    """A request exceeds the limit of one answer."""
 
     http_status = 413
 
@@ -59,13 +59,13 @@ def problem(
     map_version: int | None = None,
     **more: Any,
 ) -> ProblemResponse:
-    """A problem document.
+    """Return a problem document (RFC 9457).
 
     Args:
         status: HTTP status.
-        detail: what is wrong, in one sentence.
+        detail: the error in one sentence.
         kind: the end of the ``type`` URN; None where the status says it all ("about:blank").
-        map_version: the state of the map that was asked, where one was.
+        map_version: version of the map that the request used, if any.
         more: extension members; None is left out.
     """
     body = {
@@ -92,7 +92,7 @@ def install_problem_handlers(app: FastAPI) -> None:
 def _on_splatbot_error(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, SplatbotError)
     kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", type(error).__name__.removesuffix("Error")).lower()
-    # Of a file only its name: where the server keeps its maps is nobody's business.
+    # Only the name of a file is shown: clients must not learn the server's paths.
     file = Path(error.file).name if error.file else None
     return problem(
         error.http_status,
@@ -121,7 +121,7 @@ def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
 
 
 def _on_client_gone(request: Request, _error: Exception) -> ProblemResponse:
-    return problem(400, "The body was not sent to its end.", map_version=_version(request))  # nobody reads it
+    return problem(400, "The body was not sent to its end.", map_version=_version(request))  # the client is gone
 
 
 def _on_unexpected_error(request: Request, _error: Exception) -> ProblemResponse:

@@ -38,7 +38,7 @@ class PushedFrames:
         self._ended: str | None = None
 
     def push(self, frame: Frame) -> Future[FrameResult]:
-        """Queue a frame, whose ``index`` is set to its place in the stream; what becomes of it follows.
+        """Queue a frame and set its ``index`` to its place in the stream; the future receives its result.
 
         Raises:
             BusyError: as many frames wait as may; this one is dropped.
@@ -66,14 +66,14 @@ class PushedFrames:
                 self._frames.put(None)
 
     def answer(self, result: FrameResult) -> None:
-        """Tell the one who pushed the frame what became of it."""
+        """Report the result of a frame to the request that pushed it."""
         with self._lock:
             waiting = self._answers.pop(result.index, None)
         if waiting is not None and waiting.set_running_or_notify_cancel():
             waiting.set_result(result)
 
     def abandon(self, why: str) -> None:
-        """End, and tell everyone who waits that no answer will come."""
+        """End the stream and fail all waiting requests."""
         self.end(why)
         with self._lock:
             waiting, self._answers = list(self._answers.values()), {}

@@ -23,7 +23,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def open_allowed(uri: str, roots: Sequence[str], *, camera: str | None = None) -> Log:
-    """The log that a client names: synthetic, or in a folder under one of ``roots``, links followed.
+    """Open the log that a client names: synthetic, or a folder under one of ``roots`` after resolving links.
 
     Raises:
         InputError: it is elsewhere, whether or not there is something.
@@ -35,7 +35,7 @@ def open_allowed(uri: str, roots: Sequence[str], *, camera: str | None = None) -
         return open_log(uri, camera=camera)
     if "\x00" not in uri and len(uri) < 4096:
         for root in (Path(root).resolve() for root in roots):
-            folder = (root / uri).resolve()  # an absolute uri stands for itself
+            folder = (root / uri).resolve()  # an absolute uri is used as it is
             if folder.is_relative_to(root) and folder.is_dir():
                 stays_inside(folder)
                 return open_log(folder, camera=camera)
@@ -47,7 +47,7 @@ def unpack(archive: Path, folder: Path, *, max_bytes: int, max_pixels: int) -> P
     """Unpack an uploaded zip of a recording into ``folder``; the folder that holds its rgb.txt.
 
     Raises:
-        LogError: it is no zip, is damaged, holds what is no part of a recording, or leads outside of itself.
+        LogError: it is not a zip, is damaged, holds files of other kinds, or has paths that leave the archive.
         TooLargeError: it unpacks to more than ``max_bytes``, or an image has more than ``max_pixels``.
     """
     try:
@@ -94,7 +94,7 @@ def stays_inside(folder: Path) -> None:
 
 
 def check_picture(path: Path, max_pixels: int) -> None:
-    """Refuse an image whose head tells of more pixels than may be decoded.
+    """Refuse an image whose header declares more pixels than the limit.
 
     Raises:
         TooLargeError: it does.
@@ -108,7 +108,7 @@ def check_picture(path: Path, max_pixels: int) -> None:
 
 
 def checked_picture(data: bytes, max_pixels: int, field: str) -> bytes:
-    """``data``, if it is a PNG or JPEG of at most ``max_pixels``.
+    """Return ``data`` if it is a PNG or JPEG of at most ``max_pixels``.
 
     Raises:
         InputError: it is neither.
@@ -123,7 +123,7 @@ def checked_picture(data: bytes, max_pixels: int, field: str) -> bytes:
 
 
 def picture_size(head: bytes) -> tuple[int, int] | None:
-    """Width and height that the head of a PNG or JPEG tells; None: it is neither."""
+    """Return width and height from the header of a PNG or JPEG, or None for other data."""
     if head.startswith(_PNG) and len(head) >= 24:
         width, height = struct.unpack(">II", head[16:24])
         return int(width), int(height)
@@ -155,13 +155,13 @@ def _inside(member: zipfile.ZipInfo) -> PurePosixPath:
     if bad or link or member.flag_bits & 0x1:
         raise LogError(f"holds {member.filename[:80]!r}.", field="upload", hint="zip plain files by relative paths")
     if path.suffix.lower() not in _SUFFIXES:
-        hint = f"leave out what is none of {', '.join(sorted(_SUFFIXES))}"
+        hint = f"remove files other than  {', '.join(sorted(_SUFFIXES))}"
         raise LogError(f"holds {member.filename[:80]!r}.", field="upload", hint=hint)
     return path
 
 
 def _copy(source: IO[bytes], file: BinaryIO, left: int, max_bytes: int) -> int:
-    """Copy at most ``left`` bytes: what an archive says of its sizes may be a lie."""
+    """Copy at most ``left`` bytes: the sizes in an archive's directory may be wrong."""
     copied = 0
     while chunk := source.read(_CHUNK):
         copied += len(chunk)

@@ -21,10 +21,10 @@ _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 class RequestCounter(Protocol):
-    """What counts requests."""
+    """Interface of a request counter."""
 
     def count(self, method: str, route: str, status: int, seconds: float) -> None:
-        """One request was answered."""
+        """Count an answered request."""
         ...
 
 
@@ -45,7 +45,7 @@ class RequestLog:
         token = request_id.set(this)
         status, begin = 500, time.perf_counter()
 
-        async def told(message: Message) -> None:
+        async def counting_send(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
@@ -53,7 +53,7 @@ class RequestLog:
             await send(message)
 
         try:
-            await self.app(scope, receive, told)
+            await self.app(scope, receive, counting_send)
         finally:
             seconds = time.perf_counter() - begin
             route = scope.get("route")
@@ -68,8 +68,8 @@ class JsonFormatter(logging.Formatter):
     """One JSON object a line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record with its time, level, logger, message and the request it belongs to."""
-        told = {
+        """Format a record with its time, level, logger, message and request."""
+        fields = {
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
             "level": record.levelname.lower(),
             "logger": record.name,
@@ -77,14 +77,14 @@ class JsonFormatter(logging.Formatter):
             "request_id": request_id.get() or None,
             "error": self.formatException(record.exc_info) if record.exc_info else None,
         }
-        return json.dumps({name: value for name, value in told.items() if value is not None})
+        return json.dumps({name: value for name, value in fields.items() if value is not None})
 
 
 class TextFormatter(logging.Formatter):
     """``LEVEL: message``, with the request where there is one."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as a line."""
+        """Format a record as a line."""
         line = super().format(record)
         this = request_id.get()
         return f"{line} [{this}]" if this else line

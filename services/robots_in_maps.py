@@ -1,4 +1,4 @@
-"""Where the robot stands in a served map, what it is for collision checks, and the things around it."""
+"""Pose of the robot in a served map, its collision spheres, and the objects around it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap
 
 
-def base_in(served: ServedMap, asked: Pose | None) -> NDArray[np.float64]:
-    """T_world_base (4, 4): as asked, else as the map knows it.
+def base_in(served: ServedMap, given: Pose | None) -> NDArray[np.float64]:
+    """Return T_world_base (4, 4): that of the request, else that of the map.
 
     Raises:
         InputError: neither.
     """
-    if asked is not None:
-        return asked.matrix("base")
+    if given is not None:
+        return given.matrix("base")
     known = served.workspace.T_world_base if served.workspace is not None else None
     if known is None:
-        hint = "give base (T_world_base), or keep a scene.yaml beside the map"
+        hint = "give base (T_world_base), or put a scene.yaml next to the map"
         raise InputError(f"is not known for map {served.id!r}.", field="base", hint=hint)
     return known
 
@@ -32,13 +32,13 @@ def base_in(served: ServedMap, asked: Pose | None) -> NDArray[np.float64]:
 def arm_in(
     served: ServedMap, robot: str, base: Pose | None, margin: float, opening: float | None = None
 ) -> tuple[RobotModel, RobotSpheres]:
-    """A robot and its spheres where it stands in the map."""
+    """Return a robot and its spheres at its base in the map."""
     model = known_robot(robot)
     return model, RobotSpheres(model, T_world_base=base_in(served, base), margin=margin, opening=opening)
 
 
-def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -> GraspableObjects:
-    """The things on the table of a map, worked out once for each of its states and bases.
+def objects_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -> GraspableObjects:
+    """Return the objects on the table of a map, computed once for each version and base.
 
     Args:
         served: the map.
@@ -53,7 +53,7 @@ def things_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) -
 
 
 def joints_of(model: RobotModel, values: list[float], field: str) -> NDArray[np.float64]:
-    """Joint values (J,).
+    """Return joint values (J,).
 
     Raises:
         InputError: another number of joints, or one that is not finite.

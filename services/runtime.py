@@ -40,7 +40,7 @@ class Runtime:
         arms: that follow plans.
         plans: the latest ones.
         metrics: for Prometheus.
-        library: maps on disk; None: in memory alone.
+        library: maps on disk. If None, maps live in memory only.
         draining: the service is about to end.
     """
 
@@ -69,7 +69,7 @@ class Runtime:
         self._starter.submit(native().num_threads).result()  # the kernels' threads, too
 
     def start(self) -> None:
-        """Serve the maps that were saved, and go on saving; begin to map what is to be followed."""
+        """Serve the saved maps, start saving, and start to map the sources that are followed."""
         if self.library is not None:
             self.library.load_all(self.store)
             self._keeper.start()
@@ -92,7 +92,7 @@ class Runtime:
     def open_stream(
         self, map_id: str, *, config: Config | None = None, workspace: Workspace | None = None
     ) -> ServedMap:
-        """A new map that is fed by :meth:`stream`'s frames.
+        """Create a map that receives its frames through :meth:`stream`.
 
         Raises:
             MapExistsError: the name is taken.
@@ -109,7 +109,7 @@ class Runtime:
         return served
 
     def stream(self, map_id: str) -> PushedFrames:
-        """Where the frames of a map are pushed.
+        """Return the frame queue of a map.
 
         Raises:
             MapNotFoundError: no map of that name.
@@ -135,7 +135,7 @@ class Runtime:
         self.stream(map_id).push(frame)
 
     def remove(self, map_id: str) -> None:
-        """End the map's making, serve it no longer, and delete what was saved of it.
+        """Stop mapping it, remove it from the service, and delete its saved versions.
 
         Raises:
             MapNotFoundError: no map of that name.
@@ -201,7 +201,7 @@ class Runtime:
 
 
 def check_exposure(settings: ServiceSettings) -> None:
-    """Nothing that other machines can reach is without keys, and TLS is whole.
+    """Check that addresses other machines can reach require keys, and that TLS is complete.
 
     Raises:
         ConfigError: it is not so.

@@ -32,7 +32,7 @@ class Pose(Request):
     quat_wxyz: Vector4 = Field((1.0, 0.0, 0.0, 0.0), description="rotation")
 
     def matrix(self, field: str) -> NDArray[np.float64]:
-        """(4, 4).
+        """Return the pose (4, 4).
 
         Raises:
             InputError: a number is not finite, or the quaternion is zero.
@@ -44,7 +44,7 @@ class Pose(Request):
 
 
 class HealthResponse(BaseModel):
-    """Whether the process lives, or is ready to answer."""
+    """Liveness or readiness of the process."""
 
     status: Literal["ok", "ready"]
     version: str = Field(description="of splatbot")
@@ -90,7 +90,7 @@ class MapRequest(Request):
 
 
 class DistanceRequest(Request):
-    """Points to be asked about."""
+    """Points to query."""
 
     points: Points = Field(description="(P, 3), world frame [m]")
     n_sigma: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(
@@ -136,18 +136,18 @@ class ViewIn(Request):
 
 
 class ViewsRequest(Request):
-    """Several views at once, as a policy with several cameras asks for them."""
+    """Several views at once, as a policy with several cameras needs them."""
 
     views: list[ViewIn] = Field(min_length=1)
     modes: list[Mode] = Field(["rgb"], min_length=1, max_length=4)
 
 
 class CollisionsRequest(Request):
-    """Configurations of an arm to be asked about."""
+    """Configurations of an arm to check."""
 
     q: Configurations = Field(description="(C, J) joint values [rad or m]")
     robot: str = Field("panda", description="as `splatbot robot list` names it")
-    base: Pose | None = Field(None, description="T_world_base; by default what the map knows")
+    base: Pose | None = Field(None, description="T_world_base; by default that of the map")
     margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="room to keep [m]")
     opening: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = Field(None, description="of the gripper [m]")
     gradient: bool = Field(False, description="also the clearance's gradient over the joints")
@@ -160,8 +160,8 @@ class IkRequest(Request):
     robot: str = "panda"
     near: list[float] | None = Field(None, description="posture to stay near [rad or m]; default: home")
     seeds: Annotated[int, Field(ge=1, le=256)] = 32
-    map: str | None = Field(None, description="keep only what is free in this map")
-    base: Pose | None = Field(None, description="T_world_base; by default what the map knows")
+    map: str | None = Field(None, description="keep only solutions that are free in this map")
+    base: Pose | None = Field(None, description="T_world_base; by default that of the map")
     margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
 
@@ -172,7 +172,7 @@ class PlanRequest(Request):
     goal: list[float] | None = Field(None, description="(J,) [rad or m]")
     goal_pose: Pose | None = Field(None, description="T_base_tcp")
     robot: str = "panda"
-    base: Pose | None = Field(None, description="T_world_base; by default what the map knows")
+    base: Pose | None = Field(None, description="T_world_base; by default that of the map")
     margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="room to keep to the map [m]")
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -202,13 +202,13 @@ class PictureHint(Request):
 
 
 class GraspsRequest(Request):
-    """A thing to be grasped: named, pointed at in the world, or in a picture."""
+    """An object to grasp: by name, by a point in the world, or by a pixel of an image."""
 
     target: str | None = Field(None, max_length=200, description='words, as "largest box" or "red cup"')
-    point: Vector3 | None = Field(None, description="on or in the thing, world frame [m]")
+    point: Vector3 | None = Field(None, description="on or in the object, world frame [m]")
     picture: PictureHint | None = None
     robot: str = "panda"
-    base: Pose | None = Field(None, description="T_world_base, z up; by default what the map knows")
+    base: Pose | None = Field(None, description="T_world_base, z up; by default that of the map")
     hand_only: bool = Field(False, description="leave the arm out")
     approach: Literal["any", "top", "side"] = "any"
     friction: Annotated[float, Field(gt=0, le=2)] = 0.5
@@ -217,7 +217,9 @@ class GraspsRequest(Request):
     )
     wanted: Annotated[int, Field(ge=1, le=100)] = 10
     margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
-    min_observations: Annotated[int, Field(ge=1, le=1000)] = Field(1, description="what fewer keyframes saw is air")
+    min_observations: Annotated[int, Field(ge=1, le=1000)] = Field(
+        1, description="least number of keyframes of a Gaussian"
+    )
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
     @model_validator(mode="after")
@@ -228,7 +230,7 @@ class GraspsRequest(Request):
 
 
 class PicksRequest(Request):
-    """A thing to be picked in the twin."""
+    """An object to pick in the twin."""
 
     scene: str = Field("tabletop_clutter", description="a shipped scene")
     target: str = Field(max_length=200, description='a name of the scene, or words as "largest box"')
@@ -258,8 +260,8 @@ class TrialsRequest(Request):
     plan: str | None = Field(None, description="id of a plan to follow; default: the scene's own moves")
     trials: Annotated[int, Field(ge=1, le=100)] = 1
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of the first trial; 0 displaces nothing")
-    force: list[str] = Field([], max_length=32, description="effects that are on whatever the scene calls for")
-    forbid: list[str] = Field([], max_length=32, description="effects that are off")
+    force: list[str] = Field([], max_length=32, description="effects enabled in any case")
+    forbid: list[str] = Field([], max_length=32, description="effects that are disabled")
 
 
 class JobInfo(BaseModel):

@@ -1,4 +1,4 @@
-"""Runs the application until it is told to stop."""
+"""Runs the application until it receives a signal to stop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatbot.services.runtime import Runtime, check_exposure
 
 
 class _Server(uvicorn.Server):
-    """Tells the runtime when it is told to end, so that event streams end before uvicorn waits for them."""
+    """Notifies the runtime of the end, so that event streams end before uvicorn waits for them."""
 
     def __init__(self, config: uvicorn.Config, runtime: Runtime) -> None:
         super().__init__(config)
@@ -54,7 +54,7 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
         ssl_keyfile=settings.tls_key,
         server_header=False,
     )
-    # After its graceful end uvicorn raises the signal again for whoever else listens: here it has done its work.
+    # After its graceful end uvicorn raises the signal again for other handlers; here it has no further effect.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         _Server(config, runtime).run(sockets=listeners)
@@ -64,7 +64,7 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens.
+    """Open a listening socket.
 
     Raises:
         InputError: the address cannot be listened on.
@@ -75,7 +75,7 @@ def listen(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-        listener.listen(2048)  # now, so that who connects before the application is up waits instead of being refused
+        listener.listen(2048)  # now, so that early clients wait for the application instead of being refused
     except OSError as error:
         listener.close()
         raise InputError(
@@ -87,4 +87,4 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def _ignore(_number: int, _frame: FrameType | None) -> None:
-    """Nothing is left to do."""
+    """Ignore a signal: the service has already ended."""

@@ -1,4 +1,4 @@
-"""What the service can be told; YAML < environment (SPLATBOT_HOST, SPLATBOT_PORT, ...) < flags."""
+"""Settings of the service; YAML < environment (SPLATBOT_HOST, SPLATBOT_PORT, ...) < flags."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ServiceSettings(BaseSettings):
     tls_cert: Path | None = Field(None, description="certificate chain (PEM); with tls_key the service speaks HTTPS")
     tls_key: Path | None = Field(None, description="its private key (PEM)")
     cors_origins: Words = Field((), description="web pages' origins that may ask; none by default")
-    data_dir: Path | None = Field(None, description="folder that maps are kept in; none: in memory alone")
+    data_dir: Path | None = Field(None, description="folder of saved maps; without it maps live in memory")
     log_roots: Words = Field((), description="folders whose recordings may be mapped by POST /v1/maps")
     save_every_s: float = Field(30.0, gt=0, description="how often growing maps are saved to data_dir [s]")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")
@@ -76,7 +76,7 @@ class ServiceSettings(BaseSettings):
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can ask."""
+        """True if only this machine can connect."""
         return self.host in ("localhost", "::1") or self.host.startswith("127.")
 
     @classmethod
@@ -88,12 +88,12 @@ class ServiceSettings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Flags first, then the environment, then the YAML file."""
+        """Order the sources: flags first, then the environment, then the YAML file."""
         return init_settings, env_settings, YamlConfigSettingsSource(settings_cls)
 
 
 def load_settings(path: str | Path | None = None, **flags: Any) -> ServiceSettings:
-    """The settings of a YAML file, then the environment, then the ``flags`` that are not None; the later wins.
+    """Load a YAML file, then apply the environment, then the ``flags`` that are not None.
 
     Raises:
         ConfigError: the file is missing or is no YAML mapping, a key is unknown or a value out of range.

@@ -26,7 +26,7 @@ class MapExistsError(InputError):
     http_status = 409
 
 
-# "static": from a file; the others: being mapped from a log, which ended, or broke (what was mapped is still served).
+# "static": from a file; the others: being mapped from a log, which ended, or broke (the part mapped so far is served).
 State = Literal["static", "mapping", "ended", "failed"]
 
 
@@ -36,15 +36,15 @@ class ServedMap:
 
     Args:
         id: its name in URLs.
-        source: what it is made from, for people.
-        state: how it came about, and whether it is still growing.
+        source: its origin, for display.
+        state: origin, and whether it still grows.
         detail: why it failed.
         snapshot: None before the first state is published.
         trajectory: of the camera, as far as ``snapshot`` knows it; None where there was none.
-        workspace: where the robot stands in it, where that is known.
+        workspace: pose of the robot's base in it, if known.
         awaited: the service counts as ready only once this map has a state.
-        run: the folder of the run that made it; None: none did, or it is not known.
-        derived: what has been worked out from the snapshot.
+        run: folder of the run that made it; None if there is no such run.
+        derived: results computed from the snapshot.
     """
 
     id: str
@@ -86,10 +86,10 @@ class ServedMap:
 
 
 class MapStore:
-    """Maps by id. Writers swap whole states, readers keep the one they took: nobody waits for a computation.
+    """Maps by id. Writers swap whole versions, and readers keep theirs, so no reader waits for a computation.
 
     Args:
-        bus: told of each new state; None makes one.
+        bus: receives each new version. If None, a bus is created.
     """
 
     def __init__(self, bus: Bus | None = None) -> None:
@@ -138,7 +138,7 @@ class MapStore:
                 self.bus.publish(map_topic(map_id, TRAJECTORY), trajectory)
 
     def set_state(self, map_id: str, state: State, detail: str | None = None) -> None:
-        """Tell how the map's making goes.
+        """Set the state of the map's creation.
 
         Raises:
             MapNotFoundError: no map of that name.
@@ -147,7 +147,7 @@ class MapStore:
             self._put(replace(self._find(map_id), state=state, detail=detail))
 
     def remove(self, map_id: str) -> None:
-        """Serve a map no longer; who holds a state of it keeps that.
+        """Remove a map; readers keep the version that they hold.
 
         Raises:
             MapNotFoundError: no map of that name.
@@ -158,7 +158,7 @@ class MapStore:
             self.bus.forget(map_topic(map_id, ""))
 
     def get(self, map_id: str) -> ServedMap:
-        """The map's latest state.
+        """Return the latest version of a map.
 
         Raises:
             MapNotFoundError: no map of that name.
@@ -167,7 +167,7 @@ class MapStore:
             return self._find(map_id)
 
     def list(self) -> tuple[ServedMap, ...]:
-        """All maps at their latest states, in the order in which they were added."""
+        """List the latest versions of all maps in the order of their creation."""
         with self._lock:
             return tuple(self._maps.values())
 

@@ -1,15 +1,15 @@
-"""Names of the bus's topics and what their values are.
+"""Names of the bus's topics and the types of their values.
 
 | topic | value |
 |---|---|
 | ``maps/{id}/state`` | :class:`splatbot.services.store.ServedMap`: each published state or change of ``state`` |
-| ``maps/{id}/frame`` | :class:`splatbot.frame.Frame`: what the mapper was given |
+| ``maps/{id}/frame`` | :class:`splatbot.frame.Frame`: the frame that the mapper received |
 | ``maps/{id}/result`` | :class:`splatbot.slam.FrameResult`: odometry, verdict, keyframe, stage timings |
 | ``maps/{id}/trajectory`` | :class:`splatbot.trajectory.Trajectory`: all poses so far, at each published state |
 | ``maps/{id}/plan`` | :class:`splatbot.planning.RobotTrajectory`: the latest planned motion |
 | ``maps/{id}/grasps`` | :class:`splatbot.grasping.types.GraspResult`: the grasps that were found last |
 | ``jobs/{id}`` | :class:`splatbot.services.jobs.Job`: each change of a job |
-| ``motions/{id}`` | :class:`splatbot.protocols.Feedback`: what an arm does that follows a trajectory |
+| ``motions/{id}`` | :class:`splatbot.protocols.Feedback`: feedback of an arm that follows a trajectory |
 | ``robot/{name}/joints`` | :class:`JointState`: the robot's latest joints |
 | ``arms/{name}/joints`` | :class:`JointState`: those of one of the service's arms |
 """
@@ -48,25 +48,25 @@ class JointState:
 
 
 def map_topic(map_id: str, kind: str) -> str:
-    """The topic of a map, e.g. ``map_topic("default", RESULT)``; "*" as id makes a pattern for every map."""
+    """Return the topic of a map, e.g. ``map_topic("default", RESULT)``; "*" as id makes a pattern for every map."""
     return f"maps/{map_id}/{kind}"
 
 
 def robot_topic(robot: str, kind: str) -> str:
-    """The topic of a robot, e.g. ``robot_topic("panda", JOINTS)``."""
+    """Return the topic of a robot, e.g. ``robot_topic("panda", JOINTS)``."""
     return f"robot/{robot}/{kind}"
 
 
 def arm_topic(arm: str, kind: str) -> str:
-    """The topic of one of the service's arms; two may be of one robot's model."""
+    """Return the topic of one of the service's arms; two arms may share a robot model."""
     return f"arms/{arm}/{kind}"
 
 
 def job_topic(job_id: str) -> str:
-    """The topic of a job."""
+    """Return the topic of a job."""
     return f"jobs/{job_id}"
 
 
 def motion_topic(job_id: str) -> str:
-    """The topic of an arm's motion."""
+    """Return the topic of an arm's motion."""
     return f"motions/{job_id}"

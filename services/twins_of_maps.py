@@ -27,14 +27,14 @@ def scene_of_map(
     force: Sequence[str] = (),
     forbid: Sequence[str] = (),
 ) -> Iterator[Scene]:
-    """The scene of a map's present state, in the frame of the robot's base; its twins are made while the context lasts.
+    """Build the scene of the latest map version in the frame of the robot's base, valid inside the context.
 
     Args:
         served: the map.
         T_world_base: (4, 4).
         robot: name of the model.
         force: effects that are on in any case.
-        forbid: effects that are off.
+        forbid: effects that are disabled.
 
     Raises:
         MapNotReadyError: the map has no state yet.

@@ -28,7 +28,7 @@ class Serving:
 
 @contextmanager
 def serving(*arguments: str, log: Path) -> Iterator[Serving]:
-    """`splatbot serve ARGUMENTS...` on a free port, ready; it ends with the block.
+    """Run `splatbot serve ARGUMENTS...` on a free port until the block ends.
 
     Args:
         arguments: of the command, without --port.
@@ -52,7 +52,7 @@ def serving(*arguments: str, log: Path) -> Iterator[Serving]:
 
 
 def _ready(process: subprocess.Popen[str], log: Path) -> str:
-    """The service's URL once it is ready."""
+    """Return the service's URL once it is ready."""
     assert process.stdout is not None
     found = re.search(r"http://[^\s/]+", process.stdout.readline())
     if found is None:

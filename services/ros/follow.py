@@ -34,20 +34,20 @@ _log = logging.getLogger(__name__)
 
 
 def action_topic(arm: str, part: str) -> str:
-    """`/ARM_controller/follow_joint_trajectory/PART`, with part goal, cancel, feedback or result."""
+    """Return `/ARM_controller/follow_joint_trajectory/PART`, with part goal, cancel, feedback or result."""
     return f"/{arm}_controller/follow_joint_trajectory/{part}"
 
 
 class FollowJointTrajectory:
-    """Lets the service's arms follow what clients send, if it is free in the main map.
+    """Executes trajectories that clients send on the service's arms, if they are free in the main map.
 
-    Straight edges between the goal's points are certified against the map and the arm itself before anything moves; a
-    goal that is not free, does not begin where the arm is, or comes while it moves, is rejected with the reason.
+    Straight edges between the goal's points are certified against the map and the arm itself before the arm moves. A
+    goal is rejected with the reason if it is not free, starts elsewhere than the arm, or arrives during a motion.
 
     Args:
         graph: where the topics are.
-        arms: what follows.
-        store: the maps, and the bus that tells of motions.
+        arms: that execute the goals.
+        store: the maps, and the bus that reports motions.
     """
 
     def __init__(self, graph: RosGraph, arms: Arms, store: MapStore) -> None:
@@ -60,11 +60,11 @@ class FollowJointTrajectory:
             topics += [graph.advertise(action_topic(arm, part), kind) for part, kind in kinds.items()]
             for part in ("feedback", "result"):
                 graph.advertise(action_topic(arm, part), f"{_TYPE}{part.capitalize()}")
-        self._asked = graph.subscribe(*topics, capacity=_WAITING) if topics else None
+        self._requests = graph.subscribe(*topics, capacity=_WAITING) if topics else None
         self._news = store.bus.subscribe("motions/*", "jobs/*", capacity=_WAITING, latched=False)
         self._threads = [
             threading.Thread(target=self._take_all, name="ros-goals", daemon=True),
-            threading.Thread(target=self._tell_all, name="ros-feedback", daemon=True),
+            threading.Thread(target=self._publish_all, name="ros-feedback", daemon=True),
         ]
 
     def start(self) -> None:
@@ -74,15 +74,15 @@ class FollowJointTrajectory:
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """End; arms that move go on, they are not ours."""
-        if self._asked is not None:
-            self._asked.close()
+        if self._requests is not None:
+            self._requests.close()
         self._news.close()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout_s)
 
     def _take_all(self) -> None:
-        for news in self._asked or ():
+        for news in self._requests or ():
             arm = news.topic.split("/")[1].removesuffix("_controller")
             try:
                 if news.topic.endswith("/cancel"):
@@ -119,20 +119,20 @@ class FollowJointTrajectory:
         return Waypoints(times, q)
 
     def _cancel(self, arm: str, goal: str) -> None:
-        """An empty id cancels all of the arm's goals."""
+        """Cancel a goal; an empty id cancels all goals of the arm."""
         with self._lock:
             jobs = [job for job, (owner, known) in self._goals.items() if owner == arm and goal in ("", known.id)]
         for job in jobs:
             self._arms.motions.cancel(job)
 
-    def _tell_all(self) -> None:
+    def _publish_all(self) -> None:
         for news in self._news:
             try:
-                self._tell(news)
+                self._publish_state(news)
             except Exception:
-                _log.exception("%s could not be told", news.topic)
+                _log.exception("the state of %s could not be published", news.topic)
 
-    def _tell(self, news: News) -> None:
+    def _publish_state(self, news: News) -> None:
         job_id, value = news.topic.split("/", 1)[1], news.value
         with self._lock:
             known = self._goals.get(job_id)
@@ -147,11 +147,11 @@ class FollowJointTrajectory:
             status, code = _STATES[value.state]
             self._result(arm, goal, status, code, value.detail or "")
 
-    def _feedback(self, arm: str, goal: Message, told: Feedback) -> None:
+    def _feedback(self, arm: str, goal: Message, feedback: Feedback) -> None:
         points = {
-            "actual": {"positions": told.position, "velocities": told.velocity},
-            "desired": {"positions": told.desired},
-            "error": {"positions": told.desired - told.position},
+            "actual": {"positions": feedback.position, "velocities": feedback.velocity},
+            "desired": {"positions": feedback.desired},
+            "error": {"positions": feedback.desired - feedback.position},
         }
         names = list(self._arms.get(arm).robot.chain.names)
         self._publish(arm, "feedback", goal, _ACTIVE, "", points | {"joint_names": names})
@@ -160,8 +160,8 @@ class FollowJointTrajectory:
         self._publish(arm, "result", goal, status, text, {"error_code": code, "error_string": text})
 
     def _publish(self, arm: str, part: str, goal: Message, status: int, text: str, values: dict[str, Any]) -> None:
-        told = {"goal_id": goal, "status": status, "text": text}
+        goal_status = {"goal_id": goal, "status": status, "text": text}
         message = build(
-            f"{_TYPE}{part.capitalize()}", {"header": header(time.time(), ""), "status": told, part: values}
+            f"{_TYPE}{part.capitalize()}", {"header": header(time.time(), ""), "status": goal_status, part: values}
         )
         self._graph.publish(action_topic(arm, part), message)

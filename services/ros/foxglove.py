@@ -46,14 +46,14 @@ class FoxgloveSession:
         self._watch: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Greet the client."""
+        """Send the server's description to the client."""
         info = {"op": "serverInfo", "name": "splatbot", "capabilities": [], "supportedEncodings": ["cdr"]}
         await self._send(json.dumps(info | {"metadata": {"ROS_DISTRO": "jazzy"}, "sessionId": secrets.token_hex(8)}))
         await self._advertise()
         self._watch = asyncio.get_running_loop().create_task(self._look_for_topics())
 
     async def receive(self, text: str | bytes) -> None:
-        """Do what a client's message asks; never raises for what it holds."""
+        """Handle a client's message; a wrong message never raises."""
         try:
             self._do(json_object(text, self._most_bytes))
         except InputError as error:
@@ -77,7 +77,7 @@ class FoxgloveSession:
             for number in _entries(values, "subscriptionIds", int):
                 self._stop(number)
         else:
-            hint = "subscribe and unsubscribe are what there is"
+            hint = "the known operations are subscribe and unsubscribe"
             raise InputError(f"{str(values.get('op'))[:40]!r} is not offered.", field="op", hint=hint)
 
     def _subscribe(self, number: Any, channel: Any) -> None:

@@ -29,7 +29,7 @@ class UnknownServiceError(SplatbotError):
 
 @dataclass(frozen=True)
 class Service:
-    """What may be called.
+    """A service that clients can call.
 
     Args:
         type: `pkg/srv/Name`.
@@ -43,7 +43,7 @@ class Service:
 
 
 class RosGraph:
-    """What a ROS master would know. All methods may be called from any thread."""
+    """Registry of topics and services, as a ROS master keeps it. All methods may be called from any thread."""
 
     def __init__(self) -> None:
         self._bus = Bus()
@@ -78,7 +78,7 @@ class RosGraph:
         self._bus.publish(topic, RosMessage(kind, lambda: message, time.time(), latched, client))
 
     def publish_later(self, topic: str, kind: str, make: Callable[[], Message], *, latched: bool = False) -> None:
-        """The same with a message that is made when somebody reads it, if ever.
+        """Publish a message that is built only when a client reads it.
 
         Raises:
             InputError: as :meth:`advertise`.
@@ -86,7 +86,7 @@ class RosGraph:
         self._bus.publish(self.advertise(topic, kind), RosMessage(kind, make, time.time(), latched))
 
     def subscribe(self, *topics: str, capacity: int) -> Subscription:
-        """Read topics from now on (an empty list reads all); :meth:`latched` gives what came before.
+        """Read topics from now on (an empty list reads all); :meth:`latched` gives the earlier ones.
 
         Raises:
             InputError: a topic's name is malformed.
@@ -95,7 +95,7 @@ class RosGraph:
         return self._bus.subscribe(*names, capacity=max(capacity, 1), latched=False)
 
     def latched(self, topic: str) -> RosMessage | None:
-        """The topic's latest message, if new readers are to have it."""
+        """Return the topic's latest message if the topic is latched."""
         found = self._bus.latest(resolve(topic))
         return found.value if found is not None and found.value.latched else None
 
@@ -136,10 +136,10 @@ class RosGraph:
                 del self._services[resolve(name)]
 
     def service(self, name: str) -> Service:
-        """The service of that name.
+        """Return the service of that name.
 
         Raises:
-            UnknownServiceError: there is none.
+            UnknownServiceError: the name is unknown.
         """
         with self._lock:
             found = self._services.get(resolve(name))
@@ -150,7 +150,7 @@ class RosGraph:
 
 
 def resolve(name: Any) -> str:
-    """A topic's or service's full name.
+    """Return the full name of a topic or service.
 
     Raises:
         InputError: it is malformed.

@@ -1,4 +1,4 @@
-"""Grasps as moveit_msgs/GraspPlanning asks for them."""
+"""Grasps through the service moveit_msgs/GraspPlanning."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from splatbot.logs.ros_frames import header, pose_message
 from splatbot.logs.ros_types import to_plain
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.services.robots_in_maps import things_in
+from splatbot.services.robots_in_maps import objects_in
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.moveit import coded, robot_place
@@ -30,11 +30,11 @@ GRASP_SERVICE = "/plan_grasps"
 class GraspServices:
     """GraspPlanning on the main map of a store.
 
-    The target is the thing of that ``target.id`` (a name of the map's scene.yaml, or words such as "the red cube"), or
-    what is at its pose. The answer's grasps are sorted, best first, and told on the bus.
+    ``target.id`` names the target as the map's scene.yaml does, or describes it in words such as "the red cube".
+    Without it, the object at the target's pose is meant. The grasps are sorted, best first, and published on the bus.
 
     Args:
-        graph: is told of the service.
+        graph: registers the service.
         store: the maps.
         robot: the arm, with fingers.
     """
@@ -44,17 +44,17 @@ class GraspServices:
         graph.serve(GRASP_SERVICE, Service("moveit_msgs/srv/GraspPlanning", self.plan))
 
     def plan(self, args: Mapping[str, Any]) -> dict[str, Any]:
-        """moveit_msgs/GraspPlanning."""
+        """Answer moveit_msgs/GraspPlanning."""
 
         def work() -> dict[str, Any]:
             served, robot, base = robot_place(self._store, self._robot)
-            things = things_in(served, base, as_known=True)
-            target = find_target(_hint(args), things.scene, [WordAffordance(), PlaceAffordance()])
-            found = things.told(things.sampler(robot).sample(target, GraspOptions()))
+            objects = objects_in(served, base, as_known=True)
+            target = find_target(_hint(args), objects.scene, [WordAffordance(), PlaceAffordance()])
+            found = objects.told(objects.sampler(robot).sample(target, GraspOptions()))
             found.unwrap()
             stamp = served.ready.stamp
             self._store.bus.publish(map_topic(served.id, GRASPS), found)
-            return {"grasps": [_told(i, grasp, robot, stamp) for i, grasp in enumerate(found.grasps)]}
+            return {"grasps": [_grasp_message(i, grasp, robot, stamp) for i, grasp in enumerate(found.grasps)]}
 
         return {"grasps": []} | coded(work)
 
@@ -67,10 +67,10 @@ def _hint(args: Mapping[str, Any]) -> Hint:
     return PointHint(vector(args, "target.pose.position") + vector(primitive, "position"))
 
 
-def _told(number: int, grasp: Grasp, robot: RobotModel, stamp: float) -> dict[str, Any]:
-    """moveit_msgs/Grasp; the tool's z is the approach."""
+def _grasp_message(number: int, grasp: Grasp, robot: RobotModel, stamp: float) -> dict[str, Any]:
+    """Return a moveit_msgs/Grasp; the tool's z axis is the approach."""
     approach, distance = grasp.T_world_tcp[:3, 2], _apart(grasp)
-    way = {"desired_distance": distance, "min_distance": 0.5 * distance}
+    approach_distance = {"desired_distance": distance, "min_distance": 0.5 * distance}
     there = to_plain(header(stamp, MAP_FRAME))
     posture = None if grasp.q is None else {"name": list(robot.chain.names), "position": np.asarray(grasp.q)}
     return {
@@ -79,8 +79,8 @@ def _told(number: int, grasp: Grasp, robot: RobotModel, stamp: float) -> dict[st
         "grasp_posture": _fingers(grasp.width),
         "grasp_pose": {"header": there, "pose": to_plain(pose_message(grasp.T_world_tcp))},
         "grasp_quality": grasp.total,
-        "pre_grasp_approach": way | {"direction": {"header": there, "vector": _vector(approach)}},
-        "post_grasp_retreat": way | {"direction": {"header": there, "vector": _vector(-approach)}},
+        "pre_grasp_approach": approach_distance | {"direction": {"header": there, "vector": _vector(approach)}},
+        "post_grasp_retreat": approach_distance | {"direction": {"header": there, "vector": _vector(-approach)}},
         "max_contact_force": 0.0,
         "allowed_touch_objects": [],
         "joint_state": posture,  # not of moveit_msgs/Grasp: the arm's joints there
@@ -92,7 +92,7 @@ def _apart(grasp: Grasp) -> float:
 
 
 def _fingers(opening: float) -> dict[str, Any]:
-    """Two fingers that are ``opening`` [m] apart."""
+    """Return the posture of two fingers that are ``opening`` [m] apart."""
     return {"joint_names": ["finger1", "finger2"], "points": [{"positions": [opening / 2, opening / 2]}]}
 
 

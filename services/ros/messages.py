@@ -1,4 +1,4 @@
-"""What the service knows as ROS messages: the map, the camera's way, the robot, plans.
+"""ROS messages of the service's values: the map, the camera's path, the robot, plans.
 
 Frames: "map" is the map's world, "camera" the camera's optical frame (x right, y down, z forward).
 """
@@ -31,7 +31,7 @@ _ARROW, _LINE_STRIP = 0, 4  # of visualization_msgs/Marker
 
 
 def point_cloud_message(model: GaussianModel, stamp: float, *, splats: bool = True) -> Message:
-    """sensor_msgs/PointCloud2 of N Gaussians in the map frame: x y z rgb, one float32 each.
+    """Build a sensor_msgs/PointCloud2 of N Gaussians in the map frame: x y z rgb, one float32 each.
 
     Args:
         splats: add opacity, scales [m] and the rotation (xyzw): the whole Gaussian but for higher harmonics.
@@ -59,7 +59,7 @@ def point_cloud_message(model: GaussianModel, stamp: float, *, splats: bool = Tr
 
 
 def points_of(message: Message) -> dict[str, NDArray[np.float32]]:
-    """The float32 fields (N,) of a PointCloud2 by name; "rgb" is (N, 3) in 0..1.
+    """Return the float32 fields (N,) of a PointCloud2 by name; "rgb" is (N, 3) in 0..1.
 
     Raises:
         InputError: a field is of another type, or the data are cut short.
@@ -79,7 +79,7 @@ def points_of(message: Message) -> dict[str, NDArray[np.float32]]:
 
 
 def odometry_message(result: FrameResult) -> Message:
-    """nav_msgs/Odometry of a tracked frame's camera in the map frame, with the pose's covariance.
+    """Build a nav_msgs/Odometry of a tracked frame's camera in the map frame, with the pose's covariance.
 
     Raises:
         ValueError: the frame was lost.
@@ -99,7 +99,7 @@ def odometry_message(result: FrameResult) -> Message:
 
 
 def transform_message(stamp: float, T_parent_child: ArrayLike, parent: str, child: str) -> Message:
-    """tf2_msgs/TFMessage of one transform (4, 4)."""
+    """Build a tf2_msgs/TFMessage of one transform (4, 4)."""
     pose = pose_message(T_parent_child)
     transform = {"translation": {a: getattr(pose.position, a) for a in "xyz"}, "rotation": pose.orientation}
     stamped = {"header": header(stamp, parent), "child_frame_id": child, "transform": transform}
@@ -107,7 +107,7 @@ def transform_message(stamp: float, T_parent_child: ArrayLike, parent: str, chil
 
 
 def path_message(trajectory: Trajectory) -> Message:
-    """nav_msgs/Path of the camera in the map frame."""
+    """Build a nav_msgs/Path of the camera in the map frame."""
     stamp = float(trajectory.stamps[-1]) if len(trajectory) else 0.0
     poses = [
         {"header": header(float(t), MAP_FRAME), "pose": pose_message(T)}
@@ -117,7 +117,7 @@ def path_message(trajectory: Trajectory) -> Message:
 
 
 def joints_message(state: JointState) -> Message:
-    """sensor_msgs/JointState."""
+    """Build a sensor_msgs/JointState."""
     message = joint_state_message(state.stamp, state.position, state.names)
     if state.velocity is not None:
         message.velocity = np.asarray(state.velocity, np.float64)
@@ -125,7 +125,7 @@ def joints_message(state: JointState) -> Message:
 
 
 def joints_of(message: Message) -> JointState:
-    """The joints that a sensor_msgs/JointState tells.
+    """Return the joints of a sensor_msgs/JointState.
 
     Raises:
         InputError: there are more or fewer positions than names, or one is not finite.
@@ -139,12 +139,12 @@ def joints_of(message: Message) -> JointState:
 
 
 def joint_trajectory_message(trajectory: JointTrajectory, *, frame_id: str = "") -> Message:
-    """trajectory_msgs/JointTrajectory, a point every 10 ms."""
+    """Build a trajectory_msgs/JointTrajectory with a point every 10 ms."""
     return build("trajectory_msgs/msg/JointTrajectory", trajectory.to_ros(frame_id=frame_id))
 
 
 def waypoints_of(message: Message) -> tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]:
-    """Names, times (N,) [s] and positions (N, J) of a JointTrajectory.
+    """Return names, times (N,) [s] and positions (N, J) of a JointTrajectory.
 
     Raises:
         InputError: it has no points, sizes differ, a value is not finite or the times do not increase.
@@ -160,15 +160,15 @@ def waypoints_of(message: Message) -> tuple[tuple[str, ...], NDArray[np.float64]
     return tuple(message.joint_names), times, positions
 
 
-def camera_way_message(trajectory: Trajectory) -> Message:
-    """visualization_msgs/MarkerArray: the camera's way as a line in the map frame."""
+def camera_path_message(trajectory: Trajectory) -> Message:
+    """Build a visualization_msgs/MarkerArray: the camera's path as a line in the map frame."""
     stamp = float(trajectory.stamps[-1]) if len(trajectory) else 0.0
     line = _marker("camera", 0, _LINE_STRIP, (0.005, 0.0), (0.1, 0.8, 1.0), trajectory.positions, stamp)
     return build("visualization_msgs/msg/MarkerArray", markers=[line])
 
 
 def grasps_message(grasps: Sequence[Grasp]) -> Message:
-    """visualization_msgs/MarkerArray: an arrow for each grasp from its start to the thing, the greener the better."""
+    """Build a visualization_msgs/MarkerArray: an arrow to the object for each grasp; green marks good ones."""
     arrows = []
     for i, grasp in enumerate(grasps):
         ends = np.stack([grasp.T_world_pregrasp[:3, 3], grasp.T_world_tcp[:3, 3]])
@@ -185,7 +185,7 @@ def _marker(
     points: Array,
     stamp: float = 0.0,
 ) -> dict[str, Any]:
-    """visualization_msgs/Marker along points (N, 3) [m] of the map frame; of an arrow, widths of shaft and head [m]."""
+    """Build a visualization_msgs/Marker along points (N, 3) [m] in the map frame; ``widths``: shaft and head [m]."""
     return {
         "header": header(stamp, MAP_FRAME),
         "ns": ns,
@@ -199,11 +199,11 @@ def _marker(
 
 
 def _packed(colors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """RGB (N, 3) in 0..1 as the bytes 0x00RRGGBB of a float, which RViz and PCL expect."""
+    """Pack RGB (N, 3) in 0..1 into the bytes 0x00RRGGBB of a float, which RViz and PCL expect."""
     r, g, b = (np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint32)).T
     return ((r << 16) | (g << 8) | b).view(np.float32)
 
 
 def log_message(level: int, name: str, text: str, stamp: float) -> Message:
-    """rcl_interfaces/Log; ``level`` as of Python's logging, which ROS 2 shares."""
+    """Build an rcl_interfaces/Log; ``level`` as of Python's logging, which ROS 2 shares."""
     return build("rcl_interfaces/msg/Log", stamp=time_of(stamp), level=min(level, 50), name=name, msg=text)

@@ -24,7 +24,7 @@ from splatbot.services.topics import PLAN, map_topic
 
 PLAN_SERVICE, IK_SERVICE, VALIDITY_SERVICE = "/plan_kinematic_path", "/compute_ik", "/check_state_validity"
 
-# Of moveit_msgs/MoveItErrorCodes; the planner's own are PlanStatus.
+# Values of moveit_msgs/MoveItErrorCodes; those of the planner are in PlanStatus.
 _FRAME_TRANSFORM_FAILURE, _INVALID_GOAL = -21, -16
 _BUDGET_MS, _LONGEST_MS = 200.0, 10_000.0
 _RATE = 100.0  # points of an answer's trajectory per second
@@ -33,12 +33,12 @@ _RATE = 100.0  # points of an answer's trajectory per second
 class MoveItServices:
     """GetMotionPlan, GetPositionIK and GetStateValidity on the maps of a store.
 
-    Poses are in the frame "map" (or "world", or none named) or in the robot's base (`base_link`, the first link). What
-    fails is told by ``error_code``, with the reason as its ``message``.
+    Poses are in the frame "map" (or "world", or none named) or in the robot's base (`base_link`, the first link). An
+    error sets ``error_code``, with the reason as its ``message``.
 
     Args:
-        graph: is told of the services.
-        store: the maps; the one called "default", or else the first, is asked.
+        graph: registers the services.
+        store: the maps; "default", or else the first one, answers.
         robot: the arm.
     """
 
@@ -52,7 +52,7 @@ class MoveItServices:
             graph.serve(name, Service(f"moveit_msgs/srv/{kind}", call))
 
     def plan(self, args: Mapping[str, Any]) -> dict[str, Any]:
-        """moveit_msgs/GetMotionPlan; joint goals, or a position and orientation constraint of the tool."""
+        """Answer moveit_msgs/GetMotionPlan; joint goals, or a position and orientation constraint of the tool."""
         begin = time.perf_counter()
         answer: dict[str, Any] = {"group_name": self._name, "trajectory_start": {}, "trajectory": {}}
 
@@ -72,11 +72,11 @@ class MoveItServices:
                 "trajectory": {"joint_trajectory": trajectory.to_ros(rate=_RATE)},
             }
 
-        told = answer | coded(work)
-        return {"motion_plan_response": told | {"planning_time": time.perf_counter() - begin}}
+        response = answer | coded(work)
+        return {"motion_plan_response": response | {"planning_time": time.perf_counter() - begin}}
 
     def ik(self, args: Mapping[str, Any]) -> dict[str, Any]:
-        """moveit_msgs/GetPositionIK: the posture nearest to the seed that brings the tool there."""
+        """Answer moveit_msgs/GetPositionIK: the solution nearest to the seed state."""
 
         def work() -> dict[str, Any]:
             request = entry(args, "ik_request")
@@ -99,7 +99,7 @@ class MoveItServices:
         return {"solution": {}} | coded(work)
 
     def validity(self, args: Mapping[str, Any]) -> dict[str, Any]:
-        """moveit_msgs/GetStateValidity; the contact is the one of least clearance.
+        """Answer moveit_msgs/GetStateValidity; the contact is the one of least clearance.
 
         Raises:
             SplatbotError: the request makes no sense, or there is no map: this service has no error code.
@@ -107,7 +107,7 @@ class MoveItServices:
         served, robot, base = self._place()
         q = joints(args, "robot_state.joint_state", robot)[None]
         arm = RobotSpheres(robot, T_world_base=base)
-        verdict, room = arm.check(served.field, q), arm.clearance(served.field, q)
+        verdict, clearance = arm.check(served.field, q), arm.clearance(served.field, q)
         contacts = []
         if verdict.in_collision[0]:
             other = int(verdict.other[0])
@@ -117,7 +117,7 @@ class MoveItServices:
                     "body_type_1": 0,
                     "contact_body_2": f"link{other}" if other >= 0 else "map",
                     "body_type_2": 0 if other >= 0 else 1,
-                    "depth": max(-float(room.distance[0]), 0.0),
+                    "depth": max(-float(clearance.distance[0]), 0.0),
                 }
             )
         inside = bool(robot.within_limits(q)[0])
@@ -171,10 +171,10 @@ class UnknownFrameError(InputError):
 
 
 def main_map(store: MapStore) -> ServedMap:
-    """The map that ROS' unqualified names mean: "default", or else the first.
+    """Return the map that unqualified names of ROS mean: "default", or else the first.
 
     Raises:
-        MapNotFoundError: there is none.
+        MapNotFoundError: there is no map.
     """
     maps = store.list()
     if not maps:
@@ -183,7 +183,7 @@ def main_map(store: MapStore) -> ServedMap:
 
 
 def robot_place(store: MapStore, robot: str) -> tuple[ServedMap, RobotModel, NDArray[np.float64]]:
-    """The main map, an arm, and where it stands there, T_world_base (4, 4).
+    """Return the main map, an arm and its base T_world_base (4, 4) there.
 
     Raises:
         MapNotFoundError: there is no map.
@@ -192,8 +192,8 @@ def robot_place(store: MapStore, robot: str) -> tuple[ServedMap, RobotModel, NDA
     served = main_map(store)
     known = served.workspace.T_world_base if served.workspace is not None else None
     if known is None:
-        hint = "keep a scene.yaml beside the map: splatbot info MAP --fit-plane estimates one"
-        raise UnknownFrameError(f"where the robot stands in map {served.id!r} is not known.", field="base", hint=hint)
+        hint = "write a scene.yaml next to the map: splatbot info MAP --fit-plane"
+        raise UnknownFrameError(f"the robot's base in map {served.id!r} is unknown.", field="base", hint=hint)
     return served, known_robot(robot), known
 
 
@@ -207,7 +207,7 @@ def _joint_goal(goal: Any, robot: RobotModel) -> NDArray[np.float64]:
 
 
 def coded(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What ``work`` gives with a success code, or the code and reason of its error."""
+    """Return the result of ``work`` with a success code, or the code and reason of its error."""
     try:
         return _code(PlanStatus.SUCCESS, "") | work()
     except SplatbotError as error:

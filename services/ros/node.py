@@ -22,10 +22,10 @@ class RosNode:
     """Topics and services of a store's maps.
 
     Args:
-        store: the maps, and the bus that tells of them.
-        arms: what follows the motions that clients send; None: nothing.
+        store: the maps, and the bus that reports them.
+        arms: executes the motions that clients send. If None, they are refused.
         robot: whose joints /joint_states are, and which plans are made for where a request names none.
-        on_frame: called with each frame that clients publish; None: nobody maps them.
+        on_frame: called with each frame that clients publish. If None, frames are not mapped.
     """
 
     def __init__(

@@ -27,11 +27,11 @@ _MOST_VOXELS = 2_000_000  # of one answer: 8 MB of distances, and 24 of gradient
 class NvbloxServices:
     """EsdfAndGradients on the main map of a store.
 
-    ``esdf_and_gradients`` holds the distances [m] with dimensions x, y, z, as cuMotion reads them; ``gradients``, which
-    nvblox' message has not, the unit gradients with a fourth dimension. Requests may add ``voxel_size_m``.
+    ``esdf_and_gradients`` holds the distances [m] with dimensions x, y, z, as cuMotion reads them. ``gradients``, an
+    addition to nvblox' message, holds the unit gradients with a fourth dimension. Requests may add ``voxel_size_m``.
 
     Args:
-        graph: is told of the service.
+        graph: registers the service.
         store: the maps.
     """
 
@@ -40,7 +40,7 @@ class NvbloxServices:
         graph.serve(ESDF_SERVICE, Service("nvblox_msgs/srv/EsdfAndGradients", self.esdf))
 
     def esdf(self, args: Mapping[str, Any]) -> dict[str, Any]:
-        """The field in the request's box, or in the box around all Gaussians.
+        """Sample the distance field in the request's box, or in the box around all Gaussians.
 
         Raises:
             SplatbotError: the box is empty or too large, the frame is not the map's, or there is no map.
@@ -71,7 +71,7 @@ class NvbloxServices:
 
 
 def _multi_array(values: NDArray[np.float32], labels: str) -> dict[str, Any]:
-    """std_msgs/Float32MultiArray, row by row."""
+    """Build a std_msgs/Float32MultiArray, row by row."""
     strides = [int(np.prod(values.shape[i:])) for i in range(values.ndim)]
     sizes = zip(labels, values.shape, strides, strict=True)
     dim = [{"label": label, "size": size, "stride": stride} for label, size, stride in sizes]

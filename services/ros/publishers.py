@@ -18,7 +18,7 @@ from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import (
     CAMERA_FRAME,
     MAP_FRAME,
-    camera_way_message,
+    camera_path_message,
     grasps_message,
     joint_trajectory_message,
     joints_message,
@@ -66,13 +66,13 @@ _log = logging.getLogger(__name__)
 
 
 class RosPublishers:
-    """A thread that turns the bus's news into ROS messages; what is slow here delays nobody else.
+    """A thread that converts the bus's messages to ROS; its delays do not reach the publishers.
 
-    The map "default", or else the first one that the bus tells of, has the plain names; another map's begin with
+    The map "default", or else the first map on the bus, has the plain names; another map's begin with
     `/maps/ID`.
 
     Args:
-        bus: what the service tells.
+        bus: source of the messages.
         graph: where ROS programs read it.
     """
 
@@ -115,43 +115,43 @@ class RosPublishers:
                 elif kind in self._convert:
                     self._convert[kind](self._prefix(name), news.value)
             except Exception:  # one odd message must not silence the others
-                _log.exception("%s could not be told to ROS", news.topic)
+                _log.exception("%s could not be published to ROS", news.topic)
 
     def _prefix(self, map_id: str) -> str:
         if self._main is None or map_id == "default":
             self._main = map_id
         return "" if map_id == self._main else f"/maps/{map_id.replace('-', '_')}"
 
-    def _tell(self, prefix: str, topic: str, make: Callable[[], Message], *, latched: bool = False) -> None:
+    def _publish(self, prefix: str, topic: str, make: Callable[[], Message], *, latched: bool = False) -> None:
         self._graph.publish_later(prefix + topic, TYPES[topic], make, latched=latched)
 
     def _frame(self, prefix: str, frame: Frame) -> None:
         if frame.source == FROM_ROS:
             return
-        self._tell(prefix, INFO, lambda: camera_info_message(frame.stamp, frame.camera, CAMERA_FRAME))
-        self._tell(prefix, COLOR, lambda: image_message(frame.stamp, frame.rgb, CAMERA_FRAME))
-        self._tell(prefix, DEPTH, lambda: image_message(frame.stamp, frame.depth, CAMERA_FRAME))
+        self._publish(prefix, INFO, lambda: camera_info_message(frame.stamp, frame.camera, CAMERA_FRAME))
+        self._publish(prefix, COLOR, lambda: image_message(frame.stamp, frame.rgb, CAMERA_FRAME))
+        self._publish(prefix, DEPTH, lambda: image_message(frame.stamp, frame.depth, CAMERA_FRAME))
 
     def _result(self, prefix: str, result: FrameResult) -> None:
         T = result.T_world_camera
         if T is not None:
-            self._tell(prefix, ODOMETRY, lambda: odometry_message(result))
-            self._tell(prefix, TF, lambda: transform_message(result.stamp, T, MAP_FRAME, CAMERA_FRAME))
+            self._publish(prefix, ODOMETRY, lambda: odometry_message(result))
+            self._publish(prefix, TF, lambda: transform_message(result.stamp, T, MAP_FRAME, CAMERA_FRAME))
 
     def _state(self, prefix: str, served: ServedMap) -> None:
         snapshot = served.snapshot
         if snapshot is not None:
-            self._tell(prefix, POINTS, lambda: point_cloud_message(snapshot.model, snapshot.stamp), latched=True)
+            self._publish(prefix, POINTS, lambda: point_cloud_message(snapshot.model, snapshot.stamp), latched=True)
 
     def _trajectory(self, prefix: str, trajectory: Trajectory) -> None:
-        self._tell(prefix, PATH, lambda: path_message(trajectory), latched=True)
-        self._tell(prefix, MARKERS, lambda: camera_way_message(trajectory), latched=True)
+        self._publish(prefix, PATH, lambda: path_message(trajectory), latched=True)
+        self._publish(prefix, MARKERS, lambda: camera_path_message(trajectory), latched=True)
 
     def _plan(self, prefix: str, plan: JointTrajectory) -> None:
-        self._tell(prefix, PLANNED, lambda: joint_trajectory_message(plan, frame_id=MAP_FRAME), latched=True)
+        self._publish(prefix, PLANNED, lambda: joint_trajectory_message(plan, frame_id=MAP_FRAME), latched=True)
 
     def _grasps(self, prefix: str, found: GraspResult) -> None:
-        self._tell(prefix, GRASP_MARKERS, lambda: grasps_message(found.grasps), latched=True)
+        self._publish(prefix, GRASP_MARKERS, lambda: grasps_message(found.grasps), latched=True)
 
 
 class _RosoutHandler(logging.Handler):
@@ -165,5 +165,5 @@ class _RosoutHandler(logging.Handler):
         """Publish a record."""
         try:
             self._graph.publish(ROSOUT, log_message(record.levelno, record.name, record.getMessage(), record.created))
-        except Exception:  # what logging does with a handler that fails
+        except Exception:  # as logging treats a handler that fails
             self.handleError(record)

@@ -19,13 +19,13 @@ _log = logging.getLogger(__name__)
 class McapRecorder:
     """A thread that writes topics to a file as they come; a slow disk loses messages, which ``lost`` counts.
 
-    The file bears its name once :meth:`stop` has returned. A disk that is full ends the recording: ``error`` says so,
-    and what came before is kept where it can be.
+    The file bears its name once :meth:`stop` has returned. A full disk ends the recording: ``error``
+    holds the reason, and the part before it is kept if possible.
 
     Args:
-        graph: what is recorded.
+        graph: source of the topics.
         path: the file; must not exist.
-        topics: which; none: all, also those to come.
+        topics: names to record; an empty list records all topics, present and future.
 
     Raises:
         LogError: the file exists, or its folder cannot be written to.
@@ -54,7 +54,7 @@ class McapRecorder:
         return sum(self._news.dropped.values())
 
     def stop(self) -> Path:
-        """Write what waits, close the file and return its path."""
+        """Write the waiting messages, close the file and return its path."""
         self._stopping.set()
         self._thread.join()
         self._news.close()

@@ -15,7 +15,7 @@ from splatbot.robots.robot import RobotModel
 
 
 def json_object(text: str | bytes, most_bytes: int) -> dict[str, Any]:
-    """A client's message as JSON.
+    """Parse a client's message as a JSON object.
 
     Raises:
         InputError: it is binary, too long, or no JSON object.
@@ -34,7 +34,7 @@ def json_object(text: str | bytes, most_bytes: int) -> dict[str, Any]:
 
 
 def entry(args: Any, path: str) -> Any:
-    """``args.a.b.c`` of a dotted path; None where it is not given."""
+    """Return the value at a dotted path of ``args``, or None if it is missing."""
     for key in path.split("."):
         if not isinstance(args, Mapping):
             return None
@@ -43,7 +43,7 @@ def entry(args: Any, path: str) -> Any:
 
 
 def entries(args: Any, path: str) -> Sequence[Any]:
-    """The list at a dotted path, empty where it is not given.
+    """Return the list at a dotted path, empty if it is missing.
 
     Raises:
         InputError: there is something else.
@@ -57,7 +57,7 @@ def entries(args: Any, path: str) -> Sequence[Any]:
 
 
 def number(args: Any, path: str, default: float = 0.0) -> float:
-    """The number at a dotted path.
+    """Return the number at a dotted path.
 
     Raises:
         InputError: it is no finite number.
@@ -71,14 +71,14 @@ def number(args: Any, path: str, default: float = 0.0) -> float:
 
 
 def seconds(args: Any, path: str) -> float:
-    """A builtin_interfaces/Duration [s]; 0 where it is not given."""
+    """Return a builtin_interfaces/Duration [s], 0 if it is missing."""
     return number(args, f"{path}.sec", number(args, f"{path}.secs")) + 1e-9 * number(
         args, f"{path}.nanosec", number(args, f"{path}.nsecs")
     )
 
 
 def vector(args: Any, path: str) -> NDArray[np.float64]:
-    """A geometry_msgs/Point or Vector3 (3,) [m].
+    """Return a geometry_msgs/Point or Vector3 (3,) [m].
 
     Raises:
         InputError: a coordinate is no finite number.
@@ -87,7 +87,7 @@ def vector(args: Any, path: str) -> NDArray[np.float64]:
 
 
 def pose(args: Any, path: str) -> NDArray[np.float64]:
-    """A geometry_msgs/Pose (4, 4) [m].
+    """Return a geometry_msgs/Pose (4, 4) [m].
 
     Raises:
         InputError: it is missing, or its quaternion is zero.
@@ -102,7 +102,7 @@ def pose(args: Any, path: str) -> NDArray[np.float64]:
 
 
 def joints(args: Any, path: str, robot: RobotModel) -> NDArray[np.float64]:
-    """The configuration (J,) of a sensor_msgs/JointState, its joints in any order; home where it is empty.
+    """Return the configuration (J,) of a sensor_msgs/JointState in any joint order; home if it is empty.
 
     Raises:
         InputError: a joint of the robot is missing, or a value is no finite number.

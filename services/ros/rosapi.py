@@ -1,4 +1,4 @@
-"""/rosapi: what clients ask of topics, services and types before they use them."""
+"""/rosapi: names and types of topics and services, which clients query first."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class RosApi:
     """The services of /rosapi on a graph.
 
     Args:
-        graph: is told of them.
+        graph: registers the services.
     """
 
     def __init__(self, graph: RosGraph) -> None:
@@ -84,7 +84,7 @@ class RosApi:
 
 
 def _type_definition(kind: str) -> dict[str, Any]:
-    """rosapi_msgs/TypeDef: array lengths are -1 for none, 0 for any."""
+    """Return a rosapi_msgs/TypeDef: array lengths are -1 for none, 0 for any."""
     constants, fields = typestore().fielddefs[kind]
     names, types, lengths = [], [], []
     for name, (node, what) in fields:

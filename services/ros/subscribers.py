@@ -30,16 +30,16 @@ _log = logging.getLogger(__name__)
 
 
 class RosSubscribers:
-    """A thread that makes frames of the images that clients publish, and tells the bus of their joint states.
+    """A thread that builds frames from clients' images and publishes their joint states on the bus.
 
-    A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. What cannot
-    be used is logged, and so told on /rosout.
+    A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. Unusable
+    messages are logged, which also reaches /rosout.
 
     Args:
         graph: where clients publish.
-        bus: told of joints.
+        bus: receives the joints.
         robot: whose joints /joint_states are.
-        on_frame: called with each frame; None: nobody maps them, images are only passed on to other clients.
+        on_frame: called with each frame. If None, images are only forwarded to other clients.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class RosSubscribers:
             try:
                 self._take(news.topic, value)
             except BusyError:
-                self.dropped += 1  # as a camera's frames that nobody takes
+                self.dropped += 1  # as a camera drops frames without a reader
             except SplatbotError as error:
                 _log.warning("%s from a client: %s", news.topic, error)
             except Exception:  # one odd message must not end the others
@@ -92,7 +92,7 @@ class FramePairs:
         self._count = 0
 
     def add(self, topic: str, message: Any) -> Frame | None:
-        """The frame that an image completes, if it does.
+        """Add an image and return the frame that it completes, if any.
 
         Raises:
             InputError: the image or the intrinsics make no sense, or do not belong together.

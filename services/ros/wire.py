@@ -22,7 +22,7 @@ _TAGS = {"u2": 69, "u4": 70, "u8": 71, "i1": 72, "i2": 77, "i4": 78, "i8": 79, "
 
 @dataclass(frozen=True, eq=False)
 class RosMessage:
-    """A message on its way to readers, who share what it was made and encoded to: the first one who asks pays.
+    """A message whose readers share its encodings; the first reader of a kind causes the encoding.
 
     Args:
         type: `pkg/msg/Name`.
@@ -60,17 +60,17 @@ class RosMessage:
 
     @cached_property
     def cbor(self) -> Any:
-        """As what cbor2 writes."""
+        """Encoded as CBOR."""
         return to_cbor(self.plain)
 
 
 def to_json(value: Any) -> str:
-    """JSON as rosbridge writes it: bytes as base64, NaN and infinity as null."""
+    """Encode JSON as rosbridge writes it: bytes as base64, NaN and infinity as null."""
     return json.dumps(jsonable(value), separators=(",", ":"), allow_nan=False)
 
 
 def jsonable(value: Any) -> Any:
-    """A value of dictionaries, lists and numpy arrays as what JSON knows."""
+    """Convert a value of dictionaries, lists and numpy arrays to types of JSON."""
     if isinstance(value, dict):
         return {key: jsonable(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -85,7 +85,7 @@ def jsonable(value: Any) -> Any:
 
 
 def to_cbor(value: Any) -> Any:
-    """A value of dictionaries, lists and numpy arrays as what cbor2 writes: arrays typed, bytes as they are."""
+    """Convert a value of dictionaries, lists and numpy arrays for cbor2: typed arrays, plain bytes."""
     if isinstance(value, dict):
         return {key: to_cbor(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -17,10 +17,10 @@ from splatbot.logs.ros_types import from_cdr, full_name, typestore
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.wire import RosMessage
 
-HEARD = (COLOR, DEPTH, INFO, JOINTS)  # of what others publish
-_CLIENT = -1  # who they are to the graph
+HEARD = (COLOR, DEPTH, INFO, JOINTS)  # of the topics that others publish
+_CLIENT = -1  # identity in the graph
 _NODE, _WAITING = "splatbot", 256
-_VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"  # quality of service: what differs from ROS' defaults
+_VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"  # quality of service: differences from ROS' defaults
 _NONE = "%"  # neither enclave nor namespace
 
 _log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ class ZenohBridge:
             self._session.declare_subscriber(key, self._hear, allowed_origin=zenoh.Locality.REMOTE)
         for topic in self._graph.topics:
             if (known := self._graph.latched(topic)) is not None:
-                self._tell(topic, known)
+                self._forward(topic, known)
         self._thread.start()
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -86,9 +86,9 @@ class ZenohBridge:
     def _run(self) -> None:
         for news in self._news:
             if news.value.client != _CLIENT:
-                self._tell(news.topic, news.value)
+                self._forward(news.topic, news.value)
 
-    def _tell(self, topic: str, message: RosMessage) -> None:
+    def _forward(self, topic: str, message: RosMessage) -> None:
         try:
             if topic not in self._publishers:
                 self._publishers[topic] = self._advertise(topic, message)
@@ -106,7 +106,7 @@ class ZenohBridge:
         return _Publisher(ext.declare_advanced_publisher(self._session, key, cache=cache))
 
     def _token(self, what: str, rest: str) -> None:
-        """By these nodes know of one another's topics (`ros2 topic list`)."""
+        """Return the liveliness token that announces a topic to other nodes (`ros2 topic list`)."""
         number = self._entities
         self._entities += 1
         key = f"@ros2_lv/{self._domain}/{self._zid}/0/{number}/{what}/{_NONE}/{_NONE}/{_NODE}{rest}"
@@ -125,7 +125,7 @@ class ZenohBridge:
 
 
 class _Publisher:
-    """Counts messages: readers see by the numbers what they have missed."""
+    """Counts messages: the numbers show readers which ones they have missed."""
 
     def __init__(self, publisher: Any) -> None:
         self._publisher, self._number, self._gid = publisher, 0, secrets.token_bytes(16)

@@ -1,4 +1,4 @@
-"""Whether configurations of an arm touch the map or themselves."""
+"""Collision checks of configurations against the map and the arm itself."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Request, Response
 
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import Asked, Settings, problems
+from splatbot.services.dependencies import PatientMap, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in
 from splatbot.services.schemas import BASE_EXAMPLE, CollisionsRequest
@@ -17,7 +17,7 @@ router = APIRouter(prefix="/v1/maps", tags=["collision"])
 _HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 _EXAMPLES = {
     "one configuration": {"q": [_HOME], "base": BASE_EXAMPLE},
-    "with room and gradients": {
+    "with clearance and gradients": {
         "q": [_HOME, [0.4, *_HOME[1:]]],
         "base": BASE_EXAMPLE,
         "margin": 0.02,
@@ -44,30 +44,30 @@ _ANSWER = {
 )
 def collisions(
     request: Request,
-    served: Asked,
+    served: PatientMap,
     settings: Settings,
-    asked: Annotated[CollisionsRequest, Depends(body_of(CollisionsRequest, array="q"))],
+    query: Annotated[CollisionsRequest, Depends(body_of(CollisionsRequest, array="q"))],
 ) -> Response:
-    """For each configuration: does it touch, with which link (`other`: another link, -1: the map), how much room.
+    """Check each configuration: verdict, colliding link, its partner (`other`; -1 is the map), and clearance.
 
     "No" is certain for the map's ellipsoids at two standard deviations. `clearance` is the least distance [m] of the
     arm's spheres from them, beyond the margin; null where the map is empty.
     """
-    if len(asked.q) > settings.max_configurations:
+    if len(query.q) > settings.max_configurations:
         hint = "split the request, or raise SPLATBOT_MAX_CONFIGURATIONS"
         raise TooLargeError(f"has more than {settings.max_configurations} rows.", field="q", hint=hint)
-    _, arm = arm_in(served, asked.robot, asked.base, asked.margin, asked.opening)
+    _, arm = arm_in(served, query.robot, query.base, query.margin, query.opening)
     field = served.field
-    verdict, room = arm.check(field, asked.q), arm.clearance(field, asked.q)
+    verdict, clearance = arm.check(field, query.q), arm.clearance(field, query.q)
     body: dict[str, Any] = {
         "map_version": verdict.map_version,
         "in_collision": verdict.in_collision,
         "link": verdict.link,
         "other": verdict.other,
-        "clearance": room.distance,
-        "clearance_link": room.link,
-        "gaussian": room.index,
+        "clearance": clearance.distance,
+        "clearance_link": clearance.link,
+        "gaussian": clearance.index,
     }
-    if asked.gradient:
-        body["gradient"] = room.gradient
+    if query.gradient:
+        body["gradient"] = clearance.gradient
     return answer(request, body, array="in_collision")

@@ -8,7 +8,7 @@ import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
 
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import Asked, Settings, problems
+from splatbot.services.dependencies import PatientMap, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import DistanceRequest
 
@@ -28,23 +28,23 @@ _Body = Annotated[DistanceRequest, Depends(body_of(DistanceRequest, array="point
     responses=gives(_ANSWER, npy="distance (P,) float32") | problems(404, 413, 415, 422, 503),
     openapi_extra=takes(DistanceRequest, _EXAMPLES, npy="points (P, 3)"),
 )
-def distance(request: Request, served: Asked, settings: Settings, asked: _Body) -> Response:
-    """How many standard deviations each point is from the nearest Gaussian, which that is, and whether it is inside.
+def distance(request: Request, served: PatientMap, settings: Settings, query: _Body) -> Response:
+    """Return each point's Mahalanobis distance to the nearest Gaussian, that Gaussian's row, and a verdict.
 
     In an empty map the distance is null (infinity in npy and msgpack) and the index -1.
     """
-    if len(asked.points) > settings.max_points:
+    if len(query.points) > settings.max_points:
         raise TooLargeError(
-            f"has {len(asked.points)} rows, at most {settings.max_points} are answered at once.",
+            f"has {len(query.points)} rows, at most {settings.max_points} are answered at once.",
             field="points",
             hint="split the request, or raise SPLATBOT_MAX_POINTS",
         )
-    found = served.field.mahalanobis(asked.points.reshape(-1, 3))
+    found = served.field.mahalanobis(query.points.reshape(-1, 3))
     body = {
         "map_version": found.map_version,
-        "n_sigma": asked.n_sigma,
+        "n_sigma": query.n_sigma,
         "distance": found.distance,
         "index": found.index,
-        "inside": found.distance.astype(np.float64) <= asked.n_sigma,
+        "inside": found.distance.astype(np.float64) <= query.n_sigma,
     }
     return answer(request, body, array="distance")

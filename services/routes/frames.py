@@ -31,8 +31,8 @@ _WAIT_S = 60.0
 class FrameRequest(Body):
     """A colour image and the depth registered to it.
 
-    Images are PNG or JPEG files (base64 in JSON, bytes in msgpack), or arrays in msgpack: rgb (H, W, 3) uint8, depth
-    (H, W) float32 [m] or uint16.
+    Images are PNG or JPEG files (base64 in JSON, bytes in msgpack), or arrays in msgpack.
+    Arrays are rgb (H, W, 3) uint8 and depth (H, W) float32 [m] or uint16.
     """
 
     stamp: float = Field(allow_inf_nan=False, description="[s]; later than the frame before")
@@ -94,11 +94,11 @@ def push_frame(
     request: Request,
     served: Served,
     service: Service,
-    asked: Annotated[FrameRequest, Depends(body_of(FrameRequest))],
+    query: Annotated[FrameRequest, Depends(body_of(FrameRequest))],
 ) -> Response:
     """Track a frame and map it; the answer says where the camera was. 503: as many frames wait as may."""
     frames = service.stream(served.id)
-    pushed = frames.push(_frame(asked, service.settings.max_pixels))
+    pushed = frames.push(_frame(query, service.settings.max_pixels))
     try:
         result = pushed.result(_WAIT_S)
     except NotInTime as error:
@@ -119,24 +119,24 @@ def push_frame(
 
 @router.post("/{map_id}/end", status_code=202, response_class=Response, responses=problems(404, 409))
 def end_frames(served: Served, service: Service) -> Response:
-    """No more frames will come: the map is refined once more, and its state becomes "ended"."""
+    """End the stream: the map is refined once more, and its state becomes "ended"."""
     service.stream(served.id).end()
     return Response(status_code=202, headers={"Location": f"/v1/maps/{served.id}", "Retry-After": "1"})
 
 
-def _frame(asked: FrameRequest, max_pixels: int) -> Frame:
-    camera = Camera(**asked.camera.model_dump())
+def _frame(query: FrameRequest, max_pixels: int) -> Frame:
+    camera = Camera(**query.camera.model_dump())
     if camera.width * camera.height > max_pixels:
         raise TooLargeError(f"{camera.width}x{camera.height} has more than {max_pixels} pixels.", field="camera")
-    rgb = _decoded(asked.rgb, "rgb", cv2.IMREAD_COLOR_RGB, max_pixels)
-    depth = _decoded(asked.depth, "depth", cv2.IMREAD_UNCHANGED, max_pixels)
+    rgb = _decoded(query.rgb, "rgb", cv2.IMREAD_COLOR_RGB, max_pixels)
+    depth = _decoded(query.depth, "depth", cv2.IMREAD_UNCHANGED, max_pixels)
     if depth.dtype.kind in "iu":
-        depth = depth.astype(np.float32) / np.float32(asked.depth_scale)
-    joints = None if asked.joints is None else np.array(asked.joints, dtype=np.float64)
+        depth = depth.astype(np.float32) / np.float32(query.depth_scale)
+    joints = None if query.joints is None else np.array(query.joints, dtype=np.float64)
     if joints is not None and not np.isfinite(joints).all():
         raise InputError("has values that are not finite.", field="joints", hint="give radians and metres")
     rgb, depth = np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
-    return Frame(asked.stamp, rgb, depth, camera, joints=joints, source="the pushed frame")
+    return Frame(query.stamp, rgb, depth, camera, joints=joints, source="the pushed frame")
 
 
 def _decoded(value: Any, field: str, flags: int, max_pixels: int) -> NDArray[Any]:

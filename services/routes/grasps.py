@@ -1,4 +1,4 @@
-"""How a hand takes hold of a thing in the map."""
+"""Grasps of an object in the map."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from splatbot.grasping.summary import summary
 from splatbot.grasping.words import WordAffordance
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import Asked, Service, problems
-from splatbot.services.robots_in_maps import base_in, things_in
+from splatbot.services.dependencies import PatientMap, Service, problems
+from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS, map_topic
 
@@ -48,41 +48,41 @@ _ANSWER = {
 )
 def grasps(
     request: Request,
-    served: Asked,
+    served: PatientMap,
     service: Service,
-    asked: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))],
+    query: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))],
 ) -> Response:
-    """Grasps of one thing, best first, with each term of their scores; none is a problem that says what they fell to.
+    """Rank grasps of one object with each term of their scores; no grasp is a problem with the reasons.
 
-    Words are rules on names, colours, shapes, sizes and places; what fits two things is refused.
+    Words match names, colours, shapes, sizes and places; an ambiguous description is refused.
     """
-    robot, base = known_robot(asked.robot), base_in(served, asked.base)
-    things = things_in(served, base, as_known=asked.base is None)
-    found = find_target(_hint(asked), things.scene, [WordAffordance(), PlaceAffordance()])
-    sampler = things.sampler(
-        robot, hand_only=asked.hand_only, margin=asked.margin, min_observations=asked.min_observations
+    robot, base = known_robot(query.robot), base_in(served, query.base)
+    objects = objects_in(served, base, as_known=query.base is None)
+    found = find_target(_hint(query), objects.scene, [WordAffordance(), PlaceAffordance()])
+    sampler = objects.sampler(
+        robot, hand_only=query.hand_only, margin=query.margin, min_observations=query.min_observations
     )
     options = GraspOptions(
-        friction=asked.friction,
-        samples=asked.samples,
-        wanted=asked.wanted,
-        approach=asked.approach,
-        seed=asked.seed,
+        friction=query.friction,
+        samples=query.samples,
+        wanted=query.wanted,
+        approach=query.approach,
+        seed=query.seed,
     )
-    result = things.told(sampler.sample(found, options))
+    result = objects.told(sampler.sample(found, options))
     result.unwrap()
     service.bus.publish(map_topic(served.id, GRASPS), result)
     return answer(request, summary(result) | {"map_version": served.map_version})
 
 
-def _hint(asked: GraspsRequest) -> Hint:
-    if asked.target is not None:
-        return NameHint(asked.target)
-    if asked.point is not None:
-        return PointHint(np.array(asked.point))
-    if asked.picture is None:
+def _hint(query: GraspsRequest) -> Hint:
+    if query.target is not None:
+        return NameHint(query.target)
+    if query.point is not None:
+        return PointHint(np.array(query.point))
+    if query.picture is None:
         raise InputError("is missing.", field="target", hint="give one of target, point and picture")
-    picture = asked.picture
+    picture = query.picture
     view = ObservedView(Camera(**picture.camera.model_dump()), picture.pose.matrix("picture.pose"))
     if picture.pixel is not None:
         return PixelHint(*picture.pixel, view)

@@ -1,4 +1,4 @@
-"""Whether the process lives, whether it can answer, and what it measures of itself."""
+"""Liveness, readiness and metrics of the process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ router = APIRouter(tags=["health"])
 
 @router.get("/healthz", responses=example({"status": "ok", "version": "0.1.0", "maps": {"default": 3}}))
 def healthz(store: Store) -> HealthResponse:
-    """Alive: the process answers."""
+    """Report that the process answers."""
     return HealthResponse(status="ok", version=splatbot.__version__, maps=_versions(store))
 
 
@@ -26,7 +26,7 @@ def healthz(store: Store) -> HealthResponse:
     responses=example({"status": "ready", "version": "0.1.0", "maps": {"default": 3}}) | problems(503),
 )
 def readyz(service: Service) -> HealthResponse:
-    """Ready: the native module loads, the maps that it was started with have a state, and it is not about to end."""
+    """Check that the native module loads, the initial maps have a state, and the service is not ending."""
     try:
         importlib.import_module("splatbot._native")
     except ImportError as error:
@@ -37,7 +37,7 @@ def readyz(service: Service) -> HealthResponse:
         raise NotReadyError("The service is about to end.", hint="ask another one")
     waiting = [m.id for m in service.store.list() if m.awaited and m.snapshot is None]
     if waiting:
-        raise MapNotReadyError(f"No state yet: {', '.join(waiting)}.", hint="GET /v1/maps tells how far mapping is")
+        raise MapNotReadyError(f"No state yet: {', '.join(waiting)}.", hint="see GET /v1/maps")
     return HealthResponse(status="ready", version=splatbot.__version__, maps=_versions(service.store))
 
 
@@ -47,7 +47,7 @@ def readyz(service: Service) -> HealthResponse:
     responses={200: {"content": {"text/plain": {"example": 'splatbot_map_gaussians{map="default"} 48213.0\n'}}}},
 )
 def metrics(service: Service) -> Response:
-    """For Prometheus."""
+    """Return the metrics for Prometheus."""
     return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 

@@ -32,35 +32,35 @@ JobId = Annotated[str, Path(description="as the 202 answer named it", examples=[
 
 
 def _job(service: Service, job_id: JobId) -> Job:
-    """Looked up before a stream begins: afterwards there is no status left to say that it does not exist."""
+    """Find the job before a stream begins: afterwards the status 404 can no longer be sent."""
     return service.jobs.get(job_id)
 
 
 def info(job: Job) -> JobInfo:
-    """A job as clients see it."""
+    """Describe a job to clients."""
     return JobInfo(**asdict(job))
 
 
 def accepted(job: Job, *, under: str = "/v1/jobs") -> Response:
-    """202 with where to ask how it goes."""
+    """Return status 202 with the job's URL."""
     headers = {"Location": f"{under}/{job.id}", "Retry-After": "1"}
     return Response(info(job).model_dump_json(), 202, headers, media_type="application/json")
 
 
 def starts(what: str) -> dict[int | str, dict[str, Any]]:
-    """The OpenAPI entry of an answer that names a job."""
+    """Return the OpenAPI entry of an answer that names a job."""
     return {202: {"description": f"{what}; `Location` names it", "model": JobInfo, "content": {JSON: {"example": JOB}}}}
 
 
 @router.get("", responses=example({"jobs": [JOB]}))
 def list_jobs(service: Service) -> JobList:
-    """All jobs, the oldest first; of those that have ended, the latest 200."""
+    """List all jobs, oldest first; of the ended ones, the latest 200."""
     return JobList(jobs=[info(job) for job in service.jobs.list()])
 
 
 @router.get("/{job_id}", responses=example(JOB) | problems(404))
 def get_job(service: Service, job_id: JobId) -> JobInfo:
-    """How a job stands."""
+    """Return the state of a job."""
     return info(service.jobs.get(job_id))
 
 
@@ -72,7 +72,7 @@ def cancel_job(service: Service, job_id: JobId) -> JobInfo:
 
 @router.get("/{job_id}/events", response_class=EventSourceResponse, responses=problems(404, 503))
 async def job_events(service: Service, watched: Annotated[Job, Depends(_job)]) -> AsyncIterator[ServerSentEvent]:
-    """The job at each change, as server-sent events named by its state; the last one tells how it ended."""
+    """Stream the job at each change as server-sent events named by its state, up to the end."""
     with service.bus.subscribe(job_topic(watched.id), capacity=64) as changes:
         async for message in changes:
             job: Job = message.value

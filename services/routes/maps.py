@@ -64,7 +64,7 @@ _FormatName = Annotated[str, Path(description=f"one of {', '.join(WRITTEN)}", ex
 
 @router.get("", responses=example({"maps": [_EXAMPLE]}))
 def list_maps(store: Store) -> MapList:
-    """All maps as they are now."""
+    """List all maps."""
     return MapList(maps=[_info(served) for served in store.list()])
 
 
@@ -77,28 +77,28 @@ def list_maps(store: Store) -> MapList:
     openapi_extra=takes(MapRequest, _CREATE),
 )
 def create_map(
-    asked: Annotated[MapRequest, Depends(body_of(MapRequest))], service: Service, key: IdempotencyKey
+    query: Annotated[MapRequest, Depends(body_of(MapRequest))], service: Service, key: IdempotencyKey
 ) -> Response:
     """Make a map of a recording, by a job; or, without `log`, an empty one for frames that will be pushed."""
-    check_id(asked.id)
-    base = asked.robot_base.matrix("robot_base") if asked.robot_base is not None else None
-    if asked.log is None:
-        served = service.open_stream(asked.id, workspace=workspace_of("synthetic:", base))
-        place = {"Location": f"/v1/maps/{asked.id}"}
+    check_id(query.id)
+    base = query.robot_base.matrix("robot_base") if query.robot_base is not None else None
+    if query.log is None:
+        served = service.open_stream(query.id, workspace=workspace_of("synthetic:", base))
+        place = {"Location": f"/v1/maps/{query.id}"}
         return Response(_info(served).model_dump_json(), 201, place, media_type="application/json")
-    request = asked.model_dump_json()
+    request = query.model_dump_json()
     known = service.jobs.known(key, request)
     if known is not None:
         return accepted(known)
-    log = open_allowed(asked.log, service.settings.log_roots, camera=asked.camera)
-    total = check_length(log, service.settings.max_frames, asked.max_frames)
-    service.store.add(asked.id, source=log.name, state="mapping", workspace=workspace_of(log.uri, base), awaited=False)
+    log = open_allowed(query.log, service.settings.log_roots, camera=query.camera)
+    total = check_length(log, service.settings.max_frames, query.max_frames)
+    service.store.add(query.id, source=log.name, state="mapping", workspace=workspace_of(log.uri, base), awaited=False)
     try:
-        work = map_recording(service, asked.id, log, total)
-        gone = partial(_forget, service, asked.id)
+        work = map_recording(service, query.id, log, total)
+        gone = partial(_forget, service, query.id)
         return accepted(service.jobs.submit("map", work, key=key, request=request, abandoned=gone)[0])
     except Exception:
-        service.store.remove(asked.id)  # no room for the job: as if nothing had been asked
+        service.store.remove(query.id)  # the queue is full: undo the creation
         raise
 
 
@@ -140,7 +140,7 @@ async def upload_map(
 
 @router.get("/{map_id}", responses=example(_EXAMPLE) | problems(404))
 def get_map(served: Served, request: Request, response: Response) -> Any:
-    """One map as it is now; `state` and `detail` tell how mapping its log goes."""
+    """Describe a map; `state` and `detail` report the progress of mapping."""
     tag = etag(served)
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
@@ -161,7 +161,7 @@ def delete_map(served: Served, service: Service) -> Response:
     responses=_FILE | problems(404, 422, 503),
 )
 def export_map(served: Served, request: Request, format: _FormatName) -> Response:
-    """The map as a file, in each format that splatbot writes."""
+    """Export the map as a file in any format that splatbot writes."""
     if format not in WRITTEN:
         raise InputError(f"is {format[:20]!r}.", field="format", hint=f"use {', '.join(WRITTEN)}")
     snapshot = served.ready
@@ -195,7 +195,7 @@ def export_map(served: Served, request: Request, format: _FormatName) -> Respons
     | problems(404, 503),
 )
 def trajectory(served: Served, request: Request) -> Response:
-    """The camera's path in the map's world, as the latest state knows it."""
+    """Return the camera's path in the map's world at the latest version."""
     tag = etag(served, "trajectory " + request.headers.get("accept", ""))
     if (kept := unchanged(request, served, tag)) is not None:
         return kept

@@ -1,4 +1,4 @@
-"""Things picked in the twin."""
+"""Picks of objects in the twin."""
 
 from __future__ import annotations
 
@@ -30,58 +30,58 @@ _STAGES = list(PickStage)
 @router.post(
     "",
     status_code=202,
-    responses=starts("a job picks it; its result tells the outcome, each stage, and how far each thing rose")
+    responses=starts("a job picks it; its result holds the outcome, each stage, and the lift of each object")
     | problems(404, 409, 413, 415, 422, 503),
     openapi_extra=takes(PicksRequest, _EXAMPLES),
 )
 def pick(
-    service: Service, asked: Annotated[PicksRequest, Depends(body_of(PicksRequest))], key: IdempotencyKey
+    service: Service, query: Annotated[PicksRequest, Depends(body_of(PicksRequest))], key: IdempotencyKey
 ) -> Response:
-    """Pick a thing in the physics of a scene: scan it, find grasps, plan, approach, close, lift, check.
+    """Pick an object in the physics of a scene: scan it, find grasps, plan, approach, close, lift, check.
 
     The whole way is certified before the arm moves. A pick that ends otherwise than "picked" is a result, not a failure
     of the job; cancelling stops the arm. `progress` grows by the stages: grasp, plan, open, move, approach, close,
     lift, check and, with `home`, carry.
     """
-    if asked.scene not in scene_names():
-        raise InputError(f"is {asked.scene[:80]!r}.", field="scene", hint=f"scenes: {', '.join(scene_names())}")
-    if asked.budget_ms > service.settings.max_plan_ms:
+    if query.scene not in scene_names():
+        raise InputError(f"is {query.scene[:80]!r}.", field="scene", hint=f"scenes: {', '.join(scene_names())}")
+    if query.budget_ms > service.settings.max_plan_ms:
         hint = "give less, or raise SPLATBOT_MAX_PLAN_MS"
         raise TooLargeError(f"is more than {service.settings.max_plan_ms:g}.", field="budget_ms", hint=hint)
     options = PickOptions(
-        lift=asked.lift,
-        force=asked.force,
-        tries=asked.tries,
-        budget_ms=asked.budget_ms,
-        grasp=GraspOptions(seed=asked.seed),
-        seed=asked.seed,
+        lift=query.lift,
+        force=query.force,
+        tries=query.tries,
+        budget_ms=query.budget_ms,
+        grasp=GraspOptions(seed=query.seed),
+        seed=query.seed,
     )
-    scene = load_scene(asked.scene)
+    scene = load_scene(query.scene)
     job, _ = service.jobs.submit(
-        "pick", lambda handle: _pick(scene, asked, options, handle), key=key, request=asked.model_dump_json()
+        "pick", lambda handle: _pick(scene, query, options, handle), key=key, request=query.model_dump_json()
     )
     return accepted(job)
 
 
-def _pick(scene: Scene, asked: PicksRequest, options: PickOptions, handle: JobHandle) -> dict[str, Any]:
+def _pick(scene: Scene, query: PicksRequest, options: PickOptions, handle: JobHandle) -> dict[str, Any]:
     from splatbot.sim.picking import pick_in_twin
     from splatbot.sim.twin import Twin
 
-    def told(step: PickStep) -> None:
-        handle.tell((_STAGES.index(step.stage) + 1) / (len(_STAGES) + 1), f"{step.stage}: {step.note}")
+    def on_step(step: PickStep) -> None:
+        handle.report((_STAGES.index(step.stage) + 1) / (len(_STAGES) + 1), f"{step.stage}: {step.note}")
 
-    handle.tell(0.0, f"scanning {scene.name}")
+    handle.report(0.0, f"scanning {scene.name}")
     picked = pick_in_twin(
         Twin(scene),
-        asked.target,
+        query.target,
         [WordAffordance()],
         options,
-        views=asked.views,
-        margin=asked.margin,
-        home=asked.home,
-        seed=asked.seed,
+        views=query.views,
+        margin=query.margin,
+        home=query.home,
+        seed=query.seed,
         stop=handle.cancelled.is_set,
-        on_step=told,
+        on_step=on_step,
     )
     if handle.cancelled.is_set():
         raise JobCancelled

@@ -12,7 +12,7 @@ from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal, time_path
 from splatbot.robots.ik import solve_ik
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import Asked, Service, problems
+from splatbot.services.dependencies import PatientMap, Service, problems
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
@@ -56,30 +56,30 @@ _IK_ANSWER = {"q": [[0.1, 0.2, 0.3, -2.0, 0.0, 1.6, 0.8]], "tried": 32, "reached
 )
 def plan(
     request: Request,
-    served: Asked,
+    served: PatientMap,
     service: Service,
-    asked: Annotated[PlanRequest, Depends(body_of(PlanRequest))],
+    query: Annotated[PlanRequest, Depends(body_of(PlanRequest))],
 ) -> Response:
-    """A certified motion, with its trajectory as ROS' JointTrajectory; `id` is what POST /v1/trajectories takes.
+    """Plan a certified motion; `trajectory` is a ROS JointTrajectory, `id` is for POST /v1/trajectories.
 
     No motion is a problem (422) whose `code` is that of moveit_msgs/MoveItErrorCodes.
     """
-    if asked.budget_ms > service.settings.max_plan_ms:
+    if query.budget_ms > service.settings.max_plan_ms:
         hint = "give less, or raise SPLATBOT_MAX_PLAN_MS"
         raise TooLargeError(f"is more than {service.settings.max_plan_ms:g}.", field="budget_ms", hint=hint)
-    robot, base = known_robot(asked.robot), base_in(served, asked.base)
-    start = robot.home if asked.start is None else joints_of(robot, asked.start, "start")
+    robot, base = known_robot(query.robot), base_in(served, query.base)
+    start = robot.home if query.start is None else joints_of(robot, query.start, "start")
     goal = (
-        PoseGoal(base @ asked.goal_pose.matrix("goal_pose"))
-        if asked.goal_pose is not None
-        else JointGoal(joints_of(robot, asked.goal or [], "goal"))
+        PoseGoal(base @ query.goal_pose.matrix("goal_pose"))
+        if query.goal_pose is not None
+        else JointGoal(joints_of(robot, query.goal or [], "goal"))
     )
-    planner = GaussianRRTStar(served.field, robot, T_world_base=base, margin=asked.margin)
-    result = planner.plan(start, goal, budget_ms=asked.budget_ms, seed=asked.seed)
-    trajectory = time_path(result.unwrap(), planner.arm, served.field, velocity_scale=asked.speed)
+    planner = GaussianRRTStar(served.field, robot, T_world_base=base, margin=query.margin)
+    result = planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed)
+    trajectory = time_path(result.unwrap(), planner.arm, served.field, velocity_scale=query.speed)
     kept = service.plans.add(served.id, robot.name, result, trajectory)
     service.bus.publish(map_topic(served.id, PLAN), trajectory)
-    return answer(request, _told(kept, asked.rate))
+    return answer(request, _description(kept, query.rate))
 
 
 @router.get("/v1/plans/{plan_id}", response_class=Response, responses=gives(_ANSWER) | problems(404))
@@ -88,8 +88,8 @@ def get_plan(
     service: Service,
     plan_id: Annotated[str, Path(description="as POST .../plans named it", examples=["0d6c1b7f2a3e4f50"])],
 ) -> Response:
-    """A plan again; the latest 256 are kept."""
-    return answer(request, _told(service.plans.get(plan_id), 50.0))
+    """Return a plan; the latest 256 are kept."""
+    return answer(request, _description(service.plans.get(plan_id), 50.0))
 
 
 @router.post(
@@ -98,27 +98,27 @@ def get_plan(
     responses=gives(_IK_ANSWER, npy="q (K, J)") | problems(404, 415, 422, 503),
     openapi_extra=takes(IkRequest, _IK_EXAMPLES),
 )
-def ik(request: Request, service: Service, asked: Annotated[IkRequest, Depends(body_of(IkRequest))]) -> Response:
-    """Configurations that bring the tool to a pose, nearest to `near` first; with `map`, those that are free in it."""
-    robot = known_robot(asked.robot)
-    pose, free = asked.pose.matrix("pose"), None
-    told: dict[str, Any] = {}
-    if asked.map is not None:
-        served = service.store.get(asked.map)
-        _, arm = arm_in(served, asked.robot, asked.base, asked.margin)
+def ik(request: Request, service: Service, query: Annotated[IkRequest, Depends(body_of(IkRequest))]) -> Response:
+    """Solve the IK of a tool pose, nearest to `near` first; with `map`, keep solutions that are free in it."""
+    robot = known_robot(query.robot)
+    pose, free = query.pose.matrix("pose"), None
+    version: dict[str, Any] = {}
+    if query.map is not None:
+        served = service.store.get(query.map)
+        _, arm = arm_in(served, query.robot, query.base, query.margin)
         field = served.field
         pose = inverse(arm.T_world_base) @ pose
-        told["map_version"] = served.map_version
+        version["map_version"] = served.map_version
 
         def free(q: Any) -> Any:
             return ~arm.check(field, q).in_collision
 
-    near = None if asked.near is None else joints_of(robot, asked.near, "near")
-    found = solve_ik(robot, pose, near=near, seeds=asked.seeds, free=free)
-    return answer(request, told | {"q": found.q, "tried": found.tried, "reached": found.reached}, array="q")
+    near = None if query.near is None else joints_of(robot, query.near, "near")
+    found = solve_ik(robot, pose, near=near, seeds=query.seeds, free=free)
+    return answer(request, version | {"q": found.q, "tried": found.tried, "reached": found.reached}, array="q")
 
 
-def _told(plan: Plan, rate: float) -> dict[str, Any]:
+def _description(plan: Plan, rate: float) -> dict[str, Any]:
     result, trajectory = plan.result, plan.trajectory
     path, certificate = result.unwrap(), trajectory.certificate
     return {

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.rasterize.views import default_view, depth_limits, render_view, to_png
-from splatbot.services.dependencies import Asked, Served, Settings, etag, problems, unchanged, version_headers
+from splatbot.services.dependencies import PatientMap, Served, Settings, etag, problems, unchanged, version_headers
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import Mode, Pose, RenderRequest
 from splatbot.services.settings import ServiceSettings
@@ -47,7 +47,7 @@ def render_default(
     height: Annotated[int, Query(ge=1, examples=[480])] = 480,
     fov_deg: Annotated[float, Query(gt=0, lt=180, examples=[60.0])] = 60.0,
 ) -> Response:
-    """The map seen whole, for a browser: from where 90 % of it is in view, along the world's z axis."""
+    """Render the whole map for a browser, along the world's z axis with 90 % of it in view."""
     check_size(width, height, settings)
     tag = etag(served, f"{mode} {width} {height} {fov_deg}")
     if (kept := unchanged(request, served, tag)) is not None:
@@ -57,8 +57,8 @@ def render_default(
 
 
 @router.post("/{map_id}/render", response_class=Response, responses=_PNG | problems(404, 413, 422, 503))
-def render(served: Asked, settings: Settings, request: Annotated[RenderRequest, _BODY]) -> Response:
-    """The map seen by a given camera from a given pose."""
+def render(served: PatientMap, settings: Settings, request: Annotated[RenderRequest, _BODY]) -> Response:
+    """Render the map for a given camera and pose."""
     model = served.ready.model
     if request.camera is not None:
         check_size(request.camera.width, request.camera.height, settings)

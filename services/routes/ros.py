@@ -23,7 +23,7 @@ class _Session(Protocol):
 @router.websocket("/")
 @router.websocket("/rosbridge")
 async def rosbridge(socket: WebSocket) -> None:
-    """A rosbridge v2 client, until it leaves."""
+    """Serve a rosbridge v2 client until it leaves."""
     await socket.accept()
     wire = _Wire(socket)
     await wire.serve(RosbridgeSession(wire.graph, wire.send, most_bytes=wire.most_bytes))
@@ -31,7 +31,7 @@ async def rosbridge(socket: WebSocket) -> None:
 
 @router.websocket("/foxglove")
 async def foxglove(socket: WebSocket) -> None:
-    """A Foxglove client, until it leaves; one that offers none of its protocols is refused."""
+    """Serve a Foxglove client until it leaves; a client without its protocols is refused."""
     offered = socket.scope.get("subprotocols", [])
     known = next((name for name in SUBPROTOCOLS if name in offered), None)
     if known is None:
@@ -58,9 +58,9 @@ class _Wire:
         await (self._socket.send_bytes(data) if isinstance(data, bytes) else self._socket.send_text(data))
 
     async def serve(self, session: _Session) -> None:
-        """Give the session what the client sends until it leaves."""
+        """Pass the client's messages to the session until it leaves."""
         try:
-            with suppress(WebSocketDisconnect, RuntimeError):  # RuntimeError: sending to one who has just gone
+            with suppress(WebSocketDisconnect, RuntimeError):  # RuntimeError: the client has just left
                 while (message := await self._socket.receive())["type"] != "websocket.disconnect":
                     text = message.get("text")
                     await session.receive(text if text is not None else message["bytes"])

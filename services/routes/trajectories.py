@@ -29,7 +29,7 @@ def _motion(service: Service, job_id: _MotionId) -> Job:
 
 @router.get("/arms", responses=example({"arms": [_ARM]}))
 def list_arms(service: Service) -> dict[str, Any]:
-    """The arms that can follow plans: "fake" moves as told, "twin" is simulated."""
+    """List the arms that can follow plans: "fake" follows exactly, "twin" is simulated."""
     return {"arms": [{"name": name} for name in service.arms.names]}
 
 
@@ -37,7 +37,7 @@ def list_arms(service: Service) -> dict[str, Any]:
 def get_arm(
     service: Service, name: Annotated[str, Path(description="as GET /v1/arms lists it", examples=["fake"])]
 ) -> dict[str, Any]:
-    """Where an arm is; plans for it start there."""
+    """Return the joint positions of an arm; plans for it start there."""
     arm = service.arms.get(name)
     at = arm.feedback
     state = at.state.value if at is not None else "idle"
@@ -53,18 +53,18 @@ def get_arm(
 )
 def send_trajectory(
     service: Service,
-    asked: Annotated[TrajectoryRequest, Depends(body_of(TrajectoryRequest))],
+    query: Annotated[TrajectoryRequest, Depends(body_of(TrajectoryRequest))],
     key: IdempotencyKey,
 ) -> Response:
     """Let an arm follow a plan that begins where the arm is. 409: it moves already, or stands elsewhere."""
-    plan = service.plans.get(asked.plan)
-    job = service.arms.send(asked.arm, plan.trajectory, key=key, request=asked.model_dump_json())
+    plan = service.plans.get(query.plan)
+    job = service.arms.send(query.arm, plan.trajectory, key=key, request=query.model_dump_json())
     return accepted(job, under="/v1/trajectories")
 
 
 @router.get("/trajectories/{job_id}", responses=example(_JOB) | problems(404))
 def get_trajectory(service: Service, job_id: _MotionId) -> JobInfo:
-    """How a motion stands: "succeeded" at its end, "failed" after a fault, "cancelled" when it was stopped."""
+    """Return the state of a motion: "succeeded" at its end, "failed" after a fault, "cancelled" after a stop."""
     return info(service.arms.motions.get(job_id))
 
 
@@ -78,7 +78,7 @@ def stop_trajectory(service: Service, job_id: _MotionId) -> JobInfo:
 async def trajectory_events(
     service: Service, watched: Annotated[Job, Depends(_motion)]
 ) -> AsyncIterator[ServerSentEvent]:
-    """The arm's feedback while it moves ("feedback"), and at last how the motion ended, as server-sent events."""
+    """Stream the arm's feedback while it moves, then the final state, as server-sent events."""
     with service.bus.subscribe(job_topic(watched.id), motion_topic(watched.id), capacity=64) as news:
         async for message in news:
             value: Job | Feedback = message.value

@@ -35,33 +35,33 @@ router = APIRouter(prefix="/v1/sim", tags=["simulation"])
     ),
 )
 def trials(
-    service: Service, asked: Annotated[TrialsRequest, Depends(body_of(TrialsRequest))], key: IdempotencyKey
+    service: Service, query: Annotated[TrialsRequest, Depends(body_of(TrialsRequest))], key: IdempotencyKey
 ) -> Response:
-    """Try a motion in a scene's physics: how well the arm follows, what it touches, what falls.
+    """Try a motion in a scene's physics: tracking error, contacts, dropped objects.
 
     Trial i has the seed `seed` + i, which displaces movable objects by millimetres. In a map, which has no moves of its
-    own, a plan is followed; `notes` of a result say what the map was taken for.
+    own, a plan is followed; `notes` of a result describe the physics model of the map.
     """
-    plan = service.plans.get(asked.plan) if asked.plan is not None else None
-    if asked.map is None:
-        scene = _shipped(asked.scene or "empty")
-        place: AbstractContextManager[Scene] = nullcontext(scene.with_effects(force=asked.force, forbid=asked.forbid))
-    elif asked.scene is not None:
-        raise InputError("is given beside a map.", field="scene", hint="give one of the two")
+    plan = service.plans.get(query.plan) if query.plan is not None else None
+    if query.map is None:
+        scene = _shipped(query.scene or "empty")
+        place: AbstractContextManager[Scene] = nullcontext(scene.with_effects(force=query.force, forbid=query.forbid))
+    elif query.scene is not None:
+        raise InputError("is given in addition to a map.", field="scene", hint="give one of the two")
     elif plan is None:
         raise InputError("is missing.", field="plan", hint="a map has no moves of its own: plan one in it")
     else:
-        served = service.store.get(asked.map)
-        _ = served.ready  # a map without a state is told at once, not by the job
-        place = scene_of_map(served, base_in(served, asked.base), plan.robot, force=asked.force, forbid=asked.forbid)
+        served = service.store.get(query.map)
+        _ = served.ready  # a map without a state is refused at once, not by the job
+        place = scene_of_map(served, base_in(served, query.base), plan.robot, force=query.force, forbid=query.forbid)
 
     def work(handle: JobHandle) -> dict[str, Any]:
         with place as scene:
             trajectory = plan.trajectory if plan is not None else None
-            done = [_trial(scene, trajectory, asked, i, handle) for i in range(asked.trials)]
-        return {"scene": asked.scene or ("empty" if asked.map is None else None), "map": asked.map, "trials": done}
+            done = [_trial(scene, trajectory, query, i, handle) for i in range(query.trials)]
+        return {"scene": query.scene or ("empty" if query.map is None else None), "map": query.map, "trials": done}
 
-    return accepted(service.jobs.submit("trials", work, key=key, request=asked.model_dump_json())[0])
+    return accepted(service.jobs.submit("trials", work, key=key, request=query.model_dump_json())[0])
 
 
 def _shipped(name: str) -> Scene:
@@ -71,17 +71,17 @@ def _shipped(name: str) -> Scene:
 
 
 def _trial(
-    scene: Scene, trajectory: JointTrajectory | None, asked: TrialsRequest, number: int, handle: JobHandle
+    scene: Scene, trajectory: JointTrajectory | None, query: TrialsRequest, number: int, handle: JobHandle
 ) -> dict[str, Any]:
     from splatbot.sim.twin import Twin
 
-    twin = Twin(scene, seed=asked.seed + number)
+    twin = Twin(scene, seed=query.seed + number)
     motion = motion_from_trajectory(trajectory) if trajectory is not None else None
 
     def progress(share: float) -> None:
-        handle.tell((number + share) / asked.trials, f"trial {number + 1} of {asked.trials}")
+        handle.report((number + share) / query.trials, f"trial {number + 1} of {query.trials}")
 
     result = twin.follow(motion, progress=progress).to_dict()
     del result["decisions"]
-    told: dict[str, Any] = plain({"seed": twin.seed} | result)
-    return told
+    body: dict[str, Any] = plain({"seed": twin.seed} | result)
+    return body

@@ -12,7 +12,7 @@ from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.rasterize.views import render_view, to_png
 from splatbot.services.codecs import MSGPACK, NPY, answer, body_of, gives, takes
-from splatbot.services.dependencies import Asked, Settings, problems
+from splatbot.services.dependencies import PatientMap, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.routes.render import check_size
 from splatbot.services.schemas import ViewsRequest
@@ -40,28 +40,28 @@ _ANSWER = {"map_version": 12, "views": [{"rgb": "iVBORw0KGgo...", "depth": "iVBO
 )
 def views(
     request: Request,
-    served: Asked,
+    served: PatientMap,
     settings: Settings,
-    asked: Annotated[ViewsRequest, Depends(body_of(ViewsRequest))],
+    query: Annotated[ViewsRequest, Depends(body_of(ViewsRequest))],
 ) -> Response:
-    """What each camera would see.
+    """Render the view of each camera.
 
     JSON holds PNGs in base64. msgpack and npy hold arrays: rgb uint8, depth float32 [m] (0: nothing there), normal
     float32, alpha float32.
     """
-    if len(asked.views) * len(asked.modes) > settings.max_views:
+    if len(query.views) * len(query.modes) > settings.max_views:
         hint = "split the request, or raise SPLATBOT_MAX_VIEWS"
         raise TooLargeError(f"are more than {settings.max_views}.", field="views", hint=hint)
     accepted = request.headers.get("accept", "")
-    if NPY in accepted and (len(asked.modes) > 1 or len({(v.camera.width, v.camera.height) for v in asked.views}) > 1):
+    if NPY in accepted and (len(query.modes) > 1 or len({(v.camera.width, v.camera.height) for v in query.views}) > 1):
         raise InputError("are not one array.", field="views", hint="ask for one mode and one size, or for msgpack")
     as_arrays = NPY in accepted or MSGPACK in accepted
     drawn: list[dict[str, Any]] = []
-    for number, view in enumerate(asked.views):
+    for number, view in enumerate(query.views):
         check_size(view.camera.width, view.camera.height, settings)
         camera, pose = Camera(**view.camera.model_dump()), view.pose.matrix(f"views.{number}.pose")
         images: dict[str, Any] = {}
-        for mode in asked.modes:
+        for mode in query.modes:
             image = render_view(served.ready.model, camera, pose, mode)
             if as_arrays:
                 images[mode] = (255.0 * image + 0.5).astype(np.uint8) if mode == "rgb" else image
@@ -70,5 +70,5 @@ def views(
         drawn.append(images)
     body: dict[str, Any] = {"map_version": served.map_version, "views": drawn}
     if NPY in accepted:
-        body["array"] = np.stack([images[asked.modes[0]] for images in drawn])
+        body["array"] = np.stack([images[query.modes[0]] for images in drawn])
     return answer(request, body, array="array")

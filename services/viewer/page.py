@@ -23,7 +23,7 @@ def map_page(
     robot: str = "panda",
     plan: JointTrajectory | None = None,
 ) -> str:
-    """The page's text; about 1 MB and 43 bytes a Gaussian.
+    """Return the page's text; about 1 MB and 43 bytes a Gaussian.
 
     Args:
         model: the map.
@@ -39,7 +39,7 @@ def map_page(
         scene.look_at_all(model)
         scene.show_map(model, coloring)
         if trajectory is not None:
-            scene.show_way(trajectory)
+            scene.show_camera_path(trajectory)
         if workspace is not None and workspace.T_world_base is not None:
             arm = RobotSpheres(load_robot(robot), T_world_base=workspace.T_world_base)
             q = plan.start if plan is not None else np.asarray(load_robot(robot).home)

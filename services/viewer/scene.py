@@ -1,4 +1,4 @@
-"""What a viewer shows of one map: splats, the camera and its way, the robot, its planned motion."""
+"""Drawing of one map in a viewer: splats, the camera and its path, the robot, its planned motion."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PATH_POINTS = 60
 
 
 def open_server(host: str, port: int) -> viser.ViserServer:
-    """viser's server, at the next free port where ``port`` is taken; without its banner.
+    """Open viser's server without its banner; if ``port`` is taken, at the next free port.
 
     Raises:
         InputError: the address cannot be listened on.
@@ -51,11 +51,11 @@ def close_server(server: viser.ViserServer) -> None:
 
 
 class ViewerScene:
-    """Draws one map into a viser server; each call shows what it is given and sends only what has changed.
+    """Draws one map into a viser server; each call sends only the changes.
 
     Args:
         server: viser's.
-        up: (3,) direction upwards in the map; None: as an upright first camera has it.
+        up: (3,) up direction in the map. If None, that of an upright first camera.
     """
 
     def __init__(self, server: viser.ViserServer, *, up: Array | None = None) -> None:
@@ -67,7 +67,7 @@ class ViewerScene:
         self._unit = trimesh.creation.icosphere(subdivisions=2)
 
     def look(self, position: Array, target: Array, *, fov_deg: float = 50.0) -> None:
-        """Where browsers that come from now on look from, and at what [m]; the view's height in degrees."""
+        """Set the camera position and target [m] of new browsers, and the vertical field of view [degrees]."""
         camera = self._server.initial_camera
         camera.position, camera.look_at = tuple(position.tolist()), tuple(target.tolist())
         camera.up, camera.fov = tuple(self._up.tolist()), float(np.radians(fov_deg))
@@ -80,7 +80,7 @@ class ViewerScene:
             self.look(T[:3, 3], target)
 
     def show_map(self, model: GaussianModel, coloring: Coloring = "rgb", *, T_world_camera: Array | None = None) -> int:
-        """The Gaussians; returns how many pieces were sent."""
+        """Show the Gaussians and return the number of pieces that were sent."""
         found, sent = pieces(model, coloring, T_world_camera=T_world_camera), 0
         with self._server.atomic():
             for key in self._drawn.keys() - found.keys():
@@ -100,8 +100,8 @@ class ViewerScene:
                 sent += 1
         return sent
 
-    def show_way(self, trajectory: Trajectory, camera: Camera | None = None) -> None:
-        """The camera's way as a line, and frusta along it."""
+    def show_camera_path(self, trajectory: Trajectory, camera: Camera | None = None) -> None:
+        """Show the camera's path as a line, with frusta along it."""
         at = trajectory.positions.astype(np.float32)
         if len(at) >= 2:
             lines = np.stack([at[:-1], at[1:]], axis=1)
@@ -111,11 +111,11 @@ class ViewerScene:
             self._frustum(f"/camera/frusta/{number}", trajectory.T_world_camera[i], camera, _GREY)
 
     def show_camera(self, T_world_camera: Array, camera: Camera | None = None) -> None:
-        """Where the camera is now."""
+        """Show the present pose of the camera."""
         self._frustum("/camera/now", T_world_camera, camera, _BLUE)
 
     def show_robot(self, arm: RobotSpheres, q: Array, field: GaussianCollisionField | None, name: str = "now") -> None:
-        """The robot's spheres at joints ``q`` (J,): red where they touch the map, green from 10 cm of room on."""
+        """Show the robot's spheres at joints ``q`` (J,), red in collision, green from 10 cm of clearance."""
         centers = arm.centers(q[None])[0]
         rgb = clearance_colors(field, centers, arm.spheres.radii)
         if name not in self._balls:
@@ -135,7 +135,7 @@ class ViewerScene:
         handle.batched_positions, handle.batched_colors = centers.astype(np.float32), rgb
 
     def show_plan(self, arm: RobotSpheres, plan: JointTrajectory) -> None:
-        """The way of the tool along a planned motion."""
+        """Show the tool's path along a planned motion."""
         q = plan.at(np.linspace(0.0, plan.duration, _PATH_POINTS)).position
         last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])
         at = arm.centers(q)[:, last].astype(np.float32)
@@ -143,7 +143,7 @@ class ViewerScene:
         self._server.scene.add_line_segments("/robot/path", lines, _AMBER, thickness=0.008)
 
     def show_grasps(self, grasps: Sequence[Grasp]) -> None:
-        """Each grasp as the hand's straight way and the line between its fingers, the greener the better."""
+        """Show each grasp as the approach line and the line between its fingers; green marks good ones."""
         if not grasps:
             self._server.scene.remove_by_name("/grasps")
             return
@@ -154,7 +154,7 @@ class ViewerScene:
         self._server.scene.add_line_segments("/grasps", lines, colors, thickness=0.004)
 
     def html(self) -> str:
-        """The scene as one page that needs nothing else."""
+        """Return the scene as one self-contained page."""
         return str(self._server.get_scene_serializer().as_html())
 
     def _frustum(self, name: str, T: Array, camera: Camera | None, color: tuple[int, int, int]) -> None:
@@ -174,10 +174,10 @@ class ViewerScene:
 def clearance_colors(
     field: GaussianCollisionField | None, centers: Array, radii: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """RGB (S, 3) of spheres (S, 3), (S,) [m]: red without room to the map, yellow at 5 cm, green at 10; grey: none."""
+    """Color spheres (S, 3), (S,) [m] by clearance: red at 0, yellow at 5 cm, green from 10 cm; grey without a map."""
     if field is None or not len(field):
         return np.tile(np.array(_GREY, np.uint8), (len(centers), 1))
-    room = field.clearance(np.column_stack([centers, radii]), cut=_ROOM).distance
-    share = np.clip(room / _ROOM, 0.0, 1.0)
+    clearance = field.clearance(np.column_stack([centers, radii]), cut=_ROOM).distance
+    share = np.clip(clearance / _ROOM, 0.0, 1.0)
     red, green = np.clip(2 - 2 * share, 0, 1), np.clip(2 * share, 0, 1)
     return np.rint(255 * np.column_stack([red, green, 0.1 * np.ones_like(share)])).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A map's Gaussians as a browser draws them, in pieces of space, so that only what has changed is sent again."""
+"""A map's Gaussians for a browser, in cubes of space, so that only changed cubes are sent again."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Splats:
 
     @property
     def digest(self) -> bytes:
-        """Of the values: two pieces that look the same have the same."""
+        """Hash of the values: two pieces that look the same have the same digest."""
         parts = (self.centers, self.covariances, self.rgbs, self.opacities)
         return hashlib.blake2b(b"".join(np.ascontiguousarray(p).tobytes() for p in parts), digest_size=16).digest()
 
@@ -52,13 +52,13 @@ class Splats:
 def pieces(
     model: GaussianModel, coloring: Coloring = "rgb", *, T_world_camera: Array | None = None
 ) -> dict[tuple[int, int, int], Splats]:
-    """The Gaussians by cube of space of half a metre, or of twice, four times, ... that where there would be too many.
+    """Split the Gaussians into cubes of half a metre, or of a doubled edge where there would be too many.
 
     Args:
         model: the map.
-        coloring: what colours tell: the map's own; depth seen by a camera, red near and blue far; the direction of the
-            surface, light blue where it faces that camera; or how little a Gaussian's place is known, red for least.
-        T_world_camera: (4, 4) of that camera; None: the world's origin.
+        coloring: meaning of the colours. "rgb" shows the map's own; "depth" a camera's depth, red near and blue far.
+            "normal" shows the surface's direction, "uncertainty" the position uncertainty, red for the least known.
+        T_world_camera: (4, 4) of that camera. If None, the world's origin.
     """
     if not len(model):
         return {}
@@ -81,7 +81,7 @@ def pieces(
 
 
 def colors(model: GaussianModel, coloring: Coloring, *, T_world_camera: Array | None = None) -> NDArray[np.float32]:
-    """RGB (N, 3) in 0..1; see :func:`pieces`.
+    """Return RGB (N, 3) in 0..1; see :func:`pieces`.
 
     Raises:
         InputError: there is no such colouring.
@@ -101,7 +101,7 @@ def colors(model: GaussianModel, coloring: Coloring, *, T_world_camera: Array | 
 
 
 def _turbo(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """RGB (N, 3) of values (N,), blue at their 2nd percentile, red at the 98th."""
+    """Map values (N,) to RGB (N, 3), blue at their 2nd percentile, red at the 98th."""
     if not len(values):
         return np.zeros((0, 3), np.float32)
     low, high = np.percentile(values, [2, 98])

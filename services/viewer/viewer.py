@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _News:
-    """The latest of everything; what is None has not come, or has been shown."""
+    """The latest value of each kind; None if it has not arrived, or has been shown."""
 
     served: ServedMap | None = None
     result: FrameResult | None = None
@@ -51,7 +51,7 @@ class Viewer:
         store: the maps; ``map_id`` is shown, or the first one there is.
         host, port: where the page is served, at the next free port where that one is taken; 0 takes any.
         robot: the arm that is shown where its base is known.
-        map_id: None: the first.
+        map_id: name of the map. If None, the first map is shown.
 
     Raises:
         InputError: the host cannot be listened on.
@@ -100,7 +100,7 @@ class Viewer:
         close_server(self.server)
 
     def html(self) -> str:
-        """What is shown now as one page that needs nothing else."""
+        """Return the present view as one self-contained page."""
         return self._scene.html()
 
     def _add_controls(self) -> None:
@@ -119,7 +119,7 @@ class Viewer:
             self._show_plan_at(self._slider.value)
 
     def _collect(self) -> None:
-        """Keep the latest of each kind: what comes faster than it is drawn is passed over."""
+        """Keep the latest of each kind; values that arrive faster than they are drawn are skipped."""
         for message in self._reader:
             with self._lock:
                 self._take(message)
@@ -154,7 +154,7 @@ class Viewer:
             try:
                 self._show(news)
             except Exception:  # one odd value must not end the view
-                _log.exception("the viewer could not show what is new")
+                _log.exception("the viewer could not show the update")
             self._stopping.wait(max(_PERIOD_S - (time.monotonic() - begun), 0.05))
 
     def _show(self, news: _News) -> None:
@@ -168,7 +168,7 @@ class Viewer:
             self._stale = False
             self._scene.show_map(served.snapshot.model, self._coloring, T_world_camera=self._pose)
         if news.trajectory is not None:
-            self._scene.show_way(news.trajectory, self._camera)
+            self._scene.show_camera_path(news.trajectory, self._camera)
         if news.plan is not None and self._arm is not None:
             self._plan = news.plan
             self._scene.show_plan(self._arm, news.plan)
@@ -188,7 +188,7 @@ class Viewer:
         if first:
             self._scene.look_at_all(served.snapshot.model)
         if served.trajectory is not None and first:
-            self._scene.show_way(served.trajectory, self._camera)
+            self._scene.show_camera_path(served.trajectory, self._camera)
         base = served.workspace.T_world_base if served.workspace is not None else None
         if base is not None and self._arm is None:
             robot = known_robot(self._robot_name)

@@ -35,7 +35,7 @@ _START_S = 40.0
 
 
 def find_chromium() -> str:
-    """Its path; without one the test is skipped."""
+    """Find Chromium's path; without one the test is skipped."""
     found = next(
         (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
     )
@@ -71,7 +71,7 @@ class Chromium:
         self.call("Page.enable")
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """A DevTools command's result."""
+        """Call a DevTools command and return its result."""
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
@@ -85,13 +85,13 @@ class Chromium:
         self.call("Page.navigate", url=url)
 
     def evaluate(self, script: str) -> Any:
-        """The value of a JavaScript expression; a promise is waited for."""
+        """Evaluate a JavaScript expression; wait for a promise."""
         told = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in told, told["exceptionDetails"]
         return told["result"].get("value")
 
     def screenshot(self) -> NDArray[np.uint8]:
-        """The page as RGB (H, W, 3)."""
+        """Capture the page as RGB (H, W, 3)."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None

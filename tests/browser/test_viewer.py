@@ -39,7 +39,7 @@ def _camera() -> Camera:
 
 
 def _wall(axes: tuple[int, int, int] = (0, 1, 2)) -> GaussianModel:
-    """A wall behind the robot, across the first of the axes, one half red, the other blue, 2 m wide; opaque."""
+    """Build a wall behind the robot, across the first of the axes, one half red, the other blue, 2 m wide; opaque."""
     y, z = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 81), np.linspace(-0.4, 1.4, 73)))
     n = len(y)
     red, blue = np.array([0.9, 0.1, 0.1]), np.array([0.1, 0.2, 0.9])
@@ -69,7 +69,7 @@ def browser(tmp_path: Path) -> Iterator[Chromium]:
 
 
 def _shot(browser: Chromium, sought: NDArray[np.float64], colour: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The page once a point has about a colour; the last picture where it never has."""
+    """Capture the page once a point has about a colour, or the last picture if it never does."""
     for _ in range(60):
         time.sleep(0.5)
         image = browser.screenshot()

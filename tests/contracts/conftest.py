@@ -27,7 +27,7 @@ from splatbot.workspace import Workspace
 
 @dataclass(frozen=True)
 class Service:
-    """A running service: what a client sees of it, and its parts."""
+    """A running service: its address for clients, and its parts."""
 
     client: httpx.Client
     runtime: Runtime
@@ -40,13 +40,13 @@ class Service:
         return self.runtime.store
 
     def ws(self, path: str) -> str:
-        """The address of a WebSocket."""
+        """Return the address of a WebSocket."""
         return f"ws://127.0.0.1:{self.client.base_url.port}{path}"
 
 
 @contextmanager
 def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterator[Service]:
-    """A real server on a real socket, until the block ends."""
+    """Run a real server on a real socket until the block ends."""
     runtime = Runtime(settings, store)
     app = create_app(runtime)
     config = uvicorn.Config(
@@ -76,7 +76,7 @@ def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterato
 
 
 def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
-    """A red wall of flat Gaussians, 1 m square at depth ``z`` [m], facing the world's origin."""
+    """Build a red wall of flat Gaussians, 1 m square at depth ``z`` [m], facing the world's origin."""
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 51), np.linspace(-0.5, 0.5, 51)))
     n = len(x)
     model = GaussianModel.from_activated(
@@ -90,7 +90,7 @@ def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
 
 
 def table_with_box() -> Snapshot:
-    """A table top at z = 0, z up, and a box of 4 x 6 x 8 cm on it at (0.5, 0, 0)."""
+    """Build a table top at z = 0, z up, and a box of 4 x 6 x 8 cm on it at (0.5, 0, 0)."""
     size = np.array([0.04, 0.06, 0.08])
     grids = [_sheet(np.array([0.5, 0.0, 0.0]), 2, np.array([0.6, 0.8]), 0.02)]
     for axis in range(3):
@@ -111,7 +111,7 @@ def table_with_box() -> Snapshot:
 def _sheet(
     center: NDArray[np.float64], axis: int, size: NDArray[np.float64], step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Centres and scales of flat Gaussians on a rectangle across an axis."""
+    """Return centres and scales of flat Gaussians on a rectangle across an axis."""
     a, b = (np.arange(-s / 2 + step / 2, s / 2, step) for s in size)
     u, v = (g.ravel() for g in np.meshgrid(a, b))
     means = np.tile(center, (len(u), 1))

@@ -1,4 +1,4 @@
-"""Every call of /v1, asked as a client would: the documented examples, the typed client, arrays, jobs and motions."""
+"""Every call of /v1 from a client's side: the documented examples, the typed client, arrays, jobs and motions."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_every_documented_example_is_answered_as_documented(api: Service) -> Non
             assert response.status_code in (200, 201, 202), f"{path}, {name}: {response.text}"
             asked += 1
     for job in api.runtime.jobs.list():
-        api.runtime.jobs.cancel(job.id)  # the tests that follow need not wait for what was asked for here
+        api.runtime.jobs.cancel(job.id)  # the tests that follow need not wait for these requests
     assert asked >= 18
 
 
@@ -276,7 +276,7 @@ def test_trials_in_the_twin_are_a_job_with_a_result_for_each(api: Service, robot
 
 
 def test_a_plan_is_tried_in_the_twin_of_the_map_it_was_made_in(api: Service, robot: Client) -> None:
-    """Certified in the map, it touches nothing of what physics makes of it; 90 cm nearer to the wall it does."""
+    """A motion that is certified in the map has no contact in its twin; 90 cm nearer to the wall it has."""
     plan = robot.plan("default", goal=[0.3, *HOME[1:]], base=BASE)
     near = BASE | {"translation": [0.0, 0.5, 0.9]}
     touched = []

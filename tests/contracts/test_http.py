@@ -1,4 +1,4 @@
-"""What an HTTP client may rely on, asked with httpx of a real uvicorn server."""
+"""Promises to HTTP clients, checked with httpx on a real uvicorn server."""
 
 from __future__ import annotations
 

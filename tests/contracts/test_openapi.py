@@ -1,4 +1,4 @@
-"""Whatever fits the OpenAPI document, and much that does not, is answered without a fault of the service."""
+"""Requests that fit the OpenAPI document, and many that do not, never cause a fault of the service."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def test_two_thousand_generated_requests_meet_no_fault_and_errors_are_problems(a
                 del content[kind]
     schema = schemathesis.openapi.from_dict(document)
     operations = [operation.ok() for operation in schema.get_all_operations()]
-    # Deleting the map that all are asked about would make the rest of them 404.
+    # Deleting the map that all requests use would make the rest of them 404.
     operations = [o for o in operations if not (o.method.upper() == "DELETE" and "{map_id}" in o.path)]
     operations = [o for o in operations if not o.path.endswith("/events")]
-    each = 3 * CASES // (2 * len(operations))  # calls without parameters are asked but once
+    each = 3 * CASES // (2 * len(operations))  # calls without parameters are sent only once
     asked, statuses = 0, set()
     for operation in operations:
         quiet = settings(

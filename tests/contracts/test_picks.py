@@ -1,4 +1,4 @@
-"""Picks in the twin, asked for over HTTP."""
+"""Picks in the twin, requested over HTTP."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def test_roslibpy_reads_calls_serves_and_pushes_frames_that_are_mapped(transport
     assert abs(told["time"] - time.time()) < 120
     assert (told["code"], told["points"] > 10, told["sum"]) == (1, True, {"sum": 7})
     assert len(told["odometry"]) == 3
-    assert np.abs([list(p.values()) for p in told["odometry"]]).max() < 0.01  # the wall stood still
+    assert np.abs([list(p.values()) for p in told["odometry"]]).max() < 0.01  # the wall did not move
     assert len(service.store.get("ros").ready.model) > 100
 
 
@@ -92,7 +92,7 @@ def test_a_client_that_vanishes_or_does_not_read_delays_nobody(service: Service)
     with connect(service.ws("/rosbridge"), max_size=None) as good:
         good.send(json.dumps({"op": "subscribe", "topic": "/map/points", "compression": "cbor-raw"}))
         good.recv(timeout=20)
-        for version in range(2, 202):  # 33 MB in JSON, more than what sockets hold
+        for version in range(2, 202):  # 33 MB in JSON, more than sockets buffer
             service.store.publish("wall", wall(version))
             good.recv(timeout=20)
         assert service.client.get("/healthz").status_code == 200
@@ -127,7 +127,7 @@ def test_rosbridge_answers_at_the_root_too(service: Service) -> None:
 
 
 def _raw_websocket(url: str) -> socket.socket:
-    """A connection whose reading is left to the test."""
+    """Open a connection that the test itself reads."""
     host, port = url.removeprefix("ws://").split("/")[0].split(":")
     raw = socket.create_connection((host, int(port)), timeout=20)
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -304,7 +304,7 @@ def test_mutated_bodies_are_refused_or_answered_and_never_break_the_service(open
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["application/x-npy", "application/msgpack", "application/json"])
 def test_two_thousand_mutated_bodies_break_nothing_and_leave_no_memory_behind(open_: Service, kind: str) -> None:
-    _fuzz(open_, kind, 500, seed=2)  # what the first ones allocate is kept for the next
+    _fuzz(open_, kind, 500, seed=2)  # the first ones allocate memory that is kept for the next
     before = _resident_mib()
     _fuzz(open_, kind, 1500, seed=3)
     assert _resident_mib() - before < 8.0

@@ -1,4 +1,4 @@
-"""How rosbridge packs a message for the wire: JSON, CBOR, PNG, fragments; and unpacks what clients send."""
+"""Encoding of rosbridge messages: JSON, CBOR, PNG, fragments; and decoding of clients' messages."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _SMALLEST_FRAGMENT = 128
 
 
 def check_compression(value: Any) -> Compression:
-    """A compression by name.
+    """Check a compression by name.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: the name is unknown.
     """
     for known in get_args(Compression):
         if value == known:
@@ -37,7 +37,7 @@ def check_compression(value: Any) -> Compression:
 
 
 def pack_published(topic: str, message: RosMessage, compression: Compression) -> str | bytes:
-    """A `publish` of a message."""
+    """Encode a `publish` of a message."""
     if compression == "cbor-raw":
         sec, nanosec = divmod(round(message.stamp * 1e9), 10**9)
         raw = {"secs": sec, "nsecs": nanosec, "bytes": message.cdr}
@@ -49,7 +49,7 @@ def pack_published(topic: str, message: RosMessage, compression: Compression) ->
 
 
 def pack(values: Mapping[str, Any], compression: Compression) -> str | bytes:
-    """Any other operation."""
+    """Encode any other operation."""
     if compression in ("cbor", "cbor-raw"):
         return cbor2.dumps(to_cbor(dict(values)))
     text = to_json(dict(values))
@@ -57,7 +57,7 @@ def pack(values: Mapping[str, Any], compression: Compression) -> str | bytes:
 
 
 def png_text(text: str) -> str:
-    """A `png` operation: the text's bytes as the pixels of an RGB image, padded with newlines."""
+    """Encode a `png` operation: the text's bytes as the pixels of an RGB image, padded with newlines."""
     data = text.encode()
     width = max(math.isqrt(len(data) // 3), 1)
     height = math.ceil(len(data) / (3 * width))
@@ -68,7 +68,7 @@ def png_text(text: str) -> str:
 
 
 def unpack_png(data: Any, most_bytes: int) -> str:
-    """The text of a `png` operation.
+    """Decode the text of a `png` operation.
 
     Raises:
         InputError: it is no such image, or would unpack to more than ``most_bytes``.
@@ -94,7 +94,7 @@ def unpack_png(data: Any, most_bytes: int) -> str:
 
 
 def split(text: str, size: int | None, name: str) -> list[str]:
-    """``fragment`` operations of a text longer than ``size``; None never splits.
+    """Split a text longer than ``size`` into ``fragment`` operations; None never splits.
 
     Raises:
         InputError: the size is too small.
@@ -109,7 +109,7 @@ def split(text: str, size: int | None, name: str) -> list[str]:
 
 
 def check_fragment_size(value: Any) -> int | None:
-    """A client's fragment size [characters]; None, or a very large one, asks for none.
+    """Check a client's fragment size [characters]; None, or a very large one, disables fragments.
 
     Raises:
         InputError: it is no number, or too small.
@@ -134,7 +134,7 @@ class Fragments:
         self._parts: OrderedDict[str, dict[int, str]] = OrderedDict()
 
     def add(self, operation: Mapping[str, Any]) -> str | None:
-        """The text that a fragment completes, if it does.
+        """Add a fragment and return the text that it completes, if any.
 
         Raises:
             InputError: it makes no sense, or too much is under way.

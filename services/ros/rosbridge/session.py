@@ -1,4 +1,4 @@
-"""One rosbridge client: what it may ask, and what it is answered. Knows nothing of WebSockets."""
+"""One rosbridge client: its operations and the answers to them. Knows nothing of WebSockets."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _log = logging.getLogger(__name__)
 class RosbridgeSession:
     """Operations of one client.
 
-    What cannot be done is answered by a `status` of level error (which a client turns off by `set_level` none), a call
-    by a `service_response` whose result is false. Nothing is compressed or sent in fragments unless asked for.
+    A failed operation is answered by a `status` of level error, which `set_level` none turns off. A failed call is
+    answered by a `service_response` whose result is false. Compression and fragments are used only on request.
 
     Args:
         graph: topics and services.
@@ -74,7 +74,7 @@ class RosbridgeSession:
         }
 
     async def receive(self, text: str | bytes) -> None:
-        """Do what a client's message asks; never raises for what it holds."""
+        """Handle a client's message; a wrong message never raises."""
         operation: dict[str, Any] = {}
         try:
             operation = json_object(text, self._most_bytes)
@@ -103,7 +103,7 @@ class RosbridgeSession:
     def _operation(self, name: Any) -> Callable[[dict[str, Any]], Awaitable[None] | None]:
         if not isinstance(name, str) or name not in self._operations:
             known = ", ".join(self._operations)
-            raise InputError("asks for nothing that is known.", field="op", hint=f"the operations are {known}")
+            raise InputError("is not a known operation.", field="op", hint=f"the operations are {known}")
         return self._operations[name]
 
     async def _send(self, data: str | bytes) -> None:
@@ -112,8 +112,8 @@ class RosbridgeSession:
 
     async def _status(self, level: str, text: str, name: Any) -> None:
         if _LEVELS.index(level) <= self._level:
-            told = {"op": "status", "level": level, "msg": text} | ({} if name is None else {"id": str(name)[:256]})
-            await self._send(json.dumps(told))
+            status = {"op": "status", "level": level, "msg": text} | ({} if name is None else {"id": str(name)[:256]})
+            await self._send(json.dumps(status))
 
     def _set_level(self, operation: dict[str, Any]) -> None:
         if operation.get("level") not in _LEVELS:
@@ -144,7 +144,7 @@ class RosbridgeSession:
 
     async def _png(self, operation: dict[str, Any]) -> None:
         text = await asyncio.to_thread(unpack_png, operation.get("data"), self._most_bytes)
-        if '"png"' in text[:16]:  # one image in another, for ever
+        if '"png"' in text[:16]:  # images nested without end
             raise InputError("holds another.", field="png", hint="pack once")
         await self.receive(text.rstrip("\n"))
 

@@ -32,8 +32,8 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Wish:
-    """What one `subscribe` asked for; ``throttle`` [s], ``queue`` 0 where nothing was said."""
+class _SubscribeOptions:
+    """Options of one `subscribe`: ``throttle`` [s], and ``queue``, which is 0 by default."""
 
     throttle: float
     queue: int
@@ -49,13 +49,13 @@ class Subscriptions:
 
     Args:
         graph: where the topics are.
-        send: takes what is to go to the client; may wait.
+        send: sends a message to the client; may wait.
         most: topics at once.
     """
 
     def __init__(self, graph: RosGraph, send: Send, most: int = 256) -> None:
         self._graph, self._send, self._most = graph, send, most
-        self._wishes: dict[str, dict[Any, _Wish]] = {}
+        self._wishes: dict[str, dict[Any, _SubscribeOptions]] = {}
         self._tasks: dict[str, tuple[asyncio.Task[None], Subscription]] = {}
 
     @property
@@ -70,7 +70,7 @@ class Subscriptions:
             InputError: the topic, its type or an option makes no sense.
         """
         topic = resolve(operation.get("topic"))
-        wish = _Wish(
+        wish = _SubscribeOptions(
             throttle=_number(operation, "throttle_rate") / 1000.0,
             queue=min(int(_number(operation, "queue_length")), _LONGEST_QUEUE),
             fragment=check_fragment_size(operation.get("fragment_size")),
@@ -116,7 +116,7 @@ class Subscriptions:
     def _restart(self, topic: str, *, latched: bool) -> None:
         self._stop(topic)
         wishes = list(self._wishes[topic].values())
-        merged = _Wish(
+        merged = _SubscribeOptions(
             throttle=min(w.throttle for w in wishes),
             queue=max(w.queue for w in wishes),
             fragment=min((w.fragment for w in wishes if w.fragment is not None), default=None),
@@ -134,7 +134,9 @@ class Subscriptions:
             reader.close()
             task.cancel()
 
-    async def _deliver(self, topic: str, reader: Subscription, wish: _Wish, first: RosMessage | None) -> None:
+    async def _deliver(
+        self, topic: str, reader: Subscription, wish: _SubscribeOptions, first: RosMessage | None
+    ) -> None:
         loop = asyncio.get_running_loop()
         if first is not None:
             await self._one(topic, first, wish)
@@ -144,7 +146,7 @@ class Subscriptions:
                 await self._one(topic, news.value, wish)
                 await asyncio.sleep(max(begun + wish.throttle - loop.time(), 0.0))
 
-    async def _one(self, topic: str, message: RosMessage, wish: _Wish) -> None:
+    async def _one(self, topic: str, message: RosMessage, wish: _SubscribeOptions) -> None:
         try:
             packed = await asyncio.to_thread(pack_published, topic, message, wish.compression)
         except Exception:  # one odd message must not end the topic

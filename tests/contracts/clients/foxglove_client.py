@@ -1,4 +1,4 @@
-"""A small Foxglove client: what is advertised, and messages decoded by the advertised definitions alone."""
+"""A small Foxglove client: it lists the advertised topics and decodes messages by their advertised definitions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class FoxgloveClient:
         self._socket.send(json.dumps(values))
 
     def problem(self) -> str:
-        """The next status that the server sends."""
+        """Wait for the next status that the server sends."""
         while not self.problems:
             self._read()
         return self.problems.pop(0)

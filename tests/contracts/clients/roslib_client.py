@@ -1,4 +1,4 @@
-"""A roslibpy program: `python roslib_client.py URL TRANSPORT`; prints what it saw as one JSON object."""
+"""A roslibpy program: `python roslib_client.py URL TRANSPORT`; prints its observations as one JSON object."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WAIT_S = 20
 
 
 def _first(ros: Any, name: str, kind: str, **options: Any) -> Any:
-    """The first message of a topic."""
+    """Wait for the first message of a topic."""
     found: list[Any] = []
     came = threading.Event()
 
@@ -44,7 +44,7 @@ def _image(stamp: float, encoding: str, width: int, height: int, data: bytes) ->
 
 
 def _push_frames(ros: Any, count: int) -> Any:
-    """Publish frames of a textured wall 1 m away, and wait until odometry tells of them."""
+    """Publish frames of a textured wall 1 m away, and wait until odometry reports them."""
     names = {"color/image_raw": "Image", "depth/image_raw": "Image", "color/camera_info": "CameraInfo"}
     topics = {n: roslibpy.Topic(ros, f"/camera/{n}", f"sensor_msgs/{kind}") for n, kind in names.items()}
     for topic in topics.values():
@@ -80,7 +80,7 @@ def _serve_and_call(ros: Any) -> Any:
 
 
 def main(url: str, transport: str, frames: int) -> None:
-    """Everything that a user of roslibpy does."""
+    """Run the operations that a user of roslibpy performs."""
     ros = roslibpy.Ros(url, transport=transport)
     ros.run(timeout=_WAIT_S)
     cloud = _first(ros, "/map/points", "sensor_msgs/PointCloud2")

@@ -126,10 +126,10 @@ def test_a_map_is_measured_once_for_all_questions(run_folder: Path, monkeypatch:
 
     monkeypatch.setattr(robots_in_maps, "measured_map", counted)
     served = runtime.store.get("default")
-    first = robots_in_maps.things_in(served, np.eye(4), as_known=True)
+    first = robots_in_maps.objects_in(served, np.eye(4), as_known=True)
     moved = np.eye(4)
     moved[0, 3] = 0.1
-    second = robots_in_maps.things_in(served, moved, as_known=False)
+    second = robots_in_maps.objects_in(served, moved, as_known=False)
     assert len(asked) == 1
     assert first.measured is second.measured
 

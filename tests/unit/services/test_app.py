@@ -1,4 +1,4 @@
-"""Errors and limits of the application, asked in process."""
+"""Errors and limits of the application, requested in process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from splatbot.services.store import MapStore
 
 
 def _ask(method: str, path: str, *, error: Exception | None = None, **request: Any) -> httpx.Response:
-    """One request to an application with small limits, whose route /boom raises ``error``."""
+    """Send one request to an application with small limits, whose route /boom raises ``error``."""
     store = MapStore()
     store.add("growing", source="a log", state="mapping")
     app = create_app(Runtime(ServiceSettings(max_body_bytes=1024), store))

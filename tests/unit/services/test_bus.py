@@ -1,4 +1,4 @@
-"""The bus: latest values, bounded queues, counts of what was dropped, threads and asyncio alike."""
+"""The bus: latest values, bounded queues, counts of dropped messages, threads and asyncio alike."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is worked out once for a state of a map."""
+"""Results that are computed once for a version of a map."""
 
 from __future__ import annotations
 

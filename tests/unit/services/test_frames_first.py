@@ -1,4 +1,4 @@
-"""Questions let frames go first, and not for ever."""
+"""Queries wait for frames, for a bounded time."""
 
 from __future__ import annotations
 

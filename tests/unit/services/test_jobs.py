@@ -33,7 +33,7 @@ def _ended(jobs: Jobs, job: Job) -> Job:
 
 def _until_cancelled(handle: JobHandle) -> dict[str, Any]:
     while True:
-        handle.tell(0.5)
+        handle.report(0.5)
         time.sleep(0.005)
 
 
@@ -54,7 +54,7 @@ def test_every_change_goes_to_the_bus_in_order() -> None:
 
     def work(handle: JobHandle) -> dict[str, Any]:
         gate.wait(5)
-        handle.tell(0.5, "half")
+        handle.report(0.5, "half")
         return {}
 
     job, _ = jobs.submit("halves", work)

@@ -1,4 +1,4 @@
-"""Maps on disk: whole or not there, whatever happens in between."""
+"""Maps on disk: complete or absent, also after a crash."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _served(version: int, n: int = 5) -> ServedMap:
 
 @contextmanager
 def disk_of(size: int) -> Iterator[None]:
-    """No file can grow beyond ``size`` bytes: writing fails as on a full disk."""
+    """Limit files to ``size`` bytes: writing fails as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

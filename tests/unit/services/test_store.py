@@ -1,4 +1,4 @@
-"""The store: readers keep what they took, versions only grow."""
+"""The store: readers keep their version, versions only grow."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def _points(seconds: float = 0.6, turn: float = 0.3) -> list[dict[str, Any]]:
 
 
 class Scene:
-    """An arm beside a ball, and a client."""
+    """An arm next to a ball, and a client."""
 
     def __init__(self, at: Any) -> None:
         ball = GaussianModel.from_activated(

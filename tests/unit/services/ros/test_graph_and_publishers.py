@@ -1,4 +1,4 @@
-"""The service's news as ROS topics, and what clients publish as frames and joints."""
+"""The bus's messages as ROS topics, and clients' messages as frames and joints."""
 
 from __future__ import annotations
 

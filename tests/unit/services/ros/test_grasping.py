@@ -24,7 +24,7 @@ CENTRE, HALF = np.array([0.5, 0.05, 0.04]), np.array([0.02, 0.03, 0.04])
 
 
 def _face(centre: Any, half: Any, axis: int) -> tuple[Any, Any]:
-    """Means (N, 3) of a flat rectangle across an axis, and the quaternion of discs that lie in it."""
+    """Return means (N, 3) of a flat rectangle across an axis, and the quaternion of discs that lie in it."""
     u, v = (i for i in range(3) if i != axis)
     a, b = (np.arange(-half[i], half[i] + 1e-9, STEP) for i in (u, v))
     grid = np.stack(np.meshgrid(a, b), -1).reshape(-1, 2)

@@ -23,7 +23,7 @@ LIMIT = 100_000
 
 
 class Client:
-    """A session, and what it was sent."""
+    """A session, and the messages that it received."""
 
     def __init__(self, graph: RosGraph) -> None:
         self.sent: list[Any] = []

@@ -42,7 +42,7 @@ def _graph(model: GaussianModel, base: Any = T_WORLD_BASE) -> tuple[RosGraph, Ma
 
 
 def _call(graph: RosGraph, name: str, **args: Any) -> dict[str, Any]:
-    """As over the wire."""
+    """Call a service as over the wire."""
     return dict(json.loads(to_json(graph.service(name).call(json.loads(json.dumps(args))))))
 
 
