@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,19 +30,25 @@ def _check(cloud: Any) -> None:
 def test_the_client_reads_our_messages_from_the_sdk_s_own_server() -> None:
     foxglove = pytest.importorskip("foxglove")
     schema = foxglove.Schema(name=CLOUD, encoding="ros2msg", data=definition(CLOUD).encode())
-    context = foxglove.Context()
+    context, received = foxglove.Context(), threading.Event()
     server = foxglove.start_server(port=0, context=context)
     try:
         channel = foxglove.Channel(POINTS, schema=schema, message_encoding="cdr", context=context)
         with FoxgloveClient(f"ws://127.0.0.1:{server.port}") as client:
             client.subscribe(POINTS)
             data = to_cdr(point_cloud_message(wall().model, 1.0))
-            while not client._data:
-                channel.log(data)
-                client._read()
+            # The SDK drops messages that precede the subscription, whose arrival no status confirms: log repeatedly.
+            logger = threading.Thread(target=lambda: _repeat(lambda: channel.log(data), until=received), daemon=True)
+            logger.start()
             _check(client.message(POINTS)[1])
     finally:
+        received.set()
         server.stop()
+
+
+def _repeat(action: Callable[[], object], *, until: threading.Event) -> None:
+    while not until.wait(0.05):
+        action()
 
 
 @pytest.mark.parametrize("subprotocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
