@@ -275,4 +275,4 @@ def make_scene(values: dict[str, Any], *, file: str | Path | None = None) -> Sce
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"]) or "scene"
         message = first["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"{message}.", file=file, field=field, hint="docs/twin.md lists all keys") from error
+        raise ConfigError(f"{message}.", file=file, field=field, hint="docs/guide/twin.md lists all keys") from error

@@ -17,7 +17,7 @@ from splatbot.run import map_log
 from tests.e2e.real_grasps import check_lying_box, check_shelf_box, check_tape_roll
 
 # name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 2 cm and about 3 cm. What the third does
-# not tell (docs/tracking.md, "Keypoints from all of the image"), photogrammetry and held-out views do.
+# not tell (docs/experiments/tracking.md, "Keypoints from the whole image"), photogrammetry and held-out views do.
 LOGS = [
     pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48"),
     pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot"),

@@ -82,7 +82,7 @@ SCENES = [
 
 @pytest.mark.parametrize("log", SCENES)
 def test_errors_are_as_large_as_the_covariances_say(log: str) -> None:
-    """NEES / 6, mean of three logs: at this size more cautious than at 640x480 (see docs/tracking.md)."""
+    """NEES / 6, mean of three logs: at this size more cautious than at 640x480 (see docs/experiments/tracking.md)."""
     logs = [f"{log}&effects=depth_noise;motion_blur&frames=30&seed={seed}" for seed in (1, 2, 3)]
     assert 0.3 < np.mean([nees_of(one, small_config()) for one in logs]) < 2.0
 

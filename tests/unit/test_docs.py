@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"]
+DOCUMENTS = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "experiments/README.md"]
 DOCUMENTS += [str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))]
 GUIDES = [name for name in DOCUMENTS if name.startswith("docs/guide/")]
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)")
@@ -61,7 +61,7 @@ def test_every_make_target_of_the_readme_exists() -> None:
 
 
 def test_every_file_of_the_repository_that_a_document_names_exists() -> None:
-    folders = "splatbot|services|sim|robots|configs|tests|docs|docker|examples"
+    folders = "splatbot|services|sim|robots|configs|tests|docs|docker|examples|experiments"
     named = re.compile(rf"`((?:{folders})/[\w./-]+)`")
     missing = {
         f"{name}: {path}"
