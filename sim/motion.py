@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splatbot.errors import FormatError, InputError
+from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
-from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
 from splatbot.sim.scene import Scene
 from splatbot.sim.solids import rotation_of

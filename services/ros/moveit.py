@@ -13,7 +13,7 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError, MapNotFoundError, SplatbotError
 from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal, time_path
-from splatbot.robots.ik import solve_ik
+from splatbot.planning.ik import solve_ik
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
 from splatbot.services.ros.graph import RosGraph, Service

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 
 from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal, time_path
-from splatbot.robots.ik import solve_ik
+from splatbot.planning.ik import solve_ik
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
 from splatbot.services.dependencies import PatientMap, Service, problems

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
-from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
 from splatbot.sim.compare.trials import PolicyAction
 from splatbot.sim.motion import minimum_jerk, motion_from_samples

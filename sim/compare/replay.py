@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
-from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
 from splatbot.sim.compare.recorded import ArmRecord, pose_gap
 from splatbot.sim.contact_monitor import Touch

@@ -21,8 +21,8 @@ from splatbot.logs.raycast import Moving, RaycastSurface
 from splatbot.logs.shapes import box
 from splatbot.logs.textures import Texture
 from splatbot.mapping.selfmask import SelfMask
+from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
-from splatbot.robots.ik import solve_ik
 from splatbot.robots.panda import panda
 from splatbot.sim.effects.moving_obstacles import place_on
 from splatbot.sim.effects.registry import make_effects

@@ -21,9 +21,9 @@ from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
 from splatbot.planning import JointGoal, Path
 from splatbot.planning.cartesian import straight_line
+from splatbot.planning.ik import solve_ik
 from splatbot.planning.problem import Certificate
 from splatbot.protocols import Array
-from splatbot.robots.ik import solve_ik
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.shapes import Capsule
 from splatbot.sim.trials.discrete import RESOLUTION, Free, connect

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatbot._native import inverse_kinematics
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.collision.robot import EPS
 from splatbot.errors import InputError
 from splatbot.geometry import so3_exp, so3_log
 from splatbot.planning.causes import collision
-from splatbot.planning.goals import HasTool
+from splatbot.planning.ik import TOLERANCE, HasTool, inverse_kinematics, is_rigid
 from splatbot.planning.problem import Cause, Certificate, GoalError, Path, PlanStatus, StartError
 from splatbot.planning.timing import least_room
 from splatbot.protocols import Array
@@ -22,8 +21,6 @@ STEP = 0.01  # [m] between places on the line
 TURN = 0.05  # [rad] between them, at most
 JUMP = 0.3  # [rad or m] of any joint from one place to the next; more is another branch
 OFF_LINE = 1e-3  # [m] that the tool may be off the line between two places
-_EXACT = 1e-5  # [m], [rad] that a place may be missed by
-_ROUNDS = 60
 _FINER = 4  # times the places are doubled where the tool would leave the line
 
 
@@ -114,16 +111,8 @@ def _followed(
         T = T_start.copy()
         T[:3, 3] += share * length
         T[:3, :3] = T_start[:3, :3] @ so3_exp(share * turn)
-        found, miss = inverse_kinematics(
-            arm.native,
-            np.ascontiguousarray(T[None, :3]),
-            np.ascontiguousarray(tool[:3]),
-            chain.lower,
-            chain.upper,
-            np.ascontiguousarray(q[-1][None]),
-            _ROUNDS,
-        )
-        if (miss[0] > _EXACT).any() or np.abs(found[0] - q[-1]).max() > JUMP:
+        found, miss = inverse_kinematics(arm.native, chain, tool, T[None], q[-1][None])
+        if (miss[0] > TOLERANCE).any() or np.abs(found[0] - q[-1]).max() > JUMP:
             return np.array(q), True
         q.append(found[0])
     return np.array(q), False
@@ -179,7 +168,7 @@ def _checked(arm: RobotSpheres, start: ArrayLike, end: ArrayLike, off_line: floa
         hint = f"{arm.robot.name} has {len(arm.robot.chain)} joints"
         raise StartError(f"is {q.shape}, or not finite.", field="start", hint=hint)
     T = np.asarray(end, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+    if not is_rigid(T):
         raise GoalError("is no rigid pose.", field="T_world_end", hint="give (4, 4) with an orthonormal rotation")
     if not isinstance(arm.robot, HasTool):
         raise GoalError("is a pose.", field="T_world_end", hint=f"{arm.robot.name} has no tool")

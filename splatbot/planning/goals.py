@@ -4,34 +4,20 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatbot._native import inverse_kinematics
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.geometry import so3_exp
 from splatbot.planning.causes import beyond_limits, collision
+from splatbot.planning.ik import MAX_STARTS, TOLERANCE, HasTool, inverse_kinematics, is_rigid
 from splatbot.planning.problem import Cause, Goal, GoalError, JointGoal, PlanStatus, PoseGoal
 from splatbot.protocols import Array
 
-EXACT = 1e-6  # [m], [rad] that a posture may miss its pose by
 _BATCH = 16  # starts between two looks at the clock
-_ROUNDS = 80  # of each start
-_MOST = 512  # starts
 _FEWEST = 128  # before a pose is given up
 _APART = 0.05  # [rad or m]; postures nearer than this in every joint are one
-
-
-@runtime_checkable
-class HasTool(Protocol):
-    """A robot with a tool."""
-
-    @property
-    def T_link_tcp(self) -> Array:
-        """(4, 4), the tool's frame on the last link."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +91,13 @@ def _postures(
     found: list[Array] = []
     reached, missed = False, np.array([np.inf, np.inf])
     hit: list[Array] = []
-    for tried in range(0, _MOST, _BATCH):
+    for tried in range(0, MAX_STARTS, _BATCH):
         starts = rng.uniform(chain.lower, chain.upper, (_BATCH, len(chain)))
         offsets = rng.uniform(-1.0, 1.0, (_BATCH, 6)) * box
         if tried == 0:
             starts[0], offsets[0] = near, 0.0
         q, miss = _solve(arm, robot.T_link_tcp, T, offsets, starts)
-        good = (miss <= EXACT).all(axis=1)
+        good = (miss <= TOLERANCE).all(axis=1)
         if good.any():
             free = ~arm.check(field, q).in_collision
             hit += list(q[good & ~free][: 8 - len(hit)])
@@ -139,23 +125,13 @@ def _solve(arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Arr
     targets = np.tile(T, (len(starts), 1, 1))
     targets[:, :3, 3] += offsets[:, :3] @ T[:3, :3].T
     targets[:, :3, :3] = T[:3, :3] @ np.stack([so3_exp(turn) for turn in offsets[:, 3:]])
-    chain = arm.robot.chain
-    q, miss = inverse_kinematics(
-        arm.native,
-        np.ascontiguousarray(targets[:, :3]),
-        np.ascontiguousarray(tool[:3], dtype=np.float64),
-        chain.lower,
-        chain.upper,
-        starts,
-        _ROUNDS,
-    )
-    return q, miss
+    return inverse_kinematics(arm.native, arm.robot.chain, tool, targets, starts)
 
 
 def _region(goal: PoseGoal) -> tuple[Array, Array]:
     """The pose (4, 4) and the half-widths (6,) of the region around it."""
     T = np.asarray(goal.T_world_tcp, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+    if not is_rigid(T):
         raise GoalError("is no rigid pose.", field="T_world_tcp", hint="give (4, 4) with an orthonormal rotation")
     box = np.concatenate([np.broadcast_to(np.asarray(x, dtype=np.float64), (3,)) for x in (goal.position, goal.angle)])
     if not ((box >= 0.0) & (box < np.inf)).all() or goal.postures < 1:
