@@ -49,11 +49,12 @@ test-long: $(INSTALL_STAMP) ## the long tests: end-to-end on real logs, browser,
 	$(BIN)/python -m pytest -m long $(PYTEST_ARGS)
 
 .PHONY: check
-check: $(INSTALL_STAMP) ## ruff, mypy, layering contract, and the native code with warnings as errors
+check: $(INSTALL_STAMP) ## ruff, mypy, layering contract, prose, and the native code with warnings as errors
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.prose
 	$(BIN)/cmake -S splatbot/native -B build/werror -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja \
 	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DSPLATBOT_WERROR=ON
 	$(BIN)/cmake --build build/werror

@@ -1,4 +1,4 @@
-"""Every shipped configuration file loads and is what it says."""
+"""Every shipped configuration file loads and matches its description."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ FOLDERS = ("splatbot", *LINKED, "tests", "experiments")
 
 
 def _imports(path: Path) -> set[str]:
-    """Top-level names that a file imports."""
+    """Return the top-level names that a file imports."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
