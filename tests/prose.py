@@ -39,7 +39,7 @@ BANNED = {
     r"anew": "again",
     r"mends?|mended|mending": "fix, repair",
     r"so many|so much": "state the quantity",
-    r"is none|are none|be none|is no more": "negate the verb",
+    r"(?-i:is none|are none|be none)|is no more": "negate the verb",
     r"near to": "near",
     r"goes by|go by|went by": "depends on, uses",
     r"shall|upon|whence|thereof|whereof|hither|thither": "plain English",

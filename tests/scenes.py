@@ -17,13 +17,13 @@ NAMES = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats"
 
 
 def two_roundings(bound: float) -> float:
-    """A bound on an error for the kernels in use: SSE4.2 has no fused multiply-add, so differences lose more there."""
+    """Return an error bound for the kernels in use: SSE4.2 has no fused multiply-add and loses more in differences."""
     return 8.0 * bound if native().isa() == "v2" else bound
 
 
 @dataclass
 class Scene:
-    """Float32 inputs of a render of C views; ``backgrounds`` may be None, and so may quats and scales or covars."""
+    """Float32 inputs of a render of C views; ``backgrounds``, and quats and scales or covars, may be None."""
 
     means: Tensor
     quats: Tensor
@@ -38,19 +38,19 @@ class Scene:
     covars: Tensor | None = None
 
     def render(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
-        """Through the native kernels."""
+        """Render through the native kernels."""
         return rasterization(**self._arguments(), render_mode=render_mode, **options)
 
     def reference(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
-        """Through the float64 reference."""
+        """Render through the float64 reference."""
         return self.to(torch.float64).reference_leaves(render_mode, **options)
 
     def reference_leaves(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
-        """Through the reference, with the tensors as they are, so that gradients reach them."""
+        """Render through the reference with these tensors, so that gradients reach them."""
         return rasterization_reference(**self._arguments(), render_mode=render_mode, **options)
 
     def to(self, dtype: torch.dtype, requires_grad: bool = False) -> Scene:
-        """A copy whose tensors are leaves of ``dtype``."""
+        """Return a copy whose tensors are leaves of ``dtype``."""
         tensors = {
             name: None if value is None else value.detach().to(dtype).clone().requires_grad_(requires_grad)
             for name in NAMES
@@ -82,12 +82,12 @@ def compare(
     fixed: tuple[str, ...] = (),
     **options: Any,
 ) -> Comparison:
-    """Forward and gradients of a random loss, in the kernels and in float64, from the same float32 inputs.
+    """Compare forward pass and gradients of a random loss in the kernels and in float64, from the same float32 inputs.
 
-    A pixel that is nearer than ``jump_margin`` (relative) to a jump of the model (an alpha at 1/255 or at its cap, a
-    transmittance at 1e-4) is given no weight in either; the caller bounds how many there are. ``project`` is the
-    reference's camera, which takes ``reference_extra`` besides; the options are then the kernels' alone. Inputs named
-    in ``fixed`` ask for no gradient.
+    A pixel nearer than ``jump_margin`` (relative) to a jump of the model has no weight in either. Jumps are an alpha at
+    1/255 or at its cap, and a transmittance at 1e-4. The caller bounds the number of such pixels. ``project`` is the
+    reference's camera, which takes ``reference_extra``; the options then apply to the kernels alone. Inputs named in
+    ``fixed`` require no gradient.
     """
     reference_options = options if project is None else {"project": project, **(reference_extra or {})}
     sides = []
@@ -121,21 +121,21 @@ def compare(
 
 
 def relative_l2(got: Tensor | None, want: Tensor) -> float:
-    """‖got - want‖ / ‖want‖ in float64; ‖got‖ where want is zero."""
+    """Return the relative error ‖got - want‖ / ‖want‖ in float64; ‖got‖ where want is zero."""
     assert got is not None
     norm = float(want.double().norm())
     return float((got.double() - want.double()).norm()) / (norm if norm > 0 else 1.0)
 
 
 def pinhole(width: int, height: int, focal: float | None = None, views: int = 1) -> Tensor:
-    """Intrinsics (views, 3, 3) with the principal point at the centre."""
+    """Return the intrinsics (views, 3, 3) with the principal point at the centre."""
     f = 0.9 * width if focal is None else focal
     K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
     return K.expand(views, 3, 3).contiguous()
 
 
 def hard_scene(seed: int, n: int = 400, views: int = 1) -> Scene:
-    """Random Gaussians of which a tenth each is behind the camera, below 0.1 px, opaque (>= 0.999), off-screen."""
+    """Return random Gaussians; a tenth each is behind the camera, below 0.1 px, opaque (>= 0.999), or off-screen."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:
@@ -181,7 +181,7 @@ def one_gaussian(
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
     size: tuple[int, int] = (32, 24),
 ) -> Scene:
-    """One orange Gaussian before an identity camera."""
+    """Return one orange Gaussian in front of an identity camera."""
     return Scene(
         means=torch.tensor([mean]),
         quats=torch.tensor([quat]),

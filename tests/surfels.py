@@ -18,7 +18,7 @@ RENDERED = ("colors", "alphas", "normals", "distortion", "median")  # by the ker
 
 
 def hard_surfels(seed: int, n: int = 150, views: int = 1) -> Scene:
-    """``hard_scene``, halved, with discs at most 30 times longer than wide: needles have a bound of their own."""
+    """Return half of ``hard_scene`` with discs at most 30 times longer than wide; needles have their own bound."""
     scene = hard_scene(seed, n=n, views=views)
     scene.width, scene.height = scene.width // 2 + 1, scene.height // 2 + 1
     scene.Ks[:, :2] *= 0.5
@@ -27,24 +27,24 @@ def hard_surfels(seed: int, n: int = 150, views: int = 1) -> Scene:
 
 
 def arguments(scene: Scene) -> dict[str, Any]:
-    """Of a render of surfels, which have no covariances."""
+    """Return the arguments of a render of surfels, which have no covariances."""
     return {name: value for name, value in vars(scene).items() if name != "covars"}
 
 
 def render(scene: Scene, render_mode: str = "RGB", **options: Any) -> tuple[dict[str, Tensor], Any]:
-    """Images by name, through the native kernels, and meta."""
+    """Render images by name, through the native kernels, and meta."""
     *images, meta = rasterization_2dgs(**arguments(scene), render_mode=render_mode, **options)
     return {n: image for n, image in zip(IMAGES, images, strict=True) if image is not None}, meta
 
 
 def reference(scene: Scene, render_mode: str = "RGB", **options: Any) -> tuple[dict[str, Tensor], Any]:
-    """The same through the reference, in the type of the scene."""
+    """Render through the reference, in the type of the scene."""
     *images, meta = rasterization_2dgs_reference(**arguments(scene), render_mode=render_mode, **options)
     return {n: image for n, image in zip(IMAGES, images, strict=True) if image is not None}, meta
 
 
 def loss(images: dict[str, Tensor], safe: Tensor, of: Sequence[str]) -> Tensor:
-    """A random weighting of the pixels of some images, the same for every type."""
+    """Return a random weighting of the pixels of some images, the same for every type."""
     total = torch.zeros((), dtype=images["colors"].dtype)
     for k, name in enumerate(of):
         if name in images:
@@ -88,7 +88,7 @@ def compare_surfels(
 
 
 def wall(tilt: Tensor, *, distance: float = 2.0, sigma: float = 0.2, size: tuple[int, int] = (48, 36)) -> Scene:
-    """Overlapping discs in one plane, through (0, 0, distance) with the axes ``tilt`` (3, 3), before the camera."""
+    """Return overlapping discs in a plane through (0, 0, distance) with the axes ``tilt`` (3, 3)."""
     steps = torch.arange(-12, 13) * (0.5 * sigma)
     v, u = torch.meshgrid(steps, steps, indexing="ij")
     flat = torch.stack([u, v, torch.zeros_like(u)], -1).reshape(-1, 3).double()

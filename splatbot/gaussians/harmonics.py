@@ -8,10 +8,10 @@ SH_C0 = 0.28209479177387814  # 1 / (2 √π)
 
 
 def rgb_to_sh(rgb: Tensor) -> Tensor:
-    """DC coefficients of colours in [0, 1]; any shape."""
+    """Convert colours to DC coefficients of spherical harmonics; colours in [0, 1] of any shape."""
     return (rgb - 0.5) / SH_C0
 
 
 def sh_to_rgb(sh: Tensor) -> Tensor:
-    """Colours of DC coefficients, not clamped; any shape."""
+    """Convert DC coefficients to colours, not clamped; any shape."""
     return sh * SH_C0 + 0.5

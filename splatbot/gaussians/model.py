@@ -1,4 +1,4 @@
-"""The map: a set of 3D Gaussians as 3DGS stores them, plus what fusion knows of each."""
+"""The map: a set of 3D Gaussians as 3DGS stores them, plus the bookkeeping of depth fusion."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class GaussianModel:
         sh: (N, K, 3), K = (degree + 1)²; entry 0 is the DC term.
         observations: (N,) int32, how many keyframes support the Gaussian.
         anchors: (N,) int32, keyframe that created it, -1 for none.
-        uncertainty: (N,) standard deviation of the mean along the shortest axis [m], by the depth that was fused into
-            it; 0 where it is taken as exact, as in a map from elsewhere.
-        misses: (N,) int32, how often it was seen through of late, less what supports it again.
+        uncertainty: (N,) standard deviation of the mean along the shortest axis [m] after depth fusion. 0 marks an
+            exact mean, as in a map from another program.
+        misses: (N,) int32, recent frames that saw through it, less recent frames that support it.
 
     Raises:
         InputError: shapes do not fit together.
@@ -65,7 +65,7 @@ class GaussianModel:
 
     @classmethod
     def empty(cls, sh_degree: int = 0) -> GaussianModel:
-        """A model of no Gaussians."""
+        """Return a model of no Gaussians."""
         z = torch.zeros
         ints = torch.zeros(0, dtype=torch.int32)
         return cls(z(0, 3), z(0, 4), z(0, 3), z(0), z(0, (sh_degree + 1) ** 2, 3), ints, ints.clone())
@@ -80,7 +80,7 @@ class GaussianModel:
         opacities: ArrayLike | Tensor,
         colors: ArrayLike | Tensor,
     ) -> GaussianModel:
-        """A model from physical units: scales (N, 3) [m], opacities (N,) in 0..1, colors (N, 3) RGB in 0..1.
+        """Return a model from physical units: scales (N, 3) [m], opacities (N,) in 0..1, colors (N, 3) RGB in 0..1.
 
         Raises:
             InputError: a value is not finite or out of range, or a quaternion is zero.
@@ -160,16 +160,16 @@ class GaussianModel:
         return sum(t.numel() * t.element_size() for t in self._tensors())
 
     def clone(self) -> GaussianModel:
-        """A deep copy that shares nothing with this model."""
+        """Return a deep copy that shares nothing with this model."""
         return GaussianModel(*(t.detach().clone() for t in self._tensors()))
 
     def select(self, index: Tensor) -> GaussianModel:
-        """A model of the Gaussians that ``index`` (a boolean mask (N,) or indices) names, copied."""
+        """Return a model of the Gaussians that ``index`` (a boolean mask (N,) or indices) names, copied."""
         return GaussianModel(*(t[index] for t in self._tensors()))
 
     @staticmethod
     def concatenate(models: Sequence[GaussianModel]) -> GaussianModel:
-        """The union of models of one SH degree, in order."""
+        """Return the union of models of one SH degree, in order."""
         columns = zip(*(m._tensors() for m in models), strict=True)
         return GaussianModel(*(torch.cat(column) for column in columns))
 

@@ -9,7 +9,7 @@ from splatbot.gaussians.model import GaussianModel
 
 
 def rotations(model: GaussianModel) -> Tensor:
-    """R_world_gaussian (N, 3, 3)."""
+    """Return the rotations R_world_gaussian (N, 3, 3)."""
     w, x, y, z = torch.nn.functional.normalize(model.quats, dim=1).T
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
@@ -20,7 +20,7 @@ def rotations(model: GaussianModel) -> Tensor:
 
 
 def shortest_axes(model: GaussianModel, rows: Tensor | None = None) -> Tensor:
-    """Unit vectors (M, 3): the axis of the least scale of each Gaussian, or of those that ``rows`` (M,) name."""
+    """Return unit vectors (M, 3): the axis of the least scale of each Gaussian, or of those that ``rows`` (M,) name."""
     quats, scales = (x if rows is None else x.index_select(0, rows) for x in (model.quats, model.log_scales))
     quats = torch.nn.functional.normalize(quats, dim=1)
     w, v = quats[:, :1], quats[:, 1:]
@@ -30,6 +30,6 @@ def shortest_axes(model: GaussianModel, rows: Tensor | None = None) -> Tensor:
 
 
 def covariances(model: GaussianModel) -> Tensor:
-    """(N, 3, 3) [m²]."""
+    """Return the covariances Σ = R S Sᵀ Rᵀ (N, 3, 3) [m²]."""
     half = rotations(model) * model.scales[:, None, :]
     return half @ half.transpose(1, 2)

@@ -9,7 +9,7 @@ from splatbot.gaussians.model import GaussianModel
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The map at one moment; the mapper publishes them, nobody writes to one.
+    """The map at one moment, immutable; the mapper publishes it.
 
     Args:
         model: the Gaussians; not shared with the mapper.

@@ -32,7 +32,7 @@ class GaussianAdam:
         self.second: dict[str, Tensor] = {}
 
     def extend(self, model: GaussianModel) -> None:
-        """Rows were appended to ``model``: give them moments of zero."""
+        """Add moments of zero for rows that were appended to ``model``."""
         n = len(model) - len(self.steps)
         self.steps = torch.cat([self.steps, torch.zeros(n)])
         for name in PARAMETERS:
@@ -49,7 +49,7 @@ class GaussianAdam:
                 moments[name] = moments[name][index]
 
     def state(self) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        """The moments and counts as they are, shared: good until a step; :meth:`extend` and :meth:`select` copy."""
+        """Return the moments and counts, shared: a step changes them, :meth:`extend` and :meth:`select` copy."""
         return self.steps, dict(self.first), dict(self.second)
 
     def restore(self, state: tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]) -> None:
@@ -58,7 +58,7 @@ class GaussianAdam:
 
     @torch.no_grad()
     def step(self, model: GaussianModel, grads: Mapping[str, Tensor], visible: Tensor) -> None:
-        """One step in place, of the rows that ``visible`` (N,) marks; the others keep their bits.
+        """Perform one step in place on the rows that ``visible`` (N,) marks; the others keep their bits.
 
         Raises:
             InputError: ``visible`` or a gradient does not fit the model, or rows came without :meth:`extend`.
@@ -92,7 +92,7 @@ def adam_step(
     betas: tuple[float, float],
     eps: float,
 ) -> int:
-    """One step of Adam in place, natively, on the rows that ``visible`` marks and whose gradient is finite.
+    """Perform one step of Adam in place, natively, on the rows that ``visible`` marks and whose gradient is finite.
 
     Args:
         parameters: (N, ...) each, float32, contiguous; changed in place, as are the moments.

@@ -1,4 +1,4 @@
-"""What refinement minimises."""
+"""Losses that refinement minimises."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WINDOW = 11  # [px] side of the window of SSIM
 
 
 def l1(rendered: Tensor, observed: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean absolute difference, over ``mask`` (broadcast over channels) where given; 0 for an empty mask."""
+    """Return the mean absolute difference, over ``mask`` if given (broadcast over channels); 0 for an empty mask."""
     difference = (rendered - observed).abs()
     if mask is None:
         return difference.mean()
@@ -26,18 +26,18 @@ def l1(rendered: Tensor, observed: Tensor, mask: Tensor | None = None) -> Tensor
 def l1_dssim(
     rendered: Tensor, target: Tensor, weight: float = 0.2, mask: Tensor | None = None, *, padding: Padding = "same"
 ) -> Tensor:
-    """The colour loss of 3D Gaussian splatting: (1 - weight) L1 + weight (1 - SSIM), in one native pass.
+    """Return the colour loss of 3D Gaussian splatting: (1 - weight) L1 + weight (1 - SSIM), in one native pass.
 
-    SSIM (Wang et al. 2004, equation 13) has a Gaussian window of 11x11 pixels, σ 1.5, and constants for values in
-    0..1; both terms are means over pixels, channels and images. The result is the same, bit for bit, in every run
+    SSIM (Wang et al. 2004, equation 13) has a Gaussian window of 11x11 pixels, σ 1.5, and constants for values in 0..1.
+    Both terms are means over pixels, channels and images. The result is the same, bit for bit, in every run
     and for any number of threads.
 
     Args:
         rendered: (H, W, D) or (C, H, W, D) float32; the gradient goes here.
         target: as ``rendered``; receives no gradient.
         weight: of the SSIM term, in 0..1.
-        mask: (H, W) or (C, H, W), bool: pixels that count. Elsewhere ``rendered`` counts as equal to ``target``
-            (whose values must be finite there as well): a window across the mask's border compares what lies inside.
+        mask: (H, W) or (C, H, W), bool: pixels that count. Elsewhere ``rendered`` counts as equal to ``target``, whose
+            values must be finite there as well: a window across the mask's border compares the inside alone.
             An empty mask gives 0.
         padding: "same": a window at each pixel, both images 0 outside; "valid": windows inside the image only.
 
@@ -65,7 +65,7 @@ def l1_dssim(
 
 
 class _L1Dssim(torch.autograd.Function):
-    """The gradient is found along with the value: it shares most of the work, and whoever asks for one wants both."""
+    """The gradient is found along with the value: it shares most of the work, and callers need both."""
 
     @staticmethod
     def forward(
@@ -93,7 +93,7 @@ class _L1Dssim(torch.autograd.Function):
 
 
 def _images(name: str, tensor: Tensor) -> Tensor:
-    """As (C, H, W, D), contiguous."""
+    """Return images as contiguous (C, H, W, D)."""
     if not isinstance(tensor, Tensor):
         raise InputError(f"is a {type(tensor).__name__}.", field=name, hint="give a torch tensor")
     if tensor.ndim not in (3, 4) or tensor.numel() == 0:
@@ -106,7 +106,7 @@ def _images(name: str, tensor: Tensor) -> Tensor:
 
 
 def _mask(mask: Tensor | None, like: Tensor) -> Tensor | None:
-    """As (C, H, W) of bytes, contiguous."""
+    """Return a mask as contiguous bytes (C, H, W)."""
     if mask is None:
         return None
     if mask.dtype != torch.bool or mask.shape != like.shape[:-1] or mask.device.type != "cpu":

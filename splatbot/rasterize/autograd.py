@@ -13,13 +13,13 @@ from splatbot.rasterize.inputs import Inputs, Layout
 from splatbot.rasterize.options import RasterOptions
 from splatbot.rasterize.passes import Rendered, Wanted, run_backward
 
-_SPARSE = 4  # of the inputs, the first so many may have sparse gradients: means, quats, scales, covars
+_SPARSE = 4  # number of leading inputs that may have sparse gradients: means, quats, scales, covars
 
 
 def attach(
     inputs: Inputs, options: RasterOptions, rendered: Rendered, centers: Centers, means2d: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The rendered images as functions of the inputs and of the projected centres."""
+    """Return the rendered images as functions of the inputs and of the projected centres."""
     renders, alphas = _Rasterize.apply(*inputs.tensors(), means2d, inputs.layout, options, rendered, centers)
     return renders, alphas
 
@@ -54,7 +54,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _rows_in_view(layout: Layout, states: tuple[Any, ...]) -> Tensor:
-    """Indices of the Gaussians that any view sees, ascending."""
+    """Return indices of the Gaussians that any view sees, ascending."""
     seen = torch.zeros(layout.n_gaussians, dtype=torch.bool)
     for state in states:
         seen[torch.from_numpy(state.visible())] = True

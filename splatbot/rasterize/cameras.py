@@ -32,7 +32,7 @@ class UnscentedTransformParameters:
     kappa: float = 0.0
 
     def sigma(self) -> tuple[float, float, float]:
-        """Distance of the points in standard deviations, weight of each, and β - α², the centre's in the covariance.
+        """Return the sigma points' distance [σ], their weight, and the centre's covariance weight β - α².
 
         Raises:
             InputError: the points would coincide, or the covariance could be negative.
@@ -47,7 +47,7 @@ class UnscentedTransformParameters:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What a render is told of its cameras besides poses and intrinsics; see ``rasterization``."""
+    """Camera settings of a render in addition to poses and intrinsics; see ``rasterization``."""
 
     model: str = "pinhole"
     with_ut: bool = False
@@ -60,7 +60,7 @@ class CameraSettings:
 
     @property
     def plain(self) -> bool:
-        """Whether this is the pinhole that needs no lens."""
+        """True for a pinhole without distortion."""
         return self.model == "pinhole" and not self.with_ut
 
     def check(self) -> None:
@@ -93,7 +93,7 @@ class CameraSettings:
 
 
 class Cameras(NamedTuple):
-    """What the kernels are given of the cameras.
+    """Camera parameters as the kernels take them.
 
     Args:
         lenses: of each view; None for plain pinholes.
@@ -107,7 +107,7 @@ class Cameras(NamedTuple):
 
 
 def cameras_of(settings: CameraSettings, viewmats: Tensor, near_plane: float) -> Cameras:
-    """The cameras of all views.
+    """Return the cameras of all views.
 
     Args:
         settings: of all views; tensors have the leading dimensions of ``viewmats``.
@@ -152,7 +152,7 @@ def _motion(settings: CameraSettings, viewmats: Tensor) -> Motion:
 
 
 def pinhole_limit(radial: Sequence[float] | NDArray[np.float64]) -> float:
-    """Tangent of the angle at which OpenCV's rational distortion (k1 .. k6) stops growing, 1e30 if it never does."""
+    """Return the tangent of the angle at which OpenCV's rational distortion (k1 .. k6) stops growing, or 1e30."""
     k = np.asarray(radial, dtype=np.float64)
     above, below = np.polynomial.Polynomial([1.0, *k[:3]]), np.polynomial.Polynomial([1.0, *k[3:6]])
     s = np.polynomial.Polynomial([0.0, 1.0])  # squared tangent
@@ -161,21 +161,21 @@ def pinhole_limit(radial: Sequence[float] | NDArray[np.float64]) -> float:
 
 
 def fisheye_limit(radial: Sequence[float] | NDArray[np.float64]) -> float:
-    """Angle [rad] at which OpenCV's fisheye polynomial (k1 .. k4) stops growing, at most π."""
+    """Return the angle [rad] at which OpenCV's fisheye polynomial (k1 .. k4) stops growing, at most π."""
     k = np.asarray(radial, dtype=np.float64)
     slope = np.polynomial.Polynomial([1.0, *(k * np.array([3.0, 5.0, 7.0, 9.0]))])
     return min(math.sqrt(_first_root(slope)), math.pi)
 
 
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
-    """Least positive root, 1e60 if there is none."""
+    """Return the least positive root, or 1e60 without one."""
     roots = polynomial.trim().roots() if polynomial.trim().degree() > 0 else np.array([])
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots.real))) & (roots.real > 0)]
     return float(real.min()) if len(real) else NO_LIMIT**2
 
 
 def _coefficients(name: str, given: Tensor | None, views: tuple[int, ...], columns: int) -> NDArray[np.float64]:
-    """Rows (V, columns) of all views."""
+    """Return the rows (V, columns) of all views."""
     if given is None:
         return np.zeros((math.prod(views), columns))
     if tuple(given.shape) != (*views, columns):

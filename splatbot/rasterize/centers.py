@@ -1,9 +1,9 @@
-"""The projected centres as gsplat's strategies want them: a tensor of the graph whose gradient can be kept.
+"""The projected centres as gsplat's strategies need them: a tensor of the graph whose gradient can be kept.
 
-The rasterizer pulls gradients back to the Gaussians without stopping at the image. So that ``retain_grad()``, hooks and
-losses on ``meta["means2d"]`` work all the same, that tensor is an input of the rasterizing node, which gives it the
-gradient of the centres; the part of its gradient that came so is taken out again on the way back, because the
-rasterizer has pulled it back already.
+The rasterizer pulls gradients back to the Gaussians without stopping at the image. ``retain_grad()``, hooks and
+losses on ``meta["means2d"]`` still work: that tensor is an input of the rasterizing node, which gives it the gradient
+of the centres. On the way back this part of its gradient is removed again, because the rasterizer has already
+propagated it to the Gaussians.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from splatbot.rasterize.inputs import Inputs, Layout
 
 
 class Centers:
-    """What the two nodes and the meta know of the projected centres.
+    """State of the projected centres that the two nodes and the meta share.
 
     Args:
         layout: of the render's inputs.
-        states: of the views' passes, in packed layout; None: not packed.
+        states: rows of the views' passes in packed layout. If None, the layout is not packed.
         absgrad: whether absolute gradients are to be found.
         pinhole: whether the views are plain pinholes; only then may a loss be put on the tensor itself.
     """
@@ -35,19 +35,19 @@ class Centers:
         self._states = states
         self.absgrad = absgrad
         self._pinhole = pinhole
-        self.exposed = False  # whether somebody holds the tensor and may want its gradient
+        self.exposed = False  # whether a caller holds the tensor and may read its gradient
         self._tensor: weakref.ref[Tensor] | None = None
         self._rendered: tuple[int, Tensor] | None = None  # graph task, gradient from the rasterizing node
 
     def new_tensor(self, inputs: Inputs) -> Tensor:
-        """The tensor, (..., C, N, 2) or (P, 2), of undefined values; belongs to the graph of its inputs."""
+        """Return the tensor, (..., C, N, 2) or (P, 2), of undefined values; belongs to the graph of its inputs."""
         tensor: Tensor = _Means2d.apply(inputs.means, inputs.viewmats, inputs.Ks, self)
         self._tensor = weakref.ref(tensor)
         return tensor
 
     @functools.cached_property
     def ids(self) -> Tensor | None:
-        """Rows (P,) in view among the (views x N,) rows, in packed layout; None: all rows."""
+        """Rows (P,) in view among the (views x N,) rows, in packed layout. If None, all rows."""
         if self._states is None:
             return None
         n = self.layout.n_gaussians
@@ -61,7 +61,7 @@ class Centers:
         return (*self.layout.views, self.layout.n_gaussians, 2)
 
     def wanted(self) -> tuple[bool, bool]:
-        """Whether gradients, and absolute gradients, are to be found: not if nobody can ask for them."""
+        """Return whether gradients and absolute gradients are needed: only if a caller can read them."""
         tensor = None if self._tensor is None else self._tensor()
         if tensor is None or not tensor.requires_grad:
             return False, False
@@ -79,14 +79,14 @@ class Centers:
         return shaped
 
     def besides_rendering(self, gradient: Tensor) -> Tensor | None:
-        """The part of the tensor's gradient that did not come from the rasterizer."""
+        """Return the part of the tensor's gradient that did not come from the rasterizer."""
         rendered, self._rendered = self._rendered, None
         if rendered is None or rendered[0] != torch._C._current_graph_task_id():
             return gradient
         return None if torch.equal(gradient, rendered[1]) else gradient - rendered[1]
 
     def project(self, means: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
-        """Pinhole projection [px] of the rows of the tensor, in float64."""
+        """Return the pinhole projection [px] of the rows of the tensor, in float64."""
         if not self._pinhole:
             raise InputError("takes no loss of its own here.", field="means2d", hint="only of plain pinhole cameras")
         layout = self.layout

@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 def depth_to_normal(depths: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
-    """World normals (C, H, W, 3) of depth images (C, H, W, 1) [m]; differentiable.
+    """Compute world normals (C, H, W, 3) of depth images (C, H, W, 1) [m]; differentiable.
 
-    The cross product of the central differences of neighbouring points, of length one, facing the camera; zero at the
-    image's border and where the neighbours coincide (no depth).
+    A normal is the cross product of the central differences of neighbouring points, of length one, facing the camera.
+    It is zero at the image's border and where the neighbours coincide (no depth).
 
     Args:
         depths: along the optical axis [m]; 0 for none.
@@ -28,7 +28,7 @@ def depth_to_normal(depths: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
 
 
 def _camera_points(depths: Tensor, Ks: Tensor) -> Tensor:
-    """Points (C, H, W, 3) [m] in the camera frame."""
+    """Return the points (C, H, W, 3) [m] in the camera frame."""
     height, width = depths.shape[1:3]
     fx, fy, cx, cy = (Ks[:, i, j, None, None].to(depths.dtype) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     u = (torch.arange(width, dtype=depths.dtype)[None, None, :] + 0.5 - cx) / fx

@@ -12,7 +12,7 @@ from splatbot.errors import InputError
 
 
 def rasterization_gsplat(**arguments: Any) -> tuple[Tensor, Tensor, Any]:
-    """``gsplat.rasterization(**arguments)``; arguments are not moved between devices.
+    """Call ``gsplat.rasterization(**arguments)``; arguments are not moved between devices.
 
     Raises:
         InputError: gsplat is not installed, or there is no CUDA device.

@@ -9,10 +9,10 @@ from torch import Tensor
 
 
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
-    """Values (..., (degree + 1)²) of the real harmonics, with the signs of 3DGS, in unit directions (..., 3).
+    """Evaluate the real harmonics (..., (degree + 1)²), with the signs of 3DGS, in unit directions (..., 3).
 
-    The function of degree l and order m is at l² + l + m: √2 K cos(mφ) P_l^m(z) for m > 0 and √2 K sin(|m|φ) P_l^|m|(z)
-    for m < 0, with K² = (2l + 1) (l - |m|)! / (4π (l + |m|)!) and P with the Condon-Shortley phase.
+    Index l² + l + m holds degree l and order m: √2 K cos(mφ) P_l^m(z) for m > 0 and √2 K sin(|m|φ) P_l^|m|(z) for
+    m < 0. K² is (2l + 1) (l - |m|)! / (4π (l + |m|)!), and P has the Condon-Shortley phase.
     """
     x, y, z = directions.unbind(-1)
     values: dict[int, Tensor] = {}

@@ -1,4 +1,4 @@
-"""Checks of what a render is given: shapes, types, devices. Values are checked in C++, where they are read anyway."""
+"""Checks of the inputs of a render: shapes, types, devices. Values are checked in C++, where they are read anyway."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ class Layout:
 
     @property
     def views(self) -> tuple[int, ...]:
-        """Leading dimensions of what there is one of per view."""
+        """Leading dimensions of values per view."""
         return (*self.batch, self.n_cameras)
 
     def scene(self, tensor: Tensor, b: int) -> Tensor:
-        """The part of a tensor that belongs to scene b."""
+        """Return the part of a tensor that belongs to scene b."""
         return tensor[b] if self.batch else tensor
 
     def view(self, tensor: Tensor, b: int, c: int) -> Tensor:
-        """The part of a tensor that belongs to view c of scene b."""
+        """Return the part of a tensor that belongs to view c of scene b."""
         return tensor[b, c] if self.batch else tensor[c]
 
     def colors_of(self, colors: Tensor, b: int, c: int) -> Tensor:
-        """Colours, or their gradients, of view c of scene b."""
+        """Return colours, or their gradients, of view c of scene b."""
         return self.view(colors, b, c) if self.view_colors else self.scene(colors, b)
 
 
@@ -70,7 +70,7 @@ class Inputs:
     masks: Tensor | None = None  # uint8
 
     def tensors(self) -> tuple[Tensor | None, ...]:
-        """The differentiable ones, in the order of the fields."""
+        """Return the differentiable inputs, in the order of the fields."""
         return (
             self.means,
             self.quats,
@@ -85,7 +85,7 @@ class Inputs:
         )
 
     def detached(self) -> Inputs:
-        """The same values outside the graph."""
+        """Return the same values outside the graph."""
         tensors = (t if t is None else t.detach() for t in (*self.tensors(), self.masks))
         return Inputs(self.layout, *tensors)  # type: ignore[arg-type]
 
@@ -148,7 +148,7 @@ def check_inputs(
 def _check_colors(
     colors: Tensor | None, sh_degree: int | None, means: Tensor, views: tuple[int, ...]
 ) -> tuple[Tensor, bool]:
-    """Colours, and whether each view has its own; ``views`` are the batch dimensions and C."""
+    """Return colours, and whether each view has its own; ``views`` are the batch dimensions and C."""
     batch, n = tuple(means.shape[:-2]), means.shape[-2]
     if colors is None:
         return means.new_zeros(*batch, n, 0), False

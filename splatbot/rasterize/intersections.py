@@ -18,7 +18,7 @@ def isect_tiles(
     tile_height: int,
     image_ids: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of Gaussians and tiles, sorted by image, tile and depth; pairs of one depth by index.
+    """List the pairs of Gaussians and tiles, sorted by image, tile and depth; pairs of one depth by index.
 
     Args:
         means2d: (I, N, 2) [px]; packed, (P, 2).
@@ -30,8 +30,8 @@ def isect_tiles(
         image_ids: packed: (P,) the image of each row; else None.
 
     Returns:
-        tiles_per_gauss (I, N) or (P,) int32; isect_ids (M,) int64, which hold, from the highest bits, the image, the
-        tile and the depth's float bits; flatten_ids (M,) int32, rows of the flattened inputs.
+        ``tiles_per_gauss`` (I, N) or (P,) int32. ``isect_ids`` (M,) int64: image, tile and float bits of the depth,
+        from the highest bits on. ``flatten_ids`` (M,) int32: rows of the flattened inputs.
     """
     shape = depths.shape
     center, radius = means2d.reshape(-1, 2).double() / tile_size, radii.reshape(-1, 2).double() / tile_size
@@ -53,12 +53,12 @@ def isect_tiles(
 
 
 def tile_bits(tile_width: int, tile_height: int) -> int:
-    """How many bits of an id hold the tile."""
+    """Return the number of bits of an id that hold the tile."""
     return (tile_width * tile_height).bit_length()
 
 
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
-    """Where each tile's pairs begin, (I, tile_height, tile_width) int32, from the sorted ids of :func:`isect_tiles`."""
+    """Return each tile's first pair (I, tile_height, tile_width) int32 among the ids of :func:`isect_tiles`."""
     bits, tiles = tile_bits(tile_width, tile_height), tile_width * tile_height
     image, tile = isect_ids >> (32 + bits), (isect_ids >> 32) & ((1 << bits) - 1)
     begin = torch.searchsorted((image * tiles + tile).contiguous(), torch.arange(n_images * tiles))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def median_ids(states: tuple[Any, ...], height: int, width: int) -> Tensor:
-    """Per view, the Gaussian (C, H, W) int32 at which transmittance falls to 1/2 or below; -1 where it stays above."""
+    """Return the Gaussian (C, H, W) int32 at which transmittance falls to 1/2 or below; -1 if it stays above."""
     ids = torch.empty(len(states), height, width, dtype=torch.int32)
     for i, state in enumerate(states):
         state.medians(ids[i].numpy())
@@ -17,7 +17,7 @@ def median_ids(states: tuple[Any, ...], height: int, width: int) -> Tensor:
 
 
 def median_depth(ids: Tensor, means: Tensor, viewmats: Tensor) -> Tensor:
-    """Depths (V, H, W, 1) [m] of the Gaussians' centres, 0 where there is none; float32.
+    """Return the depths (V, H, W, 1) [m] of the Gaussians' centres, float32, 0 without a Gaussian.
 
     Differentiable in means and poses: the choice of the Gaussian is taken as given.
 

@@ -1,4 +1,4 @@
-"""What a render knows besides its images, computed when asked for."""
+"""Values of a render in addition to its images, computed on access."""
 
 from __future__ import annotations
 
@@ -30,19 +30,20 @@ _FINDERS = (
 class RenderMeta(MutableMapping[str, Any]):
     """A mapping with gsplat's names; shapes below are those of ``packed=False`` (in brackets: packed).
 
-    Packed, what there is one of per Gaussian and view has P rows, those in view, in the order of views and indices.
+    In packed layout, values per Gaussian and view have P rows: those in view, ordered by view and index.
 
     - means2d (..., C, N, 2) [P, 2] px: belongs to the graph, so that ``retain_grad()`` works; with ``absgrad``, it has
-      ``.absgrad`` after backward. Ask for it before backward if its gradient is wanted.
-    - depths (..., C, N) [P] m, conics (..., C, N, 3) [P, 3] px⁻² (inverse 2D covariance, upper triangle), radii
-      (..., C, N, 2) [P, 2] px int32, opacities (..., C, N) [P] as blended. Not differentiable.
+      ``.absgrad`` after backward. Read it before backward if its gradient is needed.
+    - depths (..., C, N) [P] m; conics (..., C, N, 3) [P, 3] px⁻²: inverse 2D covariance, upper triangle. Not
+      differentiable.
+    - radii (..., C, N, 2) [P, 2] px int32, opacities (..., C, N) [P] as blended. Not differentiable.
     - batch_ids, camera_ids, gaussian_ids: [P] int64; None if not packed.
     - tile_size px, tile_width and tile_height: the grid of gsplat's tiles; tiles_per_gauss (..., C, N) [P], isect_ids,
       flatten_ids, isect_offsets (..., C, tile_height, tile_width): see :mod:`splatbot.rasterize.intersections`.
-    - visibility (..., C, N) bool: in view; contributions (..., C, N) int32: in how many pixels the Gaussian counts;
-      visible_ids: a list of index tensors, one per view. Never packed.
+    - visibility (..., C, N) bool: in view. ``contributions`` (..., C, N) int32: number of pixels to which the Gaussian
+      contributes. ``visible_ids``: a list of index tensors, one per view. Never packed.
     - normals (..., C, H, W, 3), with ``return_normals``: in the graph. median_ids (..., C, H, W) int32, with median
-      depth: the Gaussian it is of, -1 where there is none.
+      depth: its Gaussian, or -1.
     - n_isects, state_bytes: lists over the views, of the kernels' own (Gaussian, tile) pairs and memory.
     - width, height, n_batches, n_cameras.
 
@@ -69,7 +70,7 @@ class RenderMeta(MutableMapping[str, Any]):
 
     @property
     def states(self) -> tuple[Any, ...]:
-        """What the native pass of each view left."""
+        """State that the native pass of each view left."""
         return self._states
 
     def __getitem__(self, key: str) -> Any:
@@ -109,11 +110,11 @@ class RenderMeta(MutableMapping[str, Any]):
         }
 
     def _stack(self, rows: list[Any], like: Tensor) -> Tensor:
-        """Rows (N, ...) of each view, one after the other; ``like`` is how they look where there is no view."""
+        """Stack the rows (N, ...) of all views; ``like`` gives their shape if there is no view."""
         return torch.cat([like, *map(torch.from_numpy, rows)])
 
     def _arranged(self, rows: Tensor) -> Tensor:
-        """Rows (views x N, ...) in the layout of the meta."""
+        """Arrange rows (views x N, ...) in the layout of the meta."""
         ids = self._centers.ids
         return self._dense(rows) if ids is None else rows[ids]
 

@@ -11,7 +11,7 @@ from splatbot.errors import NativeError
 
 @functools.cache
 def native() -> ModuleType:
-    """The extension module ``splatbot._native``.
+    """Return the extension module ``splatbot._native``.
 
     Raises:
         NativeError: it is missing, damaged, or its kernels cannot run on this CPU.

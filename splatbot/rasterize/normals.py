@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def facing_axes(means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, *, parallel: bool = False) -> Tensor:
-    """Unit normals (C, N, 3) in the world frame of N Gaussians as C cameras see them; differentiable in ``quats``.
+    """Return unit normals (C, N, 3), world frame, of N Gaussians facing C cameras; differentiable in ``quats``.
 
     Args:
         means: (N, 3) [m], world frame.
@@ -30,7 +30,7 @@ def facing_axes(means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, 
 
 
 def _axes(quats: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3); the columns are the Gaussians' axes."""
+    """Return the rotation matrices (N, 3, 3); the columns are the Gaussians' axes."""
     largest = quats.detach().abs().amax(-1, keepdim=True)  # squares of 1e-20 and 1e20 leave the range of a float
     zero = largest < 1e-30
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])

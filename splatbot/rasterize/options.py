@@ -1,4 +1,4 @@
-"""What a render is told besides tensors, and which of gsplat's options it refuses."""
+"""Options of a render, and the options of gsplat that it refuses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatbot.errors import InputError
 DEFAULT_TILE_SIZE = 16
 TRANSMITTANCE_MIN = 1e-4
 
-# Render mode: whether colours are rendered, and what of depth.
+# Render mode: whether colours are rendered, and the kind of depth.
 _MODES = {
     "RGB": (True, "none"),
     "D": (False, "accumulated"),
@@ -21,7 +21,7 @@ _MODES = {
     "RGB+MD": (True, "none"),
 }
 
-# gsplat's options that this rasterizer does not have, with the value that asks for nothing.
+# gsplat's options that this rasterizer does not have, with the value that has no effect.
 _ABSENT: dict[str, Any] = {
     "distributed": False,
     "segmented": False,
@@ -56,11 +56,11 @@ class RasterOptions:
     tile_size: int
     sparse_grad: bool
     absgrad: bool
-    lenses: tuple[Any, ...] | None = None  # native, of every view; None: plain pinholes
+    lenses: tuple[Any, ...] | None = None  # native, of every view. If None, plain pinholes
 
 
 def parse_mode(render_mode: str) -> tuple[bool, str]:
-    """Whether colours are rendered, and what of depth: "none", "accumulated" or "expected".
+    """Return whether colours are rendered, and the kind of depth: "none", "accumulated" or "expected".
 
     Raises:
         InputError: an unknown mode.
@@ -77,7 +77,7 @@ def check_choice(name: str, value: object, known: tuple[str, ...]) -> None:
 
 
 def refuse_absent(absent: dict[str, Any]) -> None:
-    """An option that would change the result is refused, never ignored.
+    """Refuse an option that would change the result instead of ignoring it.
 
     Raises:
         InputError: naming the option.

@@ -13,12 +13,12 @@ from splatbot.rasterize.inputs import Inputs
 from splatbot.rasterize.native import native
 from splatbot.rasterize.options import RasterOptions
 
-_GEOMETRY = 5  # of the inputs, the first so many: means, quats, scales, covars, opacities
+_GEOMETRY = 5  # number of leading inputs: means, quats, scales, covars, opacities
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """Images of all views, (B, C, H, W, X) or (C, H, W, X), and what each view's pass left."""
+    """Images of all views, (B, C, H, W, X) or (C, H, W, X), and the state of each view's pass."""
 
     renders: Tensor
     alphas: Tensor
@@ -102,7 +102,7 @@ def run_backward(
     grad_alphas: Tensor | None,
     wanted: Wanted,
 ) -> Gradients:
-    """Gradients of a loss from its gradients to the images."""
+    """Compute the gradients of a loss from its gradients to the images."""
     layout = inputs.layout
     shape = [None if t is None or not w else t for t, w in zip(inputs.tensors(), wanted.inputs, strict=True)]
     geometry_grads = [None if t is None else torch.empty_like(t, dtype=torch.float32) for t in shape[:_GEOMETRY]]
@@ -148,7 +148,7 @@ def run_backward(
 def camera_gradients(
     camera: Tensor | None, viewmats: Tensor | None, Ks: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Gradients to viewmats and Ks, each None where None is given, of their shapes and types.
+    """Compute the gradients to viewmats and Ks in their shapes and types; None for None.
 
     Args:
         camera: (views, CAMERA_SUMS), as the kernels sum it: rotation, translation, fx, fy, cx, cy, motion.

@@ -82,10 +82,10 @@ def rasterization(
 
     The model is 3D Gaussian splatting (Kerbl et al. 2023; projection: Zwicker et al. 2001) with gsplat's constants.
     Pixel (i, j) is sampled at (i + 0.5, j + 0.5): use ``Camera.K_corner``. A Gaussian of opacity o has
-    alpha = min(0.99, o exp(-σ)) at a pixel, counts from 1/255 on, and closes the pixel, without counting, if it would
-    bring the transmittance to 1e-4 or below; the gradient is zero where alpha is capped. Gaussians are blended in
-    order of depth, equal depths in order of index. The result is the same, bit for bit, in every run and for any
-    number of threads.
+    alpha = min(0.99, o exp(-σ)) at a pixel and contributes from 1/255 on. If it would bring the transmittance to 1e-4
+    or below, it closes the pixel without contributing. The gradient is zero where alpha is capped. Gaussians are
+    blended in order of depth, equal depths in order of index. The result is the same, bit for bit, in every run and for
+    any number of threads.
 
     Dimensions "..." are leading batch dimensions, the same for all arguments: scenes rendered one after the other.
 
@@ -94,8 +94,8 @@ def rasterization(
         quats: (..., N, 4) wxyz, any norm; a zero quaternion counts as no rotation and receives no gradient.
         scales: (..., N, 3) standard deviations [m].
         opacities: (..., N) in 0..1.
-        colors: (..., N, D) or (..., C, N, D), any number of channels; with ``sh_degree`` coefficients (..., N, K, 3)
-            or (..., C, N, K, 3); None in the modes D and ED.
+        colors: (..., N, D) or (..., C, N, D), any number of channels. With ``sh_degree``, coefficients
+            (..., N, K, 3) or (..., C, N, K, 3). None in the modes D and ED.
         viewmats: (..., C, 4, 4) world to camera; float32 or float64.
         Ks: (..., C, 3, 3) [px]; float32 or float64. fx, fy, cx and cy receive gradients.
         width: of the image [px].
@@ -104,61 +104,60 @@ def rasterization(
         far_plane: Gaussians farther than this are left out [m].
         radius_clip: Gaussians whose extent is at most this are left out [px].
         eps2d: added to the diagonal of each projected covariance [px²].
-        sh_degree: None, or the degree 0..4 of the spherical harmonics in use, K >= (degree + 1)²; the colour is
-            max(0, 1/2 + their sum), with 3DGS's signs, found for the Gaussians in view alone.
-        packed: the layout of meta: rows of what is in view, or one row for every Gaussian and view. The images are
-            the same.
+        sh_degree: None, or the degree 0..4 of the spherical harmonics in use, K >= (degree + 1)². The colour is
+            max(0, 1/2 + their sum) with 3DGS's signs, computed for the Gaussians in view alone.
+        packed: the layout of meta: rows of the Gaussians in view, or one row for every Gaussian and view. The images
+            are the same.
         tile_size: side of the square tiles of ``masks`` and meta [px], 16 by default; no effect on the images.
         backgrounds: (..., C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
-        render_mode: RGB; D: depth summed with the blend weights [m]; ED: that, divided by the sum of weights; RGB+D
-            and RGB+ED append it as the last channel. MD, RGB+MD: median depth, that of the centre of the Gaussian at
-            which transmittance falls to 1/2 or below, 0 where it stays above; its gradient goes to that Gaussian's
-            depth, the choice being taken as given.
+        render_mode: RGB. D: depth summed with the blend weights [m]. ED: D divided by the sum of weights. RGB+D and
+            RGB+ED append the depth as the last channel. MD, RGB+MD: median depth, that of the centre of the Gaussian at
+            which transmittance falls to 1/2 or below, or 0. Its gradient goes to the depth of that Gaussian.
         sparse_grad: gradients to means, quats, scales and covars as sparse COO tensors of the rows in view; packed
             and without batch dimensions only.
         absgrad: ``meta["means2d"].absgrad`` after backward: the sums over pixels of the absolute values of the
-            centres' gradients through alpha (Ye et al. 2024); beyond 8 channels, of each 8 channels apart.
+            centres' gradients through alpha (Ye et al. 2024). Each group of 8 channels is summed separately.
         rasterize_mode: "classic"; "antialiased" multiplies opacities by √max(det Σ / det(Σ + eps2d I), 0.005²) of the
             projected covariance Σ (Yu et al. 2024).
         channel_chunk: has no effect on the result; accepted for gsplat's sake.
         distributed: False.
-        camera_model: "pinhole"; "ortho": u = fx x + cx, with fx, fy in [px/m]; "fisheye": equidistant, a point's
-            distance from the principal point is f times its angle from the axis. Each is linearized at the Gaussian's
+        camera_model: "pinhole". "ortho": u = fx x + cx, with fx, fy in [px/m]. "fisheye": equidistant, the distance
+            from the principal point is f times the angle from the axis. Each is linearized at the Gaussian's
             centre (EWA); the pinhole's slopes are clamped 0.3 half-images beyond the edge. In all of them depth is
-            z, and what is nearer than ``near_plane`` or behind the camera is not seen.
+            z, and Gaussians nearer than ``near_plane`` or behind the camera are left out.
         segmented: has no effect on the result; accepted for gsplat's sake.
         covars: (..., N, 3, 3) [m²] in place of quats and scales; the upper triangle counts, and receives the gradient.
         masks: (..., C, tile_height, tile_width) bool; tiles that are False show the background alone and give no
             gradient to Gaussians.
-        depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat); "plane" lets it vary over the
-            footprint as that of the plane through the centre and normal to the Gaussian's shortest axis, faded out as
-            the shortest axis nears the middle one and bounded where the plane is seen edge-on. Its gradient takes
-            the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them. "plane" is for
-            the linearized pinhole, and not for median depth.
+        depth_mode: "center" gives a Gaussian one depth, that of its centre (gsplat). "plane" lets it vary over the
+            footprint as the depth of the plane through the centre, normal to the Gaussian's shortest axis. The slope
+            fades out as the shortest axis nears the middle one, and is bounded where the plane is seen edge-on. Its
+            gradient takes the plane's slopes as constants: a loss on depth moves Gaussians, it does not turn them.
+            "plane" is for the linearized pinhole, and not for median depth.
         transmittance_min: a pixel is closed before its transmittance falls to this, [0, 0.5): accuracy for time.
             gsplat's is 1e-4.
         with_ut: project by the unscented transform (Wu et al. 2024, 3DGUT): exact at seven sigma points, so that
-            distortion and rolling shutter are possible; slower. What is drawn is still an ellipse: ``with_eval3d`` is
+            distortion and rolling shutter are possible; slower. The footprint is still an ellipse: ``with_eval3d`` is
             refused. Needs quats and scales. A Gaussian of which a sigma point is nearer to a pinhole than
             ``near_plane``, or where the distortion no longer grows, is left out.
         radial_coeffs: OpenCV's (..., C, 6) k1..k6 of a pinhole or (..., C, 4) k1..k4 of a fisheye; needs ``with_ut``,
             as do all that follow.
         tangential_coeffs: (..., C, 2) p1, p2 of a pinhole.
         thin_prism_coeffs: (..., C, 4) s1..s4 of a pinhole.
-        rolling_shutter: order in which lines are read; the poses are then ``viewmats`` at the first line's centre and
-            ``viewmats_rs`` at the last's, in between rotation turns evenly and translation is linear. A point is seen
-            when its own, unrounded, line is read (gsplat rounds the line down). Depth is that half-way.
+        rolling_shutter: order in which lines are read. The poses are ``viewmats`` at the first line's centre and
+            ``viewmats_rs`` at the last one's. Rotation and translation are interpolated linearly in between. A point is
+            seen when its own, unrounded, line is read (gsplat rounds the line down). Depth is that half-way.
         viewmats_rs: (..., C, 4, 4), see there.
         ut_params: spread of the sigma points.
         return_normals: ``meta["normals"]`` (..., C, H, W, 3): the Gaussians' shortest axes, unit vectors in the world
             frame turned towards the camera, summed with the blend weights. Their gradient reaches quats and, through
             the weights, all else. A pass of its own.
         backend: "gsplat" hands the call to gsplat.rasterization, for tensors on a CUDA device.
-        absent: gsplat's other options, as long as they ask for nothing.
+        absent: gsplat's other options, as long as they have no effect.
 
     Returns:
         render_colors (..., C, H, W, X), render_alphas (..., C, H, W, 1), meta (see :class:`RenderMeta`), computed
-        when asked for.
+        on access.
 
     Raises:
         InputError: a shape, type, device or option does not fit, or a value is not finite.
@@ -190,7 +189,9 @@ def rasterization(
         options.tile_size,
     )
     if options.sparse_grad and inputs.layout.batch:
-        raise InputError("is set beside batch dimensions.", field="sparse_grad", hint="render one scene at a time")
+        raise InputError(
+            "is set together with batch dimensions.", field="sparse_grad", hint="render one scene at a time"
+        )
     settings = CameraSettings(camera_model, *(arguments[name] for name in _CAMERA))
     cameras = cameras_of(settings, inputs.viewmats, options.near_plane)
     _check_camera_goes_with(settings, covars, depth_mode)
@@ -206,7 +207,7 @@ def rasterization(
     return renders, alphas, meta
 
 
-# Arguments of CameraSettings after the model, and what asks for nothing.
+# Arguments of CameraSettings after the model, with the values that have no effect.
 _CAMERA = {
     "with_ut": False,
     "radial_coeffs": None,
@@ -261,14 +262,14 @@ def _render(inputs: Inputs, options: RasterOptions) -> tuple[Tensor, Tensor, Ren
 
 
 def _check_options(given: dict[str, Any]) -> RasterOptions:
-    """An option that would change the result is refused, never ignored."""
+    """Refuse an option that would change the result instead of ignoring it."""
     refuse_absent({**given["absent"], "distributed": given["distributed"]})
     check_choice("rasterize_mode", given["rasterize_mode"], ("classic", "antialiased"))
     check_choice("depth_mode", given["depth_mode"], ("center", "plane"))
     if given["sparse_grad"] and not given["packed"]:
         raise InputError("needs packed=True.", field="sparse_grad", hint="set packed, or leave sparse_grad out")
     if given["covars"] is not None and given["depth_mode"] == "plane":
-        raise InputError("is set beside depth_mode='plane'.", field="covars", hint="give quats and scales")
+        raise InputError("is set together with depth_mode='plane'.", field="covars", hint="give quats and scales")
     if given["render_mode"].endswith("MD") and given["depth_mode"] == "plane":
         raise InputError("'plane' is not for median depth.", field="depth_mode", hint="use 'center'")
     wants_color, depth = parse_mode(given["render_mode"])
@@ -299,7 +300,7 @@ def _check_transmittance(value: float) -> float:
 
 
 def _to_gsplat(given: dict[str, Any]) -> tuple[Tensor, Tensor, Any]:
-    """What gsplat has no name for is refused; the rest goes through as it is."""
+    """Call gsplat with the same arguments; refuse the options that it does not have."""
     check_choice("depth_mode", given.pop("depth_mode"), ("center",))
     if given.pop("transmittance_min") != TRANSMITTANCE_MIN:
         raise InputError("is fixed in gsplat.", field="transmittance_min", hint="use backend='native'")
@@ -307,7 +308,7 @@ def _to_gsplat(given: dict[str, Any]) -> tuple[Tensor, Tensor, Any]:
         raise InputError("is not known to gsplat.", field="masks", hint="use backend='native'")
     for name, nothing in {**_CAMERA, "return_normals": False}.items():
         if given[name] is None or given[name] is nothing:
-            del given[name]  # gsplat's own default asks for nothing too
+            del given[name]  # gsplat's own default has no effect either
     del given["backend"]
     absent = given.pop("absent")
     return rasterization_gsplat(**given, **absent)

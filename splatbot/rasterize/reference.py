@@ -24,7 +24,7 @@ FOV_MARGIN = 0.3  # of half the field of view, where the slope of the projection
 
 @dataclass(frozen=True)
 class ReferenceMeta:
-    """What the reference found.
+    """Intermediate results of the reference.
 
     Args:
         means2d: (C, N, 2) [px].
@@ -42,7 +42,7 @@ class ReferenceMeta:
 
 @dataclass(frozen=True)
 class ReferenceProjection:
-    """What a camera makes of N Gaussians; one it does not see has depth -1."""
+    """Projection of N Gaussians; those out of view have depth -1."""
 
     mean2d: Tensor  # (N, 2)
     sharp2d: Tensor  # (N, 2, 2) covariance before the blur
@@ -51,7 +51,8 @@ class ReferenceProjection:
     slope: Tensor  # (N, 2) change of depth per pixel
 
 
-# Of means, quats, scales, covars (None: quats and scales count), viewmat (4, 4), K (3, 3), width, height, eps2d.
+# Arguments: means, quats, scales, covars (or None, then quats and scales), viewmat (4, 4), K (3, 3), width, height,
+# eps2d.
 Projector = Callable[
     [Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor, Tensor, int, int, float], ReferenceProjection
 ]
@@ -80,7 +81,7 @@ def rasterization_reference(
     transmittance_min: float = TRANSMITTANCE_MIN,
     project: Projector | None = None,
 ) -> tuple[Tensor, Tensor, ReferenceMeta]:
-    """As :func:`splatbot.rasterize.rasterization`, computed in the type of ``means`` by torch alone.
+    """Render as :func:`splatbot.rasterize.rasterization`, computed in the type of ``means`` by torch alone.
 
     Args and returns: see there, but without batch dimensions; ``colors`` (N, D), (C, N, D) or None, with ``sh_degree``
     (N, K, 3) or (C, N, K, 3). ``project``: another camera than the pinhole, see ``reference_cameras``.
@@ -118,7 +119,7 @@ def rasterization_reference(
 
 
 def _shade(coefficients: Tensor, degree: int, means: Tensor, viewmat: Tensor) -> Tensor:
-    """Colours (N, 3) of harmonics (N, K, 3) as the camera sees them."""
+    """Evaluate harmonics (N, K, 3) towards the camera as colours (N, 3)."""
     center = -torch.linalg.solve(viewmat[:3, :3], viewmat[:3, 3]).to(means.dtype)
     basis = harmonics_basis(torch.nn.functional.normalize(means - center, dim=-1), degree)
     return (0.5 + torch.einsum("nk,nkc->nc", basis, coefficients[:, : basis.shape[-1]])).clamp_min(0.0)
@@ -131,7 +132,7 @@ def _antialias(projected: ReferenceProjection) -> Tensor:
 
 
 def reference_rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any norm."""
+    """Return the rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any norm."""
     largest = quats.abs().amax(-1, keepdim=True)
     zero = largest < 1e-30
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
@@ -157,7 +158,7 @@ def _project(
     eps2d: float,
     depth_mode: str,
 ) -> ReferenceProjection:
-    """EWA splatting (Zwicker et al. 2001, eq. 24 and 29)."""
+    """Project by EWA splatting (Zwicker et al. 2001, eq. 24 and 29)."""
     W, t = viewmat[:3, :3].to(means.dtype), viewmat[:3, 3].to(means.dtype)
     fx, fy, cx, cy = (v.to(means.dtype) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     p = means @ W.T + t
@@ -191,7 +192,7 @@ def _clamp(values: Tensor, least: Tensor, most: Tensor) -> Tensor:
 
 
 def _plane_slopes(p: Tensor, axes: Tensor, scales: Tensor, covar2d: Tensor, fx: float, fy: float) -> Tensor:
-    """d z / d (u, v) of the plane through p whose normal is the shortest axis; see the native project.cpp."""
+    """Return the slopes d z / d (u, v) of the plane through p normal to the shortest axis; see project.cpp."""
     s = scales.abs()
     ordered = s.sort(-1).values
     n = torch.gather(axes, 2, s.argmin(-1)[:, None, None].expand(-1, 3, 1))[..., 0]
@@ -213,14 +214,14 @@ def _pixel_centers(width: int, height: int, like: Tensor) -> Tensor:
 def _blend(
     projected: ReferenceProjection, opacities: Tensor, order: Tensor, pixels: Tensor, transmittance_min: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights (M, P) of the M Gaussians of ``order``, transmittance (P,) left, margins (P,)."""
+    """Return the weights (M, P) of the M Gaussians of ``order``, transmittance (P,) left, margins (P,)."""
     d = pixels[None] - projected.mean2d[order][:, None]
     conic = torch.linalg.inv(projected.covar2d[order])
     sigma = 0.5 * torch.einsum("npi,nij,npj->np", d, conic, d)
     power = opacities[order][:, None] * torch.exp(-sigma)
     counts = power >= ALPHA_MIN
     alpha = torch.where(counts, power.clamp_max(ALPHA_MAX), torch.zeros_like(power))
-    # Transmittance only falls, so whoever comes after a Gaussian that closes the pixel finds it closed as well.
+    # Transmittance only falls, so the pixel is closed for all Gaussians behind the one that closes it.
     after = torch.cumprod(1.0 - alpha, 0)
     opened = after.detach() > transmittance_min
     alpha = torch.where(opened, alpha, torch.zeros_like(alpha))
@@ -241,7 +242,7 @@ def _margins(power: Tensor, after: Tensor, counts: Tensor, transmittance_min: fl
 def _channels(
     projected: ReferenceProjection, colors: Tensor | None, order: Tensor, pixels: Tensor, render_mode: str
 ) -> list[Tensor]:
-    """Channels, each (M, 1) or (M, P)."""
+    """Return the channels, each (M, 1) or (M, P)."""
     columns = [] if colors is None else [c[:, None] for c in colors[order].unbind(-1)]
     if "D" in render_mode:
         d = pixels[None] - projected.mean2d[order][:, None]

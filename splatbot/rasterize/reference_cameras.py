@@ -1,7 +1,7 @@
 """Cameras for the reference in plain torch: the oracle of ``cameras`` and its kernels, by other means than theirs.
 
-A camera is a function of points; its derivative comes from autograd, the unscented transform sums the paper's weights
-as they stand, and the time of a rolling shutter is found by repetition.
+A camera is a function of points; its derivative comes from autograd. The unscented transform sums the paper's weights
+without rearrangement. The readout time of a rolling shutter is found by fixed-point iteration.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LINES: dict[str, Lines] = {
 
 
 def pinhole_points(points: Tensor, K: Tensor, coefficients: Tensor | None = None) -> Tensor:
-    """OpenCV's model; coefficients (12,): k1 .. k6, p1, p2, s1 .. s4."""
+    """Project by OpenCV's pinhole model; coefficients (12,): k1 .. k6, p1, p2, s1 .. s4."""
     x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
     if coefficients is not None:
         k1, k2, k3, k4, k5, k6, p1, p2, s1, s2, s3, s4 = coefficients.unbind()
@@ -44,7 +44,7 @@ def pinhole_points(points: Tensor, K: Tensor, coefficients: Tensor | None = None
 
 
 def fisheye_points(points: Tensor, K: Tensor, coefficients: Tensor | None = None) -> Tensor:
-    """Equidistant, or OpenCV's fisheye with coefficients (4,): k1 .. k4."""
+    """Project by the equidistant model, or OpenCV's fisheye with coefficients (4,): k1 .. k4."""
     x, y, z = points.unbind(-1)
     r = (x**2 + y**2).clamp_min(1e-20).sqrt()
     angle = torch.atan2(r, z)
@@ -55,12 +55,12 @@ def fisheye_points(points: Tensor, K: Tensor, coefficients: Tensor | None = None
 
 
 def ortho_points(points: Tensor, K: Tensor) -> Tensor:
-    """Parallel rays."""
+    """Project along parallel rays."""
     return _to_pixels(points[..., 0], points[..., 1], K)
 
 
 def affine_projector(camera: PointCamera) -> Projector:
-    """EWA: the Gaussian's covariance through the derivative of the camera at its centre."""
+    """Return the EWA projector: the covariance through the camera's derivative at the centre, J Σ Jᵀ."""
 
     def project(
         means: Tensor,
@@ -92,7 +92,7 @@ def unscented_projector(
     shutter: str | None = None,
     last: Tensor | None = None,
 ) -> Projector:
-    """The unscented transform (Wu et al. 2024, eq. 8 to 11).
+    """Return the projector of the unscented transform (Wu et al. 2024, eq. 8 to 11).
 
     Args:
         camera: projects points.
@@ -140,7 +140,7 @@ def unscented_projector(
 
 
 def _covariances(quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -> Tensor:
-    """(N, 3, 3) [m²]; of given ones, the upper triangle counts."""
+    """Return the covariances (N, 3, 3) [m²]; of given ones, the upper triangle counts."""
     if covars is not None:
         upper = covars.triu()
         return upper + upper.triu(1).mT
@@ -164,7 +164,7 @@ def _read(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:
-    """Pixels of world points, each at the time its line is read, and the points in the camera frame at that time."""
+    """Project world points, each at the readout time of its line; return pixels and points in the camera frame."""
     time = torch.full(points.shape[:-1], 0.5, dtype=points.dtype)
     inside = points
     for _ in range(_SHUTTER_ROUNDS):
@@ -176,7 +176,7 @@ def _read(
 
 
 def _pose_between(first: Tensor, last: Tensor, time: Tensor) -> Tensor:
-    """Poses (..., 4, 4) at times (...,) in 0..1: a share of the rotation in between (Rodrigues)."""
+    """Interpolate poses (..., 4, 4) at times (...,) in 0..1 by a share of the rotation (Rodrigues)."""
     between = last[:3, :3] @ first[:3, :3].T
     angle = torch.arccos((0.5 * (between.diagonal().sum() - 1)).clamp(-1, 1))
     K = (between - between.T) / (2 * angle.sin() if float(angle.detach()) > 1e-9 else 1.0)

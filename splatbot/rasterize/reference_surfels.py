@@ -29,14 +29,14 @@ EXPECTED_DEPTH_MIN = 1e-10
 
 @dataclass(frozen=True)
 class SurfelReferenceMeta:
-    """What the reference found.
+    """Intermediate results of the reference.
 
     Args:
         means2d: (C, N, 2) projected centres [px].
         depths: (C, N) of the centres [m].
-        margins: (C, H, W) relative distance of each pixel from its nearest jump: an alpha at 1/255 or at its cap, a
-            transmittance at 1e-4 or (for the median) at 1/2, a hit at the near plane, a disc's response equal to the
-            low-pass filter's, and a hit at the mean depth of those before (for distortion).
+        margins: (C, H, W) relative distance of each pixel from its nearest jump. Jumps are an alpha at 1/255 or at its
+            cap, a transmittance at 1e-4 or (for the median) at 1/2, a hit at the near plane. Further jumps are a disc's
+            response equal to the low-pass filter's, and a hit at the mean depth of the earlier ones (for distortion).
     """
 
     means2d: Tensor
@@ -46,7 +46,7 @@ class SurfelReferenceMeta:
 
 @dataclass(frozen=True)
 class _Hits:
-    """Of M surfels, front to back, in P pixels."""
+    """Hits of P pixels with M surfels, front to back."""
 
     power: Tensor  # (M, P) opacity x falloff, before the cap
     depth: Tensor  # (M, P)
@@ -71,7 +71,7 @@ def rasterization_2dgs_reference(
     distloss: bool = False,
     depth_mode: Literal["expected", "median"] = "expected",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, SurfelReferenceMeta]:
-    """As :func:`splatbot.rasterize.rasterization_2dgs`, computed in the type of ``means`` by torch alone.
+    """Render as :func:`splatbot.rasterize.rasterization_2dgs`, computed in the type of ``means`` by torch alone.
 
     Raises:
         InputError: an unknown render mode.
@@ -115,8 +115,10 @@ def rasterization_2dgs_reference(
 def _hit(
     centers: Tensor, axes: Tensor, scales: Tensor, opacities: Tensor, K: Tensor, pixels: Tensor, near: float
 ) -> _Hits:
-    """Where pixels' rays meet discs (Huang et al. 2024, eq. 8-10): with M = K (s₁t₁, s₂t₂, p), a pixel (x, y) lies on
-    the planes x M₃ - M₁ and y M₃ - M₂ of the disc's frame; their line meets the disc at (u, v).
+    """Intersect the pixels' rays with discs (Huang et al. 2024, eq. 8-10).
+
+    With M = K (s₁t₁, s₂t₂, p), a pixel (x, y) lies on the planes x M₃ - M₁ and y M₃ - M₂ of the disc's frame. Their
+    line meets the disc at (u, v).
     """
     z = centers[:, 2]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]  # the other entries are no parameters
@@ -150,7 +152,7 @@ def _composite(
     render_mode: str,
     distloss: bool,
 ) -> tuple[Tensor, ...]:
-    """Image (P, X), alpha, normal, distortion, median depth, expected depth, margin of P pixels."""
+    """Composite image (P, X), alpha, normal, distortion, median depth, expected depth, margin of P pixels."""
     counts = hits.power >= ALPHA_MIN
     alpha = torch.where(counts, hits.power.clamp_max(ALPHA_MAX), torch.zeros_like(hits.power))
     after = torch.cumprod(1.0 - alpha, 0)
@@ -184,7 +186,7 @@ def _composite(
 
 
 def _median(depth: Tensor, front: Tensor) -> Tensor:
-    """Depth (P,) of the last surfel that found more than half of the light; 0 for none."""
+    """Return depth (P,) of the last surfel that found more than half of the light; or 0."""
     if len(depth) == 0:
         return depth.new_zeros(depth.shape[1])
     numbers = torch.arange(1, len(depth) + 1)[:, None] * front
@@ -194,7 +196,7 @@ def _median(depth: Tensor, front: Tensor) -> Tensor:
 
 
 def _distortion(weights: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """2 Σᵢ wᵢ |mᵢ Σ_{j<i} wⱼ - Σ_{j<i} wⱼ mⱼ| (P,), and how near (M, P) each term is to its kink."""
+    """Return 2 Σᵢ wᵢ |mᵢ Σ_{j<i} wⱼ - Σ_{j<i} wⱼ mⱼ| (P,), and each term's distance (M, P) to its kink."""
     before = torch.cumsum(weights, 0) - weights
     moment = torch.cumsum(weights * depth, 0) - weights * depth
     lag = depth * before - moment

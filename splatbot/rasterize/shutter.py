@@ -27,7 +27,7 @@ class RollingShutterType(Enum):
 
 
 def shutter_of(value: Any) -> RollingShutterType:
-    """The shutter of that name, global if None; accepts gsplat's own enumeration.
+    """Return the shutter of that name, global if None; accepts gsplat's own enumeration.
 
     Raises:
         InputError: an unknown name.
@@ -48,12 +48,12 @@ class Motion:
     step: Tensor
 
     def flat(self) -> Tensor:
-        """What the kernels give gradients to: turn, step and pivot, which is the middle's translation; (..., 9)."""
+        """Return the parameters (..., 9) with native gradients: turn, step and pivot, the middle's translation."""
         return torch.cat([self.turn, self.step, self.middle[..., :3, 3]], -1)
 
 
 def motion_between(first: Tensor, last: Tensor) -> Motion:
-    """How a camera moves between two poses: rotation by the shortest way at constant speed, translation linearly.
+    """Return the motion between two poses: the shortest rotation at constant speed, linear translation.
 
     Differentiable in both poses, in float64.
 
@@ -79,7 +79,7 @@ def motion_between(first: Tensor, last: Tensor) -> Motion:
 
 
 def _rotation_vector(R: Tensor) -> Tensor:
-    """(..., 3) of rotations (..., 3, 3) by less than π: angle / (2 sin angle) times the antisymmetric part."""
+    """Return the rotation vectors (..., 3) of rotations (..., 3, 3) below π: angle / (2 sin angle) (R - Rᵀ)."""
     twice = torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
     versine = 1.5 - 0.5 * R.diagonal(dim1=-2, dim2=-1).sum(-1)  # 1 - cos(angle)
     small = versine < _SMALL

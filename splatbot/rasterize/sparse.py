@@ -1,4 +1,4 @@
-"""Parts of a picture: some pixels or tiles, who is in front there, who is in view at all."""
+"""Parts of an image: single pixels or tiles, their front Gaussians, and the Gaussians in view."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Contributors:
 
     Args:
         ids: (C, P, k) int64; -1 where fewer than k count.
-        weights: (C, P, k) float32 blend weights, in 0..1; 0 where there is none.
+        weights: (C, P, k) float32 blend weights, in 0..1; 0 without a Gaussian.
     """
 
     ids: Tensor
@@ -46,7 +46,7 @@ def rasterize_pixels(
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render P pixels of each of C views; bit for bit those of the whole picture; differentiable.
 
-    All Gaussians are projected, as for the whole; blending is done in the 4x4 blocks that hold a pixel asked for.
+    All Gaussians are projected, as for the whole; blending is done in the 4x4 blocks that hold a requested pixel.
 
     Args:
         means, quats, scales, opacities, colors, viewmats, Ks, width, height, options: as of ``rasterization``, without
@@ -142,7 +142,7 @@ def contributing_gaussians(
     k: int = 8,
     **options: Any,
 ) -> Contributors:
-    """The front k Gaussians that count in each of P pixels, and how much; without gradients.
+    """Return the front k Gaussians that contribute to each of P pixels and their weights; without gradients.
 
     Args:
         means, quats, scales, opacities, viewmats, Ks, width, height, options: as of ``rasterization``, without batch
@@ -203,9 +203,9 @@ def visible_gaussians(
     covars: Tensor | None = None,
     **camera: Any,
 ) -> Tensor:
-    """Which Gaussians (C, N) bool may be seen by each view: in view, hidden behind others or not. Renders nothing.
+    """Mark the Gaussians (C, N) bool in each view's frustum, hidden behind others or not. Render no image.
 
-    Args: as of ``rasterization``, without batch dimensions; ``camera``: ``with_ut`` and what goes with it.
+    The arguments are those of ``rasterization`` without batch dimensions; ``camera`` holds ``with_ut`` and its options.
 
     Raises:
         InputError: as ``rasterization``.
@@ -247,7 +247,7 @@ def visible_gaussians(
 
 
 def _pixels_of(pixels: Tensor, viewmats: Tensor, width: int, height: int, name: str = "pixels") -> Tensor:
-    """Checked places (C, P, 2) int64."""
+    """Return the checked pixels (C, P, 2) int64."""
     _one_scene(viewmats)
     views = len(viewmats)
     if not isinstance(pixels, Tensor) or pixels.is_floating_point() or pixels.is_complex():
@@ -277,4 +277,4 @@ def _cells(at: Tensor, width: int, height: int, size: int) -> Tensor:
 def _refuse(options: dict[str, Any], *names: str) -> None:
     for name in names:
         if name in options:
-            raise InputError("is given by the pixels asked for.", field=name, hint="leave it out")
+            raise InputError("is given by the requested pixels.", field=name, hint="leave it out")

@@ -15,7 +15,7 @@ from splatbot.rasterize.passes import camera_gradients
 
 @dataclass(frozen=True)
 class SurfelOptions:
-    """What a render is told besides tensors."""
+    """Options of a render in addition to tensors."""
 
     width: int
     height: int
@@ -28,16 +28,16 @@ class SurfelOptions:
     distortion: bool
 
     def colors_only(self) -> SurfelOptions:
-        """The same render without depth and distortion."""
+        """Return the same render without depth and distortion."""
         return replace(self, depth="none", distortion=False)
 
     def colors_of(self, colors: Tensor, i: int) -> Tensor:
-        """Colours, or their gradients, of view i."""
+        """Return colours, or their gradients, of view i."""
         return (colors[i] if self.view_colors else colors).detach()
 
 
 class RasterizeSurfels(torch.autograd.Function):
-    """One view after the other. Returns colours, alphas, normals, median and, if asked for, distortion."""
+    """One view after the other. It returns colours, alphas, normals, median and, if requested, distortion."""
 
     @staticmethod
     def forward(
@@ -121,13 +121,13 @@ class RasterizeSurfels(torch.autograd.Function):
 
 
 def _empty_images(views: int, channels: int, options: SurfelOptions) -> tuple[Tensor, ...]:
-    """Colours and depth, alphas, normals, median, distortion."""
+    """Return images without values: colours and depth, alphas, normals, median, distortion."""
     columns = (channels + int(options.depth != "none"), 1, 3, 1, *([1] if options.distortion else []))
     return tuple(torch.empty(views, options.height, options.width, n) for n in columns)
 
 
 def _image_gradients(grads: tuple[Tensor | None, ...], i: int) -> list[Tensor | None]:
-    """Of view i: (H, W, X) of colours and normals, (H, W) of the others; five, None for what has none."""
+    """Return view i's five image gradients: (H, W, X) of colours and normals, (H, W) of the others, or None."""
     found: list[Tensor | None] = []
     for k in range(5):
         grad = grads[k] if k < len(grads) else None

@@ -1,4 +1,4 @@
-"""What a render of surfels knows besides its images, computed when asked for."""
+"""Values of a render of surfels in addition to its images, computed on access."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _PLAIN = ("width", "height", "n_cameras", "opacities", "visible_ids", "gradient_
 class SurfelMeta(Mapping[str, Any]):
     """A read-only mapping with gsplat's names.
 
-    means2d (C, N, 2) projected centres [px], depths (C, N) of the centres [m], normals (C, N, 3) world frame, facing
-    the camera, radii (C, N, 2) int32 [px], tiles_per_gauss (C, N): zero for surfels out of view. opacities (C, N).
-    visible_ids: a list of C tensors of indices. tile_size (width, height) [px], tile_width and tile_height [tiles],
-    n_isects and state_bytes: lists of C. gradient_2dgs (C, N, 2): zeros that the render depends on; the others carry
-    no gradients.
+    - means2d (C, N, 2) projected centres [px], depths (C, N) of the centres [m], radii (C, N, 2) int32 [px].
+    - normals (C, N, 3) world frame, facing the camera; tiles_per_gauss (C, N). These are zero for surfels out of view.
+    - opacities (C, N). visible_ids: a list of C tensors of indices.
+    - tile_size (width, height) [px], tile_width and tile_height [tiles], n_isects and state_bytes: lists of C.
+    - gradient_2dgs (C, N, 2): zeros that the render depends on; the others carry no gradients.
     """
 
     def __init__(self, states: list[Any], opacities: Tensor, width: int, height: int, shift: Tensor) -> None:

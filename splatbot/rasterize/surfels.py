@@ -46,18 +46,18 @@ def rasterization_2dgs(
 
     The model is 2D Gaussian splatting (Huang et al. 2024). A surfel is a disc in the plane of its first two axes. A
     pixel's ray meets it (u, v) standard deviations from its centre (eq. 8-10), and its response there is
-    max(exp(-(u² + v²) / 2), exp(-d²)), d pixels from the projected centre: the second, a low-pass filter, keeps discs
-    seen edge-on or from afar (eq. 11). Blending is that of :func:`splatbot.rasterize.rasterization`. Depth is that of
-    the ray's hit with the disc, or of the centre where the low-pass filter is the larger; hits nearer than the near
-    plane do not count. (gsplat takes every depth at the centre: on a slanted surface, which no disc then shows.)
+    max(exp(-(u² + v²) / 2), exp(-d²)), d pixels from the projected centre. The second term, a low-pass filter, keeps
+    discs that are seen edge-on or from afar (eq. 11). Blending is that of :func:`splatbot.rasterize.rasterization`.
+    Depth is that of the ray's hit with the disc, or of the centre where the low-pass filter is larger. Hits nearer than
+    the near plane do not count. gsplat takes every depth at the centre.
 
     Args:
         means: (N, 3) [m], world frame.
         quats: (N, 4) wxyz, any norm; a zero quaternion counts as no rotation and receives no gradient.
-        scales: (N, 3) standard deviations [m]; the third is not looked at.
+        scales: (N, 3) standard deviations [m]; the third is ignored.
         opacities: (N,) in 0..1.
-        colors: (N, D) or (C, N, D), any number of channels; with ``sh_degree`` coefficients (N, K, 3) or
-            (C, N, K, 3); None in the modes D and ED.
+        colors: (N, D) or (C, N, D), any number of channels. With ``sh_degree``, coefficients (N, K, 3) or
+            (C, N, K, 3). None in the modes D and ED.
         viewmats: (C, 4, 4) world to camera; float32 or float64.
         Ks: (C, 3, 3) [px]; float32 or float64. Its focal lengths and principal point receive gradients.
         width: of the image [px].
@@ -71,8 +71,8 @@ def rasterization_2dgs(
         packed: has no effect on the result; accepted for gsplat's sake.
         tile_size: has no effect on the result; accepted for gsplat's sake.
         backgrounds: (C, D) colours seen where transmittance is left; of no effect in the modes D and ED.
-        render_mode: RGB; D: depth summed with the blend weights [m]; ED: that, divided by the sum of weights; RGB+D
-            and RGB+ED append it as the last channel.
+        render_mode: RGB. D: depth summed with the blend weights [m]. ED: D divided by the sum of weights. RGB+D and
+            RGB+ED append the depth as the last channel.
         distloss: whether to render the distortion.
         depth_mode: the depth whose normals are ``surf_normals``: "expected" or "median".
 
@@ -85,8 +85,8 @@ def rasterization_2dgs(
             back: Σᵢⱼ wᵢwⱼ|mᵢ - mⱼ| (eq. 13) where the hits are in the order of the centres. None without ``distloss``.
         render_median: (C, H, W, 1) depth of the last surfel that found more than half of the light left [m]; 0 for
             none.
-        meta: means2d, radii, depths, normals, opacities, tiles_per_gauss, visible_ids and the tile grid, computed when
-            asked for; gradient_2dgs (C, N, 2), zeros whose ``grad`` is that to the projected centres [px⁻¹], for
+        meta: means2d, radii, depths, normals, opacities, tiles_per_gauss, visible_ids and the tile grid, computed on
+            access. ``gradient_2dgs`` (C, N, 2), zeros whose ``grad`` is that of the projected centres [px⁻¹], serves
             densification: call its ``retain_grad()`` before ``backward()``.
 
     Raises:
@@ -128,7 +128,7 @@ def rasterization_2dgs(
         depth=depth,
         distortion=distloss,
     )
-    # A sum with a tensor that asks for gradients makes it no leaf, as gsplat's users expect: they call retain_grad().
+    # The sum with a tensor that requires gradients is not a leaf, as gsplat's users expect: they call retain_grad().
     wants_grad = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs.tensors())
     shift = torch.zeros(len(inputs.viewmats), len(inputs.means), 2, requires_grad=wants_grad)
     states: list[Any] = []
@@ -144,7 +144,7 @@ def rasterization_2dgs(
 
 
 def _render(inputs: Inputs, shift: Tensor, options: SurfelOptions, states: list[Any]) -> tuple[Tensor, ...]:
-    """All channels: the first with everything else, further ones for their colours alone."""
+    """Render all channels: the first with everything else, further ones for their colours alone."""
     most = native().MAX_SURFEL_CHANNELS
     channels = inputs.colors.shape[-1]
     geometry = (inputs.means, inputs.quats, inputs.scales, inputs.opacities)
@@ -169,7 +169,7 @@ def _expected(depth: Tensor, alphas: Tensor, kind: str) -> Tensor:
 
 
 def _reject_unsupported(sparse_grad: bool, absgrad: bool, depth_mode: str) -> None:
-    """An option that would change the result is refused, never ignored."""
+    """Refuse an option that would change the result instead of ignoring it."""
     for name, value in (("sparse_grad", sparse_grad), ("absgrad", absgrad)):
         if value:
             raise InputError("is not supported for surfels.", field=name, hint="leave it out")

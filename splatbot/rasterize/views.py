@@ -35,14 +35,14 @@ def render_view(
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> NDArray[np.float32]:
-    """What a pinhole camera at a pose sees of the map.
+    """Render the map for a pinhole camera at a pose.
 
     Args:
         model: the map; its harmonics, of any degree, colour it as seen from the pose.
         camera: intrinsics and size; without distortion.
         T_world_camera: (4, 4) rigid.
-        mode: "rgb" (H, W, 3) in 0..1; "depth" (H, W) [m] along the optical axis, of the Gaussians' planes; "normal"
-            (H, W, 3) unit vectors in the camera frame that face the camera; "alpha" (H, W) in 0..1. Depth and normal
+        mode: "rgb" (H, W, 3) in 0..1. "depth" (H, W) [m] along the optical axis, of the Gaussians' planes. "normal"
+            (H, W, 3) unit vectors in the camera frame that face the camera. "alpha" (H, W) in 0..1. Depth and normal
             are 0 where alpha < 0.5.
         background: RGB in 0..1 behind the map ("rgb" only).
 
@@ -72,13 +72,13 @@ def render_view(
 def render_rgbd(
     model: GaussianModel, camera: Camera, T_world_camera: ArrayLike, *, sh_degree: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Colour times opacity (H, W, 3), opacity (H, W) and depth (H, W) [m] of a map, in one pass and unfiltered.
+    """Render colour times opacity (H, W, 3), opacity (H, W) and depth (H, W) [m] of a map, in one pass and unfiltered.
 
     Args:
         model: the map.
         camera: intrinsics and size; without distortion.
         T_world_camera: (4, 4) rigid.
-        sh_degree: of the harmonics that are evaluated; None: all that the map has.
+        sh_degree: degree of the harmonics that are evaluated. If None, that of the map.
 
     Raises:
         InputError: the pose is not a rigid transform.
@@ -91,7 +91,7 @@ def render_rgbd(
 
 
 def facing_normals(model: GaussianModel, T_camera_world: ArrayLike) -> Tensor:
-    """Unit normals (N, 3) in the camera frame: each Gaussian's flattest axis, signed to face the camera."""
+    """Return unit normals (N, 3) in the camera frame: each Gaussian's flattest axis, signed to face the camera."""
     T = np.asarray(T_camera_world, dtype=np.float64)
     axes = T[:3, :3] @ quat_to_rotation(model.quats.detach().numpy())
     flattest = model.log_scales.detach().argmin(dim=1).numpy()
@@ -104,10 +104,11 @@ def facing_normals(model: GaussianModel, T_camera_world: ArrayLike) -> Tensor:
 def default_view(
     model: GaussianModel, *, width: int = 640, height: int = 480, fov_deg: float = 60.0
 ) -> tuple[Camera, NDArray[np.float64]]:
-    """A camera and pose T_world_camera (4, 4) that show a map whose poses are unknown.
+    """Return a camera and pose T_world_camera (4, 4) that show a map whose poses are unknown.
 
-    The camera keeps the world's axes (a mapped log's world is its first camera: x right, y down, z forward), looks at
-    the opacity-weighted centre of mass, and backs off along -z until 90 % of the Gaussians' centres are in view.
+    The camera keeps the world's axes; those of a mapped log are its first camera's (x right, y down, z forward). It
+    looks at the opacity-weighted centre of mass from a distance along -z that has 90 % of the Gaussians' centres in
+    view.
 
     Args:
         width, height: of the image [px].
@@ -132,7 +133,7 @@ def default_view(
 
 
 def depth_limits(depth: NDArray[np.float32]) -> tuple[float, float]:
-    """Range (near, far) [m] that holds 96 % of the known depths (H, W); (0, 1) where none is known."""
+    """Return the range (near, far) [m] of 96 % of the known depths (H, W), or (0, 1) without any."""
     known = depth[depth > 0]
     if known.size == 0:
         return 0.0, 1.0
@@ -143,7 +144,7 @@ def depth_limits(depth: NDArray[np.float32]) -> tuple[float, float]:
 def colorize(
     view: NDArray[np.float32], mode: Mode, *, depth_range: tuple[float, float] | None = None
 ) -> NDArray[np.uint8]:
-    """A view of :func:`render_view` as an image, (H, W, 3) RGB or, for "alpha", (H, W).
+    """Convert a view of :func:`render_view` to an image, (H, W, 3) RGB or, for "alpha", (H, W).
 
     Depth runs from red (near) to blue (far) over ``depth_range`` [m], by default :func:`depth_limits`; unknown is
     black. Normals are drawn as (x, -y, -z) → RGB, so that a surface facing the camera is light blue.
@@ -160,7 +161,7 @@ def colorize(
 
 
 def to_png(view: NDArray[np.float32], mode: Mode, *, depth_range: tuple[float, float] | None = None) -> bytes:
-    """A view of :func:`render_view` as the bytes of an 8-bit PNG (see :func:`colorize`)."""
+    """Encode a view of :func:`render_view` as the bytes of an 8-bit PNG (see :func:`colorize`)."""
     image = colorize(view, mode, depth_range=depth_range)
     ordered = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])  # OpenCV writes BGR
     ok, encoded = cv2.imencode(".png", ordered)
@@ -177,7 +178,7 @@ def _splat(
     render_mode: Literal["RGB", "ED", "RGB+ED"],
     sh_degree: int | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Blended features (H, W, C), None: the model's colours; and opacity (H, W)."""
+    """Blend features (H, W, C), or the model's colours if None; return them with the opacity (H, W)."""
     with torch.no_grad():
         images, alphas, _ = rasterization(
             means=model.means,

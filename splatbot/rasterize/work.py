@@ -1,4 +1,4 @@
-"""What a render cost: milliseconds by stage and the pairs it evaluated."""
+"""Cost of a render: milliseconds by stage and the pairs that it evaluated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from splatbot.rasterize.meta import RenderMeta
 
 @dataclass(frozen=True)
 class RasterWork:
-    """Of one view. Milliseconds of the last forward and the last backward pass (0 before one).
+    """Work of one view. Milliseconds of the last forward and the last backward pass (0 before one).
 
     Args:
         evaluated_pairs: (Gaussian, pixel) pairs of a blend pass: the pixels of the 4x4 blocks that each Gaussian
@@ -26,5 +26,5 @@ class RasterWork:
 
 
 def raster_work(meta: RenderMeta) -> list[RasterWork]:
-    """The work of each view of a render; ask after ``backward()`` for its stages."""
+    """Return the work of each view of a render; the stages of ``backward()`` appear after it."""
     return [RasterWork(**state.work()) for state in meta._states]

@@ -1,4 +1,4 @@
-"""What the kernels promise of any machine: the number of threads changes no bit, the instruction set only rounding."""
+"""Determinism of the kernels: the number of threads changes no bit, the instruction set only rounding."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _restore() -> Iterator[None]:
 
 
 def large_scene() -> Scene:
-    """Several projection blocks, sort shares and tiles, so that work is really divided."""
+    """Return a scene with several projection blocks, sort shares and tiles, so that work is divided."""
     scene = hard_scene(1, n=30_000)
     scene.scales *= 0.2
     scene.width, scene.height = 200, 140
@@ -36,7 +36,7 @@ def large_scene() -> Scene:
 
 
 def render_all(scene: Scene, mode: str = "RGB+ED") -> dict[str, Tensor]:
-    """Image, alpha and all gradients."""
+    """Return the image, alpha and all gradients."""
     leaves = scene.to(torch.float32, requires_grad=True)
     image, alpha, _ = leaves.render(mode, depth_mode="plane")
     weights = torch.linspace(-1.0, 1.0, image.numel()).reshape(image.shape)

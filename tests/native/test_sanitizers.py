@@ -14,7 +14,7 @@ NATIVE = Path(__file__).parents[2] / "splatbot" / "native"
 
 
 def tool(name: str) -> str | None:
-    """A build tool of this environment or of the system."""
+    """Return a build tool of this environment or of the system."""
     beside_python = Path(sys.executable).parent / name
     return str(beside_python) if beside_python.exists() else shutil.which(name)
 

@@ -1,4 +1,4 @@
-"""GaussianModel: physical units in and out, and what it refuses."""
+"""GaussianModel: physical units in and out, and its errors."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def model_of(n: int, rng: np.random.Generator) -> GaussianModel:
 
 
 def gradients(model: GaussianModel, rng: np.random.Generator) -> dict[str, Tensor]:
-    """Random ones, of sizes from 1e-6 to 1."""
+    """Return random gradients of sizes from 1e-6 to 1."""
     out = {}
     for name in PARAMETERS:
         shape = tuple(getattr(model, name).shape)

@@ -37,14 +37,14 @@ class Run:
         self.steps = torch.zeros(n)
 
     def gradients(self) -> dict[str, Tensor]:
-        """Of sizes from 1e-6 to 1."""
+        """Return gradients of sizes from 1e-6 to 1."""
         return {
             k: torch.randn(v.shape, generator=self.random) * 10 ** (-6 * torch.rand(v.shape, generator=self.random))
             for k, v in self.values.items()
         }
 
     def step(self, gradients: dict[str, Tensor], visible: Tensor, eps: float = 1e-15) -> None:
-        """One step in place."""
+        """Perform one step in place."""
         adam_step(
             self.values, gradients, self.first, self.second, self.steps, visible, RATES, betas=(0.9, 0.99), eps=eps
         )

@@ -28,7 +28,7 @@ def _restore() -> Iterator[None]:
 def reference(
     rendered: Tensor, target: Tensor, weight: float, padding: str = "same", mask: Tensor | None = None
 ) -> Tensor:
-    """By torch's convolution, in float64; images (C, H, W, D)."""
+    """Compute the loss by torch's convolution, in float64; images (C, H, W, D)."""
     x, y = rendered.double(), target.double()
     keep = torch.ones(x.shape[:-1]) if mask is None else mask.double()
     x = torch.where(keep[..., None] > 0, x, y)
@@ -51,7 +51,7 @@ def reference(
 
 
 def photo(*shape: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """A smooth random image with a flat part, and a noisy copy."""
+    """Return a smooth random image with a flat part, and a noisy copy."""
     g = torch.Generator().manual_seed(seed)
     small = torch.rand(shape[0], shape[3], 8, 8, generator=g)
     image = F.interpolate(small, size=shape[1:3], mode="bilinear").permute(0, 2, 3, 1).contiguous()
@@ -62,7 +62,7 @@ def photo(*shape: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 def both(
     rendered: Tensor, target: Tensor, weight: float = 0.2, padding: Padding = "same", mask: Tensor | None = None
 ) -> tuple[float, float]:
-    """Differences from the reference: of the value, and of the gradient (relative L2)."""
+    """Return the differences of value and gradient (relative L2) from the reference."""
     x, exact = rendered.clone().requires_grad_(), rendered.double().requires_grad_()
     value = l1_dssim(x, target, weight, mask, padding=padding)
     want = reference(exact, target, weight, padding, mask)
@@ -97,7 +97,7 @@ def test_an_image_smaller_than_the_window_is_padded(shape: tuple[int, ...]) -> N
 
 @pytest.mark.parametrize("padding", ["same", "valid"])
 def test_flat_images_keep_the_digits_that_float32_moments_lose(padding: Padding) -> None:
-    """Plain float32 is off by 5e-5 here: variances are differences of moments 1e7 times as large."""
+    """Plain float32 has an error of 5e-5 here: variances are differences of moments 1e7 times as large."""
     value, gradient = both(torch.full((1, 60, 80, 3), 0.7), torch.full((1, 60, 80, 3), 0.65), padding=padding)
     assert value < 1e-6
     assert gradient < 1e-4

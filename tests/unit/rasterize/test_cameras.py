@@ -40,7 +40,7 @@ ROLLING = [name for name in RollingShutterType.__members__ if name != "GLOBAL"]
 
 
 def distortion(views: int = 1) -> dict[str, Any]:
-    """Native arguments of the distorted pinhole."""
+    """Return the native arguments of the distorted pinhole."""
     c = torch.tensor(PINHOLE).expand(views, -1)
     return {
         "with_ut": True,
@@ -51,7 +51,7 @@ def distortion(views: int = 1) -> dict[str, Any]:
 
 
 def before_pinhole(limit: float, points: Tensor) -> Tensor:
-    """Whether points are in a pinhole's range."""
+    """Return True for points in a pinhole's range."""
     inside = points[..., 0] ** 2 + points[..., 1] ** 2 < (limit * points[..., 2]) ** 2
     return (points[..., 2] >= 0.01) & inside
 
@@ -70,7 +70,7 @@ def assert_equal(scene: Scene, mode: str, project: Projector, **options: Any) ->
 
 
 def wide_scene(seed: int) -> Scene:
-    """Gaussians up to 80 degrees from the axis, for a fisheye."""
+    """Return Gaussians up to 80 degrees from the axis, for a fisheye."""
     scene = hard_scene(seed)
     scene.means[:, :2] *= 3.0
     scene.Ks[:, :2, :2] *= 0.45
@@ -142,7 +142,7 @@ def test_other_sigma_points_equal_the_float64_reference() -> None:
 
 
 def second_pose(viewmats: Tensor) -> Tensor:
-    """The pose a readout later: 4 degrees and 6 cm on."""
+    """Return the pose at the end of the readout: 4 degrees and 6 cm further."""
     motion = torch.from_numpy(se3_exp([0.04, -0.03, 0.03, 0.03, -0.05, 0.04])).float()
     return motion @ viewmats
 
@@ -180,7 +180,7 @@ def test_a_rolling_shutter_that_does_not_move_is_a_global_one() -> None:
 
 
 def grid(points: int = 12, widest: float = 0.55) -> np.ndarray:
-    """Points (P, 3) before a camera, up to a tangent of ``widest`` from its axis."""
+    """Return points (P, 3) before a camera, up to a tangent of ``widest`` from its axis."""
     x, y = np.meshgrid(np.linspace(-widest, widest, points), np.linspace(-widest, widest, points))
     z = 1.0 + 0.5 * np.sin(3.0 * x + 5.0 * y)
     return np.stack([x * z, y * z, z], -1).reshape(-1, 3)
@@ -277,7 +277,7 @@ def test_camera_options_that_do_not_fit_are_refused_by_name(options: dict[str, A
 
 
 def along_rotations(poses: Tensor, gradient: Tensor) -> Tensor:
-    """Of gradients (C, 4, 4) to poses, what moves them: about the camera's axes and along them (C, 6)."""
+    """Return the tangential part (C, 6) of pose gradients (C, 4, 4): about the camera's axes and along them."""
     turned = gradient[:, :3, :3] @ poses[:, :3, :3].mT
     skew = turned - turned.mT
     return torch.cat([skew[:, [2, 0, 1], [1, 2, 0]], gradient[:, :3, 3]], -1)

@@ -1,4 +1,4 @@
-"""What programs written for gsplat rely on: layouts of tensors and of meta, gradients of projected centres, tiles.
+"""gsplat's interface: layouts of tensors and of meta, gradients of projected centres, tiles.
 
 Each is checked against closed forms, plain torch or the float64 reference.
 """

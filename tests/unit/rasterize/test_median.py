@@ -1,4 +1,4 @@
-"""Median depth and normals, against what the reference's weights say."""
+"""Median depth and normals against the reference's weights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def exact_weights(scene: Scene) -> Tensor:
 
 
 def exact_median(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Ids (C, H, W), -1 where there is none, and the distance of the transmittances from one half."""
+    """Return the ids (C, H, W), or -1, and the distance of the transmittances from one half."""
     weights = exact_weights(scene)
     exact = scene.to(torch.float64)
     ids, margins = [], []

@@ -1,4 +1,4 @@
-"""Front to back, whatever the range of depths: the sort takes as many passes, of digits as wide, as it calls for."""
+"""Front-to-back order for any range of depths: the sort adapts the number of passes and the digit width."""
 
 from __future__ import annotations
 

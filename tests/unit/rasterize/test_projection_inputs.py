@@ -20,14 +20,14 @@ GRADIENT_BOUND = 1e-4
 
 
 def with_harmonics(scene: Scene, coefficients: int, seed: int = 0) -> Scene:
-    """The scene with random coefficients, some of whose colours fall below 0."""
+    """Return the scene with random coefficients, some of whose colours fall below 0."""
     generator = torch.Generator().manual_seed(seed)
     scene.colors = 0.6 * torch.randn(len(scene.means), coefficients, 3, generator=generator)
     return scene
 
 
 def with_covars(scene: Scene) -> Scene:
-    """The same Gaussians by their covariances."""
+    """Return the same Gaussians by their covariances."""
     w, x, y, z = torch.nn.functional.normalize(scene.quats.double(), dim=-1).unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
@@ -191,7 +191,7 @@ def test_a_scene_ten_kilometres_from_the_origin_renders_as_well_as_one_around_it
     with_harmonics(far, 9)
     result = compare(far, "RGB", sh_degree=2)
     assert result.forward <= FORWARD_BOUND
-    # The pose turns about the world's origin, 10 km away: what is left of its gradient is the lever times rounding.
+    # The pose turns about the world's origin, 10 km away: the rest of its gradient is the lever times rounding.
     assert max(v for k, v in result.gradients.items()) <= GRADIENT_BOUND, result.gradients
     exact = far.reference("RGB", sh_degree=2)[2].means2d
     meta = rasterization(**vars(far), sh_degree=2, packed=False)[2]

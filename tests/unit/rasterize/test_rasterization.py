@@ -1,4 +1,4 @@
-"""The native rasterizer against the float64 reference, and what its interface promises."""
+"""The native rasterizer against the float64 reference, and the promises of its interface."""
 
 from __future__ import annotations
 

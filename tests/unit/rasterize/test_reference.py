@@ -1,4 +1,4 @@
-"""The reference against central differences and closed forms: what the kernels are measured with must itself hold."""
+"""The reference against central differences and closed forms: the oracle of the kernels must itself hold."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STEP = 1e-6
 
 
 def central_difference(scene: Scene, name: str, index: tuple[int, ...], weights: Tensor, mode: str) -> float:
-    """Slope of the weighted image along one entry of one input."""
+    """Return the slope of the weighted image along one entry of one input."""
     values = []
     for sign in (1.0, -1.0):
         moved = scene.to(torch.float64)

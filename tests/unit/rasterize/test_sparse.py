@@ -1,4 +1,4 @@
-"""Parts of a picture are bit for bit those of the whole; who is in front is who the reference blends first."""
+"""Parts of an image equal the whole bit for bit; the front Gaussian is the one that the reference blends first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The native surfel rasterizer against the float64 reference, analytic planes, and what its interface promises."""
+"""The native surfel rasterizer against the float64 reference, analytic planes, and the promises of its interface."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_two_sheets_have_the_distortion_of_their_distance() -> None:
     for name in ("quats", "scales", "opacities", "colors"):
         setattr(scene, name, getattr(scene, name).repeat(2, *[1] * (getattr(scene, name).ndim - 1)))
     images, _ = render(scene, "RGB+ED", distloss=True)
-    d2 = 0.5 / 40.0**2  # squared slope of the ray through the pixel beside the centre
+    d2 = 0.5 / 40.0**2  # squared slope of the ray through the pixel next to the centre
     front, back = (0.5 * math.exp(-0.5 * d2 * z * z) for z in (2.0, 3.0))
     assert float(images["distortion"][0, 12, 16, 0]) == pytest.approx(2.0 * front * (1.0 - front) * back, rel=1e-5)
     assert float(images["median"][0, 12, 16, 0]) == pytest.approx(

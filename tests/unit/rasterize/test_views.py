@@ -29,7 +29,7 @@ CAMERA = Camera(100, 100, 31.5, 23.5, 64, 48)
 
 
 def _plane(T_world_plane: NDArray[np.float64], color: tuple[float, float, float] = (0.2, 0.6, 1.0)) -> GaussianModel:
-    """A closed wall of flat Gaussians in the xy plane of a frame, 2 m square."""
+    """Return a closed wall of flat Gaussians in the xy plane of a frame, 2 m square."""
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 81), np.linspace(-1, 1, 81)))
     n = len(x)
     return GaussianModel.from_activated(
