@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,29 +16,33 @@ from splatbot.config import Config
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
+from splatbot.mapping.executor import Executor, InlineExecutor, ThreadExecutor
 from splatbot.mapping.joint_motion import JointMotionMonitor
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.observation import GraphLocation, Observation
 from splatbot.mapping.refine import Stop, never
-from splatbot.mapping.worker import MappingWorker
 from splatbot.tracking.health import Verdict
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from splatbot.tracking.tracker import PoseEstimate, Tracker
 from splatbot.trajectory import Trajectory
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What became of one frame.
+    """The result of one frame.
 
     Args:
         T_world_camera: (4, 4), world = first camera; None when lost.
-        verdict: "ok", "degraded" (tracked, with ``reasons`` to doubt it) or "lost" (map frozen).
-        stage: the stage whose pose was taken.
+        verdict: "ok", "degraded" (tracked, with ``reasons`` to doubt it) or "lost" (the map did not change).
+        stage: the tracking stage that estimated the pose.
         stage_ms: milliseconds by stage.
-        keyframe: whether the frame entered the map.
-        gaussians: size of the map afterwards.
-        skipped: tracking stages that there was no time for.
+        keyframe: whether the frame became a keyframe.
+        gaussians: number of Gaussians afterwards.
+        skipped: tracking stages that did not fit the time budget.
         covariance: (6, 6) of the pose, see :attr:`splatbot.tracking.estimate.PoseEstimate.covariance`; None when lost.
     """
 
@@ -57,164 +62,154 @@ class FrameResult:
 class Slam:
     """Tracks and maps a stream; ``results`` holds one entry per processed frame.
 
-    Everything runs in the calling thread in a fixed order, so the same frames give the same map, bit for bit; unless
-    ``config.mapping.threaded``: then a thread maps while the caller's tracks; :meth:`close` or :meth:`finish` ends it.
+    By default everything runs in the calling thread in a fixed order: the same frames give the same map, bit for bit.
+    With ``config.mapping.threaded`` a second thread maps while the caller's tracks; :meth:`close` or :meth:`finish`
+    ends it.
 
     Args:
-        config: None takes the defaults.
+        config: If None, the defaults apply.
     """
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
         self.results: list[FrameResult] = []
         self._tracker = Tracker(self.config.tracking)
-        mapper = Mapper(self.config)
-        self._mapper = MappingWorker(mapper) if self.config.mapping.threaded else mapper
-        self._looked = -math.inf
-        self._size: tuple[int, int] | None = None
-        self._growing = True
-        self._motion = JointMotionMonitor(self.config.mapping.still_joint_speed)
+        self._mapper = Mapper(self.config)
+        self._location = GraphLocation()
+        self._joint_motion = JointMotionMonitor(self.config.mapping.still_joint_speed)
+        self._image_size: tuple[int, int] | None = None
+        self._localization_only = False
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
-        """Track ``frame`` and, unless ``hold_out``, fuse it. Never raises for a frame that cannot be tracked.
+        """Track a frame and, unless ``hold_out``, map it; a frame that cannot be tracked does not raise.
 
-        A frame held out before the map has begun is lost: there is no world yet to place it in.
+        A frame that is held out before the map has a keyframe is lost: there is no world to localize it in.
 
         Raises:
-            InputError: the frame is of another size than those before; the map is as it was.
+            InputError: The image size differs from that of earlier frames; the map is unchanged.
         """
-        self._check_size(frame)
-        start = time.perf_counter()
-        if self._mapper.has_loop:
-            self.close_loops()
-        prepared = prepare(frame, self.config.tracking)
-        prepared_at = time.perf_counter()
-        estimate = self._track(prepared, hold_out)
-        tracked_at = time.perf_counter()
-        if self._growing:
-            self._mapper.hold(self._motion.update(frame.stamp, frame.joints))
-        placed = estimate.verdict != "lost"
-        keyframe = self._growing and placed and not hold_out and self._mapper.wants(prepared, estimate.T_world_camera)
+        clock = StageClock()
+        prepared = clock.time("prepare", self._prepare, frame)
+        self._apply_loop_closure()
+        estimate = clock.time("tracking", self._track, prepared, hold_out)
+        observation = self._observation(prepared, estimate, hold_out)
+        keyframe = self._mapper.should_insert(observation)
         if keyframe:
-            self._map(prepared, estimate)
-        elif self._growing and estimate.verdict == "ok" and not hold_out and self._looks(frame.stamp):
-            self._mapper.look(prepared, estimate.T_world_camera)
-        stage_ms = {"prepare": 1e3 * (prepared_at - start)} | estimate.stage_ms
-        stage_ms["mapping"] = 1e3 * (time.perf_counter() - tracked_at)
-        result = FrameResult(
-            index=frame.index,
-            stamp=frame.stamp,
-            T_world_camera=None if estimate.verdict == "lost" else estimate.T_world_camera,
-            verdict=estimate.verdict,
-            reasons=estimate.reasons,
-            stage=estimate.stage,
-            stage_ms=stage_ms,
-            keyframe=keyframe,
-            gaussians=self._mapper.size,
-            skipped=estimate.skipped,
-            covariance=estimate.covariance if placed else None,
-        )
-        self.results.append(result)
-        if estimate.stage_ms:
-            stages = stage_ms["prepare"] + sum(estimate.stage_ms.values())
-            if not self.config.mapping.threaded:  # then tracking does not wait for more than the hand-over
-                stages += stage_ms["mapping"]
-            self._tracker.note_rest(1e3 * (time.perf_counter() - start) - stages)
-        return result
+            self._location = self._mapper.submit(observation)
+        else:
+            self._mapper.observe(observation)
+        self._executor.run()
+        return self._record(frame, estimate, keyframe, clock)
 
     def finish(self, stop: Stop = never) -> None:
-        """Close the last loop and spend the last refinement once the stream has ended, or until ``stop`` says so."""
-        if self._growing:
-            self.close_loops()
-            self._mapper.finish(stop)
+        """Close the last loop and run the final refinement at the end of a stream, or until ``stop`` returns True."""
+        self.close_loops()
+        if self._localization_only:
+            self._executor.close()
         else:
-            self._mapper.close()
+            self._executor.finish(stop)
 
     def localise_only(self) -> None:
-        """From here on frames are placed in the map as it is, which nothing changes; the next may be anywhere in it.
+        """Localize all further frames in the map, which does not change; the next frame may be anywhere in it.
 
-        ``results`` begins anew, and the world stays the map's.
+        ``results`` starts again; the world frame remains that of the map.
 
         Raises:
-            InputError: there is no map yet.
+            InputError: There is no map yet.
         """
         if not self._mapper.keyframes:
             raise InputError("the map has no keyframes.", field="map", hint="map a log first")
         self.close_loops()
-        self._growing = False
-        self._size = None
+        with self._executor.paused():
+            self._mapper.freeze()
+        self._localization_only = True
+        self._image_size = None
         self.results = []
         self._tracker.forget()
 
     def close_loops(self) -> None:
-        """Move the map's pieces where the loops want them, and with them the poses found so far and the tracker.
+        """Apply a pending loop closure to the map, the poses estimated so far and the tracker.
 
-        Frames that are processed do so; it is for the end of a stream that is not to be finished.
+        :meth:`process` does so for each frame. A stream that ends without :meth:`finish` needs one more call.
         """
-        if not self._growing:
-            return
-        with self._mapper.paused():
+        with self._executor.paused():
             correction = self._mapper.close_loops()
-        number, moved = -1, []
+        if not correction:
+            return
+        self._executor.run()
+        number, results = -1, []
         for result in self.results:
             number += result.keyframe
-            T, known = result.T_world_camera, correction.get(number)
-            moved.append(result if T is None or known is None else replace(result, T_world_camera=known @ T))
-        self.results = moved
+            T, T_new_old = result.T_world_camera, correction.get(number)
+            known = T is not None and T_new_old is not None
+            results.append(replace(result, T_world_camera=T_new_old @ T) if known else result)
+        self.results = results
         if number in correction:
             self._tracker.move(correction[number])
 
     def close(self) -> None:
-        """End the mapping thread, if there is one, once what has been handed to it is in the map."""
-        self._mapper.close()
+        """End the mapping thread, if there is one, once all submitted keyframes are in the map."""
+        self._executor.close()
 
     def paused(self) -> AbstractContextManager[None]:
-        """A block in which nothing changes: what has been handed to a mapping thread is in the map, and it waits."""
-        return self._mapper.paused()
+        """Return a context in which the map does not change and all submitted keyframes are in it."""
+        return self._executor.paused()
 
     @property
     def memory(self) -> dict[str, int]:
-        """Bytes held: "gaussians_bytes" (bookkeeping included), "optimiser_bytes", "keyframe_images_bytes" and
+        """Memory in use [bytes].
+
+        Keys: "gaussians_bytes" (with their bookkeeping), "optimiser_bytes", "keyframe_images_bytes" and
         "keyframe_tracking_bytes" (features, sampled pixels).
         """
         return self._mapper.memory
 
     @property
     def loop_counts(self) -> dict[str, int]:
-        """How many places were recognised ("closed"), and how many only looked like it ("rejected")."""
+        """Numbers of loop closures that were accepted ("closed") and refused ("rejected")."""
         return self._mapper.loop_counts
 
     @property
     def skipped_gradients(self) -> int:
-        """How often refinement left a Gaussian as it was because its gradient was not finite."""
+        """Number of Gaussian updates that refinement skipped because the gradient was not finite."""
         return self._mapper.skipped_gradients
 
     @property
     def keyframes(self) -> Sequence[Keyframe]:
-        """What frames are tracked against."""
+        """Keyframes that frames are tracked against."""
         return self._mapper.keyframes
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses of the frames that were tracked, as they are known now."""
+        """Current estimates of the poses of all tracked frames."""
         poses = [(r.stamp, r.T_world_camera) for r in self.results if r.T_world_camera is not None]
         stamps = np.array([stamp for stamp, _ in poses], dtype=np.float64)
         return Trajectory(stamps, np.array([T for _, T in poses], dtype=np.float64).reshape(-1, 4, 4))
 
     def snapshot(self) -> Snapshot:
-        """The map as it is now, immutable."""
-        return self._mapper.snapshot()
+        """Return an immutable copy of the current map."""
+        return self._executor.snapshot()
 
-    def _check_size(self, frame: Frame) -> None:
+    @cached_property
+    def _executor(self) -> Executor:
+        return ThreadExecutor(self._mapper) if self.config.mapping.threaded else InlineExecutor(self._mapper)
+
+    def _prepare(self, frame: Frame) -> PreparedFrame:
+        """Check the image size of a frame and prepare it for tracking."""
         size = frame.camera.width, frame.camera.height
-        self._size = self._size or size
-        if size != self._size:
+        self._image_size = self._image_size or size
+        if size != self._image_size:
             raise InputError(
-                f"is {size[0]} x {size[1]}, frames before are {self._size[0]} x {self._size[1]}.",
+                f"is {size[0]} x {size[1]}, earlier frames are {self._image_size[0]} x {self._image_size[1]}.",
                 file=frame.source or f"frame {frame.index}",
                 field="image size",
-                hint="map recordings of different sizes by themselves",
+                hint="map recordings of different sizes separately",
             )
+        return prepare(frame, self.config.tracking)
+
+    def _apply_loop_closure(self) -> None:
+        if self._mapper.has_loop:
+            self.close_loops()
 
     def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
         keyframes = self._mapper.keyframes
@@ -224,12 +219,63 @@ class Slam:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         return self._tracker.start(prepared)
 
-    def _looks(self, stamp: float) -> bool:
-        """Whether it is time to look at a frame that is no keyframe."""
-        if 0 <= stamp - self._looked < self.config.mapping.observe_interval_s:
-            return False
-        self._looked = stamp
-        return True
+    def _observation(self, prepared: PreparedFrame, estimate: PoseEstimate, hold_out: bool) -> Observation:
+        """Bundle a tracked frame for the mapper, and note whether the robot moves."""
+        self._mapper.set_robot_moving(self._joint_motion.update(prepared.frame.stamp, prepared.frame.joints))
+        if estimate.verdict != "lost" and not hold_out:
+            self._location = self._mapper.locate(estimate.T_world_camera, self._location)
+        features = self._tracker.keypoints(prepared, estimate)
+        return Observation(
+            prepared, estimate.T_world_camera, features, self._location, estimate.verdict, held_out=hold_out
+        )
 
-    def _map(self, prepared: PreparedFrame, estimate: PoseEstimate) -> None:
-        self._mapper.insert(prepared, estimate.T_world_camera, self._tracker.keypoints(prepared, estimate))
+    def _record(self, frame: Frame, estimate: PoseEstimate, keyframe: bool, clock: StageClock) -> FrameResult:
+        """Append the result of a frame, and report the time outside the stages to the tracker's budget."""
+        lost = estimate.verdict == "lost"
+        mapping_ms = clock.since("tracking")
+        result = FrameResult(
+            index=frame.index,
+            stamp=frame.stamp,
+            T_world_camera=None if lost else estimate.T_world_camera,
+            verdict=estimate.verdict,
+            reasons=estimate.reasons,
+            stage=estimate.stage,
+            stage_ms={"prepare": clock.ms["prepare"]} | estimate.stage_ms | {"mapping": mapping_ms},
+            keyframe=keyframe,
+            gaussians=self._mapper.size,
+            skipped=estimate.skipped,
+            covariance=None if lost else estimate.covariance,
+        )
+        self.results.append(result)
+        if estimate.stage_ms:
+            stages = clock.ms["prepare"] + sum(estimate.stage_ms.values())
+            if not self.config.mapping.threaded:  # with a thread, the submission is all that tracking waits for
+                stages += mapping_ms
+            self._tracker.note_rest(clock.total_ms - stages)
+        return result
+
+
+class StageClock:
+    """Wall-clock times of the stages of one frame [ms]."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+        self._start = time.perf_counter()
+        self._ends: dict[str, float] = {}
+
+    def time(self, stage: str, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call a function and record its duration as that of a stage."""
+        start = time.perf_counter()
+        result = function(*args, **kwargs)
+        self._ends[stage] = time.perf_counter()
+        self.ms[stage] = 1e3 * (self._ends[stage] - start)
+        return result
+
+    def since(self, stage: str) -> float:
+        """Return the time since the end of a stage [ms]."""
+        return 1e3 * (time.perf_counter() - self._ends[stage])
+
+    @property
+    def total_ms(self) -> float:
+        """Time since the frame began [ms]."""
+        return 1e3 * (time.perf_counter() - self._start)

@@ -27,7 +27,7 @@ class PositionGradients:
         self._sum.index_add_(0, rows, gradients.norm(dim=1).nan_to_num(0.0, 0.0, 0.0) * (width / 2))
         self._steps.index_add_(0, rows, torch.ones(len(rows)))
 
-    def strongest(self, limit: float, most: int) -> Tensor:
+    def largest(self, limit: float, most: int) -> Tensor:
         """Rows, ascending, of those beyond ``limit``: the ``most`` that are pulled hardest."""
         mean = self._sum / self._steps.clamp_min(1.0)
         beyond = int((mean > limit).sum())

@@ -69,7 +69,7 @@ class DepthComparison:
 
 
 @torch.no_grad()
-def weigh(
+def compare_with_depth(
     model: GaussianModel, depth: Tensor, camera: Camera, T_world_camera: NDArray[np.float64], noise: DepthNoiseModel
 ) -> DepthComparison:
     """Compare every Gaussian with what was measured along its centre's ray.
@@ -136,7 +136,7 @@ def fuse_normals(model: GaussianModel, evidence: DepthComparison) -> GaussianMod
     return replace(model, quats=model.quats.index_copy(0, rows, turned))
 
 
-def count(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
+def update_visibility(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
     """The model with the evidence counted: what is seen through is doubted, and its opacity taken back by as much.
 
     A guess that is seen through was wrong, and one that is not :func:`stable` goes a look earlier.
@@ -155,7 +155,7 @@ def stable(model: GaussianModel) -> Tensor:
     return (model.observations >= _STABLE_LOOKS) & (model.uncertainty < _STABLE_WIDTH * width)
 
 
-def first_uncertainty(model: GaussianModel, T_world_camera: NDArray[np.float64], noise: DepthNoiseModel) -> Tensor:
+def initial_uncertainty(model: GaussianModel, T_world_camera: NDArray[np.float64], noise: DepthNoiseModel) -> Tensor:
     """σ (N,) [m] of Gaussians just made from a view: the sensor's, or a share of the depth where it was guessed."""
     T_camera_world = torch.from_numpy(inverse(T_world_camera)).float()
     z = model.means @ T_camera_world[2, :3] + T_camera_world[2, 3]

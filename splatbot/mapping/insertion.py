@@ -101,8 +101,8 @@ def guessed_gaussians(view: ModelView, keyframe: Keyframe, config: MappingConfig
     """
     guess = guess_depth(keyframe.depth)
     where = (guess > 0) & (view.alpha < config.unexplained_alpha)
-    if keyframe.still is not None:
-        where &= keyframe.still
+    if keyframe.static_mask is not None:
+        where &= keyframe.static_mask
     model = new_gaussians(replace(keyframe, depth=guess), where, config)
     model.observations.zero_()
     return model

@@ -45,7 +45,7 @@ class Keyframe:
         depth: (H, W) float32 [m], 0 missing.
         T_world_camera: (4, 4).
         features: for matching later frames.
-        still: (H, W) bool, pixels that show nothing that moves or is masked, depth being 0 elsewhere; None: all.
+        static_mask: (H, W) bool, pixels that show nothing that moves or is masked, depth being 0 elsewhere; None: all.
         reference: for aligning later frames; its depth is the model's once the keyframe has been fused.
     """
 
@@ -56,7 +56,7 @@ class Keyframe:
     T_world_camera: NDArray[np.float64]
     features: Features
     reference: Reference
-    still: Tensor | None = None
+    static_mask: Tensor | None = None
 
     @property
     def viewmat(self) -> Tensor:

@@ -1,9 +1,10 @@
-"""Places seen again: recognised, verified against the images, and the map's pieces moved so that they meet."""
+"""Loop closing: places seen again are recognized, verified against the images and closed in the pose graph."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +14,10 @@ from splatbot.config import Config
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_multiply, rotation_to_quat
 from splatbot.mapping.keyframes import Keyframe
-from splatbot.mapping.posegraph import Edge, PoseGraph, largest
+from splatbot.mapping.observation import GraphLocation, Observation
+from splatbot.mapping.posegraph import Adjacency, Edge, PoseGraph, max_residual, within_hops
 from splatbot.tracking.align import align
-from splatbot.tracking.features import Features, match_pose
+from splatbot.tracking.features import match_pose
 from splatbot.tracking.health import measure
 from splatbot.tracking.nearby_keyframes import order_by_distance, pose_distance
 from splatbot.tracking.place_recognition import votes
@@ -24,25 +26,54 @@ from splatbot.tracking.uncertainty import alignment_covariance
 
 Array = NDArray[np.float64]
 
-_NEIGHBOURS = 10  # edges of the graph within which a keyframe is no place seen again
-_NEAR = 0.25, 0.35  # [m], [rad]: a keyframe so near is a candidate although it may look different
-_TRIED = 2  # candidates by looks that are verified for a keyframe
-_UNKNOWN = np.diag([0.5**2] * 3 + [0.5**2] * 3)  # covariance of a motion that could not be measured
-# Lens and depth are calibrated to this share: over a long way the error adds up [1].
-_CALIBRATION = 5e-3
-# A loop that the solved graph leaves more open than this is wrong [m], [rad].
-_OPEN = 1e-2, 2e-2
-_JUMP = 5e-3, 5e-3  # [m], [rad]: a keyframe was moved so far by its other neighbours; its own motion is measured
+
+@dataclass(frozen=True)
+class LoopConstants:
+    """Constants of loop closing.
+
+    Args:
+        neighbor_hops: edges of the pose graph, or difference of keyframe numbers, within which a keyframe is a
+            neighbor of the odometry and not a revisited place.
+        near_translation, near_rotation: [m], [rad] a keyframe this near is a loop candidate whatever it looks like.
+        appearance_candidates: loop candidates by appearance that are verified for each keyframe.
+        unknown_sigma: [m], [rad] standard deviation of a motion that the images could not measure.
+        drift_sigma: [m/m], [rad/rad] standard deviation of the odometry error, relative to the motion. Errors of lens
+            and depth calibration add up over the path.
+        open_translation, open_rotation: [m], [rad] a loop that the optimized graph leaves open by more is wrong.
+        tracking_translation, tracking_rotation: [m], [rad] up to this difference, the images confirm the tracked
+            motion between two keyframes. Beyond it, other keyframes biased tracking.
+        drift_offset: [m], [rad] drift that a loop may correct whatever the length of its path.
+        same_translation, same_rotation: [m], [rad] two loops that imply corrections this near confirm each other.
+        unconfirmed_kept: loops that wait for a confirming one.
+    """
+
+    neighbor_hops: int = 10
+    near_translation: float = 0.25
+    near_rotation: float = 0.35
+    appearance_candidates: int = 2
+    unknown_sigma: float = 0.5
+    drift_sigma: float = 5e-3
+    open_translation: float = 1e-2
+    open_rotation: float = 2e-2
+    tracking_translation: float = 5e-3
+    tracking_rotation: float = 5e-3
+    drift_offset: float = 0.05
+    same_translation: float = 0.02
+    same_rotation: float = 0.02
+    unconfirmed_kept: int = 4
+
+
+CONSTANTS = LoopConstants()
 
 
 @dataclass(frozen=True)
 class MeasuredMotion:
-    """The motion from a keyframe to a view by the images of these two alone.
+    """The motion from a keyframe to a frame, measured from the images of these two alone.
 
     Args:
-        T_keyframe_camera: (4, 4); ``covariance`` (6, 6) of its twist in the camera's frame.
-        overlap, inliers: shares of the keyframe's points that the view sees, and of those that agree.
-        matches: features that agree.
+        T_keyframe_camera: (4, 4); ``covariance`` (6, 6) of its twist in the camera frame.
+        overlap, inliers: shares of the keyframe's points that the frame observes, and of those that agree.
+        matches: number of features that agree.
     """
 
     T_keyframe_camera: Array
@@ -52,181 +83,212 @@ class MeasuredMotion:
     matches: int
 
     def agrees(self, T_tracked: Array) -> bool:
-        """Whether it is the motion (4, 4) that was tracked, but for what alignments differ by."""
+        """Return whether it equals the tracked motion (4, 4) within the accuracy of an alignment."""
         moved, turned = pose_distance(T_tracked, self.T_keyframe_camera)
-        return moved <= _JUMP[0] and turned <= _JUMP[1]
-
-
-@dataclass(frozen=True)
-class LoopView:
-    """A frame at T_world_camera (4, 4), with its features, and the keyframe that it was tracked by before."""
-
-    prepared: PreparedFrame
-    T_world_camera: Array
-    features: Features
-    anchor: int | None
+        return moved <= CONSTANTS.tracking_translation and turned <= CONSTANTS.tracking_rotation
 
 
 class LoopCloser:
-    """Keeps the pose graph; says how keyframes are to be moved once a place has been seen again.
+    """Builds the pose graph and computes how keyframes have to move once a place has been seen again.
 
-    A loop is believed when features and images of two keyframes agree, when it asks for no more drift than the way
-    between them explains, and when the graph can be solved with it. What only looks alike (repeated texture) needs a
-    second one that says the same.
+    It accepts a loop closure if features and images of two keyframes agree, if the loop implies no more drift than the
+    path between them explains, and if the optimized graph is consistent with it. A loop that differs from the tracked
+    poses needs a second loop that implies the same correction, because repeated texture looks alike.
+
+    The mapping thread owns all of its state. The tracking thread calls :meth:`locate`, which reads ``adjacency``; that
+    mapping is replaced by assignment and never changed.
     """
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.graph = PoseGraph()
-        self.anchor: int | None = None
-        """The keyframe that the last frame was nearest to."""
+        self.adjacency: Adjacency = {}
+        """Numbers of the neighbors of each keyframe in the pose graph."""
         self.correction: dict[int, Array] | None = None
-        """T_new_old (4, 4) by keyframe number: where they are to be moved; None: nowhere."""
+        """T_new_old (4, 4) by keyframe number once a loop is closed; None otherwise."""
         self.closed = 0
         self.rejected = 0
-        self._suspected: list[Edge] = []
+        self._unconfirmed: list[Edge] = []
 
-    def is_bridge(self, T_world_camera: Array, keyframes: Sequence[Keyframe]) -> bool:
-        """Whether a frame has come upon a place seen before; keeps account of which keyframe frames are near to."""
+    def locate(self, T_world_camera: Array, keyframes: Sequence[Keyframe], previous: GraphLocation) -> GraphLocation:
+        """Return where a frame is in the pose graph.
+
+        The reference keyframe follows the nearest keyframe while that is a neighbor of the previous one. A nearest
+        keyframe outside the neighborhood is a revisited place.
+
+        Args:
+            T_world_camera: (4, 4) of the frame.
+            previous: location of the previous frame.
+        """
         if not self.config.loops.enabled or not keyframes:
-            return False
+            return GraphLocation()
         nearest = keyframes[order_by_distance(keyframes, T_world_camera)[0]].number
-        if self.anchor is None or nearest == self.anchor or abs(nearest - self.anchor) <= _NEIGHBOURS:
-            self.anchor = nearest
-        elif nearest in self.graph.poses and nearest not in self.graph.near(self.anchor, _NEIGHBOURS):
-            return True
-        else:
-            self.anchor = nearest
-        return False
+        if previous.keyframe is None or abs(nearest - previous.keyframe) <= CONSTANTS.neighbor_hops:
+            return GraphLocation(nearest)
+        adjacency = self.adjacency
+        if previous.keyframe not in adjacency:  # submitted, and not in the graph yet
+            return GraphLocation(previous.keyframe)
+        revisits = nearest not in within_hops(adjacency, previous.keyframe, CONSTANTS.neighbor_hops)
+        if revisits and nearest in adjacency:
+            return GraphLocation(previous.keyframe, revisits=True)
+        return GraphLocation(nearest)
 
-    def add(self, keyframe: Keyframe, view: LoopView, keyframes: Sequence[Keyframe]) -> None:
-        """A keyframe was made of a view: measure its motion, and look for places seen before."""
+    def add(self, keyframe: Keyframe, observation: Observation, keyframes: Sequence[Keyframe]) -> None:
+        """Add a keyframe and its odometry edges to the graph, and search for loop closures.
+
+        Args:
+            keyframe: the new one, made of ``observation``.
+            keyframes: all, including the new one.
+        """
         if not self.config.loops.enabled:
             return
         self.graph.poses[keyframe.number] = keyframe.T_world_camera
-        keyframes = [k for k in keyframes if k.number in self.graph.poses]  # later ones have their turn
-        others = [k for k in keyframes if k is not keyframe]
-        anchor = next((k for k in others if k.number == view.anchor), others[-1] if others else None)
-        self.anchor = keyframe.number
-        if anchor is None:
-            return
-        if self.correction is not None:  # it came after the loop, and moves with its neighbour
-            self.correction[keyframe.number] = self.correction[anchor.number]
-        step = self._odometry(anchor, keyframe, view)
-        self.graph.edges.append(step)
-        if others[-1] is not anchor and (tie := self._tie(others[-1], keyframe, view)) is not None:
-            self.graph.edges.append(tie)
-        T_chain = anchor.T_world_camera @ step.T_first_second
-        strangers = self._strangers(anchor, keyframe, keyframes)
-        loops = [edge for stranger in strangers if (edge := self._loop(stranger, keyframe, view, T_chain)) is not None]
-        confirmed = [edge for edge in loops if self._is_confirmed(edge)]
-        self._suspected = [*self._suspected[-4:], *loops]
-        if confirmed:
-            self._close(confirmed)
+        self._add_edges(keyframe, observation, keyframes)
+        self.adjacency = self.graph.adjacency()
 
-    def moved(self, correction: Mapping[int, Array]) -> None:
-        """The keyframes were moved."""
+    def apply_correction(self, correction: Mapping[int, Array]) -> None:
+        """Move the poses of the graph after the keyframes were moved."""
         self.graph.poses = {number: correction[number] @ T for number, T in self.graph.poses.items()}
         self.correction = None
 
-    def _odometry(self, anchor: Keyframe, keyframe: Keyframe, view: LoopView) -> Edge:
-        """The motion from the last neighbour: as tracked, unless the tracker was drawn away by other keyframes."""
-        T_tracked = inverse(anchor.T_world_camera) @ keyframe.T_world_camera
-        found = self._measure(anchor, view)
-        if found is None or not self._is_good(found):
-            near = pose_distance(np.eye(4), T_tracked)
-            known = near[0] < 2 * _NEAR[0] and near[1] < 2 * _NEAR[1]
-            return Edge(anchor.number, keyframe.number, T_tracked, _drift(T_tracked) if known else _UNKNOWN)
-        T = T_tracked if found.agrees(T_tracked) else found.T_keyframe_camera
-        return Edge(anchor.number, keyframe.number, T, found.covariance + _drift(T))
+    def state(self) -> dict[str, Any]:
+        """Return the state for :meth:`restore`, by reference; containers are copied."""
+        state = {name: copy_of(value) for name, value in vars(self).items() if name not in ("config", "graph")}
+        return state | {"graph": PoseGraph(dict(self.graph.poses), list(self.graph.edges))}
 
-    def _tie(self, latest: Keyframe, keyframe: Keyframe, view: LoopView) -> Edge | None:
-        """The motion from the keyframe before, which was not there yet, or is farther, when the frame was tracked.
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go back to an earlier :meth:`state`."""
+        vars(self).update(state)
 
-        Each keyframe with the last but one only would make two chains beside each other, and what they drift apart
-        would be taken for a loop. None where their images say something else, for then one of the motions is wrong.
+    def _add_edges(self, keyframe: Keyframe, observation: Observation, keyframes: Sequence[Keyframe]) -> None:
+        keyframes = [k for k in keyframes if k.number in self.graph.poses]  # later ones are added in their turn
+        others = [k for k in keyframes if k is not keyframe]
+        if not others:
+            return
+        reference = next((k for k in others if k.number == observation.location.keyframe), others[-1])
+        if self.correction is not None:  # the loop was found earlier: the keyframe moves with its reference
+            self.correction[keyframe.number] = self.correction[reference.number]
+        prepared = observation.prepared
+        odometry = self._odometry_edge(reference, keyframe, prepared)
+        self.graph.edges.append(odometry)
+        if others[-1] is not reference and (edge := self._covisibility_edge(others[-1], keyframe, prepared)) is not None:
+            self.graph.edges.append(edge)
+        T_world_odometry = reference.T_world_camera @ odometry.T_first_second
+        candidates = self._loop_candidates(reference, keyframe, keyframes)
+        loops = [
+            edge for other in candidates if (edge := self._loop_edge(other, keyframe, prepared, T_world_odometry))
+        ]
+        confirmed = [edge for edge in loops if self._is_confirmed(edge)]
+        self._unconfirmed = [*self._unconfirmed[-CONSTANTS.unconfirmed_kept :], *loops]
+        if confirmed:
+            self._close(confirmed)
+
+    def _odometry_edge(self, reference: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> Edge:
+        """Return the motion from the reference keyframe: as tracked, or as measured where other keyframes biased it."""
+        T_tracked = inverse(reference.T_world_camera) @ keyframe.T_world_camera
+        measured = self._measure(reference, keyframe, prepared)
+        if measured is None or not self._is_reliable(measured):
+            moved, turned = pose_distance(np.eye(4), T_tracked)
+            near = moved < 2 * CONSTANTS.near_translation and turned < 2 * CONSTANTS.near_rotation
+            covariance = _drift(T_tracked) if near else CONSTANTS.unknown_sigma**2 * np.eye(6)
+            return Edge(reference.number, keyframe.number, T_tracked, covariance)
+        T = T_tracked if measured.agrees(T_tracked) else measured.T_keyframe_camera
+        return Edge(reference.number, keyframe.number, T, measured.covariance + _drift(T))
+
+    def _covisibility_edge(self, latest: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> Edge | None:
+        """Return the motion from the previous keyframe, if that is not the reference and the images confirm the motion.
+
+        Without this edge, two chains of keyframes would alternate, and the drift between them would appear as a loop.
         """
         T_tracked = inverse(latest.T_world_camera) @ keyframe.T_world_camera
-        found = self._measure(latest, view)
-        if found is None or not self._is_good(found) or not found.agrees(T_tracked):
+        measured = self._measure(latest, keyframe, prepared)
+        if measured is None or not self._is_reliable(measured) or not measured.agrees(T_tracked):
             return None
-        return Edge(latest.number, keyframe.number, T_tracked, found.covariance + _drift(T_tracked))
+        return Edge(latest.number, keyframe.number, T_tracked, measured.covariance + _drift(T_tracked))
 
-    def _strangers(self, anchor: Keyframe, keyframe: Keyframe, keyframes: Sequence[Keyframe]) -> list[Keyframe]:
-        """Keyframes that may show the same place although no short chain of motions leads there."""
-        known = self.graph.near(anchor.number, _NEIGHBOURS)
-        others = [k for k in keyframes if k.number not in known and abs(k.number - keyframe.number) > _NEIGHBOURS]
+    def _loop_candidates(
+        self, reference: Keyframe, keyframe: Keyframe, keyframes: Sequence[Keyframe]
+    ) -> list[Keyframe]:
+        """Return keyframes that may show the same place although no short chain of edges leads there."""
+        hops = CONSTANTS.neighbor_hops
+        neighbors = within_hops(self.graph.adjacency(), reference.number, hops)
+        others = [k for k in keyframes if k.number not in neighbors and abs(k.number - keyframe.number) > hops]
         if not others:
             return []
         nearest = others[order_by_distance(others, keyframe.T_world_camera)[0]]
         moved, turned = pose_distance(nearest.T_world_camera, keyframe.T_world_camera)
-        found = [nearest] if moved < _NEAR[0] and turned < _NEAR[1] else []
+        found = [nearest] if moved < CONSTANTS.near_translation and turned < CONSTANTS.near_rotation else []
         count = votes(keyframe.features, others)
-        for index in np.argsort(-count, kind="stable")[:_TRIED]:
+        for index in np.argsort(-count, kind="stable")[: CONSTANTS.appearance_candidates]:
             if count[index] >= self.config.loops.min_votes and others[index] not in found:
                 found.append(others[index])
         return found
 
-    def _loop(self, stranger: Keyframe, keyframe: Keyframe, view: LoopView, T_chain: Array) -> Edge | None:
-        """The motion from a place seen before, if the images bear it out and the drift since then is possible.
+    def _loop_edge(
+        self, candidate: Keyframe, keyframe: Keyframe, prepared: PreparedFrame, T_world_odometry: Array
+    ) -> Edge | None:
+        """Return the motion from a loop candidate, if the images confirm it and the implied drift is possible.
 
-        ``T_chain`` (4, 4) is where the keyframe is by its last neighbour alone.
+        Args:
+            T_world_odometry: (4, 4), the keyframe's pose by its odometry edge alone.
         """
-        found = self._measure(stranger, view)
-        if found is None or not self._is_good(found) or found.matches < self.config.loops.min_matches:
-            return None
-        moved, turned = pose_distance(inverse(stranger.T_world_camera) @ T_chain, found.T_keyframe_camera)
-        way, turns = self.graph.path(stranger.number, keyframe.number)
         limits = self.config.loops
-        if moved > 0.05 + limits.max_drift * way or turned > 0.05 + limits.max_drift * turns:
+        measured = self._measure(candidate, keyframe, prepared)
+        if measured is None or not self._is_reliable(measured) or measured.matches < limits.min_matches:
+            return None
+        T_odometry = inverse(candidate.T_world_camera) @ T_world_odometry
+        moved, turned = pose_distance(T_odometry, measured.T_keyframe_camera)
+        length, rotation = self.graph.path_length(candidate.number, keyframe.number)
+        offset = CONSTANTS.drift_offset
+        if moved > offset + limits.max_drift * length or turned > offset + limits.max_drift * rotation:
             self.rejected += 1
             return None
-        T = found.T_keyframe_camera
-        return Edge(stranger.number, keyframe.number, T, found.covariance + _drift(T), loop=True)
+        T = measured.T_keyframe_camera
+        return Edge(candidate.number, keyframe.number, T, measured.covariance + _drift(T), loop=True)
 
     def _is_confirmed(self, edge: Edge) -> bool:
-        """Whether a loop asks for no more than the tracker has believed by itself, or another asks for the same."""
+        """Return whether a loop agrees with the tracked poses, or another loop implies the same correction."""
         poses = self.graph.poses
-        residual = edge.residual(poses)
-        if np.linalg.norm(residual[:3]) < 2 * _JUMP[0] and np.linalg.norm(residual[3:]) < 2 * _JUMP[1]:
+        moved, turned = max_residual([edge.residual(poses)])
+        if moved < 2 * CONSTANTS.tracking_translation and turned < 2 * CONSTANTS.tracking_rotation:
             return True
-        wanted = poses[edge.first] @ edge.T_first_second @ inverse(poses[edge.second])
-        for other in self._suspected:
-            same = poses[other.first] @ other.T_first_second @ inverse(poses[other.second])
-            at = poses[edge.second]
-            moved, turned = pose_distance(wanted @ at, same @ at)
-            if other.second != edge.second and moved < 0.02 and turned < 0.02:
+        T_world_camera = poses[edge.second]
+        expected = poses[edge.first] @ edge.T_first_second
+        for other in self._unconfirmed:
+            correction = poses[other.first] @ other.T_first_second @ inverse(poses[other.second])
+            moved, turned = pose_distance(expected, correction @ T_world_camera)
+            same = moved < CONSTANTS.same_translation and turned < CONSTANTS.same_rotation
+            if other.second != edge.second and same:
                 return True
         return False
 
     def _close(self, loops: list[Edge]) -> None:
-        """Solve the graph with new loops; keep them if everything that was measured still holds."""
+        """Optimize the graph with new loop edges; keep them if all measured motions remain consistent."""
         self.graph.edges += loops
         limits = self.config.loops
-        if largest(edge.residual(self.graph.poses) for edge in self.graph.edges)[0] < limits.min_translation and (
-            largest(edge.residual(self.graph.poses) for edge in self.graph.edges)[1] < limits.min_rotation
-        ):
+        moved, turned = max_residual(edge.residual(self.graph.poses) for edge in self.graph.edges)
+        if moved < limits.min_translation and turned < limits.min_rotation:
             self.closed += 1
             return
-        poses = self.graph.optimised()
-        moved, turned = largest(edge.residual(poses) for edge in loops)
-        strained = max(_strain(edge, poses) for edge in self.graph.edges if not edge.loop)
-        if moved > _OPEN[0] or turned > _OPEN[1] or strained > limits.max_edge_sigma:
+        poses = self.graph.optimize()
+        moved, turned = max_residual(edge.residual(poses) for edge in loops)
+        sigma = max(_mahalanobis(edge, poses) for edge in self.graph.edges if not edge.loop)
+        is_open = moved > CONSTANTS.open_translation or turned > CONSTANTS.open_rotation
+        if is_open or sigma > limits.max_edge_sigma:
             self.graph.edges = [edge for edge in self.graph.edges if all(edge is not loop for loop in loops)]
             self.rejected += len(loops)
             return
         self.closed += 1
         self.correction = {number: poses[number] @ inverse(T) for number, T in self.graph.poses.items()}
 
-    def _measure(self, keyframe: Keyframe, view: LoopView) -> MeasuredMotion | None:
-        """Align a view to one keyframe; None where there is nothing to start from."""
-        config, levels = self.config.tracking, view.prepared.levels
-        camera = view.prepared.frame.camera
-        T_world_keyframe = keyframe.reference.T_world_camera
-        matched = match_pose(view.features, [(keyframe.features, T_world_keyframe)], camera)
-        start = matched.T_world_camera if matched is not None else view.T_world_camera
-        gate = config.sensor.max_depth_difference
-        reference = [keyframe.reference]
+    def _measure(self, other: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> MeasuredMotion | None:
+        """Align the frame of a keyframe to one other keyframe; return None if the alignment does not converge."""
+        config, levels = self.config.tracking, prepared.levels
+        camera, gate = prepared.frame.camera, config.sensor.max_depth_difference
+        T_world_other = other.reference.T_world_camera
+        matched = match_pose(keyframe.features, [(other.features, T_world_other)], camera)
+        start = matched.T_world_camera if matched is not None else keyframe.T_world_camera
+        reference = [other.reference]
         coarse = align(
             levels,
             reference,
@@ -253,21 +315,30 @@ class LoopCloser:
         if not np.isfinite(covariance).all() or not np.isfinite(found.T_world_camera).all():
             return None
         return MeasuredMotion(
-            T_keyframe_camera=inverse(T_world_keyframe) @ found.T_world_camera,
+            T_keyframe_camera=inverse(T_world_other) @ found.T_world_camera,
             covariance=covariance,
             overlap=health.overlap,
             inliers=min(health.photometric_inliers, health.geometric_inliers),
             matches=0 if matched is None else len(matched.points),
         )
 
-    def _is_good(self, found: MeasuredMotion) -> bool:
+    def _is_reliable(self, found: MeasuredMotion) -> bool:
         return found.overlap >= self.config.loops.min_overlap and found.inliers >= self.config.loops.min_inliers
 
 
-def move_gaussians(model: GaussianModel, correction: Mapping[int, Array]) -> GaussianModel:
-    """A model whose Gaussians have been moved rigidly with the keyframes they are anchored to.
+def copy_of(value: Any) -> Any:
+    """Return a shallow copy of a list or dict, other values as they are."""
+    return value.copy() if isinstance(value, list | dict) else value
 
-    Harmonics above degree 0 are not turned: the online map has none.
+
+def move_gaussians(model: GaussianModel, correction: Mapping[int, Array]) -> GaussianModel:
+    """Return the model with each Gaussian moved rigidly with the keyframe that it is anchored to.
+
+    For an anchor with the correction ``(R, t)``, the mean becomes ``μ' = R μ + t`` and the covariance ``Σ' = R Σ Rᵀ``.
+    Spherical harmonics above degree 0 are not rotated: the online map has none.
+
+    Args:
+        correction: T_new_old (4, 4) by keyframe number.
     """
     anchors = model.anchors.numpy()
     means, quats = model.means.numpy().astype(np.float64), model.quats.numpy().astype(np.float64)
@@ -284,19 +355,22 @@ def move_gaussians(model: GaussianModel, correction: Mapping[int, Array]) -> Gau
 
 
 def move_keyframe(keyframe: Keyframe, correction: Mapping[int, Array]) -> Keyframe:
-    """A keyframe, and what is aligned to it, at its new pose."""
+    """Return a keyframe and its reference at the corrected pose."""
     T = correction[keyframe.number] @ keyframe.T_world_camera
     return replace(keyframe, T_world_camera=T, reference=replace(keyframe.reference, T_world_camera=T))
 
 
 def _drift(T: Array) -> Array:
-    """Covariance (6, 6) of errors that grow with the motion."""
+    """Compute the covariance (6, 6) of the odometry error, which grows with the motion (4, 4).
+
+    σ_t = s (‖t‖ + θ · 1 m) and σ_ω = s θ, with s = ``drift_sigma``.
+    """
     moved, turned = pose_distance(np.eye(4), T)
-    shift, turn = (_CALIBRATION * (moved + turned)) ** 2, (_CALIBRATION * turned) ** 2
-    return np.diag([shift] * 3 + [turn] * 3)
+    sigma = CONSTANTS.drift_sigma
+    return np.diag([(sigma * (moved + turned)) ** 2] * 3 + [(sigma * turned) ** 2] * 3)
 
 
-def _strain(edge: Edge, poses: Mapping[int, Array]) -> float:
-    """How far [σ] an edge is stretched."""
+def _mahalanobis(edge: Edge, poses: Mapping[int, Array]) -> float:
+    """Compute the Mahalanobis distance √(rᵀ Σ⁻¹ r) of an edge's residual [σ]."""
     residual = edge.residual(poses)
     return float(np.sqrt(residual @ np.linalg.solve(edge.covariance + 1e-6 * np.eye(6), residual)))

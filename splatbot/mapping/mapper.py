@@ -1,11 +1,15 @@
-"""The only writer of the map: takes keyframes in, keeps the Gaussians true to them, publishes snapshots."""
+"""The mapper inserts keyframes into the Gaussian map, refines it, and is the only writer of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+import math
+import threading
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,265 +20,392 @@ from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.densify import PositionGradients, split
-from splatbot.mapping.depth_fusion import DepthNoiseModel, count, first_uncertainty, fuse_depth, fuse_normals, weigh
+from splatbot.mapping.depth_fusion import (
+    DepthNoiseModel,
+    compare_with_depth,
+    fuse_depth,
+    fuse_normals,
+    initial_uncertainty,
+    update_visibility,
+)
 from splatbot.mapping.dynamic_objects import DynamicObjectFilter
 from splatbot.mapping.exposure import in_exposure_of_map
 from splatbot.mapping.insertion import ModelView, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
-from splatbot.mapping.keyframes import HasPose, Keyframe, is_keyframe, mapping_images, resized
-from splatbot.mapping.loop import LoopCloser, LoopView, move_gaussians, move_keyframe
+from splatbot.mapping.keyframes import Keyframe, is_keyframe, mapping_images, resized
+from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
 from splatbot.mapping.memory import memory_of
-from splatbot.mapping.merge import merge_alike
-from splatbot.mapping.prune import fittest, worth_keeping
+from splatbot.mapping.merge import merge_similar
+from splatbot.mapping.observation import GraphLocation, Observation
+from splatbot.mapping.prune import best_supported, keep_mask
 from splatbot.mapping.refine import Refiner, Stop, never
-from splatbot.tracking.features import Features
-from splatbot.tracking.prepare import PreparedFrame, valid_share, with_depth
-from splatbot.tracking.reference import Reference, make_reference
+from splatbot.tracking.prepare import valid_share, with_depth
+from splatbot.tracking.reference import make_reference
 
-_BEFORE = 3  # of the last steps, the share of one in so many goes before densifying: it tells where
-_REVEALED = 0.03  # share of a frame that the map has nothing of, from which on the frame is wanted
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Observation:
-    """A frame that is to become a keyframe.
+class MapperConstants:
+    """Constants of the mapper.
 
     Args:
-        prepared: its images.
-        T_world_camera: (4, 4).
-        features: what finds its keypoints, called once, in the thread that maps.
-        anchor: number of the keyframe that frames were near to before.
+        backlog: keyframes that may wait for depth fusion; while as many wait, no further one is inserted.
+        densify_after: share of the final iterations that run before densification; they measure the gradients.
+        unmapped_share: share of an image without any map behind it that makes the next frame a keyframe.
     """
 
-    prepared: PreparedFrame
-    T_world_camera: NDArray[np.float64]
-    features: Callable[[], Features]
-    anchor: int | None = None
+    backlog: int = 3
+    densify_after: float = 1 / 3
+    unmapped_share: float = 0.03
+
+
+CONSTANTS = MapperConstants()
 
 
 class Mapper:
-    """Holds the keyframes and the model; all work is done in the thread that calls."""
+    """Holds the keyframes and the map.
+
+    The tracking thread calls :meth:`locate`, :meth:`should_insert`, :meth:`submit`, :meth:`observe` and
+    :meth:`set_robot_moving`. An executor (:mod:`splatbot.mapping.executor`) calls :meth:`step` in the mapping thread,
+    which may be the same. Each keyframe takes these steps:
+
+    1. add: the frame becomes a keyframe with its measured depth as reference; frames can be tracked against it at once.
+    2. insert: depth fusion, new Gaussians, pruning, a reference with the depth of the map, loop detection.
+    3. refine: ``refine_iterations`` gradient steps.
+
+    The list of keyframes and their references are replaced by assignment, never changed: a reader in another thread
+    sees the old or the new state.
+    """
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.keyframes: list[Keyframe] = []
         self.model = GaussianModel.empty()
-        self.owed = 0
-        """Refinement steps that keyframes have called for and that were not spent yet."""
+        self.pending_iterations = 0
+        """Refinement iterations that the keyframes require and that have not run yet."""
+        self.version = 0
+        """Number of changes of the map: an insertion, an observation, a loop closure, a keyframe's refinement."""
         self.loops = LoopCloser(config)
         self._refiner = Refiner(config.mapping, config.seed)
         self._refiner.adam.extend(self.model)
-        self._movers = DynamicObjectFilter(config.mapping.dynamic_timeout_s)
-        self._revealed = False
-        self._noise = DepthNoiseModel.of(config.tracking)
-        self._held = False
-        self._version = 0
+        self._dynamic_objects = DynamicObjectFilter(config.mapping.dynamic_timeout_s)
+        self._depth_noise = DepthNoiseModel.of(config.tracking)
+        self._unmapped_seen = False
+        self._robot_moving = False
+        self._frozen = False
         self._stamp = 0.0
+        # Written by the tracking thread only.
+        self._observed_stamp = -math.inf
+        # The two threads share these under the lock.
+        self._lock = threading.Lock()
+        self._submitted: deque[Observation] = deque()
+        self._latest: Observation | None = None
+        # Added to the keyframes, not in the map yet.
+        self._added: deque[tuple[Observation, Keyframe]] = deque()
+
+    # --- state ---
 
     @property
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.model)
 
-    def wants(
-        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], to_come: Sequence[HasPose] = ()
-    ) -> bool:
-        """Whether a frame at this pose would be a keyframe: a new view, with depth for later frames to align to.
-
-        ``to_come`` are views that will be in the map, but are not yet.
-        """
-        if valid_share(prepared) < self.config.tracking.min_depth_coverage:
-            return False
-        bridge = self.loops.is_bridge(T_world_camera, self.keyframes)
-        if bridge or (self._revealed and not to_come):
-            return True
-        return is_keyframe(T_world_camera, [*self.keyframes, *to_come], self.config.mapping)
-
-    def insert(
-        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Callable[[], Features]
-    ) -> None:
-        """Fuse a frame into the map, refine, and make it a reference for tracking; ``features`` finds its keypoints.
-
-        An exception leaves keyframes and map as they were.
-        """
-        observation = Observation(prepared, T_world_camera, features, self.loops.anchor)
-        with self._undone_on_error():
-            keyframe = self.add_keyframe(observation)
-            self.fuse(observation, keyframe)
-            self.refine(0 if self._held else self.owed)
-            self.make_reference(observation, keyframe)
-        self.look_for_loops(observation, keyframe)
-
-    def look_for_loops(self, observation: Observation, keyframe: Keyframe) -> None:
-        """Whether a keyframe shows a place seen before; :meth:`close_loops` acts on it."""
-        view = LoopView(observation.prepared, observation.T_world_camera, keyframe.features, observation.anchor)
-        self.loops.add(keyframe, view, self.keyframes)
-
-    def close_loops(self, *, refine: bool = True) -> dict[int, NDArray[np.float64]]:
-        """Move keyframes and their Gaussians where the pose graph has them; T_new_old (4, 4) by keyframe number.
-
-        Nobody may track or map meanwhile. Empty when no loop waits. ``refine`` spends the steps owed at once; else they
-        stay owed, and nobody waits for them.
-        """
-        correction = self.loops.correction
-        if correction is None:
-            return {}
-        self.keyframes = [move_keyframe(keyframe, correction) for keyframe in self.keyframes]
-        self.model = move_gaussians(self.model, correction)
-        self.loops.moved(correction)
-        self.owed += self.config.mapping.refine_iterations
-        self.refine(self.owed if refine and not self._held else 0)
-        self._version += 1
-        return correction
-
     @property
     def memory(self) -> dict[str, int]:
-        """Bytes held, by what for."""
+        """Memory in use [bytes] by category; approximate while another thread maps."""
         return memory_of(self.model, self._refiner.adam, self.keyframes)
 
     @property
     def loop_counts(self) -> dict[str, int]:
-        """Loops that were "closed", and "rejected" ones."""
+        """Numbers of loop closures that were "closed" and "rejected"."""
         return {"closed": self.loops.closed, "rejected": self.loops.rejected}
 
     @property
     def skipped_gradients(self) -> int:
-        """Gradients that were not finite, and so moved nothing."""
+        """Number of gradients that were not finite and did not change the map."""
         return self._refiner.adam.skipped
 
     @property
     def has_loop(self) -> bool:
-        """Whether :meth:`close_loops` has something to do."""
-        return self.loops.correction is not None
+        """Whether :meth:`close_loops` would move the map; keyframes that wait for insertion come first."""
+        return not self._frozen and self.loops.correction is not None and not self.has_keyframes_to_insert
 
-    def hold(self, moving: bool) -> None:
-        """Whether refinement is to wait, because the robot moves; steps owed are spent once it stands."""
-        self._held = moving
-        if not moving and self.owed:
-            self.refine(min(self.owed, self.config.mapping.refine_iterations))
-            self._version += 1
+    @property
+    def has_keyframes_to_insert(self) -> bool:
+        """Whether submitted observations are not in the map yet."""
+        return bool(self._submitted or self._added)
 
-    def finish(self, stop: Stop = never) -> None:
-        """Refine over all keyframes once no more will come, and densify where their pictures ask for it.
+    @property
+    def has_observations(self) -> bool:
+        """Whether submitted observations, or an observed frame, are not processed yet."""
+        return self.has_keyframes_to_insert or self._latest is not None
 
-        ``stop`` is asked before each step; once it says so there are no more, and nothing is added to the map.
-        """
-        self.refine(self.owed, stop)
-        steps, pull = self.config.mapping.final_iterations, PositionGradients(len(self.model))
-        self._refiner.refine_all(self.model, self.keyframes, steps // _BEFORE, pull, stop)
-        if not stop():
-            self._densify(pull)
-            self._refiner.refine_all(self.model, self.keyframes, steps - steps // _BEFORE, stop=stop)
-        self._prune()
-        self._version += 1
-
-    def close(self) -> None:
-        """Nothing goes on in the background that would have to be ended."""
-
-    def paused(self) -> AbstractContextManager[None]:
-        """Nothing goes on in the background that would have to wait."""
-        return nullcontext()
+    @property
+    def has_work(self) -> bool:
+        """Whether :meth:`step` has work now."""
+        return self.has_observations or self._may_refine
 
     def snapshot(self) -> Snapshot:
-        """The map as it is, copied."""
-        return Snapshot(self.model.clone(), self._version, self._stamp)
+        """Copy the map; not while another thread runs :meth:`step`."""
+        return Snapshot(self.model.clone(), self.version, self._stamp)
 
-    def add_keyframe(self, observation: Observation, *, provisional: bool = False) -> Keyframe:
-        """A keyframe of an observation, which the map does not know yet.
+    # --- calls of the tracking thread ---
 
-        ``provisional`` gives it a reference of the measured depth, for tracking until :meth:`make_reference`.
+    def locate(self, T_world_camera: Array, previous: GraphLocation) -> GraphLocation:
+        """Return where a frame is in the pose graph.
+
+        Args:
+            T_world_camera: (4, 4) of the frame.
+            previous: location of the previous frame.
         """
-        keyframe = self._make_keyframe(observation.prepared, observation.T_world_camera, observation.features())
-        if provisional:
-            levels, n_pixels = observation.prepared.levels, self.config.tracking.n_pixels
-            keyframe.reference = make_reference(levels, observation.T_world_camera, n_pixels)
-        # A new list: the tracker may be reading the old one.
-        self.keyframes = without_redundant([*self.keyframes, keyframe], self.config.mapping.max_keyframes)
-        return keyframe
+        return self.loops.locate(T_world_camera, self.keyframes, previous)
 
-    def look(self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64]) -> None:
-        """Weigh the map against a frame that is no keyframe: what has gone goes, what moves is followed.
+    def should_insert(self, observation: Observation) -> bool:
+        """Return whether a frame qualifies as a keyframe; changes no state.
 
-        Where it shows what the map has nothing of, the next frame is wanted as a keyframe, from wherever it is.
+        It needs enough depth for later frames to align to. It must be a new view, revisit a place without a loop
+        closure, or follow a frame that the map does not cover. No frame qualifies while ``backlog`` keyframes wait for
+        insertion, or while a loop closure waits for them.
         """
-        camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
-        depths = torch.from_numpy(depth)
-        self._weigh(depths, camera, T_world_camera)
-        self._prune()
-        view = view_of(self.model, camera, T_world_camera)
-        colors = in_exposure_of_map(torch.from_numpy(np.ascontiguousarray(rgb)), depths, view)
-        stamp = prepared.frame.stamp
-        self._movers.find(view, colors, depths, camera, T_world_camera, self.keyframes, stamp)
-        bare = (depths > 0) & (view.alpha < self.config.mapping.unexplained_alpha)
-        self._revealed = float(bare.float().mean()) > _REVEALED
-        self._version += 1
+        if self._frozen or observation.held_out or observation.verdict == "lost":
+            return False
+        if valid_share(observation.prepared) < self.config.tracking.min_depth_coverage:
+            return False
+        waiting = self._waiting()
+        if len(waiting) >= CONSTANTS.backlog or self.loops.correction is not None:
+            return False
+        if observation.location.revisits or (self._unmapped_seen and not waiting):
+            return True
+        return is_keyframe(observation.T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
 
-    def fuse(self, observation: Observation, keyframe: Keyframe) -> None:
-        """Bring a keyframe's evidence and its new surfaces into the map; it calls for refinement."""
-        self._stamp = observation.prepared.frame.stamp
-        self._weigh(keyframe.depth, keyframe.camera, keyframe.T_world_camera)
-        view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
-        keyframe.rgb = in_exposure_of_map(keyframe.rgb, keyframe.depth, view)
-        self._leave_out_what_moves(keyframe, view)
-        self._add(keyframe, view)
-        self._prune()
-        self._revealed = False
-        self.owed += self.config.mapping.refine_iterations
-        self._version += 1
+    def submit(self, observation: Observation) -> GraphLocation:
+        """Queue a frame as the next keyframe; return its own location in the pose graph."""
+        with self._lock:
+            self._submitted.append(observation)
+            return GraphLocation(self._next_number() + len(self._submitted) - 1)
 
-    def refine(self, steps: int, stop: Stop = never) -> None:
-        """Spend at most so many of the steps owed, first on the latest keyframe if it has had none."""
-        if steps <= 0:
+    def observe(self, observation: Observation) -> None:
+        """Offer a frame that is not a keyframe for the comparison with the map; the next one replaces it.
+
+        Only frames with the verdict "ok" count, at intervals of ``observe_interval_s``.
+        """
+        if self._frozen or observation.held_out or observation.verdict != "ok":
             return
-        steps = min(steps, self.owed)
-        self.owed -= steps
-        self._refiner.refine(self.model, self.keyframes, steps, stop)
-        self._prune()  # or what refinement made faint, huge or not finite would be rendered
+        if not 0 <= observation.stamp - self._observed_stamp < self.config.mapping.observe_interval_s:
+            self._observed_stamp = observation.stamp
+            with self._lock:
+                self._latest = observation
 
-    def make_reference(self, observation: Observation, keyframe: Keyframe) -> None:
-        """What later frames are aligned to: the frame's own grey, the map's depth where the map is solid."""
-        levels = observation.prepared.levels
-        view = view_of(self.model, levels[0].camera, keyframe.T_world_camera)
-        depth = model_depth(view, levels[0].depth, self.config.mapping)
-        if keyframe.still is not None:
-            depth = np.where(resized(keyframe.still.numpy(), depth.shape), depth, np.float32(0))
-        n_pixels = self.config.tracking.n_pixels
-        keyframe.reference = make_reference(with_depth(levels, depth), keyframe.T_world_camera, n_pixels)
+    def set_robot_moving(self, moving: bool) -> None:
+        """Pause refinement while the robot moves; the pending iterations run once it stops."""
+        self._robot_moving = moving
+
+    # --- steps of the mapping thread ---
+
+    def step(self, iterations: int = 1) -> bool:
+        """Do the next piece of work and return whether there is more; an error leaves the state as it was.
+
+        The order is the one that serves tracking soonest: add a keyframe, insert a keyframe, compare the latest
+        observed frame, refine.
+
+        Args:
+            iterations: limit of refinement iterations in this step.
+        """
+        with self.rollback_on_error():
+            if self._submitted:
+                self.add_keyframe()
+            elif self._added:
+                self.insert_keyframe()
+            elif self._latest is not None:
+                self._compare_latest()
+            elif self._may_refine:
+                self.refine(iterations)
+        return self.has_work
 
     @contextmanager
-    def _undone_on_error(self) -> Iterator[None]:
-        """Puts everything back when the block raises. Cheap: up to :meth:`refine` the block writes to copies only."""
-        before = self.keyframes, self.model, self.owed, self._version, self._stamp, self._refiner.state()
-        movers = copy(self._movers)
+    def rollback_on_error(self) -> Iterator[None]:
+        """Return a context that restores the state if its block raises, and drops what was submitted and not inserted.
+
+        The state consists of keyframes, map, optimizer, dynamic objects, pose graph and version. It is kept by
+        reference: all steps but refinement write to copies, and :meth:`Refiner.step` undoes its own writes.
+        """
+        before = self._state()
         try:
             yield
         except BaseException:
-            self.keyframes, self.model, self.owed, self._version, self._stamp, state = before
-            self._refiner.restore(state)
-            self._movers = movers
+            self._restore(before)
             raise
 
-    def _make_keyframe(
-        self, prepared: PreparedFrame, T_world_camera: NDArray[np.float64], features: Features
-    ) -> Keyframe:
+    def add_keyframe(self) -> None:
+        """Make the first submitted observation a keyframe that refers to its measured depth."""
+        observation = self._submitted[0]
+        keyframe = self._make_keyframe(observation)
+        with self._lock:
+            self.keyframes = [*self.keyframes, keyframe]
+            self._added.append((observation, keyframe))
+            self._submitted.popleft()
+
+    def insert_keyframe(self) -> None:
+        """Insert the first added keyframe into the map, update its reference and search for loop closures."""
+        observation, keyframe = self._added[0]
+        self.keyframes = without_redundant(self.keyframes, self.config.mapping.max_keyframes)
+        self.fuse(observation, keyframe)
+        self.make_reference(observation, keyframe)
+        self.loops.add(keyframe, observation, self.keyframes)
+        self._added.popleft()
+
+    def fuse(self, observation: Observation, keyframe: Keyframe) -> None:
+        """Update the Gaussians by a keyframe's depth and create new ones where the map does not explain it."""
+        self._stamp = observation.stamp
+        self._fuse_depth(keyframe.depth, keyframe.camera, keyframe.T_world_camera)
+        view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
+        keyframe.rgb = in_exposure_of_map(keyframe.rgb, keyframe.depth, view)
+        self._mask_dynamic_objects(keyframe, view)
+        self._add_gaussians(keyframe, view)
+        self._prune()
+        self._unmapped_seen = False
+        self.pending_iterations += self.config.mapping.refine_iterations
+        self.version += 1
+
+    def make_reference(self, observation: Observation, keyframe: Keyframe) -> None:
+        """Set what later frames align to: the frame's own gray values, and the map's depth where the map is opaque."""
+        levels = observation.prepared.levels
+        view = view_of(self.model, levels[0].camera, keyframe.T_world_camera)
+        depth = model_depth(view, levels[0].depth, self.config.mapping)
+        if keyframe.static_mask is not None:
+            depth = np.where(resized(keyframe.static_mask.numpy(), depth.shape), depth, np.float32(0))
+        n_pixels = self.config.tracking.n_pixels
+        keyframe.reference = make_reference(with_depth(levels, depth), keyframe.T_world_camera, n_pixels)
+
+    def refine(self, iterations: int, stop: Stop = never) -> None:
+        """Run at most ``iterations`` of the pending ones, the first on the latest keyframe if it had none."""
+        iterations = min(iterations, self.pending_iterations)
+        if iterations <= 0:
+            return
+        self.pending_iterations -= iterations
+        self._refiner.refine(self.model, self.keyframes, iterations, stop)
+        self._prune()  # refinement may have made Gaussians faint, huge or not finite
+        if self.pending_iterations % max(1, self.config.mapping.refine_iterations) == 0:
+            self.version += 1
+
+    # --- calls while no step runs ---
+
+    def close_loops(self) -> dict[int, Array]:
+        """Move keyframes and their Gaussians to the poses of the optimized pose graph.
+
+        No other thread may track or map meanwhile. Refinement of the moved map becomes pending.
+
+        Returns:
+            ``T_new_old`` (4, 4) by keyframe number; empty without a loop closure.
+        """
+        correction = self.loops.correction
+        if correction is None or self._frozen:
+            return {}
+        self._latest = None  # its pose belongs to the map before the correction
+        self.keyframes = [move_keyframe(keyframe, correction) for keyframe in self.keyframes]
+        self.model = move_gaussians(self.model, correction)
+        self.loops.apply_correction(correction)
+        self.pending_iterations += self.config.mapping.refine_iterations
+        self.version += 1
+        return correction
+
+    def freeze(self) -> None:
+        """Keep the map as it is from here on: no keyframes, no observations, no refinement."""
+        self._frozen = True
+        self._latest = None
+
+    def finish(self, stop: Stop = never) -> None:
+        """Refine over all keyframes at the end of a log, and densify where the loss gradients are large.
+
+        Args:
+            stop: called before each iteration. Once it returns True, no iteration and no densification follows.
+        """
+        self.refine(self.pending_iterations, stop)
+        final, gradients = self.config.mapping.final_iterations, PositionGradients(len(self.model))
+        first = int(final * CONSTANTS.densify_after)
+        self._refiner.refine_all(self.model, self.keyframes, first, gradients, stop)
+        if not stop():
+            self._densify(gradients)
+            self._refiner.refine_all(self.model, self.keyframes, final - first, stop=stop)
+        self._prune()
+        self.version += 1
+
+    # --- implementation ---
+
+    @property
+    def _may_refine(self) -> bool:
+        return self.pending_iterations > 0 and not (self._robot_moving or self._frozen)
+
+    def _waiting(self) -> list[Observation]:
+        """Return the observations that were submitted and are not in the map yet."""
+        with self._lock:
+            return [*self._submitted, *(observation for observation, _ in self._added)]
+
+    def _next_number(self) -> int:
+        return self.keyframes[-1].number + 1 if self.keyframes else 0
+
+    def _state(self) -> dict[str, Any]:
+        names = ("keyframes", "model", "pending_iterations", "version", "_stamp", "_unmapped_seen")
+        state = {name: getattr(self, name) for name in names}
+        return state | {"_dynamic_objects": copy(self._dynamic_objects), "": (self._refiner.state(), self.loops.state())}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        refiner, loops = state.pop("")
+        self._refiner.restore(refiner)
+        self.loops.restore(loops)
+        vars(self).update(state)
+        with self._lock:
+            dropped = {id(keyframe) for _, keyframe in self._added}
+            self.keyframes = [keyframe for keyframe in self.keyframes if id(keyframe) not in dropped]
+            self._submitted.clear()
+            self._added.clear()
+            self._latest = None
+
+    def _make_keyframe(self, observation: Observation) -> Keyframe:
+        prepared, T_world_camera = observation.prepared, observation.T_world_camera
         camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
         mask = prepared.frame.mask
         return Keyframe(
-            number=self.keyframes[-1].number + 1 if self.keyframes else 0,
+            number=self._next_number(),
             camera=camera,
             rgb=torch.from_numpy(np.ascontiguousarray(rgb)),
             depth=torch.from_numpy(depth),
             T_world_camera=T_world_camera,
-            features=features,
-            reference=Reference(T_world_camera, ()),
-            still=None if mask is None else torch.from_numpy(resized(mask, depth.shape)),
+            features=observation.features(),
+            reference=make_reference(prepared.levels, T_world_camera, self.config.tracking.n_pixels),
+            static_mask=None if mask is None else torch.from_numpy(resized(mask, depth.shape)),
         )
 
-    def _weigh(self, depth: torch.Tensor, camera: Camera, T_world_camera: NDArray[np.float64]) -> None:
-        evidence = weigh(self.model, depth, camera, T_world_camera, self._noise)
-        self.model = count(fuse_normals(fuse_depth(self.model, evidence), evidence), evidence)
+    def _compare_latest(self) -> None:
+        with self._lock:
+            observation, self._latest = self._latest, None
+        if observation is not None:
+            self._compare(observation)
 
-    def _leave_out_what_moves(self, keyframe: Keyframe, view: ModelView) -> None:
-        moving = self._movers.find(
+    def _compare(self, observation: Observation) -> None:
+        """Compare the map with a frame that is not a keyframe.
+
+        Gaussians that it sees through lose opacity, and dynamic objects are followed. Where it shows a part of the
+        scene without a map, the next frame becomes a keyframe.
+        """
+        frame, T_world_camera = observation.prepared.frame, observation.T_world_camera
+        camera, rgb, measured = mapping_images(frame, self.config.mapping, self.config.tracking)
+        depth = torch.from_numpy(measured)
+        self._fuse_depth(depth, camera, T_world_camera)
+        self._prune()
+        view = view_of(self.model, camera, T_world_camera)
+        colors = in_exposure_of_map(torch.from_numpy(np.ascontiguousarray(rgb)), depth, view)
+        self._dynamic_objects.find(view, colors, depth, camera, T_world_camera, self.keyframes, frame.stamp)
+        unmapped = (depth > 0) & (view.alpha < self.config.mapping.unexplained_alpha)
+        self._unmapped_seen = float(unmapped.float().mean()) > CONSTANTS.unmapped_share
+        self.version += 1
+
+    def _fuse_depth(self, depth: torch.Tensor, camera: Camera, T_world_camera: Array) -> None:
+        comparison = compare_with_depth(self.model, depth, camera, T_world_camera, self._depth_noise)
+        self.model = update_visibility(fuse_normals(fuse_depth(self.model, comparison), comparison), comparison)
+
+    def _mask_dynamic_objects(self, keyframe: Keyframe, view: ModelView) -> None:
+        dynamic = self._dynamic_objects.find(
             view,
             keyframe.rgb,
             keyframe.depth,
@@ -283,33 +414,33 @@ class Mapper:
             [k for k in self.keyframes if k.number < keyframe.number],
             self._stamp,
         )
-        if moving.any():
-            keyframe.still = ~moving if keyframe.still is None else keyframe.still & ~moving
-            keyframe.depth = torch.where(moving, 0.0, keyframe.depth)
+        if dynamic.any():
+            keyframe.static_mask = ~dynamic if keyframe.static_mask is None else keyframe.static_mask & ~dynamic
+            keyframe.depth = torch.where(dynamic, 0.0, keyframe.depth)
 
-    def _add(self, keyframe: Keyframe, view: ModelView) -> None:
+    def _add_gaussians(self, keyframe: Keyframe, view: ModelView) -> None:
         measured = new_gaussians(keyframe, unexplained(view, keyframe.depth, self.config.mapping), self.config.mapping)
         guessed = guessed_gaussians(view, keyframe, self.config.mapping)
         for new in (measured, guessed):
-            new.uncertainty = first_uncertainty(new, keyframe.T_world_camera, self._noise)
+            new.uncertainty = initial_uncertainty(new, keyframe.T_world_camera, self._depth_noise)
         self.model = GaussianModel.concatenate([self.model, measured, guessed])
         self._refiner.adam.extend(self.model)
 
-    def _densify(self, pull: PositionGradients) -> None:
-        room = self.config.mapping.max_gaussians - len(self.model)
-        self.model = split(self.model, pull.strongest(self.config.mapping.densify_gradient, room))
+    def _densify(self, gradients: PositionGradients) -> None:
+        free = self.config.mapping.max_gaussians - len(self.model)
+        self.model = split(self.model, gradients.largest(self.config.mapping.densify_gradient, free))
         self._refiner.adam.extend(self.model)
 
     def _prune(self) -> None:
-        keep = worth_keeping(self.model, self.config.mapping)
+        keep = keep_mask(self.model, self.config.mapping)
         if not keep.all():
             self._select(keep.nonzero()[:, 0])
         excess = len(self.model) - self.config.mapping.max_gaussians
         if excess > 0:
-            self.model, rows = merge_alike(self.model, excess)
+            self.model, rows = merge_similar(self.model, excess)
             self._refiner.adam.select(rows)
         if len(self.model) > self.config.mapping.max_gaussians:
-            self._select(fittest(self.model, self.config.mapping.max_gaussians))
+            self._select(best_supported(self.model, self.config.mapping.max_gaussians))
 
     def _select(self, index: torch.Tensor) -> None:
         self.model = self.model.select(index)

@@ -18,7 +18,7 @@ _PARALLEL = 0.9  # cosine of their shortest axes
 _SIZE = 2.0  # and their largest σ by at most this factor
 
 
-def merge_alike(model: GaussianModel, excess: int) -> tuple[GaussianModel, Tensor]:
+def merge_similar(model: GaussianModel, excess: int) -> tuple[GaussianModel, Tensor]:
     """The model with up to ``excess`` pairs merged, most alike first, and the rows (ascending) that it kept.
 
     A merged Gaussian has the mean and covariance of the two weighted by opacity times size, which also gives its colour

@@ -1,10 +1,10 @@
-"""Keyframes' poses and the measured motions between them; the poses that fit all of them best."""
+"""Pose graph of the keyframes: measured relative motions as edges, and the poses that fit all of them best."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import gtsam
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from splatbot.geometry import inverse, se3_log
 
 Array = NDArray[np.float64]
+Adjacency = Mapping[int, tuple[int, ...]]
 
-_CAUCHY = 1.0  # [σ] from which a loop counts less
-# No measured motion is better than this, whatever its residuals say [m], [rad].
-_FLOOR = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
+_CAUCHY_SIGMA = 1.0  # scale of the Cauchy loss of loop edges [σ]
+# Least covariance of an edge: standard deviations of 1 mm and 0.5 mrad, however small the residuals of its alignment.
+_LEAST_COVARIANCE = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Edge:
         first, second: their numbers.
         T_first_second: (4, 4).
         covariance: (6, 6) of the twist (t [m], ω [rad]) in the second camera's frame.
-        loop: whether it was found by recognising a place, and may be wrong.
+        loop: whether it is a loop closure, which may be wrong.
     """
 
     first: int
@@ -38,100 +39,111 @@ class Edge:
     loop: bool = False
 
     def residual(self, poses: Mapping[int, Array]) -> Array:
-        """Twist (6,) from the measured motion to that of ``poses``, in the second camera's frame."""
+        """Compute the twist (6,) from the measured to the estimated motion, in the second camera's frame.
+
+        r = log(T_first_second⁻¹ · T_first⁻¹ · T_second), the residual of a between factor.
+        """
         T = inverse(poses[self.first]) @ poses[self.second]
         return se3_log(inverse(self.T_first_second) @ T)
 
 
+@dataclass
 class PoseGraph:
-    """Poses T_world_camera by keyframe number, and edges between them."""
+    """Poses T_world_camera (4, 4) by keyframe number, and the edges between them."""
 
-    def __init__(self) -> None:
-        self.poses: dict[int, Array] = {}
-        self.edges: list[Edge] = []
+    poses: dict[int, Array] = field(default_factory=dict)
+    edges: list[Edge] = field(default_factory=list)
 
-    def near(self, number: int, hops: int) -> set[int]:
-        """Keyframes that are at most so many edges away."""
-        neighbours: dict[int, list[int]] = {}
+    def adjacency(self, *, loops: bool = True) -> Adjacency:
+        """Return the neighbors of each keyframe; without loop closures if ``loops`` is False."""
+        found: dict[int, list[int]] = {number: [] for number in self.poses}
         for edge in self.edges:
-            neighbours.setdefault(edge.first, []).append(edge.second)
-            neighbours.setdefault(edge.second, []).append(edge.first)
-        found, front = {number}, deque([(number, 0)])
-        while front:
-            at, distance = front.popleft()
-            for other in neighbours.get(at, ()) if distance < hops else ():
-                if other not in found:
-                    found.add(other)
-                    front.append((other, distance + 1))
-        return found
+            if loops or not edge.loop:
+                found.setdefault(edge.first, []).append(edge.second)
+                found.setdefault(edge.second, []).append(edge.first)
+        return {number: tuple(others) for number, others in found.items()}
 
-    def path(self, first: int, second: int) -> tuple[float, float]:
-        """Metres and radians of the shortest way (in edges) from one keyframe to another, loops left out; inf: none."""
-        way = self._way(first, second)
-        if way is None:
+    def path_length(self, first: int, second: int) -> tuple[float, float]:
+        """Compute translation [m] and rotation [rad] summed over the path with the fewest odometry edges.
+
+        Both are infinite if no path connects the two keyframes.
+        """
+        path = self._path(first, second)
+        if path is None:
             return np.inf, np.inf
-        steps = [se3_log(inverse(self.poses[a]) @ self.poses[b]) for a, b in pairwise(way)]
+        steps = [se3_log(inverse(self.poses[a]) @ self.poses[b]) for a, b in pairwise(path)]
         return (
             float(sum(np.linalg.norm(step[:3]) for step in steps)),
             float(sum(np.linalg.norm(step[3:]) for step in steps)),
         )
 
-    def optimised(self) -> dict[int, Array]:
-        """Poses of least squares, the first keyframe's held; loops count as Cauchy's function has it.
+    def optimize(self) -> dict[int, Array]:
+        """Compute the poses that minimize the cost of all edges; the first keyframe is fixed.
 
-        Levenberg-Marquardt on SE(3), by gtsam.
+        min Σ_odometry ‖r_ij‖²_Σij + Σ_loop ρ(‖r_ij‖_Σij), with the residual of :meth:`Edge.residual`, the squared
+        Mahalanobis norm ‖r‖²_Σ = rᵀ Σ⁻¹ r and the Cauchy loss ρ(x) = c² / 2 · log(1 + x² / c²). GTSAM solves it by
+        Levenberg-Marquardt on SE(3) (Dellaert & Kaess 2017, Factor Graphs for Robot Perception).
         """
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         fixed = min(self.poses)
         for number, T in self.poses.items():
             values.insert(number, gtsam.Pose3(T))
-        graph.add(gtsam.PriorFactorPose3(fixed, gtsam.Pose3(self.poses[fixed]), _noise(1e-8 * np.eye(6))))
+        graph.add(gtsam.PriorFactorPose3(fixed, gtsam.Pose3(self.poses[fixed]), _noise_model(1e-8 * np.eye(6))))
         for edge in self.edges:
-            noise = _noise(edge.covariance + _FLOOR)
+            noise = _noise_model(edge.covariance + _LEAST_COVARIANCE)
             if edge.loop:
-                robust = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY)
+                robust = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY_SIGMA)
                 noise = gtsam.noiseModel.Robust.Create(robust, noise)
             graph.add(gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise))
         found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         return {number: _orthonormal(found.atPose3(number).matrix()) for number in self.poses}
 
-    def _way(self, first: int, second: int) -> list[int] | None:
-        before: dict[int, int] = {first: first}
-        front = deque([first])
-        links: dict[int, list[int]] = {}
-        for edge in self.edges:
-            if not edge.loop:
-                links.setdefault(edge.first, []).append(edge.second)
-                links.setdefault(edge.second, []).append(edge.first)
-        while front and second not in before:
-            at = front.popleft()
-            for other in links.get(at, ()):
-                if other not in before:
-                    before[other] = at
-                    front.append(other)
-        if second not in before:
+    def _path(self, first: int, second: int) -> list[int] | None:
+        """Find the path with the fewest odometry edges by breadth-first search."""
+        adjacency = self.adjacency(loops=False)
+        parent: dict[int, int] = {first: first}
+        queue = deque([first])
+        while queue and second not in parent:
+            number = queue.popleft()
+            for other in adjacency.get(number, ()):
+                if other not in parent:
+                    parent[other] = number
+                    queue.append(other)
+        if second not in parent:
             return None
-        way = [second]
-        while way[-1] != first:
-            way.append(before[way[-1]])
-        return way[::-1]
+        path = [second]
+        while path[-1] != first:
+            path.append(parent[path[-1]])
+        return path[::-1]
 
 
-def largest(residuals: Iterable[Array]) -> tuple[float, float]:
-    """The largest translation [m] and rotation [rad] of twists (6,)."""
+def within_hops(adjacency: Adjacency, number: int, hops: int) -> set[int]:
+    """Return the keyframes at most ``hops`` edges away from one, including it."""
+    found, queue = {number}, deque([(number, 0)])
+    while queue:
+        at, distance = queue.popleft()
+        for other in adjacency.get(at, ()) if distance < hops else ():
+            if other not in found:
+                found.add(other)
+                queue.append((other, distance + 1))
+    return found
+
+
+def max_residual(residuals: Iterable[Array]) -> tuple[float, float]:
+    """Compute the largest translation [m] and rotation [rad] of twists (6,)."""
     found = list(residuals)
     moved = max((float(np.linalg.norm(r[:3])) for r in found), default=0.0)
     return moved, max((float(np.linalg.norm(r[3:])) for r in found), default=0.0)
 
 
-def _noise(covariance: Array) -> gtsam.noiseModel.Base:
-    """gtsam's twists have the rotation first."""
+def _noise_model(covariance: Array) -> gtsam.noiseModel.Base:
+    """Convert a covariance (6, 6); GTSAM's twists begin with the rotation."""
     order = [3, 4, 5, 0, 1, 2]
     return gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(order, order)])
 
 
 def _orthonormal(T: Array) -> Array:
-    """The nearest pose with an exact rotation (polar decomposition)."""
+    """Return the nearest pose with an exact rotation, by polar decomposition."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = U @ Vt, T[:3, 3]

@@ -9,7 +9,7 @@ from splatbot.config import MappingConfig
 from splatbot.gaussians import GaussianModel
 
 
-def worth_keeping(model: GaussianModel, config: MappingConfig) -> Tensor:
+def keep_mask(model: GaussianModel, config: MappingConfig) -> Tensor:
     """Mask (N,) of finite, visible Gaussians of a sane size."""
     finite = torch.isfinite(model.means).all(1) & torch.isfinite(model.log_scales).all(1)
     finite &= torch.isfinite(model.quats).all(1) & torch.isfinite(model.opacity_logits)
@@ -18,7 +18,7 @@ def worth_keeping(model: GaussianModel, config: MappingConfig) -> Tensor:
     return finite & sane & (model.opacities > config.min_opacity)
 
 
-def fittest(model: GaussianModel, count: int) -> Tensor:
+def best_supported(model: GaussianModel, count: int) -> Tensor:
     """Indices, ascending, of the ``count`` Gaussians with most evidence: observations first, opacity second."""
     merit = model.observations.float() + model.opacities
     return torch.argsort(merit, descending=True, stable=True)[:count].sort().values

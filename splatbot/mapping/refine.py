@@ -73,18 +73,18 @@ class Refiner:
         model: GaussianModel,
         keyframes: Sequence[Keyframe],
         iterations: int,
-        pull: PositionGradients | None = None,
+        position_gradients: PositionGradients | None = None,
         stop: Stop = never,
     ) -> None:
-        """Spend ``iterations`` steps on all keyframes alike; ``pull`` gathers how hard they pull at the centres."""
+        """Spend ``iterations`` steps on all keyframes alike; ``position_gradients`` gathers how hard they position_gradients at the centres."""
         for _ in takewhile(lambda _: not stop(), range(iterations if len(model) else 0)):
-            self.step(model, keyframes[int(self._random.integers(len(keyframes)))], pull)
+            self.step(model, keyframes[int(self._random.integers(len(keyframes)))], position_gradients)
 
     def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
         pool = keyframes[-self.config.window :] if self._random.random() < 0.5 else keyframes
         return pool[int(self._random.integers(len(pool)))]
 
-    def step(self, model: GaussianModel, keyframe: Keyframe, pull: PositionGradients | None = None) -> float:
+    def step(self, model: GaussianModel, keyframe: Keyframe, position_gradients: PositionGradients | None = None) -> float:
         """One step on one keyframe; returns the loss before it.
 
         Torch's threads spin after each operation and so starve the rasterizer's; one is several times faster here.
@@ -92,11 +92,11 @@ class Refiner:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            return self._step(model, keyframe, pull)
+            return self._step(model, keyframe, position_gradients)
         finally:
             torch.set_num_threads(threads)
 
-    def _step(self, model: GaussianModel, keyframe: Keyframe, pull: PositionGradients | None) -> float:
+    def _step(self, model: GaussianModel, keyframe: Keyframe, position_gradients: PositionGradients | None) -> float:
         parameters = {name: getattr(model, name).detach().requires_grad_(True) for name in PARAMETERS}
         renders, alphas, meta = rasterization(
             parameters["means"],
@@ -112,11 +112,11 @@ class Refiner:
             depth_mode="plane",  # what tracking is aligned to
         )
         rows = meta["visible_ids"][0]
-        centers = [] if pull is None else [meta["means2d"]]
+        centers = [] if position_gradients is None else [meta["means2d"]]
         loss = self._loss(renders[0], alphas[0], keyframe)
         grads = torch.autograd.grad(loss, [*parameters.values(), *centers])
-        if pull is not None:
-            pull.add(rows, grads[-1], keyframe.camera.width)
+        if position_gradients is not None:
+            position_gradients.add(rows, grads[-1], keyframe.camera.width)
         visible = torch.zeros(len(model), dtype=torch.bool)
         visible[rows] = True
         means, normals = model.means.index_select(0, rows), shortest_axes(model, rows)
@@ -154,8 +154,8 @@ class Refiner:
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         observed = keyframe.rgb.float() / 255.0
         covered = alpha[..., 0].detach() > 0.5
-        if keyframe.still is not None:
-            covered &= keyframe.still
+        if keyframe.static_mask is not None:
+            covered &= keyframe.static_mask
         # What was before the map's surface and is there no more has nothing to say of what is behind.
         covered &= ~((keyframe.depth > 0) & (render[..., 3].detach() * (1 - _GONE) > keyframe.depth))
         color = self._color_loss(render[..., :3], observed, covered)

@@ -1,0 +1,53 @@
+"""Observations: tracked frames as the tracking thread submits them to the mapper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.tracking.features import Features
+from splatbot.tracking.health import Verdict
+from splatbot.tracking.prepare import PreparedFrame
+
+
+class GraphLocation(NamedTuple):
+    """Where a tracked frame is in the pose graph.
+
+    Args:
+        keyframe: number of its reference keyframe: the nearest one that the trajectory leads to. If None, the map has
+            no keyframes or loop closing is disabled.
+        revisits: whether the frame is at a place that the trajectory visited before, without a loop closure yet.
+    """
+
+    keyframe: int | None = None
+    revisits: bool = False
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A tracked frame.
+
+    Args:
+        prepared: its images.
+        T_world_camera: (4, 4), from tracking; without meaning for the verdict "lost".
+        features: returns its keypoints. The mapping thread calls it once, if the frame becomes a keyframe.
+        location: the frame in the pose graph.
+        verdict: of tracking.
+        held_out: whether the map must not use the frame.
+    """
+
+    prepared: PreparedFrame
+    T_world_camera: NDArray[np.float64]
+    features: Callable[[], Features] = Features.none
+    location: GraphLocation = GraphLocation()
+    verdict: Verdict = "ok"
+    held_out: bool = False
+
+    @property
+    def stamp(self) -> float:
+        """Time of the frame [s]."""
+        return self.prepared.frame.stamp
