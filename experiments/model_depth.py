@@ -19,10 +19,11 @@ from splatbot.config import Config
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse
 from splatbot.logs.synthetic import PREFIX, SyntheticLog
+from splatbot.mapping.executor import InlineExecutor
 from splatbot.mapping.insertion import model_depth, view_of
 from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.observation import Observation
 from splatbot.rasterize import rasterization
-from splatbot.tracking.features import Features
 from splatbot.tracking.prepare import prepare
 
 Depth = NDArray[np.float32]
@@ -46,10 +47,11 @@ def biases(uri: str, config: Config) -> dict[str, dict[str, Bias]]:
     log = SyntheticLog(uri)
     exact = SyntheticLog(uri.split("&effects=")[0].split("?effects=")[0])
     mapper, poses = Mapper(config), log.ground_truth.T_world_camera
-    T_first_world = inverse(poses[0])
+    executor, T_first_world = InlineExecutor(mapper), inverse(poses[0])
     keyframes = list(range(0, len(log), _KEYFRAME_PERIOD))
     for i in keyframes:
-        mapper.insert(prepare(log[i], config.tracking), T_first_world @ poses[i], Features.none)
+        mapper.submit(Observation(prepare(log[i], config.tracking), T_first_world @ poses[i]))
+        executor.run()
     views = {"keyframes": keyframes, "between": [i + _KEYFRAME_PERIOD // 2 for i in keyframes[:-1]]}
     found: dict[str, dict[str, list[Bias]]] = {}
     for kind, indices in views.items():

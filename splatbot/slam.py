@@ -141,8 +141,9 @@ class Slam:
         for result in self.results:
             number += result.keyframe
             T, T_new_old = result.T_world_camera, correction.get(number)
-            known = T is not None and T_new_old is not None
-            results.append(replace(result, T_world_camera=T_new_old @ T) if known else result)
+            if T is not None and T_new_old is not None:
+                result = replace(result, T_world_camera=T_new_old @ T)
+            results.append(result)
         self.results = results
         if number in correction:
             self._tracker.move(correction[number])

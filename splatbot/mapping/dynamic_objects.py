@@ -1,8 +1,9 @@
-"""What moves: pixels that contradict the map in colour and depth, in space that was seen to be free."""
+"""Dynamic objects: pixels that contradict the map in color and depth, in space that keyframes observed to be free."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,25 +18,47 @@ from splatbot.mapping.keyframes import Keyframe
 
 Mask = NDArray[np.bool_]
 
-_DEPTH = 0.06  # nearer than the map by more than this is another thing [share of depth]
-_COLOUR = 0.06  # colours that differ by more, on average over the channels, are another thing's [0..1]
-_SOLID = 0.8  # where the map covers less it cannot be contradicted
-_SPECK = 5  # things narrower than this are noise [px]
-_MARGIN = 9  # and what is so near to one is it as well [px]
-_WITNESSES = 6  # keyframes that are asked whether a place was free
-_CELL = 0.03  # [m] within which a thing that stays is the same
-_FORGET = 0.6  # places not seen for longer begin anew [s]
+
+@dataclass(frozen=True)
+class DynamicObjectConstants:
+    """Constants of the dynamic object filter.
+
+    Args:
+        depth_share: [share of depth] a pixel nearer than the map by more shows another object.
+        color_difference: [0..1] a mean difference of the channels by more shows another object.
+        opaque_alpha: only where the map covers more can a pixel contradict it.
+        least_width: [px] narrower objects are noise.
+        margin: [px] pixels this near a dynamic object count as part of it.
+        checked_keyframes: number of nearest keyframes that may have observed free space.
+        cell_size: [m] an object that stays within cells of this size is static.
+        forget_after_s: [s] a cell that is not observed for longer starts again.
+        least_z: [m] points nearer to a camera are outside its image.
+    """
+
+    depth_share: float = 0.06
+    color_difference: float = 0.06
+    opaque_alpha: float = 0.8
+    least_width: int = 5
+    margin: int = 9
+    checked_keyframes: int = 6
+    cell_size: float = 0.03
+    forget_after_s: float = 0.6
+    least_z: float = 0.05
+
+
+CONSTANTS = DynamicObjectConstants()
 
 
 class DynamicObjectFilter:
-    """Tells what moves from what is new, and accepts what has stayed.
+    """Separates dynamic objects from new static ones, and accepts an object once it has stayed long enough.
 
     Args:
-        settle: what appeared in free space and has been at its place for so long belongs to the scene [s].
+        timeout_s: an object that appeared in free space becomes static once it has stayed for this long [s].
     """
 
-    def __init__(self, settle: float) -> None:
-        self.settle = settle
+    def __init__(self, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        # Occupied cells, sorted by key: key, time of the first and of the latest observation [s].
         self._cells = np.zeros(0, np.int64)
         self._since = np.zeros(0)
         self._seen = np.zeros(0)
@@ -50,32 +73,33 @@ class DynamicObjectFilter:
         keyframes: Sequence[Keyframe],
         stamp: float,
     ) -> Tensor:
-        """Pixels (H, W) bool that show a thing that moves.
+        """Find the pixels (H, W) bool that show a dynamic object, and remember where it is.
 
         Args:
-            view: the map from the same pose, of the same size.
+            view: the map rendered from the same pose, at the same size.
             rgb: (H, W, 3) uint8.
             depth: (H, W) [m], 0 missing.
-            keyframes: their depths tell which space was free.
-            stamp: time [s]; what was found before is remembered.
+            T_world_camera: (4, 4).
+            keyframes: their depth images show which space was free.
+            stamp: time [s].
         """
-        candidates = _disagreeing(view, rgb, depth)
+        candidates = _contradictions(view, rgb, depth)
         if not candidates.any():
             return torch.from_numpy(candidates)
         v, u = np.nonzero(candidates)
         points = transform_points(T_world_camera, camera.backproject(depth.numpy())[v, u].astype(np.float64))
-        moving = np.zeros_like(candidates)
-        moving[v, u] = _was_free(points, keyframes, T_world_camera) & ~self._settled(points, stamp)
-        kernel = np.ones((_SPECK, _SPECK), np.uint8)
-        things = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, kernel)
-        return torch.from_numpy(cv2.dilate(things, np.ones((2 * _MARGIN + 1,) * 2, np.uint8)) > 0)
+        dynamic = np.zeros_like(candidates)
+        dynamic[v, u] = _was_free(points, keyframes, T_world_camera) & ~self._is_static(points, stamp)
+        kernel = np.ones((CONSTANTS.least_width, CONSTANTS.least_width), np.uint8)
+        objects = cv2.morphologyEx(dynamic.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+        return torch.from_numpy(cv2.dilate(objects, np.ones((2 * CONSTANTS.margin + 1,) * 2, np.uint8)) > 0)
 
-    def _settled(self, points: NDArray[np.float64], stamp: float) -> Mask:
-        """Which points (N, 3) lie in cells that have been taken without a break for ``settle`` seconds."""
-        i = np.floor(points / _CELL).astype(np.int64) + (1 << 20)
-        cells = (i[:, 0] << 42) | (i[:, 1] << 21) | i[:, 2]
-        now, place = np.unique(cells, return_inverse=True)
-        alive = stamp - self._seen <= _FORGET
+    def _is_static(self, points: NDArray[np.float64], stamp: float) -> Mask:
+        """Return which points (N, 3) lie in cells that were occupied without a break for ``timeout_s`` seconds."""
+        i = np.floor(points / CONSTANTS.cell_size).astype(np.int64) + (1 << 20)
+        keys = (i[:, 0] << 42) | (i[:, 1] << 21) | i[:, 2]
+        now, index = np.unique(keys, return_inverse=True)
+        alive = stamp - self._seen <= CONSTANTS.forget_after_s
         cells_before, since_before = self._cells[alive], self._since[alive]
         since = np.full(len(now), stamp)
         if len(cells_before):
@@ -83,31 +107,32 @@ class DynamicObjectFilter:
             known = cells_before[at] == now
             since[known] = since_before[at[known]]
         rest = ~np.isin(cells_before, now)
-        every = np.concatenate([now, cells_before[rest]])
-        order = np.argsort(every)
-        self._cells = every[order]
+        cells = np.concatenate([now, cells_before[rest]])
+        order = np.argsort(cells)
+        self._cells = cells[order]
         self._since = np.concatenate([since, since_before[rest]])[order]
         self._seen = np.concatenate([np.full(len(now), stamp), self._seen[alive][rest]])[order]
-        return np.asarray((stamp - since >= self.settle)[place])
+        return np.asarray((stamp - since >= self.timeout_s)[index])
 
 
-def _disagreeing(view: ModelView, rgb: Tensor, depth: Tensor) -> Mask:
-    """Pixels that are nearer than the map and of another colour, where the map is solid."""
-    nearer = (depth > 0) & (depth < (1 - _DEPTH) * view.depth)
-    other = (view.rgb - rgb.float() / 255.0).abs().mean(-1) > _COLOUR
-    return np.asarray((nearer & other & (view.alpha > _SOLID)).numpy())
+def _contradictions(view: ModelView, rgb: Tensor, depth: Tensor) -> Mask:
+    """Return pixels nearer than the map and of another color, where the map is opaque."""
+    nearer = (depth > 0) & (depth < (1 - CONSTANTS.depth_share) * view.depth)
+    recolored = (view.rgb - rgb.float() / 255.0).abs().mean(-1) > CONSTANTS.color_difference
+    return np.asarray((nearer & recolored & (view.alpha > CONSTANTS.opaque_alpha)).numpy())
 
 
 def _was_free(points: NDArray[np.float64], keyframes: Sequence[Keyframe], T_world_camera: NDArray[np.float64]) -> Mask:
-    """Which points (N, 3) of the world some near keyframe has seen through."""
+    """Return which points (N, 3) of the world lie in front of the depth of one of the nearest keyframes."""
     near = sorted(keyframes, key=lambda k: float(np.linalg.norm(k.T_world_camera[:3, 3] - T_world_camera[:3, 3])))
     free = np.zeros(len(points), dtype=np.bool_)
-    for keyframe in near[:_WITNESSES]:
+    for keyframe in near[: CONSTANTS.checked_keyframes]:
         camera, local = keyframe.camera, transform_points(inverse(keyframe.T_world_camera), points)
         z = np.maximum(local[:, 2], 1e-6)
         u = np.rint(camera.fx * local[:, 0] / z + camera.cx)
         v = np.rint(camera.fy * local[:, 1] / z + camera.cy)
-        inside = (local[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        behind = keyframe.depth.numpy()[np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)]
-        free |= inside & (behind * (1 - _DEPTH) > local[:, 2])
+        in_image = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        inside = (local[:, 2] > CONSTANTS.least_z) & in_image
+        measured = keyframe.depth.numpy()[np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)]
+        free |= inside & (measured * (1 - CONSTANTS.depth_share) > local[:, 2])
     return free

@@ -1,4 +1,4 @@
-"""Whether the robot moves, by its joints."""
+"""Robot motion, detected from joint positions."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from numpy.typing import NDArray
 
 
 class JointMotionMonitor:
-    """Compares joint positions of one frame with the next.
+    """Compares the joint positions of consecutive frames.
 
     Args:
-        still: joints that move slower than this stand still [rad/s].
+        still_speed: a joint below this speed counts as still [rad/s].
     """
 
-    def __init__(self, still: float) -> None:
-        self.still = still
+    def __init__(self, still_speed: float) -> None:
+        self.still_speed = still_speed
         self._last: tuple[float, NDArray[np.float64]] | None = None
 
     def update(self, stamp: float, joints: NDArray[np.float64] | None) -> bool:
-        """Whether any joint has moved since the last call; False where nothing can be said.
+        """Return whether a joint has moved since the last call; False if the joints or the interval are unknown.
 
         Args:
             stamp: time [s].
-            joints: (n,) [rad]; None where the robot told none.
+            joints: (n,) [rad]; None if the robot reports none.
         """
         last = self._last
         self._last = (stamp, np.array(joints, dtype=np.float64)) if joints is not None else None
         if last is None or self._last is None or last[1].shape != self._last[1].shape or stamp <= last[0]:
             return False
-        return bool(np.abs(self._last[1] - last[1]).max(initial=0.0) > self.still * (stamp - last[0]))
+        return bool(np.abs(self._last[1] - last[1]).max(initial=0.0) > self.still_speed * (stamp - last[0]))

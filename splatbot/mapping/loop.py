@@ -171,13 +171,12 @@ class LoopCloser:
         prepared = observation.prepared
         odometry = self._odometry_edge(reference, keyframe, prepared)
         self.graph.edges.append(odometry)
-        if others[-1] is not reference and (edge := self._covisibility_edge(others[-1], keyframe, prepared)) is not None:
+        edge = None if others[-1] is reference else self._covisibility_edge(others[-1], keyframe, prepared)
+        if edge is not None:
             self.graph.edges.append(edge)
         T_world_odometry = reference.T_world_camera @ odometry.T_first_second
         candidates = self._loop_candidates(reference, keyframe, keyframes)
-        loops = [
-            edge for other in candidates if (edge := self._loop_edge(other, keyframe, prepared, T_world_odometry))
-        ]
+        loops = [loop for other in candidates if (loop := self._loop_edge(other, keyframe, prepared, T_world_odometry))]
         confirmed = [edge for edge in loops if self._is_confirmed(edge)]
         self._unconfirmed = [*self._unconfirmed[-CONSTANTS.unconfirmed_kept :], *loops]
         if confirmed:

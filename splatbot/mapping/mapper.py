@@ -71,7 +71,7 @@ class Mapper:
 
     1. add: the frame becomes a keyframe with its measured depth as reference; frames can be tracked against it at once.
     2. insert: depth fusion, new Gaussians, pruning, a reference with the depth of the map, loop detection.
-    3. refine: ``refine_iterations`` gradient steps.
+    3. refine: ``refine_iterations`` gradient steps, then a reference with the depth of the refined map.
 
     The list of keyframes and their references are replaced by assignment, never changed: a reader in another thread
     sees the old or the new state.
@@ -102,6 +102,8 @@ class Mapper:
         self._latest: Observation | None = None
         # Added to the keyframes, not in the map yet.
         self._added: deque[tuple[Observation, Keyframe]] = deque()
+        # In the map, with a reference to renew after refinement.
+        self._inserted: deque[tuple[Observation, Keyframe]] = deque(maxlen=CONSTANTS.backlog)
 
     # --- state ---
 
@@ -253,6 +255,8 @@ class Mapper:
         self.make_reference(observation, keyframe)
         self.loops.add(keyframe, observation, self.keyframes)
         self._added.popleft()
+        if self._may_refine:
+            self._inserted.append((observation, keyframe))
 
     def fuse(self, observation: Observation, keyframe: Keyframe) -> None:
         """Update the Gaussians by a keyframe's depth and create new ones where the map does not explain it."""
@@ -286,6 +290,8 @@ class Mapper:
         self._refiner.refine(self.model, self.keyframes, iterations, stop)
         self._prune()  # refinement may have made Gaussians faint, huge or not finite
         if self.pending_iterations % max(1, self.config.mapping.refine_iterations) == 0:
+            while self._inserted:
+                self.make_reference(*self._inserted.popleft())
             self.version += 1
 
     # --- calls while no step runs ---
@@ -302,6 +308,7 @@ class Mapper:
         if correction is None or self._frozen:
             return {}
         self._latest = None  # its pose belongs to the map before the correction
+        self._inserted.clear()
         self.keyframes = [move_keyframe(keyframe, correction) for keyframe in self.keyframes]
         self.model = move_gaussians(self.model, correction)
         self.loops.apply_correction(correction)
@@ -346,8 +353,8 @@ class Mapper:
 
     def _state(self) -> dict[str, Any]:
         names = ("keyframes", "model", "pending_iterations", "version", "_stamp", "_unmapped_seen")
-        state = {name: getattr(self, name) for name in names}
-        return state | {"_dynamic_objects": copy(self._dynamic_objects), "": (self._refiner.state(), self.loops.state())}
+        state = {name: getattr(self, name) for name in names} | {"_dynamic_objects": copy(self._dynamic_objects)}
+        return state | {"": (self._refiner.state(), self.loops.state())}
 
     def _restore(self, state: dict[str, Any]) -> None:
         refiner, loops = state.pop("")
@@ -359,6 +366,7 @@ class Mapper:
             self.keyframes = [keyframe for keyframe in self.keyframes if id(keyframe) not in dropped]
             self._submitted.clear()
             self._added.clear()
+            self._inserted.clear()
             self._latest = None
 
     def _make_keyframe(self, observation: Observation) -> Keyframe:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,8 @@ from splatbot.tracking.health import Verdict
 from splatbot.tracking.prepare import PreparedFrame
 
 
-class GraphLocation(NamedTuple):
+@dataclass(frozen=True)
+class GraphLocation:
     """Where a tracked frame is in the pose graph.
 
     Args:
@@ -25,6 +25,9 @@ class GraphLocation(NamedTuple):
 
     keyframe: int | None = None
     revisits: bool = False
+
+
+_NOWHERE = GraphLocation()
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Observation:
     prepared: PreparedFrame
     T_world_camera: NDArray[np.float64]
     features: Callable[[], Features] = Features.none
-    location: GraphLocation = GraphLocation()
+    location: GraphLocation = _NOWHERE
     verdict: Verdict = "ok"
     held_out: bool = False
 

@@ -1,9 +1,11 @@
-"""Refinement: a few steps of gradient descent on the map, over the latest keyframes and some old ones."""
+"""Refinement: gradient descent on the map, over the latest keyframes and some older ones."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any
 
@@ -22,18 +24,42 @@ from splatbot.optimize.losses import l1, l1_dssim
 from splatbot.rasterize import rasterization
 
 Stop = Callable[[], bool]
-"""Asked before each step whether there are to be no more."""
+"""Called before each iteration; refinement ends once it returns True."""
 
-_GONE = 0.1  # where a keyframe is nearer than the map by more, it shows something that has gone [share of depth]
+
+@dataclass(frozen=True)
+class RefineConstants:
+    """Constants of refinement.
+
+    Args:
+        removed_depth_share: [share of depth] where a keyframe's depth is smaller than the map's by more, it shows an
+            object that was removed since; such pixels carry no loss.
+        covered_alpha: pixels that the map covers less carry no loss.
+        least_depth: [m] smaller measured depths do not increase the weight of the depth loss further.
+        latest_share: share of the random draws that come from the latest ``window`` keyframes.
+    """
+
+    removed_depth_share: float = 0.1
+    covered_alpha: float = 0.5
+    least_depth: float = 0.1
+    latest_share: float = 0.5
+
+
+CONSTANTS = RefineConstants()
 
 
 def never() -> bool:
-    """Nothing ends it early."""
+    """Return False: the default of :data:`Stop`."""
     return False
 
 
 class Refiner:
-    """Owns the optimiser; the mapper tells it when rows come and go."""
+    """Minimizes the photometric and depth loss of the map with Adam; owns the optimizer and the random draws.
+
+    Learning rates are those of ``config``: ``means_lr`` [m], ``quats_lr``, ``scales_lr`` (log-scales),
+    ``opacities_lr`` (logits) and ``sh_lr``. They stay constant, in contrast to the decay of Kerbl et al. 2023,
+    because new Gaussians keep arriving.
+    """
 
     def __init__(self, config: MappingConfig, seed: int) -> None:
         self.config = config
@@ -47,26 +73,28 @@ class Refiner:
             }
         )
         self._random = np.random.default_rng(seed)
-        self._latest = -1  # number of the latest keyframe that a step was spent on as such
+        self._latest_refined = -1
+        """Number of the latest keyframe that has had its first iteration."""
 
     def state(self) -> Any:
-        """All that steps change besides the model, for :meth:`restore`."""
-        return self.adam.state(), self._random.bit_generator.state, self._latest
+        """Return the state besides the model, for :meth:`restore`."""
+        return self.adam.state(), self._random.bit_generator.state, self._latest_refined
 
     def restore(self, state: Any) -> None:
-        """Go back to a :meth:`state`."""
-        adam, self._random.bit_generator.state, self._latest = state
+        """Go back to an earlier :meth:`state`."""
+        adam, self._random.bit_generator.state, self._latest_refined = state
         self.adam.restore(adam)
 
     def refine(self, model: GaussianModel, keyframes: Sequence[Keyframe], iterations: int, stop: Stop = never) -> None:
-        """Spend ``iterations`` steps on the model, in place: on the latest keyframe if it has had none, then at random.
+        """Run iterations on the model, in place: the first on a new keyframe, then on random ones.
 
-        Half of the random draws come from the latest ``config.window`` keyframes, half from all, against forgetting.
+        Half of the random draws come from the latest ``config.window`` keyframes, half from all of them, because the
+        map would forget older views otherwise.
         """
         for _ in takewhile(lambda _: not stop(), range(iterations if len(model) else 0)):
-            fresh = keyframes[-1].number > self._latest
-            self._latest = keyframes[-1].number
-            self.step(model, keyframes[-1] if fresh else self._draw(keyframes))
+            is_new = keyframes[-1].number > self._latest_refined
+            self._latest_refined = keyframes[-1].number
+            self.step(model, keyframes[-1] if is_new else self._draw(keyframes))
 
     def refine_all(
         self,
@@ -76,18 +104,20 @@ class Refiner:
         position_gradients: PositionGradients | None = None,
         stop: Stop = never,
     ) -> None:
-        """Spend ``iterations`` steps on all keyframes alike; ``position_gradients`` gathers how hard they position_gradients at the centres."""
+        """Run iterations on uniformly drawn keyframes, in place.
+
+        Args:
+            position_gradients: If given, it accumulates the gradients of the projected centers.
+        """
         for _ in takewhile(lambda _: not stop(), range(iterations if len(model) else 0)):
             self.step(model, keyframes[int(self._random.integers(len(keyframes)))], position_gradients)
 
-    def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
-        pool = keyframes[-self.config.window :] if self._random.random() < 0.5 else keyframes
-        return pool[int(self._random.integers(len(pool)))]
+    def step(
+        self, model: GaussianModel, keyframe: Keyframe, position_gradients: PositionGradients | None = None
+    ) -> float:
+        """Run one iteration on one keyframe and return the loss before it; an error leaves model and optimizer as is.
 
-    def step(self, model: GaussianModel, keyframe: Keyframe, position_gradients: PositionGradients | None = None) -> float:
-        """One step on one keyframe; returns the loss before it.
-
-        Torch's threads spin after each operation and so starve the rasterizer's; one is several times faster here.
+        PyTorch uses one thread meanwhile: its threads spin after each operation, which starves the rasterizer's.
         """
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
@@ -95,6 +125,11 @@ class Refiner:
             return self._step(model, keyframe, position_gradients)
         finally:
             torch.set_num_threads(threads)
+
+    def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
+        latest = self._random.random() < CONSTANTS.latest_share
+        pool = keyframes[-self.config.window :] if latest else keyframes
+        return pool[int(self._random.integers(len(pool)))]
 
     def _step(self, model: GaussianModel, keyframe: Keyframe, position_gradients: PositionGradients | None) -> float:
         parameters = {name: getattr(model, name).detach().requires_grad_(True) for name in PARAMETERS}
@@ -109,7 +144,7 @@ class Refiner:
             keyframe.camera.width,
             keyframe.camera.height,
             render_mode="RGB+ED",
-            depth_mode="plane",  # what tracking is aligned to
+            depth_mode="plane",  # the depth that tracking aligns to
         )
         rows = meta["visible_ids"][0]
         centers = [] if position_gradients is None else [meta["means2d"]]
@@ -120,29 +155,45 @@ class Refiner:
         visible = torch.zeros(len(model), dtype=torch.bool)
         visible[rows] = True
         means, normals = model.means.index_select(0, rows), shortest_axes(model, rows)
-        self.adam.step(model, dict(zip(PARAMETERS, grads[: len(PARAMETERS)], strict=True)), visible)
-        self._keep_on_surface(model, rows, means, normals)
-        self._keep_flat(model, keyframe, rows)
+        with self._rows_restored_on_error(model, rows):
+            self.adam.step(model, dict(zip(PARAMETERS, grads[: len(PARAMETERS)], strict=True)), visible)
+            self._limit_normal_motion(model, rows, means, normals)
+            self._limit_shape(model, keyframe, rows)
         return float(loss.detach())
 
-    def _keep_on_surface(self, model: GaussianModel, rows: Tensor, means: Tensor, normals: Tensor) -> None:
-        """Take back most of what a step has moved means along their normals.
+    @contextmanager
+    def _rows_restored_on_error(self, model: GaussianModel, rows: Tensor) -> Iterator[None]:
+        """Return a context that undoes writes to these rows of parameters and moments if its block raises."""
+        parameters = [getattr(model, name) for name in PARAMETERS]
+        tensors = [*parameters, *self.adam.first.values(), *self.adam.second.values(), self.adam.steps]
+        before = [tensor.index_select(0, rows) for tensor in tensors]
+        try:
+            yield
+        except BaseException:
+            for tensor, values in zip(tensors, before, strict=True):
+                tensor.index_copy_(0, rows, values)
+            raise
 
-        The depth of all looks has been fused there, by its noise. A step sees one picture, and colour says next to
-        nothing of how far a plain wall is; where along the surface a Gaussian belongs, it does say.
+    def _limit_normal_motion(self, model: GaussianModel, rows: Tensor, means: Tensor, normals: Tensor) -> None:
+        """Scale the part of a step that moves means along their normals by ``normal_step_scale``.
+
+        μ' = μ + Δ - (1 - s) (nᵀ Δ) n. Depth fusion estimates the position along the normal from all depth images and
+        their noise. An iteration uses one image, whose colors hardly constrain the distance of a plain wall. Colors do
+        constrain the position along the surface.
 
         Args:
-            means, normals: (M, 3) [m] of ``rows`` before the step.
+            rows: (M,) Gaussians that the iteration changed.
+            means, normals: (M, 3) before the step, [m] and unit vectors.
         """
         after = model.means.index_select(0, rows)
         along = ((after - means) * normals).sum(1, keepdim=True)
         model.means.index_copy_(0, rows, after.addcmul_(along, normals, value=self.config.normal_step_scale - 1))
 
-    def _keep_flat(self, model: GaussianModel, keyframe: Keyframe, rows: Tensor) -> None:
-        """Gaussians in view stay discs: thin, and no larger than ``config.max_pixels`` of this keyframe.
+    def _limit_shape(self, model: GaussianModel, keyframe: Keyframe, rows: Tensor) -> None:
+        """Keep visible Gaussians thin discs, of no more than ``config.max_pixels`` in this keyframe.
 
-        Pictures do not ask for it: a needle before a plain wall changes no pixel, and a blob shows what its disc does.
-        But both reach into free space, and the normal of a blob is any.
+        The photometric loss does not: a needle in front of a plain wall changes no pixel, and a sphere looks like its
+        disc. But both reach into free space, and a sphere has no normal.
         """
         viewmat = keyframe.viewmat[0].to(torch.float32)
         z = model.means[rows] @ viewmat[2, :3] + viewmat[2, 3]
@@ -152,17 +203,23 @@ class Refiner:
         model.log_scales[rows] = torch.empty_like(sizes).scatter_(1, axes, sizes)
 
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
+        """Compute the loss L = L_color + w_d · mean |(D - D*) / D*| over covered, static pixels.
+
+        L_color is the mean |C - C*|, or with ``dssim_weight`` λ the loss (1 - λ) L1 + λ (1 - SSIM) of Kerbl et al.
+        2023, Eq. 7. D is the rendered and D* the measured depth; w_d is ``depth_weight``.
+        """
         observed = keyframe.rgb.float() / 255.0
-        covered = alpha[..., 0].detach() > 0.5
+        covered = alpha[..., 0].detach() > CONSTANTS.covered_alpha
         if keyframe.static_mask is not None:
             covered &= keyframe.static_mask
-        # What was before the map's surface and is there no more has nothing to say of what is behind.
-        covered &= ~((keyframe.depth > 0) & (render[..., 3].detach() * (1 - _GONE) > keyframe.depth))
+        # An object that was removed since hides the surface behind it, so its pixels carry no information on the map.
+        seen_behind = render[..., 3].detach() * (1 - CONSTANTS.removed_depth_share) > keyframe.depth
+        covered &= ~((keyframe.depth > 0) & seen_behind)
         color = self._color_loss(render[..., :3], observed, covered)
         depth = keyframe.depth[..., None]
-        ranged = (depth > 0) & covered[..., None]
-        relative = l1(render[..., 3:] / depth.clamp_min(0.1), depth / depth.clamp_min(0.1), ranged)
-        return color + self.config.depth_weight * relative
+        measured = (depth > 0) & covered[..., None]
+        scale = depth.clamp_min(CONSTANTS.least_depth)
+        return color + self.config.depth_weight * l1(render[..., 3:] / scale, depth / scale, measured)
 
     def _color_loss(self, rendered: Tensor, observed: Tensor, covered: Tensor) -> Tensor:
         if self.config.dssim_weight > 0:

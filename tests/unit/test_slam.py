@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 
@@ -183,6 +186,14 @@ def test_images_too_small_to_track_well_do_not_raise(size: str, levels: int) -> 
     assert len(slam.results) == 3
     assert slam.results[0].verdict == "ok"
     assert len(slam.snapshot().model) > 10
+
+
+def test_processing_a_frame_reads_like_an_algorithm() -> None:
+    """At most 12 statements: prepare, track, decide on a keyframe, submit or observe, record."""
+    (function,) = ast.parse(textwrap.dedent(inspect.getsource(Slam.process))).body
+    assert isinstance(function, ast.FunctionDef)
+    statements = [node for node in ast.walk(function) if isinstance(node, ast.stmt)]
+    assert len(statements) - 2 <= 12  # without the definition itself and its docstring
 
 
 def test_nothing_processed_has_an_empty_map() -> None:

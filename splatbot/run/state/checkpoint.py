@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+import warnings
 import zlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,17 @@ from numpy.typing import NDArray
 
 from splatbot import __version__
 from splatbot.config import Config, config_from_yaml
-from splatbot.errors import ConfigError, FormatError, LogError
+from splatbot.errors import ConfigError, DeprecatedNameWarning, FormatError, LogError
 from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.run.state.container import read_container, write_container
 from splatbot.run.state.journal import Entry, Journal, read_entry
+from splatbot.run.state.schema import FORMAT_VERSION, upgrade_version_1
 from splatbot.run.state.tree import Decoder, Encoder
 from splatbot.slam import Slam
 
 FOLDER, FILE = "state", "run.state"
-_HINT = "restore the folder from a copy, or map the log again"
+_DEPRECATED = "the run was saved by splatbot 0.1; resume it once with --save-every to write the current format"
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ class Checkpoint:
         encoder = Encoder(config, keep)
         header = {
             "tree": encoder.encode({"slam": slam, "loop": dict(loop)}),
+            "format": FORMAT_VERSION,
             "splatbot": __version__,
             "config": config.to_yaml(),
             "log": {f.name: getattr(place, f.name) for f in fields(place)},
@@ -163,18 +166,15 @@ class SavedRun:
         path = folder / FOLDER / FILE
         header, arrays = read_container(path)
         try:
-            config = config_from_yaml(header["config"])
+            config = _config(header)
             place = LogPlace(**header["log"])
             kept = partial(read_entry, path.parent / header["images"])
-            values = Decoder(config, arrays, kept).decode(header["tree"])
-            slam, loop = values["slam"], values["loop"]
+            slam, loop = _decode(header, config, arrays, kept)
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, ConfigError) as error:
             why = f"does not fit this version of splatbot ({error})."
             by = header.get("splatbot", "another version")
             hint = f"open it with splatbot {by}, or map the log again"
             raise FormatError(why, file=path, hint=hint) from error
-        for missing in _differences(Slam(config), slam):
-            raise FormatError(f"has no {missing}: it is of another version.", file=path, hint=_HINT)
         return cls(folder, config, place, slam, loop)
 
 
@@ -192,14 +192,24 @@ def _lasting_arrays(slam: Slam) -> Iterator[object]:
             yield from vars(level).values()
 
 
-def _differences(fresh: object, saved: object, path: str = "slam") -> Iterator[str]:
-    """Attributes of a fresh object, and of the plain objects in it, that a saved one lacks."""
-    if not type(fresh).__module__.startswith("splatbot.") or not hasattr(fresh, "__dict__"):
-        return
-    if is_dataclass(fresh) or type(fresh).__module__.startswith("splatbot.config"):
-        return
-    for name, value in vars(fresh).items():
-        if not hasattr(saved, name):
-            yield f"{path}.{name}"
-        else:
-            yield from _differences(value, getattr(saved, name), f"{path}.{name}")
+def _config(header: Mapping[str, Any]) -> Config:
+    """Return the configuration of a state; version 1 names its keys differently, which :func:`_decode` reports once."""
+    with warnings.catch_warnings():
+        if "format" not in header:
+            warnings.simplefilter("ignore", DeprecatedNameWarning)
+        return config_from_yaml(header["config"])
+
+
+def _decode(
+    header: Mapping[str, Any], config: Config, arrays: list[NDArray[Any]], kept: Callable[[Entry], NDArray[Any]]
+) -> tuple[Slam, dict[str, Any]]:
+    """Decode the objects of a state; version 1 has no version number in its header."""
+    version = header.get("format", 1)
+    if version not in (1, FORMAT_VERSION):
+        raise ValueError(f"it has version {version} of the format, this splatbot reads 1 to {FORMAT_VERSION}")
+    decoder = Decoder(config, arrays, kept, version)
+    values = decoder.decode(header["tree"])
+    if version == 1:
+        warnings.warn(_DEPRECATED, DeprecatedNameWarning, stacklevel=3)
+        upgrade_version_1(values["slam"], decoder.unused)
+    return values["slam"], values["loop"]

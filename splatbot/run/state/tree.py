@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -16,31 +14,24 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from splatbot.config import Config
+from splatbot.run.state.schema import FORMAT_VERSION, TYPES, type_names, version_1_field, version_1_type
 
 Array = NDArray[Any]
 Tree = Any
 
-# Only classes of these modules are made when a state is read, and none of their code runs but __setstate__.
-_MODULES = (
-    "splatbot.camera",
-    "splatbot.frame",
-    "splatbot.gaussians.",
-    "splatbot.mapping.",
-    "splatbot.optimize.",
-    "splatbot.slam",
-    "splatbot.tracking.",
-)
+_SEQUENCES: dict[str, type] = {"list": list, "tuple": tuple, "set": set, "deque": deque}
 
 
 class Encoder:
-    """Turns objects into trees; ``arrays`` collects what the trees refer to by number.
+    """Turns objects into trees; the trees refer to ``arrays`` by index.
 
-    An object or array that is met twice is written once. Sections of the configuration are named, not written.
+    An object or array that occurs twice is written once. Sections of the configuration are written by name only.
+    Objects have the type and field names of :mod:`splatbot.run.state.schema`.
 
     Args:
-        config: whose sections are named.
-        keep: takes an array that never changes in place and the object that owns it, and returns a tree for it, or None
-            to have it collected like the others.
+        config: configuration whose sections are written by name.
+        keep: takes the owner of an array and the array, and returns a tree if it stores the array itself. If it returns
+            None, the array is appended to ``arrays``.
     """
 
     def __init__(self, config: Config, keep: Callable[[object, Array], Tree | None]) -> None:
@@ -51,10 +42,10 @@ class Encoder:
         self._known: dict[int, tuple[int, object]] = {}
 
     def encode(self, value: object) -> Tree:
-        """The tree of a value.
+        """Return the tree of a value.
 
         Raises:
-            TypeError: it holds something that cannot be saved.
+            TypeError: The value holds an object, or an object has an attribute, that the schema does not list.
         """
         if value is None or isinstance(value, bool | int | str):
             return value
@@ -66,7 +57,7 @@ class Encoder:
             return self._section(value)
         if id(value) in self._known:
             return {"$": "again", "is": self._known[id(value)][0]}
-        self._known[id(value)] = (len(self._known), value)  # holding it keeps its id its own
+        self._known[id(value)] = (len(self._known), value)  # the reference keeps the id from being reused
         return self._container(value)
 
     def _container(self, value: Any) -> Tree:
@@ -94,12 +85,15 @@ class Encoder:
 
     def _object(self, value: object) -> Tree:
         kind = type(value)
-        name = f"{kind.__module__}:{kind.__qualname__}"
-        if not kind.__module__.startswith(_MODULES):
-            raise TypeError(f"{name} cannot be saved; give its owner a __getstate__ that leaves it out")
-        own = kind.__dict__.get("__getstate__")
-        state = own(value) if own is not None else vars(value)
-        return {"$": "object", "class": name, "is": {key: self.encode(item) for key, item in state.items()}}
+        name = type_names().get(kind)
+        if name is None:
+            raise TypeError(f"{kind.__module__}:{kind.__qualname__} is not in splatbot/run/state/schema.py")
+        saved, attributes = TYPES[name], vars(value)
+        unlisted = attributes.keys() - set(saved.fields.values()) - saved.transient
+        if unlisted:
+            raise TypeError(f"splatbot/run/state/schema.py lists no field for {kind.__qualname__}.{min(unlisted)}")
+        fields = {field: self.encode(attributes[attribute]) for field, attribute in saved.fields.items()}
+        return {"$": "object", "type": name, "is": fields}
 
     def _section(self, value: BaseModel) -> Tree:
         if value is self._config or value == self._config:
@@ -107,29 +101,35 @@ class Encoder:
         for name, section in self._sections:
             if value is section or value == section:
                 return {"$": "config", "is": name}
-        raise TypeError(f"{type(value).__name__} is no part of the configuration in force")
+        raise TypeError(f"{type(value).__name__} is not a section of this run's configuration")
 
 
 class Decoder:
     """Turns trees of :class:`Encoder` back into objects.
 
     Args:
-        config: what sections are taken from.
-        arrays: by number.
-        kept: gives the arrays that the encoder's ``keep`` took care of.
+        config: configuration that holds the sections.
+        arrays: by index.
+        kept: returns the array for a tree that the encoder's ``keep`` returned.
+        version: format version of the tree.
     """
 
-    def __init__(self, config: Config, arrays: Sequence[Array], kept: Callable[[Tree], Array]) -> None:
+    def __init__(
+        self, config: Config, arrays: Sequence[Array], kept: Callable[[Tree], Array], version: int = FORMAT_VERSION
+    ) -> None:
+        self.unused: dict[str, dict[str, Any]] = {}
+        """Fields of version 1 that this version does not have, by type."""
         self._config = config
         self._arrays = arrays
         self._kept = kept
+        self._version = version
         self._known: list[Any] = []
 
     def decode(self, tree: Tree) -> Any:
-        """The value of a tree.
+        """Return the value of a tree.
 
         Raises:
-            ValueError: the tree is none of an encoder's, or names a class or a field that there is not.
+            ValueError: An encoder did not write the tree, or a type or field is unknown or missing.
         """
         if not isinstance(tree, dict):
             return tree
@@ -142,13 +142,13 @@ class Decoder:
             return getattr(self._config, inner) if inner else self._config
         if kind == "again":
             return self._known[inner]
-        place = len(self._known)
+        index = len(self._known)
         self._known.append(None)
-        return self._make(tree, kind, inner, place)
+        return self._make(tree, kind, inner, index)
 
-    def _make(self, tree: Tree, kind: str, inner: Any, place: int) -> Any:
+    def _make(self, tree: Tree, kind: str, inner: Any, index: int) -> Any:
         if kind == "object":
-            return self._object(tree["class"], inner, place)
+            return self._object_of_version_1(tree, index) if self._version == 1 else self._object(tree, index)
         if kind in ("array", "tensor"):
             array = self._arrays[inner] if isinstance(inner, int) else self._kept(inner)
             value: Any = torch.from_numpy(array) if kind == "tensor" else array
@@ -163,35 +163,40 @@ class Decoder:
             value.bit_generator.state = self.decode(inner)
         else:
             raise ValueError(f"unknown kind {kind!r}")
-        self._known[place] = value
+        self._known[index] = value
         return value
 
-    def _object(self, name: str, inner: dict[str, Tree], place: int) -> Any:
-        kind = _class_of(name)
-        value: Any = object.__new__(kind)
-        self._known[place] = value
-        state = {key: self.decode(item) for key, item in inner.items()}
-        if "__setstate__" in kind.__dict__:
-            value.__setstate__(state)
-            return value
-        if is_dataclass(kind) and {f.name for f in fields(kind)} - set(state):
-            raise ValueError(f"{name} has other fields than those saved")
-        for key, item in state.items():
-            object.__setattr__(value, key, item)  # frozen dataclasses included
+    def _object(self, tree: Tree, index: int) -> Any:
+        name, inner = tree["type"], tree["is"]
+        if name not in TYPES:
+            raise ValueError(f"{name} is not a type of a saved run")
+        different = inner.keys() ^ TYPES[name].fields.keys()
+        if different:
+            raise ValueError(f"{name} has other fields: {', '.join(sorted(different))}")
+        value = self._known[index] = self._blank(name)
+        self._set(value, name, {field: self.decode(item) for field, item in inner.items()})
         return value
 
+    def _object_of_version_1(self, tree: Tree, index: int) -> Any:
+        name = version_1_type(tree["class"])
+        value = self._known[index] = self._blank(name) if name in TYPES else None
+        fields = {version_1_field(name, attribute): self.decode(item) for attribute, item in tree["is"].items()}
+        if name == "mapping_worker":
+            value = self._known[index] = fields.pop("mapper")
+        known = TYPES[name].fields if name in TYPES else {}
+        self.unused.setdefault(name, {}).update({f: fields.pop(f) for f in [*fields] if f not in known})
+        missing = known.keys() - fields.keys()
+        if missing and TYPES[name].create is None:
+            raise ValueError(f"{name} has no {min(missing)}")
+        if known:
+            self._set(value, name, fields)
+        return value
 
-_SEQUENCES: dict[str, type] = {"list": list, "tuple": tuple, "set": set, "deque": deque}
+    def _blank(self, name: str) -> Any:
+        saved = TYPES[name]
+        return object.__new__(saved.cls) if saved.create is None else saved.create(self._config)
 
-
-def _class_of(name: str) -> type:
-    module, _, qualname = name.partition(":")
-    if not module.startswith(_MODULES) or "." in qualname:
-        raise ValueError(f"{name} is no class that a state may hold")
-    try:
-        kind = getattr(importlib.import_module(module), qualname)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"there is no {name}") from error
-    if not isinstance(kind, type) or kind.__module__ != module:
-        raise ValueError(f"{name} is no class of its module")
-    return kind
+    @staticmethod
+    def _set(value: Any, name: str, fields: Mapping[str, Any]) -> None:
+        for field, item in fields.items():
+            object.__setattr__(value, TYPES[name].fields[field], item)  # frozen dataclasses included

@@ -11,8 +11,12 @@ from numpy.typing import ArrayLike
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
+from splatbot.mapping.executor import InlineExecutor
 from splatbot.mapping.keyframes import Keyframe
+from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.observation import Observation
 from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import prepare
 from splatbot.tracking.reference import Reference
 from tests.rgbd import CAMERA, Array, wall_frame
 
@@ -20,7 +24,7 @@ MakeKeyframe = Callable[..., Keyframe]
 
 
 def keyframe_of(frame: Frame, T_world_camera: Array, number: int = 0) -> Keyframe:
-    """A keyframe of a frame as it is, without what tracking needs of it."""
+    """Make a keyframe of a frame as it is, without features and reference pixels."""
     return Keyframe(
         number=number,
         camera=frame.camera,
@@ -32,9 +36,29 @@ def keyframe_of(frame: Frame, T_world_camera: Array, number: int = 0) -> Keyfram
     )
 
 
+def insert(mapper: Mapper, frame: Frame, T_world_camera: Array | None = None) -> None:
+    """Insert a frame as a keyframe, in the calling thread, and refine."""
+    T = np.eye(4) if T_world_camera is None else T_world_camera
+    mapper.submit(Observation(prepare(frame, mapper.config.tracking), T))
+    InlineExecutor(mapper).run()
+
+
+def observe(mapper: Mapper, frame: Frame, T_world_camera: Array | None = None) -> None:
+    """Compare the map with a frame that is no keyframe, in the calling thread."""
+    T = np.eye(4) if T_world_camera is None else T_world_camera
+    mapper.observe(Observation(prepare(frame, mapper.config.tracking), T))
+    InlineExecutor(mapper).run()
+
+
+def should_insert(mapper: Mapper, frame: Frame, T_world_camera: Array | None = None) -> bool:
+    """Return whether a frame qualifies as a keyframe."""
+    T = np.eye(4) if T_world_camera is None else T_world_camera
+    return mapper.should_insert(Observation(prepare(frame, mapper.config.tracking), T))
+
+
 @pytest.fixture
 def make_keyframe() -> MakeKeyframe:
-    """Builds a keyframe that looks at the textured wall ``normal · x = distance``."""
+    """Return a function that makes a keyframe of the textured wall ``normal · x = distance``."""
 
     def make(
         T_world_camera: Array | None = None,

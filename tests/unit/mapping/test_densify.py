@@ -49,17 +49,17 @@ def test_two_halves_have_the_mean_and_covariance_of_the_whole_and_all_else_of_it
         torch.testing.assert_close(getattr(found, name)[[0, 2, 3]], getattr(model, name)[[0, 2, 3]], rtol=0, atol=0)
 
 
-def test_the_hardest_pulled_beyond_the_limit_are_chosen_as_far_as_there_is_room_whatever_a_pictures_size() -> None:
-    pull = PositionGradients(5)
-    assert len(pull.strongest(0.0, 9)) == 0
+def test_the_largest_gradients_beyond_the_limit_are_chosen_up_to_the_cap_for_any_image_size() -> None:
+    gradients = PositionGradients(5)
+    assert len(gradients.largest(0.0, 9)) == 0
     for width in (100, 400):
-        gradients = torch.tensor([[3.0, 4.0], [0.0, 2.0], [6.0, 8.0], [float("nan"), 1.0]]) / width
-        pull.add(torch.tensor([0, 1, 3, 4]), gradients, width)
-    pull.add(torch.tensor([0]), torch.zeros(1, 2), 100)  # looked at once more, the mean is less: 5/3
-    assert pull.strongest(0.9, 9).tolist() == [0, 1, 3]
-    assert pull.strongest(0.9, 2).tolist() == [0, 3]
-    assert pull.strongest(0.9, -1).tolist() == []
-    assert pull.strongest(1.2, 9).tolist() == [0, 3]
+        image_gradients = torch.tensor([[3.0, 4.0], [0.0, 2.0], [6.0, 8.0], [float("nan"), 1.0]]) / width
+        gradients.add(torch.tensor([0, 1, 3, 4]), image_gradients, width)
+    gradients.add(torch.tensor([0]), torch.zeros(1, 2), 100)  # one more observation lowers the mean to 5/3
+    assert gradients.largest(0.9, 9).tolist() == [0, 1, 3]
+    assert gradients.largest(0.9, 2).tolist() == [0, 3]
+    assert gradients.largest(0.9, -1).tolist() == []
+    assert gradients.largest(1.2, 9).tolist() == [0, 3]
 
 
 @pytest.mark.parametrize("cap", [150_000, 5_000])

@@ -14,12 +14,12 @@ from splatbot.geometry import inverse, quat_multiply, se3_exp, transform_points
 from splatbot.mapping.depth_fusion import (
     DepthComparison,
     DepthNoiseModel,
-    count,
-    first_uncertainty,
+    compare_with_depth,
     fuse_depth,
     fuse_normals,
+    initial_uncertainty,
     stable,
-    weigh,
+    update_visibility,
 )
 from splatbot.mapping.keyframes import Keyframe
 from tests.rgbd import CAMERA, Array
@@ -46,7 +46,7 @@ def flat(means: Array, normal_axis: int = 2, sigma: float = 0.0) -> GaussianMode
 
 
 def weighed(model: GaussianModel, keyframe: Keyframe) -> DepthComparison:
-    return weigh(model, keyframe.depth, keyframe.camera, keyframe.T_world_camera, NOISE)
+    return compare_with_depth(model, keyframe.depth, keyframe.camera, keyframe.T_world_camera, NOISE)
 
 
 def brute_force(model: GaussianModel, keyframe: Keyframe) -> tuple[list[bool], list[bool]]:
@@ -140,8 +140,8 @@ def test_many_looks_average_their_noise_and_never_claim_certainty(make_keyframe:
     model = flat(np.column_stack([grid, 1 + rng.normal(0, 3e-3, len(grid))]), sigma=3e-3)
     for _ in range(30):
         noisy = exact + torch.from_numpy(rng.normal(0, 3e-3, exact.shape).astype(np.float32))
-        evidence = weigh(model, noisy, CAMERA, np.eye(4), NOISE)
-        model = count(fuse_depth(model, evidence), evidence)
+        evidence = compare_with_depth(model, noisy, CAMERA, np.eye(4), NOISE)
+        model = update_visibility(fuse_depth(model, evidence), evidence)
     assert float((model.means[:, 2] - 1).std()) < 1e-3
     assert abs(float((model.means[:, 2] - 1).mean())) < 2e-4
     assert 0.25 * 3e-3 < float(model.uncertainty.min()) <= float(model.uncertainty.max()) < 1.2e-3
@@ -165,8 +165,8 @@ def test_looks_turn_discs_into_the_surface_and_average_their_noise(make_keyframe
     assert 10 < np.median(tilts(model, normal)) < tilts(model, normal).max() < 45
     for _ in range(12):
         noisy = keyframe.depth + torch.from_numpy(rng.normal(0, 4e-3, (120, 160)).astype(np.float32))
-        evidence = weigh(model, noisy, CAMERA, POSE, NOISE)
-        model = count(fuse_normals(fuse_depth(model, evidence), evidence), evidence)
+        evidence = compare_with_depth(model, noisy, CAMERA, POSE, NOISE)
+        model = update_visibility(fuse_normals(fuse_depth(model, evidence), evidence), evidence)
     assert np.percentile(tilts(model, normal), 95) < 4
 
 
@@ -188,7 +188,9 @@ def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> N
     nothing = (torch.zeros(3), torch.full((3,), torch.inf), torch.zeros(3, 3), torch.zeros(3, 3))
     looks = [([0, 0, 1], [1, 1, 0])] * 2 + [([0, 1, 1], [1, 0, 0])]
     for supported, through in looks:
-        model = count(model, DepthComparison(torch.tensor(supported) > 0, torch.tensor(through) > 0, *nothing))
+        model = update_visibility(
+            model, DepthComparison(torch.tensor(supported) > 0, torch.tensor(through) > 0, *nothing)
+        )
     assert model.misses.tolist() == [3, 1, 0]
     assert model.opacities[0] < 1e-3
     assert model.opacities[1] > 0.3
@@ -208,7 +210,8 @@ def test_what_is_hardly_known_goes_a_look_earlier_than_what_is_stable() -> None:
         torch.zeros(3, 3),
         torch.zeros(3, 3),
     )
-    once, twice = count(model, away), count(count(model, away), away)
+    once = update_visibility(model, away)
+    twice = update_visibility(once, away)
     assert (once.opacities > 0.5).all()
     assert (twice.opacities > 0.1).tolist() == [True, False, False]
 
@@ -216,4 +219,4 @@ def test_what_is_hardly_known_goes_a_look_earlier_than_what_is_stable() -> None:
 def test_a_new_gaussian_is_as_uncertain_as_the_sensor_and_a_guess_far_more() -> None:
     model = flat(np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0]]))
     model.observations[1] = 0
-    assert first_uncertainty(model, np.eye(4), NOISE).tolist() == pytest.approx([9e-3, 0.1])
+    assert initial_uncertainty(model, np.eye(4), NOISE).tolist() == pytest.approx([9e-3, 0.1])

@@ -15,8 +15,9 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_multiply, quat_to_rotation, se3_exp
 from splatbot.logs import open_log
 from splatbot.mapping.loop import move_gaussians
-from splatbot.mapping.mapper import Mapper, Observation
-from splatbot.mapping.posegraph import Edge, PoseGraph, largest
+from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.observation import GraphLocation, Observation
+from splatbot.mapping.posegraph import Edge, PoseGraph, max_residual, within_hops
 from splatbot.slam import Slam
 from splatbot.tracking.features import detect
 from splatbot.tracking.prepare import prepare
@@ -44,11 +45,11 @@ def test_a_loop_takes_the_drift_out_of_its_end_and_spreads_it_over_the_chain() -
     graph, truth = circle(24, 4e-3)
     before = pose_distance(graph.poses[23], truth[23])[0]
     graph.edges.append(Edge(0, 23, inverse(truth[0]) @ truth[23], TIGHT, loop=True))
-    poses = graph.optimised()
+    poses = graph.optimize()
     assert np.allclose(poses[0], graph.poses[0], atol=1e-12)
     assert before > 0.03
     assert pose_distance(poses[23], truth[23])[0] < 0.2 * before
-    assert largest(edge.residual(poses) for edge in graph.edges)[0] < 0.2 * before
+    assert max_residual(edge.residual(poses) for edge in graph.edges)[0] < 0.2 * before
     for T in poses.values():
         assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
 
@@ -56,7 +57,7 @@ def test_a_loop_takes_the_drift_out_of_its_end_and_spreads_it_over_the_chain() -
 def test_a_graph_without_contradiction_stays_as_it_is() -> None:
     graph, truth = circle(12, 0.0)
     graph.edges.append(Edge(0, 11, inverse(truth[0]) @ truth[11], TIGHT, loop=True))
-    poses = graph.optimised()
+    poses = graph.optimize()
     assert max(np.abs(poses[k] - truth[k]).max() for k in truth) < 1e-9
 
 
@@ -66,23 +67,23 @@ def test_a_wrong_loop_among_right_ones_counts_for_little() -> None:
         Edge(a, b, inverse(truth[a]) @ truth[b], TIGHT, loop=True) for a, b in ((0, 23), (1, 22), (0, 22), (1, 23))
     ]
     graph.edges += right
-    alone = graph.optimised()
+    alone = graph.optimize()
     graph.edges.append(Edge(5, 17, se3_exp([0.5, 0.0, 0.0, 0.0, 0.3, 0.0]), TIGHT, loop=True))
-    both = graph.optimised()
+    both = graph.optimize()
     assert max(pose_distance(alone[k], both[k])[0] for k in truth) < 0.02
 
 
 def test_ways_and_neighbours_follow_the_edges() -> None:
     graph, _ = circle(24, 0.0)
-    assert graph.near(5, 2) == {3, 4, 5, 6, 7}
-    moved, turned = graph.path(2, 12)
+    assert within_hops(graph.adjacency(), 5, 2) == {3, 4, 5, 6, 7}
+    moved, turned = graph.path_length(2, 12)
     assert turned == pytest.approx(10 * 2 * np.pi / 24)
     assert moved == pytest.approx(3.0, rel=0.05)
     graph.edges.append(Edge(2, 12, np.eye(4), TIGHT, loop=True))
-    assert graph.path(2, 12) == (moved, turned)  # a loop is no way that drift has come
-    assert 12 in graph.near(2, 1)
-    assert graph.path(2, 99) == (np.inf, np.inf)
-    assert largest([]) == (0.0, 0.0)
+    assert graph.path_length(2, 12) == (moved, turned)  # a loop is no way that drift has come
+    assert 12 in within_hops(graph.adjacency(), 2, 1)
+    assert graph.path_length(2, 99) == (np.inf, np.inf)
+    assert max_residual([]) == (0.0, 0.0)
 
 
 def test_gaussians_move_rigidly_with_their_keyframe(rng: np.random.Generator) -> None:
@@ -216,8 +217,10 @@ def test_keyframes_that_each_follow_the_last_but_one_are_no_loop() -> None:
         prepared = prepare(frame, config.tracking)
         T = T @ se3_exp([3e-3 * (number % 2), 0, 0, 0, 0, 0])
         features = detect(frame.rgb, prepared.depth, frame.camera, config.tracking.n_features)
-        observation = Observation(prepared, T, lambda features=features: features, max(number - 2, 0))  # type: ignore[misc]
-        mapper.look_for_loops(observation, mapper.add_keyframe(observation, provisional=True))
+        mapper.submit(Observation(prepared, T, lambda features=features: features, GraphLocation(max(number - 2, 0))))  # type: ignore[misc]
+        mapper.add_keyframe()
+        observation, keyframe = mapper._added.pop()
+        mapper.loops.add(keyframe, observation, mapper.keyframes)
     assert mapper.loop_counts == {"closed": 0, "rejected": 0}
     ties = [edge for edge in mapper.loops.graph.edges if edge.second - edge.first == 1]
     assert len(ties) > 20

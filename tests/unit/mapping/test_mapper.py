@@ -13,23 +13,15 @@ import torch
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, se3_exp, transform_points
+from splatbot.mapping.executor import InlineExecutor
 from splatbot.mapping.insertion import view_of
 from splatbot.mapping.mapper import Mapper
-from splatbot.tracking.features import Features
-from splatbot.tracking.prepare import PreparedFrame, prepare
-from tests.rgbd import CAMERA, Array, small_config, tabletop, wall_frame
+from splatbot.mapping.observation import GraphLocation, Observation
+from splatbot.tracking.prepare import prepare
+from tests.rgbd import CAMERA, small_config, tabletop, wall_frame
+from tests.unit.mapping.conftest import insert, observe, should_insert
 
-NO_FEATURES = Features.none
 SIDE = se3_exp([0.1, 0, 0, 0, 0, 0])
-
-
-def insert(mapper: Mapper, frame: Frame, T_world_camera: Array | None = None) -> None:
-    T = np.eye(4) if T_world_camera is None else T_world_camera
-    mapper.insert(prepare(frame, mapper.config.tracking), T, NO_FEATURES)
-
-
-def prepared(frame: Frame) -> PreparedFrame:
-    return prepare(frame, small_config().tracking)
 
 
 def equal(a: GaussianModel, b: GaussianModel) -> bool:
@@ -57,7 +49,7 @@ def test_nothing_mapped_is_an_empty_snapshot_and_finishing_it_does_not_raise() -
     assert len(mapper.snapshot().model) == 0
 
 
-def test_every_insertion_and_the_finish_are_a_new_version_with_the_stamp_of_the_last_frame() -> None:
+def test_every_insertion_its_refinement_and_the_finish_are_a_new_version_with_the_stamp_of_the_last_frame() -> None:
     mapper = Mapper(small_config())
     versions = []
     for stamp, T in ((1.0, np.eye(4)), (2.5, SIDE)):
@@ -65,7 +57,7 @@ def test_every_insertion_and_the_finish_are_a_new_version_with_the_stamp_of_the_
         versions.append(mapper.snapshot().map_version)
         assert mapper.snapshot().stamp == stamp
     mapper.finish()
-    assert [*versions, mapper.snapshot().map_version] == [1, 2, 3]
+    assert [*versions, mapper.snapshot().map_version] == [2, 4, 5]
     assert mapper.snapshot().stamp == 2.5
 
 
@@ -186,7 +178,9 @@ def test_gaussians_that_went_bad_are_pruned_before_anyone_renders_them(monkeypat
 
 def test_the_optimiser_keeps_the_rows_that_the_model_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper = Mapper(small_config(mapping__max_gaussians=1500))
-    monkeypatch.setattr("splatbot.mapping.mapper.merge_alike", lambda model, excess: (model, torch.arange(len(model))))
+    monkeypatch.setattr(
+        "splatbot.mapping.mapper.merge_similar", lambda model, excess: (model, torch.arange(len(model)))
+    )
     prune, pruned = mapper._prune, []
 
     def tagged() -> None:
@@ -222,15 +216,15 @@ def test_the_reference_of_a_keyframe_lies_on_the_map() -> None:
         assert np.abs(world @ [0.2, 0.1, 0.97] - 1.1).max() < 5e-3
 
 
-def test_only_a_new_view_with_enough_depth_is_wanted() -> None:
+def test_only_a_new_view_with_enough_depth_becomes_a_keyframe() -> None:
     mapper = Mapper(small_config())
     frame = wall_frame(np.eye(4))
     blind = replace(frame, depth=np.zeros_like(frame.depth))
-    assert mapper.wants(prepared(frame), np.eye(4))
-    assert not mapper.wants(prepared(blind), np.eye(4))
+    assert should_insert(mapper, frame)
+    assert not should_insert(mapper, blind)
     insert(mapper, frame)
-    assert not mapper.wants(prepared(frame), np.eye(4))
-    assert mapper.wants(prepared(frame), SIDE)
+    assert not should_insert(mapper, frame)
+    assert should_insert(mapper, frame, SIDE)
 
 
 def test_the_map_of_the_tabletop_shows_views_it_was_not_made_of() -> None:
@@ -246,7 +240,7 @@ def test_the_map_of_the_tabletop_shows_views_it_was_not_made_of() -> None:
     assert float(depth_error.median()) < 4e-3
 
 
-@pytest.mark.parametrize("broken", ["_add", "refine", "make_reference"])
+@pytest.mark.parametrize("broken", ["_add_gaussians", "refine", "make_reference", "add_keyframe", "insert_keyframe"])
 def test_an_exception_in_an_insertion_leaves_the_map_and_what_follows_as_if_it_had_not_been_tried(
     broken: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,3 +266,80 @@ def test_an_exception_in_an_insertion_leaves_the_map_and_what_follows_as_if_it_h
     for m in (mapper, other):
         insert(m, wall_frame(SIDE), SIDE)
     assert equal(mapper.model, other.model)  # the optimiser and the draws are back, too
+
+
+def test_whether_a_frame_becomes_a_keyframe_changes_no_state() -> None:
+    mapper = Mapper(small_config())
+    insert(mapper, wall_frame(np.eye(4)))
+    before = {name: (id(value), repr(value)) for name, value in vars(mapper).items()}
+    loops = {name: (id(value), repr(value)) for name, value in vars(mapper.loops).items()}
+    assert should_insert(mapper, wall_frame(SIDE), SIDE)
+    mapper.locate(SIDE, GraphLocation(0))
+    assert {name: (id(value), repr(value)) for name, value in vars(mapper).items()} == before
+    assert {name: (id(value), repr(value)) for name, value in vars(mapper.loops).items()} == loops
+
+
+def test_frames_that_are_lost_or_held_out_and_a_frozen_map_change_nothing() -> None:
+    mapper = Mapper(small_config())
+    insert(mapper, wall_frame(np.eye(4)))
+    seen = Observation(prepare(wall_frame(SIDE), mapper.config.tracking), SIDE)
+    assert mapper.should_insert(seen)
+    for unusable in (replace(seen, verdict="lost"), replace(seen, held_out=True)):
+        assert not mapper.should_insert(unusable)
+        mapper.observe(unusable)
+        assert not mapper.has_work
+    mapper.pending_iterations = 5
+    mapper.freeze()
+    assert not mapper.should_insert(seen)
+    mapper.observe(seen)
+    assert not mapper.has_work
+    assert not mapper.step()
+
+
+def test_frames_are_observed_at_intervals_and_only_the_latest() -> None:
+    mapper = Mapper(small_config(mapping__observe_interval_s=0.2))
+    insert(mapper, wall_frame(np.eye(4)))
+    for stamp in (1.0, 1.1, 1.3):
+        frame = prepare(wall_frame(np.eye(4), stamp=stamp), mapper.config.tracking)
+        mapper.observe(Observation(frame, np.eye(4)))
+    assert mapper._latest is not None
+    assert mapper._latest.stamp == 1.3
+    observations = mapper.model.observations.clone()
+    InlineExecutor(mapper).run()
+    assert int((mapper.model.observations - observations).max()) == 1
+
+
+def test_an_error_within_a_refinement_iteration_leaves_the_map_and_the_optimizer_as_they_were(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mapper = Mapper(small_config())
+    insert(mapper, wall_frame(np.eye(4)))
+    model, adam = mapper.model.clone(), mapper._refiner.adam
+    moments = {name: tensor.clone() for name, tensor in adam.first.items()}
+
+    def broken(*_: object) -> None:
+        raise MemoryError("on purpose")
+
+    monkeypatch.setattr(mapper._refiner, "_limit_shape", broken)
+    mapper.pending_iterations = 3
+    with pytest.raises(MemoryError):
+        mapper.step()
+    assert equal(mapper.model, model)
+    assert all(torch.equal(adam.first[name], moments[name]) for name in moments)
+    assert mapper.pending_iterations == 3
+
+
+def test_an_observation_that_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = Mapper(small_config())
+    insert(mapper, wall_frame(np.eye(4)))
+    before = mapper.snapshot()
+
+    def broken() -> None:
+        raise MemoryError("on purpose")
+
+    monkeypatch.setattr(mapper, "_prune", broken)
+    with pytest.raises(MemoryError):
+        observe(mapper, wall_frame(np.eye(4)))
+    assert equal(mapper.model, before.model)
+    assert mapper.version == before.map_version
+    assert not mapper.has_observations

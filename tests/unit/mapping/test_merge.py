@@ -8,8 +8,8 @@ import torch
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import covariances
 from splatbot.mapping.insertion import new_gaussians, view_of
-from splatbot.mapping.merge import merge_alike
-from splatbot.mapping.prune import fittest
+from splatbot.mapping.merge import merge_similar
+from splatbot.mapping.prune import best_supported
 from tests.rgbd import CAMERA, small_config
 from tests.unit.mapping.conftest import MakeKeyframe
 
@@ -30,7 +30,7 @@ def pair(**changes: torch.Tensor) -> GaussianModel:
 
 def test_a_merged_pair_has_the_mean_and_covariance_of_the_mixture() -> None:
     model = pair()
-    merged, rows = merge_alike(model, 1)
+    merged, rows = merge_similar(model, 1)
     assert rows.tolist() == [0]
     scales = model.scales.double().numpy()
     weights = model.opacities.double().numpy() * scales[:, 0] * scales[:, 1]
@@ -51,15 +51,15 @@ def test_what_differs_in_colour_orientation_size_or_evidence_is_not_merged() -> 
         {"means": torch.tensor([0.0, 0.0, 1.005])},
         {"observations": torch.tensor(0)},
     ):
-        assert len(merge_alike(pair(**changes), 1)[0]) == 2, changes
+        assert len(merge_similar(pair(**changes), 1)[0]) == 2, changes
 
 
 def test_no_more_are_merged_than_asked_for_and_none_of_an_empty_map(make_keyframe: MakeKeyframe) -> None:
     keyframe = make_keyframe()
     model = new_gaussians(keyframe, keyframe.depth > 0, small_config().mapping)
-    merged, rows = merge_alike(model, 100)
+    merged, rows = merge_similar(model, 100)
     assert len(merged) == len(rows) == len(model) - 100
-    assert len(merge_alike(GaussianModel.empty(), 5)[0]) == 0
+    assert len(merge_similar(GaussianModel.empty(), 5)[0]) == 0
 
 
 def test_merging_a_third_of_a_wall_changes_its_view_less_than_dropping_it(make_keyframe: MakeKeyframe) -> None:
@@ -71,6 +71,6 @@ def test_merging_a_third_of_a_wall_changes_its_view_less_than_dropping_it(make_k
     def change(smaller: GaussianModel) -> float:
         return float((view_of(smaller, CAMERA, np.eye(4)).rgb - before.rgb).abs().mean())
 
-    merged, _ = merge_alike(model, excess)
+    merged, _ = merge_similar(model, excess)
     assert len(merged) < len(model) - 0.8 * excess
-    assert change(merged) < 0.35 * change(model.select(fittest(model, len(merged))))
+    assert change(merged) < 0.35 * change(model.select(best_supported(model, len(merged))))

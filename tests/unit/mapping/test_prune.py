@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatbot.gaussians import GaussianModel
-from splatbot.mapping.prune import fittest, worth_keeping
+from splatbot.mapping.prune import best_supported, keep_mask
 from tests.rgbd import small_config
 
 CONFIG = small_config(mapping__min_opacity=0.05, mapping__max_scale=0.5).mapping
@@ -25,14 +25,14 @@ def model_of(n: int, rng: np.random.Generator) -> GaussianModel:
 
 
 def test_sound_gaussians_stay(rng: np.random.Generator) -> None:
-    assert worth_keeping(model_of(50, rng), CONFIG).all()
+    assert keep_mask(model_of(50, rng), CONFIG).all()
 
 
 def test_the_faint_and_the_huge_go_and_their_neighbours_stay(rng: np.random.Generator) -> None:
     model = model_of(6, rng)
     model.opacity_logits[:2] = torch.logit(torch.tensor([0.049, 0.051]))
     model.log_scales[2:4, 1] = torch.tensor([0.501, 0.499]).log()
-    assert worth_keeping(model, CONFIG).tolist() == [False, True, False, True, True, True]
+    assert keep_mask(model, CONFIG).tolist() == [False, True, False, True, True, True]
 
 
 @pytest.mark.parametrize("column", ["means", "quats", "log_scales", "opacity_logits"])
@@ -40,19 +40,19 @@ def test_the_faint_and_the_huge_go_and_their_neighbours_stay(rng: np.random.Gene
 def test_what_is_not_finite_goes(column: str, value: float, rng: np.random.Generator) -> None:
     model = model_of(5, rng)
     getattr(model, column)[3] = value
-    assert worth_keeping(model, CONFIG).tolist() == [True, True, True, False, True]
+    assert keep_mask(model, CONFIG).tolist() == [True, True, True, False, True]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_colour_that_is_not_finite_goes(value: float, rng: np.random.Generator) -> None:
     model = model_of(3, rng)
     model.sh[1, 0, 2] = value
-    assert worth_keeping(model, CONFIG).tolist() == [True, False, True]
+    assert keep_mask(model, CONFIG).tolist() == [True, False, True]
 
 
 def test_an_empty_model_has_nothing_to_prune() -> None:
-    assert worth_keeping(GaussianModel.empty(), CONFIG).shape == (0,)
-    assert fittest(GaussianModel.empty(), 10).shape == (0,)
+    assert keep_mask(GaussianModel.empty(), CONFIG).shape == (0,)
+    assert best_supported(GaussianModel.empty(), 10).shape == (0,)
 
 
 @pytest.mark.parametrize("count", [0, 1, 37, 99, 100, 1000])
@@ -61,7 +61,7 @@ def test_the_cap_holds_exactly_and_keeps_those_seen_most_often_then_the_most_opa
 ) -> None:
     model = model_of(100, rng)
     model.observations = torch.from_numpy(rng.integers(0, 6, 100).astype(np.int32))
-    kept = fittest(model, count).tolist()
+    kept = best_supported(model, count).tolist()
     merit = sorted(range(100), key=lambda i: (-int(model.observations[i]), -float(model.opacities[i])))
     assert kept == sorted(merit[:count])
 
@@ -70,9 +70,9 @@ def test_guesses_are_the_first_to_go(rng: np.random.Generator) -> None:
     model = model_of(10, rng)
     model.observations[:4] = 0
     model.opacity_logits[:4] = 5.0
-    assert fittest(model, 6).tolist() == [4, 5, 6, 7, 8, 9]
+    assert best_supported(model, 6).tolist() == [4, 5, 6, 7, 8, 9]
 
 
 def test_of_equals_the_oldest_stay(rng: np.random.Generator) -> None:
     model = model_of(1, rng).select(torch.zeros(20, dtype=torch.long))
-    assert fittest(model, 7).tolist() == list(range(7))
+    assert best_supported(model, 7).tolist() == list(range(7))

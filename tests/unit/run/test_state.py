@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
+import warnings
 from collections import deque
-from dataclasses import replace
+from dataclasses import fields as dataclass_fields
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -15,19 +19,22 @@ import torch
 
 from splatbot.camera import Camera
 from splatbot.config import Config, MappingConfig
-from splatbot.errors import FormatError, InputError, LogError
+from splatbot.errors import DeprecatedNameWarning, FormatError, InputError, LogError
 from splatbot.geometry import inverse
 from splatbot.logs import open_log
 from splatbot.run import Progress, map_log
 from splatbot.run.state import SavedRun
+from splatbot.run.state.container import read_container, write_container
 from splatbot.run.state.journal import Journal, read_entry
 from splatbot.run.state.pixels import pack, unpack
+from splatbot.run.state.schema import FORMAT_VERSION, TYPES
 from splatbot.run.state.tree import Decoder, Encoder
 from splatbot.slam import Slam
 from splatbot.tracking.place_recognition import likeliest, votes
 from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import small_config
 
+OLD_RUN = Path(__file__).parents[2] / "data" / "old_run"
 LOG = "synthetic:tabletop?width=160&height=120&frames=14"
 
 
@@ -249,15 +256,81 @@ def test_what_is_known_of_an_object_that_only_others_hold_is_saved_with_it() -> 
 
 
 @pytest.mark.parametrize("value", [open, object(), np.array([object()]), Path(), MappingConfig(stride=7)])
-def test_what_cannot_be_saved_is_refused_not_dropped(value: object) -> None:
+def test_values_that_cannot_be_saved_are_refused_not_dropped(value: object) -> None:
     with pytest.raises(TypeError):
         Encoder(Config(), lambda owner, array: None).encode({"value": value})
 
 
+@pytest.mark.parametrize("version", [1, FORMAT_VERSION])
 @pytest.mark.parametrize("name", ["os:system", "splatbot.slam:time", "splatbot.slam:Nothing", "splatbot.cli:main"])
-def test_a_state_makes_no_object_but_those_of_the_slam(name: str) -> None:
+def test_a_state_makes_no_object_but_those_of_the_slam(name: str, version: int) -> None:
+    tree = {"$": "object", "class": name, "type": name, "is": {}}
     with pytest.raises(ValueError, match=name):
-        Decoder(Config(), [], lambda entry: np.zeros(0)).decode({"$": "object", "class": name, "is": {}})
+        Decoder(Config(), [], lambda entry: np.zeros(0), version).decode(tree)
+
+
+def test_an_attribute_that_the_schema_does_not_list_is_refused() -> None:
+    camera = Camera(1.0, 2.0, 3.0, 4.0, 5, 6)
+    object.__setattr__(camera, "shutter", 0.01)
+    with pytest.raises(TypeError, match=r"Camera\.shutter"):
+        Encoder(Config(), lambda owner, array: None).encode(camera)
+
+
+@pytest.mark.parametrize("fields", [{}, {"number": 1}, {"first": 1, "unknown": 2}])
+def test_an_object_with_other_fields_than_the_schema_is_refused(fields: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="edge has other fields"):
+        Decoder(Config(), [], lambda entry: np.zeros(0)).decode({"$": "object", "type": "edge", "is": fields})
+
+
+def test_a_saved_run_names_no_module_class_or_private_attribute(half: Path) -> None:
+    header, _ = read_container(half / "state" / "run.state")
+    assert header["format"] == FORMAT_VERSION
+    text = json.dumps(header["tree"])
+    assert "splatbot" not in text
+    assert not re.search(r'"_\w+":', text)
+
+
+def test_the_schema_lists_each_type_and_attribute_once() -> None:
+    assert len({saved.cls for saved in TYPES.values()}) == len(TYPES)
+    for name, saved in TYPES.items():
+        assert len(set(saved.fields.values())) == len(saved.fields), name
+        assert not saved.transient & set(saved.fields.values()), name
+        if is_dataclass(saved.cls):
+            assert set(saved.fields.values()) == {field.name for field in dataclass_fields(saved.cls)}, name
+
+
+def test_a_state_of_a_later_version_is_refused(copy: Path) -> None:
+    path = copy / "state" / "run.state"
+    header, arrays = read_container(path)
+    write_container(path, header | {"format": FORMAT_VERSION + 1}, arrays)
+    with pytest.raises(FormatError, match=f"version {FORMAT_VERSION + 1}"):
+        SavedRun.load(copy)
+
+
+def test_a_run_that_version_0_1_saved_is_resumed_and_localized_in_with_one_warning(tmp_path: Path) -> None:
+    """The fixture is a threaded run of synthetic frames, saved before the format had a schema."""
+    shutil.copytree(OLD_RUN, tmp_path / "run")
+    log = open_log("synthetic:tabletop?frames=8&width=64&height=48")
+    with pytest.warns(DeprecatedNameWarning, match=r"splatbot 0\.1") as caught:
+        saved = SavedRun.load(tmp_path / "run")
+    assert len(caught) == 1
+    assert saved.place.next_index == 8
+    assert len(saved.slam.keyframes) == 2
+    assert saved.slam._mapper.version > 0
+    assert saved.slam._location.keyframe == 1
+    localized = map_log(log, out=tmp_path / "localized", localise=saved)
+    assert localized.metrics["lost"] <= 1  # the first frame, which a second has to confirm
+    assert localized.metrics["ate_rmse_m"] < 2e-3
+    with pytest.warns(DeprecatedNameWarning):
+        saved = SavedRun.load(tmp_path / "run")
+    longer = open_log("synthetic:tabletop?frames=12&width=64&height=48")
+    resumed = map_log(longer, out=tmp_path / "run", resume=saved, save_every=0.0)
+    assert resumed.metrics["frames"] == 12
+    assert resumed.metrics["lost"] == 0
+    assert resumed.metrics["ate_rmse_m"] < 2e-3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert SavedRun.load(tmp_path / "run").place.next_index == 12
 
 
 def test_a_journal_that_is_mostly_waste_is_begun_anew(tmp_path: Path) -> None:

@@ -1,0 +1,242 @@
+"""Schema of saved runs: stable names of the saved types and fields, independent of modules, classes and attributes.
+
+A rename in the code changes the right side of this table only. A new attribute needs a row, or has to be listed as
+transient. A changed meaning needs a higher :data:`FORMAT_VERSION` and a conversion for earlier versions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any
+
+from splatbot.camera import Camera
+from splatbot.config import Config
+from splatbot.gaussians import GaussianModel
+from splatbot.mapping.depth_fusion import DepthNoiseModel
+from splatbot.mapping.dynamic_objects import DynamicObjectFilter
+from splatbot.mapping.joint_motion import JointMotionMonitor
+from splatbot.mapping.keyframes import Keyframe
+from splatbot.mapping.loop import LoopCloser
+from splatbot.mapping.mapper import Mapper
+from splatbot.mapping.observation import GraphLocation
+from splatbot.mapping.posegraph import Edge, PoseGraph
+from splatbot.mapping.refine import Refiner
+from splatbot.optimize.adam import GaussianAdam
+from splatbot.slam import FrameResult, Slam
+from splatbot.tracking.budget import Costs
+from splatbot.tracking.features import Features
+from splatbot.tracking.gicp import GicpStage
+from splatbot.tracking.motion_model import ConstantVelocity
+from splatbot.tracking.reference import Reference, ReferencePoints
+from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidate
+from splatbot.tracking.tracker import Tracker
+from splatbot.tracking.uncertainty import Uncertainty
+
+FORMAT_VERSION = 2
+"""Version of the saved state. Version 1 names modules, classes and attributes of splatbot 0.1."""
+
+
+@dataclass(frozen=True)
+class SavedType:
+    """A class whose objects a saved run holds.
+
+    Args:
+        cls: the class.
+        fields: attribute by stable field name.
+        transient: attributes that are not saved; ``create`` sets them.
+        create: makes an object without saved fields. If None, the fields are all of its attributes.
+    """
+
+    cls: type
+    fields: Mapping[str, str]
+    transient: frozenset[str] = frozenset()
+    create: Callable[[Config], object] | None = None
+
+
+def _dataclass(cls: type) -> SavedType:
+    """Describe a dataclass whose field names are stable."""
+    return SavedType(cls, {field.name: field.name for field in fields(cls)})
+
+
+def _fields(*same: str, **renamed: str) -> dict[str, str]:
+    return {name: name for name in same} | renamed
+
+
+TYPES: Mapping[str, SavedType] = {
+    "slam": SavedType(
+        Slam,
+        _fields(
+            "config",
+            "results",
+            tracker="_tracker",
+            mapper="_mapper",
+            location="_location",
+            image_size="_image_size",
+            localization_only="_localization_only",
+            joint_motion="_joint_motion",
+        ),
+        transient=frozenset({"_executor"}),
+        create=Slam,
+    ),
+    "frame_result": _dataclass(FrameResult),
+    "graph_location": _dataclass(GraphLocation),
+    "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", last="_last")),
+    "camera": _dataclass(Camera),
+    "gaussians": _dataclass(GaussianModel),
+    "keyframe": _dataclass(Keyframe),
+    "mapper": SavedType(
+        Mapper,
+        _fields(
+            "config",
+            "keyframes",
+            "model",
+            "pending_iterations",
+            "version",
+            "loops",
+            refiner="_refiner",
+            dynamic_objects="_dynamic_objects",
+            depth_noise="_depth_noise",
+            unmapped_seen="_unmapped_seen",
+            robot_moving="_robot_moving",
+            frozen="_frozen",
+            stamp="_stamp",
+            observed_stamp="_observed_stamp",
+        ),
+        transient=frozenset({"_lock", "_submitted", "_latest", "_added", "_inserted"}),
+        create=Mapper,
+    ),
+    "loop_closer": SavedType(
+        LoopCloser,
+        _fields("config", "graph", "adjacency", "correction", "closed", "rejected", unconfirmed="_unconfirmed"),
+        create=LoopCloser,
+    ),
+    "pose_graph": _dataclass(PoseGraph),
+    "edge": _dataclass(Edge),
+    "refiner": SavedType(Refiner, _fields("config", "adam", random="_random", latest_refined="_latest_refined")),
+    "adam": SavedType(GaussianAdam, _fields("rates", "steps", "skipped", "first", "second")),
+    "dynamic_objects": SavedType(
+        DynamicObjectFilter, _fields(timeout="timeout_s", cells="_cells", since="_since", seen="_seen")
+    ),
+    "depth_noise": _dataclass(DepthNoiseModel),
+    "tracker": SavedType(
+        Tracker,
+        _fields(
+            "config",
+            "motion",
+            lost="_lost",
+            uncertainties="_known",
+            last_covariance="_last_covariance",
+            costs="_costs",
+            gicp="_wide",
+            place_search="_search",
+            relocalization_candidate="_sighting",
+        ),
+        create=lambda config: Tracker(config.tracking),
+    ),
+    "motion_model": SavedType(
+        ConstantVelocity,
+        _fields(last="_last", twist="_twist", interval="_interval", dead_reckoning="_reckoned"),
+        create=lambda _: ConstantVelocity(),
+    ),
+    "stage_costs": SavedType(Costs, _fields(frame="_frame", runs="_runs"), create=lambda _: Costs()),
+    "gicp": SavedType(
+        GicpStage, _fields("config"), frozenset({"_clouds"}), create=lambda config: GicpStage(config.tracking)
+    ),
+    "place_search": SavedType(PlaceSearch, _fields(next="_next"), create=lambda _: PlaceSearch()),
+    "relocalization_candidate": _dataclass(RelocalizationCandidate),
+    "uncertainty": _dataclass(Uncertainty),
+    "features": _dataclass(Features),
+    "reference": _dataclass(Reference),
+    "reference_points": _dataclass(ReferencePoints),
+}
+"""Saved types by stable name."""
+
+
+@cache
+def type_names() -> Mapping[type, str]:
+    """Return the stable name of each saved class."""
+    return {saved.cls: name for name, saved in TYPES.items()}
+
+
+# Names of version 1 by stable name: the class, and attributes whose field name is not the attribute without underscore.
+_VERSION_1: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "slam": ("splatbot.slam:Slam", {"_motion": "joint_motion", "_size": "image_size"}),
+    "frame_result": ("splatbot.slam:FrameResult", {}),
+    "joint_motion": ("splatbot.mapping.motion:JointMotion", {"still": "still_speed"}),
+    "camera": ("splatbot.camera:Camera", {}),
+    "gaussians": ("splatbot.gaussians.model:GaussianModel", {}),
+    "keyframe": ("splatbot.mapping.keyframes:Keyframe", {"still": "static_mask"}),
+    "mapper": (
+        "splatbot.mapping.mapper:Mapper",
+        {
+            "owed": "pending_iterations",
+            "_movers": "dynamic_objects",
+            "_noise": "depth_noise",
+            "_revealed": "unmapped_seen",
+            "_held": "robot_moving",
+        },
+    ),
+    "loop_closer": ("splatbot.mapping.loop:LoopCloser", {"_suspected": "unconfirmed"}),
+    "pose_graph": ("splatbot.mapping.posegraph:PoseGraph", {}),
+    "edge": ("splatbot.mapping.posegraph:Edge", {}),
+    "refiner": ("splatbot.mapping.refine:Refiner", {"_latest": "latest_refined"}),
+    "adam": ("splatbot.optimize.adam:GaussianAdam", {}),
+    "dynamic_objects": ("splatbot.mapping.moving:Movers", {"settle": "timeout"}),
+    "depth_noise": ("splatbot.mapping.evidence:DepthNoise", {}),
+    "tracker": (
+        "splatbot.tracking.tracker:Tracker",
+        {
+            "_known": "uncertainties",
+            "_wide": "gicp",
+            "_search": "place_search",
+            "_sighting": "relocalization_candidate",
+        },
+    ),
+    "motion_model": ("splatbot.tracking.predict:ConstantVelocity", {"_reckoned": "dead_reckoning"}),
+    "stage_costs": ("splatbot.tracking.budget:Costs", {}),
+    "gicp": ("splatbot.tracking.wide:WideStage", {}),
+    "place_search": ("splatbot.tracking.recover:KeyframeSearch", {}),
+    "relocalization_candidate": ("splatbot.tracking.recover:Sighting", {}),
+    "uncertainty": ("splatbot.tracking.uncertainty:Uncertainty", {}),
+    "features": ("splatbot.tracking.features:Features", {}),
+    "reference": ("splatbot.tracking.reference:Reference", {}),
+    "reference_points": ("splatbot.tracking.reference:ReferencePoints", {}),
+    # Its mapper takes its place.
+    "mapping_worker": ("splatbot.mapping.worker:MappingWorker", {}),
+}
+
+
+def version_1_type(name: str) -> str:
+    """Return the stable type name of a class name ``module:Class`` of version 1.
+
+    Raises:
+        ValueError: Version 1 has no such class.
+    """
+    known = {cls: stable for stable, (cls, _) in _VERSION_1.items()}
+    if name not in known:
+        raise ValueError(f"{name} is not a class of a saved run")
+    return known[name]
+
+
+def version_1_field(type_name: str, attribute: str) -> str:
+    """Return the stable field name of an attribute of version 1."""
+    return _VERSION_1[type_name][1].get(attribute, attribute.lstrip("_"))
+
+
+def upgrade_version_1(slam: Slam, unused: Mapping[str, Mapping[str, Any]]) -> None:
+    """Complete a SLAM of version 1, whose state was distributed over other objects.
+
+    Args:
+        slam: decoded, without the fields that version 1 lacks.
+        unused: saved fields of version 1 without a place in this version, by type.
+    """
+    mapper, outer = slam._mapper, unused.get("slam", {})
+    mapper.loops.adjacency = mapper.loops.graph.adjacency()
+    mapper.set_robot_moving(unused.get("mapping_worker", {}).get("held", mapper._robot_moving))
+    mapper._observed_stamp = outer.get("looked", mapper._observed_stamp)
+    slam._location = GraphLocation(unused.get("loop_closer", {}).get("anchor"))
+    if not outer.get("growing", True):
+        slam._localization_only = True
+        mapper.freeze()
