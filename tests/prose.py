@@ -251,7 +251,7 @@ def cpp(path: Path) -> Iterator[Finding]:
     """Check the comments of a C++ file."""
     block: list[tuple[int, str]] = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        found = re.search(r"(?<![:\"])//+ ?(.*)$", line)
+        found = None if "SPDX" in line else re.search(r"(?<![:\"])//+ ?(.*)$", line)
         own_line = found is not None and not line[: found.start()].strip()
         if block and (found is None or not own_line or block[-1][0] + 1 != number):
             yield from _flush(path, block)

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What module.cpp enters into the Python module: one function a concept.
+// Functions by which module.cpp fills the Python module, one for each concept.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -50,7 +50,7 @@ class ArmPlanner {
     return static_cast<int>(planner_.run(span_of(start), span_of(goals), {seconds, iterations, seed, good_enough}));
   }
 
-  // `unpaired` is the same arm, which may touch itself: what is new in the map says nothing of that.
+  // `unpaired` is the same arm without self-collision pairs: changes of the map do not affect them.
   int rerun(Numbers start, std::shared_ptr<CollisionField> field, std::shared_ptr<CollisionField> added,
             const Arm& unpaired, double seconds, std::uint64_t iterations, std::uint64_t seed) {
     if (start.shape(0) != joints_ || planner_.tree() == nullptr) {

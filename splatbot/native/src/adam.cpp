@@ -87,7 +87,7 @@ Scratch& scratch(std::size_t widest) {
   return instance;
 }
 
-// Whether a row's gradients are all finite: 0 times anything else is NaN.
+// True if a row's gradients are all finite: 0 times any other value is NaN.
 bool is_finite(const std::vector<AdamGroup>& groups, std::size_t row) {
   float sum = 0.0F;
   for (const AdamGroup& group : groups) {

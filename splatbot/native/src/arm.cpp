@@ -85,7 +85,7 @@ Arm::Arm(const ArmSpec& spec) {
     for (std::size_t k = 0; k < 3; ++k) {
       center_[k][s] = static_cast<float>(spec.centers[3 * s + k]);
     }
-    // Farthest from each axis: the offsets' lengths from there on, of the first one only what is across the axis.
+    // Largest distance from each axis: the sum of the following offsets' lengths, the first one only across the axis.
     const auto link = static_cast<std::size_t>(link_[s]);
     double beyond = norm(&spec.centers[3 * s]);
     double across = std::hypot(spec.centers[3 * s], spec.centers[3 * s + 1]);

@@ -246,7 +246,7 @@ std::shared_ptr<const CollisionField> CollisionField::updated(std::span<const st
     const SolidBlock& block = *blocks_[b];
     std::vector<SolidItem> kept;
     append_items(block, kept);
-    for (std::size_t l = 0; l < leaf_count(block); ++l) {  // only what goes changes the grid
+    for (std::size_t l = 0; l < leaf_count(block); ++l) {  // only removals change the grid
       const SolidLeaf& leaf = leaf_at(block, l, room);
       for (int lane = 0; lane < kFan && leaf.id[lane] >= 0; ++lane) {
         if (next->block_of_[static_cast<std::size_t>(leaf.id[lane])] != static_cast<std::int32_t>(b)) {

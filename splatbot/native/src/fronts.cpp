@@ -11,7 +11,7 @@ namespace splatbot {
 
 namespace {
 
-// What a look at the tile lists needs of a finished render.
+// The parts of a finished render that a walk over the tile lists needs.
 BlendArgs finished(const RasterState& const_state) {
   auto& state = const_cast<RasterState&>(const_state);  // read only: the kernels' structure serves writers as well
   BlendArgs args{};

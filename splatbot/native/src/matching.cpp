@@ -9,7 +9,7 @@
 #include <numeric>
 #include <vector>
 
-// Every CPU that runs the kernels counts bits in one instruction (isa.cpp asks for it).
+// Every CPU that runs the kernels counts bits in one instruction (isa.cpp requires it).
 #if defined(__x86_64__)
 #define SB_POPCNT __attribute__((target("popcnt")))
 #else

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Depth order, then tile lists by a stable counting scatter: cheaper than sorting (tile, depth) keys, and every list comes
-// out in depth order. Each thread sorts a share of its own by radix, and sorted shares are merged in pairs: few loops,
-// because a sleeping thread takes tens of microseconds to wake. All of it is stable, so the result is one and the same
-// for any division of the work.
+// Depth order, then tile lists by a stable counting scatter. This is cheaper than sorting (tile, depth) keys, and
+// every list comes out in depth order. Each thread sorts a share by radix, and sorted shares are merged in pairs.
+// Loops are few, because a sleeping thread takes tens of microseconds to wake. All steps are stable, so the result is
+// the same for any division of the work.
 #include <algorithm>
 #include <bit>
 #include <limits>
@@ -17,8 +17,8 @@ namespace splatbot {
 
 namespace {
 
-// How keys are cut into digits: as few passes as the range of depths allows, unless there are so many keys that the
-// places they go to outgrow the cache.
+// Division of keys into digits: as few passes as the range of depths allows, unless the destinations of a digit
+// outgrow the cache.
 struct Digits {
   std::uint32_t least;  // of all keys
   unsigned bits, passes;

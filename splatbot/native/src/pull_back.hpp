@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the rasterizers' backward passes share outside the kernels.
+// Code that the rasterizers' backward passes share outside the kernels.
 #pragma once
 
 #include <array>
@@ -14,7 +14,7 @@ T* pointer(std::span<T> span) {
   return span.empty() ? nullptr : span.data();
 }
 
-// What the passes sum of a camera's gradient: about the view's origin, and to the camera's centre.
+// Sums of a camera's gradient: about the view's origin, and to the camera's centre.
 struct CameraGradient {
   std::array<double, kCameraSums> sums{};
   std::array<double, 3> center{};
@@ -29,8 +29,8 @@ void add_camera_gradient(const View& view, const CameraGradient& from, std::span
 void add_background_gradient(const TileLists& lists, const View& view, const float* final_state, int planes,
                              std::span<const float> grad_colors, std::span<double> out);
 
-// Whether the gradient to the colours is needed to go on into harmonics: of degree 1 and up, they depend on where the
-// Gaussian and the camera are.
+// True if the gradient to the colours goes on into harmonics: from degree 1 on, they depend on the positions of the
+// Gaussian and the camera.
 bool wants_harmonics(const Gaussians& gaussians, const Gradients& out);
 
 // From the gradient to the colours (N, 3) to those of coefficients, means and the camera's centre.

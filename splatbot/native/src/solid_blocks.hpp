@@ -16,7 +16,7 @@ struct SolidItem {
   std::uint64_t key;  // block, then the place in it along a Morton curve
   float mean[3], quat[4], axes[3];
   std::int32_t id;
-  std::uint32_t turn;  // of one that was packed already: packing anew would turn it again
+  std::uint32_t turn;  // of an already packed ellipsoid: packing again would turn it again
   bool packed;
 };
 

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Covers of the collision field's trees: how far at least, in their own sizes, the ellipsoids below a node are.
+// Covers of the collision field's trees: lower bounds of the distance to the ellipsoids below a node, in their own
+// metrics.
 //
-// Let every covariance S_i of some ellipsoids be at most M (as quadratic forms). Then (p - m_i)' S_i^-1 (p - m_i) is at
-// least |p - m_i|^2 in the metric of M^-1, and that distance at least the one to a center less the radius of the ball
-// that holds the means. M is the mean of the S_i, made larger until it covers each. Boxes alone leave most of a tree
-// to be searched: where Gaussians are flat and oblique, their boxes are as long as they are.
+// Let every covariance S_i of some ellipsoids be at most M (as quadratic forms). Then (p - m_i)' S_i^-1 (p - m_i) is
+// at least |p - m_i|^2 in the metric of M^-1. That distance is at least the one to a center less the radius of the
+// ball that holds the means. M is the mean of the S_i, enlarged until it covers each. Boxes alone leave most of a
+// tree to search: boxes of flat, oblique Gaussians are as long as they are.
 #pragma once
 
 #include <span>

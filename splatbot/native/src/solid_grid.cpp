@@ -16,9 +16,9 @@ namespace splatbot {
 
 namespace {
 
-constexpr float kMargin = 0.3F;        // [m] around what is mapped: as far as a bound reaches
+constexpr float kMargin = 0.3F;        // [m] around the mapped region: the range of a bound
 constexpr double kOutside = 0.004;     // share of the Gaussians at either end of an axis that the grid need not hold
-constexpr double kMostOutside = 0.05;  // beyond it the grid is made anew
+constexpr double kMostOutside = 0.05;  // beyond it the grid is rebuilt
 
 struct Range {
   std::int32_t low[3], high[3];  // voxels [low, high)
@@ -64,7 +64,7 @@ std::uint8_t& mark_of(BoundGrid& g, std::int32_t x, std::int32_t y, std::int32_t
                  static_cast<std::size_t>(x)];
 }
 
-// Whether all of a few voxels are marked already, as is common where ellipsoids are smaller than voxels.
+// True if all of a few voxels are marked already, as is common for ellipsoids smaller than voxels.
 bool all_marked(BoundGrid& grid, const Range& r) {
   if (r.count() > 8) {
     return false;
@@ -236,7 +236,7 @@ bool reaches_out(const BoundGrid& grid, BlockList blocks) {
   return false;
 }
 
-// Where the Gaussians' means are, but for a share at either end of each axis, with a margin; false if there is none.
+// Bounds of the Gaussians' means without a share at either end of each axis, with a margin; false for an empty field.
 bool extent(BlockList blocks, double aside, float* low, float* high) {
   std::vector<float> along[3];
   SolidLeaf room;
@@ -280,7 +280,7 @@ std::shared_ptr<BoundGrid> make_grid(BlockList blocks, const FieldOptions& optio
   if (!(options.voxel > 0.0F) || !extent(blocks, 0.0, low, high)) {
     return nullptr;
   }
-  if (!fit(*grid, low, high, options.max_voxels)) {  // without what lies far off
+  if (!fit(*grid, low, high, options.max_voxels)) {  // without distant outliers
     extent(blocks, kOutside, low, high);
     while (!fit(*grid, low, high, options.max_voxels)) {
       grid->voxel *= 1.03F;

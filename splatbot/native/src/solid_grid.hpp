@@ -12,13 +12,13 @@ namespace splatbot {
 
 using BlockList = std::span<const std::shared_ptr<const SolidBlock>>;
 
-// Where most Gaussians are, with room for what is mapped later; null if there is none or options want no grid.
+// A grid over most Gaussians, with space for later ones; null for an empty field, or if the options disable it.
 std::shared_ptr<BoundGrid> make_grid(BlockList blocks, const FieldOptions& options);
 
-// Whether so many Gaussians lie outside that a new grid is due.
+// True if enough Gaussians lie outside to require a new grid.
 bool outgrown(const BoundGrid& grid, BlockList blocks);
 
-// Marks and bounds anew as far as they depend on what lies in the box (low 3, high 3) [m].
+// Updates marks and bounds that depend on the box (low 3, high 3) [m].
 void refresh(BoundGrid& grid, BlockList blocks, const float box[6]);
 
 }  // namespace splatbot

@@ -44,7 +44,7 @@ const cpu_set_t& process_cpus() {
 }
 #endif
 
-// Of the calling thread: where cores are short, those of lower niceness go first.
+// Niceness of the calling thread: on busy cores, threads of lower niceness go first.
 int niceness() {
 #if defined(__linux__)
   return getpriority(PRIO_PROCESS, 0);
@@ -169,7 +169,7 @@ void ThreadPool::run_erased(std::size_t count, Function function, void* context)
   }
 }
 
-// Whether the calling thread leaves the workers, which have the priority of whoever made the pool, to others.
+// True if the calling thread yields the workers, which have the priority of the pool's creator, to other threads.
 bool ThreadPool::yields() {
   thread_local const int mine = niceness();
   if (mine <= niceness_) {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Every camera model through Gaussians before, behind, beside and around it, and the questions asked of a finished
-// render, for the sanitizers to watch; the number of threads changes no bit.
+// Every camera model with Gaussians all around it, and the queries of a finished render, under the sanitizers. The
+// number of threads changes no bit.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

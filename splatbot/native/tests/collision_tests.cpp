@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The collision field and an arm in it, for the sanitizers to watch: packed and not, through updates, asked by many
-// threads while the next field is made; distances against bisection in float64. The number of threads changes no bit.
+// The collision field and an arm in it, under the sanitizers: packed and not, and through updates. Many threads query it
+// during the construction of the next field. Distances are compared with bisection in float64. The number of
+// threads changes no bit.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -77,8 +78,8 @@ std::array<double, 3> seen_from(const Map& map, std::size_t i, const double* p) 
   return v;
 }
 
-// The signed distance of a point to the n-sigma ellipsoid of Gaussian i: the root s of sum (a v / (a^2 - min a^2 +
-// s))^2 = 1 by bisection (Eberly, distance from a point to an ellipsoid).
+// The signed distance of a point to the n-sigma ellipsoid of Gaussian i, by bisection for the root s. The equation is
+// sum (a v / (a^2 - min a^2 + s))^2 = 1 (Eberly, distance from a point to an ellipsoid).
 double distance_to(const Map& map, std::size_t i, const double* p) {
   std::array<double, 3> v = seen_from(map, i, p);
   double a[3], least = 1e30;
@@ -130,7 +131,7 @@ std::vector<double> points_in_box(std::size_t count, unsigned seed) {
   return points;
 }
 
-// All that a field says of some points, as numbers to compare.
+// All answers of a field for some points, as numbers to compare.
 std::vector<double> answers(const CollisionField& field, const std::vector<double>& points) {
   const std::size_t n = points.size() / 3;
   std::vector<float> radii(n, 0.03F), bounds(n);
@@ -186,7 +187,7 @@ void check_mahalanobis(const Map& map, const CollisionField& field) {
   }
 }
 
-// A field of what is left and what comes, and the same made anew, while another thread asks the field before.
+// An updated field, and the same built from scratch, while another thread queries the earlier one.
 void check_updates(const Map& map, const FieldOptions& options) {
   const auto field = std::make_shared<const CollisionField>(map.solids(), options);
   const std::vector<double> points = points_in_box(200, 6);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Runs the rasterizer through its hard corners, on every instruction set that this CPU has, for the sanitizers to
-// watch, and checks that the number of threads changes no bit. Prints what it did; exits 1 at the first broken promise.
+// Runs the rasterizer through its hard corners, on every instruction set of this CPU, under the sanitizers. Checks
+// that the number of threads changes no bit. Prints its steps; exits 1 at the first broken promise.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -48,7 +48,7 @@ struct Scene {
   }
 };
 
-// Gaussians before, behind and beside the camera, thin, huge, opaque and invisible, with odd quaternions.
+// Gaussians in front of, behind and next to the camera, thin, huge, opaque and invisible, with odd quaternions.
 Scene make_scene(std::size_t n, int channels, unsigned seed) {
   std::mt19937 random(seed);
   std::normal_distribution<float> normal;

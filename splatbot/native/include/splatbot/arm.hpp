@@ -35,7 +35,7 @@ struct ArmClearance {
 
 class Arm {
  public:
-  // Throws std::invalid_argument for what does not fit together, or has too many joints, spheres or pairs.
+  // Throws std::invalid_argument if sizes do not fit together, or if there are too many joints, spheres or pairs.
   explicit Arm(const ArmSpec& spec);
   Arm(const Arm&) = delete;
   Arm& operator=(const Arm&) = delete;

@@ -34,7 +34,7 @@ struct ArmView {
   const float* link_reach;   // (joints + 1, joints): the farthest of each link's spheres
 };
 
-// What became of a configuration or an edge.
+// Result of checking a configuration or an edge.
 enum ArmVerdict : std::int32_t {
   kArmFree = -1,
   // 0 to spheres - 1: that sphere may touch the map. From kArmSelf on: that pair of links may touch.
@@ -51,8 +51,8 @@ struct ArmKernels {
   // Verdicts of configurations (C, joints). A field of null: self-collision alone.
   void (*configurations)(const ArmView&, const SolidsView* field, const double* q, std::size_t begin, std::size_t end,
                          std::int32_t* verdict);
-  // Edges from `from` to `to` (E, joints), straight in joint space: every configuration on them, or else rejected;
-  // where a sphere has less than `eps` [m] of room, so that halving ends.
+  // Certifies straight edges in joint space from `from` to `to` (E, joints): every configuration on a certified edge
+  // is free. An edge is rejected where a sphere has less than `eps` [m] of clearance, which bounds the bisection.
   void (*certify)(const ArmView&, const SolidsView* field, const double* from, const double* to, float eps,
                   std::size_t begin, std::size_t end, ArmEdge* out);
   // Edges by `samples` configurations each, evenly spaced with both ends.

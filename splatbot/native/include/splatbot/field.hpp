@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The collision field: n-sigma ellipsoids under a tree of boxes, in blocks of space that successive fields share, and a
-// grid of proven lower bounds of the distance. Immutable, so any number of threads may ask at once.
+// The collision field: n-sigma ellipsoids under a tree of boxes, and a grid of proven lower bounds of the distance.
+// Successive fields share blocks of space. A field is immutable, so any number of threads may query it at once.
 #pragma once
 
 #include <atomic>
@@ -18,7 +18,7 @@ namespace splatbot {
 
 struct FieldOptions {
   float n_sigma = 2.0F;      // where an ellipsoid's surface is
-  float voxel = 0.02F;       // [m] of the grid; 0: no grid. Made larger where max_voxels asks for it
+  float voxel = 0.02F;       // [m] of the grid, 0 without a grid; enlarged to respect max_voxels
   std::size_t max_voxels = 2'000'000;
   bool packed = false;  // less memory, larger errors; see packing.hpp
 };
@@ -72,11 +72,12 @@ class CollisionField {
  public:
   CollisionField(const Solids& solids, const FieldOptions& options);
 
-  // A field of the same options without the ids `removed`, and with `inserted`. An id in both is moved. Blocks that no
-  // change concerns are shared. The answers are those of a field built anew.
+  // Returns a field of the same options without the ids `removed`, and with `inserted`. An id in both is moved.
+  // Unchanged blocks are shared. The answers equal those of a field that is built from scratch.
   std::shared_ptr<const CollisionField> updated(std::span<const std::int32_t> removed, const Solids& inserted) const;
 
-  // A field of what `earlier` has not, by geometry and not by id: what may be in the way only now. Without a grid.
+  // Returns a field, without a grid, of the geometry that `earlier` lacks: the obstacles that are new. Ids are not
+  // compared.
   std::shared_ptr<const CollisionField> added_since(const CollisionField& earlier) const;
 
   std::size_t size() const noexcept { return size_; }
@@ -102,7 +103,7 @@ class CollisionField {
   FieldOptions options_;
   std::size_t size_ = 0;
   std::vector<std::shared_ptr<const SolidBlock>> blocks_;  // a slot stays empty when its last Gaussian goes
-  std::vector<std::int32_t> block_of_;                     // by id; -1: none. A packed field makes it anew
+  std::vector<std::int32_t> block_of_;                     // by id; -1 if absent. A packed field rebuilds it
   std::vector<SolidNode> top_;
   std::vector<SolidBlockView> views_;
   std::shared_ptr<const BoundGrid> grid_;

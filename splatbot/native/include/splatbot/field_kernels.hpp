@@ -9,8 +9,8 @@
 
 namespace splatbot {
 
-// Answer for one sphere: the certified signed distance from its surface, of which ellipsoid, the outward normal there
-// (the gradient) and the nearest point of that ellipsoid.
+// Answer for one sphere: the certified signed distance from its surface to an ellipsoid and that ellipsoid. The outward
+// normal (the gradient) and the nearest point there follow.
 struct NearestSolid {
   double distance;  // [m]; +infinity: none within the cut
   double normal[3];
@@ -31,13 +31,13 @@ struct BoundArgs {
   std::int32_t size[3];       // nx, ny, nz
   bool open;                  // something may be anywhere outside of the grid
   std::int32_t low[3], high[3];
-  std::int32_t x0, x1, y0, y1;  // low and high with what lies around them
+  std::int32_t x0, x1, y0, y1;  // low and high with their surroundings
   std::uint8_t* along_z;        // scratch (high z - low z, y1 - y0, x1 - x0): squared distances along z
   std::uint8_t* bound;          // output, as marks
 };
 
 struct FieldKernels {
-  // Whether a sphere may touch an ellipsoid: false is proven. out: 0 or 1.
+  // Writes 1 if a sphere may touch an ellipsoid, else 0, which is proven.
   void (*hits)(const SolidsView&, const SphereQueries&, std::size_t begin, std::size_t end, std::uint8_t* out);
   // The nearest ellipsoid, as far as `cut` [m] from the surface of the sphere.
   void (*nearest)(const SolidsView&, const SphereQueries&, float cut, std::size_t begin, std::size_t end,
@@ -45,8 +45,8 @@ struct FieldKernels {
   // The k nearest, nearest first: (P, k) distances (+infinity: none) and ids.
   void (*k_nearest)(const SolidsView&, const SphereQueries&, int k, float cut, std::size_t begin, std::size_t end,
                     double* distance, std::int32_t* id);
-  // The smallest Mahalanobis distance and the lowest id that attains it; infinity and -1 if there is none. For points
-  // order[begin] to order[end - 1], quickest where each is near the one before.
+  // The smallest Mahalanobis distance and the lowest id that attains it; infinity and -1 in an empty field. Answers
+  // points order[begin] to order[end - 1], fastest if successive points are near each other.
   void (*mahalanobis)(const SolidsView&, const SolidCoversView&, const double* points, const std::uint32_t* order,
                       std::size_t begin, std::size_t end, double* distance, std::int32_t* id);
   // A proven lower bound of the signed distance at each point, from the grid alone; 0 outside of it.

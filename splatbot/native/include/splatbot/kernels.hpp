@@ -82,12 +82,13 @@ struct ProjectBackwardArgs {
   bool accumulate;  // add to the outputs
   bool accumulate_colors;
   bool geometry;  // not the colours' gradients alone
-  // Outputs; null: not asked for.
+  // Outputs; null if not requested.
   float *means, *quats, *scales, *covars, *opacities, *colors, *means2d, *absolute2d;
   double* camera;  // (blocks, kCameraSums) partial sums
 };
 
-// Harmonics of what is in view; the colours go to (and, backwards, come from) the records of either kind of splat.
+// Harmonics of the Gaussians in view. The colours go to the records of either kind of splat; their gradients come
+// from there.
 struct HarmonicsArgs {
   std::size_t count;
   const float *means, *coefficients;  // (N, 3), (N, held, 3)
@@ -101,7 +102,7 @@ struct HarmonicsArgs {
 
 struct HarmonicsBackwardArgs {
   HarmonicsArgs forward;
-  const float* colors;  // (N, 3): gradient to the colours of what is in view
+  const float* colors;  // (N, 3): gradient to the colours of Gaussians in view
   bool accumulate;      // add to the coefficients' gradient
   float* coefficients;  // output, or null
   float* means;         // output, always added to, or null
@@ -184,8 +185,7 @@ struct AdamGroup {
   float rate;
 };
 
-// Of one block of rows. step_scale is sqrt(1 - b2^t) / (1 - b1^t) of each row, 0 for a row that is left alone; eps is
-// scaled by sqrt(1 - b2^t) as well.
+// Steps one block of rows. `step_scale` is sqrt(1 - b2^t) / (1 - b1^t) of each row, 0 for a row that is not stepped. `eps` is scaled by sqrt(1 - b2^t) as well.
 struct AdamBlock {
   std::size_t begin, count;
   const float *step_scale, *eps;

@@ -16,7 +16,7 @@ enum class Shutter : std::uint8_t { global, top_to_bottom, left_to_right, bottom
 
 struct Lens {
   CameraModel model = CameraModel::pinhole;
-  // Project by the unscented transform instead of by the derivative at the centre. What follows needs it.
+  // Project by the unscented transform instead of by the derivative at the centre. The options below need it.
   bool unscented = false;
   // OpenCV's coefficients. Pinhole: (k1 .. k6), (p1, p2), (s1 .. s4). Fisheye: radial (k1 .. k4) alone.
   double radial[6] = {}, tangential[2] = {}, thin_prism[4] = {};
@@ -25,8 +25,8 @@ struct Lens {
   double nearest = 0.0;  // [m] a pinhole sees no sigma point nearer than this
   // The sigma points lie `spread` standard deviations from the centre and weigh `weight` each; `excess` is the centre's.
   double spread = 0.0, weight = 0.0, excess = 0.0;
-  // Rolling shutter: at time s in -1/2..1/2 the camera has turned by the rotation vector s `turn` (its own axes at s = 0)
-  // and its translation has grown by s `step`; View holds the pose at s = 0, whose translation is `pivot`.
+  // Rolling shutter: at time s in -1/2..1/2 the camera has turned by the rotation vector s `turn` (its own axes at s
+  // = 0). Its translation has grown by s `step`. View holds the pose at s = 0, whose translation is `pivot`.
   Shutter shutter = Shutter::global;
   double turn[3] = {}, step[3] = {}, pivot[3] = {};
 };

@@ -20,15 +20,15 @@ struct LossOptions {
   bool inside_only = false;  // only windows that lie inside the image count
 };
 
-// (1 - w) mean|x - y| + w (1 - mean SSIM(x, y)) with w = dssim_weight, over pixels and channels of all images, and its
-// gradient to `rendered`, unless `gradient` is empty.
+// (1 - w) mean|x - y| + w (1 - mean SSIM(x, y)) with w = dssim_weight, over pixels and channels of all images. Its
+// gradient goes to `rendered`, unless `gradient` is empty.
 //
-// SSIM (Wang et al. 2004, equation 13) of values in 0..1 with a Gaussian window of 11x11 pixels, sigma 1.5; outside the
-// image, both images are 0. Under a mask, both means are over its pixels, and outside it the rendered image counts as
-// equal to the target, so that a window across its border compares what lies inside. An empty mask gives 0.
+// SSIM (Wang et al. 2004, equation 13) of values in 0..1 with a Gaussian window of 11x11 pixels, sigma 1.5. Outside
+// the image, both images are 0. Under a mask, both means are over its pixels. Outside the mask the rendered image
+// equals the target, so that a window across the border compares the inside alone. An empty mask gives 0.
 //
-// Not finite if a value (under the mask, of `rendered`; anywhere, of `target`) is not finite or above 1e18. The result
-// does not depend on the number of threads. Throws std::invalid_argument if sizes do not fit.
+// Not finite if a value (under the mask, of `rendered`; anywhere, of `target`) is not finite or above 1e18. The
+// result does not depend on the number of threads. Throws std::invalid_argument if sizes do not fit.
 double l1_dssim(const LossImages& images, const LossOptions& options, std::span<float> gradient);
 
 }  // namespace splatbot

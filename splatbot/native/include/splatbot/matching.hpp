@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Binary descriptors of 256 bits matched near to where they are expected.
+// Matching of 256-bit binary descriptors near their expected places.
 #pragma once
 
 #include <cstddef>
@@ -15,9 +15,9 @@ struct Keypoints {
   std::span<const std::uint8_t> descriptors;   // (N, 32)
 };
 
-// For each expected keypoint the found one with the least Hamming distance within `radius` pixels of it, or -1: where
-// there is none, where it is farther than max_distance bits, or where the second best is not clearly worse (Lowe's
-// ratio). A found keypoint goes to the expected one that is nearest in bits.
+// For each expected keypoint, the found one with the least Hamming distance within `radius` pixels, or -1. A match is
+// rejected beyond max_distance bits, or if the second best is not clearly worse (Lowe's ratio). A found keypoint goes
+// to the expected one that is nearest in bits.
 void match_near(const Keypoints& expected, const Keypoints& found, float radius, int max_distance, float ratio,
                 std::span<std::int32_t> out);
 

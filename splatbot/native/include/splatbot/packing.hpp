@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Leaves of the collision field in 18 bytes an ellipsoid in place of 56, for those in a block of space: its mean in 16
-// bits an axis, its rotation in 32 (the three smaller components of the quaternion), its semi-axes in 10 bits each,
-// rounded up. How far that can move a surface is taken off every distance, so that what is proven stays so.
+// Leaves of the collision field in 18 instead of 56 bytes an ellipsoid, relative to a block of space. The mean takes
+// 16 bits an axis, the rotation 32 (the three smaller components of the quaternion). The semi-axes take 10 bits each,
+// rounded up. Every distance is reduced by the largest shift of a surface, so that certified answers stay certified.
 //
-// An ellipsoid of mean m, rotation R and semi-axes A reaches n.m + |A R' n| along a unit n. With a mean off by at most
-// kPackedOff, a rotation off by an angle of at most kPackedTurn and semi-axes no smaller, the packed one reaches at
-// least as far less kPackedOff + kPackedTurn max(A).
+// An ellipsoid of mean m, rotation R and semi-axes A reaches n.m + |A R' n| along a unit n. Let the packed mean
+// deviate by at most kPackedOff, the rotation by an angle of at most kPackedTurn, and no semi-axis be smaller. The
+// packed one then reaches at least as far, less kPackedOff + kPackedTurn max(A).
 #pragma once
 
 #include <cstdint>
@@ -19,8 +19,9 @@ namespace splatbot {
 
 inline constexpr float kPackedStep = kBlockEdge / 65536.0F;  // [m]
 inline constexpr float kPackedOff = 1.7321F * kPackedStep;   // [m] the last step rounds down
-// Components are off by half a step of sqrt(2)/1023, and so at most sqrt(3)/2 of one in all; on the sphere of unit
-// quaternions that is at most twice as far (the component left out is 1/2 at least), and a rotation turns by twice that.
+// Components deviate by half a step of sqrt(2)/1023, and so by at most sqrt(3)/2 of a step in total. On the sphere of
+// unit quaternions that is at most twice as far, as the omitted component is at least 1/2. A rotation turns by twice
+// that.
 inline constexpr float kPackedTurn = 4.85e-3F;  // [rad]
 inline constexpr float kTurnStep = 1.3824180e-3F;
 inline constexpr float kPackedLeast = 1.0F / 32768.0F;  // [m] thinner ellipsoids are made as thick

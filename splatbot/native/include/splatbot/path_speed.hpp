@@ -15,9 +15,11 @@ struct PathShape {
   std::span<const double> velocity, acceleration;  // (J,) limits, above 0
 };
 
-// The fastest squared speeds (ds/dt)^2 at the places, at rest at both ends, such that |dq/dt| and |d2q/dt2| respect the
-// limits at every place: reachability analysis on the path (Pham and Pham, TOPP-RA, T-RO 2018), backwards for the speeds
-// from which the end can be reached, forwards the largest of them. Throws std::invalid_argument for what does not fit.
+// The fastest squared speeds (ds/dt)^2 at the places, at rest at both ends, such that |dq/dt| and |d2q/dt2| respect
+// the limits everywhere. Reachability analysis on the path (Pham and Pham, TOPP-RA, T-RO 2018). A backward pass
+// finds
+// the speeds from which the end is reachable, a forward pass takes the largest. Throws std::invalid_argument if sizes
+// do not fit.
 void fastest_speeds(const PathShape& path, std::span<double> squared);
 
 }  // namespace splatbot

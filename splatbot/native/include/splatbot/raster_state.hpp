@@ -27,13 +27,14 @@ inline constexpr int kBlockPixels = kBlock * kBlock;
 inline constexpr int kTilePixels = kTileWidth * kTileHeight;
 static_assert(kBlocks <= 32 && kTileHeight % 16 == 0);
 
-// Where a tile keeps its pixel (x, y): block by block, 16 to a block, column by column within it, so that what depends
-// on a pixel's line alone is four numbers over and over. Always inlined: the kernels are compiled for several CPUs.
+// The index of pixel (x, y) in a tile: block by block, 16 pixels to a block, column by column within it. Values that
+// depend on a pixel's line alone then repeat every four numbers. Always inlined: the kernels are compiled for several
+// CPUs.
 __attribute__((always_inline)) inline constexpr int pixel_index(int x, int y) {
   return ((y / kBlock) * kBlockColumns + x / kBlock) * kBlockPixels + (x % kBlock) * kBlock + y % kBlock;
 }
 
-// Gaussians are projected in blocks of this many, whatever the number of threads: sums over them are in fixed order.
+// Gaussians are projected in blocks of this many for any number of threads: sums over them are in fixed order.
 inline constexpr std::size_t kProjectBlock = 1024;
 
 // Pairs are blended in chunks of this many: one bit each in a std::uint64_t.
@@ -47,13 +48,13 @@ inline constexpr int kSlot = 16;
 inline constexpr int kAbsolute = 14;
 static_assert(kMoments + kRecordChannels <= kAbsolute && kAbsolute + 2 <= kSlot);
 
-// What a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
+// State that a blend pass keeps of each pixel: transmittance, the channels' sums, the sum of weights.
 inline constexpr int kFinalPlanes = 2 + kRecordChannels;
 inline constexpr int kWeightPlane = 1 + kRecordChannels;  // for expected depth only
 
-// A projected Gaussian, one cache line. With d = pixel centre - (mx, my), u = l11 dx + l21 dy and w = l22 dy, it has
-// alpha = 2^(lo - u^2 - w^2): (l11 l21; 0 l22) is a root of the inverse 2D covariance times log2(e) / 2, so nothing
-// cancels for needles. It reaches the pixels with u^2 + w^2 <= reach^2; `lean` is w at its rightmost point.
+// A projected Gaussian, one cache line. With d = pixel centre - (mx, my), u = l11 dx + l21 dy and w = l22 dy, alpha
+// is 2^(lo - u^2 - w^2). (l11 l21; 0 l22) is a root of the inverse 2D covariance times log2(e) / 2, so no digits
+// cancel for needles. It reaches the pixels with u^2 + w^2 <= reach^2; `lean` is w at its rightmost point.
 struct alignas(64) Record {
   float mx, my, l11, l21, l22, lo, reach, lean;
   float channels[kRecordChannels];  // depth first, if rendered, then colours; for plane depth its slopes come last
@@ -93,7 +94,7 @@ struct ChannelPass {
   std::array<int, kRecordChannels> column{};  // in the rendered image
 };
 
-// Which tiles N projected things go to and in what order, whatever their shape.
+// Tiles of N projected primitives of any shape, and their order.
 struct TileLists {
   int columns = 0, rows = 0;  // tiles
 

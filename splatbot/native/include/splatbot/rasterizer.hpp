@@ -35,7 +35,7 @@ struct View {
   float rotation[9];  // world to camera, row-major
   float translation[3];
   float origin[3];
-  float center_low[3];   // the camera's centre less origin: what rounding the origin took from it
+  float center_low[3];   // the camera's centre less origin: the rounding error of the origin
   float fx, fy, cx, cy;  // [px]
   int width, height;     // [px]
   Lens lens{};
@@ -54,7 +54,7 @@ struct RasterOptions {
   float eps2d = 0.3F;        // [px^2]; added to the diagonal of the projected covariance
   DepthMode depth = DepthMode::none;
   bool plane_depth = false;  // depth varies over a footprint as that of the Gaussian's own plane
-  bool antialiased = false;  // opacity falls by what the blur adds to a footprint's area
+  bool antialiased = false;  // opacity falls by the ratio in which the blur enlarges a footprint's area
   float transmittance_min = 1e-4F;  // a pixel is closed before its transmittance falls to this
 };
 
@@ -70,16 +70,16 @@ struct Fault {
   std::size_t row;
 };
 
-// What a forward pass leaves for its backward pass. Opaque; see raster_state.hpp.
+// State that a forward pass leaves for its backward pass. Opaque; see raster_state.hpp.
 struct RasterState;
 using RasterStatePtr = std::shared_ptr<RasterState>;
 
-// Renders colours (H, W, channels [+ 1 when depth is asked for, last]) and alphas (H, W).
+// Renders colours (H, W, channels [+ 1 for a requested depth, last]) and alphas (H, W).
 //
-// The model is that of 3D Gaussian splatting (Kerbl 2023, Zwicker 2001) with gsplat's constants: a Gaussian counts in a
-// pixel from alpha = 1/255 on, alpha is capped at 0.99, and a pixel is closed by the Gaussian that would bring its
-// transmittance to 1e-4 or below, which is left out. Order is by depth, equal depths by index. The result depends
-// neither on the number of threads nor on earlier calls. `background` (channels,) may be empty.
+// The model is that of 3D Gaussian splatting (Kerbl 2023, Zwicker 2001) with gsplat's constants. A Gaussian
+// contributes to a pixel from alpha = 1/255 on, and alpha is capped at 0.99. The Gaussian that would bring the
+// transmittance to 1e-4 or below closes the pixel and is left out. Order is by depth, equal depths by index. The
+// result depends neither on the number of threads nor on earlier calls. `background` (channels,) may be empty.
 //
 // Returns the fault instead of rendering if an input is not finite.
 std::optional<Fault> rasterize_forward(const Gaussians& gaussians, const View& view, const RasterOptions& options,
@@ -92,12 +92,12 @@ std::optional<Fault> rasterize_forward(const Gaussians& gaussians, const View& v
 std::optional<Fault> find_visible(const Gaussians& gaussians, const View& view, const RasterOptions& options,
                                   std::vector<std::uint32_t>& ids);
 
-// Sums over Gaussians that a camera's gradient is made of: rotation, translation, fx, fy, cx, cy; then those of a rolling
-// shutter's turn, step and pivot (see Lens), 0 for others.
+// Sums over Gaussians for a camera's gradient: rotation, translation, fx, fy, cx, cy. Those of a rolling shutter's
+// turn, step and pivot follow (see Lens), 0 for others.
 inline constexpr int kMotionSums = 9;
 inline constexpr int kCameraSums = 16 + kMotionSums;
 
-// Where gradients go; an empty span is not computed. With `accumulate`, they are added to what is there.
+// Destinations of gradients; an empty span is not computed. With `accumulate`, they are added to the present values.
 struct Gradients {
   std::span<float> means, quats, scales, covars, opacities, colors;
   std::span<double> camera;      // (kCameraSums,): dL/d(world-to-camera rotation row-major, translation, fx, fy, cx, cy, ...)
@@ -112,7 +112,7 @@ struct Gradients {
 void rasterize_backward(const RasterState& state, const Gaussians& gaussians, std::span<const float> background,
                         std::span<const float> grad_colors, std::span<const float> grad_alphas, const Gradients& out);
 
-// What projection found, one row a Gaussian; rows of Gaussians out of view are zero.
+// Results of projection, one row a Gaussian; rows of Gaussians out of view are zero.
 struct Projections {
   std::span<float> means2d;               // (N, 2) [px]
   std::span<float> depths;                // (N,)

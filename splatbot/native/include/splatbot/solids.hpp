@@ -37,13 +37,14 @@ struct alignas(64) SolidNode {
 
 inline constexpr float kCoverRounding = 4e-6F;
 
-// For each child of a node: in the metric of `whiten`, a triangle of rows, a point's distance from `center` less `radius`
-// is at most its distance from any of the ellipsoids below, each in the ellipsoid's own metric (1 on its surface).
+// For each child of a node, a bound in the metric of `whiten`, a triangle of rows. A point's distance from `center`
+// less `radius` is at most its
+  // distance from any ellipsoid below. Each distance is in the ellipsoid's own metric (1 on its surface).
 struct alignas(64) SolidCover {
   float center[3][kFan];  // world [m]
   float whiten[6][kFan];  // (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
   float radius[kFan];
-  float thin[kFan];  // [1/m], one over the least semi-axis below: what a metre of rounding may come to
+  float thin[kFan];  // [1/m], one over the least semi-axis below: effect of a metre of rounding
 };
 
 // Covers of a field's nodes, in the order of the nodes; an array for each block.
@@ -67,7 +68,7 @@ struct BoundGridView {
   float voxel, per_voxel;  // [m], [1/m]
 };
 
-// What the kernels see of a field.
+// The part of a field that the kernels read.
 struct SolidsView {
   const SolidNode* top;  // the first is the root; null if there is no Gaussian
   const SolidBlockView* blocks;

@@ -11,9 +11,10 @@ inline constexpr float kFilter = 2.0F;          // 1 / variance of the low-pass 
 inline constexpr float kLeastScale = 1e-6F;     // [px]; a thinner disc counts as this thick
 inline constexpr float kMedianLight = 0.5F;     // transmittance at which the median depth is
 
-// A projected surfel, two cache lines. Its centre is (mx + part_x, my + part_y), of which the first are whole pixels: a
-// float of a pixel's place in a large image has too few digits for a thin disc. With d = pixel centre - centre and D = kappa + h d, the ray meets the disc at
-// u = (b d)_0 / D, v = (b d)_1 / D [standard deviations] and depth z kappa / D.
+// A projected surfel, two cache lines. Its centre is (mx + part_x, my + part_y), where the first parts are whole
+// pixels. A single float of a pixel's place in a large image has too few digits for a thin disc. Let d = pixel centre
+// - centre and D = kappa + h d. The ray meets the disc at u = (b d)_0 / D, v = (b d)_1 / D [standard deviations] and
+// depth z kappa / D.
 struct alignas(64) SurfelRecord {
   float mx, my, part_x, part_y;
   float b[4];    // row-major
@@ -30,8 +31,8 @@ struct alignas(64) SurfelRecord {
 };
 static_assert(sizeof(SurfelRecord) == 128);
 
-// Sums of one (surfel, tile) pair. With g = d loss / d log(alpha): g; numerators of u, v and D times (dx, dy, 1);
-// z kappa; depth of the centre; low-pass dx, dy; then weights times gradients of normals and colours.
+// Sums of one (surfel, tile) pair. With g = d loss / d log(alpha) they are g and the numerators of u, v and D
+// times (dx, dy, 1). Next are z kappa, the depth of the centre, and the low-pass dx, dy. Weights times gradients of normals and colours follow.
 enum SurfelSum : int {
   kSumAlpha,
   kSumU,
@@ -48,7 +49,7 @@ enum SurfelSum : int {
 inline constexpr int kSurfelSlot = 32;
 static_assert(kSurfelGeometrySums <= 16 && kSumColor + kMaxSurfelChannels <= kSurfelSlot);
 
-// What a blend keeps of each pixel for its backward pass.
+// State that a blend keeps of each pixel for its backward pass.
 enum SurfelPlane : int {
   kPlaneTransmittance,
   kPlaneWeights,  // sum of weights
@@ -104,7 +105,7 @@ struct SurfelProjectBackwardArgs {
   bool sum_channels;
   bool accumulate;  // add to the outputs
   bool accumulate_colors;
-  float *means, *quats, *scales, *opacities, *colors, *means2d;  // outputs; null: not asked for
+  float *means, *quats, *scales, *opacities, *colors, *means2d;  // outputs; null if not requested
   double* camera;                                                // (blocks, kCameraSums) partial sums, or null
 };
 

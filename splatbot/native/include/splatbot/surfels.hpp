@@ -20,9 +20,9 @@ struct SurfelOptions {
   bool distortion = false;
 };
 
-// Where a surfel render goes. `median` and `distortion` are (H, W), the latter empty if not asked for.
+// Outputs of a surfel render. `median` and `distortion` are (H, W), the latter empty if not requested.
 struct SurfelImages {
-  std::span<float> colors;   // (H, W, channels [+ 1 when depth is asked for, last])
+  std::span<float> colors;   // (H, W, channels [+ 1 for a requested depth, last])
   std::span<float> alphas;   // (H, W)
   std::span<float> normals;  // (H, W, 3), world frame
   std::span<float> median;
@@ -33,10 +33,10 @@ struct SurfelState;
 using SurfelStatePtr = std::shared_ptr<SurfelState>;
 
 // Renders flat Gaussians (Huang et al. 2024, 2D Gaussian Splatting): discs in the plane of the first two axes, met by
-// each pixel's ray; the third scale is not looked at. A disc's response is exp(-(u^2 + v^2) / 2) at the hit, in standard
-// deviations, or, if that is more, exp(-d^2) d pixels from its projected centre. Depth is that of the hit, or of the
-// centre where the second response counts. Hits nearer than the near plane are none. Blending is that of
-// rasterize_forward().
+// each pixel's ray. The third scale is ignored. A disc's response is exp(-(u^2 + v^2) / 2) at the hit, in standard
+// deviations. If it is larger, exp(-d^2) counts instead, d pixels from the projected centre. Depth is that of the
+// hit, or of the centre if the second response counts. Hits nearer than the near plane are ignored. Blending is that
+// of rasterize_forward().
 std::optional<Fault> surfels_forward(const Gaussians& surfels, const View& view, const SurfelOptions& options,
                                      std::span<const float> background, const SurfelImages& out,
                                      SurfelStatePtr& state);
@@ -50,7 +50,7 @@ struct SurfelImageGradients {
 void surfels_backward(const SurfelState& state, const Gaussians& surfels, std::span<const float> background,
                       const SurfelImageGradients& grads, const Gradients& out);
 
-// What projection found, one row a surfel; rows of surfels out of view are zero.
+// Results of projection, one row a surfel; rows of surfels out of view are zero.
 struct SurfelProjections {
   std::span<float> means2d;               // (N, 2) [px]
   std::span<float> depths;                // (N,)

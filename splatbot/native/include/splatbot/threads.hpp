@@ -25,9 +25,9 @@ class ThreadPool {
 
   unsigned size() const noexcept { return size_; }
 
-  // Calls task(i) for every i in [0, count) and returns when all are done. A pool busy with another caller's loop is
-  // not waited for: the caller then runs its tasks itself; so does one of lower priority than the pool's for a second
-  // after another has used it. The first exception of a task is rethrown here.
+  // Calls task(i) for every i in [0, count) and returns when all are done. A caller does not wait for a pool that is
+  // busy with another loop: it runs its tasks itself. So does a caller of lower priority than the pool's, for a
+  // second after another has used it. The first exception of a task is rethrown here.
   template <class Task>
   void run(std::size_t count, Task&& task) {
     using Plain = std::remove_reference_t<Task>;
@@ -45,7 +45,7 @@ class ThreadPool {
   bool yields();
 
   unsigned size_;
-  int niceness_;                         // of the workers, who inherit it
+  int niceness_;                         // priority that the workers inherit
   std::atomic<std::int64_t> last_used_;  // [ns] by a thread of no lower priority
   std::mutex owner_;  // held by the caller whose loop is being run
   std::mutex mutex_;
@@ -62,8 +62,8 @@ class ThreadPool {
 // The pool all kernels share: SPLATBOT_NUM_THREADS threads, or as many as the process may run on.
 std::shared_ptr<ThreadPool> thread_pool();
 
-// Whether loops that the calling thread starts are run by it alone, whatever the pool's size: for work in the background
-// that is to leave the other cores to somebody else. Off in a new thread.
+// True if loops of the calling thread run on it alone: background work leaves the other cores to other threads. False
+// in a new thread.
 void keep_to_this_thread(bool alone) noexcept;
 
 // Replaces the shared pool; 0 returns to the default. Throws std::invalid_argument above 1024.

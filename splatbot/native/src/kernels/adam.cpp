@@ -63,7 +63,7 @@ void adam(const AdamGroup& group, const AdamBlock& block) {
   if (i == n) {
     return;
   }
-  // The last few elements go through a copy: what lies beyond may be another block's, or nobody's.
+  // The last few elements go through a copy: the memory behind them may belong to another block.
   alignas(64) float tail[6][W] = {};
   const std::size_t left = (n - i) * sizeof(float);
   const float* const sources[6] = {all.values + i, all.first + i, all.second + i, all.gradient + i, step_scale + i, eps + i};

@@ -32,7 +32,7 @@ SB_INLINE std::uint32_t not_proven(const ArmView& arm, const BoundGridView& g, c
   const F zero = set1(0.0F);
   const M inside = (x >= zero) & (y >= zero) & (z >= zero) & (x < set1(static_cast<float>(g.size[0]))) &
                    (y < set1(static_cast<float>(g.size[1]))) & (z < set1(static_cast<float>(g.size[2])));
-  // Voxels that the ball needs: with what rounding may have moved its centre by.
+  // Voxels that the ball needs, enlarged by the rounding error of its centre.
   const F most = max(absolute(from[0]), max(absolute(from[1]), absolute(from[2]))) + set1(4.0F);  // and of the arm
   const F need = fma(most, set1(8e-7F), r) * set1(g.per_voxel * (1.0F + 2e-5F));
   alignas(64) float needed[W];
@@ -106,7 +106,7 @@ std::uint32_t check_lanes(const ArmView& arm, const SolidsView* field, const Joi
   return field == nullptr ? alive : check_field(arm, *field, placed, alive, verdict);
 }
 
-// A stretch of an edge: its middle, half its length, and what of the arm is not yet known to be free on it.
+// A stretch of an edge: its middle, half its length, and the spheres not yet known to be free on it.
 struct Stretch {
   float middle, half;
   std::uint64_t spheres[kMostSpheres / 64];

@@ -7,8 +7,8 @@
 
 namespace splatbot::SPLATBOT_KERNELS {
 
-// Sine and cosine of x + rest, |rest| far below |x|, for |x| < 1e4: reduced by multiples of pi/2 in three parts, then
-// minimax polynomials on [-pi/4, pi/4] (absolute error below 1e-7).
+// Sine and cosine of x + rest, |rest| far below |x|, for |x| < 1e4. The argument is reduced by multiples of pi/2 in
+// three parts; minimax polynomials on [-pi/4, pi/4] follow (absolute error below 1e-7).
 SB_INLINE void sine_cosine(F x, F rest, F& sine, F& cosine) {
   const F k = floor(fma(x, set1(0.636619772F), set1(0.5F)));
   F r = fnma(k, set1(1.5703125F), x);

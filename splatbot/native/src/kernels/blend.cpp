@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Front-to-back blending of one tile. 64 Gaussians at a time: their block masks are found first, then each block goes
-// through the Gaussians that reach it with its transmittance and colours in registers.
+// Front-to-back blending of one tile, 64 Gaussians at a time. Their block masks are found first. Then each block goes
+// through the Gaussians that reach it, with its transmittance and colours in registers.
 #include "entry.hpp"
 #include "image.hpp"
 #include "reach.hpp"
@@ -26,12 +26,12 @@ struct Chunk {
 
 struct TileState {
   alignas(64) float through[kTilePixels];        // see advance()
-  alignas(64) float transmittance[kTilePixels];  // what the Gaussians that count leave
+  alignas(64) float transmittance[kTilePixels];  // transmittance behind the contributing Gaussians
   alignas(64) float channels[kRecordChannels][kTilePixels];
   alignas(64) float weights[kTilePixels];  // for expected depth, where 1 - transmittance has too few digits if small
 };
 
-// What a blend does besides summing channels.
+// Options of a blend in addition to summing channels.
 struct Extras {
   bool plane;  // depth varies over a footprint
   bool weigh;  // sum the weights
@@ -166,7 +166,7 @@ void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile
   args.tile_done[tile] = at - begin;
 }
 
-// Sums to what is asked for: the background behind them, depth divided by the weights.
+// Converts sums to outputs: adds the background, divides depth by the weights.
 void finish(const BlendArgs& args, TileState& state) {
   const ChannelPass& pass = *args.pass;
   for (std::size_t i = 0; i < kPlane; i += W) {

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Gradient of blend(). Gaussian by Gaussian, front to back, with each pixel's transmittance T and the rest
-// R = sum over what is still to be blended of (channels . gradient) x weight + T_final x gradient of T_final, so that
+// Gradient of blend(), Gaussian by Gaussian, front to back. T is each pixel's transmittance. The rest R is the sum of
+// (channels . gradient) x weight over the Gaussians still to blend, plus T_final x gradient of T_final. Then
 //   d loss / d alpha = T (channels . gradient) - R_after / (1 - alpha),
-// without a division by T and in the order and with the masks of the forward pass. The sums of one (Gaussian, tile)
-// pair go to a slot of their own: nothing is shared between threads and nothing depends on their number.
+// without a division by T. Order and masks are those of the forward pass. The sums of one (Gaussian, tile) pair
+// go to their own slot. Threads share no sums, and the result does not depend on their number.
 #include "entry.hpp"
 #include "image.hpp"
 
@@ -86,12 +86,12 @@ void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, int channe
 
 SB_INLINE F abs(F a) { return max(a, -a); }
 
-// What is summed of each pair besides the channels' gradients.
+// Sums of each pair in addition to the channels' gradients.
 enum class Sums { none, moments, absolute };
 
-// Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha); then weight times gradient for the first S channels; then,
-// if absolute, the absolute gradients of the centre in x (less a factor) and y. Without moments there is no need of
-// the gradient to alpha.
+// Sums: 1, u, w, uu, uw, ww times d loss / d log(alpha). Weight times gradient follows for the first S channels. If
+// absolute, the absolute gradients of the centre in x (less a factor) and y follow. Without moments the gradient to
+// alpha is not needed.
 template <int C, int S, bool Plane, Sums Kind>
 SB_INLINE void sum_pair(const Record& record, const Lines& lines, const float* channels, const PlaneDepth& plane,
                         std::uint32_t mask, F limit, TileGradient& state, float* slot) {

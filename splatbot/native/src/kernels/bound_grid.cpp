@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Squared distances between voxels and the nearest marked voxel, exact and separable: along z by two sweeps, then along
-// y and x by a minimum over all shifts that matter. Cubes n voxels apart are n - 1 voxels from each other.
+// Squared distances between voxels and the nearest marked voxel, exact and separable. Two sweeps run along z, then a
+// minimum over all relevant shifts along y and x. Cubes n voxels apart are n - 1 voxels from each other.
 #include "field_entry.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {

@@ -19,7 +19,8 @@ struct Seen {
   Found solid;
 };
 
-// Whether `id` goes before one found already that is as near: the lowest wins, that of an unused lane never.
+// True if `id` precedes one found already at the same distance: the lowest id wins, that of an unused lane never
+// does.
 SB_INLINE bool goes_before(std::int32_t id, const Found& found) {
   return found.block >= 0 && static_cast<std::uint32_t>(id) < static_cast<std::uint32_t>(found.id);
 }
@@ -57,11 +58,11 @@ SB_INLINE void visit_leaves(const SolidsView& s, const Split& p, Place place, st
   }
 }
 
-// What a walk looks for: `limit` says how far it need look, `enter` is told of each node whose children's bounds are
-// asked for, `leaf` takes what it finds.
+// Goal of a walk: `limit` bounds the search, `enter` is called for each node before its children's bounds, `leaf`
+// collects the result.
 //
-// Boxes in order of their bounds; a bound is compared with `limit()` and a box is left out only if it is greater, so
-// that equals are all seen and the lowest id wins.
+// Boxes are visited in order of their bounds. A box is skipped only if its bound is greater than `limit()`, so that
+// all equals are seen and the lowest id wins.
 template <class Search>
 SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
   if (s.top == nullptr) {
@@ -204,8 +205,8 @@ struct MahalanobisSearch {
     return select(size > set1(0.0F), size * size, set1(0.0F));
   }
 
-  // Where p is delta beyond a box that reaches at least to the ellipsoid's own box, it is at least 1 + delta / extent
-  // of that ellipsoid's size away.
+  // If p is delta beyond a box that contains the ellipsoid's own box, it is at least 1 + delta / extent of that
+  // ellipsoid's size away.
   SB_INLINE F by_box(const SolidNode& node, const Split& p, int at) const {
     F most = set1(0.0F);
     for (int k = 0; k < 3; ++k) {
@@ -215,7 +216,7 @@ struct MahalanobisSearch {
     return select(most > set1(0.0F), most + set1(1.0F), set1(0.0F));
   }
 
-  // What float32 rounds off is below 4e-6 of |d|_1 over the least semi-axis, here and in a leaf together.
+  // The rounding error of float32 is below 4e-6 of |d|_1 over the least semi-axis, here and in a leaf together.
   SB_INLINE F by_cover(const Split& p, int at) const {
     const F x = set1(p.hi[0]) - load(cover->center[0] + at), y = set1(p.hi[1]) - load(cover->center[1] + at),
             z = set1(p.hi[2]) - load(cover->center[2] + at);
@@ -339,8 +340,8 @@ void solve(const Exact& e, NearestSolid& out) {
   }
 }
 
-// Certified and smooth: the float64 distance of the winner less what float32 and packing may have hidden, or, should
-// the bound not have come that close, the bound itself.
+// Certified and smooth: the float64 distance of the winner, less the largest error of float32 and packing. If the
+// bound did not come that close, the bound itself.
 double certified(const Exact& e, double exact, double bound) {
   double size = e.a[0];
   for (int k = 0; k < 3; ++k) {
@@ -413,7 +414,7 @@ void field_k_nearest(const SolidsView& s, const SphereQueries& q, int k, float c
 void field_mahalanobis(const SolidsView& s, const SolidCoversView& covers, const double* points,
                        const std::uint32_t* order, std::size_t begin, std::size_t end, double* distance,
                        std::int32_t* id) {
-  Found last;  // what was nearest to the point before leaves little to search, wherever it is
+  Found last;  // the nearest Gaussian of the previous point bounds the search closely
   for (std::size_t at = begin; at < end; ++at) {
     const std::size_t i = order[at];
     const Split p = split(points + 3 * i);

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which Gaussians a pixel meets first: the forward pass over again, with names in place of colours, and no longer than
-// there is something to find.
+// The first Gaussians of each pixel: the forward pass again, with ids in place of colours, up to the last one needed.
 #include "entry.hpp"
 #include "tile.hpp"
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// View-dependent colour of the Gaussians in view: max(0, 1/2 + sum of spherical harmonics x coefficients), in the
-// direction from the camera's centre to the Gaussian's, and its gradient. Real harmonics with the signs of 3DGS
-// (Kerbl et al. 2023; polynomials after Sloan, JCGT 2013); beyond the unit sphere they are continued as the
-// polynomials written here, which does not matter, since only gradients along the sphere are used.
+// View-dependent colour of the Gaussians in view and its gradient. The colour is max(0, 1/2 + sum of spherical
+// harmonics x coefficients), in the direction from the camera's centre to the Gaussian. Real harmonics with the signs of 3DGS
+// (Kerbl et al. 2023; polynomials after Sloan, JCGT 2013). Beyond the unit sphere they continue as these polynomials,
+// which has no effect, since only gradients along the sphere are used.
 #include "entry.hpp"
 #include "simd.hpp"
 

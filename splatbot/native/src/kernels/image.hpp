@@ -65,7 +65,7 @@ inline void copy_out(const TileFrame& frame, std::size_t width, const float* con
   }
 }
 
-// The other way; what lies outside the image is left alone.
+// The inverse operation; pixels outside the image are left unchanged.
 inline void copy_in(const TileFrame& frame, std::size_t width, const float* image, int channels, const int* column,
                     int count, float* const* planes) {
   if (count == 1 && channels == 1 && of_whole_blocks(frame)) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the projections share.
+// Code that the projections share.
 #pragma once
 
 #include "project.hpp"

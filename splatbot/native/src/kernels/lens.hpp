@@ -119,8 +119,8 @@ SB_INLINE Affine affine_of(const F (&p)[3], F fx, F fy) {
   return out;
 }
 
-// From the gradients to the centre's pixel (mx, my), its depth and, through the covariance, the derivative j, to the
-// centre p in the camera frame.
+// Propagates gradients to the centre p in the camera frame. They are those of its pixel (mx, my), of its depth and,
+// through the covariance, of the derivative j.
 template <Projection P>
 SB_INLINE void pull_back_affine(const Affine& lens, const F (&p)[3], F fx, F fy, F mx, F my, F z, F (&gj)[2][3],
                                 F (&out)[3]) {

@@ -171,13 +171,13 @@ void linearize(const LinearizeArgs& args, LinearizeSums& sums) {
     const F depth = sample_depth(args.depth, args.width, index, a, b);
     const M measured = depth > zero;
     const F sigma_z = fma(set1(args.sigma_depth_quad) * qz, qz, set1(args.sigma_depth_floor));
-    // A point far behind or before what the camera sees is occluded or gone: its colour tells nothing either.
+    // A point far behind or before the camera's surface is occluded or gone: its colour is no evidence either.
     const M contradicted = measured & (abs(depth - qz) > fma(set1(3.0F), sigma_z, set1(args.gate)));
     const M used = and_not(inside, contradicted);
 
     if (args.use_photometric) {
       const Sample s = sample_gray(args.gray, args.width, index, a, b);
-      // Masked pixels are NaN, and so is what is interpolated from one.
+      // Masked pixels are NaN, and so are values interpolated from one.
       const M seen = used & (abs(s.value) + abs(s.du) + abs(s.dv) < set1(1e6F));
       const F reference = load(gray.values + k);
       const F r = s.value - fma(set1(args.gain), reference, set1(args.offset));

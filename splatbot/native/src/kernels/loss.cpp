@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // L1 and SSIM of one tile, and their gradient. Rows stream through: products of the two images are blurred along the
-// row and put into a ring of eleven rows, from which the blur across rows gives the moments of one row of windows. SSIM's
+// row and enter a ring of eleven rows. The blur across these rows gives the moments of one row of windows. SSIM's
 // derivatives by those moments go through a second such ring, because the gradient is their blur.
 //
-// Both images are taken relative to the tile's mean: variances as differences of moments would otherwise lose the
-// digits that matter in flat regions, where they are small against SSIM's constant 9e-4.
+// Both images are relative to the tile's mean. Variances as differences of moments would otherwise lose the
+// significant digits in flat regions, where they are small against SSIM's constant 9e-4.
 #include "entry.hpp"
 #include "simd.hpp"
 
@@ -247,8 +247,8 @@ RingRows ring_rows(int newest, const Line& line) {
   return rows;
 }
 
-// A row of windows at image row `row`, of which the moments' ring holds all it needs; its derivatives are blurred along
-// the row into the other ring.
+// Processes a row of windows at image row `row`, whose moments the ring holds. Its derivatives are blurred along the
+// row into the other ring.
 template <bool kGradient>
 void center_row(const Tile& t, int row, int newest, int number, const Lines& lines, LossSums& sums) {
   const LossArgs& a = t.args;

@@ -8,10 +8,10 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
-// Change of depth per pixel over a Gaussian's footprint if its matter lies in the plane through its centre whose
-// normal n is its flattest axis: the ray of pixel (u, v) meets that plane at z(u, v), and d z/d u is
-// -z^2 n_x / (fx n.p). A Gaussian with no flattest axis has no plane, so the slope fades with (least scale / middle scale)^2; it is bounded
-// where the plane is seen edge-on: over one footprint, depth varies by no more than twice the Gaussian's own.
+// Change of depth per pixel over a Gaussian's footprint, if its mass lies in the plane through its centre normal to
+// its flattest axis n. The ray of pixel (u, v) meets that plane at z(u, v), and d z/d u is -z^2 n_x / (fx n.p). A
+// Gaussian without a flattest axis has no plane, so the slope fades with (least scale / middle scale)^2. It is
+// bounded where the plane is seen edge-on: over one footprint, depth varies by at most twice the Gaussian's own.
 SB_INLINE void plane_slopes(const GaussianLanes& g, const CameraLanes& cam, const Projected& o, F (&slope)[2]) {
   F s[3];
   for (int k = 0; k < 3; ++k) {
@@ -45,7 +45,7 @@ SB_INLINE void plane_slopes(const GaussianLanes& g, const CameraLanes& cam, cons
   slope[1] = zero_unless(known, slope[1] * shrink);
 }
 
-// What is written of W Gaussians in view.
+// Outputs of W Gaussians in view.
 struct Written {
   F record[8];  // as Record's first eight
   F depth, slope[2];
@@ -95,7 +95,7 @@ SB_INLINE void store_group(float* rows, std::size_t stride, std::size_t g, const
 SB_INLINE void few_channels(const ProjectArgs& args, const Written& w, std::size_t first, int n, F (&out)[8]) {
   const F zero = set1(0.0F);
   F color[3] = {zero, zero, zero};
-  if (args.sh_degree < 0 && args.channels == 3) {  // else harmonics() writes them, or there are none
+  if (args.sh_degree < 0 && args.channels == 3) {  // else harmonics() writes them, or they are absent
     load_lanes<3>(args.colors, first, n, color);
   }
   const bool depth = args.passes[0].depth_first;
@@ -108,8 +108,8 @@ SB_INLINE void few_channels(const ProjectArgs& args, const Written& w, std::size
   }
 }
 
-// Records and placements of the rows from `first` on, W of each or those in view; the others' are not looked at but for
-// a placement of no tiles.
+// Records and placements of the rows from `first` on, for W rows or those in view. The others only get a placement of
+// no tiles.
 SB_INLINE void write(const ProjectArgs& args, std::size_t first, int n, M keep, std::uint32_t kept, const Written& w,
                      ProjectedBlock& out) {
   static_assert(sizeof(Record) == 16 * sizeof(float) && sizeof(Placement) == 4 * sizeof(float));

@@ -54,7 +54,7 @@ struct Projected {
   F unit[4];                // unit quaternion
   F rotation[9];            // of the Gaussian
   F a[9];                   // camera rotation x Gaussian rotation
-  // Of a covariance, a is the camera rotation alone.
+  // Given a covariance, a is the camera rotation alone.
   F rows[2][3];             // a[0] - slope x a[2] and a[1] - slope y a[2]
   F m[2][3];                // root of the 2D covariance: j x rows x scale; of a covariance: (covariance j rows)^T
   F s00, s11, det_sharp;    // 2D covariance before the blur

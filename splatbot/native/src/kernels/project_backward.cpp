@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// From the sums of blend_backward() to the gradients of the inputs, W Gaussians at once. The projection is computed
-// anew: cheaper than keeping it.
+// Propagates the sums of blend_backward() to the gradients of the inputs, W Gaussians at once. The projection is
+// computed again: cheaper than keeping it.
 #include "entry.hpp"
 #include "lanes.hpp"
 #include "project.hpp"
@@ -25,7 +25,7 @@ struct LaneGradients {
   MotionLanes moved;              // of a rolling shutter
 };
 
-// Sum of a Gaussian's slots in the order of its tiles, on top of what earlier passes left.
+// Adds a Gaussian's slots, in the order of its tiles, to the sums of earlier passes.
 SB_INLINE void sum_slots(const ProjectBackwardArgs& args, const ProjectedBlock& block, std::size_t id, float* sums) {
   const Placement& place = args.forward.placements[id];
   const float* slot = args.slots + (block.first_pair + place.slot) * kSlot;
@@ -57,7 +57,7 @@ void write_colors(const ProjectBackwardArgs& args, std::size_t id, const float* 
   }
 }
 
-// What reaches the projection: gradients to the 2D centre, the 2D covariance and the depth.
+// Gradients that reach the projection: to the 2D centre, the 2D covariance and the depth.
 struct ImageGradients {
   F mx, my, z;
   F g00, g01, g11;  // d loss = g00 d c00 + 2 g01 d c01 + g11 d c11
@@ -133,7 +133,7 @@ SB_INLINE RowGradients into_covar(const Projected& o, const ImageGradients& imag
     for (int j = i; j < 3; ++j) {
       const F mixed = fma(b[0][i], b[1][j], b[1][i] * b[0][j]);
       const F entry = fma(image.g00, b[0][i] * b[0][j], fma(image.g01, mixed, image.g11 * b[1][i] * b[1][j]));
-      out.covar[at++] = i == j ? entry : two * entry;  // an entry off the diagonal stands for two
+      out.covar[at++] = i == j ? entry : two * entry;  // an off-diagonal entry counts twice
     }
   }
   return r;
@@ -161,8 +161,8 @@ SB_INLINE void through_pinhole(const GaussianLanes& g, const CameraLanes& cam, c
   const F gjx = fma(image.mx, o.p[0], r.jx);
   const F gjy = fma(image.my, o.p[1], r.jy);
   if (camera) {
-    // j x (a - slope a') has a derivative of a / z to the focal length where the slope is clamped: j x slope is
-    // constant then.
+    // j x (a - slope a') has the derivative a / z to the focal length where the slope is clamped: j x slope is
+    // constant there.
     const F clamped_x = dot3(o.a, r.rows[0]) / cam.fx, clamped_y = dot3(o.a + 3, r.rows[1]) / cam.fy;
     out.intrinsics[0] = fma(image.mx * o.p[0], iz, select(o.slope_free[0], r.jx * iz, clamped_x));
     out.intrinsics[1] = fma(image.my * o.p[1], iz, select(o.slope_free[1], r.jy * iz, clamped_y));
@@ -191,7 +191,7 @@ SB_INLINE void through_affine(const GaussianLanes& g, const CameraLanes& cam, co
   pull_back_affine<P>(lens, o.p, cam.fx, cam.fy, image.mx, image.my, image.z, gj, gp);
 }
 
-// Of a camera whose pixels are the focal lengths times something, plus the principal point.
+// Applies to a camera whose pixels are the focal lengths times a direction, plus the principal point.
 SB_INLINE void into_intrinsics(const CameraLanes& cam, const Projected& o, const ImageGradients& image,
                                LaneGradients& out) {
   const F two = set1(2.0F);

@@ -28,9 +28,9 @@ SB_INLINE EllipseLanes load_ellipses(const Record* records, const Pair* pairs, i
   return {cx, cy, first[2], first[3], second[0], second[2], second[3]};
 }
 
-// For each of W Gaussians, a bit for each block whose rectangle of pixel centres meets u^2 + w^2 <= reach^2. Exact for
-// each row of blocks: the ellipse cut by the row's strip is convex, so it meets the blocks that its extent in x spans,
-// and that extent ends at the ellipse's outermost point or, if that is outside, where the strip's nearer edge cuts it.
+// For each of W Gaussians, a bit for each block whose rectangle of pixel centres meets u^2 + w^2 <= reach^2. Exact for each row of blocks. The ellipse cut by the row's strip is convex, so it meets the blocks that its
+// extent in x spans. That extent ends at the ellipse's outermost point or, if that is outside, at the cut of the strip's nearer
+// edge.
 SB_INLINE I block_masks(const EllipseLanes& e) {
   constexpr float kMargin = 0.01F;  // [px], against rounding
   constexpr float kShare = 1.0F / kBlock;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows of arrays to lanes of vectors and back: lane i of vector c is column c of row i. Rows of up to four floats go as
-// quads, one load or store each, and four vectors of quads are transposed in registers; a column of scalar stores read
-// back as one vector would wait for all of them to reach the cache.
+// Rows of arrays to lanes of vectors and back: lane i of vector c is column c of row i. Rows of up to four floats are
+// loaded and stored as quads, and four vectors of quads are transposed in registers. A column of scalar stores that
+// is read back as one vector would wait for all of them to reach the cache.
 #pragma once
 
 #include "simd.hpp"

@@ -46,7 +46,7 @@ SB_INLINE void turn_by(const Lens& lens, D s, D (&r)[9]) {
   r[7] += a * w[0];
 }
 
-// What a point seen through a rolling shutter depends on besides the point, at the time s it was read.
+// State of a rolling shutter at the readout time s of a point.
 struct Reading {
   D s, r[9], turned[3];  // time, rotation since s = 0, and the point turned by it about the pivot
   D whole[2][3];         // derivative of the pixel by the point in the camera frame of that time
@@ -54,8 +54,8 @@ struct Reading {
   D line;                // pixel coordinate along which lines are read
 };
 
-// Through a shutter that reads line after line: the pose is that of the time at which the pixel, which depends on the
-// pose, is read. Newton's method on the time; the derivative is that of the implicit function.
+// Projects through a rolling shutter: the pose is that of the pixel's readout time, which depends on the pose.
+// Newton's method finds the time; the derivative is that of the implicit function.
 SB_APART Sight see_rolling(const View& view, const D (&p)[3], Reading* kept) {
   constexpr int kSteps = 8;
   const Lens& lens = view.lens;

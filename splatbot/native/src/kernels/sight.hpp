@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Points seen exactly through distorted lenses, in double: what counts are second differences of pixels.
+// Exact projection of points through distorted lenses, in double: the result depends on second differences of pixels.
 #pragma once
 
 #include "project.hpp"

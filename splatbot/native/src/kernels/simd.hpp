@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // One vector type per instruction set: AVX-512 (16 lanes), AVX2 with FMA (8), else the compiler's own 4-lane vectors
-// (SSE4.2, NEON). F holds floats, I 32-bit integers, M one truth value a lane. Contraction is off for these files: a
-// product and a sum fuse where fma() says so and nowhere else, so that forward and backward round alike.
+// (SSE4.2, NEON). F holds floats, I 32-bit integers, M one truth value a lane. Contraction is disabled for these
+// files. A product and a sum fuse only in fma(), so that forward and backward round alike.
 #pragma once
 
 #include <cstddef>
@@ -91,7 +91,7 @@ SB_INLINE F reciprocal(F a) {  // one Newton step from 14 bits
 // Square roots of positive numbers with a relative error below kRootError.
 inline constexpr float kRootError = 0x1p-13F;
 SB_INLINE F rough_sqrt(F a) { return {_mm512_mul_ps(a.v, _mm512_rsqrt14_ps(a.v))}; }
-// In each quad of lanes, what four vectors hold of it is a 4x4 matrix: transpose it.
+// Each quad of lanes of four vectors is a 4x4 matrix: transpose it.
 SB_INLINE void transpose_quads(F (&a)[4]) {
   const __m512d low01 = _mm512_castps_pd(_mm512_unpacklo_ps(a[0].v, a[1].v));
   const __m512d high01 = _mm512_castps_pd(_mm512_unpackhi_ps(a[0].v, a[1].v));
@@ -351,9 +351,9 @@ alignas(64) inline constexpr std::uint32_t kRoots[32] = {
     0x3f7504f3, 0x3f74fbaf, 0x3f7508a4, 0x3f752c4d, 0x3f75672a, 0x3f75b9be, 0x3f76248c, 0x3f76a81e,
     0x3f7744fd, 0x3f77fbb8, 0x3f78ccdf, 0x3f79b907, 0x3f7ac0c7, 0x3f7be4ba, 0x3f7d257d, 0x3f7e83b3};
 
-// 2^q to 1.2e-7 relative for -126 <= q < 128: q = n + k/32 + x, |x| <= 1/64, with 2^(k/32) from a table in two
-// registers, n added to its exponent and 2^x by a minimax polynomial of degree 2. Few multiplications: those limit the
-// blend loops.
+// 2^q to 1.2e-7 relative for -126 <= q < 128, with q = n + k/32 + x, |x| <= 1/64. 2^(k/32) comes from a table in two
+// registers, n is added to its exponent, 2^x is a minimax polynomial of degree 2. Multiplications are few: they limit
+// the blend loops.
 SB_INLINE F exp2(F q) {
   const F magic = set1(393216.0F);  // 1.5 x 2^18: the last bit is worth 1/32, so t ends in 32 n + k
   const F t = q + magic;

@@ -12,7 +12,8 @@ struct Place {
   float bound;
 };
 
-// Children pushed by one path from root to leaf: at most 15 a level beside the one followed, over at most 16 levels.
+// Children pushed by one path from root to leaf: at most 15 a level in addition to the one followed, over at most 16
+// levels.
 inline constexpr int kStack = 16 * kFan;
 
 SB_INLINE const SolidNode& node_at(const SolidsView& s, Place p) {
@@ -39,7 +40,7 @@ SB_INLINE void prefetch(const SolidBlockView& block, std::int32_t leaf) {
   }
 }
 
-// Whether the ball of radius r around p may touch one of the leaf's ellipsoids; false is proven.
+// True if the ball of radius r around p may touch one of the leaf's ellipsoids; false is proven.
 SB_INLINE bool touches(const LeafView& leaf, const Split& p, float r) {
   const float reach = (r + p.slack) * (1.0F + 1e-5F);
   for (int at = 0; at < kFan; at += W) {

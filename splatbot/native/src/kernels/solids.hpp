@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // Distances between a point and the ellipsoids of a leaf, lane by lane.
 //
-// With v the point in the ellipsoid's frame and a its semi-axes, the signed distance is the maximum over unit n of
-// n.v - |a n| (support function of a convex body), so that any n gives a lower bound: what comes out is safe wherever
-// the search for n ends. The best n is w/|w|, w_i = v_i / (D_i + s), D_i = a_i^2 - min(a)^2, at the root s of
-// |q(s)| = 1, q_i = a_i v_i / (D_i + s); 1/|q| is concave and increasing, so that Newton from the left (s0 = max_i(a_i
-// |v_i| - D_i), where one term alone is 1) never passes it (Hebden 1973). It serves points inside as well (s < min(a)^2).
+// Let v be the point in the ellipsoid's frame and a its semi-axes. The signed distance is the maximum over unit n of
+// n.v - |a n| (support function of a convex body). Any n gives a lower bound, so the search for n may end anywhere.
+//
+// The best n is w/|w| with w_i = v_i / (D_i + s) and D_i = a_i^2 - min(a)^2. Here s is the root of |q(s)| = 1 with
+// q_i = a_i v_i / (D_i + s). 1/|q| is concave and increasing, so Newton from the left never passes the root (Hebden 1973).
+// It starts at s0 = max_i(a_i |v_i| - D_i), where one term alone is 1. It serves points inside as well (s <
+// min(a)^2).
 #pragma once
 
 #include "simd.hpp"
@@ -16,14 +18,14 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 // Rounding of v, n.v and |a n| in float32, relative to |v|_1 + min(a); the sum of the roundings is below 9e-7.
 inline constexpr float kRounding = 1e-6F;
-// A point closer to the plane of the two longer axes than this share of the least is taken to lie that far off: on the
-// plane itself inside, the root is at a pole. It only picks n.
+// A point closer to the plane of the two longer axes than this share of the least is moved to that distance. On the
+// plane itself, inside, the root is at a pole. This only selects n.
 inline constexpr float kOffPlane = 2e-6F;
 
 // A point as two floats a coordinate: 1 km from the origin it keeps its micrometres.
 struct Split {
   float hi[3], lo[3];
-  float slack;  // [m] between hi and the point, and what comparing boxes with hi rounds off
+  float slack;  // [m] between hi and the point, and the rounding error of comparing boxes with hi
 };
 
 SB_INLINE float magnitude(float x) { return x < 0.0F ? -x : x; }
@@ -94,7 +96,7 @@ SB_INLINE F box_squared(const Local& l) {
 
 SB_INLINE F least_axis(const Local& l) { return min(l.a[0], min(l.a[1], l.a[2])); }
 
-// What is taken off a distance, for rounding and packing.
+// Reduction of a distance for rounding and packing.
 SB_INLINE F rounding(const Local& l, F least) {
   return fma(set1(kRounding), (absolute(l.v[0]) + absolute(l.v[1])) + (absolute(l.v[2]) + least), l.off);
 }
@@ -128,7 +130,7 @@ SB_INLINE F distance_bound(const Local& l) {
   }
   F along = set1(0.0F), support = set1(0.0F), length = set1(0.0F);
   for (int k = 0; k < 3; ++k) {
-    // w s: of the size of v, whatever the size of the ellipsoid.
+    // w s: of the size of v for any size of the ellipsoid.
     inverse[k] = s / (D[k] + s);
     const F n = v[k] * inverse[k];
     const F an = l.a[k] * n;

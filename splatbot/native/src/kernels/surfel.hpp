@@ -7,10 +7,10 @@
 
 namespace splatbot::SPLATBOT_KERNELS {
 
-// With t0, t1 the disc's axes and p its centre in the camera frame, n = t0 x t1 and p' = p / z, the ray of the pixel at
-// m + d meets the disc's plane at u = z e . (t1 x p') / (s0 D) and v = z e . (p' x t0) / (s1 D), where
-// e = (dx / fx, dy / fy, 0) and D = n . p' + n . e (Cramer's rule). Unlike the homography of Huang et al. 2024, eq. 8,
-// nothing here cancels for a small disc far from the image's corner.
+// Let t0, t1 be the disc's axes, p its centre in the camera frame, n = t0 x t1 and p' = p / z. The ray of the pixel
+// at m + d meets the disc's plane at u = z e . (t1 x p') / (s0 D) and v = z e . (p' x t0) / (s1 D). Here e = (dx /
+// fx, dy / fy, 0) and D = n . p' + n . e (Cramer's rule). Unlike the homography of Huang et al. 2024, eq. 8, no
+// digits cancel for a small disc far from the image's corner.
 struct Surfel {
   F slope[2];          // p'
   F flip;              // -1 where n points towards the camera; all of b, n and kappa are multiplied by it
@@ -55,8 +55,8 @@ SB_INLINE void project_surfel(const GaussianLanes& g, const CameraLanes& cam, Pr
   s.my = fma(cam.fy, s.slope[1], cam.cy);
 }
 
-// The numbers of Surfel that a blend is sensitive to: thin and grazing discs magnify their rounding, so they are found
-// in double precision and rounded once.
+// The numbers of Surfel to which a blend is sensitive. Thin and grazing discs magnify their rounding, so they are
+// computed in double precision and rounded once.
 struct PreciseLanes {
   alignas(64) float whole[2][W], part[2][W], slope[2][W], z[W], b[4][W], kappa[W], h[2][W], flip[W];
 };
@@ -125,7 +125,7 @@ SB_INLINE void project_precisely(const F (&means)[3], const GaussianLanes& g, co
   }
 }
 
-// What a blend reads of a surfel, its centre from the tile's corner.
+// Inputs of a blend from a surfel, with its centre relative to the tile's corner.
 enum SurfelRow : int {
   kRowX,
   kRowY,
@@ -188,7 +188,7 @@ SB_INLINE SurfelHit hit_at(F x, F y, const float* row, F near) {
   return h;
 }
 
-// Whether a surfel is that of the median depth unless a later one is: it counts and finds more than half of the light.
+// True if a surfel is the median one unless a later one is: it contributes and receives more than half of the light.
 SB_INLINE M median_candidate(const SurfelHit& h, const Step& step, F through) {
   return step.open & (h.alpha.alpha > set1(0.0F)) & (through > set1(kMedianLight));
 }

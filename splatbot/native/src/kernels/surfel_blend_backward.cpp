@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Gradient of surfel_blend(), as blend_backward.cpp: front to back with each pixel's transmittance and the rest R of
-// the weights' gradients. Distortion is 2 sum_i w_i |m_i A_i - B_i| with A_i, B_i the sums of w_j and w_j m_j over
-// j < i; with the signs s_i of its terms held, its gradients are 2 (|m_i A_i - B_i| + sum_{j>i} s_j w_j (m_j - m_i)) to
-// w_i and 2 w_i (s_i A_i - sum_{j>i} s_j w_j) to m_i. It is of degree 2 in the weights: R counts it twice (Euler).
+// the weights' gradients.
+//
+// Distortion is 2 sum_i w_i |m_i A_i - B_i| with A_i, B_i the sums of w_j and w_j m_j over j < i. With the signs s_i
+// of its terms fixed, its gradient to w_i is 2 (|m_i A_i - B_i| + sum_{j>i} s_j w_j (m_j - m_i)). That to m_i is 2
+// w_i (s_i A_i - sum_{j>i} s_j w_j). It is of degree 2 in the weights: R counts it twice (Euler).
 #include "surfel.hpp"
 #include "surfel_entry.hpp"
 

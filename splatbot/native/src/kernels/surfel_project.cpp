@@ -6,7 +6,7 @@ namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
 
-// What a cover is found from, as the blend will have it.
+// Inputs of a cover as the blend will use them.
 SB_INLINE void recall(const PreciseLanes& precise, Projected& o, Surfel& s) {
   o.p[2] = load(precise.z);
   for (int i = 0; i < 2; ++i) {
@@ -17,7 +17,7 @@ SB_INLINE void recall(const PreciseLanes& precise, Projected& o, Surfel& s) {
   s.my = load(precise.whole[1]) + load(precise.part[1]);
 }
 
-// What a surfel covers on the image: an ellipse, the low-pass filter's circle around its centre, and a box of both.
+// The cover of a surfel on the image: an ellipse, the low-pass filter's circle around its centre, and a box of both.
 struct Cover {
   M bounded;  // the ellipse exists
   F ex, ey, l11, l21, l22, lean;
@@ -26,10 +26,10 @@ struct Cover {
   F radius_x, radius_y;
 };
 
-// The image of the disc |(u, v)| <= c. It is an ellipse if the disc stays in front of the camera's plane: with rows
-// A = J (s0 t0, s1 t1) of its linear image and b = (s0 t0z, s1 t1z) / z, w = 1 - c^2 |b|^2 > 0, centre
-// m - c^2 A b / w and "covariance" c^2 / w^2 (w A A^T + c^2 A b b^T A^T), whose determinant is c^4 det(A)^2 / w^3: all
-// sums of positive terms. Rounded up: rounding must not lose a pixel at the rim.
+// The image of the disc |(u, v)| <= c. It is an ellipse if the disc stays in front of the camera's plane. With rows A
+// = J (s0 t0, s1 t1) of its linear image and b = (s0 t0z, s1 t1z) / z, that is w = 1 - c^2 |b|^2 > 0. The centre is m
+// - c^2 A b / w, the "covariance" c^2 / w^2 (w A A^T + c^2 A b b^T A^T). Its determinant is c^4 det(A)^2 / w^3: all
+// are sums of positive terms. They are rounded up: rounding must not lose a pixel at the rim.
 SB_INLINE Cover cover(const Projected& o, const Surfel& s, const CameraLanes& cam, F reach2) {
   constexpr float kMargin = 1e-3F;     // [px^2]
   constexpr float kInflate = 1.0005F;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// From the sums of surfel_blend_backward() to the gradients of the inputs, W surfels at once. The projection is
-// computed anew: cheaper than keeping it.
+// Propagates the sums of surfel_blend_backward() to the gradients of the inputs, W surfels at once. The projection is
+// computed again: cheaper than keeping it.
 #include "surfel.hpp"
 #include "surfel_entry.hpp"
 
@@ -126,7 +126,7 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
       out.rotation[3 * i + j] = fma(gp[i], g.mean[j], turned);
     }
   }
-  // Of the focal lengths, b and h fall by the inverse.
+  // b and h fall with the inverse of the focal lengths.
   const F fall_x = fma(s.b[0], sum(kSumU), fma(s.b[2], sum(kSumV), s.hx * sum(kSumD)));
   const F fall_y = fma(s.b[1], sum(kSumU + 1), fma(s.b[3], sum(kSumV + 1), s.hy * sum(kSumD + 1)));
   out.intrinsics[0] = fms(out.point[0], s.slope[0], fall_x / cam.fx);
@@ -141,7 +141,7 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   pull_back_rotation(o, r, out.quat);
 }
 
-// Replaces what the forward pass knew more precisely, and what must not differ between the passes.
+// Replaces values that the forward pass had more precisely, and that must not differ between the passes.
 void recall(const SurfelRecord* records, const std::uint32_t* ids, int n, const CameraLanes& cam, Projected& o,
             Surfel& s) {
   enum { kX, kY, kPartX, kPartY, kB, kKappa = kB + 4, kHx, kHy, kZ, kFlip, kValues };

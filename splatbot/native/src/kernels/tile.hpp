@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the two blend passes share: a tile's geometry and the alpha of a Gaussian in W of its pixels.
+// Code that the two blend passes share: a tile's geometry and the alpha of a Gaussian in W of its pixels.
 #pragma once
 
 #include "simd.hpp"
@@ -24,7 +24,7 @@ SB_INLINE TileFrame tile_frame(const View& view, int columns, std::size_t tile) 
   return {x0, y0, width, height};
 }
 
-// Whether a pixel of the image is asked for.
+// True if a pixel of the image is requested.
 SB_INLINE bool kept(const BlendArgs& args, int x, int y) {
   return args.mask == nullptr || args.mask[(y / args.mask_size) * args.mask_columns + x / args.mask_size] != 0;
 }
@@ -49,7 +49,7 @@ inline constexpr Centers kCenters{};
 // The lines of pixels that a block's part crosses begin here in arrays over a tile's lines.
 SB_INLINE int first_line(int block) { return block / kBlockColumns * kBlock; }
 
-// A Gaussian along a tile's lines of pixels: u at the tile's left edge, w, and what they leave of log2(alpha).
+// A Gaussian along a tile's lines of pixels: u at the tile's left edge, w, and their rest of log2(alpha).
 struct Lines {
   alignas(64) float u[kTileHeight], w[kTileHeight], rest[kTileHeight];
   float l11;
@@ -124,9 +124,9 @@ struct Step {
   M open;
 };
 
-// `through` is the product of (1 - alpha) over all Gaussians so far, those that came after the pixel was closed
-// included (0 outside the image): it only falls, so it is above the limit as long as the pixel is open, and the chain
-// of steps, of which each waits for the one before, is one multiplication long.
+// `through` is the product of (1 - alpha) over all Gaussians so far, including those behind the one that closed the
+// pixel (0 outside the image). It only falls, so it is above the limit as long as the pixel is open. The chain of
+// dependent steps is one multiplication long.
 SB_INLINE Step advance(const Alpha& a, F& through, F limit) {
   const F next = through * a.left;
   const M open = next > limit;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Projection of Gaussians through distorted lenses and rolling shutters by the unscented transform (Wu et al. 2024,
-// 3DGUT): seven sigma points, the centre and two on each axis, are projected exactly. In double: the points lie a
-// fraction of a standard deviation apart, and what counts are second differences of their pixels.
+// 3DGUT). Seven sigma points, the centre and two on each axis, are projected exactly. It runs in double: the points
+// lie a fraction of a standard deviation apart, and the result depends on second differences of their pixels.
 #pragma once
 
 #include "shutter.hpp"
@@ -54,10 +54,10 @@ SB_APART SigmaPoints sigma_points(const View& view, const GaussianLanes& g, cons
   return s;
 }
 
-// As project_rest(). With e_i the pixels of the points about the centre's and m their weighted sum, the mean is the
-// centre's pixel + m and the covariance weight x sum e_i e_i^T + (beta - alpha^2) m m^T: the weights sum to one, so
-// the paper's large terms of opposite sign (-99 and 6 x 16.7 by default) cancel beforehand. A Gaussian of which a point
-// is not seen by the lens is left out (det 0).
+// As project_rest(). Let e_i be the points' pixels relative to the centre's and m their weighted sum. The mean is the
+// centre's pixel + m, the covariance weight x sum e_i e_i^T + (beta - alpha^2) m m^T. The weights sum to one, so the
+// paper's large terms of opposite sign (-99 and 6 x 16.7 by default) cancel beforehand. A Gaussian with a point out
+// of the lens's view is left out (det 0).
 SB_INLINE void project_unscented(const GaussianLanes& g, const CameraLanes& cam, const View& view, F eps2d,
                                  Projected& o) {
   rotate_gaussian(g, cam, o);
@@ -93,14 +93,15 @@ SB_INLINE void project_unscented(const GaussianLanes& g, const CameraLanes& cam,
   o.det = zero_unless(load(seen) > set1(0.5F), o.det);
 }
 
-// What a camera in motion gets besides, lane by lane.
+// Additional state of a moving camera, lane by lane.
 struct MotionLanes {
   F motion[kMotionSums];
   F focal, center;  // across the lines
 };
 
-// Gradients in the camera frame: of the centre, of the Gaussian's axes (Projected::a), of its scales, and of the motion
-// unless that is null; `image` holds those of its 2D mean, its depth, and of c00, twice c01 and c11.
+// Gradients in the camera frame: of the centre, of the Gaussian's axes (Projected::a), of its scales. That of the
+// motion is computed unless its pointer is null. `image` holds the gradients of the 2D mean, the depth, and c00,
+// twice c01 and c11.
 template <class ImageGradients>
 SB_INLINE void pull_back_unscented(const GaussianLanes& g, const View& view, const Projected& o,
                                    const ImageGradients& image, F (&out_p)[3], F (&out_a)[9], F (&out_scale)[3],

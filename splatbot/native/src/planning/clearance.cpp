@@ -15,7 +15,7 @@ namespace {
 
 constexpr std::size_t kLooks = 8;  // configurations of each edge, for an upper bound
 constexpr float kEps = 2e-4F;      // [m]
-constexpr double kNearly = 0.9;    // of the room seen: what is tried first
+constexpr double kNearly = 0.9;    // share of the observed clearance that is tried first
 constexpr int kAtLeast = 2;        // rounds, unless the first one shows some room
 
 // The least room of configurations along the path.

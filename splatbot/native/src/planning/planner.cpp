@@ -72,7 +72,7 @@ PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLi
   *sampler_ = Sampler(*space_, start_, goals_);
   edges_before_ = space_->edges();
   forget_best();
-  // A new path is sooner found than the tree is asked.
+  // A new path is found sooner than the tree is checked.
   std::uint64_t left = limits.iterations;
   const bool met = connect_->run(start_, random_, stop, kInfinity, left);
   iterations_ = limits.iterations - left;
@@ -94,7 +94,7 @@ PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLi
   return search(limits, stop);
 }
 
-// Configurations that were in the tree: what still can be reached of them.
+// Configurations of the old tree: reconnects those that are still reachable.
 void Planner::join(const Configuration& orphans, const Stop& stop) {
   for (std::size_t i = 0; i < orphans.size() && !stop.now(); i += space_->size()) {
     if (star_->grow(orphans.data() + i, stop)) {

@@ -6,7 +6,7 @@
 namespace splatbot::planning {
 
 namespace {
-constexpr double kLeast = 1e-6;  // relative to the path: what a change must save
+constexpr double kLeast = 1e-6;  // relative to the path: least saving of a change
 }
 
 Shortcut::Shortcut(Space& space, Configuration waypoints)
@@ -39,7 +39,7 @@ bool Shortcut::improve(Random& random) {
   if (from > to) {
     std::swap(from, to);
   }
-  // Often from waypoint to waypoint: that saves most, and needs no checks of what is left of an edge.
+  // Often from waypoint to waypoint: that saves most and leaves no partial edges to check.
   const bool corners = random.uniform() < 0.3;
   std::size_t first = place(from, a_.data()), last = place(to, b_.data());
   if (corners && size() > 2) {

@@ -48,7 +48,7 @@ void Tree::root(std::int32_t node) {
   renew_costs(node);
 }
 
-// Of a node and all below it.
+// Subtracts the saving from a node and all nodes below it.
 void Tree::renew_costs(std::int32_t node) {
   stack_.assign(1, node);
   while (!stack_.empty()) {

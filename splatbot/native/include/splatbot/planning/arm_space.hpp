@@ -15,7 +15,7 @@ class ArmSpace final : public Space {
   ArmSpace(const Arm& arm, std::shared_ptr<const CollisionField> field, std::span<const double> lower,
            std::span<const double> upper, float eps);
 
-  // Asks another field from now on.
+  // Queries another field from now on.
   void look_at(std::shared_ptr<const CollisionField> field) { field_ = std::move(field); }
 
  protected:

@@ -8,9 +8,9 @@
 
 namespace splatbot::planning {
 
-// A proven lower bound [m] of the room to the map along a path (N, joints), at most `cut`; 0 if there is none. Found by
-// certifying the path for an arm with larger spheres: nearly by the room seen at some configurations, then by what halving
-// an interval suggests, `rounds` times in all and, but for the first two, no more than fit into `seconds`.
+// A proven lower bound [m] of the clearance to the map along a path (N, joints), at most `cut`, or 0. It certifies
+// the path for an arm with larger spheres. The first try is close to the clearance at some configurations, later ones
+// bisect. There are `rounds` tries, and from the third on only those that fit into `seconds`.
 double path_clearance(const Arm& arm, const CollisionField& field, std::span<const double> path, double cut, int rounds,
                       double seconds);
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The first path: RRT-Connect between the start and any number of goals (Kuffner and LaValle, ICRA 2000), the smaller of
-// the two trees growing (Qureshi and Ayaz 2015; Kuffner and LaValle 2011).
+// The first path: RRT-Connect between the start and any number of goals (Kuffner and LaValle, ICRA 2000). The smaller
+// of the two trees grows (Qureshi and Ayaz 2015; Kuffner and LaValle 2011).
 #pragma once
 
 #include <cstdint>

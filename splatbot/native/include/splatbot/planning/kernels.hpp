@@ -13,7 +13,7 @@ struct PlanKernels {
   // coordinates[d * stride + i].
   void (*squared_distances)(const float* coordinates, std::size_t stride, std::size_t dims, const float* q,
                             std::size_t count, float* out);
-  // The first place from `begin` on where a value is at most `limit`; `count`, a multiple of kPlanLanes, if there is none.
+  // The first place from `begin` on where a value is at most `limit`; else `count`, a multiple of kPlanLanes.
   std::size_t (*first_at_most)(const float* values, std::size_t begin, std::size_t count, float limit);
   // The least of `count` values, a multiple of kPlanLanes.
   float (*least)(const float* values, std::size_t count);

@@ -23,7 +23,7 @@ class Neighbours {
   void add(const double* q);  // its id is how many were there
   void clear() noexcept { size_ = 0; }
 
-  // The nearest, the lowest id of equals; -1 if there is none.
+  // The nearest node, the lowest id among equals; -1 in an empty tree.
   std::int32_t nearest(const double* q);
   // The k nearest (or all), in no order.
   std::span<const Neighbour> nearest(const double* q, std::size_t k);

@@ -39,16 +39,16 @@ class Planner {
   // From the start to one of the goals (K, dims), all free. The tree is kept until the next call.
   PlanEnd run(std::span<const double> start, std::span<const double> goals, const PlanLimits& limits);
 
-  // The same after the space has changed: what `added` says is in the way now is cut off, the rest of the last run's tree
-  // is kept, and planning goes on from `start`, which is on the last best path, or from anywhere. Edges of the tree are
-  // asked of `added` alone.
+  // Replans after the space has changed. The part of the last tree that collides with `added` is cut off, the rest is
+  // kept. Planning goes on from `start`, on the last best path or elsewhere. Edges of the tree are checked against
+  // `added` alone.
   PlanEnd rerun(std::span<const double> start, Space& added, const PlanLimits& limits);
 
   // The following may be called while run() is busy in another thread.
   BestPath best() const;
   void cancel() noexcept { cancelled_.store(true, std::memory_order_relaxed); }
 
-  // Of the last run.
+  // Statistics of the last run.
   const Tree* tree() const noexcept { return star_ ? &star_->tree() : nullptr; }
   std::uint64_t iterations() const noexcept { return iterations_; }
   std::uint64_t edges() const noexcept { return space_->edges() - edges_before_; }

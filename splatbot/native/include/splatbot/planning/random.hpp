@@ -29,7 +29,7 @@ class Random {
     return i < count ? i : count - 1;
   }
 
-  // Of the standard normal distribution, by the polar method of Marsaglia.
+  // A sample of the standard normal distribution, by the polar method of Marsaglia.
   double normal() {
     for (;;) {
       const double x = 2.0 * uniform() - 1.0, y = 2.0 * uniform() - 1.0;

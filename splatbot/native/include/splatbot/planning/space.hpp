@@ -42,7 +42,7 @@ class Space {
     return std::sqrt(sum);
   }
 
-  // Whether every configuration on the straight edge is free.
+  // True if every configuration on the straight edge is free.
   bool free(const double* a, const double* b) {
     ++edges_;
     return check(a, b);
