@@ -1,0 +1,24 @@
+"""Start the service, map a log through it, query distances, plan a motion and send it to a simulated arm."""
+
+from pathlib import Path
+
+from splatbot.client import Client
+from splatbot.serving import serving
+
+BASE = {"translation": [0.0, 0.5, 0.0]}  # the robot stands behind the first camera
+GOAL = [0.3, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8]
+
+with serving("--data", "maps", log=Path("service.log")) as service, Client(service.url) as client:
+    job = client.create_map("desk", "synthetic:tabletop?frames=6&width=160&height=120")
+    client.wait(job["id"])
+    print(f"map desk has {client.map('desk')['gaussians']} Gaussians")
+
+    found = client.distance("desk", [[0.0, 0.0, 0.5], [0.0, 0.0, 30.0]])
+    sigmas = ", ".join(f"{distance:.1f}" for distance in found.distance)
+    print(f"nearest Gaussians: {sigmas} sigma away, map version {found.map_version}")
+
+    plan = client.plan("desk", goal=GOAL, base=BASE)
+    print(f"plan of {plan['duration_s']:.2f} s, certified: {plan['certified']}")
+    motion = client.send(plan["id"], arm="fake")
+    done = client.wait(motion["id"], under="/v1/trajectories")
+    print(f"motion: {done['state']}")
