@@ -6,10 +6,12 @@ import csv
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from splatbot.atomic import atomic_write
-from splatbot.bench.timing import Timing
+
+if TYPE_CHECKING:
+    from splatbot.bench.timing import Timing
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class Results:
 
     machine: dict[str, Any]
     rows: list[Row] = field(default_factory=list)
+    curves: dict[str, Any] = field(default_factory=dict)
+    """Data of plots that no row holds; they are not written."""
 
     def add(
         self,

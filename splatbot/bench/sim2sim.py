@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from splatbot.bench.planning_log import FilmedMap, map_film, shoot
+from splatbot.bench.film import FilmedMap, map_film, shoot
 from splatbot.bench.planning_problems import problems
 from splatbot.bench.tabletop import Ball, Block, Can, Solid, Tabletop, tabletop
 from splatbot.bench.timing import threads
 from splatbot.bench.truth import Truth
-from splatbot.bench.twin_paths import truth_scene
+from splatbot.bench.twin.paths import truth_scene
 from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_error
 from splatbot.formats.ply import save_ply
 from splatbot.geometry import inverse

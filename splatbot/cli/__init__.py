@@ -41,37 +41,6 @@ COMMANDS = {
     "sim2real": _Command(
         "splatbot.cli.sim2real", "sim2real", "Say how far the twin is from a recorded log, and from a held-out twin."
     ),
-    "bench twin": _Command(
-        "splatbot.cli.bench_twin", "bench_twin", "Measure the twin: cost of each effect, error against the time step."
-    ),
-    "bench raster": _Command(
-        "splatbot.cli.bench_raster", "bench_raster", "Measure the rasterizer's speed, and what accuracy costs in time."
-    ),
-    "bench tracking": _Command(
-        "splatbot.cli.bench_tracking",
-        "bench_tracking",
-        "Measure tracking: error against milliseconds, beside other trackers.",
-    ),
-    "bench collision": _Command(
-        "splatbot.cli.bench_collision",
-        "bench_collision",
-        "Measure the collision field: questions a second, and errors against exact truth.",
-    ),
-    "bench planning": _Command(
-        "splatbot.cli.bench_planning",
-        "bench_planning",
-        "Measure the planner: paths over time budgets, looked at by exact truth, beside other planners.",
-    ),
-    "bench grasping": _Command(
-        "splatbot.cli.bench_grasping",
-        "bench_grasping",
-        "Measure grasping: candidates a second, time to a ranked list, contacts against exact shapes.",
-    ),
-    "bench service": _Command(
-        "splatbot.cli.bench_service",
-        "bench_service",
-        "Measure the service: frames mapped and questions answered at once, and what HTTP costs.",
-    ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
 }
 
@@ -127,12 +96,14 @@ def _print_warning(
 def _dispatch(words: list[str]) -> Any:
     import tyro
 
-    for length in (1, 2):
-        name = " ".join(words[:length])
-        if name in COMMANDS:
-            return _run(name, words[length:])
-    # No known command: tyro prints the help, or names the nearest command, and leaves.
+    if words and words[0] in COMMANDS:
+        return _run(words[0], words[1:])
     group = words[0] if words and words[0] in _GROUPS else ""
+    if group and len(words) > 1 and words[1] in _summaries(group):
+        from splatbot.cli.bench import run_benchmark
+
+        return run_benchmark(words[1], words[2:])
+    # Without a known command, tyro prints the help or names the nearest command, and exits.
     return tyro.extras.subcommand_cli_from_dict(
         {name: _outline(summary) for name, summary in _summaries(group).items()},
         prog=f"splatbot {group}".strip(),
@@ -149,23 +120,24 @@ def _run(name: str, words: list[str]) -> Any:
     return tyro.cli(
         function,
         prog=f"splatbot {name}",
-        description=_description(function),
+        description=description(function),
         args=words,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
 
 
-def _description(function: Callable[..., Any]) -> str:
-    """The docstring without its "Args:"; tyro alone would drop the examples."""
-    return inspect.cleandoc(function.__doc__ or "").split("\nArgs:")[0].rstrip()
+def description(documented: object) -> str:
+    """Return the docstring of a command up to its "Args:"; tyro alone would drop the examples."""
+    return inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
 
 
 def _summaries(group: str) -> dict[str, str]:
-    """What the help of a group of commands lists; the group "" is the program."""
-    if group:
-        words = {name: name.removeprefix(f"{group} ") for name in COMMANDS if name.startswith(f"{group} ")}
-        return {word: COMMANDS[name].summary for name, word in words.items()}
-    return {name: command.summary for name, command in COMMANDS.items() if " " not in name} | _GROUPS
+    """Return the summary of each command of a group; the group "" is the program."""
+    if group == "bench":
+        from splatbot.bench.benchmark import BENCHMARKS
+
+        return {name: entry.summary for name, entry in BENCHMARKS.items()}
+    return {name: command.summary for name, command in COMMANDS.items()} | _GROUPS
 
 
 def _outline(summary: str) -> Callable[[], None]:

@@ -203,8 +203,7 @@ def _view(map_: Path, index: int) -> ObservedView:
 def _print(result: GraspResult, folder: Path) -> None:
     from rich.table import Table
 
-    from splatbot.cli.bench_tables import wide_console
-    from splatbot.cli.tables import print_table
+    from splatbot.cli.tables import print_table, wide_console
 
     target = result.target
     seconds = sum(result.seconds.values())

@@ -118,7 +118,7 @@ def _compare_twins(plan: SimToSimPlan, folder: Path, json: Path | None, tell: Te
     from rich.table import Table
 
     from splatbot.bench.sim2sim import run_sim_to_sim
-    from splatbot.cli.bench_tables import wide_console
+    from splatbot.cli.tables import wide_console
     from splatbot.sim.compare.page import (
         POLICY_HEAD,
         PROMISE_HEAD,

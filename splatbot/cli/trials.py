@@ -85,7 +85,7 @@ def _print(values: Mapping[str, object], folder: Path) -> None:
 
     from rich.table import Table
 
-    from splatbot.cli.bench_tables import wide_console
+    from splatbot.cli.tables import wide_console
     from splatbot.sim.trials.table import HEAD, table_rows
 
     table = Table(*HEAD, title=f"picks, {values['scenes']}")

@@ -9,7 +9,17 @@ import pytest
 
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
-from splatbot.bench.stress import CASES, LOST, RECOVERY, SILENT, VIEWS, StressCase, StressFigures, run_case, run_stress
+from splatbot.bench.tracking.stress import (
+    CASES,
+    LOST,
+    RECOVERY,
+    SILENT,
+    VIEWS,
+    StressCase,
+    StressFigures,
+    run_case,
+    run_stress,
+)
 from splatbot.config import Config, load_config
 from splatbot.evaluation import nees
 from splatbot.logs import open_log

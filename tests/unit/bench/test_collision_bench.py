@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.collision import CollisionPlan, run_collision
+from splatbot.bench.collision import BENCHMARK, CollisionSettings
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop, tabletop
 from splatbot.bench.truth import Truth, apart_from_itself, score
@@ -22,12 +22,12 @@ from splatbot.robots.panda import panda
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
     """One quick run with peers, for all tests."""
     folder = tmp_path_factory.mktemp("bench")
-    return run_collision(CollisionPlan.quick_plan(peers=True), folder), folder
+    return BENCHMARK.run(CollisionSettings(out=folder, peers=True, quick=True)), folder
 
 
 def test_speed_and_memory_are_measured_at_every_size(run: tuple[Results, Path]) -> None:
     results, _ = run
-    for count in CollisionPlan.quick_plan().counts:
+    for count in CollisionSettings.quick_values["counts"]:
         for threads in ("1 thread", "2 threads"):
             for metric in ("build", "memory", "configurations", "exact clearance in the clutter"):
                 found = results.find(f"{count} Gaussians, {threads}", metric)
@@ -79,7 +79,7 @@ def test_the_command_prints_its_tables(tmp_path: Path, capsys: pytest.CaptureFix
     code = main(["bench", "collision", "--quick", "--out", str(tmp_path / "o"), "--json", str(tmp_path / "f.json")])
     assert code == 0
     out = capsys.readouterr().out
-    assert "Edges against exact truth" in out
+    assert "Edges against the ground truth" in out
     assert (tmp_path / "f.json").exists()
 
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from splatbot.bench.grasping import GraspingPlan, run_grasping
+from splatbot.bench.grasping import BENCHMARK, GraspingSettings
 from splatbot.bench.results import Results
 from splatbot.cli import main
 
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    return run_grasping(GraspingPlan.quick_plan(), tmp_path_factory.mktemp("grasping"))
+    return BENCHMARK.run(GraspingSettings(out=tmp_path_factory.mktemp("grasping"), quick=True))
 
 
 def test_every_case_has_its_figures(ran: Results) -> None:

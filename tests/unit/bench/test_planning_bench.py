@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.planning import PlanningPlan, run_planning
-from splatbot.bench.planning_audit import audit
-from splatbot.bench.planning_peers import add_ratio
+from splatbot.bench.planning import BENCHMARK, PlanningSettings
+from splatbot.bench.planning.audit import audit
+from splatbot.bench.planning.peers import add_ratio
 from splatbot.bench.planning_problems import ROOM, problems
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
@@ -24,12 +24,12 @@ from splatbot.robots.panda import panda
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
     """One quick run with peers, for all tests."""
     folder = tmp_path_factory.mktemp("bench")
-    return run_planning(PlanningPlan.quick_plan(peers=True), folder), folder
+    return BENCHMARK.run(PlanningSettings(out=folder, peers=True, quick=True)), folder
 
 
 def test_every_problem_is_solved_and_no_path_touches_anything(run: tuple[Results, Path]) -> None:
     results, _ = run
-    for budget in PlanningPlan.quick_plan().budgets_ms:
+    for budget in PlanningSettings.quick_values["budgets"]:
         case = f"budget {budget:g} ms"
         assert results.find(case, "solved") == 6
         for metric in ("touch the truth", "touch themselves", "nearer to the truth than promised", "uncertified paths"):

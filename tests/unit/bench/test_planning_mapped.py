@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.planning_audit import STEP, audit, configurations
-from splatbot.bench.planning_log import Film, FilmedMap, map_film, shoot
-from splatbot.bench.planning_mapped import touches
+from splatbot.bench.film import Film, FilmedMap, map_film, shoot
+from splatbot.bench.planning.audit import STEP, audit, configurations
+from splatbot.bench.planning.mapped_log import touches
 from splatbot.bench.planning_problems import HAND, map_problems
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.truth import Truth

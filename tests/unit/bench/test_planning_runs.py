@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.planning_runs import free_place, plan_in_run
+from splatbot.bench.planning.recorded_run import free_place, plan_in_run
 from splatbot.bench.results import Results
 from splatbot.cli import main
 from splatbot.collision import GaussianCollisionField

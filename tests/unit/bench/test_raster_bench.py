@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from splatbot.bench.effects import all_effects
-from splatbot.bench.raster import BACKWARD_FLOP, FORWARD_FLOP, RasterPlan, run_raster
+from splatbot.bench.raster import BENCHMARK, RasterSettings
+from splatbot.bench.raster.options import all_effects
+from splatbot.bench.raster.speed import BACKWARD_FLOP, FORWARD_FLOP, scenes_of
 from splatbot.bench.results import Results
 from splatbot.cli import main
 
@@ -19,7 +20,7 @@ from splatbot.cli import main
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
     """One quick run with peers, for all tests."""
     folder = tmp_path_factory.mktemp("bench")
-    return run_raster(RasterPlan.quick_plan(peers=True), folder), folder
+    return BENCHMARK.run(RasterSettings(out=folder, peers=True, quick=True)), folder
 
 
 def figures(results: Results, case: str, peer: str | None = None) -> dict[str, Any]:
@@ -29,8 +30,7 @@ def figures(results: Results, case: str, peer: str | None = None) -> dict[str, A
 
 def test_every_scene_size_and_number_of_threads_is_measured(run: tuple[Results, Path]) -> None:
     results, _ = run
-    plan = RasterPlan.quick_plan()
-    for scene in plan.scenes():
+    for scene in scenes_of(RasterSettings(quick=True)):
         for threads in ("1 thread", "2 threads"):
             found = figures(results, f"{scene.name} 32x24, {threads}")
             for metric in ("forward", "forward+backward", "forward+pose backward", "evaluated pairs", "state memory"):
@@ -114,7 +114,7 @@ def test_the_command_prints_its_tables_and_writes_where_told(
         ["bench", "raster", "--quick", "--out", str(out), "--json", str(tmp_path / "more.json"), "--threads", "1"]
     )
     assert code == 0
-    assert "Accuracy against time" in capsys.readouterr().out
+    assert "Error over time" in capsys.readouterr().out
     assert json.loads((tmp_path / "more.json").read_text()) == json.loads((out / "raster.json").read_text())
 
 

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from splatbot.bench.service import ServicePlan, run_service_bench
-
-PLAN = ServicePlan("synthetic:tabletop?frames=6&width=160&height=120&arc=4", 10.0, 3, 4.0, 100, 2.0, 1000)
+from splatbot.bench.service import BENCHMARK, ServiceSettings
 
 
 @pytest.mark.long
 def test_questions_are_asked_at_their_times_and_all_answered(tmp_path: Path) -> None:
-    results = run_service_bench(PLAN, tmp_path)
+    values = {**ServiceSettings.quick_values, "per_s": 4.0}
+    results = BENCHMARK.run(ServiceSettings(out=tmp_path, **values))
     case = "3 clients x 4/s"
     asked = results.find(case, "questions")
     assert asked is not None

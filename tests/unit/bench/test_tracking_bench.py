@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.odometry import TrackingPeer, tracking_peers
 from splatbot.bench.results import Results
-from splatbot.bench.tracking import ATE, LOST, NEES, RESIDENT, RPE, TRACKED, TrackingPlan, run_log, run_tracking
+from splatbot.bench.tracking import ATE, BENCHMARK, LOST, NEES, RESIDENT, RPE, TRACKED, TrackingSettings
+from splatbot.bench.tracking.accuracy import run_log
+from splatbot.bench.tracking.peers import TrackingPeer, tracking_peers
 from splatbot.cli import main
-from splatbot.config import Config, MappingConfig
 from splatbot.evaluation import absolute_error
 from splatbot.frame import Frame
 from splatbot.logs import open_log
@@ -25,8 +25,9 @@ LOG = "synthetic:tabletop?frames=8&width=320&height=240"
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
     """One comparison, for all tests."""
     folder = tmp_path_factory.mktemp("bench")
-    config = Config(mapping=MappingConfig(refine_iterations=1))
-    return run_tracking([open_log(LOG)], TrackingPlan(budgets=(100.0,), config=config), folder), folder
+    config = folder / "config.yaml"
+    config.write_text("mapping: {refine_iterations: 1}\n")
+    return BENCHMARK.run(TrackingSettings(logs=(LOG,), out=folder, budgets=(100.0,), config=config)), folder
 
 
 @pytest.mark.parametrize("peer", tracking_peers(), ids=lambda peer: peer.name)
@@ -72,8 +73,9 @@ def test_only_a_tracker_that_says_how_sure_it_is_has_a_nees(run: tuple[Results, 
 
 
 def test_logs_of_one_name_have_rows_of_their_own(tmp_path: Path) -> None:
-    logs = [open_log(f"{LOG}&seed={seed}") for seed in (0, 1)]
-    found = run_tracking(logs, TrackingPlan(budgets=(100.0,), peers=False, max_frames=3), tmp_path)
+    logs = tuple(f"{LOG}&seed={seed}" for seed in (0, 1))
+    settings = TrackingSettings(logs=logs, out=tmp_path, budgets=(100.0,), no_peers=True, max_frames=3)
+    found = BENCHMARK.run(settings)
     cases = [row.case for row in found.rows if row.metric == ATE]
     assert cases == ["tabletop, 100 ms", "tabletop #2, 100 ms"]
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
-from splatbot.bench.twin_bounds import FORCED, broken_bounds
-from splatbot.bench.twin_paths import DEPTH, arm_room, push, timed, truth_scene, try_paths
+from splatbot.bench.twin.bounds import FORCED, broken_bounds
+from splatbot.bench.twin.paths import DEPTH, arm_room, push, timed, truth_scene, try_paths
 from splatbot.robots.panda import panda
 from splatbot.sim.twin import Twin
 
@@ -55,7 +55,7 @@ def test_a_pushed_path_ends_a_centimetre_deep() -> None:
 
 
 def test_planned_paths_touch_nothing_and_pushed_ones_are_seen() -> None:
-    trials = try_paths(2, gaussians=6000, budget_ms=60.0, say=lambda text: None)
+    trials = try_paths(2, gaussians=6000, budget_ms=60.0)
     assert trials.planned == trials.certified == 2
     assert trials.touched == 0
     assert trials.least_room > 0

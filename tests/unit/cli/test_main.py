@@ -6,11 +6,13 @@ import importlib
 import inspect
 import subprocess
 import sys
+from dataclasses import fields
 from typing import Any
 
 import pytest
 
 import splatbot
+from splatbot.bench.benchmark import BENCHMARKS, Settings, load_benchmark
 from splatbot.cli import COMMANDS
 from splatbot.errors import LogError, MapNotFoundError, SplatbotError
 from tests.unit.cli.conftest import RunCommand
@@ -20,7 +22,15 @@ HEAVY = ("torch", "open3d", "cv2", "matplotlib", "mujoco", "fastapi", "numpy")
 
 @pytest.mark.parametrize(
     "words",
-    [["--help"], ["--version"], ["map", "--help"], ["render", "--help"], ["simulate", "--help"], ["doctor", "-h"]],
+    [
+        ["--help"],
+        ["--version"],
+        ["map", "--help"],
+        ["render", "--help"],
+        ["simulate", "--help"],
+        ["doctor", "-h"],
+        ["bench", "raster", "--help"],
+    ],
 )
 def test_help_imports_nothing_heavy(words: list[str]) -> None:
     program = (
@@ -33,12 +43,12 @@ def test_help_imports_nothing_heavy(words: list[str]) -> None:
 
 
 def test_the_help_lists_every_command(run: RunCommand) -> None:
-    for name, command in COMMANDS.items():
-        *group, word = name.split()
+    for group, members in (((), COMMANDS), (("bench",), BENCHMARKS)):
         answer = run(*group, "--help")
         assert answer.code == 0
-        assert word in answer.out
-        assert command.summary.split()[0] in answer.out
+        for name, member in members.items():
+            assert name in answer.out
+            assert member.summary.split()[0] in answer.out
 
 
 def test_no_words_at_all_show_the_help(run: RunCommand) -> None:
@@ -57,6 +67,18 @@ def test_every_command_shows_examples_and_explains_every_option(run: RunCommand,
     documented = (inspect.getdoc(function) or "").partition("Args:")[2]
     for parameter in inspect.signature(function).parameters:
         assert f"{parameter}:" in documented
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_every_benchmark_shows_examples_and_explains_every_option(run: RunCommand, name: str) -> None:
+    answer = run("bench", name, "--help")
+    assert answer.code == 0
+    assert f"splatbot bench {name}" in answer.out.split("Examples:")[1]
+    settings = load_benchmark(name).settings
+    assert settings.name == name
+    documented = "".join((inspect.getdoc(part) or "").partition("Args:")[2] for part in (settings, Settings))
+    for field in fields(settings):
+        assert f"{field.name}:" in documented
 
 
 def test_an_unknown_command_is_wrong_input_and_the_known_ones_are_named(run: RunCommand) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatbot.bench.collision_peers import solid_mesh
+from splatbot.bench.collision.peers import solid_mesh
 from splatbot.bench.tabletop import Block, Solid, Tabletop
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres

@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from splatbot.bench.collision import depth_views as exact_views
+from splatbot.bench.collision.accuracy import depth_views as exact_views
 from splatbot.bench.tabletop import Tabletop
 from splatbot.camera import Camera
 from splatbot.cli import main

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatbot.bench.collision_peers import solid_mesh
+from splatbot.bench.collision.peers import solid_mesh
 from splatbot.bench.tabletop import Block, Can, Tabletop
 from splatbot.camera import Camera
 from splatbot.errors import FormatError, InputError

@@ -15,7 +15,7 @@ import pytest
 from splatbot.bench import sim2sim
 from splatbot.bench.sim2sim import middle_of, movable_truth, work_table
 from splatbot.bench.tabletop import Block, Can, Tabletop
-from splatbot.bench.twin_paths import truth_scene
+from splatbot.bench.twin.paths import truth_scene
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
 from splatbot.planning import GaussianRRTStar

@@ -49,14 +49,14 @@ print(np.average(u, weights=w), np.average(v, weights=w), *camera.project((np.li
 """
 
 _AMONG_GAUSSIANS = """
-from splatbot.bench.twin_composite import exact_map
+from splatbot.bench.twin.composite import exact_map
 found = exact_map(6, 60_000, width=320, seed=1)
 print(*found.overlap)
 print(*found.astray)
 """
 
 _FILMED = """
-from splatbot.bench.twin_composite import filmed_map
+from splatbot.bench.twin.composite import filmed_map
 found = filmed_map(6, 40, width=240)
 print(*found.overlap)
 print(*found.plain_db)

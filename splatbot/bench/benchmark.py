@@ -1,0 +1,131 @@
+"""A benchmark: its settings, its measurement, and the tables and plots of its results.
+
+A benchmark is one module that defines ``BENCHMARK``, and one line in :data:`BENCHMARKS`. `splatbot bench NAME` takes
+its options and its help from the settings. The module may be a package, which imports its measurement only to run it,
+so that `--help` does not wait for torch or open3d.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
+
+from tyro.conf import arg
+
+from splatbot.bench.results import Results
+from splatbot.bench.tables import Table
+
+ReportProgress = Callable[[str], None]
+
+
+def ignore_progress(text: str) -> None:
+    """Drop a message on progress."""
+
+
+class Entry(NamedTuple):
+    """A registered benchmark: its module, and the summary that `splatbot bench --help` shows without importing it."""
+
+    module: str
+    summary: str
+
+
+BENCHMARKS = {
+    "twin": Entry("splatbot.bench.twin", "Measure the twin: cost of each effect, error against the time step."),
+    "raster": Entry("splatbot.bench.raster", "Measure the rasterizer: speed, and error against time."),
+    "tracking": Entry("splatbot.bench.tracking", "Measure tracking: error against time, compared with other trackers."),
+    "collision": Entry("splatbot.bench.collision", "Measure the collision field: queries per second, errors."),
+    "planning": Entry("splatbot.bench.planning", "Measure the planner: paths over time budgets, checked exactly."),
+    "grasping": Entry("splatbot.bench.grasping", "Measure grasping: candidates per second, errors of the contacts."),
+    "service": Entry("splatbot.bench.service", "Measure the service: mapping under queries, and the cost of HTTP."),
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of every benchmark; a subclass adds its own and documents them under "Args:".
+
+    Args:
+        out: Folder for the JSON and CSV files and the plots. If not given, runs/bench-NAME.
+        json: Additional path for the JSON file.
+        csv: Additional path for the CSV file.
+        quick: Run a tiny workload in seconds, to check that the benchmark runs.
+    """
+
+    name: ClassVar[str]
+    quick_values: ClassVar[Mapping[str, Any]] = {}
+    """Values that replace those of the fields with ``quick``."""
+
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    json: Annotated[Path | None, arg(metavar="FILE")] = None
+    csv: Annotated[Path | None, arg(metavar="FILE")] = None
+    quick: bool = False
+
+    def validate(self) -> None:
+        """Raise an InputError for a value that makes no sense."""
+
+    @property
+    def stem(self) -> str:
+        """Name of the written files, without suffix."""
+        return self.name
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the written files."""
+        return self.out if self.out is not None else Path("runs") / f"bench-{self.name}"
+
+    @property
+    def peak_ms(self) -> float:
+        """Duration [ms] of the measurement of the machine's peak, for each instruction set and number of threads."""
+        return 20.0 if self.quick else 200.0
+
+    def save(self, results: Results) -> None:
+        """Write the JSON file; a measurement calls it after each of its parts."""
+        results.write_json(self.folder / f"{self.stem}.json")
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What `splatbot bench NAME` runs and shows.
+
+    Args:
+        settings: The class of the settings; its docstring is the help of the command.
+        measure: Measures with such settings, reports its progress, and returns the results.
+        tables: The tables to print, in this order; empty ones are left out.
+        plot: Writes the plots of the results into a folder.
+        violations: Returns a message for each figure out of its bounds; any of them makes the exit code 1. It is not
+            called with ``quick``.
+    """
+
+    settings: type[Settings]
+    measure: Callable[[Any, ReportProgress], Results]
+    tables: Sequence[Table]
+    plot: Callable[[Results, Path], None] = lambda results, folder: None
+    violations: Callable[[Results], list[str]] = lambda results: []
+
+    def run(self, settings: Settings, report_progress: ReportProgress = ignore_progress) -> Results:
+        """Measure, and write the JSON and CSV files and the plots.
+
+        Raises:
+            InputError: A setting makes no sense.
+        """
+        settings.validate()
+        if settings.quick:
+            settings = replace(settings, **settings.quick_values)
+        settings.folder.mkdir(parents=True, exist_ok=True)
+        results = self.measure(settings, report_progress)
+        settings.save(results)
+        results.write_csv(settings.folder / f"{settings.stem}.csv")
+        self.plot(results, settings.folder)
+        if settings.json is not None:
+            results.write_json(settings.json)
+        if settings.csv is not None:
+            results.write_csv(settings.csv)
+        return results
+
+
+def load_benchmark(name: str) -> Benchmark:
+    """Import the benchmark of that name in :data:`BENCHMARKS`."""
+    return cast(Benchmark, importlib.import_module(BENCHMARKS[name].module).BENCHMARK)

@@ -1,0 +1,60 @@
+"""`splatbot bench grasping`: candidates per second, time to a ranked list, and errors against exact shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+
+from tyro.conf import arg
+
+from splatbot.bench.benchmark import Benchmark, ReportProgress, Settings
+from splatbot.bench.results import Results
+from splatbot.bench.tables import Table, per_metric
+from splatbot.errors import InputError
+
+
+@dataclass(frozen=True)
+class GraspingSettings(Settings):
+    """Measure grasping on a table top of exact shapes.
+
+    The benchmark measures candidates per second and the time to a ranked list, including reachability by the arm. It
+    varies the size of the map and the number of samples. It also measures the distance of contacts to the true
+    surfaces, and the angle between the true normals and the line through the contacts.
+
+    Examples:
+        splatbot bench grasping
+        splatbot bench grasping --gaussians 150000 --samples 400 3200
+        splatbot bench grasping --quick --json figures.json
+
+    Args:
+        gaussians: Sizes of the maps. Samples are varied on the first.
+        samples: Numbers of seeds on the surface of an object.
+    """
+
+    name: ClassVar[str] = "grasping"
+    quick_values: ClassVar[Mapping[str, Any]] = {"gaussians": (10_000,), "samples": (50, 100)}
+
+    gaussians: Annotated[tuple[int, ...], arg(metavar="N ...")] = (50_000, 10_000, 150_000)
+    samples: Annotated[tuple[int, ...], arg(metavar="N ...")] = (50, 100, 200, 400, 800, 1600)
+
+    def validate(self) -> None:
+        """Raise an InputError for numbers below 1."""
+        if not self.gaussians or min((*self.gaussians, *self.samples)) < 1:
+            raise InputError("has a number below 1.", field="--gaussians, --samples", hint="give positive numbers")
+
+
+def _measure(settings: GraspingSettings, report_progress: ReportProgress) -> Results:
+    from splatbot.bench.grasping.accuracy import run_grasping
+
+    return run_grasping(settings, report_progress)
+
+
+BENCHMARK = Benchmark(
+    GraspingSettings,
+    _measure,
+    tables=(
+        Table("By size of the map", lambda row: "Gaussians" in row.case, layout=per_metric),
+        Table("By samples", lambda row: "samples" in row.case, layout=per_metric),
+    ),
+)

@@ -1,0 +1,127 @@
+"""The planner on maps of recordings: an arm beside what was mapped, to within what the depth images showed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from splatbot.bench.collision.recorded_run import lifted
+from splatbot.bench.planning.audit import configurations
+from splatbot.bench.planning_problems import map_problems
+from splatbot.bench.results import Results
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import so3_exp
+from splatbot.logs import Log
+from splatbot.planning import GaussianRRTStar, PlanResult
+from splatbot.protocols import Array
+from splatbot.results.folder import RunFolder
+from splatbot.results.margin import own_margin
+from splatbot.robots.in_view import reopen_log
+from splatbot.robots.panda import panda
+from splatbot.tracking.prepare import usable_depth
+from splatbot.workspace import AHEAD, Workspace, find_workspace, fit_workspace
+
+_FRAMES = 40  # whose depth the paths are compared with, at least
+_EVERY = 5  # pixel of them
+_TURNS = (0, *(sign * angle for angle in range(30, 181, 30) for sign in (1, -1)))  # [deg]
+_TRIED, _FREE = 1000, 0.1  # configurations, and the share of them that must be free
+_BOX = ((0.2, -0.5, 0.0), (0.9, 0.5, 0.8))  # [m]
+_SPARSE = 8  # configurations of a path per one that is compared with depth: 1/32 rad
+
+
+def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float, seed: int = 0) -> None:
+    """Seeded problems in a run's map, with margin 0 and with the map's own.
+
+    The base stands where the run's scene.yaml says; without one, where :func:`splatbot.workspace.fit_workspace`
+    proposes, or as near to it around the same middle as leaves the arm free to move.
+
+    Raises:
+        InputError: there is no plane in the map, or its scene.yaml lacks the base or the workspace.
+    """
+    model = GaussianModel.load(run / "map.ply")
+    field = GaussianCollisionField(model)
+    place = find_workspace(run) or free_place(field, fit_workspace(model))
+    if place.T_world_base is None or place.box is None:
+        raise InputError(
+            "is not known.",
+            file=run / "scene.yaml",
+            field="T_world_base, workspace",
+            hint="give both, or no scene.yaml",
+        )
+    folder = RunFolder(run)
+    log = reopen_log(folder)
+    own = own_margin(run, log, field, place.T_world_base)
+    measured = cKDTree(_measured(folder, log))
+    for margin in (0.0, own):
+        case = f"{run.resolve().name}, margin {1e3 * margin:.1f} mm"
+        planner = GaussianRRTStar(field, panda(), T_world_base=place.T_world_base, margin=margin)
+        wanted = map_problems(panda(), planner.arm, field, place.box, problems, seed)
+        results.add(case, "Gaussians", float(len(field)), "")
+        results.add(case, "problems found", float(len(wanted)), f"of {problems}")
+        runs = [planner.plan(p.start, p.goal, budget_ms=budget_ms, seed=k) for k, p in enumerate(wanted)]
+        if runs:
+            _add(results, case, runs, planner, measured)
+
+
+def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
+    """A proposed place (base known), turned about the middle of its surface until the arm can be in many postures.
+
+    A turned one has a box of its own: what lies in reach before the arm. None is: the place as it was.
+    """
+    T = place.T_world_base
+    assert T is not None
+    some = panda().random(_TRIED, np.random.default_rng(0))
+    for degrees in _TURNS:
+        turn = np.eye(4)
+        turn[:3, :3] = so3_exp([0.0, 0.0, np.radians(degrees)])
+        turn[:3, 3] = [AHEAD, 0.0, 0.0] - turn[:3, :3] @ [AHEAD, 0.0, 0.0]
+        arm = RobotSpheres(panda(), T_world_base=T @ turn)
+        if (~arm.check(field, some).in_collision).mean() > _FREE:
+            return place if degrees == 0 else replace(place, T_world_base=T @ turn, box=np.array(_BOX))
+    return place
+
+
+def _add(results: Results, case: str, runs: list[PlanResult], planner: GaussianRRTStar, measured: cKDTree) -> None:
+    paths = [run.path for run in runs if run.path is not None]
+    results.add(case, "solved", float(len(paths)), f"of {len(runs)}")
+    results.add(case, "the whole call, median", 1e3 * float(np.median([run.seconds for run in runs])), "ms")
+    if not paths:
+        return
+    first = [1e3 * run.first_seconds for run in runs if run]
+    results.add(case, "certified", float(sum(path.certificate.certified for path in paths)), f"of {len(paths)}")
+    results.add(case, "first path, median", float(np.median(first)), "ms")
+    results.add(case, "first path, most", max(first), "ms")
+    results.add(case, "cost, mean", float(np.mean([path.cost for path in paths])), "rad")
+    promised = [1e3 * path.certificate.clearance for path in paths]
+    results.add(case, "clearance promised beyond the margin, least", min(promised), "mm")
+    results.add(case, "clearance promised beyond the margin, median", float(np.median(promised)), "mm")
+    rooms = np.array([_room(planner.arm, path.waypoints, measured) for path in paths])
+    results.add(case, "touch a measured point", float((rooms <= 0).sum()), f"of {len(paths)}")
+    results.add(case, "deepest", 1e3 * max(0.0, -float(rooms.min())), "mm")
+
+
+def _measured(folder: RunFolder, log: Log) -> Array:
+    """Points (P, 3) [m, world] of the log's depth, without what mapping leaves out."""
+    config = folder.load_config().tracking
+    poses = sorted(folder.load_poses().items())
+    parts = []
+    for index, T in poses[:: max(1, len(poses) // _FRAMES)]:
+        frame = log[index]
+        depth = usable_depth(frame, config)
+        v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
+        parts.append(lifted(depth, u[::_EVERY], v[::_EVERY], frame.camera, T))
+    return np.concatenate(parts)
+
+
+def _room(arm: RobotSpheres, path: Array, measured: cKDTree) -> float:
+    """Least gap [m] between the arm's moving spheres along a path and measured points; up to 10 cm."""
+    moving = arm.spheres.link > 0
+    centers = arm.centers(configurations(path)[::_SPARSE])[:, moving]
+    distance, _ = measured.query(centers.reshape(-1, 3), distance_upper_bound=0.1 + float(arm.spheres.radii.max()))
+    gap = np.minimum(distance.reshape(len(centers), -1) - arm.spheres.radii[moving], 0.1)
+    return float(gap.min())

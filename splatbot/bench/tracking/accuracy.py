@@ -1,0 +1,175 @@
+"""Tracking on recorded logs: error against milliseconds, for each time budget and beside other trackers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.bench.benchmark import ReportProgress, ignore_progress
+from splatbot.bench.machine import describe_machine
+from splatbot.bench.results import Results
+from splatbot.bench.timing import memory_peak
+from splatbot.bench.tracking import (
+    ATE,
+    FRAME_MS,
+    LOST,
+    NEES,
+    PERCENTILES,
+    RESIDENT,
+    RPE,
+    RPE_ROT,
+    TRACKED,
+    TrackingSettings,
+)
+from splatbot.bench.tracking.peers import Odometry, tracking_peers
+from splatbot.bench.tracking.stress import run_stress
+from splatbot.config import Config, load_config
+from splatbot.evaluation import absolute_error, nees, relative_error
+from splatbot.frame import Frame
+from splatbot.logs import Log, open_log
+from splatbot.slam import Slam
+from splatbot.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One row of the comparison: a tracker, its name among peers (None: splatbot), a setting and a note."""
+
+    peer: str | None
+    setting: str
+    note: str
+    make: Callable[[], Odometry]
+
+
+@dataclass
+class TrackingOutcome:
+    """What a tracker made of a log: milliseconds by frame, the poses it gave, how sure it was, and memory.
+
+    Covariances (N, 6, 6) of the trajectory's poses as of :func:`splatbot.evaluation.nees`; None of a tracker without.
+    """
+
+    ms: list[float]
+    trajectory: Trajectory
+    frames: int
+    resident: int | None
+    with_mapping_ms: list[float]
+    covariances: Array | None
+
+
+class SlamOdometry:
+    """splatbot as a tracker; its milliseconds are told apart from those of mapping."""
+
+    def __init__(self, config: Config) -> None:
+        self.slam = Slam(config)
+
+    def track(self, frame: Frame) -> Array | None:
+        """See :class:`Odometry`."""
+        return self.slam.process(frame).T_world_camera
+
+    @property
+    def last_tracking_ms(self) -> float:
+        """Milliseconds that the last frame's pose took, mapping left out."""
+        return sum(ms for stage, ms in self.slam.results[-1].stage_ms.items() if stage != "mapping")
+
+    def refined(self) -> Trajectory:
+        """The trajectory as it is once the log has ended."""
+        found = [(r.stamp, r.T_world_camera) for r in self.slam.results if r.T_world_camera is not None]
+        return _trajectory([stamp for stamp, _ in found], [T for _, T in found])
+
+    def covariances(self) -> Array | None:
+        """Of these poses (N, 6, 6); None where one is not known."""
+        found = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
+        known = [covariance for covariance in found if covariance is not None]
+        return np.array(known) if len(known) == len(found) > 0 else None
+
+
+def run_tracking(settings: TrackingSettings, report_progress: ReportProgress = ignore_progress) -> Results:
+    """Run every contender on every log, and score it."""
+    config = load_config(settings.config)
+    logs = [open_log(address, camera=settings.camera) for address in settings.addresses]
+    results = Results(describe_machine((1,), peak_ms=20))
+    for name, log in zip(distinct([log.name for log in logs]), logs, strict=True):
+        for contender in contenders(settings, config):
+            report_progress(f"{name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
+            add_rows(results, log, contender, run_log(log, contender.make(), settings.max_frames), name)
+    if settings.stress:
+        frames, width = settings.stress_frames, settings.stress_width
+        run_stress(results, config, frames=frames, width=width, report_progress=report_progress)
+    return results
+
+
+def distinct(names: Sequence[str]) -> list[str]:
+    """The names, those that occur again numbered: room, room #2."""
+    return [name if (n := names[: k + 1].count(name)) == 1 else f"{name} #{n}" for k, name in enumerate(names)]
+
+
+def contenders(settings: TrackingSettings, config: Config) -> Iterator[Contender]:
+    """splatbot with each budget, then its peers."""
+    for budget in settings.budgets:
+        limited = _with_budget(config, budget)
+        yield Contender(None, f"{budget:g} ms", "", lambda limited=limited: SlamOdometry(limited))  # type: ignore[misc]
+    for peer in tracking_peers() if not settings.no_peers else ():
+        yield Contender(peer.name, "", peer.note, peer.make)
+
+
+def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> TrackingOutcome:
+    """Track the frames of a log; decoding is not timed."""
+    count = len(log) if max_frames is None else min(len(log), max_frames)
+    ms, whole, stamps, poses = [], [], [], []
+    with memory_peak() as peak:
+        for index in range(count):
+            frame = log[index]
+            start = time.perf_counter()
+            T_world_camera = odometry.track(frame)
+            whole.append(1e3 * (time.perf_counter() - start))
+            ms.append(odometry.last_tracking_ms if isinstance(odometry, SlamOdometry) else whole[-1])
+            if T_world_camera is not None:
+                stamps.append(frame.stamp)
+                poses.append(T_world_camera)
+    if isinstance(odometry, SlamOdometry):
+        return TrackingOutcome(ms, odometry.refined(), count, peak(), whole, odometry.covariances())
+    return TrackingOutcome(ms, _trajectory(stamps, poses), count, peak(), whole, None)
+
+
+def add_rows(results: Results, log: Log, contender: Contender, outcome: TrackingOutcome, name: str) -> None:
+    """The figures of one run. ATE is RMSE over all tracked frames, SE(3)-aligned; RPE from frame to frame."""
+    case = f"{name}, {contender.setting}" if contender.setting else name
+
+    def add(metric: str, value: float | None, unit: str, note: str | None = None) -> None:
+        results.add(case, metric, value, unit, peer=contender.peer, note=note or None)
+
+    truth, tracked = log.ground_truth, outcome.trajectory
+    if truth is None or len(tracked) < 3:
+        why = "no reference" if truth is None else "tracked fewer than three frames"
+        for metric in (ATE, RPE, RPE_ROT):
+            add(metric, None, "mm", why)
+    else:
+        relative = relative_error(truth, tracked)
+        add(ATE, 1e3 * absolute_error(truth, tracked).rmse, "mm", contender.note)
+        add(RPE, 1e3 * relative.trans_rmse, "mm")
+        add(RPE_ROT, float(np.degrees(relative.rot_rmse)), "°")
+        if outcome.covariances is not None:
+            add(NEES, nees(truth, tracked, outcome.covariances).mean, "")
+    add(TRACKED, 100.0 * len(tracked) / outcome.frames, "%")
+    add(LOST, outcome.frames - len(tracked), "")
+    for p in PERCENTILES:
+        add(f"p{p}", float(np.percentile(outcome.ms, p)), "ms")
+    if contender.peer is None:
+        add(FRAME_MS, float(np.median(outcome.with_mapping_ms)), "ms")
+    add(RESIDENT, None if outcome.resident is None else outcome.resident / 1e6, "MB")
+
+
+def _with_budget(config: Config, budget_ms: float) -> Config:
+    values = config.model_dump(mode="json")  # where null stands for what a budget decides
+    values["tracking"]["budget_ms"] = budget_ms
+    return Config.model_validate(values)
+
+
+def _trajectory(stamps: Sequence[float], poses: Sequence[Array]) -> Trajectory:
+    return Trajectory(np.array(stamps), np.array(poses, dtype=np.float64).reshape(-1, 4, 4))
