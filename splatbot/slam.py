@@ -221,7 +221,7 @@ class Slam:
         return self._tracker.start(prepared)
 
     def _observation(self, prepared: PreparedFrame, estimate: PoseEstimate, hold_out: bool) -> Observation:
-        """Bundle a tracked frame for the mapper, and note whether the robot moves."""
+        """Collect a tracked frame for the mapper, and note whether the robot moves."""
         self._mapper.set_robot_moving(self._joint_motion.update(prepared.frame.stamp, prepared.frame.joints))
         if estimate.verdict != "lost" and not hold_out:
             self._location = self._mapper.locate(estimate.T_world_camera, self._location)

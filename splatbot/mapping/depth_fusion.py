@@ -1,4 +1,4 @@
-"""What a depth image says of Gaussians that are there: that they are where it is, how far off, or that they are not."""
+"""Depth fusion: a depth image supports Gaussians, moves them along their normals, or shows free space instead."""
 
 from __future__ import annotations
 
@@ -17,47 +17,77 @@ from splatbot.gaussians.shape import shortest_axes
 from splatbot.geometry import inverse, quat_multiply
 from splatbot.mapping.normals import smooth_normals
 
-_GATE = 3.0  # standard deviations up to which depth and Gaussian are of one surface
-_LEAST_GATE = 0.012  # [share of depth] the same at least: calibration and pose are not the sensor's noise
-_GRAZING = 0.2  # cosine below which depth says little of where a surface is
-_LEAST_GAIN = 0.3  # σ of the map over σ of one measurement: below it the map would cease to learn
-_REACH = 6  # [px] half the side of the window to which a normal is fitted
-_SAME_SIDE = 0.7  # cosine below which a measured normal is that of another surface
-_LEAST_TURN = 0.1  # share of a new normal in the mean of all
-_GUESS = 0.05  # σ of a guessed depth [share of it]
-_DOUBT = 1.0  # odds of a Gaussian fall by e with each look through it
-_STABLE_LOOKS, _STABLE_WIDTH = 3, 0.5  # support, and share of its width below which σ of its mean is, of a stable one
-_GONE, _GONE_UNSTABLE = 3, 2  # looks through it, net of support, after which a Gaussian goes
+
+@dataclass(frozen=True)
+class DepthFusionConstants:
+    """Constants of depth fusion.
+
+    Args:
+        gate_sigma: [σ] up to this difference, a measured depth and a Gaussian belong to one surface.
+        least_gate_share: [share of depth] lower limit of that difference. It covers errors of calibration and pose.
+        grazing_cosine: below this cosine of ray and normal, depth hardly constrains the surface.
+        least_sigma_ratio: lower limit of the map's σ over that of one measurement. Measurements from one viewpoint
+            share errors, and below the limit the map would not follow new ones.
+        normal_window: [px] half the side of the window that a normal is fitted to.
+        same_surface_cosine: below this cosine, a measured normal belongs to another surface.
+        least_normal_gain: lower limit of the weight of a measured normal.
+        guessed_sigma_share: [share of depth] standard deviation of a guessed depth.
+        miss_log_odds: decrease of a Gaussian's log-odds of existence with each observation through it.
+        stable_observations: number of supporting observations of a stable Gaussian.
+        stable_sigma_share: [share of width] largest standard deviation of the mean of a stable Gaussian.
+        removal_misses, unstable_removal_misses: misses, net of support, that remove a stable or another Gaussian.
+        removed_logit: opacity logit that lets pruning remove a Gaussian.
+        least_z: [m] points nearer to the camera are outside the image.
+    """
+
+    gate_sigma: float = 3.0
+    least_gate_share: float = 0.012
+    grazing_cosine: float = 0.2
+    least_sigma_ratio: float = 0.3
+    normal_window: int = 6
+    same_surface_cosine: float = 0.7
+    least_normal_gain: float = 0.1
+    guessed_sigma_share: float = 0.05
+    miss_log_odds: float = 1.0
+    stable_observations: int = 3
+    stable_sigma_share: float = 0.5
+    removal_misses: int = 3
+    unstable_removal_misses: int = 2
+    removed_logit: float = CONSTANTS.removed_logit
+    least_z: float = 0.05
+
+
+CONSTANTS = DepthFusionConstants()
 
 
 @dataclass(frozen=True)
 class DepthNoiseModel:
-    """σ_z = floor + quad z² [m]."""
+    """Standard deviation of measured depth, σ_z = floor + quad z² [m] (after Nguyen et al. 2012)."""
 
     floor: float
     quad: float
 
     @classmethod
     def of(cls, config: TrackingConfig) -> DepthNoiseModel:
-        """The sensor's, as tracking has it."""
+        """Return the noise model of the configured sensor."""
         return cls(config.sensor.sigma_depth_floor, config.sensor.sigma_depth_quad)
 
     def __call__(self, depth: Tensor) -> Tensor:
-        """Standard deviation [m] of measured depths [m]."""
+        """Compute the standard deviation [m] of measured depths [m]."""
         return self.floor + self.quad * depth.square()
 
 
 @dataclass(frozen=True)
 class DepthComparison:
-    """What a depth image says of each Gaussian.
+    """Comparison of each Gaussian with a depth image.
 
     Args:
-        supported: (N,) measured where it is.
-        seen_through: (N,) something farther was measured, at its centre's pixel and all around.
+        supported: (N,) the measured surface is at the Gaussian.
+        seen_through: (N,) the measured surface is farther, at the pixel of the Gaussian's center and all around it.
         offset: (N,) [m] from the mean to the measured surface along ``normals``; 0 where not supported.
-        variance: (N,) [m²] of that measurement; inf where it says nothing.
-        normals: (N, 3) shortest axes in the world frame; zero where nothing was measured.
-        measured_normals: (N, 3) of the measured surface there, in the world frame; zero where it says nothing.
+        variance: (N,) [m²] of that measurement; inf without information.
+        normals: (N, 3) shortest axes in the world frame; zero without a measurement.
+        measured_normals: (N, 3) of the measured surface, in the world frame; zero without information.
     """
 
     supported: Tensor
@@ -72,112 +102,122 @@ class DepthComparison:
 def compare_with_depth(
     model: GaussianModel, depth: Tensor, camera: Camera, T_world_camera: NDArray[np.float64], noise: DepthNoiseModel
 ) -> DepthComparison:
-    """Compare every Gaussian with what was measured along its centre's ray.
+    """Compare every Gaussian with the depth measured along the ray r of its center's pixel.
 
-    Depth and Gaussian are of one surface up to 3 σ of both, or 1.2 % of the depth. The distance is taken from the
-    pixel's own point, along the Gaussian's normal: the centre of a slanted disc need not lie on the pixel's centre.
+    Depth z and a Gaussian belong to one surface if |z - z_μ| < max(3 √(σ_z² + σ_μ²), 0.012 z). The offset is
+    d = nᵀ (z r - μ) along the normal n. It uses the ray of the pixel: the center of a slanted disc may lie next to it.
+    The variance of the offset is R = (σ_z nᵀ r)².
 
     Args:
-        depth: (H, W) [m], 0 missing, as seen by ``camera`` at ``T_world_camera`` (4, 4).
+        depth: (H, W) [m], 0 missing, as observed by ``camera``.
+        T_world_camera: (4, 4).
     """
     T_camera_world = torch.from_numpy(inverse(T_world_camera)).float()
     points = model.means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     rays, row, column, inside = _rays(camera, points)
-    rows = (inside & (depth[row, column] > 0)).nonzero()[:, 0]  # the others are neither borne out nor contradicted
+    rows = (inside & (depth[row, column] > 0)).nonzero()[:, 0]  # depth neither supports nor contradicts the others
     points, rays, row, column = points[rows], rays[rows], row[rows], column[rows]
-    z, farther = depth[row, column], _nearest_around(depth)[row, column]
+    z, farther = depth[row, column], _least_depth_around(depth)[row, column]
     normals = shortest_axes(model, rows)
     facing = normals @ T_camera_world[:3, :3].T
     sigma = noise(z)
-    tolerance = torch.maximum(_GATE * (sigma.square() + model.uncertainty[rows].square()).sqrt(), _LEAST_GATE * z)
+    spread = (sigma.square() + model.uncertainty[rows].square()).sqrt()
+    tolerance = torch.maximum(CONSTANTS.gate_sigma * spread, CONSTANTS.least_gate_share * z)
     supported = (points[:, 2] - z).abs() < tolerance
     slant = (facing * rays).sum(1)
     offset = (facing * (rays * z[:, None] - points)).sum(1)
     cosine = slant.abs() / rays.norm(dim=1)
-    useful = supported & (cosine > _GRAZING) & (offset.abs() < tolerance)
-    around = torch.from_numpy(smooth_normals(depth.numpy(), camera, row.numpy(), column.numpy(), _REACH)).float()
+    informative = supported & (cosine > CONSTANTS.grazing_cosine) & (offset.abs() < tolerance)
+    window = CONSTANTS.normal_window
+    around = torch.from_numpy(smooth_normals(depth.numpy(), camera, row.numpy(), column.numpy(), window)).float()
+    measured_normals = torch.where(informative[:, None], around, 0.0) @ T_camera_world[:3, :3]
     return DepthComparison(
-        supported=_of_all(len(model), rows, supported),
-        seen_through=_of_all(len(model), rows, (farther > 0) & (points[:, 2] + tolerance < farther)),
-        offset=_of_all(len(model), rows, torch.where(useful, offset, 0.0)),
-        variance=_of_all(len(model), rows, torch.where(useful, (sigma * slant).square(), torch.inf), torch.inf),
-        normals=_of_all(len(model), rows, normals),
-        measured_normals=_of_all(len(model), rows, torch.where(useful[:, None], around, 0.0) @ T_camera_world[:3, :3]),
+        supported=_scattered(len(model), rows, supported),
+        seen_through=_scattered(len(model), rows, (farther > 0) & (points[:, 2] + tolerance < farther)),
+        offset=_scattered(len(model), rows, torch.where(informative, offset, 0.0)),
+        variance=_scattered(len(model), rows, torch.where(informative, (sigma * slant).square(), torch.inf), torch.inf),
+        normals=_scattered(len(model), rows, normals),
+        measured_normals=_scattered(len(model), rows, measured_normals),
     )
 
 
-def fuse_depth(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
-    """The model with means moved along their normals by a Kalman filter, and with what that leaves uncertain.
+def fuse_depth(model: GaussianModel, comparison: DepthComparison) -> GaussianModel:
+    """Return the model after a Kalman update of the means along their normals.
 
-    With P the variance of the mean and R that of the measurement, the mean moves by P / (P + R) of the offset and P
-    becomes P R / (P + R), the information form of which is Λ += 1 / R; but P stays above a share of R, for measurements
-    from one place err together.
+    With the variance P of the mean and R of the measurement, the gain is K = P / (P + R). The mean becomes
+    μ' = μ + K d n, with the offset d along the normal n, and the variance P' = (1 - K) P, that is 1/P' = 1/P + 1/R.
+    P' stays above 0.3² R, because measurements from one viewpoint share errors.
     """
-    P, R = model.uncertainty.square(), evidence.variance
+    P, R = model.uncertainty.square(), comparison.variance
     gain = torch.where(torch.isinf(R), 0.0, P / (P + R))
-    means = model.means + (gain * evidence.offset)[:, None] * evidence.normals
-    fused = torch.where(torch.isinf(R), P, torch.maximum(P * (1 - gain), _LEAST_GAIN**2 * R))
+    means = model.means + (gain * comparison.offset)[:, None] * comparison.normals
+    fused = torch.where(torch.isinf(R), P, torch.maximum(P * (1 - gain), CONSTANTS.least_sigma_ratio**2 * R))
     return replace(model, means=means, uncertainty=torch.minimum(fused, P).sqrt())
 
 
-def fuse_normals(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
-    """The model with shortest axes turned towards the measured normals, so that they become the mean of all looks.
+def fuse_normals(model: GaussianModel, comparison: DepthComparison) -> GaussianModel:
+    """Return the model with shortest axes rotated towards the measured normals, to the mean of all observations.
 
-    A disc of 3 cm that is tilted by 10° reaches 5 mm out of its surface; what one look tells of a normal is no better.
+    n' = normalize(n + g (n* - n)), with the gain g = max(1 / (1 + observations), 0.1). A single
+    measured normal is wrong by up to 10°. A disc of 3 cm with that tilt leaves its surface by 5 mm.
     """
-    cosine = (evidence.normals * evidence.measured_normals).sum(1)
-    rows = (cosine.abs() > _SAME_SIDE).nonzero()[:, 0]
-    normals, toward = evidence.normals[rows], cosine[rows].sign()[:, None] * evidence.measured_normals[rows]
-    gain = (1.0 / (1.0 + model.observations[rows])).clamp_min(_LEAST_TURN)
+    cosine = (comparison.normals * comparison.measured_normals).sum(1)
+    rows = (cosine.abs() > CONSTANTS.same_surface_cosine).nonzero()[:, 0]
+    normals, toward = comparison.normals[rows], cosine[rows].sign()[:, None] * comparison.measured_normals[rows]
+    gain = (1.0 / (1.0 + model.observations[rows])).clamp_min(CONSTANTS.least_normal_gain)
     target = torch.nn.functional.normalize(normals + gain[:, None] * (toward - normals), dim=1)
-    # The shortest rotation from one unit vector to another: (1 + cos, a x b), of half the angle once normalised.
+    # The quaternion of the shortest rotation from a to b is (1 + aᵀb, a × b), normalized.
     turn = torch.cat([1 + (normals * target).sum(1, keepdim=True), normals.cross(target, dim=1)], 1)
     turned = torch.from_numpy(quat_multiply(torch.nn.functional.normalize(turn, dim=1), model.quats[rows])).float()
     return replace(model, quats=model.quats.index_copy(0, rows, turned))
 
 
-def update_visibility(model: GaussianModel, evidence: DepthComparison) -> GaussianModel:
-    """The model with the evidence counted: what is seen through is doubted, and its opacity taken back by as much.
+def update_visibility(model: GaussianModel, comparison: DepthComparison) -> GaussianModel:
+    """Return the model with observations and misses counted and the opacity of missed Gaussians reduced.
 
-    A guess that is seen through was wrong, and one that is not :func:`stable` goes a look earlier.
+    Each miss subtracts 1 from the opacity logit, the log-odds update of occupancy mapping (Hornung et al. 2013, Eq. 2).
+    A miss removes a guessed Gaussian at once. It takes three misses, net of support, to remove a :func:`stable` one and
+    two to remove another.
     """
-    limit = torch.where(stable(model), _GONE, _GONE_UNSTABLE)
-    supported, through = evidence.supported, evidence.seen_through
+    limit = torch.where(stable(model), CONSTANTS.removal_misses, CONSTANTS.unstable_removal_misses)
+    supported, through = comparison.supported, comparison.seen_through
     misses = torch.where(supported, (model.misses - 1).clamp_min(0), model.misses + through.int())
-    logits = model.opacity_logits - _DOUBT * through.float()
-    logits[(through & (model.observations == 0)) | (misses >= limit)] = -10.0
+    logits = model.opacity_logits - CONSTANTS.miss_log_odds * through.float()
+    logits[(through & (model.observations == 0)) | (misses >= limit)] = CONSTANTS.removed_logit
     return replace(model, observations=model.observations + supported.int(), misses=misses, opacity_logits=logits)
 
 
 def stable(model: GaussianModel) -> Tensor:
-    """Which Gaussians (N,) are well measured: supported thrice, the mean known to half the width of the disc."""
+    """Return which Gaussians (N,) are well measured: three observations, and σ of the mean below half their width."""
     width = model.log_scales.median(1).values.exp()
-    return (model.observations >= _STABLE_LOOKS) & (model.uncertainty < _STABLE_WIDTH * width)
+    return (model.observations >= CONSTANTS.stable_observations) & (
+        model.uncertainty < CONSTANTS.stable_sigma_share * width
+    )
 
 
 def initial_uncertainty(model: GaussianModel, T_world_camera: NDArray[np.float64], noise: DepthNoiseModel) -> Tensor:
-    """σ (N,) [m] of Gaussians just made from a view: the sensor's, or a share of the depth where it was guessed."""
+    """Compute σ (N,) [m] of new Gaussians: that of the sensor, or a share of the depth where it was guessed."""
     T_camera_world = torch.from_numpy(inverse(T_world_camera)).float()
     z = model.means @ T_camera_world[2, :3] + T_camera_world[2, 3]
-    return torch.where(model.observations > 0, noise(z), _GUESS * z)
+    return torch.where(model.observations > 0, noise(z), CONSTANTS.guessed_sigma_share * z)
 
 
 def _rays(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of points (N, 3) in the camera frame: ray (N, 3) of z = 1 through the nearest pixel; row; column; if inside."""
+    """Project points (N, 3) of the camera frame: rays (N, 3) of z = 1 of their pixels, rows, columns, if inside."""
     z = points[:, 2].clamp_min(1e-6)
     u = torch.round(camera.fx * points[:, 0] / z + camera.cx)
     v = torch.round(camera.fy * points[:, 1] / z + camera.cy)
-    inside = (points[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    inside = (points[:, 2] > CONSTANTS.least_z) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     u, v = torch.where(inside, u, 0.0), torch.where(inside, v, 0.0)
     rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], 1)
     return rays, v.long(), u.long(), inside
 
 
-def _nearest_around(depth: Tensor) -> Tensor:
-    """The least depth (H, W) of each pixel's 3x3 neighbours: 0 where one of them is missing."""
+def _least_depth_around(depth: Tensor) -> Tensor:
+    """Compute the least depth (H, W) of each pixel's 3x3 neighbors: 0 where one of them is missing."""
     return torch.from_numpy(cv2.erode(depth.numpy(), np.ones((3, 3), np.uint8)))
 
 
-def _of_all(count: int, rows: Tensor, values: Tensor, rest: float = 0.0) -> Tensor:
-    """``values`` (M, ...) of the Gaussians that ``rows`` (M,) name, ``rest`` of the others: (count, ...)."""
+def _scattered(count: int, rows: Tensor, values: Tensor, rest: float = 0.0) -> Tensor:
+    """Return (count, ...) values: ``values`` (M, ...) at ``rows`` (M,), ``rest`` elsewhere."""
     return values.new_full((count, *values.shape[1:]), rest).index_copy_(0, rows, values)

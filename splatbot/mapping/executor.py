@@ -68,7 +68,7 @@ class InlineExecutor:
         self._mapper.finish(stop)
 
     def close(self) -> None:
-        """Do nothing: there is no thread to end."""
+        """Return at once: there is no thread to end."""
 
     def snapshot(self) -> Snapshot:
         """Copy the map."""
@@ -186,7 +186,7 @@ class ThreadExecutor:
             return self._stepping
 
     def _may_step(self) -> bool:
-        """Whether there is work; a pause or the end waits for keyframes only, not for observations or refinement."""
+        """Return whether there is work; a pause or the end waits for keyframes, not for observations or refinement."""
         if self._closing or self._pause_requests:
             return self._mapper.has_keyframes_to_insert
         return self._mapper.has_work

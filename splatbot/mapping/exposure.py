@@ -1,4 +1,4 @@
-"""A keyframe's exposure against the map's: where it jumps, it is taken out before colours are fused."""
+"""Exposure of a keyframe relative to the map: large differences are corrected before colors are fused."""
 
 from __future__ import annotations
 
@@ -14,78 +14,103 @@ from splatbot.mapping.insertion import ModelView
 
 Image = NDArray[np.float64]
 
-_BLOCK = 16  # [px] over whose side colours are averaged: the map's blur and noise would pass for contrast
-_LEAST_BLOCKS = 20
-_SOLID = 0.9  # alpha from which on the map shows colour
-_AGREES = 0.05  # depths that differ by less are of the same surface [share of depth]
-_CLIPPED = (2, 253)  # values beyond these say only that there was as little, or as much
-_STEPS, _SCALE = 10, 0.02  # of the robust fit; residuals of this size still count half
-# Smaller differences [0..1] stay. Automatic exposure makes up to 0.16 from keyframe to keyframe of recorded logs: there
-# the map shows each place as it looked, and taken out each time, the map's own errors would add up.
-_JUMP = 0.2
+
+@dataclass(frozen=True)
+class ExposureConstants:
+    """Constants of the exposure correction.
+
+    Args:
+        block_size: [px] side of the blocks whose mean colors are compared. Single pixels differ by blur and noise.
+        least_blocks: with fewer blocks, the exposure counts as unchanged.
+        opaque_alpha: the map's color is valid where it covers more.
+        depth_share: [share of depth] up to this difference, map and image show the same surface.
+        black, white: [0..255] values below or above are clipped.
+        fit_iterations: iterations of the robust fit.
+        fit_scale: [0..1] a residual of this size has half the weight.
+        offset_prior: weight of the prior that draws the offset to 0. A uniform gray determines only the gain.
+        least_gain, most_gain: a fit outside these limits is implausible.
+        correction_threshold: [0..1] smaller differences remain. Automatic exposure changes by up to 0.16 between
+            keyframes of recorded logs. Corrections of such differences would accumulate the map's own errors.
+    """
+
+    block_size: int = 16
+    least_blocks: int = 20
+    opaque_alpha: float = 0.9
+    depth_share: float = 0.05
+    black: int = 2
+    white: int = 253
+    fit_iterations: int = 10
+    fit_scale: float = 0.02
+    offset_prior: float = 1e-3
+    least_gain: float = 0.1
+    most_gain: float = 10.0
+    correction_threshold: float = 0.2
+
+
+CONSTANTS = ExposureConstants()
 
 
 @dataclass(frozen=True)
 class ExposureFit:
-    """Colours of an image, 0..1, as ``gain`` times the map's plus ``offset`` (Engel, Koltun, Cremers 2018, 2.1)."""
+    """Affine brightness I = gain · M + offset of image I and map M, in 0..1 (Engel, Koltun, Cremers 2018, Sec. 2.1)."""
 
     gain: float = 1.0
     offset: float = 0.0
 
     @property
     def is_jump(self) -> bool:
-        """Whether black or white differs by more than automatic exposure makes of it between keyframes."""
-        return max(abs(self.offset), abs(self.gain + self.offset - 1.0)) > _JUMP
+        """True if black or white differs by more than automatic exposure changes between keyframes."""
+        return max(abs(self.offset), abs(self.gain + self.offset - 1.0)) > CONSTANTS.correction_threshold
 
 
 def exposure_of(rgb: Tensor, depth: Tensor, view: ModelView) -> ExposureFit:
-    """How an image is exposed against the map.
+    """Estimate the exposure of an image relative to the map.
+
+    The result is neutral if the map covers too little of the image, or if the fit is implausible.
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) [m], 0 missing: what the map shows of another surface is left out.
-        view: the map from the same pose, of the same size.
-
-    Neutral where the map shows too little of the image, or the fit is absurd.
+        depth: (H, W) [m], 0 missing; pixels where the map shows another surface are excluded.
+        view: the map rendered from the same pose, at the same size.
     """
     seen = rgb.numpy()
-    inside = cv2.inRange(seen, (_CLIPPED[0] + 1,) * 3, (_CLIPPED[1] - 1,) * 3) > 0
-    there = depth.numpy() > 0
-    same = np.abs(view.depth.numpy() - depth.numpy()) < _AGREES * depth.numpy()
-    used = inside & there & same & (view.alpha.numpy() > _SOLID)
+    inside = cv2.inRange(seen, (CONSTANTS.black + 1,) * 3, (CONSTANTS.white - 1,) * 3) > 0
+    measured = depth.numpy() > 0
+    same = np.abs(view.depth.numpy() - depth.numpy()) < CONSTANTS.depth_share * depth.numpy()
+    used = inside & measured & same & (view.alpha.numpy() > CONSTANTS.opaque_alpha)
     of_map, of_image = _blocks(_gray(view.rgb.numpy()), used), _blocks(_gray(seen) / 255.0, used)
     full = np.isfinite(of_map)
-    if full.sum() < _LEAST_BLOCKS:
+    if full.sum() < CONSTANTS.least_blocks:
         return ExposureFit()
     gain, offset = _robust_line(of_map[full], of_image[full])
-    return ExposureFit(gain, offset) if 0.1 < gain < 10 else ExposureFit()
+    return ExposureFit(gain, offset) if CONSTANTS.least_gain < gain < CONSTANTS.most_gain else ExposureFit()
 
 
 def in_exposure_of_map(rgb: Tensor, depth: Tensor, view: ModelView) -> Tensor:
-    """The image (H, W, 3) uint8 as it would be in the map's exposure; itself where they differ by no jump.
+    """Return the image (H, W, 3) uint8 in the map's exposure; the same image if the difference is small.
 
-    What was clipped is as bright, or as dark, as the map has it, if the map goes further.
+    A clipped pixel takes the map's value if that is brighter than white or darker than black.
     """
     exposure = exposure_of(rgb, depth, view)
     if not exposure.is_jump:
         return rgb
     seen = rgb.numpy()
     corrected = (seen / 255.0 - exposure.offset) / exposure.gain
-    shown, solid = view.rgb.numpy(), (view.alpha.numpy() > _SOLID)[..., None]
-    corrected = np.where(solid & (seen > _CLIPPED[1]), np.maximum(corrected, shown), corrected)
-    corrected = np.where(solid & (seen < _CLIPPED[0]), np.minimum(corrected, shown), corrected)
+    shown, solid = view.rgb.numpy(), (view.alpha.numpy() > CONSTANTS.opaque_alpha)[..., None]
+    corrected = np.where(solid & (seen > CONSTANTS.white), np.maximum(corrected, shown), corrected)
+    corrected = np.where(solid & (seen < CONSTANTS.black), np.minimum(corrected, shown), corrected)
     return torch.from_numpy(np.rint(255.0 * corrected.clip(0, 1)).astype(np.uint8))
 
 
 def _gray(rgb: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Mean (H, W) over the channels."""
+    """Compute the mean (H, W) over the channels."""
     return np.asarray(cv2.transform(np.asarray(rgb, dtype=np.float32), np.full((1, 3), 1 / 3)), dtype=np.float32)
 
 
 def _blocks(image: NDArray[np.floating], used: NDArray[np.bool_]) -> Image:
-    """Means over blocks of the pixels used, one row; NaN where less than half are."""
-    height, width = (side // _BLOCK for side in image.shape)
-    crop = (slice(height * _BLOCK), slice(width * _BLOCK))
+    """Compute the means (B,) of the used pixels over blocks; NaN where less than half of a block is used."""
+    height, width = (side // CONSTANTS.block_size for side in image.shape)
+    crop = (slice(height * CONSTANTS.block_size), slice(width * CONSTANTS.block_size))
     if not height or not width:
         return np.zeros(0)
 
@@ -98,14 +123,15 @@ def _blocks(image: NDArray[np.floating], used: NDArray[np.bool_]) -> Image:
 
 
 def _robust_line(x: Image, y: Image) -> tuple[float, float]:
-    """Slope and intercept of y over x, Cauchy weights; the intercept is drawn to 0, for one grey tells but a gain.
+    """Fit gain and offset of y over x by iteratively reweighted least squares with Cauchy weights.
 
-    Begins with the gain of the medians, so that things that are there no more do not mislead it.
+    w = 1 / (1 + (r / s)²). A weak prior draws the offset to 0, because a uniform gray determines only the gain. The
+    fit starts with the ratio of the medians, which is robust against removed objects.
     """
     gain, offset = float(np.median(y) / max(np.median(x), 1e-3)), 0.0
     A = np.stack([x, np.ones_like(x)], 1)
-    for _ in range(_STEPS):
-        weight = 1.0 / (1.0 + ((gain * x + offset - y) / _SCALE) ** 2)
-        H = (A * weight[:, None]).T @ A + np.diag([0.0, 1e-3 * weight.sum()])
+    for _ in range(CONSTANTS.fit_iterations):
+        weight = 1.0 / (1.0 + ((gain * x + offset - y) / CONSTANTS.fit_scale) ** 2)
+        H = (A * weight[:, None]).T @ A + np.diag([0.0, CONSTANTS.offset_prior * weight.sum()])
         gain, offset = (float(value) for value in np.linalg.solve(H, (A * weight[:, None]).T @ y))
     return gain, offset

@@ -1,4 +1,4 @@
-"""From a keyframe to Gaussians: new ones where the map does not explain it, evidence for those already there."""
+"""Insertion: new Gaussians where the map does not explain a keyframe, and renderings of the map to compare with."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from splatbot.rasterize import rasterization
 
 @dataclass(frozen=True)
 class ModelView:
-    """The map seen from a pose: colour (H, W, 3), depth (H, W) [m], alpha (H, W)."""
+    """The map rendered from a pose: color (H, W, 3), depth (H, W) [m], alpha (H, W)."""
 
     rgb: Tensor
     depth: Tensor
@@ -30,7 +30,7 @@ class ModelView:
 
 @torch.no_grad()
 def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.float64]) -> ModelView:
-    """Render the map; depth is that of the Gaussians' planes, which spares slanted surfaces the blend's bias."""
+    """Render the map; depth is that of the Gaussians' planes, which avoids the bias of centers on slanted surfaces."""
     if len(model) == 0:
         blank = torch.zeros(camera.height, camera.width)
         return ModelView(blank[..., None].repeat(1, 1, 3), blank, blank.clone())
@@ -51,30 +51,30 @@ def view_of(model: GaussianModel, camera: Camera, T_world_camera: NDArray[np.flo
 
 
 def model_depth(view: ModelView, measured: NDArray[np.float32], config: MappingConfig) -> NDArray[np.float32]:
-    """Depth (H, W) [m] to track against: the map's where it is solid and does not contradict the measured one.
+    """Return depth (H, W) [m] to track against: the map's where it is opaque and agrees with the measured depth.
 
-    There, all of it is scaled to where it was measured: of Gaussians that scatter about a surface the nearer ones cover
-    the others, so the blend lies before the surface (0.9 mm at 1.3 m when seen once), and every pose that is aligned to
-    it would be off by as much.
+    One factor scales all of the map's depth to the measured depth. Gaussians scatter about a surface, and the nearer
+    ones occlude the others. The rendered depth is therefore too small, by 0.9 mm at 1.3 m after a single observation,
+    and would bias every pose that is aligned to it.
     """
     depth = view.depth.numpy()
-    # Strictly less: never true where nothing was measured, for the map may hold a guess there.
+    # Strictly less, hence false where no depth was measured: the map may hold a guessed Gaussian there.
     agrees = np.abs(depth - measured) < config.surface_depth_tolerance * measured
-    solid = (view.alpha.numpy() > config.reference_alpha) & agrees
-    scale = _middle(measured[solid] / depth[solid]) if solid.any() else 1.0
-    return np.where(solid, scale * depth, measured).astype(np.float32)
+    opaque = (view.alpha.numpy() > config.reference_alpha) & agrees
+    scale = _robust_mean(measured[opaque] / depth[opaque]) if opaque.any() else 1.0
+    return np.where(opaque, scale * depth, measured).astype(np.float32)
 
 
-def _middle(values: NDArray[np.float32]) -> float:
-    """Mean of all within three deviations of the median of some: as robust, and far better known than that."""
-    some = values[::16]  # a median takes a while
-    median = np.median(some)
-    spread = 1.4826 * np.median(np.abs(some - median))
+def _robust_mean(values: NDArray[np.float32]) -> float:
+    """Compute the mean of all values within 3 σ of the median of a subset: robust, with less variance than a median."""
+    subset = values[::16]  # a median of all values is slow
+    median = np.median(subset)
+    spread = 1.4826 * np.median(np.abs(subset - median))  # σ of normal values
     return float(values[np.abs(values - median) <= 3 * spread].mean(dtype=np.float64))
 
 
 def unexplained(view: ModelView, depth: Tensor, config: MappingConfig) -> Tensor:
-    """Pixels (H, W) whose measured depth the map does not account for: nothing there, or something farther."""
+    """Return the pixels (H, W) with measured depth where the map is transparent or farther."""
     measured = depth > 0
     empty = view.alpha < config.unexplained_alpha
     in_front = depth < view.depth - config.surface_depth_tolerance * depth
@@ -82,7 +82,7 @@ def unexplained(view: ModelView, depth: Tensor, config: MappingConfig) -> Tensor
 
 
 def guess_depth(depth: Tensor) -> Tensor:
-    """Depth (H, W) [m] where none was measured: that of the nearest measured pixel; 0 elsewhere."""
+    """Return the depth (H, W) [m] of the nearest measured pixel where none was measured; 0 elsewhere."""
     missing = (depth == 0).numpy()
     if missing.all() or not missing.any():
         return torch.zeros_like(depth)
@@ -95,9 +95,9 @@ def guess_depth(depth: Tensor) -> Tensor:
 
 
 def guessed_gaussians(view: ModelView, keyframe: Keyframe, config: MappingConfig) -> GaussianModel:
-    """Gaussians that only carry colour where the sensor measured no depth and the map shows nothing.
+    """Create Gaussians where the sensor measured no depth and the map is empty; they only carry color.
 
-    Their depth is a guess, so they have no observation and count as air for collision until a keyframe supports them.
+    Their depth is a guess. They have no observation, and collision checks ignore them until a keyframe supports them.
     """
     guess = guess_depth(keyframe.depth)
     where = (guess > 0) & (view.alpha < config.unexplained_alpha)
@@ -109,19 +109,23 @@ def guessed_gaussians(view: ModelView, keyframe: Keyframe, config: MappingConfig
 
 
 def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> GaussianModel:
-    """One flat Gaussian for each chosen pixel on a grid of ``config.stride`` pixels.
+    """Create one flat Gaussian for each selected pixel on a grid of ``config.stride`` pixels.
 
-    Its disc covers the grid's footprint on the surface: σ = 0.5 stride · z / f across, stretched by the slant (at most
-    3) along it, ``config.thickness`` of that through it. A pixel that fits no plane faces the camera.
+    Its disc covers the grid's footprint on the surface. The standard deviations are σ = 0.5 stride · z / f across the
+    slant, σ / cos θ (at most 3 σ) along it, and ``config.thickness`` · σ through the surface. A pixel without a fitted
+    plane gets a disc that faces the camera.
+
+    Args:
+        where: (H, W) bool, selected pixels.
     """
     s = config.stride
     grid = torch.zeros_like(where)
     grid[s // 2 :: s, s // 2 :: s] = True
-    chosen = (where & grid).numpy()
+    selected = (where & grid).numpy()
     camera = keyframe.camera
     depth = keyframe.depth.numpy()
-    points = camera.backproject(depth)[chosen].astype(np.float64)
-    rows, columns = np.nonzero(chosen)
+    points = camera.backproject(depth)[selected].astype(np.float64)
+    rows, columns = np.nonzero(selected)
     normals = fitted_normals(depth, camera, rows, columns, reach=2 * s)
     toward = -points / np.linalg.norm(points, axis=1, keepdims=True)
     normals = np.where((normals**2).sum(1, keepdims=True) > 0.25, normals, toward)
@@ -135,7 +139,7 @@ def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> G
             quats=_disc_quats(normals, toward, R_world_camera),
             scales=scales,
             opacities=np.full(len(points), config.initial_opacity),
-            colors=keyframe.rgb.numpy()[chosen] / 255.0,
+            colors=keyframe.rgb.numpy()[selected] / 255.0,
         ),
         keyframe.number,
     )
@@ -144,7 +148,7 @@ def new_gaussians(keyframe: Keyframe, where: Tensor, config: MappingConfig) -> G
 def _disc_quats(
     normals: NDArray[np.float64], toward: NDArray[np.float64], R: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Orientations (N, 4): z along the normal, x along the direction in which the slant stretches the footprint."""
+    """Compute quaternions (N, 4): z along the normal, x along the direction in which slant stretches the footprint."""
     x = toward - (toward * normals).sum(1, keepdims=True) * normals
     length = np.linalg.norm(x, axis=1, keepdims=True)
     spare = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))

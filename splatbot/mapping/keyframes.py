@@ -1,4 +1,4 @@
-"""Keyframes: the frames that the map is made of and that later frames are tracked against."""
+"""Keyframes: frames that the map is built from and that later frames are tracked against."""
 
 from __future__ import annotations
 
@@ -22,13 +22,30 @@ from splatbot.tracking.prepare import Level, halve, usable_depth
 from splatbot.tracking.reference import Reference
 from splatbot.tracking.tracker import pose_distance
 
-_ROWS = 4  # of which one tells the noise
-_MAD = 0.6745  # median of the absolute of a normal variable
-_GATE = 3.7  # σ of depth: three of how far, on a plane, a pixel lies from half-way between two others, which is √1.5 σ
+
+@dataclass(frozen=True)
+class SmoothingConstants:
+    """Constants of depth smoothing.
+
+    Args:
+        row_step: every this many image rows serve the estimate of the noise.
+        median_of_absolute: median of the absolute value of a standard normal variable.
+        gate_sigma: [σ of depth] limit of a pixel's deviation from the mean of two neighbors. On a plane that deviation
+            has the standard deviation √1.5 σ, so the gate is three of its deviations.
+        full_mask_share: a resized mask is true where at least this share of the covered pixels is.
+    """
+
+    row_step: int = 4
+    median_of_absolute: float = 0.6745
+    gate_sigma: float = 3.7
+    full_mask_share: float = 0.999
+
+
+CONSTANTS = SmoothingConstants()
 
 
 class HasPose(Protocol):
-    """What has a pose."""
+    """An object with a pose."""
 
     @property
     def T_world_camera(self) -> NDArray[np.float64]: ...
@@ -36,17 +53,18 @@ class HasPose(Protocol):
 
 @dataclass
 class Keyframe:
-    """One observation as the map keeps it.
+    """A frame with the images that the map keeps.
 
     Args:
-        number: counts all keyframes there have been.
-        camera: of the images kept here.
+        number: consecutive number of all keyframes, including removed ones.
+        camera: of these images.
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 [m], 0 missing.
         T_world_camera: (4, 4).
-        features: for matching later frames.
-        static_mask: (H, W) bool, pixels that show nothing that moves or is masked, depth being 0 elsewhere; None: all.
-        reference: for aligning later frames; its depth is the model's once the keyframe has been fused.
+        features: keypoints that later frames are matched with.
+        reference: pixels that later frames are aligned to; their depth is the map's once the keyframe is in the map.
+        static_mask: (H, W) bool, pixels that are neither masked nor show a dynamic object; elsewhere, depth is 0. If
+            None, all pixels are static.
     """
 
     number: int
@@ -60,47 +78,48 @@ class Keyframe:
 
     @property
     def viewmat(self) -> Tensor:
-        """T_camera_world (1, 4, 4) float64, as the rasterizer takes it."""
+        """T_camera_world (1, 4, 4) float64 for the rasterizer."""
         return torch.from_numpy(inverse(self.T_world_camera))[None]
 
     @property
     def K(self) -> Tensor:
-        """(1, 3, 3) float64 for pixel centres at +0.5."""
+        """Intrinsic matrix (1, 3, 3) float64, for pixel centers at +0.5."""
         return torch.from_numpy(self.camera.K_corner)[None]
 
 
 def mapping_images(
     frame: Frame, config: MappingConfig, tracking: TrackingConfig
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.float32]]:
-    """Camera, colour and valid, unmasked, smoothed depth of a frame, halved until at most ``config.max_width`` wide."""
+    """Return camera, color and valid, unmasked, smoothed depth, halved until at most ``config.max_width`` wide."""
     rgb = frame.rgb
     level = Level(np.zeros(frame.depth.shape, np.float32), usable_depth(frame, tracking), frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
         width, height = level.camera.width, level.camera.height
-        even = rgb[: 2 * height, : 2 * width]  # as `halve` crops, or an odd size would shift colour against depth
+        even = rgb[: 2 * height, : 2 * width]  # the crop of `halve`: with an odd size, color would shift against depth
         rgb = np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
     return level.camera, rgb, smooth_depth(level.depth, config, tracking)
 
 
 def smooth_depth(depth: NDArray[np.float32], config: MappingConfig, tracking: TrackingConfig) -> NDArray[np.float32]:
-    """Depth (H, W) [m], each pixel the mean of those of its 3x3 that are of its surface; 0 stays missing.
+    """Average each pixel of a depth image (H, W) [m] over the 3x3 neighbors on its surface; 0 stays missing.
 
-    A Gaussian stands for some 3x3 pixels, and all of them measured where it is. Of Gaussians that scatter by a single
-    pixel's noise the nearer ones cover the others, so the blend would lie before the surface, most where it was seen
-    once, and what is aligned to it would be off. What bends by more than the image's own noise is shape, and kept.
+    A Gaussian represents about 3x3 pixels, and all of them measured its position. If Gaussians scattered by the noise
+    of single pixels, the nearer ones would occlude the others. The rendered surface and the poses aligned to it would
+    then be biased towards the camera. A curvature beyond the noise of the image is shape and remains.
     """
-    gate = _GATE * noise_share(depth, tracking)
+    gate = CONSTANTS.gate_sigma * noise_share(depth, tracking)
     floor, quad = gate * tracking.sensor.sigma_depth_floor, gate * tracking.sensor.sigma_depth_quad
     return np.asarray(_native.smooth_depth(np.ascontiguousarray(depth), config.surface_depth_tolerance, floor, quad))
 
 
 def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
-    """The noise of depth (H, W) [m] over what tracking allows for, at most 1; 0 of depth that shows none.
+    """Estimate the noise of depth (H, W) [m] relative to the sensor model, at most 1; 0 for depth without noise.
 
-    By the median of how far pixels lie from half-way between their neighbours in the row, which is σ √1.5 of a plane.
+    On a plane, the deviation of a pixel from the mean of its neighbors in the row has the standard deviation √1.5 σ.
+    Its median absolute value gives σ.
     """
-    z = depth[::_ROWS].astype(np.float64)
+    z = depth[:: CONSTANTS.row_step].astype(np.float64)
     left, z, right = z[:, :-2], z[:, 1:-1], z[:, 2:]
     known = (left > 0) & (z > 0) & (right > 0)
     if not known.any():
@@ -108,11 +127,11 @@ def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
     bend = np.abs((left + right) / 2 - z)[known] / (
         tracking.sensor.sigma_depth_floor + tracking.sensor.sigma_depth_quad * z[known] ** 2
     )
-    return min(1.0, float(np.median(bend)) / (_MAD * np.sqrt(1.5)))
+    return min(1.0, float(np.median(bend)) / (CONSTANTS.median_of_absolute * np.sqrt(1.5)))
 
 
 def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[HasPose], config: MappingConfig) -> bool:
-    """Whether a view is new: farther or turned further from every keyframe than the configuration says."""
+    """Return whether a view is new: its translation or rotation from every keyframe exceeds the configured limit."""
     for keyframe in reversed(keyframes):
         moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)
         if moved < config.keyframe_translation and turned < config.keyframe_rotation:
@@ -121,8 +140,8 @@ def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[HasPose
 
 
 def resized(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The mask at another size (rows, columns): true where all that a pixel covers is."""
+    """Resize a mask to (rows, columns); a pixel is true if all pixels that it covers are."""
     if mask.shape == shape:
         return mask
     share = cv2.resize(mask.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
-    return np.asarray(share > 0.999)
+    return np.asarray(share > CONSTANTS.full_mask_share)

@@ -34,7 +34,8 @@ class LoopConstants:
     Args:
         neighbor_hops: edges of the pose graph, or difference of keyframe numbers, within which a keyframe is a
             neighbor of the odometry and not a revisited place.
-        near_translation, near_rotation: [m], [rad] a keyframe this near is a loop candidate whatever it looks like.
+        near_translation, near_rotation: [m], [rad] a keyframe this near is a loop candidate, even with
+            another appearance.
         appearance_candidates: loop candidates by appearance that are verified for each keyframe.
         unknown_sigma: [m], [rad] standard deviation of a motion that the images could not measure.
         drift_sigma: [m/m], [rad/rad] standard deviation of the odometry error, relative to the motion. Errors of lens
@@ -42,7 +43,7 @@ class LoopConstants:
         open_translation, open_rotation: [m], [rad] a loop that the optimized graph leaves open by more is wrong.
         tracking_translation, tracking_rotation: [m], [rad] up to this difference, the images confirm the tracked
             motion between two keyframes. Beyond it, other keyframes biased tracking.
-        drift_offset: [m], [rad] drift that a loop may correct whatever the length of its path.
+        drift_offset: [m], [rad] drift that a loop may correct for a path of any length.
         same_translation, same_rotation: [m], [rad] two loops that imply corrections this near confirm each other.
         unconfirmed_kept: loops that wait for a confirming one.
     """
@@ -91,9 +92,11 @@ class MeasuredMotion:
 class LoopCloser:
     """Builds the pose graph and computes how keyframes have to move once a place has been seen again.
 
-    It accepts a loop closure if features and images of two keyframes agree, if the loop implies no more drift than the
-    path between them explains, and if the optimized graph is consistent with it. A loop that differs from the tracked
-    poses needs a second loop that implies the same correction, because repeated texture looks alike.
+    It accepts a loop closure under three conditions. Features and images of two keyframes agree. The loop implies no
+    more drift than the path between them explains. The optimized graph is consistent with it.
+
+    A loop that differs from the tracked poses needs a second loop that implies the same correction, because repeated
+    texture looks alike.
 
     The mapping thread owns all of its state. The tracking thread calls :meth:`locate`, which reads ``adjacency``; that
     mapping is replaced by assignment and never changed.

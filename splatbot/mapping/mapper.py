@@ -129,22 +129,22 @@ class Mapper:
 
     @property
     def has_loop(self) -> bool:
-        """Whether :meth:`close_loops` would move the map; keyframes that wait for insertion come first."""
+        """True if :meth:`close_loops` would move the map; keyframes that wait for insertion come first."""
         return not self._frozen and self.loops.correction is not None and not self.has_keyframes_to_insert
 
     @property
     def has_keyframes_to_insert(self) -> bool:
-        """Whether submitted observations are not in the map yet."""
+        """True while submitted observations are not in the map yet."""
         return bool(self._submitted or self._added)
 
     @property
     def has_observations(self) -> bool:
-        """Whether submitted observations, or an observed frame, are not processed yet."""
+        """True while submitted observations, or an observed frame, are not processed yet."""
         return self.has_keyframes_to_insert or self._latest is not None
 
     @property
     def has_work(self) -> bool:
-        """Whether :meth:`step` has work now."""
+        """True if :meth:`step` has work now."""
         return self.has_observations or self._may_refine
 
     def snapshot(self) -> Snapshot:
@@ -205,7 +205,7 @@ class Mapper:
     # --- steps of the mapping thread ---
 
     def step(self, iterations: int = 1) -> bool:
-        """Do the next piece of work and return whether there is more; an error leaves the state as it was.
+        """Run the next piece of work and return whether there is more; an error leaves the state as it was.
 
         The order is the one that serves tracking soonest: add a keyframe, insert a keyframe, compare the latest
         observed frame, refine.
@@ -226,7 +226,7 @@ class Mapper:
 
     @contextmanager
     def rollback_on_error(self) -> Iterator[None]:
-        """Return a context that restores the state if its block raises, and drops what was submitted and not inserted.
+        """Return a context that restores the state if its block raises, and drops observations that are not in the map.
 
         The state consists of keyframes, map, optimizer, dynamic objects, pose graph and version. It is kept by
         reference: all steps but refinement write to copies, and :meth:`Refiner.step` undoes its own writes.
@@ -272,7 +272,7 @@ class Mapper:
         self.version += 1
 
     def make_reference(self, observation: Observation, keyframe: Keyframe) -> None:
-        """Set what later frames align to: the frame's own gray values, and the map's depth where the map is opaque."""
+        """Set the reference for later frames: gray values of the frame, and depth of the map where that is opaque."""
         levels = observation.prepared.levels
         view = view_of(self.model, levels[0].camera, keyframe.T_world_camera)
         depth = model_depth(view, levels[0].depth, self.config.mapping)

@@ -1,4 +1,4 @@
-"""What the map and what maps it hold in memory."""
+"""Memory use of the map, the optimizer and the keyframes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatbot.optimize.adam import GaussianAdam
 
 
 def memory_of(model: GaussianModel, adam: GaussianAdam, keyframes: Sequence[Keyframe]) -> dict[str, int]:
-    """Bytes of the Gaussians with their bookkeeping, of the optimiser's moments, and of keyframes: images, the rest."""
+    """Compute the bytes of the Gaussians, the optimizer's moments, the keyframes' images and their tracking data."""
     moments: list[Tensor] = [adam.steps, *adam.first.values(), *adam.second.values()]
     return {
         "gaussians_bytes": model.nbytes,

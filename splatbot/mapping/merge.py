@@ -1,8 +1,8 @@
-"""Making room under the cap: near-identical neighbours become one Gaussian of the same moments."""
+"""Merging: similar neighbors become one Gaussian of the same moments, to keep the map below its size limit."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -11,21 +11,41 @@ from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import covariances, shortest_axes
 from splatbot.geometry import rotation_to_quat
 
-_CELLS = 4.0  # side of the cells in which partners are sought [median largest σ]
-_NEAR = 2.6  # new neighbours lie 2 σ apart: a map over its cap becomes coarser, not thinner [σ]
-_COLOUR = 0.15  # [0..1] and their colours differ by at most this
-_PARALLEL = 0.9  # cosine of their shortest axes
-_SIZE = 2.0  # and their largest σ by at most this factor
+
+@dataclass(frozen=True)
+class MergeConstants:
+    """Constants of merging.
+
+    Args:
+        cell_size: [median of the largest σ] side of the cells in which pairs are formed.
+        largest_distance: [σ] distance of the centers of a pair. New neighbors are 2 σ apart, so a map above its limit
+            becomes coarser and not sparser.
+        color_difference: [0..1] largest difference of a color channel within a pair.
+        parallel_cosine: least cosine of the shortest axes of a pair.
+        size_ratio: largest ratio of the largest σ within a pair.
+        least_opacity, most_opacity: limits of the merged opacity.
+    """
+
+    cell_size: float = 4.0
+    largest_distance: float = 2.6
+    color_difference: float = 0.15
+    parallel_cosine: float = 0.9
+    size_ratio: float = 2.0
+    least_opacity: float = 0.01
+    most_opacity: float = 0.99
+
+
+CONSTANTS = MergeConstants()
 
 
 def merge_similar(model: GaussianModel, excess: int) -> tuple[GaussianModel, Tensor]:
-    """The model with up to ``excess`` pairs merged, most alike first, and the rows (ascending) that it kept.
+    """Return the model with up to ``excess`` pairs merged, the most similar first, and the kept rows, ascending.
 
-    A merged Gaussian has the mean and covariance of the two weighted by opacity times size, which also gives its colour
-    and its opacity; it takes the first one's row.
+    With weights w = opacity · area normalized to 1, the merged Gaussian has the moments of the mixture:
+    μ = Σ w_i μ_i and Σ = Σ w_i (Σ_i + (μ_i - μ)(μ_i - μ)ᵀ). It takes the row of the first one.
     """
     first, second = _pairs(model)
-    cost = _unlikeness(model, first, second)
+    cost = _merge_cost(model, first, second)
     chosen = torch.argsort(cost, stable=True)[: min(excess, int(torch.isfinite(cost).sum()))]
     first, second = first[chosen], second[chosen]
     keep = torch.ones(len(model), dtype=torch.bool)
@@ -37,11 +57,11 @@ def merge_similar(model: GaussianModel, excess: int) -> tuple[GaussianModel, Ten
 
 
 def _pairs(model: GaussianModel) -> tuple[Tensor, Tensor]:
-    """Rows of neighbours: two that follow each other in a cell of space; no row is in two pairs."""
+    """Return the rows of disjoint pairs: two successive Gaussians in a cell of space."""
     nothing = torch.zeros(0, dtype=torch.long)
     if len(model) < 2:
         return nothing, nothing
-    side = _CELLS * float(model.scales.amax(1).median())
+    side = CONSTANTS.cell_size * float(model.scales.amax(1).median())
     cells = torch.floor((model.means.double() - model.means.double().mean(0)) / side + 0.5).long()
     key = (cells[:, 0] * 1_000_003 + cells[:, 1]) * 1_000_003 + cells[:, 2]
     order = torch.argsort(key, stable=True)
@@ -53,19 +73,19 @@ def _pairs(model: GaussianModel) -> tuple[Tensor, Tensor]:
     return order[:-1][opens], order[1:][opens]
 
 
-def _unlikeness(model: GaussianModel, first: Tensor, second: Tensor) -> Tensor:
-    """Squared distance of centres in σ (P,); inf for pairs that must not merge."""
+def _merge_cost(model: GaussianModel, first: Tensor, second: Tensor) -> Tensor:
+    """Compute the squared Mahalanobis distance (P,) of the centers; inf for pairs that must not merge."""
     a, b = model.select(first), model.select(second)
     between = a.means - b.means
     spread = (covariances(a) + covariances(b)) / 2
     along = torch.linalg.solve(spread + 1e-12 * torch.eye(3), between[..., None])[..., 0] if len(a) else between
     cost = (between * along).sum(1)
     sizes = a.log_scales.amax(1) - b.log_scales.amax(1)
-    alike = (a.colors - b.colors).abs().amax(1) < _COLOUR
-    alike &= (shortest_axes(a) * shortest_axes(b)).sum(1).abs() > _PARALLEL
-    alike &= sizes.abs() < torch.tensor(_SIZE).log()
-    alike &= (a.observations > 0) == (b.observations > 0)
-    return torch.where(alike & (cost < _NEAR**2), cost, torch.inf)
+    similar = (a.colors - b.colors).abs().amax(1) < CONSTANTS.color_difference
+    similar &= (shortest_axes(a) * shortest_axes(b)).sum(1).abs() > CONSTANTS.parallel_cosine
+    similar &= sizes.abs() < torch.tensor(CONSTANTS.size_ratio).log()
+    similar &= (a.observations > 0) == (b.observations > 0)
+    return torch.where(similar & (cost < CONSTANTS.largest_distance**2), cost, torch.inf)
 
 
 def _merge(a: GaussianModel, b: GaussianModel) -> GaussianModel:
@@ -91,15 +111,15 @@ def _merge(a: GaussianModel, b: GaussianModel) -> GaussianModel:
         uncertainty=(p[:, 0] * a.uncertainty.square() + q[:, 0] * b.uncertainty.square()).sqrt(),
         misses=torch.minimum(a.misses, b.misses),
     )
-    opacities = (weights.sum(0) / _area(merged)).clamp(0.01, 0.99)
+    opacities = (weights.sum(0) / _area(merged)).clamp(CONSTANTS.least_opacity, CONSTANTS.most_opacity)
     merged.opacity_logits = torch.logit(
-        torch.maximum(opacities, torch.minimum(a.opacities, b.opacities)).clamp_max(0.99)
+        torch.maximum(opacities, torch.minimum(a.opacities, b.opacities)).clamp_max(CONSTANTS.most_opacity)
     )
     return merged
 
 
 def _area(model: GaussianModel) -> Tensor:
-    """Product of the two largest σ (N,) [m²]."""
+    """Compute the product of the two largest σ (N,) [m²]."""
     return (model.log_scales.sum(1) - model.log_scales.amin(1)).exp()
 
 

@@ -80,8 +80,8 @@ class PoseGraph:
     def optimize(self) -> dict[int, Array]:
         """Compute the poses that minimize the cost of all edges; the first keyframe is fixed.
 
-        min Σ_odometry ‖r_ij‖²_Σij + Σ_loop ρ(‖r_ij‖_Σij), with the residual of :meth:`Edge.residual`, the squared
-        Mahalanobis norm ‖r‖²_Σ = rᵀ Σ⁻¹ r and the Cauchy loss ρ(x) = c² / 2 · log(1 + x² / c²). GTSAM solves it by
+        min Σ_odometry ½ ‖r_ij‖²_Σij + Σ_loop ρ(‖r_ij‖_Σij), with the residual r of :meth:`Edge.residual`. The squared
+        Mahalanobis norm is ‖r‖²_Σ = rᵀ Σ⁻¹ r. The Cauchy loss is ρ(x) = c² / 2 · log(1 + x² / c²). GTSAM solves it by
         Levenberg-Marquardt on SE(3) (Dellaert & Kaess 2017, Factor Graphs for Robot Perception).
         """
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

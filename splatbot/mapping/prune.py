@@ -1,4 +1,4 @@
-"""Which Gaussians leave the map."""
+"""Pruning: selection of the Gaussians that stay in the map."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatbot.gaussians import GaussianModel
 
 
 def keep_mask(model: GaussianModel, config: MappingConfig) -> Tensor:
-    """Mask (N,) of finite, visible Gaussians of a sane size."""
+    """Return the mask (N,) of finite Gaussians that are opaque and small enough."""
     finite = torch.isfinite(model.means).all(1) & torch.isfinite(model.log_scales).all(1)
     finite &= torch.isfinite(model.quats).all(1) & torch.isfinite(model.opacity_logits)
     finite &= torch.isfinite(model.sh).flatten(1).all(1)
@@ -19,6 +19,6 @@ def keep_mask(model: GaussianModel, config: MappingConfig) -> Tensor:
 
 
 def best_supported(model: GaussianModel, count: int) -> Tensor:
-    """Indices, ascending, of the ``count`` Gaussians with most evidence: observations first, opacity second."""
+    """Return the rows, ascending, of the ``count`` Gaussians with the most observations, then the highest opacity."""
     merit = model.observations.float() + model.opacities
     return torch.argsort(merit, descending=True, stable=True)[:count].sort().values

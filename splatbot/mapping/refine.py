@@ -33,7 +33,7 @@ class RefineConstants:
 
     Args:
         removed_depth_share: [share of depth] where a keyframe's depth is smaller than the map's by more, it shows an
-            object that was removed since; such pixels carry no loss.
+            object that was removed since. Such pixels carry no loss.
         covered_alpha: pixels that the map covers less carry no loss.
         least_depth: [m] smaller measured depths do not increase the weight of the depth loss further.
         latest_share: share of the random draws that come from the latest ``window`` keyframes.
@@ -77,7 +77,7 @@ class Refiner:
         """Number of the latest keyframe that has had its first iteration."""
 
     def state(self) -> Any:
-        """Return the state besides the model, for :meth:`restore`."""
+        """Return the state of the optimizer and the random draws, for :meth:`restore`."""
         return self.adam.state(), self._random.bit_generator.state, self._latest_refined
 
     def restore(self, state: Any) -> None:

@@ -1,4 +1,4 @@
-"""The robot's own body in the picture: it moves with the camera or before it, and is no part of the scene."""
+"""Self mask: the robot's own body in the image moves with or in front of the camera and is not part of the scene."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from splatbot.frame import Frame
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array, RobotKinematics
 
-REACH = 0.02  # [m] around the robot that counts as the robot
+REACH = 0.02  # [m] distance from the robot's spheres that counts as the robot
 
 
 class SelfMask:
-    """Leaves out of frames what may show the robot: within ``reach`` of its spheres at the frame's joints.
+    """Masks the pixels of frames that may show the robot: within ``reach`` of its spheres at the frame's joints.
 
-    A pixel is left out where its ray meets an enlarged sphere at or before the measured depth, or where nothing was
-    measured; or where the measured point lies in one. What is seen in front of the robot stays.
+    A pixel is masked if its ray meets an enlarged sphere at or in front of the measured depth, or without a measured
+    depth. It is also masked if its measured point lies in such a sphere. Objects in front of the robot remain.
 
     Args:
         robot: joints, links and the spheres that cover them.
         T_link_camera: (4, 4), the camera on the link that carries it.
-        link: that carries the camera; -1: the last one, 0: the base, for a camera that stands beside the robot.
-        opening: of the gripper [m]; None: as wide as it goes.
-        reach: [m]
+        link: index of the link that carries the camera. -1 is the last one; 0 is the base, for a static camera.
+        opening: opening of the gripper [m]. If None, the gripper is fully open.
+        reach: enlargement of the spheres [m].
 
     Raises:
-        InputError: the camera's pose is not rigid, the link is not there, or reach is negative.
+        InputError: The camera pose is not rigid, the link does not exist, or the reach is negative.
     """
 
     def __init__(
@@ -58,26 +58,26 @@ class SelfMask:
         self._radii = self._arm.spheres.radii + reach
 
     def __call__(self, frame: Frame) -> Frame:
-        """The frame with the robot left out of its mask.
+        """Return the frame with the robot removed from its mask.
 
         Raises:
-            InputError: the frame tells no joints, or another number of them.
+            InputError: The frame has no joints or too few.
         """
         free = self.usable(frame)
         return replace(frame, mask=free if frame.mask is None else frame.mask & free)
 
     def usable(self, frame: Frame) -> NDArray[np.bool_]:
-        """Pixels (H, W) that do not show the robot.
+        """Compute the pixels (H, W) that do not show the robot.
 
         Raises:
-            InputError: as for the whole.
+            InputError: The frame has no joints or too few.
         """
         joints = len(self._arm.robot.chain)
         where = frame.source or f"frame {frame.index}"
         if frame.joints is None or len(frame.joints) < joints:
-            told = "no" if frame.joints is None else str(len(frame.joints))
+            count = "no" if frame.joints is None else str(len(frame.joints))
             hint = f"record the joints of {self._arm.robot.name} with the frames, or map without its mask"
-            raise InputError(f"has {told} joints.", file=where, field="joints", hint=hint)
+            raise InputError(f"has {count} joints.", file=where, field="joints", hint=hint)
         q = np.asarray(frame.joints[:joints], dtype=np.float64)  # a gripper's own may follow
         T_base_camera = self._arm.forward(q)[0, self._link] @ self._T_link_camera
         centers = transform_points(inverse(T_base_camera), self._arm.centers(q)[0])
@@ -88,7 +88,7 @@ class SelfMask:
 
 
 def _hide(hidden: NDArray[np.bool_], depth: NDArray[np.float32], camera: Camera, center: Array, radius: float) -> None:
-    """Mark the pixels whose ray meets a sphere (camera's frame) no farther than their depth, or ends in it."""
+    """Mark the pixels whose ray meets a sphere (camera frame) not farther than their depth, or ends in it."""
     rows, columns = _window(camera, center, radius)
     if rows.start >= rows.stop or columns.start >= columns.stop:
         return
@@ -107,7 +107,7 @@ def _hide(hidden: NDArray[np.bool_], depth: NDArray[np.float32], camera: Camera,
 
 
 def _window(camera: Camera, center: Array, radius: float) -> tuple[slice, slice]:
-    """The pixels that a sphere can cover: of the box around it; all of them if that reaches behind the camera."""
+    """Compute the rows and columns of a sphere's bounding box; the whole image if it reaches behind the camera."""
     whole = slice(0, camera.height), slice(0, camera.width)
     if center[2] + radius <= 0.0:
         return slice(0, 0), slice(0, 0)

@@ -15,7 +15,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Interrupts:
     """Turns SIGINT and SIGTERM into a request that a long job honours where it is safe.
 
-    While active, a signal only sets :attr:`requested`, so that what is under way is done and saved whole. Inside
+    While active, a signal only sets :attr:`requested`, so that the work in progress is completed and saved. Inside
     :meth:`interruptible`, around work that may be cut short without loss, it raises KeyboardInterrupt. Outside the
     main thread Python delivers no signals, and this does nothing.
     """
@@ -37,17 +37,17 @@ class Interrupts:
 
     @contextmanager
     def interruptible(self, *, after: int = 0) -> Iterator[None]:
-        """A block that KeyboardInterrupt ends, or is not even begun, once more than ``after`` signals have come."""
+        """Return a context that raises KeyboardInterrupt once more than ``after`` signals have arrived."""
         self._raises_after = after
         try:
-            self._raise_if_asked()
+            self._raise_if_requested()
             yield
         finally:
             self._raises_after = None
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """A block that KeyboardInterrupt ends as well, whoever raised it, and which makes a request of it."""
+        """Return a context that turns a KeyboardInterrupt in its block into a request."""
         try:
             yield
         except KeyboardInterrupt:
@@ -56,9 +56,9 @@ class Interrupts:
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1
         self.requested = self.requested or number
-        self._raise_if_asked()
+        self._raise_if_requested()
 
-    def _raise_if_asked(self) -> None:
+    def _raise_if_requested(self) -> None:
         if self._raises_after is not None and self._count > self._raises_after:
-            self._raises_after = None  # at once: the next signal must not cut the cleaning up
+            self._raises_after = None  # the next signal must not interrupt the cleanup
             raise KeyboardInterrupt

@@ -25,7 +25,7 @@ from splatbot.slam import Slam
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run: where it lies, its ``metrics.json``, and what ended it early, if anything did."""
+    """A finished run: its folder, its ``metrics.json``, and the error or signal that ended it early, if any."""
 
     folder: Path
     metrics: dict[str, Any]
@@ -61,33 +61,33 @@ def map_log(
     """Map a log and write the run folder ``out``.
 
     Every ``config.mapping.holdout_every``-th frame is tracked but kept out of the map, and the finished map is scored
-    against it. Ctrl-C, SIGTERM and an unreadable frame end the mapping early; what was mapped until then is saved,
-    scored and reported like a whole run. A second Ctrl-C gives up scoring and report.
+    against it. Ctrl-C, SIGTERM and an unreadable frame end the mapping early. The map up to there is saved,
+    scored and reported like a complete run. A second Ctrl-C skips scoring and report.
 
     Args:
         log: the recording.
         out: folder to write; files of an earlier run there are replaced once there is something to replace them with.
-        config: None takes that of ``slam``, or the defaults.
-        slam: the SLAM to run, fresh; None makes one from ``config``.
+        config: configuration. If None, that of ``slam`` or the defaults apply.
+        slam: the SLAM to run, without frames yet. If None, one is made from ``config``.
         on_progress: called after every frame and at every phase.
-        on_bad_frame: what to do about a frame that cannot be read.
+        on_bad_frame: whether a frame that cannot be read ends the mapping or is skipped.
         max_frames: read no more frames than this.
-        localise: place the frames in this run's map, which stays as it is; the trajectory is in its world. The run's
-            configuration is taken.
-        realtime: give frames at the times of their stamps, as a camera would, map in a thread beside tracking, and drop
-            frames that there is no time for; they and those done late are counted.
-        rate: give frames at this rate [Hz] instead of their stamps'; implies ``realtime``.
-        save_every: save the whole state into ``out/state`` whenever so many seconds have passed, and at the end; a run
-            that is killed loses what came after the last save. None: never.
-        resume: go on where this run was saved; ``log`` must be its log, and ``config`` and ``slam`` are the run's.
-        source: what else it takes to open the log again, kept beside its uri in ``metrics.json`` under "log".
-        effects: the account of the sensor effects that the log's frames went through; None takes the log's own.
-        map_page: makes a page of the finished map, which the report shows; None: it shows none.
+        localise: run whose map the frames are localized in. The map does not change, the trajectory is in its world
+            frame, and its configuration applies.
+        realtime: deliver frames at the times of their stamps, as a camera does, and map in a second thread. Frames that
+            arrive while an earlier one is processed are dropped; dropped and late frames are counted.
+        rate: deliver frames at this rate [Hz] instead of that of their stamps; implies ``realtime``.
+        save_every: interval [s] at which the whole state is saved into ``out/state``; it is also saved at the end. A
+            run that is killed loses the frames after the last save. If None, the state is not saved.
+        resume: saved run to continue. ``log`` must be its log; ``config`` and ``slam`` are those of the run.
+        source: further arguments needed to open the log again; ``metrics.json`` keeps them under "log".
+        effects: description of the sensor effects that the log's frames went through. If None, that of the log.
+        map_page: makes a page of the finished map for the report. If None, the report has no such page.
 
     Raises:
-        LogError: the log is empty, no frame could be read, or it is not the log of ``resume``; nothing is written then.
+        LogError: The log is empty, no frame could be read, or it is not the log of ``resume``; no file is written.
         InputError: ``out`` cannot be written.
-        KeyboardInterrupt: interrupted before the first frame was mapped.
+        KeyboardInterrupt: A signal arrived before the first frame was mapped.
     """
     if resume is not None:
         resume.place.check(log)
@@ -101,13 +101,13 @@ def map_log(
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")
     if realtime and slam is None:
         threaded = config.mapping.model_copy(update={"threaded": True})
-        by_the_clock = config.tracking.model_copy(update={"deterministic": False})
-        config = config.model_copy(update={"mapping": threaded, "tracking": by_the_clock})
+        wall_clock = config.tracking.model_copy(update={"deterministic": False})
+        config = config.model_copy(update={"mapping": threaded, "tracking": wall_clock})
     folder = RunFolder.create(out)
     total = len(log) if max_frames is None else min(len(log), max_frames)
     if total == 0:
         raise LogError("has no frames.", file=log.name, hint="record the log again, or name another one")
-    truth = log.ground_truth  # now: a damaged file must not cost the user a whole run
+    truth = log.ground_truth  # read now: a damaged file must not cost the user a whole run
     frames = PacedSource(log, total, rate) if realtime else LogFrames(log, total)
     loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, on_progress or (lambda _: None))
     if resume is not None:

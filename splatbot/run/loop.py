@@ -1,4 +1,4 @@
-"""The frames of a log, one after the other."""
+"""The loop over the frames of a log."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DROPPED = "a newer frame had arrived"
 
 
 class FrameSaver(Protocol):
-    """What the loop asks of the one who saves it; ``cost`` says how often that was and how long it took."""
+    """Saves the loop while it runs; ``cost`` holds the number of saves and their duration."""
 
     @property
     def cost(self) -> dict[str, Any]: ...
@@ -36,19 +36,19 @@ class FrameSaver(Protocol):
 
 @dataclass
 class FrameLoop:
-    """The loop over the frames, and what came of them.
+    """The loop over the frames, and their results.
 
     Args:
-        source: gives the frames.
-        slam, config: what is run.
+        source: delivers the frames.
+        slam, config: the SLAM to run and its configuration.
         on_bad_frame: "stop" or "skip".
-        tell: receives the progress.
+        on_progress: receives the progress.
         ms: wall-clock milliseconds by frame.
-        held_out: frames that were kept out of the map.
-        skipped: why a frame could not be read, by frame.
+        held_out: frames that the map does not use.
+        skipped: reason why a frame could not be read, by frame.
         keyframes, lost: counts so far.
         error: the unreadable frame that ended the log.
-        crash: what broke unexpectedly.
+        crash: the unexpected exception that ended the loop.
         first_bad: the first unreadable frame.
         started: clock at the start [s].
         saver: saves the run while it goes on.
@@ -58,7 +58,7 @@ class FrameLoop:
     slam: Slam
     config: Config
     on_bad_frame: str
-    tell: Callable[[Progress], None]
+    on_progress: Callable[[Progress], None]
     ms: dict[int, float] = field(default_factory=dict)
     held_out: set[int] = field(default_factory=set)
     skipped: dict[int, str] = field(default_factory=dict)
@@ -71,7 +71,7 @@ class FrameLoop:
     saver: FrameSaver | None = None
 
     def run(self, interrupts: Interrupts) -> None:
-        """Process the frames until they end, ``error``, ``crash`` or a signal; raises nothing."""
+        """Process the frames until they end or until an error, a crash or a signal; never raises."""
         through = False
         try:
             with interrupts.noted():
@@ -92,10 +92,10 @@ class FrameLoop:
             self.slam.close()
 
     def _all_frames(self, interrupts: Interrupts) -> bool:
-        """Whether the log ended, rather than a signal or an unreadable frame ending the run.
+        """Process all frames; return False if a signal or an unreadable frame ended the run.
 
         Raises:
-            KeyboardInterrupt: of a signal while a frame is waited for, or of a callback.
+            KeyboardInterrupt: A signal arrived during the wait for a frame, or a callback raised it.
         """
         with closing(iter(self.source)) as arrivals:
             while interrupts.requested is None:
@@ -143,9 +143,9 @@ class FrameLoop:
     def progress(
         self, phase: Phase, *, done: int | None = None, result: FrameResult | None = None, skipped: str = ""
     ) -> None:
-        """Tell the caller where the run stands."""
+        """Report the progress to the caller."""
         results = self.slam.results
-        self.tell(
+        self.on_progress(
             Progress(
                 phase=phase,
                 done=self.done if done is None else done,
@@ -163,11 +163,11 @@ class FrameLoop:
 
     @property
     def done(self) -> int:
-        """Frames read, or tried."""
+        """Number of frames that were read, skipped or dropped."""
         return len(self.ms) + len(self.skipped) + len(self.source.dropped)
 
     def rows(self) -> list[FrameRow]:
-        """One row per frame, in the log's order."""
+        """Return one row per frame, in the order of the log."""
         rows = [
             FrameRow(
                 index=r.index,
@@ -191,7 +191,7 @@ class FrameLoop:
         return sorted(rows, key=lambda row: row.index)
 
     def covariances(self) -> NDArray[np.float64] | None:
-        """Covariances (N, 6, 6) of the tracked poses; None where one is not known."""
+        """Return the covariances (N, 6, 6) of the tracked poses, or None if one is unknown."""
         tracked = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
         if any(covariance is None for covariance in tracked):
             return None

@@ -1,4 +1,4 @@
-"""What is done with a map when its frames are through: save, score, report."""
+"""Outcome of a run after its last frame: files, scores and report."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from splatbot.run.loop import FrameLoop
 from splatbot.trajectory import Trajectory
 
 MapPage = Callable[[GaussianModel, Trajectory], str]
-"""Makes of a map and the camera's way a page on which both can be turned."""
+"""Makes an interactive page of a map and the camera trajectory."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass
 class RunOutcome:
-    """All that is known of a run once its frames are through."""
+    """Results of a run after its last frame."""
 
     loop: FrameLoop
     source: dict[str, Any]
@@ -44,7 +44,7 @@ class RunOutcome:
     map_page: MapPage | None = None
 
     def save(self, folder: RunFolder) -> None:
-        """Save first; then score and report, unless a signal beside the one that ended the mapping cuts that short."""
+        """Save the results, then score and report; a signal after the end of the mapping skips both."""
         with self.interrupts.noted():
             self.loop.progress("saving")
         self.save_files(folder)
@@ -56,7 +56,7 @@ class RunOutcome:
             folder.save_metrics(self.metrics())
 
     def save_files(self, folder: RunFolder) -> None:
-        """Write all that takes no scoring."""
+        """Write the files that need no scoring."""
         folder.save(
             config=self.loop.config,
             rows=self.rows,
@@ -72,7 +72,7 @@ class RunOutcome:
         self.views = score_views(self.loop.source.log, self.model, held_out)
         folder.save_metrics(self.metrics())
         self.loop.progress("reporting")
-        turned = self._save_map_page(folder)
+        map_page = self._save_map_page(folder)
         folder.save_report(
             report_html(
                 rows=self.rows,
@@ -81,23 +81,23 @@ class RunOutcome:
                 trajectory=self.trajectory,
                 track=self.track,
                 views=self.views,
-                map_page=turned,
+                map_page=map_page,
             )
         )
 
     def _save_map_page(self, folder: RunFolder) -> str | None:
-        """Its name, for the report beside it; None if there is none."""
+        """Write the map page; return its name for the report, or None if it was not written."""
         if self.map_page is None or not len(self.model):
             return None
         try:
             folder.save_map_page(self.map_page(self.model, self.trajectory))
         except (SplatbotError, OSError) as error:
-            _log.warning("the report has no map to turn: %s", error)
+            _log.warning("the report has no interactive map: %s", error)
             return None
         return folder.map_page.name
 
     def metrics(self) -> dict[str, Any]:
-        """The contents of ``metrics.json``."""
+        """Return the contents of ``metrics.json``."""
         log, error = self.loop.source.log, self.loop.error or self.loop.crash
         values = {
             **self.costs,
@@ -115,12 +115,12 @@ class RunOutcome:
             "saves": self.loop.saver.cost if self.loop.saver is not None else None,
             "interrupted": self.interrupts.requested is not None,
             "error": str(error) if error else None,
-            "log": {"name": log.name, "frames": len(log), "uri": _lasting(log.uri), **self.source},
+            "log": {"name": log.name, "frames": len(log), "uri": _absolute(log.uri), **self.source},
             "splatbot": __version__,
         }
         return without_nan(values)
 
 
-def _lasting(uri: str) -> str:
-    """A path that still holds when the run is scored from another folder; anything else as it is."""
+def _absolute(uri: str) -> str:
+    """Return an existing path as an absolute one, which is valid in other working directories; other URIs as is."""
     return str(Path(uri).resolve()) if Path(uri).exists() else uri

@@ -1,4 +1,4 @@
-"""Frames of a log as they are asked for, or as a camera would give them: each at its time, gone when the next comes."""
+"""Frames of a log on demand, or in real time as from a camera: a frame is dropped when the next one arrives."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.logs import Log
 
-_AHEAD = 8  # frames decoded in advance: they bound memory
+_MAX_DECODED = 8  # frames decoded in advance; the limit bounds memory
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """Frame ``index`` of a log, or the error that reading it met."""
+    """Frame ``index`` of a log, or the error on reading it."""
 
     index: int
     frame: Frame | InputError
 
 
 class LogFrames:
-    """The first ``total`` frames of a log, each when it is asked for.
+    """The first ``total`` frames of a log, on demand.
 
-    Args:
-        first: the frame to begin with; a run that is resumed has processed those before.
-        dropped: frames that nobody took before a newer one arrived.
-        late: frames that were still being worked on when a newer one arrived.
+    Attributes:
+        first: index of the first frame to deliver; a resumed run has processed the earlier ones.
+        dropped: frames that were not delivered before a newer one arrived.
+        late: frames that were still being processed when a newer one arrived.
     """
 
     def __init__(self, log: Log, total: int) -> None:
@@ -42,7 +42,7 @@ class LogFrames:
 
     @property
     def pace(self) -> str | None:
-        """How frames are timed, for reports; None: as they are asked for."""
+        """Timing of the frames, for reports; None for frames on demand."""
         return None
 
     def __iter__(self) -> Generator[Arrival, None, None]:
@@ -50,10 +50,10 @@ class LogFrames:
 
 
 class PacedSource(LogFrames):
-    """The frames at the times of their stamps, or at ``rate`` [Hz]; the newest arrived is given, older ones drop out.
+    """The frames at the times of their stamps, or at ``rate`` [Hz]: the newest is delivered, older ones are dropped.
 
-    A thread decodes ahead. While the log itself cannot keep up (ray-casting a scene takes longer than a frame), the
-    clock stands still: what is measured is the one who takes the frames.
+    A thread decodes ahead. The clock stops while the log itself is too slow, for example because it ray-casts a scene.
+    The dropped and late frames thus measure the consumer only.
     """
 
     def __init__(self, log: Log, total: int, rate: float | None = None) -> None:
@@ -62,7 +62,7 @@ class PacedSource(LogFrames):
 
     @property
     def pace(self) -> str | None:
-        """By the stamps or at a rate."""
+        """Timing of the frames: by their stamps or at a rate."""
         return "by stamps" if self.rate is None else f"{self.rate:g} Hz"
 
     def __iter__(self) -> Generator[Arrival, None, None]:
@@ -81,15 +81,15 @@ class PacedSource(LogFrames):
 
     @staticmethod
     def _superseded(reader: _FrameReader, clock: _Schedule) -> bool:
-        """Whether a newer frame has arrived."""
+        """Return whether a newer frame has arrived."""
         newer = reader.peek()
-        if newer is None or not isinstance(newer.frame, Frame):  # what cannot be read takes nobody's place
+        if newer is None or not isinstance(newer.frame, Frame):  # an unreadable frame replaces no other
             return False
         return clock.due(newer) <= time.perf_counter()
 
 
 def read(log: Log, index: int) -> Arrival:
-    """Read one frame; an InputError is part of the answer."""
+    """Read one frame; an InputError becomes part of the result."""
     try:
         return Arrival(index, log[index])
     except InputError as error:
@@ -97,26 +97,26 @@ def read(log: Log, index: int) -> Arrival:
 
 
 class _Schedule:
-    """When frames arrive [s, of time.perf_counter]; the first does at once."""
+    """Arrival times of frames [s, of time.perf_counter]; the first arrives at once."""
 
     def __init__(self, rate: float | None) -> None:
         self._rate = rate
         self._start = 0.0  # of frame 0, or of stamp 0
-        self._begun = False
+        self._started = False
         self._latest = 0.0
 
     def due(self, arrival: Arrival) -> float:
-        """When a frame arrives: never before an earlier one; one that could not be read comes with the one before."""
+        """Return the arrival time of a frame, not before earlier ones; an unreadable one arrives with the previous."""
         if self._rate is not None:
             return self._start + arrival.index / self._rate
         return (
             max(self._latest, self._start + arrival.frame.stamp) if isinstance(arrival.frame, Frame) else self._latest
         )
 
-    def waited(self, arrival: Arrival, since: float) -> None:
-        """Somebody waited ``since`` then for the log to give ``arrival``; the clock stood still meanwhile."""
+    def add_decoding_wait(self, arrival: Arrival, since: float) -> None:
+        """Stop the clock for the time that the consumer waited for the log to decode a frame, from ``since`` on."""
         now = time.perf_counter()
-        if not self._begun:
+        if not self._started:
             self._begin(arrival, now)
         self._start += max(0.0, now - max(since, self.due(arrival)))
 
@@ -126,16 +126,16 @@ class _Schedule:
             self._start = now - arrival.index / self._rate
         elif isinstance(arrival.frame, Frame):
             self._start = now - arrival.frame.stamp
-        self._begun = self._rate is not None or isinstance(arrival.frame, Frame)
+        self._started = self._rate is not None or isinstance(arrival.frame, Frame)
 
     def sleep_until(self, arrival: Arrival) -> None:
-        """Wait for a frame's time."""
+        """Wait until the arrival time of a frame."""
         self._latest = self.due(arrival)
         time.sleep(max(0.0, self._latest - time.perf_counter()))
 
 
 class _FrameReader:
-    """Decodes ahead, in a thread of its own."""
+    """Decodes frames in advance, in a separate thread."""
 
     def __init__(self, log: Log, first: int, total: int) -> None:
         self._log = log
@@ -148,7 +148,7 @@ class _FrameReader:
         threading.Thread(target=self._run, name="reading", daemon=True).start()
 
     def take(self, clock: _Schedule) -> Arrival | None:
-        """The next frame, waiting for it if need be; None after the last."""
+        """Return the next frame, after a wait if necessary; None after the last."""
         with self._change:
             since = time.perf_counter() if not self._ready else math.inf
             self._change.wait_for(lambda: self._ready or self._left == 0 or self._crash)
@@ -158,16 +158,16 @@ class _FrameReader:
                 return None
             arrival = self._ready.popleft()
             self._change.notify_all()
-        clock.waited(arrival, since)
+        clock.add_decoding_wait(arrival, since)
         return arrival
 
     def peek(self) -> Arrival | None:
-        """The frame after, if it has been decoded."""
+        """Return the next frame without removing it, or None if it is not decoded yet."""
         with self._change:
             return self._ready[0] if self._ready else None
 
     def stop(self) -> None:
-        """Decode no more."""
+        """Stop decoding."""
         with self._change:
             self._stopped = True
             self._change.notify_all()
@@ -177,13 +177,13 @@ class _FrameReader:
             for index in range(self._first, self._total):
                 arrival = read(self._log, index)
                 with self._change:
-                    self._change.wait_for(lambda: len(self._ready) < _AHEAD or self._stopped)
+                    self._change.wait_for(lambda: len(self._ready) < _MAX_DECODED or self._stopped)
                     if self._stopped:
                         return
                     self._ready.append(arrival)
                     self._left -= 1
                     self._change.notify_all()
-        except Exception as crash:  # a bug in a reader: raised where the frames are taken
+        except Exception as crash:  # a bug in a reader: the consumer raises it
             with self._change:
                 self._crash = crash
                 self._change.notify_all()

@@ -12,19 +12,19 @@ Phase = Literal["mapping", "refining", "saving", "scoring", "reporting"]
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands.
+    """Progress of a run.
 
     Args:
-        phase: what is being done.
+        phase: current phase.
         done: frames read so far, of ``total``.
         total: frames to read.
         elapsed_s: time since the first frame [s].
-        result: what became of the latest frame; None when it could not be read, or after the last.
-        skipped: why the latest frame could not be read, "" otherwise.
+        result: result of the latest frame; None if it could not be read, and after the last.
+        skipped: reason why the latest frame could not be read, "" otherwise.
         keyframes: frames that entered the map so far.
         lost: frames lost so far.
         gaussians: size of the map.
-        late, dropped: frames of a paced run that were not done, or not begun, when the next one arrived.
+        late, dropped: frames of a paced run that were unfinished, or not started, when the next one arrived.
     """
 
     phase: Phase

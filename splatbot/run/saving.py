@@ -1,4 +1,4 @@
-"""When a run is saved while it goes on, and what of the loop over its frames is saved with it."""
+"""Saving a run at intervals, including the state of the loop over its frames."""
 
 from __future__ import annotations
 
@@ -11,17 +11,30 @@ from splatbot.logs import Log
 from splatbot.run.loop import FrameLoop
 from splatbot.run.state.checkpoint import Checkpoint, LogPlace, SavedRun, checksum
 
-# What belongs to one process, or is given anew by the one who resumes.
-_NOT_SAVED = {"source", "slam", "config", "on_bad_frame", "tell", "saver", "error", "crash", "first_bad", "started"}
+# Fields that belong to one process, or that the resuming process sets again.
+_NOT_SAVED = {
+    "source",
+    "slam",
+    "config",
+    "on_bad_frame",
+    "on_progress",
+    "saver",
+    "error",
+    "crash",
+    "first_bad",
+    "started",
+}
 
 
 class Saver:
     """Saves a run every so often, and when its frames are through.
 
     Args:
-        checkpoint: where to, and how often.
-        log: that is read; ``camera`` is what it was opened with, ``robot`` what was left out of its frames.
-        write_results: writes the files that other programs read (map, trajectory, figures so far).
+        checkpoint: folder and interval of the saves.
+        log: log of the run.
+        camera: camera file that the log was opened with.
+        write_results: writes the files that other programs read (map, trajectory, metrics so far).
+        robot: robot that is masked in the frames.
     """
 
     def __init__(
@@ -40,7 +53,7 @@ class Saver:
         self._index: int | None = None
 
     def processed(self, loop: FrameLoop, frame: Frame, index: int) -> None:
-        """A frame has been processed: save if it is time."""
+        """Save the run if the interval has passed since the last save; called after each processed frame."""
         self._last, self._index = frame, index
         if self.checkpoint.due:
             self.save(loop)
@@ -66,18 +79,18 @@ class Saver:
 
     @property
     def cost(self) -> dict[str, Any]:
-        """How often was saved, and the seconds that took."""
+        """Number of saves and their duration [s]."""
         return {"count": self.checkpoint.saves, "seconds": round(self.checkpoint.seconds, 3)}
 
 
 def loop_state(loop: FrameLoop) -> dict[str, Any]:
-    """The loop's counters by name, and which frames its source has dropped or given late."""
+    """Return the counters of the loop by name, and the frames that its source dropped or delivered late."""
     counters = {f.name: getattr(loop, f.name) for f in fields(loop) if f.name not in _NOT_SAVED}
     return {"loop": counters, "source": {"dropped": loop.source.dropped, "late": loop.source.late}}
 
 
 def resume_loop(loop: FrameLoop, saved: SavedRun) -> None:
-    """Let a fresh loop go on where a saved one was."""
+    """Restore the state of a saved loop into a new one."""
     for name, value in saved.loop["loop"].items():
         setattr(loop, name, value)
     loop.source.first = saved.place.next_index

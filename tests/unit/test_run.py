@@ -1,4 +1,4 @@
-"""map_log: what it keeps, what it scores, and that nothing computed is lost."""
+"""map_log: its files, its scores, and no loss of computed results."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def truncate(path: Path, share: float = 0.5) -> None:
 
 
 def interrupt_at(frame: int, times: int = 1) -> Callable[[Progress], None]:
-    """A progress callback that acts as Ctrl-C once so many frames are done."""
+    """Return a progress callback that acts as Ctrl-C once a number of frames is done."""
 
     def on_progress(progress: Progress) -> None:
         if progress.phase == "mapping" and progress.done == frame:
@@ -81,7 +81,7 @@ def test_a_run_leaves_every_file_and_every_documented_metric(log: Log, tmp_path:
     assert result.metrics["stages"]["track"]["p50"] == 2.0
 
 
-def test_stages_without_time_and_gradients_left_out_are_told(log: Log, tmp_path: Path) -> None:
+def test_stages_without_time_and_skipped_gradients_are_reported(log: Log, tmp_path: Path) -> None:
     result = map_log(log, out=tmp_path / "run", slam=oracle(log, degraded=(6,)))
     lines = (tmp_path / "run" / "frames.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["skipped"] for line in lines[5:7]] == [[], ["features"]]
@@ -97,7 +97,7 @@ def test_held_out_frames_never_enter_the_map_and_are_scored(log: Log, tmp_path: 
     assert result.metrics["depth_median_m"] < 0.2  # the frames' planes lie within 15 cm
 
 
-def test_no_frame_is_held_out_when_told_so(log: Log, tmp_path: Path) -> None:
+def test_no_frame_is_held_out_if_configured_so(log: Log, tmp_path: Path) -> None:
     config = load_config(overrides={"mapping.holdout_every": 0}, environ={})
     result = map_log(log, out=tmp_path / "run", slam=oracle(log), config=config)
     assert result.metrics["held_out"] == 0
@@ -126,7 +126,7 @@ def test_errors_are_null_without_a_reference(make_log: MakeLog, tmp_path: Path) 
     assert metrics["psnr_holdout_db"] is not None
 
 
-def test_a_bad_frame_ends_the_run_and_what_was_mapped_is_saved(make_log: MakeLog, tmp_path: Path) -> None:
+def test_a_bad_frame_ends_the_run_and_the_map_is_saved(make_log: MakeLog, tmp_path: Path) -> None:
     folder = make_log(12)
     truncate(folder / "rgb" / "000009.png")
     log = open_log(folder)
@@ -204,7 +204,7 @@ def test_ctrl_c_finishes_the_frame_and_saves_a_whole_run(log: Log, tmp_path: Pat
     assert signal.getsignal(signal.SIGINT) is handler
 
 
-def test_a_second_ctrl_c_at_once_still_saves_what_was_mapped(log: Log, tmp_path: Path) -> None:
+def test_a_second_ctrl_c_at_once_still_saves_the_map(log: Log, tmp_path: Path) -> None:
     result = map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=interrupt_at(10, times=2))
     assert result.exit_code == 130
     assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 10
@@ -350,7 +350,7 @@ def test_progress_counts_frames_keyframes_and_losses(log: Log, tmp_path: Path) -
     assert [p.phase for p in seen[16:]] == ["refining", "saving", "scoring", "reporting"]
 
 
-def test_a_run_in_real_time_counts_what_it_had_no_time_for(log: Log, tmp_path: Path) -> None:
+def test_a_run_in_real_time_counts_dropped_and_late_frames(log: Log, tmp_path: Path) -> None:
     class Slow(OracleSlam):
         def process(self, frame: Frame, *, hold_out: bool = False) -> Any:
             time.sleep(0.12 if frame.index == 2 else 0.0)
@@ -373,7 +373,7 @@ def test_a_run_in_real_time_counts_what_it_had_no_time_for(log: Log, tmp_path: P
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
-def test_a_rate_that_is_none_is_refused_before_anything_is_read(rate: float, log: Log, tmp_path: Path) -> None:
+def test_an_invalid_rate_is_refused_before_a_frame_is_read(rate: float, log: Log, tmp_path: Path) -> None:
     slam = oracle(log)
     with pytest.raises(InputError, match="rate"):
         map_log(log, out=tmp_path / "run", slam=slam, rate=rate)

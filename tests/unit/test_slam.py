@@ -1,4 +1,4 @@
-"""The whole loop: the same bits for the same frames, held-out frames that leave no trace, a map within its bounds."""
+"""The SLAM loop: the same bits for the same frames, no trace of held-out frames, a map within its size limit."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_run_tracks_and_maps_the_tabletop() -> None:
     assert slam.results[-1].gaussians == len(slam.snapshot().model) > 1500
 
 
-def test_a_result_tells_the_milliseconds_of_each_stage() -> None:
+def test_a_result_has_the_milliseconds_of_each_stage() -> None:
     frames, _ = tabletop()
     slam = run(frames[:2])
     assert set(slam.results[0].stage_ms) == {"prepare", "mapping"}

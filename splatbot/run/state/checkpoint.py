@@ -1,4 +1,4 @@
-"""Saving a run while it goes on, and opening what was saved."""
+"""Checkpoints: saving a run while it continues, and loading a saved run."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ _DEPRECATED = "the run was saved by splatbot 0.1; resume it once with --save-eve
 
 @dataclass(frozen=True)
 class LogPlace:
-    """Which log a run reads, how far it has come, and how to tell that the log is still the same.
+    """The log of a run, the progress in it, and a fingerprint that detects another log.
 
     Args:
-        name, uri, frames: of the log; ``camera`` is what it was opened with beside the uri.
-        robot: that was left out of its frames.
-        next_index: the first frame that has not been processed.
-        last_index, last_stamp, last_checksum: the last frame that has: position, time [s] and CRC-32 of its pixels;
-            None before there is one.
+        name, uri, frames: of the log.
+        camera: camera file that the log was opened with.
+        next_index: index of the first frame that has not been processed.
+        last_index, last_stamp, last_checksum: index, time [s] and CRC-32 of the last processed frame; None before the
+            first.
+        robot: robot that is masked in the frames.
     """
 
     name: str
@@ -52,10 +53,10 @@ class LogPlace:
     robot: str | None = None
 
     def check(self, log: Log) -> None:
-        """That ``log`` begins with the frames that were processed.
+        """Check that a log begins with the processed frames.
 
         Raises:
-            LogError: it does not.
+            LogError: The log is another one.
         """
         hint = "give the log that the run was begun with, or map this one into a folder of its own"
         if len(log) < self.next_index:
@@ -70,7 +71,7 @@ class LogPlace:
             raise LogError(was, file=log.uri, field=f"frame {self.last_index}", hint=hint)
         if checksum(frame) != self.last_checksum:
             raise LogError(
-                "shows something else than when it was mapped.",
+                "differs from the frame that was mapped.",
                 file=log.uri,
                 field=f"frame {self.last_index}",
                 hint=hint,
@@ -78,18 +79,18 @@ class LogPlace:
 
 
 def checksum(frame: Frame) -> int:
-    """CRC-32 of a frame's colour and depth."""
+    """Compute the CRC-32 of a frame's color and depth."""
     return zlib.crc32(np.ascontiguousarray(frame.depth).data, zlib.crc32(np.ascontiguousarray(frame.rgb).data))
 
 
 class Checkpoint:
-    """Saves a run into ``run/state``; the save before stays whole until the new one is.
+    """Saves a run into ``run/state``; the previous save stays valid until the new one is complete.
 
-    Keyframes' images, features and sampled pixels are appended once to a journal; the map, the poses and all else go
-    into one new file each time, which replaces the last by renaming.
+    Images, features and sampled pixels of a keyframe are appended once to a journal. The map, the poses and all other
+    state go into a new file at each save, which replaces the previous one by renaming.
 
     Args:
-        run: the run's folder.
+        run: folder of the run.
         every_s: least time between two saves [s].
     """
 
@@ -103,7 +104,7 @@ class Checkpoint:
 
     @property
     def due(self) -> bool:
-        """Whether it is time for the next save."""
+        """True once the interval has passed since the last save."""
         return time.perf_counter() - self._saved_at >= self.every_s
 
     def save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
@@ -118,10 +119,10 @@ class Checkpoint:
     def _save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._journal.begin()
-        lasting = {id(owner) for owner in _lasting_arrays(slam)}
+        constant = {id(owner) for owner in _constant_arrays(slam)}
 
         def keep(owner: object, array: NDArray[Any]) -> Entry | None:
-            return self._journal.put(owner, array) if id(owner) in lasting else None
+            return self._journal.put(owner, array) if id(owner) in constant else None
 
         encoder = Encoder(config, keep)
         header = {
@@ -139,13 +140,13 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class SavedRun:
-    """A run as it was when it was saved last.
+    """A run in the state of its last save.
 
     Args:
         folder: of the run.
-        config: that it was begun with.
-        place: how far it has come in which log.
-        slam: to go on with.
+        config: configuration of the run.
+        place: its log and the progress in it.
+        slam: its SLAM, ready for the next frame.
         loop: counters of the loop over the frames, by name.
     """
 
@@ -157,10 +158,10 @@ class SavedRun:
 
     @classmethod
     def load(cls, run: str | Path) -> SavedRun:
-        """Open the state of a run's folder.
+        """Load the state of a run's folder.
 
         Raises:
-            FormatError: there is none, or it is damaged or of another version.
+            FormatError: The state is missing, damaged or of another version.
         """
         folder = Path(run)
         path = folder / FOLDER / FILE
@@ -179,13 +180,13 @@ class SavedRun:
 
 
 def _unused_number(folder: Path) -> int:
-    """Of a journal: greater than those there are, which an earlier state may need until the first save is whole."""
+    """Return a number for a new journal; an earlier state needs the existing ones until the first save is complete."""
     used = [path.stem.partition("-")[2] for path in folder.glob("images-*.bin")]
     return 1 + max((int(number) for number in used if number.isdigit()), default=-1)
 
 
-def _lasting_arrays(slam: Slam) -> Iterator[object]:
-    """Arrays of keyframes that are replaced, never changed in place: images, features, sampled pixels."""
+def _constant_arrays(slam: Slam) -> Iterator[object]:
+    """Yield the arrays of keyframes that never change in place: images, features, sampled pixels."""
     for keyframe in slam.keyframes:
         yield from (keyframe.rgb, keyframe.depth, *vars(keyframe.features).values())
         for level in keyframe.reference.levels:

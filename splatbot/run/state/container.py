@@ -24,7 +24,7 @@ _HINT = "restore the folder from a copy, or map the log again"
 
 
 def write_container(path: Path, header: dict[str, Any], arrays: Sequence[Array]) -> None:
-    """Replace ``path`` by a whole new file, on the disk before it takes the old one's place."""
+    """Write a new file to the disk, then replace ``path`` by it."""
     plain = [np.ascontiguousarray(array) for array in arrays]
     table = [[a.dtype.str, list(a.shape), zlib.crc32(p.data)] for a, p in zip(arrays, plain, strict=True)]
     text = json.dumps(header | {"arrays": table}, allow_nan=False).encode()
@@ -38,10 +38,10 @@ def write_container(path: Path, header: dict[str, Any], arrays: Sequence[Array])
 
 
 def read_container(path: Path) -> tuple[dict[str, Any], list[Array]]:
-    """Header and arrays of a state file.
+    """Read header and arrays of a state file.
 
     Raises:
-        FormatError: the file is missing, of another format, cut off or altered.
+        FormatError: The file is missing, of another format, truncated or altered.
     """
     try:
         data = path.read_bytes()
@@ -80,7 +80,7 @@ def _read_header(path: Path, data: bytes) -> tuple[dict[str, Any], int]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Let the new name reach the disk; where folders cannot be opened (Windows) there is nothing to do."""
+    """Flush the new file name to the disk; not possible on Windows, where folders cannot be opened."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -1,4 +1,4 @@
-"""A file of arrays that only grows: what is saved once, keyframes' images, is not written again by the next save."""
+"""Append-only file of arrays: images of keyframes are written once, not at every save."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Array = NDArray[Any]
 Entry = list[Any]
 """[offset, size, CRC-32, packing, dtype, shape] of one array in the file."""
 
-_SPARE = 0.5  # share of bytes that nobody refers to, from which the journal is written anew
+_UNUSED_SHARE = 0.5  # unused share of the bytes from which the journal is written again
 _HINT = "restore the folder from a copy, or map the log again"
 
 
 @dataclass
 class Journal:
-    """Arrays appended to ``folder/images-N.bin``; the state file names the journal and the entries that are in use.
+    """Arrays appended to ``folder/images-N.bin``; the state file lists the journal and the entries in use.
 
     Args:
         folder: of the state.
-        number: N of the file that is written now; a journal is never changed, only appended to or replaced by the next.
+        number: N of the current file. A journal is only appended to, or replaced by the next one.
     """
 
     folder: Path
@@ -39,19 +39,19 @@ class Journal:
 
     @property
     def path(self) -> Path:
-        """The file in use."""
+        """Path of the current file."""
         return self.folder / f"images-{self.number}.bin"
 
     def begin(self) -> None:
-        """A save begins; forgets which entries the one before has used, and tidies up when too much is unused."""
+        """Begin a save; start a new file if too many bytes of the current one are unused."""
         live = sum(self._entries[key][2][1] for key in self._used if key in self._entries)
-        if self._end and live < (1.0 - _SPARE) * self._end:
+        if self._end and live < (1.0 - _UNUSED_SHARE) * self._end:
             self._entries.clear()
             self.number, self._end = self.number + 1, 0
         self._used = set()
 
     def put(self, owner: object, array: Array) -> Entry:
-        """Append an array unless its owner, which is not changed in place, has been appended before."""
+        """Append an array and return its entry; an unchanged owner keeps its earlier entry."""
         version = getattr(owner, "_version", 0)  # torch counts changes in place
         known = self._entries.get(id(owner))
         self._used.add(id(owner))
@@ -67,13 +67,13 @@ class Journal:
         return entry
 
     def sync(self) -> None:
-        """Let what was appended reach the disk; to be called before a state file refers to it."""
+        """Flush the appended arrays to the disk; needed before a state file refers to them."""
         if self._end:
             with self.path.open("r+b") as file:
                 os.fsync(file.fileno())
 
     def finish(self) -> None:
-        """The state file is in place: forget arrays that are gone, remove journals that nobody refers to."""
+        """End a save: forget unused arrays and remove journals that the state file does not refer to."""
         self._entries = {key: value for key, value in self._entries.items() if key in self._used}
         for path in self.folder.glob("images-*.bin"):
             if path != self.path:
@@ -81,10 +81,10 @@ class Journal:
 
 
 def read_entry(path: Path, entry: Entry) -> Array:
-    """One array of a journal.
+    """Read one array of a journal.
 
     Raises:
-        FormatError: the file is missing, cut off or altered.
+        FormatError: The file is missing, truncated or altered.
     """
     try:
         offset, size, checksum, packing, dtype, shape = entry
@@ -100,4 +100,4 @@ def read_entry(path: Path, entry: Entry) -> Array:
     try:
         return np.asarray(unpack(Packed(data, packing, dtype, shape)))
     except (ValueError, TypeError) as error:
-        raise FormatError(f"holds no array ({error}).", file=path, field=f"byte {offset}", hint=_HINT) from error
+        raise FormatError(f"is not an array ({error}).", file=path, field=f"byte {offset}", hint=_HINT) from error

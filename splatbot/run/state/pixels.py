@@ -1,4 +1,4 @@
-"""Arrays as bytes: images compressed without loss, everything else as it lies in memory."""
+"""Arrays as bytes: images with lossless compression, other arrays as in memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[Any]
 
 
 class Packed(NamedTuple):
-    """An array's bytes, and what they are: the way of packing, the type and the shape."""
+    """The bytes of an array, with packing, type and shape."""
 
     data: bytes
     packing: str
@@ -23,10 +23,10 @@ class Packed(NamedTuple):
 
 
 def pack(array: Array, *, compress: bool) -> Packed:
-    """An array (any shape) as bytes; with ``compress``, colour (H, W, 3) uint8 and images (H, W) float32 as PNG.
+    """Pack an array (any shape); with ``compress``, color (H, W, 3) uint8 and images (H, W) float32 become PNG.
 
-    A float's four bytes are the four channels of a picture: neighbours differ in the low ones only, and PNG codes
-    differences. No bit is lost, NaN included.
+    The four bytes of a float become the four channels of an image: neighbors differ in the low bytes only, and PNG
+    encodes differences. All bits are preserved, including NaN.
     """
     dtype, shape = array.dtype.str, list(array.shape)
     array = np.ascontiguousarray(array)  # which has one dimension at least
@@ -38,10 +38,10 @@ def pack(array: Array, *, compress: bool) -> Packed:
 
 
 def unpack(packed: Packed) -> Array:
-    """The array again, bit for bit.
+    """Unpack an array, bit for bit.
 
     Raises:
-        ValueError: the bytes are no such array.
+        ValueError: The bytes are not such an array.
     """
     if packed.packing == "raw":
         return np.frombuffer(packed.data, np.dtype(packed.dtype)).reshape(packed.shape).copy()

@@ -1,4 +1,4 @@
-"""Evidence of a depth image against a count one by one in float64, and fusion against the information form."""
+"""Depth comparison against a brute-force computation in float64, and fusion against the information form."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SLANTED = (0.2, 0.1, 0.97)
 
 
 def flat(means: Array, normal_axis: int = 2, sigma: float = 0.0) -> GaussianModel:
-    """Discs whose shortest axis is an axis of the world."""
+    """Make discs whose shortest axis is an axis of the world."""
     scales = np.full((len(means), 3), 0.01)
     scales[:, normal_axis] = 0.001
     model = GaussianModel.from_activated(
@@ -50,7 +50,7 @@ def weighed(model: GaussianModel, keyframe: Keyframe) -> DepthComparison:
 
 
 def brute_force(model: GaussianModel, keyframe: Keyframe) -> tuple[list[bool], list[bool]]:
-    """Evidence one Gaussian at a time in float64."""
+    """Compare one Gaussian at a time in float64."""
     supported, through = [], []
     depth = keyframe.depth.numpy()
     padded = np.pad(depth, 1, constant_values=np.inf)
@@ -109,7 +109,7 @@ def test_the_offset_is_the_distance_to_the_surface_along_the_normal_wherever_in_
     np.testing.assert_allclose(means[:, 2] + signed, 1.0, atol=1e-5)
 
 
-def test_a_grazing_look_does_not_move_a_gaussian(make_keyframe: MakeKeyframe) -> None:
+def test_a_grazing_view_does_not_move_a_gaussian(make_keyframe: MakeKeyframe) -> None:
     evidence = weighed(flat(np.array([[0.0, 0.0, 1.004]]), normal_axis=0), make_keyframe(distance=1.0))
     assert evidence.supported.all()
     assert evidence.offset.item() == 0
@@ -133,7 +133,7 @@ def test_fusing_adds_information_and_moves_the_mean_by_its_share() -> None:
     assert model.means[0, 2] == 1.0  # the one that readers hold
 
 
-def test_many_looks_average_their_noise_and_never_claim_certainty(make_keyframe: MakeKeyframe) -> None:
+def test_many_observations_average_their_noise_and_never_reach_certainty(make_keyframe: MakeKeyframe) -> None:
     rng = np.random.default_rng(4)
     grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 20), np.linspace(-0.3, 0.3, 20)), -1).reshape(-1, 2)
     exact = make_keyframe(distance=1.0).depth
@@ -149,12 +149,12 @@ def test_many_looks_average_their_noise_and_never_claim_certainty(make_keyframe:
 
 
 def tilts(model: GaussianModel, normal: Array) -> Array:
-    """Angles (N,) [deg] from each disc's axis to a normal."""
+    """Compute the angles (N,) [deg] from each disc's axis to a normal."""
     cosine = np.abs(shortest_axes(model).double().numpy() @ normal)
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def test_looks_turn_discs_into_the_surface_and_average_their_noise(make_keyframe: MakeKeyframe) -> None:
+def test_observations_rotate_discs_into_the_surface_and_average_their_noise(make_keyframe: MakeKeyframe) -> None:
     rng = np.random.default_rng(5)
     keyframe = make_keyframe(POSE, normal=SLANTED, distance=1.5)
     normal = np.array(SLANTED) / np.linalg.norm(SLANTED)
@@ -182,7 +182,7 @@ def test_a_disc_of_another_surface_or_at_an_edge_is_not_turned(make_keyframe: Ma
     assert not torch.isnan(turned.quats).any()
 
 
-def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> None:
+def test_three_misses_remove_a_gaussian_and_support_in_between_keeps_it() -> None:
     model = flat(np.zeros((3, 3)), sigma=1e-3)
     model.observations[:] = 3
     nothing = (torch.zeros(3), torch.full((3,), torch.inf), torch.zeros(3, 3), torch.zeros(3, 3))
@@ -197,7 +197,7 @@ def test_what_is_seen_through_thrice_goes_and_support_in_between_saves_it() -> N
     assert model.opacities[2] == pytest.approx(0.8)
 
 
-def test_what_is_hardly_known_goes_a_look_earlier_than_what_is_stable() -> None:
+def test_an_unstable_gaussian_is_removed_one_miss_earlier_than_a_stable_one() -> None:
     model = flat(np.zeros((3, 3)), sigma=1e-3)
     model.observations[:] = torch.tensor([3, 2, 3])
     model.uncertainty[2] = 6e-3  # of a disc of 1 cm

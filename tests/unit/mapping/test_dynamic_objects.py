@@ -1,4 +1,4 @@
-"""Things that move: kept out while they do, mapped once they stay, and gone from the map after they went."""
+"""Dynamic objects are mapped once they stay and not while they move; removed objects leave the map."""
 
 from __future__ import annotations
 

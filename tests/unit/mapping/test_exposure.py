@@ -1,4 +1,4 @@
-"""Exposure: found against the map, taken out of what enters it, and left alone where there is none."""
+"""Exposure is estimated against the map and corrected in keyframes, and small differences remain."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ def exposed(rgb: NDArray[np.uint8], gain: float, offset: float = 0.0) -> NDArray
 
 
 def scene() -> tuple[ModelView, NDArray[np.uint8], torch.Tensor]:
-    """The map as exact as can be, a frame's colours and its depth."""
+    """Return an exact view of the map, and color and depth of a frame."""
     frame = tabletop()[0][0]
     rgb, depth = torch.from_numpy(frame.rgb.copy()), torch.from_numpy(frame.depth.copy())
     return ModelView(rgb.float() / 255, depth, (depth > 0).float()), frame.rgb, depth
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.3, 0.0), (0.5, 0.0), (0.8, 20.0), (1.0, -12.0), (2.0, 0.0)])
-def test_gain_and_offset_are_found_from_what_is_not_clipped(gain: float, offset: float) -> None:
+def test_gain_and_offset_are_estimated_from_pixels_that_are_not_clipped(gain: float, offset: float) -> None:
     view, rgb, depth = scene()
     found = exposure_of(torch.from_numpy(exposed(rgb, gain, offset)), depth, view)
     assert found.gain == pytest.approx(gain, rel=0.04)
     assert found.offset == pytest.approx(offset / 255, abs=0.012)
 
 
-def test_a_thing_that_is_not_in_the_map_does_not_change_the_exposure() -> None:
+def test_an_object_that_is_not_in_the_map_does_not_change_the_exposure() -> None:
     view, rgb, depth = scene()
     other = exposed(rgb, 1.4)
     other[30:70, 20:80] = (230, 20, 20)
@@ -60,7 +60,7 @@ def test_a_map_that_shows_nothing_of_the_image_leaves_it_alone() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.5, 2.0])
-def test_colours_are_brought_back_and_what_was_clipped_is_as_the_map_has_it(gain: float) -> None:
+def test_colors_are_corrected_and_clipped_pixels_take_the_color_of_the_map(gain: float) -> None:
     view, rgb, depth = scene()
     back = in_exposure_of_map(torch.from_numpy(exposed(rgb, gain)), depth, view).numpy()
     off = np.abs(back.astype(int) - rgb.astype(int))[depth.numpy() > 0]

@@ -1,4 +1,4 @@
-"""Fusion: new Gaussians lie on what was measured and only where the map lacked it; evidence against brute force."""
+"""Insertion: new Gaussians lie on measured surfaces and only where the map does not explain them."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ EVERYWHERE = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
 
 
 def fused(keyframe: Keyframe) -> GaussianModel:
-    """A map of one keyframe alone."""
+    """Map a single keyframe."""
     return new_gaussians(keyframe, keyframe.depth > 0, CONFIG)
 
 
 def axes(model: GaussianModel) -> NDArray[np.float64]:
-    """Orientations (N, 3, 3): columns are the axes in the world."""
+    """Compute orientations (N, 3, 3): columns are the axes in the world."""
     return np.asarray(Rotation.from_quat(model.quats.double().numpy(), scalar_first=True).as_matrix())
 
 
@@ -190,7 +190,7 @@ def test_model_depth_has_the_detail_of_the_map_at_the_measured_distance() -> Non
 
 def test_strays_within_the_gate_do_not_move_model_depth() -> None:
     measured = np.full((60, 80), 1.5, np.float32)
-    measured[:, :20] = 1.54  # what a quarter shows lies 4 cm behind the rest
+    measured[:, :20] = 1.54  # a quarter of the image is 4 cm behind the rest
     view = ModelView(torch.zeros(60, 80, 3), torch.full((60, 80), 1.49), torch.ones(60, 80))
     found = model_depth(view, measured, CONFIG)
     np.testing.assert_allclose(found, 1.5, atol=1e-6)

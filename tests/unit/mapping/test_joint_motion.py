@@ -1,4 +1,4 @@
-"""Joint motion: what counts as standing still."""
+"""Joint motion: joints below a speed count as still."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def test_one_joint_that_moves_faster_than_the_bound_is_motion() -> None:
     assert not motion.update(0.2, np.array([0.004, -0.006, 0.0]))
 
 
-def test_without_joints_or_with_a_clock_that_stands_nothing_is_known() -> None:
+def test_without_joints_or_with_a_stopped_clock_the_robot_counts_as_still() -> None:
     motion = JointMotionMonitor(0.05)
     assert not motion.update(0.0, None)
     assert not motion.update(0.1, np.ones(3))

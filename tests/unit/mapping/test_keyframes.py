@@ -51,7 +51,7 @@ def test_matrices_are_those_the_rasterizer_takes(make_keyframe: MakeKeyframe) ->
     np.testing.assert_array_equal(keyframe.K[0].numpy(), CAMERA.K_corner)
 
 
-def test_images_of_the_width_asked_for_are_kept_as_they_are() -> None:
+def test_images_of_the_configured_width_do_not_change() -> None:
     frame = wall_frame(np.eye(4))
     camera, rgb, depth = mapping_images(frame, CONFIG.mapping, CONFIG.tracking)
     assert camera is CAMERA
@@ -61,7 +61,7 @@ def test_images_of_the_width_asked_for_are_kept_as_they_are() -> None:
 
 @pytest.mark.parametrize("size", [(256, 192), (255, 191), (129, 97)])
 def test_colour_depth_and_camera_stay_registered_when_halved(size: tuple[int, int]) -> None:
-    """Colour tells, four levels a pixel, where a pixel of the last 60 columns and rows was: the middle of its block."""
+    """Colors encode the position of a pixel in the last 60 columns and rows, four levels a pixel: a block center."""
     width, height = size
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     ramps = 4 * np.stack([u - width + 60, v - height + 60], -1)
@@ -88,7 +88,7 @@ def test_depth_that_tracking_would_not_believe_is_not_fused() -> None:
 
 
 def _smoothed_by_hand(depth: Array) -> Array:
-    """The rule of :func:`smooth_depth` pixel by pixel, in float64."""
+    """Apply the rule of :func:`smooth_depth` pixel by pixel, in float64."""
     out = np.zeros_like(depth)
     padded = np.pad(depth, 1)
     sigma = CONFIG.tracking.sensor.sigma_depth_floor + CONFIG.tracking.sensor.sigma_depth_quad * depth**2
@@ -114,7 +114,7 @@ def _smoothed_by_hand(depth: Array) -> Array:
     return out
 
 
-def test_smoothed_depth_is_the_mean_of_what_is_of_one_surface(rng: np.random.Generator) -> None:
+def test_smoothed_depth_is_the_mean_of_pixels_of_one_surface(rng: np.random.Generator) -> None:
     depth = np.where(np.arange(40) < 17, 1.0, 1.6) + 0.002 * rng.standard_normal((30, 40))
     depth[rng.random(depth.shape) < 0.2] = 0.0
     depth = depth.astype(np.float32).astype(np.float64)
@@ -136,7 +136,7 @@ def test_a_slanted_plane_stays_where_it_is_and_a_third_of_its_noise_is_left(rng:
     assert abs(off.mean()) < 0.02
 
 
-def test_what_stands_out_by_more_than_an_images_own_noise_is_kept(rng: np.random.Generator) -> None:
+def test_shape_beyond_the_noise_of_an_image_is_kept(rng: np.random.Generator) -> None:
     tracking = CONFIG.tracking
     sigma = tracking.sensor.sigma_depth_floor + tracking.sensor.sigma_depth_quad
     exact = np.where(np.arange(400) % 40 == 20, 1.0 - sigma, 1.0) * np.ones((80, 1))  # ridges, one pixel wide
@@ -148,7 +148,7 @@ def test_what_stands_out_by_more_than_an_images_own_noise_is_kept(rng: np.random
     assert (found - exact).std() < 0.6 * (noisy - exact).std()
 
 
-def test_the_noise_of_depth_is_told_by_an_image_of_it(rng: np.random.Generator) -> None:
+def test_the_noise_of_depth_is_estimated_from_one_image(rng: np.random.Generator) -> None:
     tracking = CONFIG.tracking
     exact = wall_depth(CAMERA, np.eye(4), [0.6, 0.0, 0.8], 1.0)
     sigma = tracking.sensor.sigma_depth_floor + tracking.sensor.sigma_depth_quad * exact**2
@@ -160,7 +160,7 @@ def test_the_noise_of_depth_is_told_by_an_image_of_it(rng: np.random.Generator) 
     assert noise_share(np.zeros((1, 1), np.float32), tracking) == 0.0
 
 
-def test_pixels_without_depth_stay_without_and_say_nothing() -> None:
+def test_pixels_without_depth_stay_without_and_do_not_count() -> None:
     depth = np.full((5, 5), 1.5, np.float32)
     depth[2, 2], depth[0, 0] = 0.0, np.nan
     found = smooth_depth(depth, CONFIG.mapping, CONFIG.tracking)

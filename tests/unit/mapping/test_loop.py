@@ -1,4 +1,4 @@
-"""Loops: closed where a place is seen again, not where one only looks like it; the map moves piece by piece."""
+"""Loops are closed at revisited places, not at places that only look alike; Gaussians move with their keyframes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TIGHT = np.diag([1e-3**2] * 6)
 
 
 def circle(count: int, drift: float) -> tuple[PoseGraph, dict[int, Array]]:
-    """A chain of exact motions round a circle whose poses have drifted by a constant twist a step; and the truth."""
+    """Return a chain of exact motions around a circle, whose poses drift by a constant twist a step, and the truth."""
     truth, graph = {}, PoseGraph()
     step = se3_exp([0.3, 0.0, 0.0, 0.0, 2 * np.pi / count, 0.0])
     wrong = se3_exp(drift * np.array([1.0, -0.5, 0.7, 0.2, 0.4, -0.3]))
@@ -115,7 +115,7 @@ FRAMES, AGAIN = 72, 14  # of a circuit, and beyond
 
 
 def through_a_wrong_lens() -> tuple[Iterator[Frame], list[Array]]:
-    """Once round the room and on, through a lens whose focal length is told 3 % too long; and the true poses."""
+    """Return frames of more than one circuit of the room, with a focal length 3 % too long, and the true poses."""
     uri = f"synthetic:room?trajectory=laps&frames={FRAMES + AGAIN}&rate={FRAMES / 20}&width=160&height=120"
     log = open_log(uri)
     truth = log.ground_truth
@@ -126,13 +126,13 @@ def through_a_wrong_lens() -> tuple[Iterator[Frame], list[Array]]:
 
 
 def drifting_slam(enabled: bool) -> Slam:
-    """Depth as much believed as its noise allows: a wrong lens then drifts by 11 cm, more than a loop is off."""
+    """Make a SLAM with the plain depth noise: a wrong lens then drifts by 11 cm, more than the error after a loop."""
     return Slam(small_config(loops__enabled=enabled, mapping__refine_iterations=1, sensor__depth_sigma_scale=1.0))
 
 
 @cache
 def circuit(enabled: bool) -> tuple[Slam, list[Array]]:
-    """The whole way, mapped; and the true poses."""
+    """Map the whole circuit; return the SLAM and the true poses."""
     frames, truth = through_a_wrong_lens()
     slam = drifting_slam(enabled)
     for frame in frames:
@@ -141,7 +141,7 @@ def circuit(enabled: bool) -> tuple[Slam, list[Array]]:
 
 
 def gap(slam: Slam, truth: list[Array], closed: int = FRAMES) -> float:
-    """How far [m] the poses before the circuit is closed, by this frame, and after it contradict each other."""
+    """Compute how far [m] the poses before and after the end of the circuit at this frame contradict each other."""
     poses = [r.T_world_camera for r in slam.results]
     worst = 0.0
     for k in range(closed - 8, min(closed, len(poses) - 8)):
@@ -187,7 +187,7 @@ def test_a_gap_of_a_centimetre_closes_before_frames_are_aligned_to_both_sides_of
 
 
 def checkered(T_world_camera: Array, stamp: float, period: float) -> Frame:
-    """A wall with patches of 5 cm and random colours that repeat every ``period`` [m] to the side."""
+    """Return a frame of a wall with patches of 5 cm and random colours that repeat every ``period`` [m] to the side."""
     colors = np.random.default_rng(1).integers(30, 226, (40, round(period / 0.05), 3), dtype=np.uint8)
     z = wall_depth(CAMERA, T_world_camera, (0.0, 0.0, 1.0), 1.0)
     points = (rays_of(CAMERA) * z[..., None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]

@@ -29,14 +29,14 @@ def equal(a: GaussianModel, b: GaussianModel) -> bool:
 
 
 def with_ball(frame: Frame, depth: float) -> Frame:
-    """A disc of another depth in the middle of the image."""
+    """Return a frame with a disc of another depth in the middle."""
     v, u = np.mgrid[:120, :160]
     disc = (u - 80) ** 2 + (v - 60) ** 2 < 20**2
     return replace(frame, depth=np.where(disc, np.float32(depth), frame.depth))
 
 
 def near_disc(model: GaussianModel, depth: float) -> torch.Tensor:
-    """Rows at this depth on the rays of the disc's middle."""
+    """Return a mask of Gaussians at this depth on the rays of the disc's middle."""
     x, y, z = model.means.T
     return ((x / z).abs() < 0.1) & ((y / z).abs() < 0.1) & ((z - depth).abs() < 0.03)
 
@@ -71,7 +71,7 @@ def test_a_finish_that_is_stopped_spends_no_more_steps_and_adds_nothing() -> Non
     assert 0 < len(mapper.snapshot().model) <= before
 
 
-def test_a_snapshot_is_not_changed_by_what_comes_after() -> None:
+def test_a_snapshot_does_not_change_with_the_map() -> None:
     mapper = Mapper(small_config())
     insert(mapper, wall_frame(np.eye(4)))
     held = mapper.snapshot()
@@ -81,7 +81,7 @@ def test_a_snapshot_is_not_changed_by_what_comes_after() -> None:
     assert equal(held.model, kept)
 
 
-def test_a_second_look_at_the_same_place_adds_next_to_nothing_and_confirms_what_is_there() -> None:
+def test_a_second_observation_of_a_place_adds_few_gaussians_and_supports_the_others() -> None:
     mapper = Mapper(small_config())
     insert(mapper, wall_frame(np.eye(4)))
     first = len(mapper.model)
@@ -90,7 +90,7 @@ def test_a_second_look_at_the_same_place_adds_next_to_nothing_and_confirms_what_
     assert float((mapper.model.observations[:first] == 2).float().mean()) > 0.98
 
 
-def test_a_new_view_adds_gaussians_only_beside_the_old_one() -> None:
+def test_a_new_view_adds_gaussians_only_outside_the_old_one() -> None:
     mapper = Mapper(small_config(mapping__refine_iterations=0))
     insert(mapper, wall_frame(np.eye(4)))
     T = se3_exp([0.4, 0, 0, 0, 0, 0])
@@ -110,7 +110,7 @@ def test_gaussians_are_anchored_in_the_keyframe_that_made_them() -> None:
     assert set(mapper.model.anchors.tolist()) == {0, 1, 2}
 
 
-def test_what_is_seen_through_loses_its_odds_each_time_until_it_is_gone() -> None:
+def test_misses_reduce_the_odds_of_a_gaussian_until_it_is_removed() -> None:
     mapper = Mapper(small_config(mapping__refine_iterations=0))
     insert(mapper, with_ball(wall_frame(np.eye(4)), 0.7))
     ghosts = []
@@ -126,7 +126,7 @@ def test_what_is_seen_through_loses_its_odds_each_time_until_it_is_gone() -> Non
         insert(mapper, wall_frame(np.eye(4)))
     assert ghosts[0] > 50
     assert ghosts[-1] == 0
-    assert int(near_disc(mapper.model, 1.0).sum()) > 50  # what was behind has been mapped
+    assert int(near_disc(mapper.model, 1.0).sum()) > 50  # the surface behind has been mapped
 
 
 def test_a_guess_that_is_seen_through_goes_at_once() -> None:
@@ -241,7 +241,7 @@ def test_the_map_of_the_tabletop_shows_views_it_was_not_made_of() -> None:
 
 
 @pytest.mark.parametrize("broken", ["_add_gaussians", "refine", "make_reference", "add_keyframe", "insert_keyframe"])
-def test_an_exception_in_an_insertion_leaves_the_map_and_what_follows_as_if_it_had_not_been_tried(
+def test_an_exception_in_an_insertion_leaves_the_map_and_later_insertions_unchanged(
     broken: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mapper, other = Mapper(small_config()), Mapper(small_config())

@@ -1,4 +1,4 @@
-"""Memory is bounded, and what holds it is told."""
+"""Memory is bounded and reported by category."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_run_with_few_keyframes_tracks_on_and_keeps_no_more() -> None:
     assert np.linalg.norm((inverse(poses[-1]) @ last)[:3, 3]) < 2e-3
 
 
-def test_the_bytes_told_are_those_of_the_arrays() -> None:
+def test_the_reported_bytes_are_those_of_the_arrays() -> None:
     frames, _ = tabletop()
     slam = Slam(small_config())
     for frame in frames[:4]:
@@ -71,7 +71,7 @@ def test_the_bytes_told_are_those_of_the_arrays() -> None:
 
 
 def resident() -> int:
-    """Bytes of this process that are in memory."""
+    """Return the bytes of this process that are in memory."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 

@@ -15,7 +15,7 @@ from tests.unit.mapping.conftest import MakeKeyframe
 
 
 def pair(**changes: torch.Tensor) -> GaussianModel:
-    """Two discs side by side on a plane."""
+    """Make two discs side by side on a plane."""
     model = GaussianModel.from_activated(
         means=[[0.0, 0.0, 1.0], [0.008, 0.002, 1.0]],
         quats=[[1.0, 0, 0, 0], [1.0, 0, 0, 0.3]],
@@ -43,7 +43,7 @@ def test_a_merged_pair_has_the_mean_and_covariance_of_the_mixture() -> None:
     np.testing.assert_allclose(merged.colors[0], weights @ model.colors.numpy(), atol=1e-6)
 
 
-def test_what_differs_in_colour_orientation_size_or_evidence_is_not_merged() -> None:
+def test_gaussians_that_differ_in_color_orientation_size_or_observation_are_not_merged() -> None:
     for changes in (
         {"sh": torch.tensor([[1.5, 0.0, 0.0]])},
         {"quats": torch.tensor([0.7, 0.7, 0.0, 0.0])},
@@ -54,7 +54,7 @@ def test_what_differs_in_colour_orientation_size_or_evidence_is_not_merged() -> 
         assert len(merge_similar(pair(**changes), 1)[0]) == 2, changes
 
 
-def test_no_more_are_merged_than_asked_for_and_none_of_an_empty_map(make_keyframe: MakeKeyframe) -> None:
+def test_no_more_are_merged_than_required_and_none_of_an_empty_map(make_keyframe: MakeKeyframe) -> None:
     keyframe = make_keyframe()
     model = new_gaussians(keyframe, keyframe.depth > 0, small_config().mapping)
     merged, rows = merge_similar(model, 100)

@@ -13,7 +13,7 @@ ROWS, COLUMNS = (grid.ravel() for grid in np.mgrid[0 : CAMERA.height : 3, 0 : CA
 
 
 def plane(normal: NDArray[np.float64], distance: float) -> NDArray[np.float32]:
-    """Depth (H, W) [m] of the plane n · p = distance."""
+    """Compute the depth (H, W) [m] of the plane n · p = distance."""
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
     return (distance / (rays @ normal)).astype(np.float32)

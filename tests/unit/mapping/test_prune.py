@@ -1,4 +1,4 @@
-"""Pruning: what nobody can see, what is absurd, and a cap that holds exactly and keeps the fittest."""
+"""Pruning removes invisible and invalid Gaussians; the size limit is exact and keeps the best supported ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CONFIG = small_config(mapping__min_opacity=0.05, mapping__max_scale=0.5).mapping
 
 
 def model_of(n: int, rng: np.random.Generator) -> GaussianModel:
-    """Sound Gaussians: opacity 0.1 to 0.9, 1 to 10 cm."""
+    """Make valid Gaussians: opacity 0.1 to 0.9, 1 to 10 cm."""
     return GaussianModel.from_activated(
         means=rng.normal(size=(n, 3)),
         quats=rng.normal(size=(n, 4)),
@@ -37,7 +37,7 @@ def test_the_faint_and_the_huge_go_and_their_neighbours_stay(rng: np.random.Gene
 
 @pytest.mark.parametrize("column", ["means", "quats", "log_scales", "opacity_logits"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_goes(column: str, value: float, rng: np.random.Generator) -> None:
+def test_gaussians_that_are_not_finite_are_removed(column: str, value: float, rng: np.random.Generator) -> None:
     model = model_of(5, rng)
     getattr(model, column)[3] = value
     assert keep_mask(model, CONFIG).tolist() == [True, True, True, False, True]

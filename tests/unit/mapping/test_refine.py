@@ -1,4 +1,4 @@
-"""Refinement: the loss goes down, what cannot be refined is left alone, and draws favour the latest keyframes."""
+"""Refinement: the loss decreases, unrefinable parameters do not change, and draws favor the latest keyframes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def refiner_for(model: GaussianModel, seed: int = 0, **overrides: object) -> Ref
 
 
 def disturbed(keyframe: Keyframe, seed: int = 0) -> GaussianModel:
-    """The keyframe's Gaussians with colours off by a fifth and positions by a centimetre."""
+    """Make the keyframe's Gaussians with colors wrong by a fifth and positions by a centimeter."""
     model = new_gaussians(keyframe, keyframe.depth > 0, CONFIG)
     g = torch.Generator().manual_seed(seed)
     model.sh += 0.7 * torch.randn(model.sh.shape, generator=g)
@@ -152,7 +152,7 @@ def test_the_number_of_torch_threads_is_the_callers_again(make_keyframe: MakeKey
 
 
 def drawn(iterations: int, monkeypatch: pytest.MonkeyPatch, make: MakeKeyframe, seed: int = 0) -> list[int]:
-    """Numbers of the keyframes that a refinement over 20 of them visits, with a window of 4."""
+    """Return the numbers of the keyframes that a refinement over 20 of them visits, with a window of 4."""
     model = disturbed(make())
     refiner = refiner_for(model, seed, mapping__window=4)
     visited: list[int] = []
@@ -177,7 +177,7 @@ def test_draws_are_those_of_the_seed(monkeypatch: pytest.MonkeyPatch, make_keyfr
     assert first == again != other
 
 
-def test_a_needle_in_view_shrinks_to_what_a_keyframe_can_tell(make_keyframe: MakeKeyframe) -> None:
+def test_a_visible_needle_shrinks_to_the_resolution_of_a_keyframe(make_keyframe: MakeKeyframe) -> None:
     keyframe = make_keyframe()
     model = disturbed(keyframe)
     model.log_scales[:50, 0] = np.log(0.4)

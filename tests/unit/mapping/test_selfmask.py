@@ -32,7 +32,7 @@ def log() -> WristLog:
 
 
 def _distance_to_arm(points: Array, q: Array) -> Array:
-    """Of points (P, 3) in the base's frame to the true capsules (P,) [m]."""
+    """Compute the distances (P,) [m] of points (P, 3) in the base frame to the true capsules."""
     robot = panda()
     T = robot.fk(q)
     shapes = [(T[s.link], np.array(s.start), np.array(s.end), s.radius) for s in robot.shapes if isinstance(s, Capsule)]
@@ -60,7 +60,7 @@ def test_the_hand_is_in_view_and_every_pixel_of_it_is_left_out(log: WristLog) ->
         usable = mask.usable(frame)
         assert not (usable & shown).any()
         assert usable.mean() > 0.3
-        # Whatever is used lies at least 2 cm from the arm.
+        # All unmasked points lie at least 2 cm from the arm.
         points = transform_points(
             T_PANDA_CAMERA, frame.camera.backproject(frame.depth)[usable & (frame.depth > 0)].astype(float)
         )
@@ -89,7 +89,7 @@ def test_with_the_mask_no_gaussian_is_near_the_swept_arm_and_without_it_many_are
     assert blocked[1] > 0.5 * len(log)
 
 
-def test_what_is_seen_in_front_of_the_robot_stays_and_so_does_what_is_far_beside_it() -> None:
+def test_objects_in_front_of_the_robot_and_far_from_it_are_not_masked() -> None:
     camera = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)
     q = START
     rgb = np.zeros((120, 160, 3), np.uint8)

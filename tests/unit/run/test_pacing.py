@@ -43,7 +43,7 @@ def source(log: Any, *, paced: bool = True, rate: float | None = None) -> LogFra
     return PacedSource(log, len(log), rate) if paced else LogFrames(log, len(log))
 
 
-def test_without_pacing_every_frame_comes_when_asked_for_and_errors_in_their_place() -> None:
+def test_without_pacing_every_frame_is_delivered_on_demand_and_errors_in_their_place() -> None:
     arrivals = list(source(Stream(4, bad=(2,)), paced=False))
     assert [a.index for a in arrivals] == [0, 1, 2, 3]
     assert [isinstance(a.frame, InputError) for a in arrivals] == [False, False, True, False]

@@ -1,4 +1,4 @@
-"""Saving a run and going on with it: the same bits, and clear words when something does not fit."""
+"""A resumed run has the same bits as an uninterrupted one, and a state that does not fit is refused with a reason."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def test_values_of_every_kind_come_back_and_shared_ones_stay_shared() -> None:
     assert back["random"].random() == generator.random()
 
 
-def test_what_is_known_of_an_object_that_only_others_hold_is_saved_with_it() -> None:
+def test_weak_references_to_an_object_that_others_hold_are_saved() -> None:
     key = Camera(1.0, 2.0, 3.0, 4.0, 5, 6)
     encoder = Encoder(Config(), lambda owner, array: None)
     tree = encoder.encode([key, WeakKeyDictionary({key: 7})])
