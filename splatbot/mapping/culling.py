@@ -31,6 +31,6 @@ def _distances(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
     T = np.stack([keyframe.T_world_camera for keyframe in keyframes])
     moved = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
     cosine = 0.5 * (np.einsum("aij,bij->ab", T[:, :3, :3], T[:, :3, :3]) - 1.0)
-    gaps: NDArray[np.float64] = moved + _METERS_PER_METERS_PER_METERS_PER_RADIAN * np.arccos(np.clip(cosine, -1.0, 1.0))
+    gaps: NDArray[np.float64] = moved + _METERS_PER_RADIAN * np.arccos(np.clip(cosine, -1.0, 1.0))
     np.fill_diagonal(gaps, np.inf)
     return gaps

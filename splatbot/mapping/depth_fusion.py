@@ -53,7 +53,7 @@ class DepthFusionConstants:
     stable_sigma_share: float = 0.5
     removal_misses: int = 3
     unstable_removal_misses: int = 2
-    removed_logit: float = CONSTANTS.removed_logit
+    removed_logit: float = -10.0
     least_z: float = 0.05
 
 
