@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from splatbot.grasping.affordance import Hint, NameHint, PointHint, find_target
+from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.places import PlaceAffordance
+from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.types import Grasp
-from splatbot.grasping.words import WordAffordance
 from splatbot.logs.ros_frames import header, pose_message
 from splatbot.logs.ros_types import to_plain
 from splatbot.protocols import Array
@@ -49,7 +49,7 @@ class GraspServices:
         def work() -> dict[str, Any]:
             served, robot, base = robot_place(self._store, self._robot)
             objects = objects_in(served, base, as_known=True)
-            target = find_target(_hint(args), objects.scene, [WordAffordance(), PlaceAffordance()])
+            target = find_target(_hint(args), objects.scene, [LanguageAffordance(), SpatialAffordance()])
             found = objects.told(objects.sampler(robot).sample(target, GraspOptions()))
             found.unwrap()
             stamp = served.ready.stamp

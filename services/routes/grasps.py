@@ -10,10 +10,10 @@ from fastapi import APIRouter, Depends, Request, Response
 from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.grasping.affordance import BoxHint, Hint, NameHint, ObservedView, PixelHint, PointHint, find_target
+from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.places import PlaceAffordance
+from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.summary import summary
-from splatbot.grasping.words import WordAffordance
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
 from splatbot.services.dependencies import PatientMap, Service, problems
@@ -58,7 +58,7 @@ def grasps(
     """
     robot, base = known_robot(query.robot), base_in(served, query.base)
     objects = objects_in(served, base, as_known=query.base is None)
-    found = find_target(_hint(query), objects.scene, [WordAffordance(), PlaceAffordance()])
+    found = find_target(_hint(query), objects.scene, [LanguageAffordance(), SpatialAffordance()])
     sampler = objects.sampler(
         robot, hand_only=query.hand_only, margin=query.margin, min_observations=query.min_observations
     )

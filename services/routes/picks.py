@@ -7,9 +7,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Response
 
 from splatbot.errors import InputError
+from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_types import PickOptions, PickStage, PickStep
-from splatbot.grasping.words import WordAffordance
 from splatbot.services.codecs import body_of, plain, takes
 from splatbot.services.dependencies import IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobCancelled, JobHandle
@@ -74,7 +74,7 @@ def _pick(scene: Scene, query: PicksRequest, options: PickOptions, handle: JobHa
     picked = pick_in_twin(
         Twin(scene),
         query.target,
-        [WordAffordance()],
+        [LanguageAffordance()],
         options,
         views=query.views,
         margin=query.margin,

@@ -118,7 +118,7 @@ class SolidReach:
 
 
 class SolidPickPlanner:
-    """Ways to grasps; see :class:`splatbot.grasping.pick_planner.Ways`.
+    """Ways to grasps; see :class:`splatbot.grasping.pick_planner.PickPlanner`.
 
     Args:
         sampler: of the grasps.
@@ -137,16 +137,16 @@ class SolidPickPlanner:
         own[target.rows] = True
         self._beside = world.around(np.flatnonzero(own))
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
-        """See :class:`splatbot.grasping.pick_planner.Ways`; of what moved nothing is known here."""
+    def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
+        """See :class:`splatbot.grasping.pick_planner.PickPlanner`; of what moved nothing is known here."""
         if grasp.q_pregrasp is None:
             return "no posture is known"
         opening = min(grasp.opening, self.s.hand.stroke)
         far = SolidArm(self.robot, self._T, opening, self.world.whole)
         begin = time.perf_counter()
-        there = self._connect(far, start, grasp.q_pregrasp)
-        planned = time.perf_counter() - begin
-        if there is None:
+        to_pregrasp = self._connect(far, start, grasp.q_pregrasp)
+        planning_seconds = time.perf_counter() - begin
+        if to_pregrasp is None:
             return "no path was found"
         near = SolidArm(self.robot, self._T, opening, self._around)
         approach = straight(near, near.free, grasp.q_pregrasp, grasp.T_world_tcp)
@@ -155,30 +155,30 @@ class SolidPickPlanner:
         q = approach[-1]
         closed = SolidArm(self.robot, self._T, grasp.width, self._beside)
         attached = in_hand(closed.spheres, q, self._object)
-        free = straight(closed, closed.free, q, raised(self.s, closed.spheres, q, self.o.free))
-        if free is None:
+        lift_off = straight(closed, closed.free, q, raised(self.s, closed.spheres, q, self.o.lift_off))
+        if lift_off is None:
             return "it cannot be lifted"
         loaded = SolidArm(self.robot, self._T, grasp.width, self._beside, attached)
-        top = raised(self.s, closed.spheres, free[-1], self.o.lift - self.o.free)
-        lift = straight(loaded, loaded.free, free[-1], top)
+        top = raised(self.s, closed.spheres, lift_off[-1], self.o.lift - self.o.lift_off)
+        lift = straight(loaded, loaded.free, lift_off[-1], top)
         if lift is None:
             return "it cannot be lifted"
         return PickPlan(
             grasp,
             opening,
             attached,
-            _leg(there, far),
-            _leg(approach, near),
-            _leg(free, closed),
-            _leg(lift, closed),
-            planned,
+            _segment(to_pregrasp, far),
+            _segment(approach, near),
+            _segment(lift_off, closed),
+            _segment(lift, closed),
+            planning_seconds,
         )
 
-    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
-        """See :class:`splatbot.grasping.pick_planner.Ways`."""
-        loaded = SolidArm(self.robot, self._T, way.grasp.width, self._beside, way.attached)
+    def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
+        """See :class:`splatbot.grasping.pick_planner.PickPlanner`."""
+        loaded = SolidArm(self.robot, self._T, plan.grasp.width, self._beside, plan.attached)
         path = self._connect(loaded, start, np.asarray(goal.q, dtype=np.float64))
-        return "no path was found" if path is None else _leg(path, loaded)
+        return "no path was found" if path is None else _segment(path, loaded)
 
     def _connect(self, arm: SolidArm, start: Array, goal: Array) -> Array | None:
         if not arm.free(np.stack([start, goal])).all():
@@ -196,7 +196,7 @@ def straight(arm: SolidArm, free: Free, start: Array, T_world_end: Array) -> Arr
     return line.path.waypoints if free(line.path.waypoints).all() else None
 
 
-def _leg(path: Array, arm: SolidArm) -> Segment:
+def _segment(path: Array, arm: SolidArm) -> Segment:
     """Close waypoints, so that corners are hardly rounded: how far that may go nobody knows here."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     parts = [

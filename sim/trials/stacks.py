@@ -15,8 +15,8 @@ from splatbot.grasping.affordance import Target, find_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
 from splatbot.grasping.pick_types import PickOptions
-from splatbot.grasping.places import PlaceAffordance
 from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.planning import JointGoal
 from splatbot.protocols import Array
@@ -108,7 +108,7 @@ def decide(known: Knowledge, look: Look) -> StackDecision:
     Raises:
         AffordanceError: there is nothing.
     """
-    target = find_target(look.hint, known.scene, [PlaceAffordance()])
+    target = find_target(look.hint, known.scene, [SpatialAffordance()])
     sampler, ways = known.towards(target)
     begin = time.perf_counter()
     grasps = sampler.sample(target, OPTIONS.grasp)
@@ -122,13 +122,13 @@ class _Remembered:
         self._ways = ways
         self._found: dict[tuple[int, bool], PickPlan | str] = {}
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
+    def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
         """As when it was first asked."""
-        key = id(grasp), cautious
+        key = id(grasp), avoid_moving
         if key not in self._found:
-            self._found[key] = self._ways.to(grasp, start, cautious=cautious)
+            self._found[key] = self._ways.plan_to(grasp, start, avoid_moving=avoid_moving)
         return self._found[key]
 
-    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
+    def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
         """Asked anew."""
-        return self._ways.onwards(way, start, goal)
+        return self._ways.plan_carry(plan, start, goal)

@@ -175,7 +175,7 @@ def attempt(
     assert controller.gripper is not None
     before = _height(twin, trial.target)
     picker = Picker(
-        decision.sampler, controller, controller.gripper, options=OPTIONS, make_ways=lambda target: decision.ways
+        decision.sampler, controller, controller.gripper, options=OPTIONS, make_planner=lambda target: decision.ways
     )
     result = picker.pick(decision.target, grasps=decision.grasps)
     rose = _height(twin, trial.target) - before
@@ -238,7 +238,7 @@ def _failure(result: PickResult, touched: tuple[str, ...], mistaken: bool) -> Fa
         return Failure.PERCEPTION
     if result.outcome is PickOutcome.NO_GRASP:
         return Failure.IK if "hands: " in result.reason else Failure.GRASP
-    if result.outcome is PickOutcome.NO_WAY:
+    if result.outcome is PickOutcome.NO_PLAN:
         return Failure.PLAN
     if set(touched) - {TABLE}:
         return Failure.COLLISION
@@ -277,7 +277,7 @@ def _row(
     ideal: TwinPickResult,
     reality: TwinPickResult,
 ) -> TrialRow:
-    planned = None if result is None or result.planned is None else 1e3 * result.planned
+    planned = None if result is None or result.planning_seconds is None else 1e3 * result.planning_seconds
     return TrialRow(
         seed=trial.seed,
         family=trial.family,

@@ -14,9 +14,9 @@ def name_backends(*, vlm: bool) -> list[Affordance]:
     Raises:
         InputError: the model is asked for and not named in the environment.
     """
-    from splatbot.grasping.words import WordAffordance
+    from splatbot.grasping.language import LanguageAffordance
 
-    rules = WordAffordance()
+    rules = LanguageAffordance()
     if not vlm:
         return [rules]
     from splatbot.grasping.vision import EndpointModel, VisionAffordance

@@ -97,7 +97,7 @@ def grasp(
     from splatbot.cli.affordances import name_backends
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.options import GraspOptions
-    from splatbot.grasping.places import PlaceAffordance
+    from splatbot.grasping.spatial import SpatialAffordance
     from splatbot.grasping.summary import summary
     from splatbot.grasping.tags import TagAffordance
     from splatbot.report.grasp_view import grasp_png
@@ -110,7 +110,7 @@ def grasp(
     things = _things(map, base)
     scene = things.scene
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
-    found = find_target(hint, scene, [*name_backends(vlm=vlm), PlaceAffordance(), TagAffordance()])
+    found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
     sampler = things.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
     sampler.margin = margin_of(margin, map, sampler.field, scene.T_world_base)
     result = things.told(sampler.sample(found, options))
@@ -219,7 +219,7 @@ def _print(result: GraspResult, folder: Path) -> None:
     for name in ("", "total", "approach", "width", "opens", "room", *terms):
         table.add_column(name, justify="left" if name == "approach" else "right")
     for k, g in enumerate(result.grasps):
-        lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.room))
+        lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *(f"{g.terms[name]:.2f}" for name in terms))
     wide_console().print(table)
     print("width, opens and room in mm; the terms are 1 at best")

@@ -1,1 +1,1 @@
-"""From a hint to a grasp: who says where, and how the hand takes hold of it."""
+"""Grasping: locate a target from a hint, and sample, score and rank antipodal grasps of it."""

@@ -1,4 +1,4 @@
-"""Who says where to grasp: hints, the backends that understand them, and the target that they find."""
+"""Target selection: hints, the backends that resolve them, and the target that results."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from splatbot.segmentation import SegmentedMap
 
 @dataclass(frozen=True, eq=False)
 class ObservedView:
-    """A camera that looks at the map.
+    """A camera pose with an optional image.
 
     Args:
-        camera: without distortion.
-        T_world_camera: (4, 4).
-        rgb: (H, W, 3) uint8, what it saw, for backends that look at pictures; None: the map as it renders.
+        camera: undistorted pinhole camera.
+        T_world_camera: (4, 4) pose of the camera.
+        rgb: (H, W, 3) uint8 image for backends that use images. If None, the map is rendered.
     """
 
     camera: Camera
@@ -32,7 +32,7 @@ class ObservedView:
 
 @dataclass(frozen=True)
 class NameHint:
-    """Words: a name, or what the thing looks like ("red cup", "largest box", "the box left of the tape")."""
+    """A name or a description of the object ("red cup", "largest box", "the box left of the tape")."""
 
     text: str
 
@@ -48,7 +48,7 @@ class PixelHint:
 
 @dataclass(frozen=True, eq=False)
 class PointHint:
-    """A point (3,) on or in the thing [m, world]."""
+    """A point (3,) on or in the object [m, world]."""
 
     point: Array
 
@@ -74,12 +74,12 @@ class BoxHint:
 
 @dataclass(frozen=True, eq=False)
 class TagHint:
-    """An AprilTag on the thing, in any of the views.
+    """An AprilTag on the object, visible in at least one view.
 
     Args:
-        number: of the tag.
-        views: with pictures.
-        family: of the tag, as OpenCV's ``DICT_APRILTAG_36h11``.
+        number: id of the tag.
+        views: views with images.
+        family: tag family, the suffix of OpenCV's ``DICT_APRILTAG_36h11``.
     """
 
     number: int
@@ -92,16 +92,16 @@ Hint = NameHint | PixelHint | PointHint | MaskHint | BoxHint | TagHint
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What shall be grasped.
+    """The object to grasp.
 
     Args:
-        rows: (M,) int64, its Gaussians in the scene's map.
-        point: (3,) on it [m, world]: grasps near to it are better, where one was pointed at; None: anywhere.
-        label: what it is called in answers.
-        backend: who found it.
-        score: 0..1, how sure that is.
-        notes: what was considered, in words.
-        number: of the object in the scene; -1: it is no segmented object.
+        rows: (M,) int64 indices of its Gaussians in the map of the scene.
+        point: (3,) indicated point on it [m, world], near which grasps score higher. If None, no point is preferred.
+        label: name of the target in results.
+        backend: name of the backend that found it.
+        score: confidence, 0..1.
+        notes: remarks on the selection, each a sentence.
+        number: index of the object in the scene; -1 if it is not a segmented object.
     """
 
     rows: NDArray[np.int64]
@@ -114,13 +114,13 @@ class Target:
 
 
 class AffordanceError(SplatbotError):
-    """No backend can say which object is meant, or more than one is (INVALID_OBJECT_NAME).
+    """No backend found the object, or the hint is ambiguous (INVALID_OBJECT_NAME).
 
     Args:
-        message: as of :class:`splatbot.errors.SplatbotError`.
-        field: likewise.
-        hint: likewise.
-        candidates: what it could have been.
+        message: see :class:`splatbot.errors.SplatbotError`.
+        field: see :class:`splatbot.errors.SplatbotError`.
+        hint: see :class:`splatbot.errors.SplatbotError`.
+        candidates: descriptions of the objects that match best.
     """
 
     http_status = 422
@@ -136,35 +136,35 @@ class AffordanceError(SplatbotError):
 
 @runtime_checkable
 class Affordance(Protocol):
-    """A backend that finds the target of some kinds of hints."""
+    """A backend that resolves some kinds of hints to a target."""
 
     @property
     def name(self) -> str:
-        """As results tell it."""
+        """Name of the backend in results."""
         ...
 
     def understands(self, hint: Hint) -> bool:
-        """Whether it is worth asking."""
+        """Return whether the backend can resolve this kind of hint."""
         ...
 
     def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
-        """The target.
+        """Find the target of a hint.
 
         Raises:
-            AffordanceError: there is none, or it is not clear which is meant.
-            InputError: the hint makes no sense, as a pixel out of its view.
+            AffordanceError: no object matches, or the hint is ambiguous.
+            InputError: the hint is invalid, for example a pixel outside of its view.
         """
         ...
 
 
 def find_target(hint: Hint, scene: SegmentedMap, backends: Sequence[Affordance]) -> Target:
-    """The answer of the first backend that has one; what those before it said is among its notes.
+    """Return the target from the first backend that finds one; its notes include the errors of earlier backends.
 
     Raises:
-        AffordanceError: none has one; the message says what each said.
-        InputError: the hint makes no sense.
+        AffordanceError: no backend found a target; the message contains the error of each.
+        InputError: the hint is invalid.
     """
-    said: list[str] = []
+    errors: list[str] = []
     candidates: tuple[str, ...] = ()
     for backend in backends:
         if not backend.understands(hint):
@@ -172,15 +172,15 @@ def find_target(hint: Hint, scene: SegmentedMap, backends: Sequence[Affordance])
         try:
             target = backend.locate(hint, scene)
         except AffordanceError as error:
-            said.append(f"{backend.name}: {error}")
+            errors.append(f"{backend.name}: {error}")
             candidates = candidates or error.candidates
             continue
-        return _with_notes(target, tuple(said))
-    if not said:
+        return _with_notes(target, tuple(errors))
+    if not errors:
         raise AffordanceError(
             f"is a {type(hint).__name__}, which none of {len(backends)} backends understands.", field="target"
         )
-    raise AffordanceError(" | ".join(said), field="target", candidates=candidates)
+    raise AffordanceError(" | ".join(errors), field="target", candidates=candidates)
 
 
 def _with_notes(target: Target, more: tuple[str, ...]) -> Target:

@@ -1,4 +1,4 @@
-"""Poses of the hand for pairs of contacts, and the room that it has beside the target."""
+"""Hand poses for contact pairs, and the collision of fingers and palm with the target."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from splatbot.grasping.antipodal import Pairs
 from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array, HandShape
 
-FLUSH = 0.006  # [m] that anything under the pads may stand out beyond the contact
-SLACK = 0.003  # [m] between each pad and the target as the hand comes
-OPENINGS = 0.002  # [m] that openings are rounded up to
-_CHUNK, _SAMPLE = 32, 250  # hands at once; points for a first look
-_GIVE = 0.003  # [m] that implied sides are off by and do not stop a hand
-_TOUCH = 0.003  # [m] between a pad and what it presses
-_SINK = 0.001  # [m] that a pad gives way where it touches
-_END = 0.002  # [m] from the end of flat pads where a contact may be at most
-_LOOK = 0.03  # [m] of room beyond which more is no better
+MAX_PROTRUSION_M = 0.006  # of the target under a pad beyond the planned contact
+PAD_GAP_M = 0.003  # between each pad and the target during the approach
+OPENING_STEP_M = 0.002  # finger openings are rounded up to multiples of it
+_CHUNK = 32  # hands that are evaluated at once
+_QUICK_POINTS = 250  # surface points of the quick palm test
+_COMPLETION_TOLERANCE_M = 0.003  # error of completed points, by which they are shrunk
+_CONTACT_TOLERANCE_M = 0.003  # distance between a pad and a surface point in contact
+_PAD_COMPLIANCE_M = 0.001  # depth over which the soft pad distributes its contact
+_TIP_MARGIN_M = 0.002  # minimum distance of a contact from the finger tips
+MAX_CLEARANCE_M = 0.03  # larger clearances are clipped
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,51 +29,53 @@ class Hands:
 
     Args:
         T: (K, 4, 4) T_world_tcp.
-        pair: (K,) which pair of contacts it presses.
-        opening: (K,) of the fingers as they come [m].
-        room: (K,) to the target, beside the pads and behind, on the straight way to the grasp [m]; below 0: it is hit.
-        stands_out: (K,) how far the target stands out beyond the contacts under the pads [m].
-        held: (K,) share of the pads' flat ends that has something under it, 0..1.
-        closure: (K,) as of pairs, of where the pads touch as they close: what was planned as contacts may be beside it.
+        pair: (K,) index of the contact pair.
+        opening: (K,) finger opening during the approach [m].
+        clearance: (K,) signed distance of fingers and palm to the target along the straight approach [m]; negative in
+            collision. The volume between the pads does not count.
+        protrusion: (K,) height of the target under the pads beyond the planned contacts [m].
+        pad_coverage: (K,) fraction of the flat pad ends in contact with the target, 0..1, minimum of both pads.
+        closure: (K,) force-closure margin as in :class:`splatbot.grasping.antipodal.Pairs`, at the points that the pads
+            touch first. They may differ from the planned contacts.
     """
 
     T: Array
     pair: NDArray[np.int64]
     opening: Array
-    room: Array
-    stands_out: Array
-    held: Array
+    clearance: Array
+    protrusion: Array
+    pad_coverage: Array
     closure: Array
 
     def __len__(self) -> int:
         return len(self.T)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Hands:
-        """Those that are named."""
+        """Return the chosen hands."""
         return Hands(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
 def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: Array, lowest: float) -> Hands:
-    """Every pair, from ``rolls`` sides around the line between its contacts, at ``depths`` depths.
+    """Place hands on every pair, with ``rolls`` approach directions around the closing axis and ``depths`` depths.
 
     Args:
-        pairs: of contacts.
-        hand: the fingers.
-        rolls: directions around the closing axis.
-        depths: how far the contacts are from the tips: from near the tips to near the palm.
-        up: (3,) unit, in the world.
-        lowest: the least cosine between the approach and the way down that is tried.
+        pairs: contact pairs.
+        hand: shape of the hand.
+        rolls: number of approach directions around the line of the contacts.
+        depths: number of distances between contacts and finger tips, from near the tips to near the palm.
+        up: (3,) unit up axis [world].
+        lowest: minimum cosine between the approach direction and down.
     """
     y = pairs.contacts[:, 1] - pairs.contacts[:, 0]
     y = y / np.linalg.norm(y, axis=1, keepdims=True)
-    down = -up - np.einsum("i,ci->c", -up, y)[:, None] * y  # the most downward approach
+    down = -up - np.einsum("i,ci->c", -up, y)[:, None] * y  # steepest approach that is normal to y
     level = np.linalg.norm(down, axis=1) < 1e-3
     down[level] = np.cross(y[level], np.eye(3)[np.abs(y[level]).argmin(axis=1)])
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     across = np.cross(y, down)
     turns = np.linspace(0.0, 2 * np.pi, rolls, endpoint=False)
     z = np.cos(turns)[None, :, None] * down[:, None] + np.sin(turns)[None, :, None] * across[:, None]
-    front, back = min((hand.tip + hand.pad) / 2, hand.tip - _END), -0.6 * hand.palm
+    front, back = min((hand.tip + hand.pad) / 2, hand.tip - _TIP_MARGIN_M), -0.6 * hand.palm
     places = np.linspace(front, back, depths)
     shape = (len(pairs), rolls, depths)
     T = np.zeros((*shape, 4, 4))
@@ -85,13 +88,16 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     steep = -(poses[:, :3, 2] @ up) >= lowest
     poses, pair = poses[steep], pair[steep]
     zero = np.zeros(len(poses))
-    opening = np.minimum(np.ceil((pairs.width[pair] + 2 * SLACK) / OPENINGS) * OPENINGS, hand.stroke)
+    opening = np.minimum(np.ceil((pairs.width[pair] + 2 * PAD_GAP_M) / OPENING_STEP_M) * OPENING_STEP_M, hand.stroke)
     return Hands(poses, pair, opening, *(zero.copy() for _ in range(4)))
 
 
-def clear_palm(hands: Hands, surface: GraspSurface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
-    """Whether the palm has nothing of a sample of the target before it (K,): quick, to be followed by more."""
-    step = max(1, len(surface) // _SAMPLE)
+def palm_free(hands: Hands, surface: GraspSurface, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
+    """Return whether the swept palm is free of a subsample of the target (K,).
+
+    This quick test rejects most hands before :func:`measure_hands`.
+    """
+    step = max(1, len(surface) // _QUICK_POINTS)
     p = (surface.points[::step] - surface.center).astype(np.float32)
     free = np.ones(len(hands), np.bool_)
     for k in range(0, len(hands), 32 * _CHUNK):
@@ -103,7 +109,7 @@ def clear_palm(hands: Hands, surface: GraspSurface, hand: HandShape, *, retreat:
     return free
 
 
-def beside_target(
+def measure_hands(
     hands: Hands,
     pairs: Pairs,
     surface: GraspSurface,
@@ -113,15 +119,24 @@ def beside_target(
     n_sigma: float,
     friction: float,
 ) -> Hands:
-    """The hands with their opening, their room to the target on a straight way of ``retreat`` [m], and what they hold.
+    """Compute opening, clearance, protrusion, pad coverage and closure of hands on an approach of ``retreat`` [m].
 
-    Each Gaussian is the box around its ellipsoid along the hand's axes, which is no smaller. Under the pads it asks for
-    a wider opening; beside a finger, behind its tip, or where the palm is, it is in the way.
+    Each Gaussian is represented by the bounding box of its ellipsoid along the hand's axes, which is conservative.
+    Gaussians between the pads increase the opening; all others are obstacles for the fingers and the palm.
+
+    Args:
+        hands: poses of the hand.
+        pairs: contact pairs of the poses.
+        surface: surface of the target.
+        hand: shape of the hand.
+        retreat: length of the straight approach [m].
+        n_sigma: size of the ellipsoids in standard deviations.
+        friction: friction coefficient mu.
     """
     center = surface.center
     p = (surface.points - center).astype(np.float32)
-    axes = [np.ascontiguousarray((n_sigma * surface.half[:, :, i]).astype(np.float32).T) for i in range(3)]
-    give = np.where(surface.seen, 0.0, _GIVE).astype(np.float32)
+    axes = [np.ascontiguousarray((n_sigma * surface.axes[:, :, i]).astype(np.float32).T) for i in range(3)]
+    tolerance = np.where(surface.observed, 0.0, _COMPLETION_TOLERANCE_M).astype(np.float32)
     out = [np.empty(len(hands)) for _ in range(5)]
     half = (pairs.width[hands.pair] / 2).astype(np.float32)
     for k in range(0, len(hands), _CHUNK):
@@ -131,12 +146,14 @@ def beside_target(
         for i in range(3):
             u = np.ascontiguousarray(R[:, :, i])
             local.append(u @ p.T - np.einsum("ij,ij->i", u, at)[:, None])
-            reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)) - give)
+            reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)) - tolerance)
         found = _measured(local, reach, half[k : k + _CHUNK, None], hand, retreat)
-        for into, values in zip(out, (*found, _closure(local, give, hand, np.arctan(friction))), strict=True):
+        for into, values in zip(out, (*found, _closure(local, tolerance, hand, np.arctan(friction))), strict=True):
             into[k : k + _CHUNK] = values
-    opening, room, stands_out, held, closure = out
-    return replace(hands, opening=opening, room=room, stands_out=stands_out, held=held, closure=closure)
+    opening, clearance, protrusion, coverage, closure = out
+    return replace(
+        hands, opening=opening, clearance=clearance, protrusion=protrusion, pad_coverage=coverage, closure=closure
+    )
 
 
 def _measured(
@@ -146,16 +163,18 @@ def _measured(
     hand: HandShape,
     retreat: float,
 ) -> tuple[Array, Array, Array, Array]:
-    """Opening, room, what stands out and what is held, (K,) each, of K hands and M Gaussians (K, M)."""
+    """Return opening, clearance, protrusion and pad coverage, (K,) each, from points in the hands' frames (K, M)."""
     x, y, z = local
     side = np.abs(y)
-    dx = np.abs(x) - reach[0] - hand.width / 2  # gap to the fingers across
-    dz = z - reach[2] - hand.tip  # gap ahead of the tips
+    dx = np.abs(x) - reach[0] - hand.width / 2  # gap to the fingers along x
+    dz = z - reach[2] - hand.tip  # gap to the tips along z
     under = (np.abs(x) < hand.width / 2) & (z < hand.tip) & (z > -hand.palm)
-    stands_out = np.where(under & (side < half + 0.02), side - half, -np.inf).max(axis=1)
-    solid = np.where(under & (side < half + FLUSH), side + np.minimum(reach[1], FLUSH), half).max(axis=1)
-    opening = 2 * (np.maximum(solid, half[:, 0]) + SLACK)
-    opening = np.minimum(np.ceil(opening.astype(np.float64) / OPENINGS) * OPENINGS, hand.stroke)
+    protrusion = np.where(under & (side < half + 0.02), side - half, -np.inf).max(axis=1)
+    solid = np.where(under & (side < half + MAX_PROTRUSION_M), side + np.minimum(reach[1], MAX_PROTRUSION_M), half).max(
+        axis=1
+    )
+    opening = 2 * (np.maximum(solid, half[:, 0]) + PAD_GAP_M)
+    opening = np.minimum(np.ceil(opening.astype(np.float64) / OPENING_STEP_M) * OPENING_STEP_M, hand.stroke)
     inner = opening[:, None] / 2
     dy = np.maximum(inner - (side + reach[1]), (side - reach[1]) - inner - hand.thickness)
     finger = np.maximum(np.maximum(dx, dz), np.maximum(dy, -hand.palm - retreat - z - reach[2]))
@@ -163,56 +182,59 @@ def _measured(
         np.maximum(np.abs(x) - reach[0] - hand.palm_size[0] / 2, side - reach[1] - hand.palm_size[1] / 2),
         np.maximum(z - reach[2] + hand.palm, -hand.palm - retreat - z - reach[2]),
     )
-    room = np.minimum(np.minimum(finger, palm).min(axis=1), _LOOK)
-    held = _held(x, y, z, half, hand)
-    return opening, room, stands_out, held
+    clearance = np.minimum(np.minimum(finger, palm).min(axis=1), MAX_CLEARANCE_M)
+    return opening, clearance, protrusion, _pad_coverage(x, y, z, half, hand)
 
 
-def _held(
+def _pad_coverage(
     x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], half: NDArray[np.float32], hand: HandShape
 ) -> Array:
-    """Of four by four parts of the flat end of each pad, the share that has the surface under it, of the lesser pad."""
+    """Return the fraction of the 4 x 4 cells of a flat pad end that touch the surface (K,), minimum of both pads."""
     column = np.floor((x / hand.width + 0.5) * 4)
     line = np.floor((z - hand.pad) / hand.width * 4) + 4
     on = (column >= 0) & (column < 4) & (line >= 0) & (line < 4)
     part = np.left_shift(1, np.where(on, 4 * column + line, 0).astype(np.int32))
     found = []
     for sign in (-1.0, 1.0):
-        touched = on & (np.abs(sign * y - half) < _TOUCH)
-        bits = np.bitwise_or.reduce(np.where(touched, part, 0), axis=1)
+        contact = on & (np.abs(sign * y - half) < _CONTACT_TOLERANCE_M)
+        bits = np.bitwise_or.reduce(np.where(contact, part, 0), axis=1)
         found.append(np.unpackbits(bits.astype(np.uint16)[:, None].view(np.uint8), axis=1).sum(axis=1) / 16)
     return np.minimum(*found)
 
 
-def _closure(local: list[NDArray[np.float32]], give: NDArray[np.float32], hand: HandShape, cone: float) -> Array:
-    """How far inside of the friction cone the line between the places is where the pads touch first (K,).
+def _closure(local: list[NDArray[np.float32]], tolerance: NDArray[np.float32], hand: HandShape, cone: float) -> Array:
+    """Return the force-closure margin of the points that the pads touch first (K,).
 
-    Flat pads meet what stands out most under them, wherever a grasp was meant to be; a round finger meets it with a
-    face that is turned, which pushes it out.
+    A pad first touches the highest surface points under it, which may differ from the planned contacts. Each contact is
+    the mean of the points under the pad with the weights exp(height / compliance). The contact normal is that of the
+    pad: on a rounded finger end it is inclined and pushes the object out.
     """
     x, y, z = local
     side, side_back = _rounded(np.abs(x) - hand.pad_width / 2, (hand.width - hand.pad_width) / 2)
     end, end_back = _rounded(z - hand.pad, hand.tip - hand.pad)
     side *= np.sign(x)
     under = (np.abs(x) < hand.width / 2) & (z < hand.tip) & (z > -hand.palm)
-    places, turned = [], []
+    contacts, inclined = [], []
     for sign in (-1.0, 1.0):
-        height = np.where(under & (sign * y > 0.0), sign * y - side_back - end_back - give, -np.inf)
+        height = np.where(under & (sign * y > 0.0), sign * y - side_back - end_back - tolerance, -np.inf)
         top = height.max(axis=1, keepdims=True)
-        weight = np.exp((height - np.where(np.isfinite(top), top, 0.0)) / _SINK)
+        weight = np.exp((height - np.where(np.isfinite(top), top, 0.0)) / _PAD_COMPLIANCE_M)
         weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
-        places.append(np.stack([np.einsum("km,km->k", weight, values) for values in local], axis=1))
-        turned.append(np.stack([np.einsum("km,km->k", weight, values) for values in (side, end)], axis=1))
-    line = places[1] - places[0]
+        contacts.append(np.stack([np.einsum("km,km->k", weight, values) for values in local], axis=1))
+        inclined.append(np.stack([np.einsum("km,km->k", weight, values) for values in (side, end)], axis=1))
+    line = contacts[1] - contacts[0]
     line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
     cosines = []
-    for sign, sines in zip((-1.0, 1.0), turned, strict=True):
+    for sign, sines in zip((-1.0, 1.0), inclined, strict=True):
         facing = np.sqrt(np.maximum(1.0 - (sines**2).sum(axis=1), 0.0))
         cosines.append(line[:, 1] * facing - sign * (line[:, [0, 2]] * sines).sum(axis=1))
     return np.asarray(1.0 - np.arccos(np.clip(np.minimum(*cosines), -1.0, 1.0)) / cone)
 
 
 def _rounded(beyond: Array | NDArray[np.float32], radius: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Of a face so far ``beyond`` its flat part, rounded off with a radius [m]: sine of its turn, and its set-back."""
+    """Return the sine of the inclination and the set-back [m] of a rounded edge, ``beyond`` [m] the flat part.
+
+    On an edge of radius r at the distance b from the flat part: sin(a) = b / r, set-back = r (1 - cos(a)).
+    """
     sine = np.clip(beyond / max(radius, 1e-6), 0.0, 0.999).astype(np.float32)
     return sine, (max(radius, 0.0) * (1.0 - np.sqrt(1.0 - sine**2))).astype(np.float32)

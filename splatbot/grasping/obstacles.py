@@ -1,4 +1,4 @@
-"""What is around a target, as the hand has to avoid it."""
+"""Obstacles around a target: the map without the target and with flattened support planes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import rotation_to_quat
 from splatbot.segmentation import SegmentedMap
 
-_THICK = 1e-3  # [m] of a support
+_SUPPORT_STD_M = 1e-3  # standard deviation of a support's Gaussians along the normal of its plane
 
 
 def around_target(scene: SegmentedMap, rows: NDArray[np.int64]) -> GaussianModel:
-    """The map without the target's ``rows`` (M,), its supports as flat as they were found to be.
+    """Return the map without the target's ``rows`` (M,), with the Gaussians of each support moved into its plane.
 
-    A support is a plane that hundreds of Gaussians agree on, to less than a millimetre in its mean; one by one they are
-    blobs that reach a centimetre above it, and no hand could take anything thin off a table. Each of a support's
-    Gaussians is put into its plane, as a disc that is 1 mm thick.
+    Hundreds of Gaussians determine a support plane to less than a millimetre. A single one may reach a centimetre above
+    it, which would make thin objects on a table ungraspable. Each Gaussian of a support is therefore projected onto the
+    plane and flattened to a disc with a standard deviation of 1 mm along the normal.
     """
     keep = np.ones(len(scene.model), np.bool_)
     keep[rows] = False
@@ -37,5 +37,7 @@ def around_target(scene: SegmentedMap, rows: NDArray[np.int64]) -> GaussianModel
         quat = rotation_to_quat(np.stack([side, np.cross(up, side), up], axis=1))
         model.quats[index] = torch.from_numpy(quat).to(model.quats.dtype)
         widest = model.log_scales[index].sort(dim=1).values[:, 1]
-        model.log_scales[index] = torch.stack([widest, widest, torch.full_like(widest, float(np.log(_THICK)))], dim=1)
+        model.log_scales[index] = torch.stack(
+            [widest, widest, torch.full_like(widest, float(np.log(_SUPPORT_STD_M)))], dim=1
+        )
     return model.select(torch.from_numpy(np.flatnonzero(keep)))

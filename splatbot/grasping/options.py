@@ -1,4 +1,4 @@
-"""How grasps are looked for."""
+"""Options of grasp sampling."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ APPROACHES = ("any", "top", "side")
 
 @dataclass(frozen=True)
 class GraspOptions:
-    """What a search for grasps may spend and return.
+    """Options of a search for antipodal grasps.
 
     Args:
-        friction: coefficient between pads and target.
-        samples: seeds on the surface: the knob of time against how much of it is tried; where that finds nothing,
-            four times as many are tried once, with sharper rims.
-        rolls: sides around each pair of contacts that the hand comes from.
-        depths: how deep between the fingers the contacts may be.
-        pregrasp: length of the straight approach [m].
-        wanted: how many grasps to return.
-        approach: "any", or only from the "top" or the "side".
-        seed: of all that is drawn.
+        friction: Coulomb friction coefficient mu between pads and target.
+        samples: number of seed points on the surface. More seeds take longer and cover more of it. If no grasp is
+            found, the search is repeated once with four times as many seeds and sharper edges.
+        rolls: number of approach directions around the closing axis of each contact pair.
+        depths: number of distances from the finger tips at which the contacts are placed.
+        pregrasp: length of the straight approach from the pre-grasp to the grasp [m].
+        wanted: maximum number of grasps to return.
+        approach: "any", "top" or "side".
+        seed: seed of the random generator.
 
     Raises:
         InputError: a value is out of range.

@@ -1,4 +1,4 @@
-"""Picking: a grasp, the whole way to it and back up, certified before anything moves; then each stage in turn."""
+"""Picking: sample grasps, certify a complete plan, then execute its stages."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from splatbot.planning import JointGoal, time_path
 from splatbot.planning.follow import follow
 from splatbot.protocols import Array, Controller, Feedback, Gripper, MotionState
 
-_SETTLE = 6.0  # [s] in which fingers must come to rest
-_NOT_CLEAR = "no way was found that keeps clear of where something moved; this one does not"
+_SETTLE_S = 6.0  # [s] after which moving fingers are an error
+_MOVING_NOTE = "no plan avoids the regions where motion was observed; this plan crosses one"
 
 
 class _EndedError(Exception):
-    """A stage that the pick ends in."""
+    """Ends the pick in the current stage."""
 
     def __init__(self, outcome: PickOutcome, reason: str, error: SplatbotError | None = None) -> None:
         self.outcome, self.reason, self.error = outcome, reason, error
@@ -30,22 +30,22 @@ class _EndedError(Exception):
 class Picker:
     """Picks objects of one state of the map.
 
-    The way to the grasp, the straight approach, and the straight lift with the object as spheres of the hand are all
-    certified before the arm moves. Whatever fails ends the pick: the arm is told to stop; fingers that hold something
-    keep it, and those that closed on nothing open again.
+    All segments are certified before the arm moves: the path to the pre-grasp, the straight approach and the straight
+    lift. On the lift the object is part of the arm as attached spheres. Any failure ends the pick and stops the arm.
+    Fingers that hold an object keep it; fingers that closed without an object open again.
 
     Args:
-        sampler: of grasps; it has the map, the robot and where it stands.
-        controller: of the arm.
-        gripper: its fingers.
-        options: how.
-        stop: asked all the time; True ends the pick.
-        on_step: told of each stage that is done.
-        make_ways: gives, for a target, who finds the ways to its grasps; by default
-            :class:`splatbot.grasping.pick_planner.MapPickPlanner`.
+        sampler: grasp sampler with the map, the robot and its base pose.
+        controller: controller of the arm.
+        gripper: the gripper.
+        options: options of the pick.
+        stop: polled in every control period; the pick ends if it returns True.
+        on_step: called after each completed stage.
+        make_planner: returns the planner of a target. If None, a
+            :class:`splatbot.grasping.pick_planner.MapPickPlanner` is used.
 
     Raises:
-        InputError: the gripper opens less than the robot's hand.
+        InputError: the stroke of the gripper is smaller than that of the robot's hand model.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Picker:
         options: PickOptions | None = None,
         stop: Callable[[], bool] | None = None,
         on_step: Callable[[PickStep], None] | None = None,
-        make_ways: Callable[[Target], PickPlanner] | None = None,
+        make_planner: Callable[[Target], PickPlanner] | None = None,
     ) -> None:
         if gripper.stroke < sampler.hand.stroke - 1e-6:
             text = f"opens {gripper.stroke:g} m, the hand of the robot {sampler.hand.stroke:g} m."
@@ -65,10 +65,14 @@ class Picker:
         self.sampler, self.controller, self.gripper = sampler, controller, gripper
         self.options = options or PickOptions()
         self._stop, self._on_step = stop, on_step
-        self.make_ways = make_ways or (lambda target: MapPickPlanner(sampler, target, self.options))
+        self.make_planner = make_planner or (lambda target: MapPickPlanner(sampler, target, self.options))
 
     def pick(self, target: Target, *, grasps: GraspResult | None = None) -> PickResult:
-        """Take a target and lift it; ``grasps``: those that are known already.
+        """Grasp a target and lift it.
+
+        Args:
+            target: the target.
+            grasps: grasps that were sampled before. If None, they are sampled.
 
         Raises:
             InputError: the target has no Gaussians.
@@ -77,7 +81,7 @@ class Picker:
 
 
 class _Pick:
-    """One pick: its stages, and what is known so far."""
+    """State and stages of one pick."""
 
     def __init__(self, picker: Picker, target: Target) -> None:
         self.p, self.o, self.target = picker, picker.options, target
@@ -88,7 +92,7 @@ class _Pick:
         self.opening: float | None = None
         self.attached: Array | None = None
         self.q: Array | None = None
-        self.planned: float | None = None
+        self.planning_seconds: float | None = None
         self.notes: list[str] = []
         self._began = time.perf_counter()
 
@@ -96,11 +100,11 @@ class _Pick:
         try:
             found = grasps or self.s.sample(self.target, self.o.grasp)
             if not found.grasps:
-                raise _EndedError(PickOutcome.NO_GRASP, _why_none(found))
+                raise _EndedError(PickOutcome.NO_GRASP, NoGraspError(found).message)
             self._done(f"{len(found.grasps)} grasps of {found.candidates} hands")
-            way = self._way(found)
-            self.grasp, self.planned = way.grasp, way.planned
-            self._execute(way)
+            plan = self._plan(found)
+            self.grasp, self.planning_seconds = plan.grasp, plan.planning_seconds
+            self._execute(plan)
         except _EndedError as end:
             return self._ended(end)
         except GripperError as error:
@@ -111,104 +115,106 @@ class _Pick:
             return self._ended(_EndedError(PickOutcome.NOT_FOLLOWED, error.message, error))
         return self._result(PickOutcome.PICKED, "")
 
-    def _way(self, found: GraspResult) -> PickPlan:
-        """Of the best grasp that has one."""
+    def _plan(self, found: GraspResult) -> PickPlan:
+        """Plan to the grasps in order of their score, and return the first plan that is found."""
         self.stage = PickStage.PLAN
-        self.ways = self.p.make_ways(self.target)
+        self.planner = self.p.make_planner(self.target)
         start = self.controller.step().position
-        tried = list(enumerate(found.grasps[: self.o.tries], start=1))
-        asked = [(k, grasp, grasp.clear and self.s.moving is not None) for k, grasp in tried]
-        asked += [(k, grasp, False) for k, grasp, cautious in asked if cautious]
-        why: list[str] = []
-        for k, grasp, cautious in asked:
-            way = self.ways.to(grasp, start, cautious=cautious)
-            if isinstance(way, PickPlan):
-                self._noted(way)
-                self._done(f"grasp {k}, {grasp.approach}; {1e3 * way.room:.1f} mm of room all the way")
-                return way
-            why.append(f"grasp {k}: {way}")
-        raise _EndedError(PickOutcome.NO_WAY, "; ".join(why))
+        candidates = list(enumerate(found.grasps[: self.o.tries], start=1))
+        attempts = [(k, grasp, grasp.avoids_moving and self.s.moving is not None) for k, grasp in candidates]
+        attempts += [(k, grasp, False) for k, grasp, avoid_moving in attempts if avoid_moving]
+        reasons: list[str] = []
+        for k, grasp, avoid_moving in attempts:
+            plan = self.planner.plan_to(grasp, start, avoid_moving=avoid_moving)
+            if isinstance(plan, PickPlan):
+                self._note_moving(plan)
+                self._done(f"grasp {k}, {grasp.approach}; {1e3 * plan.clearance:.1f} mm minimum clearance")
+                return plan
+            reasons.append(f"grasp {k}: {plan}")
+        raise _EndedError(PickOutcome.NO_PLAN, "; ".join(reasons))
 
-    def _noted(self, way: PickPlan | Segment) -> None:
-        """Keep in mind that a way is not clear of where something moved."""
-        if not way.clear:
-            self.notes.append(f"{self.stage}: {_NOT_CLEAR}")
+    def _note_moving(self, plan: PickPlan | Segment) -> None:
+        """Append a note if a plan crosses regions where motion was observed."""
+        if not plan.avoids_moving:
+            self.notes.append(f"{self.stage}: {_MOVING_NOTE}")
 
-    def _execute(self, way: PickPlan) -> None:
+    def _execute(self, plan: PickPlan) -> None:
         self.stage = PickStage.OPEN
-        self.gripper.move(way.opening)
+        self.gripper.move(plan.opening)
         self._settle()
         self._done(f"{1e3 * self.gripper.opening():.0f} mm")
-        self._follow(PickStage.MOVE, way.there, 1.0)
-        self._follow(PickStage.APPROACH, way.approach, self.o.slow)
-        self._close(way)
-        self._follow(PickStage.LIFT, way.free, self.o.slow)
-        self._follow(PickStage.LIFT, way.lift, self.o.slow)
+        self._follow(PickStage.MOVE, plan.to_pregrasp, 1.0)
+        self._follow(PickStage.APPROACH, plan.approach, self.o.slow)
+        self._close(plan)
+        self._follow(PickStage.LIFT, plan.lift_off, self.o.slow)
+        self._follow(PickStage.LIFT, plan.lift, self.o.slow)
         self._check()
         if self.o.carry_to is not None:
-            self._carry(way)
+            self._carry(plan)
 
-    def _close(self, way: PickPlan) -> None:
+    def _close(self, plan: PickPlan) -> None:
         self.stage = PickStage.CLOSE
         self.gripper.move(0.0, force=self.o.force)
         self._settle()
         self.opening = self.gripper.opening()
         if not self.gripper.holds():
-            self.gripper.move(way.opening)
-            raise _EndedError(PickOutcome.NOTHING_HELD, "the fingers closed on nothing, and were opened again")
-        self.attached = way.attached
-        self._done(f"{1e3 * self.opening:.1f} mm between the fingers, {1e3 * way.grasp.width:.1f} mm expected")
+            self.gripper.move(plan.opening)
+            raise _EndedError(PickOutcome.NOTHING_HELD, "the fingers closed without an object and opened again")
+        self.attached = plan.attached
+        self._done(f"{1e3 * self.opening:.1f} mm between the fingers, {1e3 * plan.grasp.width:.1f} mm expected")
 
     def _check(self) -> None:
         self.stage = PickStage.CHECK
         if not self.gripper.holds():
             self.attached = None
-            raise _EndedError(PickOutcome.LOST, "nothing is between the fingers any more")
+            raise _EndedError(PickOutcome.LOST, "the object is no longer between the fingers")
         self._done(f"{1e3 * self.gripper.opening():.1f} mm between the fingers")
 
-    def _carry(self, way: PickPlan) -> None:
-        """To where it was asked for, around everything with what is held."""
+    def _carry(self, plan: PickPlan) -> None:
+        """Carry the object to ``PickOptions.carry_to`` on a path that is planned with the attached object."""
         self.stage = PickStage.CARRY
         assert self.o.carry_to is not None
         assert self.q is not None
-        leg = self.ways.onwards(way, self.q, JointGoal(self.o.carry_to))
-        if not isinstance(leg, Segment):
-            raise _EndedError(PickOutcome.NO_WAY, leg)
-        self._noted(leg)
-        self._follow(PickStage.CARRY, leg, self.o.slow)
+        segment = self.planner.plan_carry(plan, self.q, JointGoal(self.o.carry_to))
+        if not isinstance(segment, Segment):
+            raise _EndedError(PickOutcome.NO_PLAN, segment)
+        self._note_moving(segment)
+        self._follow(PickStage.CARRY, segment, self.o.slow)
         if not self.gripper.holds():
             self.attached = None
-            raise _EndedError(PickOutcome.LOST, "nothing is between the fingers any more")
+            raise _EndedError(PickOutcome.LOST, "the object is no longer between the fingers")
 
-    def _follow(self, stage: PickStage, leg: Segment, share: float) -> None:
+    def _follow(self, stage: PickStage, segment: Segment, factor: float) -> None:
         self.stage = stage
-        speed = self.o.speed * share
-        trajectory = time_path(leg.path, leg.arm, leg.around, velocity_scale=speed, acceleration_scale=speed)
+        scale = self.o.speed * factor
+        trajectory = time_path(
+            segment.path, segment.arm, segment.around, velocity_scale=scale, acceleration_scale=scale
+        )
         if not trajectory.certificate.certified:
-            raise _EndedError(PickOutcome.NO_WAY, "the timed way is not free")
-        done = follow(self.controller, trajectory, stop=self._asked)
+            raise _EndedError(PickOutcome.NO_PLAN, "the timed trajectory is not certified as free")
+        done = follow(self.controller, trajectory, stop=self._stop_requested)
         self.q = trajectory.end
-        if done.state is MotionState.STOPPED and self._asked(None):
-            raise _EndedError(PickOutcome.STOPPED, "it was told to stop")
+        if done.state is MotionState.STOPPED and self._stop_requested(None):
+            raise _EndedError(PickOutcome.STOPPED, "a stop was requested")
         if not done:
             raise _EndedError(PickOutcome.NOT_FOLLOWED, done.fault or f"the arm ended {done.state}")
-        self._done(f"{trajectory.duration:.2f} s of motion, {1e3 * done.error.max():.1f} mrad off at most")
+        self._done(f"{trajectory.duration:.2f} s of motion, tracking error at most {1e3 * done.error.max():.1f} mrad")
 
     def _settle(self) -> None:
-        """Let time pass until the fingers rest: by the controller's clock, and by the wall's where that is behind."""
-        until, periods = time.monotonic() + _SETTLE, int(_SETTLE / self.controller.period)
+        """Wait until the fingers rest; the timeout must expire on both the controller's clock and the wall clock."""
+        until, periods = time.monotonic() + _SETTLE_S, int(_SETTLE_S / self.controller.period)
         while self.gripper.moving():
-            if self._asked(None):
+            if self._stop_requested(None):
                 self.gripper.stop()
-                raise _EndedError(PickOutcome.STOPPED, "it was told to stop")
+                raise _EndedError(PickOutcome.STOPPED, "a stop was requested")
             if self.controller.step().state is MotionState.FAULT:
-                raise _EndedError(PickOutcome.NOT_FOLLOWED, "the controller is at fault")
+                raise _EndedError(PickOutcome.NOT_FOLLOWED, "the controller reports a fault")
             periods -= 1
             if periods < 0 and time.monotonic() > until:
                 self.gripper.stop()
-                raise _EndedError(PickOutcome.GRIPPER_FAILED, f"the fingers still move after {_SETTLE:g} s")
+                raise _EndedError(PickOutcome.GRIPPER_FAILED, f"the fingers still move after {_SETTLE_S:g} s")
 
-    def _asked(self, feedback: Feedback | None) -> bool:
+    def _stop_requested(self, feedback: Feedback | None) -> bool:
         return self.p._stop is not None and self.p._stop()
 
     def _done(self, note: str) -> None:
@@ -219,7 +225,7 @@ class _Pick:
             self.p._on_step(self.steps[-1])
 
     def _ended(self, end: _EndedError) -> PickResult:
-        """The arm at rest; fingers as they are."""
+        """Stop the arm, leave the fingers as they are, and return the result."""
         self.controller.stop()
         self.controller.step()
         self._done(end.reason)
@@ -228,9 +234,5 @@ class _Pick:
     def _result(self, outcome: PickOutcome, reason: str, error: SplatbotError | None = None) -> PickResult:
         return PickResult(
             outcome, self.stage, reason, self.grasp, tuple(self.steps), self.opening, self.attached, self.q, error,
-            self.planned, tuple(self.notes),
+            self.planning_seconds, tuple(self.notes),
         )  # fmt: skip
-
-
-def _why_none(found: GraspResult) -> str:
-    return NoGraspError(found).message

@@ -1,4 +1,4 @@
-"""The whole way of a pick, to a grasp and up again with the object, certified before anything moves."""
+"""Plans of a pick: transit to the pre-grasp, approach, lift-off and lift, all certified before the arm moves."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.hands import OPENINGS
-from splatbot.grasping.held import covering_spheres
+from splatbot.grasping.attached import covering_spheres
+from splatbot.grasping.hands import OPENING_STEP_M
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.sampler import GraspSampler
@@ -23,92 +23,105 @@ from splatbot.planning import GaussianRRTStar, JointGoal, Path
 from splatbot.planning.cartesian import StraightResult, straight_line
 from splatbot.protocols import Array
 
-_N_SIGMA = 1.0  # of a held object's Gaussians
-_SIDES = 5  # on which the object must be around a stray within it; the sixth may be open, as a cup's
+_N_SIGMA = 1.0  # standard deviations to which the Gaussians of an attached object are inflated
+# Number of the six axis directions in which the object must surround a stray Gaussian inside of it. The sixth direction
+# may be open, as in a cup.
+_ENCLOSED_SIDES = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A part of the way.
+    """A certified segment of a pick plan.
 
     Args:
-        path: of the arm.
-        arm: its spheres, with what it holds.
-        around: that it is free of, as far as corners may be rounded; None: that was looked at otherwise.
-        clear: whether it keeps clear of where something moved; True also where nothing did.
+        path: joint path.
+        arm: spheres of the arm and of an attached object.
+        around: field against which rounded corners of the path are certified. If None, the planner checks collisions
+            by other means and the corners are not certified.
+        avoids_moving: whether the path avoids the regions where motion was observed; True without such regions.
     """
 
     path: Path
     arm: RobotSpheres
     around: GaussianCollisionField | None
-    clear: bool = True
+    avoids_moving: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class PickPlan:
-    """To one grasp and up again.
+    """Plan of a pick: all segments from the start to the lifted object.
 
     Args:
-        grasp: that it leads to.
-        opening: of the fingers on the way there [m].
-        attached: (A, 4) spheres of the object in the last link's frame, as planning takes it along.
-        there: to the pre-grasp.
-        approach: straight to the grasp.
-        free: straight up, the first stretch of the lift.
-        lift: the rest of it, with the object.
-        planned: seconds that the search for ``there`` took.
+        grasp: the grasp to execute.
+        opening: finger opening until the grasp [m].
+        attached: (A, 4) spheres (x, y, z, radius) [m] of the attached object in the frame of the last link.
+        to_pregrasp: path from the start to the pre-grasp.
+        approach: straight line from the pre-grasp to the grasp.
+        lift_off: straight line up, first part of the lift; the object still touches its support.
+        lift: straight line up, remaining part of the lift with the attached object.
+        planning_seconds: duration of planning ``to_pregrasp`` [s].
     """
 
     grasp: Grasp
     opening: float
     attached: Array
-    there: Segment
+    to_pregrasp: Segment
     approach: Segment
-    free: Segment
+    lift_off: Segment
     lift: Segment
-    planned: float
+    planning_seconds: float
 
     @property
-    def room(self) -> float:
-        """All the way [m]."""
-        return min(leg.path.certificate.clearance for leg in (self.there, self.approach, self.lift))
+    def clearance(self) -> float:
+        """Minimum certified clearance of the plan [m], without the lift-off."""
+        return min(segment.path.certificate.clearance for segment in (self.to_pregrasp, self.approach, self.lift))
 
     @property
-    def clear(self) -> bool:
-        """All of it, of where something moved."""
-        return all(leg.clear for leg in (self.there, self.approach, self.free, self.lift))
+    def avoids_moving(self) -> bool:
+        """Return whether all segments avoid the regions where motion was observed."""
+        return all(s.avoids_moving for s in (self.to_pregrasp, self.approach, self.lift_off, self.lift))
 
 
 class PickPlanner(Protocol):
-    """Finds ways to grasps of one target; words instead of a way say what is in it."""
+    """Plans picks of one target; a method returns the reason as text if it finds no plan."""
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
-        """From where the arm is (J,) to the grasp and up again; ``cautious``: clear of where something moved, too."""
+    def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
+        """Plan from ``start`` (J,) to the grasp and the lift.
+
+        If ``avoid_moving`` is set, the plan also avoids the regions where motion was observed.
+        """
         ...
 
-    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
-        """From where the way ended, with the object, to another place."""
+    def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
+        """Plan from the end of ``plan`` to a goal with the attached object."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class _Obstacles:
-    """What a way keeps clear of: the whole map, the map around the target, and that less the target's own strays."""
+    """Collision fields of a plan.
+
+    Args:
+        whole: the whole map.
+        around: the map without the target.
+        around_held: ``around`` without stray Gaussians inside of the target, which move with it.
+    """
 
     whole: GaussianCollisionField
     around: GaussianCollisionField
-    beside: GaussianCollisionField
+    around_held: GaussianCollisionField
 
 
 class MapPickPlanner:
-    """Among the Gaussians of the sampler's map, every stretch certified.
+    """Plans picks against the Gaussians of the sampler's map; every segment is certified.
 
-    Where something moved while the map was made is one more obstacle of cautious ways; their certificates are of both.
+    Regions where motion was observed during mapping are additional obstacles of plans with ``avoid_moving``. The
+    certificates of such plans cover both.
 
     Args:
-        sampler: of the grasps; it has the map, the robot and where it stands.
-        target: that is to be picked.
-        options: how.
+        sampler: grasp sampler with the map, the robot and its base pose.
+        target: the target to pick.
+        options: options of the pick.
     """
 
     def __init__(self, sampler: GraspSampler, target: Target, options: PickOptions) -> None:
@@ -116,26 +129,26 @@ class MapPickPlanner:
         self._T = sampler.scene.T_world_base
         self._object = target_spheres(sampler, target)
         around = around_target(sampler.scene, target.rows)
-        # What is within the target are its own strays, which segmentation has left out.
+        # Gaussians inside of the target are its own strays, which segmentation did not assign to it.
         inside = within(around.means.detach().double().numpy(), self._object)
-        beside = around.select(torch.from_numpy(~inside))
+        around_held = around.select(torch.from_numpy(~inside))
         field = sampler.collision_field
-        self._static = _Obstacles(sampler.field, field(around), field(beside))
-        self._cautious: _Obstacles | None = None
+        self._static = _Obstacles(sampler.field, field(around), field(around_held))
+        self._avoiding_moving: _Obstacles | None = None
         if sampler.moving is not None:
-            models = (sampler.scene.model, around, beside)
-            self._cautious = _Obstacles(*(field(model, cautious=True) for model in models))
+            models = (sampler.scene.model, around, around_held)
+            self._avoiding_moving = _Obstacles(*(field(model, avoid_moving=True) for model in models))
 
-    def to(self, grasp: Grasp, start: Array, *, cautious: bool = False) -> PickPlan | str:
-        """See :class:`PickPlanner`."""
+    def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
+        """Plan a pick; see :class:`PickPlanner`."""
         if grasp.q_pregrasp is None:
             return "no posture is known"
-        obstacles, clear = self._obstacles(cautious)
-        opening = min(float(np.ceil(grasp.opening / OPENINGS - 1e-6)) * OPENINGS, self.s.hand.stroke)
+        obstacles, avoids_moving = self._obstacles(avoid_moving)
+        opening = min(float(np.ceil(grasp.opening / OPENING_STEP_M - 1e-6)) * OPENING_STEP_M, self.s.hand.stroke)
         planner = self._planner(obstacles.whole, opening)
         begin = time.perf_counter()
         plan = planner.plan(start, JointGoal(grasp.q_pregrasp), budget_ms=self.o.budget_ms, seed=self.o.seed)
-        planned = time.perf_counter() - begin
+        planning_seconds = time.perf_counter() - begin
         if plan.path is None:
             return plan.reason.rstrip(".")
         approach = straight_line(planner.arm, obstacles.around, grasp.q_pregrasp, grasp.T_world_tcp)
@@ -145,38 +158,38 @@ class MapPickPlanner:
         closed = self._arm(grasp.width)
         attached = in_hand(closed, q, self._object)
         loaded = self._arm(grasp.width, attached)
-        free = self._up(closed, obstacles.beside, q, self.o.free)
-        if not free or free.path is None:
-            return f"it cannot be lifted: {free.reason.rstrip('.')}"
-        lift = self._up(loaded, obstacles.beside, free.path.waypoints[-1], self.o.lift - self.o.free)
+        lift_off = self._up(closed, obstacles.around_held, q, self.o.lift_off)
+        if not lift_off or lift_off.path is None:
+            return f"it cannot be lifted: {lift_off.reason.rstrip('.')}"
+        lift = self._up(loaded, obstacles.around_held, lift_off.path.waypoints[-1], self.o.lift - self.o.lift_off)
         if not lift or lift.path is None:
             return f"it cannot be lifted: {lift.reason.rstrip('.')}"
         return PickPlan(
             grasp,
             opening,
             attached,
-            Segment(plan.path, planner.arm, obstacles.whole, clear),
-            Segment(approach.path, planner.arm, obstacles.around, clear),
-            Segment(free.path, closed, obstacles.beside, clear),
-            Segment(lift.path, loaded, obstacles.beside, clear),
-            planned,
+            Segment(plan.path, planner.arm, obstacles.whole, avoids_moving),
+            Segment(approach.path, planner.arm, obstacles.around, avoids_moving),
+            Segment(lift_off.path, closed, obstacles.around_held, avoids_moving),
+            Segment(lift.path, loaded, obstacles.around_held, avoids_moving),
+            planning_seconds,
         )
 
-    def onwards(self, way: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
-        """Around everything, with what is held; where it can be, clear of where something moved, too."""
-        for cautious in (True, False) if self._cautious is not None and way.clear else (False,):
-            obstacles, clear = self._obstacles(cautious)
-            planner = self._planner(obstacles.beside, way.grasp.width, way.attached)
-            plan = planner.plan(start, goal, budget_ms=self.o.budget_ms, seed=self.o.seed)
-            if plan.path is not None:
-                return Segment(plan.path, planner.arm, obstacles.beside, clear)
-        return plan.reason
+    def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
+        """Plan a path with the attached object, if possible around the regions where motion was observed."""
+        for avoid_moving in (True, False) if self._avoiding_moving is not None and plan.avoids_moving else (False,):
+            obstacles, avoids_moving = self._obstacles(avoid_moving)
+            planner = self._planner(obstacles.around_held, plan.grasp.width, plan.attached)
+            result = planner.plan(start, goal, budget_ms=self.o.budget_ms, seed=self.o.seed)
+            if result.path is not None:
+                return Segment(result.path, planner.arm, obstacles.around_held, avoids_moving)
+        return result.reason
 
-    def _obstacles(self, cautious: bool) -> tuple[_Obstacles, bool]:
-        """Of a way, and whether all that moved is among them."""
-        if cautious and self._cautious is not None:
-            return self._cautious, True
-        return self._static, self._cautious is None
+    def _obstacles(self, avoid_moving: bool) -> tuple[_Obstacles, bool]:
+        """Return the obstacles of a plan, and whether they include all regions where motion was observed."""
+        if avoid_moving and self._avoiding_moving is not None:
+            return self._avoiding_moving, True
+        return self._static, self._avoiding_moving is None
 
     def _planner(
         self, field: GaussianCollisionField, opening: float, attached: ArrayLike | None = None
@@ -190,40 +203,49 @@ class MapPickPlanner:
             self.s.robot, T_world_base=self._T, opening=opening, attached=attached, margin=self.s.margin
         )
 
-    def _up(self, arm: RobotSpheres, beside: GaussianCollisionField, q: Array, by: float) -> StraightResult:
-        return straight_line(arm, beside, q, raised(self.s, arm, q, by))
+    def _up(self, arm: RobotSpheres, field: GaussianCollisionField, q: Array, height: float) -> StraightResult:
+        return straight_line(arm, field, q, raised(self.s, arm, q, height))
 
 
 def target_spheres(sampler: GraspSampler, target: Target) -> Array:
-    """A target as spheres (A, 4) [m, world] that cover its surface, what was not seen of it included."""
+    """Cover the surface of a target, completed on its unobserved sides, by spheres (A, 4) (x, y, z, radius) [m, world].
+
+    Each surface point is inflated by its sampling radius where it was completed, and by its standard deviation along
+    the normal.
+    """
     surface = sampler.surface(target)
-    return covering_spheres(surface.points, np.where(surface.seen, 0.0, surface.spread) + _N_SIGMA * surface.doubt)
+    return covering_spheres(
+        surface.points, np.where(surface.observed, 0.0, surface.spread) + _N_SIGMA * surface.normal_std
+    )
 
 
 def within(points: Array, spheres: Array) -> NDArray[np.bool_]:
-    """Which points (P, 3) are in spheres (A, 4), or have some of them on five of six sides: an object's own strays."""
+    """Return which points (P, 3) are strays inside of an object that spheres (A, 4) cover.
+
+    A point is inside if a sphere contains it, or if spheres lie in at least five of the six axis directions from it.
+    """
     low, high = (spheres[:, :3] - spheres[:, 3:]).min(axis=0), (spheres[:, :3] + spheres[:, 3:]).max(axis=0)
     found = np.zeros(len(points), np.bool_)
     rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     between = spheres[None, :, :3] - points[rows, None]
     sides = np.zeros(len(rows), np.int64)
     for k in range(3):
-        beside = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
-        sides += (beside & (between[..., k] > 0)).any(axis=1)
-        sides += (beside & (between[..., k] < 0)).any(axis=1)
-    found[rows] = (sides >= _SIDES) | (np.linalg.norm(between, axis=2) <= spheres[:, 3]).any(axis=1)
+        aligned = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
+        sides += (aligned & (between[..., k] > 0)).any(axis=1)
+        sides += (aligned & (between[..., k] < 0)).any(axis=1)
+    found[rows] = (sides >= _ENCLOSED_SIDES) | (np.linalg.norm(between, axis=2) <= spheres[:, 3]).any(axis=1)
     return found
 
 
 def in_hand(arm: RobotSpheres, q: Array, spheres: Array) -> Array:
-    """Spheres (A, 4) of the world in the frame of the last link, the arm being at ``q`` (J,)."""
+    """Transform spheres (A, 4) from the world to the frame of the last link at joint positions ``q`` (J,)."""
     T_link_world = inverse(arm.forward(q[None])[0, -1])
     return np.c_[transform_points(T_link_world, spheres[:, :3]), spheres[:, 3]]
 
 
-def raised(sampler: GraspSampler, arm: RobotSpheres, q: Array, by: float) -> Array:
-    """The tool's pose (4, 4) at ``q`` (J,), higher by so much [m]."""
+def raised(sampler: GraspSampler, arm: RobotSpheres, q: Array, height: float) -> Array:
+    """Return the tool pose T_world_tcp (4, 4) at ``q`` (J,), raised by ``height`` [m] along the up axis."""
     tool = np.asarray(sampler.robot.T_link_tcp, dtype=np.float64)  # type: ignore[attr-defined]
     T = np.asarray(arm.forward(q[None])[0, -1] @ tool)
-    T[:3, 3] += by * sampler.scene.up
+    T[:3, 3] += height * sampler.scene.up
     return T

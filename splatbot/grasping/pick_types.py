@@ -1,4 +1,4 @@
-"""What a pick is told, and what came of it."""
+"""Options, stages and results of a pick."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatbot.protocols import Array
 
 
 class PickStage(StrEnum):
-    """In the order in which they come."""
+    """Stages of a pick, in their order."""
 
     GRASP = "grasp"
     PLAN = "plan"
@@ -26,47 +26,48 @@ class PickStage(StrEnum):
 
 
 class PickOutcome(StrEnum):
-    """How a pick ended."""
+    """Outcome of a pick."""
 
     PICKED = "picked"
     NO_GRASP = "no grasp"
-    NO_WAY = "no way"  # every grasp's way is blocked
-    NOT_FOLLOWED = "not followed"  # the arm faulted or did not arrive
+    NO_PLAN = "no way"  # no grasp has a certified plan; the value is part of the HTTP interface
+    NOT_FOLLOWED = "not followed"  # the controller faulted or did not reach the end of the trajectory
     GRIPPER_FAILED = "gripper failed"
     NOTHING_HELD = "nothing held"
-    LOST = "lost"  # it was held, and is no more
+    LOST = "lost"  # the fingers held the object and lost it
     STOPPED = "stopped"
 
 
 _CODES = {
     PickOutcome.NO_GRASP: -31,  # NO_IK_SOLUTION
-    PickOutcome.NO_WAY: -1,  # PLANNING_FAILED
+    PickOutcome.NO_PLAN: -1,  # PLANNING_FAILED
     PickOutcome.STOPPED: -7,  # PREEMPTED
 }
 
 
 @dataclass(frozen=True)
 class PickOptions:
-    """How to pick.
+    """Options of a pick.
 
     Args:
-        lift: how far up [m].
-        free: the first part of it [m], on which the object leaves what it stands on: certified for the arm, not for it.
-        force: of the fingers [N]; None: the gripper's own.
-        speed: share of the arm's limits; of the straight stretches, ``slow`` of that.
-        slow: see there.
-        tries: grasps whose way is looked for.
-        budget_ms: for the way to each.
-        grasp: how grasps are looked for.
-        carry_to: (J,) where to take the object; None: it stays lifted.
-        seed: of the planner.
+        lift: height of the lift [m].
+        lift_off: first part of the lift [m], on which the object separates from its support. Only the arm is certified
+            on it, since the object is still in contact.
+        force: grip force [N]. If None, the gripper uses its default.
+        speed: fraction of the arm's velocity and acceleration limits.
+        slow: additional factor on ``speed`` for approach, lift and carry.
+        tries: maximum number of grasps for which a plan is searched.
+        budget_ms: planning budget for the path to each pre-grasp [ms].
+        grasp: options of grasp sampling.
+        carry_to: (J,) joint positions to which the object is carried. If None, the object stays lifted.
+        seed: seed of the motion planner.
 
     Raises:
         InputError: a value is out of range.
     """
 
     lift: float = 0.15
-    free: float = 0.03
+    lift_off: float = 0.03
     force: float | None = None
     speed: float = 0.5
     slow: float = 0.3
@@ -77,20 +78,20 @@ class PickOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        good = 0.0 < self.free < self.lift <= 1.0 and 0.0 < self.speed <= 1.0 and 0.0 < self.slow <= 1.0
+        good = 0.0 < self.lift_off < self.lift <= 1.0 and 0.0 < self.speed <= 1.0 and 0.0 < self.slow <= 1.0
         if not good or self.tries < 1 or not self.budget_ms > 0.0 or (self.force is not None and not self.force > 0.0):
-            hint = "give metres with 0 < free < lift <= 1, shares in 0..1, a number of tries, and newtons above 0"
+            hint = "give metres with 0 < lift_off < lift <= 1, fractions in 0..1, tries >= 1, and newtons above 0"
             raise InputError("is out of range.", field="options", hint=hint)
 
 
 @dataclass(frozen=True)
 class PickStep:
-    """A stage that was done, or that the pick ended in.
+    """A completed stage, or the stage in which the pick ended.
 
     Args:
-        stage: which.
-        seconds: that it took.
-        note: what came of it.
+        stage: the stage.
+        seconds: its duration [s].
+        note: its result in one line.
     """
 
     stage: PickStage
@@ -100,20 +101,21 @@ class PickStep:
 
 @dataclass(frozen=True, eq=False)
 class PickResult:
-    """What came of a pick. True if the object is held.
+    """Result of a pick; its truth value is True if the object is held.
 
     Args:
-        outcome: how it ended.
-        stage: in which stage.
-        reason: in one sentence; empty if it is held.
-        grasp: that was taken; None: there was none.
+        outcome: the outcome.
+        stage: the stage in which the pick ended.
+        reason: reason of a failure, one sentence; empty if the object is held.
+        grasp: the executed grasp. If None, no grasp was selected.
         steps: the stages, in order.
-        opening: of the fingers on the object [m]; None: they did not get there.
-        attached: (A, 4) spheres of the object in the last link's frame, as planning takes it along; None likewise.
-        q: (J,) where the arm was told to be last; None: it did not move.
-        error: of a part that failed.
-        planned: seconds that the search for the way to the pre-grasp took; None: there is no way.
-        notes: what else is to be known of the way that was taken, each in a sentence.
+        opening: finger opening on the object [m]. If None, the fingers were not closed.
+        attached: (A, 4) spheres (x, y, z, radius) [m] of the attached object in the frame of the last link. If None, no
+            object is held.
+        q: (J,) last commanded joint positions. If None, the arm did not move.
+        error: error of the component that failed.
+        planning_seconds: duration of planning the path to the pre-grasp [s]. If None, no plan was found.
+        notes: remarks on the executed plan, each a sentence.
     """
 
     outcome: PickOutcome
@@ -125,17 +127,17 @@ class PickResult:
     attached: Array | None = None
     q: Array | None = None
     error: SplatbotError | None = None
-    planned: float | None = None
+    planning_seconds: float | None = None
     notes: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return self.outcome is PickOutcome.PICKED
 
     def unwrap(self) -> Grasp:
-        """The grasp that holds the object.
+        """Return the grasp that holds the object.
 
         Raises:
-            PickError: it is not held.
+            PickError: the object is not held.
         """
         if self.outcome is not PickOutcome.PICKED or self.grasp is None:
             raise PickError(self)
@@ -143,7 +145,7 @@ class PickResult:
 
 
 class PickError(SplatbotError):
-    """A pick that did not succeed; ``result`` has the outcome and the stage."""
+    """Error of a failed pick; ``result`` holds the outcome and the stage."""
 
     http_status = 409
 
@@ -156,8 +158,8 @@ class PickError(SplatbotError):
 _HINTS = {
     PickOutcome.PICKED: None,
     PickOutcome.NO_GRASP: "see the target from more sides, or take another",
-    PickOutcome.NO_WAY: "clear what is around, give more tries or a larger budget_ms",
-    PickOutcome.NOT_FOLLOWED: "reset the controller; look at what holds the arm up",
+    PickOutcome.NO_PLAN: "clear the surroundings, give more tries or a larger budget_ms",
+    PickOutcome.NOT_FOLLOWED: "reset the controller and remove the obstacle",
     PickOutcome.GRIPPER_FAILED: "check the gripper and activate it",
     PickOutcome.NOTHING_HELD: "map the target again: it may have moved",
     PickOutcome.LOST: "press harder, lift slower, or grasp nearer to its middle",

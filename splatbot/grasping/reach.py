@@ -1,4 +1,4 @@
-"""Whether an arm gets there: postures at a grasp, and the straight way to it."""
+"""Reachability of grasps: inverse kinematics at the grasp and a certified straight approach."""
 
 from __future__ import annotations
 
@@ -11,56 +11,56 @@ import numpy as np
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
-from splatbot.grasping.hands import OPENINGS
+from splatbot.grasping.hands import OPENING_STEP_M
 from splatbot.planning.cartesian import straight_line
 from splatbot.planning.goals import goal_configurations
 from splatbot.planning.problem import PlanStatus, PoseGoal
 from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
 
-_POSTURES = 4  # of a grasp whose approach is tried
-ROOM = 0.03  # [m] of the arm beyond which more is no better
+_MAX_SOLUTIONS = 4  # IK solutions of a grasp whose approach is tried
+ARM_FULL_SCORE_CLEARANCE_M = 0.03  # clearance of the arm with the score 1
 
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """How an arm reaches a grasp, or why not.
+    """Result of a reachability check.
 
     Args:
-        q: (J,) at the grasp; None: it does not.
-        path: (K, J) from the pre-grasp to the grasp.
-        room: of the arm along it [m].
-        limits: the least distance to a joint's limit, as a part of half its range, 0..1.
-        why: it does not, in words; empty: it does.
-        kind: of the reason, as results count them.
+        q: (J,) joint positions at the grasp. If None, the arm does not reach it.
+        path: (K, J) path from the pre-grasp to the grasp.
+        clearance: minimum clearance of the arm along the path [m].
+        limits: minimum distance to a joint limit as a fraction of half the joint's range, 0..1.
+        reason: reason for which the grasp is not reachable; empty if it is.
+        kind: category of the reason, under which results count it.
     """
 
     q: Array | None
     path: Array | None
-    room: float
+    clearance: float
     limits: float
-    why: str = ""
+    reason: str = ""
     kind: str = ""
 
 
 class ReachabilityCheck(Protocol):
-    """Who says whether a grasp can be reached."""
+    """Checks whether an arm reaches a grasp."""
 
     def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
-        """Postures at the grasp and a straight way to it.
+        """Find joint positions at the grasp and a straight approach to it.
 
         Args:
-            T_world_tcp: (4, 4) at the grasp.
-            T_world_pregrasp: (4, 4) where the straight way begins.
-            opening: of the fingers on it [m].
+            T_world_tcp: (4, 4) pose of the tool at the grasp.
+            T_world_pregrasp: (4, 4) pose of the tool at the start of the approach.
+            opening: finger opening during the approach [m].
         """
         ...
 
 
 def hand_of(robot: RobotKinematics) -> HandShape:
-    """The robot's fingers.
+    """Return the shape of the robot's hand.
 
     Raises:
-        InputError: it has none.
+        InputError: the robot has no fingers.
     """
     hand = robot.hand if isinstance(robot, HasHand) else None
     if hand is None:
@@ -69,15 +69,15 @@ def hand_of(robot: RobotKinematics) -> HandShape:
 
 
 class ArmReach:
-    """An arm among the Gaussians of a map: inverse kinematics, then a straight line that is certified.
+    """Checks reachability against the Gaussians of a map: inverse kinematics, then a certified straight line.
 
     Args:
-        robot: with a tool.
-        T_world_base: (4, 4) where it stands.
-        around: the map without the target, that the whole way is certified against.
-        whole: the map with it, that the arm must be free of at the start of the way.
-        margin: room to keep from the map [m].
-        seed: of the postures.
+        robot: arm with a tool.
+        T_world_base: (4, 4) pose of its base.
+        around: field of the map without the target; the whole approach is certified against it.
+        whole: field of the whole map, of which the arm must be free at the pre-grasp. If None, this is not checked.
+        margin: clearance to keep from the map [m].
+        seed: seed of inverse kinematics.
     """
 
     def __init__(
@@ -99,22 +99,22 @@ class ArmReach:
 
         @cache
         def arm(steps: int) -> RobotSpheres:
-            width = min(steps * OPENINGS, stroke)
+            width = min(steps * OPENING_STEP_M, stroke)
             return RobotSpheres(robot, T_world_base=T_world_base, opening=width, margin=margin)
 
         self._arm = arm
 
     def arm(self, opening: float) -> RobotSpheres:
-        """The arm with its fingers opened at least so far [m]."""
-        return self._arm(int(np.ceil(opening / OPENINGS - 1e-6)))
+        """Return the arm's spheres with the fingers opened to ``opening`` [m], rounded up to 2 mm."""
+        return self._arm(int(np.ceil(opening / OPENING_STEP_M - 1e-6)))
 
     def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
-        """See :class:`ReachabilityCheck`."""
+        """Check a grasp; see :class:`ReachabilityCheck`."""
         arm = self.arm(opening)
         goals = goal_configurations(
             arm,
             self.around,
-            PoseGoal(T_world_tcp, postures=_POSTURES),
+            PoseGoal(T_world_tcp, postures=_MAX_SOLUTIONS),
             near=self._near,
             seed=self.seed,
             until=time.perf_counter(),
@@ -122,19 +122,19 @@ class ArmReach:
         if not len(goals.q):
             kind = "no posture reaches" if goals.status is PlanStatus.NO_IK_SOLUTION else "the arm is in the way of"
             return Reached(None, None, 0.0, 0.0, goals.reason.rstrip("."), kind)
-        why, kind = "", ""
+        reason, kind = "", ""
         for q in goals.q:
             back = straight_line(arm, self.around, q, T_world_pregrasp)
             if not back or back.path is None:
-                why, kind = f"its approach is blocked: {back.reason.rstrip('.')}", "have a blocked approach"
+                reason, kind = f"its approach is blocked: {back.reason.rstrip('.')}", "have a blocked approach"
                 continue
             start = back.path.waypoints[-1]
             if self.whole is not None and arm.check(self.whole, start[None]).in_collision[0]:
-                why, kind = "the arm touches the target before it approaches", "have a blocked approach"
+                reason, kind = "the arm touches the target before it approaches", "have a blocked approach"
                 continue
-            room = float(back.path.certificate.clearance)
-            return Reached(q, back.path.waypoints[::-1].copy(), room, self._limits(q))
-        return Reached(None, None, 0.0, 0.0, why, kind)
+            clearance = float(back.path.certificate.clearance)
+            return Reached(q, back.path.waypoints[::-1].copy(), clearance, self._limits(q))
+        return Reached(None, None, 0.0, 0.0, reason, kind)
 
     def _limits(self, q: Array) -> float:
         chain = self.robot.chain

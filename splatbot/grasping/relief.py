@@ -1,4 +1,4 @@
-"""A face of a thing as a picture of its heights: where it ends, and how far within its rim a place of it is."""
+"""Height map of the surface that faces a direction, with its edges and the distance of points from its boundary."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-CELL = 0.002  # [m] of the picture
-DISC = 0.004  # [m] that a point covers of it at most
-STEP = 0.006  # [m] from where on a difference in height is an edge
-_OVERHANG = 0.5  # standard deviations that a Gaussian covers
-_GAP = 5  # cells between Gaussians that are no edge
+CELL = 0.002  # [m] size of a cell
+DISC = 0.004  # [m] maximum radius that a point covers
+STEP = 0.006  # [m] minimum height difference of an edge
+_COVERED_STD = 0.5  # standard deviations of a Gaussian that it covers
+_MAX_GAP_CELLS = 5  # gaps between Gaussians up to which the face is closed
 
 
 def frame_along(direction: Array) -> Array:
-    """(3, 3) rows: two unit vectors across the direction, and itself."""
+    """Return an orthonormal frame (3, 3) with rows (side, side, direction)."""
     side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     side /= np.linalg.norm(side)
     return np.stack([side, np.cross(direction, side), direction])
@@ -27,11 +27,11 @@ def frame_along(direction: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """Heights of what faces a direction.
+    """Height map of the points that face a direction.
 
     Args:
-        heights: (H, W) the greatest in each cell [m], -inf where there is none.
-        low: (2,) the low corner [m].
+        heights: (H, W) maximum height in each cell [m], -inf in empty cells.
+        low: (2,) coordinates of the lower corner [m].
     """
 
     heights: Array
@@ -39,8 +39,14 @@ class Relief:
 
     @staticmethod
     def of(flat: Array, spread: Array | None = None, *, like: Relief | None = None) -> Relief:
-        """Of points (P, 3), coordinates across and along; each covers a disc, of what is given by its standard
-        deviation (P,) [m]. ``like``: on the cells of another."""
+        """Rasterize points into a height map.
+
+        Args:
+            flat: (P, 3) two coordinates in the plane of the map and the height [m].
+            spread: (P,) standard deviation of each point [m]; each covers a disc of half of it, at most 4 mm. If None,
+                the disc has a radius of 4 mm.
+            like: height map whose grid is used. If None, the grid covers the points.
+        """
         if like is None:
             low = flat[:, :2].min(axis=0) - 3 * CELL - DISC
             shape = tuple(np.ceil((flat[:, :2].max(axis=0) + 3 * CELL + DISC - low) / CELL).astype(int) + 1)
@@ -50,7 +56,7 @@ class Relief:
         if not len(flat):
             return Relief(heights, low)
         at = np.floor((flat[:, :2] - low) / CELL).astype(int)
-        reach = np.full(len(flat), DISC) if spread is None else np.minimum(_OVERHANG * spread, DISC)
+        reach = np.full(len(flat), DISC) if spread is None else np.minimum(_COVERED_STD * spread, DISC)
         radius = int(DISC / CELL)
         for i in range(-radius, radius + 1):
             for j in range(-radius, radius + 1):
@@ -61,11 +67,14 @@ class Relief:
         return Relief(heights, low)
 
     def at(self, cells: NDArray[np.int64]) -> Array:
-        """Coordinates across (P, 2) [m] of the middle of cells (P, 2)."""
+        """Return the coordinates (P, 2) [m] of the centres of cells (P, 2)."""
         return np.asarray(self.low + (cells + 0.5) * CELL)
 
     def inwards(self, flat: Array) -> Array:
-        """How far places (P, 2+) [m] are within the rim, holes closed (P,) [m]; 0 beside the face."""
+        """Return the distance of points (P, 2+) [m] from the boundary of the face (P,) [m]; 0 outside of it.
+
+        Small holes are closed first.
+        """
         cell = np.floor((flat[:, :2] - self.low) / CELL).astype(int)
         on = np.asarray(((cell >= 0) & (cell < self.heights.shape)).all(axis=1))
         cell = np.where(on[:, None], cell, 0)
@@ -78,13 +87,22 @@ class Relief:
     @cached_property
     def _closed(self) -> NDArray[np.uint8]:
         known = np.isfinite(self.heights).astype(np.uint8)
-        return np.asarray(cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((_GAP, _GAP), np.uint8)), dtype=np.uint8)
+        return np.asarray(
+            cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((_MAX_GAP_CELLS, _MAX_GAP_CELLS), np.uint8)),
+            dtype=np.uint8,
+        )
 
     def edges(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
-        """Cells (E, 2) at which the face ends, the way out (E, 2), its height there (E,) and that beyond (E,)."""
+        """Find the edges of the face.
+
+        Returns:
+            Cells (E, 2), outward directions (E, 2), heights of the face (E,) [m] and heights beyond the edge (E,) [m].
+        """
         filled, holes = self.heights, (self._closed == 1) & ~np.isfinite(self.heights)
         if holes.any():
-            spread = cv2.dilate(np.where(np.isfinite(filled), filled, -1e9), np.ones((_GAP, _GAP), np.uint8))
+            spread = cv2.dilate(
+                np.where(np.isfinite(filled), filled, -1e9), np.ones((_MAX_GAP_CELLS, _MAX_GAP_CELLS), np.uint8)
+            )
             filled = np.where(holes, spread, filled)
         found, outs, tops, beyonds = [], [], [], []
         padded = np.pad(filled, 1, constant_values=-np.inf)
@@ -95,12 +113,12 @@ class Relief:
             with np.errstate(invalid="ignore"):
                 edge = np.isfinite(filled) & (filled > -1e8) & ((filled - beyond > STEP) | ~np.isfinite(beyond))
             cells = np.argwhere(edge)
-            way = -slope[cells[:, 0], cells[:, 1]]
-            length = np.linalg.norm(way, axis=1, keepdims=True)
-            way = np.where(length > 1e-3, way / np.maximum(length, 1e-12), [[i, j]])
-            good = way @ [i, j] > 0.3
+            outward = -slope[cells[:, 0], cells[:, 1]]
+            length = np.linalg.norm(outward, axis=1, keepdims=True)
+            outward = np.where(length > 1e-3, outward / np.maximum(length, 1e-12), [[i, j]])
+            good = outward @ [i, j] > 0.3
             found.append(cells[good])
-            outs.append(way[good])
+            outs.append(outward[good])
             tops.append(filled[edge][good])
             beyonds.append(beyond[edge][good])
         return np.concatenate(found), np.concatenate(outs), np.concatenate(tops), np.concatenate(beyonds)

@@ -1,4 +1,4 @@
-"""Grasps of targets in one state of the map."""
+"""Grasp sampler: ranked grasps of targets in one state of the map."""
 
 from __future__ import annotations
 
@@ -25,25 +25,27 @@ MakeReach = Callable[[GaussianCollisionField, GaussianCollisionField], Reachabil
 
 
 class GraspSampler:
-    """Grasps of targets in one state of the map.
+    """Samples, scores and ranks grasps of targets in one state of the map.
 
     Args:
-        scene: the map and what is in it; its base is the robot's.
-        robot: with fingers.
-        hand_only: leave the arm out, and look at the hand alone.
-        make_reach: gives, for the map without the target and the whole map, who says whether the arm gets there; by
-            default :class:`splatbot.grasping.reach.ArmReach`.
-        observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known; None: nowhere is.
-        views: depth that was measured of the scene, which tells where there is nothing.
-        n_sigma: where the surface of a Gaussian is; less than for planning, as the hand has to come near.
-        min_observations: Gaussians that fewer keyframes support are air; see
+        scene: segmented map; its base frame is that of the robot.
+        robot: robot with fingers.
+        hand_only: check only the hand, not whether an arm reaches the grasp.
+        make_reach: returns the reachability check for the map without the target and the whole map. If None,
+            :class:`splatbot.grasping.reach.ArmReach` is used.
+        observers: (N, 3) camera centre from which each Gaussian was observed [m, world], NaN where unknown. If None,
+            all are unknown.
+        views: measured depth images of the scene, which show free space.
+        n_sigma: size of the Gaussians in standard deviations. It is smaller than for planning, since the hand has to
+            come close to the target.
+        min_observations: Gaussians with fewer observing keyframes do not count as obstacles; see
             :class:`splatbot.collision.GaussianCollisionField`.
-        margin: room to keep from the map [m].
-        moving: balls (V, 4) [m, world] where something was at times; see :func:`splatbot.collision.find_moving`. Grasps
-            for which hand and arm need not go there are better.
+        margin: clearance to keep from the map [m].
+        moving: (V, 4) balls (x, y, z, radius) [m, world] of regions where motion was observed; see
+            :func:`splatbot.collision.find_moving`. Grasps that avoid them score higher.
 
     Raises:
-        InputError: the robot has no fingers, or an argument makes no sense.
+        InputError: the robot has no fingers, or an argument is invalid.
     """
 
     def __init__(
@@ -73,10 +75,10 @@ class GraspSampler:
         self._make_reach = None if hand_only else make_reach or self._arm_reach
 
     def sample(self, target: Target, options: GraspOptions | None = None) -> GraspResult:
-        """Ranked grasps of a target; without any, what the candidates fell to.
+        """Sample ranked grasps of a target; a result without grasps holds the reasons.
 
-        Where few hands are possible it is chance whether one is drawn, so where none is found four times the samples
-        are looked at, on a surface with sharper rims, and the notes say so; not of what is too large for the hand.
+        If no grasp is found, the search is repeated once with four times the samples and sharper edges, and a note
+        reports it. A target that is wider than the stroke is not searched again.
 
         Raises:
             InputError: the target has no Gaussians.
@@ -86,26 +88,32 @@ class GraspSampler:
         return Search(self, target, options or GraspOptions()).run()
 
     def surface(self, target: Target, *, seed: int = 0, sharp: bool = False) -> GraspSurface:
-        """Of a target, with unseen sides; see :func:`splatbot.grasping.shape_completion.target_surface`."""
+        """Return the completed surface of a target; see :func:`splatbot.grasping.shape_completion.target_surface`."""
         return target_surface(
             self.scene, target.rows, observers=self.observers, views=self.views, seed=seed, sharp=sharp
         )
 
-    def collision_field(self, model: GaussianModel, *, cautious: bool = False) -> GaussianCollisionField:
-        """A part of the map as the hand and the arm avoid it; ``cautious``: and where something moved."""
-        if cautious and self.moving is not None:
+    def collision_field(self, model: GaussianModel, *, avoid_moving: bool = False) -> GaussianCollisionField:
+        """Return the collision field of a part of the map.
+
+        If ``avoid_moving`` is set, it includes the regions where motion was observed.
+        """
+        if avoid_moving and self.moving is not None:
             model = with_balls(model, self.moving, n_sigma=self.n_sigma, observations=self.min_observations)
         return GaussianCollisionField(model, self.n_sigma, min_observations=self.min_observations)
 
     def reach(self, around: GaussianCollisionField) -> ReachabilityCheck | None:
-        """Who says whether the arm gets there in the map without the target; None: nobody is asked."""
+        """Return the reachability check against the map without the target; None if only the hand is checked."""
         return None if self._make_reach is None else self._make_reach(around, self.field)
 
-    def cautious_reach(self, around: GaussianModel) -> ReachabilityCheck | None:
-        """The same, of an arm that keeps clear of where something moved; None: nothing did, or nobody is asked."""
+    def reach_avoiding_moving(self, around: GaussianModel) -> ReachabilityCheck | None:
+        """Return the reachability check that also avoids the regions where motion was observed.
+
+        It returns None without such regions, or if only the hand is checked.
+        """
         if self._make_reach is None or self.moving is None:
             return None
-        fields = (self.collision_field(model, cautious=True) for model in (around, self.scene.model))
+        fields = (self.collision_field(model, avoid_moving=True) for model in (around, self.scene.model))
         return self._make_reach(*fields)
 
     def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> ReachabilityCheck:

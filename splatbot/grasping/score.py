@@ -1,4 +1,4 @@
-"""What makes a grasp good: terms in 0..1, and their weighted mean."""
+"""Grasp score: terms in 0..1 and their weighted mean."""
 
 from __future__ import annotations
 
@@ -9,34 +9,37 @@ from numpy.typing import NDArray
 
 from splatbot.grasping.antipodal import Pairs
 from splatbot.grasping.hands import Hands
-from splatbot.grasping.reach import ROOM, Reached
+from splatbot.grasping.reach import ARM_FULL_SCORE_CLEARANCE_M, Reached
 from splatbot.grasping.volume import Volume
 from splatbot.protocols import Array, HandShape
 
 WEIGHTS: Mapping[str, float] = {
-    # How far inside of the friction cone the places are where the pads touch: how much friction may be missing, and how
-    # far off hand and map may be. What does not hold is of no use, however well it is reached.
+    # Force-closure margin of the points that the pads touch. It absorbs errors of the friction coefficient, the hand
+    # pose and the map. It has the largest weight, since no other term matters for a grasp that slips.
     "closure": 6.0,
-    "held": 2.0,  # how much of the pads is on the surface
-    "centre": 2.0,  # how near the line between the contacts is to the target's centre of mass
-    "torque": 4.0,  # how much of the pads' friction its weight leaves, which turns it about that line
-    "width": 1.0,  # how much of the stroke is left
-    "clear": 4.0,  # whether hand and arm keep clear of where something moved; only where something did
-    "room": 2.0,  # of the hand to the target and to all else, on the way
-    "seen": 2.0,  # how much of the contacts was measured, not implied
-    "certain": 1.0,  # how well it is known where they are
-    "upright": 0.5,  # how far from above the hand comes
-    "near": 2.0,  # to what was pointed at
-    "arm": 1.0,  # room of the whole arm along the approach
-    "limits": 1.0,  # of the joints
+    "held": 2.0,  # pad coverage
+    "centre": 2.0,  # distance of the line of the contacts from the centre of mass
+    "torque": 4.0,  # remaining friction after the load of the object's weight
+    "width": 1.0,  # remaining stroke
+    "clear": 4.0,  # whether hand and arm avoid regions where motion was observed; absent without such regions
+    "room": 2.0,  # clearance of the hand along the approach
+    "seen": 2.0,  # observed fraction of the surface at the contacts
+    "certain": 1.0,  # standard deviation of the surface at the contacts
+    "upright": 0.5,  # cosine between the approach direction and down
+    "near": 2.0,  # distance of the contacts from the indicated point; absent without one
+    "arm": 1.0,  # clearance of the arm along the approach
+    "limits": 1.0,  # distance from the joint limits
 }
+"""Weight of each score term; the names are fields of results over HTTP."""
 
-FAR = 0.05  # [m] from the middle, or from what was pointed at, that is as bad as farther
-_SPARE = 0.02  # [m] of the stroke left that is as good as more
-_ROOM = 0.02  # [m] of the hand that is as good as more
-_DOUBT = 0.004  # [m] of uncertainty that is as bad as more
-_DENSITY = 1000.0  # [kg/m³] that is taken for granted: water's
-_PULL = 2 * 9.81  # [m/s²]: its weight, and as much again as it is moved
+ZERO_SCORE_DISTANCE_M = 0.05  # from the centre of mass, or from the indicated point, at which a term is 0
+_FULL_SCORE_STROKE_M = 0.02  # remaining stroke with the score 1
+_HAND_FULL_SCORE_CLEARANCE_M = 0.02  # clearance of the hand with the score 1
+_ZERO_SCORE_STD_M = 0.004  # standard deviation of the surface with the score 0
+_DENSITY = 1000.0  # [kg/m³] assumed density, that of water
+_LOAD_ACCELERATION = 2 * 9.81  # [m/s²] gravity plus an equal acceleration of the arm
+_SIMILAR_DISTANCE_M = 0.008  # between the tools of similar grasps
+_SIMILAR_ANGLE_RAD = 0.26  # between the axes of similar grasps
 
 
 def hand_terms(
@@ -44,23 +47,30 @@ def hand_terms(
     pairs: Pairs,
     body: Volume,
     hand: HandShape,
-    room: Array,
+    clearance: Array,
     *,
     friction: float,
     up: Array,
     near: Array | None,
 ) -> dict[str, Array]:
-    """The terms (K,) that need no arm.
+    """Compute the score terms (K,) that do not depend on the arm.
+
+    Let a be the distance of the contact line from the centre of mass and z the approach direction. Let b be the
+    distance of the nearest contact from the indicated point. The terms are clipped to 0..1::
+
+        centre = 1 - a / 5 cm          torque = 1 - load / friction limit, see friction_load
+        width = (stroke - width) / 2 cm    room = clearance / 2 cm
+        certain = 1 - std / 4 mm       upright = -z · up       near = 1 - b / 5 cm
 
     Args:
-        hands: with the pairs that they press.
-        pairs: of contacts.
-        body: the target's volume.
-        hand: the fingers.
-        room: (K,) of the whole hand [m].
-        friction: coefficient.
-        up: (3,) unit [world].
-        near: (3,) [m, world] what was pointed at.
+        hands: hand poses.
+        pairs: their contact pairs.
+        body: volume of the target.
+        hand: shape of the hand.
+        clearance: (K,) clearance of the whole hand [m].
+        friction: friction coefficient mu.
+        up: (3,) unit up axis [world].
+        near: (3,) indicated point [m, world]. If None, the term is absent.
     """
     p = hands.pair
     middle = pairs.contacts[p].mean(axis=1)
@@ -69,53 +79,57 @@ def hand_terms(
     aside = np.linalg.norm(np.cross(body.center - middle, line), axis=1)
     found = {
         "closure": hands.closure,
-        "held": hands.held,
-        "centre": 1.0 - aside / FAR,
-        "torque": 1.0 - friction_share(body.size * _DENSITY * _PULL, aside, hand, friction),
-        "width": (hand.stroke - pairs.width[p]) / _SPARE,
-        "room": room / _ROOM,
-        "seen": pairs.seen[p],
-        "certain": 1.0 - pairs.doubt[p] / _DOUBT,
+        "held": hands.pad_coverage,
+        "centre": 1.0 - aside / ZERO_SCORE_DISTANCE_M,
+        "torque": 1.0 - friction_load(body.size * _DENSITY * _LOAD_ACCELERATION, aside, hand, friction),
+        "width": (hand.stroke - pairs.width[p]) / _FULL_SCORE_STROKE_M,
+        "room": clearance / _HAND_FULL_SCORE_CLEARANCE_M,
+        "seen": pairs.observed[p],
+        "certain": 1.0 - pairs.normal_std[p] / _ZERO_SCORE_STD_M,
         "upright": -(hands.T[:, :3, 2] @ up),
     }
     if near is not None:
-        found["near"] = 1.0 - np.linalg.norm(pairs.contacts[p] - near, axis=2).min(axis=1) / FAR
+        found["near"] = 1.0 - np.linalg.norm(pairs.contacts[p] - near, axis=2).min(axis=1) / ZERO_SCORE_DISTANCE_M
     return {name: np.clip(values, 0.0, 1.0) for name, values in found.items()}
 
 
-def friction_share(load: float, aside: Array, hand: HandShape, friction: float) -> Array:
-    """How much of the friction of two pads a load takes that acts ``aside`` (K,) [m] of the line between them (K,).
+def friction_load(load: float, aside: Array, hand: HandShape, friction: float) -> Array:
+    """Return the fraction (K,) of the friction limit of two soft pads that a load takes.
 
-    A soft pad resists a pull and a turn together as an ellipsoid bounds them (Howe & Cutkosky 1996):
-    (f / mu N)² + (tau / (e mu N))² <= 1, with e two thirds of the radius of a round pad that presses evenly. Above 1 it
-    slips or turns.
+    An ellipsoid approximates the limit surface of a soft contact (Howe and Cutkosky 1996). With the tangential force f,
+    the torque tau about the normal and the normal force N::
+
+        (f / (mu N))² + (tau / (e mu N))² <= 1
+
+    The lever e is two thirds of the radius of a round pad with uniform pressure. Each pad carries half of the load and
+    its torque. Above 1 the object slips or rotates.
 
     Args:
         load: [N].
-        aside: see there.
-        hand: the fingers, whose force is all used.
-        friction: coefficient mu.
+        aside: (K,) distance of the load from the line between the pads [m].
+        hand: shape of the hand; its maximum force is used.
+        friction: friction coefficient mu.
     """
     lever = 2 / 3 * hand.width / 2
     return np.asarray(load / (2 * friction * hand.force) * np.hypot(1.0, aside / lever))
 
 
 def arm_terms(reached: Reached) -> dict[str, float]:
-    """The terms of an arm that gets there."""
+    """Compute the score terms of an arm that reaches the grasp."""
     return {
-        "arm": float(np.clip(reached.room / ROOM, 0.0, 1.0)),
+        "arm": float(np.clip(reached.clearance / ARM_FULL_SCORE_CLEARANCE_M, 0.0, 1.0)),
         "limits": float(np.clip(3 * reached.limits, 0.0, 1.0)),
     }
 
 
 def totals(terms: Mapping[str, Array]) -> Array:
-    """Weighted means (K,) of the terms that there are."""
+    """Compute the weighted mean (K,) of the given terms: sum_i w_i t_i / sum_i w_i."""
     weights = np.array([WEIGHTS[name] for name in terms])
     return np.asarray(np.stack(list(terms.values()), axis=-1) @ weights / weights.sum())
 
 
-def best_apart(hands: Hands, total: Array, *, most: int) -> NDArray[np.int64]:
-    """Rows of the best hands, best first, none within 8 mm and 15 degrees of a better one."""
+def suppress_similar(hands: Hands, total: Array, *, most: int) -> NDArray[np.int64]:
+    """Return the indices of the best hands, best first, without those within 8 mm and 15 degrees of a better one."""
     order = np.argsort(-total, kind="stable")
     kept: list[int] = []
     z, at = hands.T[:, :3, 2], hands.T[:, :3, 3]
@@ -123,9 +137,9 @@ def best_apart(hands: Hands, total: Array, *, most: int) -> NDArray[np.int64]:
         if len(kept) == most:
             break
         if kept:
-            near = np.linalg.norm(at[kept] - at[row], axis=1) < 0.008
-            same = (z[kept] @ z[row] > np.cos(0.26)) & (
-                np.abs(hands.T[kept, :3, 1] @ hands.T[row, :3, 1]) > np.cos(0.26)
+            near = np.linalg.norm(at[kept] - at[row], axis=1) < _SIMILAR_DISTANCE_M
+            same = (z[kept] @ z[row] > np.cos(_SIMILAR_ANGLE_RAD)) & (
+                np.abs(hands.T[kept, :3, 1] @ hands.T[row, :3, 1]) > np.cos(_SIMILAR_ANGLE_RAD)
             )
             if (near & same).any():
                 continue

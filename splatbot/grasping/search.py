@@ -1,4 +1,4 @@
-"""One search for grasps of a target among Gaussians: sampled, tested, scored and ranked."""
+"""One search for grasps of a target: candidates are sampled, tested, scored and ranked."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
-from splatbot.grasping.hands import FLUSH, Hands, beside_target, clear_palm, place_hands
+from splatbot.grasping.hands import MAX_PROTRUSION_M, Hands, measure_hands, palm_free, place_hands
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ReachabilityCheck
-from splatbot.grasping.score import FAR, arm_terms, best_apart, hand_terms, totals
-from splatbot.grasping.sweep import fingers_room, swept_room, touches
+from splatbot.grasping.score import ZERO_SCORE_DISTANCE_M, arm_terms, hand_terms, suppress_similar, totals
+from splatbot.grasping.sweep import finger_clearance, swept_clearance, touches
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.grasping.volume import enclosed_volume
 from splatbot.planning.cartesian import along
@@ -29,21 +29,22 @@ from splatbot.protocols import Array
 if TYPE_CHECKING:
     from splatbot.grasping.sampler import GraspSampler
 
-_MORE = 4  # times the samples for another look
-_HANDS = 2000  # whose room beside the target is looked at
-_WIDER = 0.003  # [m] that fingers may be in the map before it is known how wide they open
-_TRIED = 200  # hands whose room in the map is looked at
-_ASKED = 60  # of them that an arm is asked for
-_TOP, _LOWEST = np.cos(np.radians(40.0)), -0.26  # cosine between the approach and down: from the top; the least of all
-_LEVEL = 0.5  # of a side approach, at most
+_RETRY_FACTOR = 4  # on the number of samples of the second search
+_MAX_HANDS_TARGET = 2000  # hands that are checked against the target
+_MAX_HANDS_MAP = 200  # hands that are checked against the map
+_MAX_HANDS_ARM = 60  # hands whose reachability is checked
+_EARLY_PENETRATION_M = 0.003  # of fingers in the map before their final opening is known
+_MIN_TOP_COSINE = np.cos(np.radians(40.0))  # between the approach direction and down, of a top approach
+_MIN_DOWN_COSINE = -0.26  # the same of any approach
+_MAX_SIDE_COSINE = 0.5  # between the approach direction and the vertical, of a side approach
 
 _IN_TARGET = "hands are in the target on their way"
-_IN_MAP = "hands touch what is around the target"
+_IN_MAP = "hands touch the surroundings of the target"
 
 
 @dataclass(eq=False)
 class _SearchLog:
-    """What was rejected and why, the best of it, and seconds by stage."""
+    """Number of rejected candidates by reason, the best rejected grasp, and the duration of each stage [s]."""
 
     rejected: dict[str, int] = field(default_factory=dict)
     best: Grasp | None = None
@@ -60,15 +61,15 @@ class _SearchLog:
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """Hands with their room [m] and the terms of their scores, each (K,)."""
+    """Hands with their clearances (K,) [m] and score terms (K,)."""
 
     hands: Hands
-    room: Array
+    clearance: Array
     terms: Mapping[str, Array]
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> _Scored:
         terms = {name: values[chosen] for name, values in self.terms.items()}
-        return _Scored(self.hands.select(chosen), self.room[chosen], terms)
+        return _Scored(self.hands.select(chosen), self.clearance[chosen], terms)
 
     @property
     def totals(self) -> Array:
@@ -76,7 +77,7 @@ class _Scored:
 
 
 class Search:
-    """The steps, each of which leaves fewer hands; :meth:`run` is all of them, at most twice."""
+    """Pipeline of tests that each reduce the number of hands; :meth:`run` executes it at most twice."""
 
     def __init__(self, sampler: GraspSampler, target: Target, options: GraspOptions) -> None:
         self.s, self.target, self.o = sampler, target, options
@@ -86,13 +87,13 @@ class Search:
     def run(self) -> GraspResult:
         self.model, self.around, self.own = self._split()
         self.log.stage("fields")
-        grasps, notes = self._look(self.o.samples), []
+        grasps, notes = self._search(self.o.samples), []
         too_large = not len(self.pairs.width) and self.found.too_wide > 0
         if not grasps and not too_large:
             few = min(self.o.samples, len(self.surface))
-            grasps = self._look(_MORE * self.o.samples, sharp=True)
-            more = min(_MORE * self.o.samples, len(self.surface))
-            notes.append(f"Nothing was found with {few} samples, so {more} were looked at, with sharper rims.")
+            grasps = self._search(_RETRY_FACTOR * self.o.samples, sharp=True)
+            more = min(_RETRY_FACTOR * self.o.samples, len(self.surface))
+            notes.append(f"No grasp was found with {few} samples; {more} samples with sharper edges were searched.")
         return GraspResult(
             self.target,
             grasps,
@@ -104,8 +105,8 @@ class Search:
             (*notes, *self._notes(grasps)),
         )
 
-    def _look(self, samples: int, *, sharp: bool = False) -> tuple[Grasp, ...]:
-        """What so many samples lead to."""
+    def _search(self, samples: int, *, sharp: bool = False) -> tuple[Grasp, ...]:
+        """Run all stages with a number of seeds."""
         self.surface = self.s.surface(self.target, seed=self.o.seed, sharp=sharp)
         self.body = enclosed_volume(self.surface.points, self.surface.normals, seed=self.o.seed)
         self.log.stage("surface")
@@ -113,14 +114,14 @@ class Search:
         self.log.stage("contacts")
         hands = self._placed()
         self.candidates += len(hands)
-        scored = self._beside_target(hands)
+        scored = self._outside_target(hands)
         self.log.stage("hands")
         scored = self._in_map(scored, self.around)
         if self.s.moving is not None:
-            scored = self._moving(scored)
+            scored = self._with_moving_term(scored)
         self.log.stage("map")
-        scored = self._apart(scored, self.own)
-        grasps = self._reached(scored, self.s.reach(self.around), self.s.cautious_reach(self.model))
+        scored = self._outside_ellipsoids(scored, self.own)
+        grasps = self._reached(scored, self.s.reach(self.around), self.s.reach_avoiding_moving(self.model))
         self.log.stage("reach")
         return grasps
 
@@ -141,38 +142,41 @@ class Search:
 
     def _placed(self) -> Hands:
         up, o = self.s.scene.up, self.o
-        lowest = _TOP if o.approach == "top" else _LOWEST
+        lowest = _MIN_TOP_COSINE if o.approach == "top" else _MIN_DOWN_COSINE
         hands = place_hands(self.pairs, self.s.hand, rolls=o.rolls, depths=o.depths, up=up, lowest=lowest)
-        return hands.select(np.abs(hands.T[:, :3, 2] @ up) < _LEVEL) if o.approach == "side" else hands
+        return hands.select(np.abs(hands.T[:, :3, 2] @ up) < _MAX_SIDE_COSINE) if o.approach == "side" else hands
 
     def _promising(self, hands: Hands) -> Hands:
-        """At most 2000, those whose palm has room, of the best pairs."""
-        free = clear_palm(hands, self.surface, self.s.hand, retreat=self.o.pregrasp)
+        """Return at most 2000 hands with a free palm, those of the best contact pairs."""
+        free = palm_free(hands, self.surface, self.s.hand, retreat=self.o.pregrasp)
         self.log.drop(_IN_TARGET, (~free).sum())
-        hands = self._above(hands.select(free))
+        hands = self._fingers_outside_map(hands.select(free))
         aside = np.linalg.norm(self.pairs.contacts.mean(axis=1) - self.body.center, axis=1)
-        good = (self.pairs.closure + self.pairs.seen - aside / 0.1)[hands.pair]
-        best = np.sort(np.argsort(-good, kind="stable")[:_HANDS])
+        good = (self.pairs.closure + self.pairs.observed - aside / 0.1)[hands.pair]
+        best = np.sort(np.argsort(-good, kind="stable")[:_MAX_HANDS_TARGET])
         self.log.drop("hands are of worse contacts than others", len(hands) - len(best))
         return hands.select(best)
 
-    def _above(self, hands: Hands) -> Hands:
-        """Those whose fingers are not in the rest of the map: of what is low most others are. Few millimetres are left
-        to what follows, for fingers that have to open wider are elsewhere."""
-        room = fingers_room(self.s.robot, hands, self.around, self.s.hand)
-        free = room > -_WIDER
+    def _fingers_outside_map(self, hands: Hands) -> Hands:
+        """Return the hands whose fingers are outside of the rest of the map.
+
+        Most hands on a low object fail this quick test. A penetration of 3 mm is left to later tests, since the final
+        opening moves the fingers.
+        """
+        clearance = finger_clearance(self.s.robot, hands, self.around, self.s.hand)
+        free = clearance > -_EARLY_PENETRATION_M
         self.log.drop(_IN_MAP, (~free).sum())
-        if len(free) and not free.any() and self.log.best is None:  # in the first look others came farther
-            k = int(np.argmax(room))
-            room = room - self.s.margin
-            self.log.best = self._grasp(self._scored(hands, room), k, rejected=_deep(room[k]))
+        if len(free) and not free.any() and self.log.best is None:  # the first search may have a better rejected grasp
+            k = int(np.argmax(clearance))
+            clearance = clearance - self.s.margin
+            self.log.best = self._grasp(self._scored(hands, clearance), k, rejected=_deep(clearance[k]))
         return hands.select(free)
 
-    def _beside_target(self, hands: Hands) -> _Scored:
-        """Those that the target lets come, with their scores but for the map."""
+    def _outside_target(self, hands: Hands) -> _Scored:
+        """Return the hands without collision with the target, scored without the rest of the map."""
         hands = self._promising(hands)
         if len(hands):
-            hands = beside_target(
+            hands = measure_hands(
                 hands,
                 self.pairs,
                 self.surface,
@@ -181,45 +185,47 @@ class Search:
                 n_sigma=self.s.n_sigma,
                 friction=self.o.friction,
             )
-        uneven = hands.stands_out > FLUSH
-        free = ~uneven & (hands.room > 0.0)
+        uneven = hands.protrusion > MAX_PROTRUSION_M
+        free = ~uneven & (hands.clearance > 0.0)
         self.log.drop("hands have something that stands out under a pad", uneven.sum())
         self.log.drop(_IN_TARGET, (~uneven & ~free).sum())
-        scored = self._scored(hands, hands.room)
+        scored = self._scored(hands, hands.clearance)
         if len(hands) and not free.any():
-            worst = np.where(uneven, -hands.stands_out - 1.0, hands.room)
+            worst = np.where(uneven, -hands.protrusion - 1.0, hands.clearance)
             k = int(np.argmax(worst))
-            why = (
-                f"has something under a pad that stands out {1e3 * hands.stands_out[k]:.0f} mm"
+            reason = (
+                f"has something under a pad that stands out {1e3 * hands.protrusion[k]:.0f} mm"
                 if uneven[k]
-                else f"is {-1e3 * hands.room[k]:.1f} mm deep in the target"
+                else f"is {-1e3 * hands.clearance[k]:.1f} mm deep in the target"
             )
-            self.log.best = self._grasp(scored, k, rejected=why)
+            self.log.best = self._grasp(scored, k, rejected=reason)
         return scored.select(free)
 
     def _in_map(self, scored: _Scored, around: GaussianCollisionField) -> _Scored:
-        """The best of them, those that are free of the rest of the map on their whole way."""
-        best = best_apart(scored.hands, scored.totals, most=_TRIED)
+        """Return the best dissimilar hands that are free of the rest of the map along their approach."""
+        best = suppress_similar(scored.hands, scored.totals, most=_MAX_HANDS_MAP)
         self.log.drop("hands are like a better one", len(scored.hands) - len(best))
         tried = scored.select(best)
-        room = swept_room(self.s.robot, tried.hands, around, retreat=self.o.pregrasp) - self.s.margin
-        tried = self._scored(tried.hands, room)
-        free = room > 0.0
+        clearance = swept_clearance(self.s.robot, tried.hands, around, retreat=self.o.pregrasp) - self.s.margin
+        tried = self._scored(tried.hands, clearance)
+        free = clearance > 0.0
         self.log.drop(_IN_MAP, (~free).sum())
         if len(free) and not free.any():
-            k = int(np.argmax(room))
-            self.log.best = self._grasp(tried, k, rejected=_deep(room[k]))
+            k = int(np.argmax(clearance))
+            self.log.best = self._grasp(tried, k, rejected=_deep(clearance[k]))
         return tried.select(free)
 
-    def _moving(self, scored: _Scored) -> _Scored:
-        """With a term for hands that keep clear, on their way, of where something moved."""
-        field = self.s.collision_field(GaussianModel.empty(self.s.scene.model.sh_degree), cautious=True)
-        clear = swept_room(self.s.robot, scored.hands, field, retreat=self.o.pregrasp) > self.s.margin
-        return _Scored(scored.hands, scored.room, {**scored.terms, "clear": clear.astype(np.float64)})
+    def _with_moving_term(self, scored: _Scored) -> _Scored:
+        """Add the score term for hands that avoid the regions where motion was observed."""
+        field = self.s.collision_field(GaussianModel.empty(self.s.scene.model.sh_degree), avoid_moving=True)
+        clear = swept_clearance(self.s.robot, scored.hands, field, retreat=self.o.pregrasp) > self.s.margin
+        return _Scored(scored.hands, scored.clearance, {**scored.terms, "clear": clear.astype(np.float64)})
 
-    def _apart(self, scored: _Scored, own: GaussianCollisionField) -> _Scored:
-        """The best of them, best first, those that do not touch the target's own ellipsoids."""
-        order = np.argsort(-scored.totals, kind="stable")[:_ASKED] if len(scored.hands) else np.zeros(0, np.int64)
+    def _outside_ellipsoids(self, scored: _Scored, own: GaussianCollisionField) -> _Scored:
+        """Return the best hands, best first, whose boxes do not intersect the target's ellipsoids."""
+        order = (
+            np.argsort(-scored.totals, kind="stable")[:_MAX_HANDS_ARM] if len(scored.hands) else np.zeros(0, np.int64)
+        )
         scored = scored.select(order)
         inside = touches(own, scored.hands, self.s.hand, retreat=self.o.pregrasp)
         self.log.drop("hands touch the target's ellipsoids", inside.sum())
@@ -228,58 +234,63 @@ class Search:
         return scored.select(~inside)
 
     def _reached(
-        self, scored: _Scored, reach: ReachabilityCheck | None, cautious: ReachabilityCheck | None
+        self, scored: _Scored, reach: ReachabilityCheck | None, avoid_moving: ReachabilityCheck | None
     ) -> tuple[Grasp, ...]:
-        """Those that the arm reaches, best first; cautiously, where it can and the hand can."""
+        """Return the grasps that the arm reaches, best first.
+
+        Grasps that avoid the regions where motion was observed are checked first, with these regions as obstacles.
+        """
         left = [self._grasp(scored, k) for k in range(len(scored.hands))]
         found: list[Grasp] = []
-        if cautious is not None:
-            clear = [k for k, grasp in enumerate(left) if grasp.clear]
-            asked = self._asked([left[k] for k in clear], cautious, self.o.wanted)
-            found = [grasp for grasp, _ in asked if not grasp.rejected]
-            known = {k for k, (grasp, _) in zip(clear, asked, strict=False) if not grasp.rejected}
+        if avoid_moving is not None:
+            clear = [k for k, grasp in enumerate(left) if grasp.avoids_moving]
+            checked = self._checked([left[k] for k in clear], avoid_moving, self.o.wanted)
+            found = [grasp for grasp, _ in checked if not grasp.rejected]
+            known = {k for k, (grasp, _) in zip(clear, checked, strict=False) if not grasp.rejected}
             left = [_exposed(grasp) for k, grasp in enumerate(left) if k not in known]
-        asked = self._asked(left, reach, self.o.wanted - len(found))
-        blocked = [(grasp, kind) for grasp, kind in asked if grasp.rejected]
+        checked = self._checked(left, reach, self.o.wanted - len(found))
+        blocked = [(grasp, kind) for grasp, kind in checked if grasp.rejected]
         for _, kind in blocked:
             self.log.drop(f"hands: {kind}", 1)
         if blocked:
             self.log.best = blocked[0][0]
-        found += [grasp for grasp, _ in asked if not grasp.rejected]
+        found += [grasp for grasp, _ in checked if not grasp.rejected]
         return tuple(sorted(found, key=lambda g: -g.total))
 
-    def _asked(self, grasps: Sequence[Grasp], reach: ReachabilityCheck | None, wanted: int) -> list[tuple[Grasp, str]]:
-        """What an arm says of each in turn, until enough are reached: the grasp, and of what kind its rejection is."""
-        asked: list[tuple[Grasp, str]] = []
+    def _checked(
+        self, grasps: Sequence[Grasp], reach: ReachabilityCheck | None, wanted: int
+    ) -> list[tuple[Grasp, str]]:
+        """Check grasps in order until ``wanted`` are reachable; return each with the kind of its rejection."""
+        checked: list[tuple[Grasp, str]] = []
         for grasp in grasps:
             if wanted == 0:
                 break
-            asked.append((grasp, "") if reach is None else self._with_arm(grasp, reach))
-            wanted -= not asked[-1][0].rejected
-        return asked
+            checked.append((grasp, "") if reach is None else self._with_arm(grasp, reach))
+            wanted -= not checked[-1][0].rejected
+        return checked
 
     def _with_arm(self, grasp: Grasp, reach: ReachabilityCheck) -> tuple[Grasp, str]:
         reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening)
         if reached.q is None or reached.path is None:
-            return replace(grasp, rejected=reached.why), reached.kind
+            return replace(grasp, rejected=reached.reason), reached.kind
         terms = dict(grasp.terms) | arm_terms(reached)
         total = float(totals({name: np.array([value]) for name, value in terms.items()})[0])
         q = reached.q
         found = replace(grasp, terms=terms, total=total, q=q, q_pregrasp=reached.path[0], approach_path=reached.path)
         return found, ""
 
-    def _scored(self, hands: Hands, room: Array) -> _Scored:
+    def _scored(self, hands: Hands, clearance: Array) -> _Scored:
         terms = hand_terms(
             hands,
             self.pairs,
             self.body,
             self.s.hand,
-            room,
+            clearance,
             friction=self.o.friction,
             up=self.s.scene.up,
             near=self.target.point,
         )
-        return _Scored(hands, room, terms)
+        return _Scored(hands, clearance, terms)
 
     def _grasp(self, scored: _Scored, k: int, *, rejected: str = "") -> Grasp:
         T, pair = scored.hands.T[k], int(scored.hands.pair[k])
@@ -292,23 +303,23 @@ class Search:
             approach=self._approach(T),
             terms={name: float(values[k]) for name, values in scored.terms.items()},
             total=float(scored.totals[k]),
-            room=float(scored.room[k]),
+            clearance=float(scored.clearance[k]),
             T_world_pregrasp=along(T, -self.o.pregrasp),
             rejected=rejected,
         )
 
     def _approach(self, T: Array) -> str:
         z = T[:3, 2]
-        if -(z @ self.s.scene.up) >= _TOP:
+        if -(z @ self.s.scene.up) >= _MIN_TOP_COSINE:
             return "top"
-        if abs(z @ self.s.scene.up) >= _LEVEL:
+        if abs(z @ self.s.scene.up) >= _MAX_SIDE_COSINE:
             return "free"
         ahead = T[:3, 3] - self.s.scene.T_world_base[:3, 3]
         ahead = ahead - (ahead @ self.s.scene.up) * self.s.scene.up
-        return "front" if z @ ahead >= _TOP * np.linalg.norm(ahead) else "side"
+        return "front" if z @ ahead >= _MIN_TOP_COSINE * np.linalg.norm(ahead) else "side"
 
     def _split(self) -> tuple[GaussianModel, GaussianCollisionField, GaussianCollisionField]:
-        """The map without the target, also as a field, and the target alone."""
+        """Return the map without the target, its collision field, and the collision field of the target alone."""
         own = self.s.scene.model.select(torch.from_numpy(self.target.rows))
         around = around_target(self.s.scene, self.target.rows)
         return around, self.s.collision_field(around), self.s.collision_field(own)
@@ -316,18 +327,18 @@ class Search:
     def _notes(self, grasps: Sequence[Grasp]) -> tuple[str, ...]:
         notes = []
         if self.s.moving is not None and grasps:
-            clear = sum(grasp.clear for grasp in grasps)
-            notes.append(f"Something moved; {clear} of {len(grasps)} grasps keep clear of where it was seen.")
+            clear = sum(grasp.avoids_moving for grasp in grasps)
+            notes.append(f"Motion was observed; {clear} of {len(grasps)} grasps avoid its region.")
         if grasps and self.target.point is not None:
             away = float(np.linalg.norm(grasps[0].contacts - self.target.point, axis=1).min())
-            if away > FAR:
+            if away > ZERO_SCORE_DISTANCE_M:
                 notes.append(
-                    f"The best grasp is {100 * away:.0f} cm from what was pointed at; if that is another thing, both "
-                    "hang together in the map, and a mask tells them apart."
+                    f"The best grasp is {100 * away:.0f} cm from the indicated point. If it is on another object, both "
+                    "are connected in the map; a mask separates them."
                 )
-        implied = float(1.0 - self.surface.seen.mean())
-        if implied > 0.05:
-            notes.append(f"{implied:.0%} of its surface was not seen and is implied.")
+        completed = float(1.0 - self.surface.observed.mean())
+        if completed > 0.05:
+            notes.append(f"{completed:.0%} of its surface was not observed and is completed.")
         if np.isfinite(self.found.narrowest):
             narrowest, opens = 1e3 * self.found.narrowest, 1e3 * self.s.hand.stroke
             notes.append(
@@ -337,10 +348,10 @@ class Search:
         return tuple(notes)
 
 
-def _deep(room: float) -> str:
-    return f"is {-1e3 * room:.1f} mm deep in what is around the target"
+def _deep(clearance: float) -> str:
+    return f"is {-1e3 * clearance:.1f} mm deep in the surroundings of the target"
 
 
 def _exposed(grasp: Grasp) -> Grasp:
-    """A grasp for which the arm has to go where something moved."""
+    """Return a grasp with the score term 0 for crossing a region where motion was observed."""
     return replace(grasp, terms={**grasp.terms, "clear": 0.0})

@@ -1,4 +1,8 @@
-"""The surface of a target: what was measured, and the sides that nobody saw but what was seen implies."""
+"""Shape completion: the observed surface of a target with inferred points on its unobserved sides.
+
+Sides are extruded from the edges of observed faces: down from the top to the support, and backwards from front faces.
+Measured depth that passes behind a face limits the inferred depth.
+"""
 
 from __future__ import annotations
 
@@ -10,31 +14,33 @@ from numpy.typing import NDArray
 from splatbot.collision.visibility import DepthView, evidence_at
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.relief import CELL, DISC, STEP, Relief, frame_along
-from splatbot.grasping.surface import MOST, GraspSurface, measured_surface
+from splatbot.grasping.surface import MAX_POINTS, GraspSurface, measured_surface
 from splatbot.grasping.volume import winding_numbers
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
-from splatbot.segmentation.parts import nearest_of
+from splatbot.segmentation.faces import nearest_of
 
-_WITHIN = 0.45  # winding number, from where on a point is within what was seen
-_FACING, _TURNED = 0.7, 0.1  # cosines between a direction and the normals of what faces it, and of what it still sees
-_TURNED_AWAY = 0.7  # below it a normal is of another face
-_FEW = 20  # points that are no face
-_FLAT, _MOST_OF_IT = 0.97, 0.4  # cosine between the normals of a flat face; share of the target that it is
-_NARROW = 0.005  # [m] standard deviation of places across a face, below which its normals tell better how it is turned
-_MOST_TURNED = 0.47  # tangent of 25 degrees
-_SLOPE = 0.7  # cosine between up and normals of a side
-_LEANS = 0.17  # [rad] from where on a flat side leans
-_BEHIND = 0.04  # [m] that sides reach behind a face of which nothing tells how deep it is
-_SHOWN = 0.008  # [m] of depth that was seen, from where on it is all there is
-_SPREAD = 1.65  # standard deviations, that 5 % of what is noisy are beyond
-_TUBE = 0.003  # [m] around a line within which it meets a point, where none is left out
-_SEEN = 0.006  # [m] around seen points of a side within which none is added
-_ROWS = 0.003  # [m] between added points
-_THROUGH = 2  # views that must see through a point that nobody saw
-_HOLLOW = 0.03  # share of a face, but for its rim, that was seen through behind, from where on the thing ends
-_RIM = 0.014  # [m] of a face, as far as depth images smear its edges outwards and evidence is in doubt
-_COLUMNS = 300  # places of a face that are asked
+_INSIDE_WINDING = 0.45  # winding number above which a point is inside of the observed surface
+_FACING_COSINE = 0.7  # minimum cosine between a direction and the normals of a face that points in it
+_VISIBLE_COSINE = 0.1  # minimum cosine between a direction and the normals that are visible from it
+_SAME_FACE_COSINE = 0.7  # between normals of one face
+_MIN_FACE_POINTS = 20
+_FLAT_COSINE = 0.97  # between normals of a flat face
+_DOMINANT_FRACTION = 0.4  # of the target that a dominant flat face covers
+_WIDTH_PRIOR_M = 0.005  # width of a face below which its normals determine its orientation better than its points
+_MAX_ROTATION_TANGENT = 0.47  # of the correction of a face's orientation, 25 degrees
+_SIDE_COSINE = 0.7  # maximum cosine between up and the normals of a side
+_MIN_LEAN_RAD = 0.17  # angle from the vertical above which a flat face leans
+_DEFAULT_DEPTH_M = 0.04  # half of the maximum depth that is inferred without an observation of the depth
+_MIN_OBSERVED_DEPTH_M = 0.008  # observed depth above which it is the depth of the object
+_NOISE_QUANTILE = 1.65  # standard deviations that 5 % of a normal distribution exceed
+_TUBE_M = 0.003  # distance of a ray from a point that it meets, for the full point density
+_OBSERVED_RADIUS_M = 0.006  # around observed points of a side in which no points are added
+_SPACING_M = 0.003  # between added points
+_MIN_THROUGH_VIEWS = 2  # views with depth behind an unobserved point that prove it free
+_MAX_FREE_FRACTION = 0.03  # of a face, without its boundary, with free space behind it at the depth of the object
+_BOUNDARY_M = 0.014  # at the edges of a face, where depth images smear and free space is uncertain
+_MAX_COLUMNS = 300  # points of a face behind which free space is queried
 
 _Points = tuple[Array, Array, Array]
 
@@ -48,231 +54,258 @@ def target_surface(
     seed: int = 0,
     sharp: bool = False,
 ) -> GraspSurface:
-    """The surface of the Gaussians ``rows`` (M,) of a scene, with the sides that go down from its top to the support,
-    and back from the face that was seen in front.
+    """Return the observed surface of a target, completed on its unobserved sides.
+
+    Sides reach from the top down to the support, and from a face that was observed in front to its inferred back.
 
     Args:
-        scene: the map.
-        rows: of the target.
-        observers: (N, 3) where each Gaussian of the map was seen from [m, world], NaN where that is not known.
-        views: depth that was measured; no side is implied where it saw through.
-        seed: of which Gaussians are kept where there are more than 1800.
+        scene: the segmented map.
+        rows: (M,) indices of the target's Gaussians.
+        observers: (N, 3) camera centre from which each Gaussian was observed [m, world], NaN where unknown.
+        views: measured depth images; no side is completed where they prove free space.
+        seed: seed of the subsampling of more than 1800 Gaussians.
         sharp: see :func:`splatbot.grasping.surface.measured_surface`.
     """
-    seen, areas = measured_surface(scene, rows, observers=observers, seed=seed, sharp=sharp)
-    up = _along(seen, scene.up)
-    leans = bool(up @ scene.up < np.cos(_LEANS / 2))
-    floor = float(np.percentile(seen.points @ up, 1)) if leans else _floor(scene, seen, up)
-    down = _sides(seen, up, floor)
-    parts = [(*down, np.full(len(down[0]), _ROWS / 2))]
-    faces = [_ImpliedFace(direction, seen) for direction in _directions(seen, up)]
+    measured, areas = measured_surface(scene, rows, observers=observers, seed=seed, sharp=sharp)
+    up = _along(measured, scene.up)
+    leans = bool(up @ scene.up < np.cos(_MIN_LEAN_RAD / 2))
+    floor = float(np.percentile(measured.points @ up, 1)) if leans else _floor(scene, measured, up)
+    down = _extruded_sides(measured, up, floor)
+    parts = [(*down, np.full(len(down[0]), _SPACING_M / 2))]
+    faces = [_CompletedFace(direction, measured) for direction in _directions(measured, up)]
     backs = []
     for face in faces:
-        sides, back = _behind(seen, face, up, views)
+        sides, back = _behind(measured, face, up, views)
         parts.append(sides)
         backs.append(back)
-    points, normals, doubt = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    # Sides go down to the floor; so where those of a face that was seen in front end above it, there is no bottom.
-    standing = np.flatnonzero((normals @ up > -_TURNED_AWAY) | (points @ up < floor + STEP))
-    thin = np.unique(np.floor(points[standing] / _ROWS).astype(np.int64), axis=0, return_index=True)[1]
-    every = 1 + len(thin) // MOST
+    points, normals, normal_std = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    # Sides reach down to the floor, so downward points of a front face's sides above it are no bottom.
+    standing = np.flatnonzero((normals @ up > -_SAME_FACE_COSINE) | (points @ up < floor + STEP))
+    thin = np.unique(np.floor(points[standing] / _SPACING_M).astype(np.int64), axis=0, return_index=True)[1]
+    every = 1 + len(thin) // MAX_POINTS
     kept = standing[thin[::every]]
     for face, back in zip(faces, backs, strict=True):
         kept = kept[~face.hides(points[kept], back)]
-    outer = winding_numbers(points[kept], seen.points, seen.normals, areas, softened=_ROWS) < _WITHIN
+    winding = winding_numbers(points[kept], measured.points, measured.normals, areas, softened=_SPACING_M)
     evidence = evidence_at(points[kept], views)
-    kept = kept[outer & ~(evidence.seen_through & (evidence.passes >= _THROUGH))]
-    kept = kept[~_inside(points[kept], normals[kept], tube=_TUBE * np.sqrt(every))]
+    kept = kept[(winding < _INSIDE_WINDING) & ~(evidence.seen_through & (evidence.passes >= _MIN_THROUGH_VIEWS))]
+    kept = kept[~_inside(points[kept], normals[kept], tube=_TUBE_M * np.sqrt(every))]
     return GraspSurface(
-        np.concatenate([seen.points, points[kept]]),
-        np.concatenate([seen.normals, normals[kept]]),
-        np.concatenate([seen.half, np.zeros((len(kept), 3, 3))]),
-        np.concatenate([seen.spread, np.full(len(kept), _ROWS / 2)]),
-        np.concatenate([seen.seen, np.zeros(len(kept), np.bool_)]),
-        np.concatenate([seen.doubt, doubt[kept]]),
-        seen.center,
+        np.concatenate([measured.points, points[kept]]),
+        np.concatenate([measured.normals, normals[kept]]),
+        np.concatenate([measured.axes, np.zeros((len(kept), 3, 3))]),
+        np.concatenate([measured.spread, np.full(len(kept), _SPACING_M / 2)]),
+        np.concatenate([measured.observed, np.zeros(len(kept), np.bool_)]),
+        np.concatenate([measured.normal_std, normal_std[kept]]),
+        measured.center,
     )
 
 
-class _ImpliedFace:
-    """What of a target faces a direction (3,)."""
+class _CompletedFace:
+    """Observed points of a target that face a direction (3,)."""
 
-    def __init__(self, direction: Array, seen: GraspSurface) -> None:
+    def __init__(self, direction: Array, measured: GraspSurface) -> None:
         self.direction = direction
-        self.points = seen.points[seen.normals @ direction > _FACING]
+        self.points = measured.points[measured.normals @ direction > _FACING_COSINE]
         self.across = frame_along(direction)
         self.flat = self.points @ self.across.T
-        self.relief = Relief.of(self.flat) if len(self.points) >= _FEW else None
+        self.relief = Relief.of(self.flat) if len(self.points) >= _MIN_FACE_POINTS else None
 
     def hides(self, points: Array, back: float) -> NDArray[np.bool_]:
-        """Whether points (P, 3) are between it and its back, but for its rim (P,): there is no side."""
+        """Return which points (P, 3) are between the face and its back, away from the boundary: no side is there."""
         if self.relief is None:
             return np.zeros(len(points), np.bool_)
         flat = points @ self.across.T
-        behind = self.relief.inwards(flat) > _SEEN + DISC
-        return np.asarray(behind & (flat[:, 2] > back + _SEEN) & (flat[:, 2] < np.percentile(self.flat[:, 2], 95)))
+        behind = self.relief.inwards(flat) > _OBSERVED_RADIUS_M + DISC
+        top = np.percentile(self.flat[:, 2], 95)
+        return np.asarray(behind & (flat[:, 2] > back + _OBSERVED_RADIUS_M) & (flat[:, 2] < top))
 
     def seen_through(self, views: Sequence[DepthView]) -> float:
-        """Where along its direction [m, world] something behind it was seen through: what is flat in front ends before
-        that.
+        """Return the coordinate along the direction [m, world] at which measured depth proves free space behind it.
 
-        Minus infinity: nowhere within the depth that is implied at most. What is behind its rim is not asked.
+        A flat object ends in front of this coordinate. It is minus infinity if no free space was observed within the
+        maximum inferred depth. Points behind the boundary of the face are not queried.
         """
         if self.relief is None or not views:
             return -np.inf
-        front = self.points[self.relief.inwards(self.flat) > _RIM]
-        front = front[:: 1 + len(front) // _COLUMNS]
-        if len(front) < _FEW:
+        front = self.points[self.relief.inwards(self.flat) > _BOUNDARY_M]
+        front = front[:: 1 + len(front) // _MAX_COLUMNS]
+        if len(front) < _MIN_FACE_POINTS:
             return -np.inf
-        deep = np.arange(_ROWS, 2 * _BEHIND, _ROWS)
-        evidence = evidence_at((front[None] - deep[:, None, None] * self.direction).reshape(-1, 3), views)
-        through = (evidence.seen_through & (evidence.passes >= _THROUGH)).reshape(len(deep), len(front))
-        ended = np.logical_or.accumulate(through, axis=0).mean(axis=1) >= _HOLLOW
-        return float(np.median(front @ self.direction) - deep[ended.argmax()]) if ended.any() else -np.inf
+        depths = np.arange(_SPACING_M, 2 * _DEFAULT_DEPTH_M, _SPACING_M)
+        evidence = evidence_at((front[None] - depths[:, None, None] * self.direction).reshape(-1, 3), views)
+        through = (evidence.seen_through & (evidence.passes >= _MIN_THROUGH_VIEWS)).reshape(len(depths), len(front))
+        free = np.logical_or.accumulate(through, axis=0).mean(axis=1) >= _MAX_FREE_FRACTION
+        return float(np.median(front @ self.direction) - depths[free.argmax()]) if free.any() else -np.inf
 
 
-def _behind(seen: GraspSurface, face: _ImpliedFace, up: Array, views: Sequence[DepthView]) -> tuple[_Points, float]:
-    """Of the sides behind a face and of the back: points and normals (K, 3), their standard deviation (K,) [m]; and
-    where the back is along the face's direction [m, world]; infinity: it is curved."""
-    back, mirrored = _back(seen, face.direction, up)
-    guess = _ROWS / 2
-    along = seen.points @ face.direction
-    if not mirrored and back < np.percentile(along, 5):  # nothing of the thing shows how deep it is
-        back = max(back, face.seen_through(views))
-        guess = max(guess, float(np.median(along) - back) / np.sqrt(12))  # all in between is as likely
-    points, normals = _sides(seen, face.direction, back, closed=True, mirrored=mirrored)
-    doubt = np.where(normals @ face.direction < -_TURNED_AWAY, guess, _ROWS / 2)
-    return (points, normals, doubt), np.inf if mirrored else back
+def _behind(
+    measured: GraspSurface, face: _CompletedFace, up: Array, views: Sequence[DepthView]
+) -> tuple[_Points, float]:
+    """Infer the sides behind a face and its back.
 
-
-def _along(seen: GraspSurface, up: Array) -> Array:
-    """The direction (3,) in which the target stands: ``up``, or along the flat face that is most of it and leans.
-
-    What leans, as a book on a wall, has its back parallel to its face, and its sides end where they do in its own
-    frame, not below; what is round, or has several sides, shows no single face that is most of it.
+    Returns:
+        Points (K, 3), normals (K, 3) and standard deviations along the normal (K,) [m]. The last value is the
+        coordinate of the back along the face's direction [m, world], infinity for a curved back.
     """
-    side = seen.normals[np.abs(seen.normals @ up) < _SLOPE]
-    if len(side) < max(_FEW, _MOST_OF_IT * len(seen)):
+    back, mirrored = _back(measured, face.direction, up)
+    back_std = _SPACING_M / 2
+    along = measured.points @ face.direction
+    if not mirrored and back < np.percentile(along, 5):  # no observation of the depth
+        back = max(back, face.seen_through(views))
+        back_std = max(back_std, float(np.median(along) - back) / np.sqrt(12))  # uniform distribution of the depth
+    points, normals = _extruded_sides(measured, face.direction, back, closed=True, mirrored=mirrored)
+    normal_std = np.where(normals @ face.direction < -_SAME_FACE_COSINE, back_std, _SPACING_M / 2)
+    return (points, normals, normal_std), np.inf if mirrored else back
+
+
+def _along(measured: GraspSurface, up: Array) -> Array:
+    """Return the axis (3,) of the target: ``up``, or the steepest direction in a dominant flat face that leans.
+
+    The back of a leaning object, such as a book against a wall, is parallel to its face. Its sides end in its own
+    frame rather than at the support. Round objects and objects with several visible sides have no dominant face.
+    """
+    side = measured.normals[np.abs(measured.normals @ up) < _SIDE_COSINE]
+    if len(side) < max(_MIN_FACE_POINTS, _DOMINANT_FRACTION * len(measured)):
         return up
-    close = side @ side[:: max(1, len(side) // 100)].T > _FLAT
+    close = side @ side[:: max(1, len(side) // 100)].T > _FLAT_COSINE
     best = int(close.sum(axis=0).argmax())
-    if close[:, best].sum() < _MOST_OF_IT * len(seen):
+    if close[:, best].sum() < _DOMINANT_FRACTION * len(measured):
         return up
     face = side[close[:, best]].mean(axis=0)
     face /= np.linalg.norm(face)
     lean = float(face @ up)
-    if abs(lean) < np.sin(_LEANS):
+    if abs(lean) < np.sin(_MIN_LEAN_RAD):
         return up
     along = up - lean * face
     return np.asarray(along / np.linalg.norm(along))
 
 
-def _directions(seen: GraspSurface, up: Array) -> list[Array]:
-    """Level directions that many of what was seen face, unless the opposite side was seen as well."""
-    level = np.abs(seen.normals @ up) < 0.5
-    left, points = seen.normals[level], seen.points[level]
+def _directions(measured: GraspSurface, up: Array) -> list[Array]:
+    """Return the horizontal directions of observed faces whose opposite side was not observed."""
+    level = np.abs(measured.normals @ up) < 0.5
+    left, points = measured.normals[level], measured.points[level]
     left = left - np.outer(left @ up, up)
     left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
-    few = max(_FEW, 0.05 * len(seen))
+    min_points = max(_MIN_FACE_POINTS, 0.05 * len(measured))
     found: list[Array] = []
-    while len(left) >= few and len(found) < 8:
+    while len(left) >= min_points and len(found) < 8:
         close = left @ left[:: max(1, len(left) // 100)].T > 0.9
         own = close[:, int(close.sum(axis=0).argmax())]
-        if own.sum() < few:
+        if own.sum() < min_points:
             break
         face = left[own].mean(axis=0)
         face /= np.linalg.norm(face)
         found.append(_across(points[own], face, up))
-        other = left @ face < _TURNED_AWAY
+        other = left @ face < _SAME_FACE_COSINE
         left, points = left[other], points[other]
-    return [face for face in found if not any(face @ other < -_FACING for other in found)]
+    return [face for face in found if not any(face @ other < -_FACING_COSINE for other in found)]
 
 
 def _across(points: Array, face: Array, up: Array) -> Array:
-    """The level direction (3,) across the places (P, 3) of what looks to ``face`` (3,): normals that were seen at a
-    slant are off together, by 10 degrees and more. Both halves of a plane are turned like all of it, those of a step or
-    of what is round are not, and leave the normals' direction."""
+    """Correct the horizontal direction (3,) of a face by a line fit to its points (P, 3).
+
+    Normals that were observed at a slant share an error of 10 degrees and more. The correction applies to planes alone:
+    the fits to both halves must agree with the fit to the whole face. For steps and round faces the direction of the
+    normals is kept.
+    """
     aside = np.cross(up, face)
     local = points @ np.stack([aside, up, face], axis=1)
     left = local[:, 0] < np.median(local[:, 0])
     whole, *halves = (_slope(part) for part in (local, local[left], local[~left]))
-    if abs(whole) > _MOST_TURNED or min(np.sign(whole) * half for half in halves) < 0.5 * abs(whole):
+    if abs(whole) > _MAX_ROTATION_TANGENT or min(np.sign(whole) * half for half in halves) < 0.5 * abs(whole):
         return face
     turned = face - whole * aside
     return np.asarray(turned / np.linalg.norm(turned))
 
 
 def _slope(local: Array) -> float:
-    """Of depth over width in places (P, 3) = (width, height, depth) [m], without what lies beside their plane; the
-    smaller, the narrower they are, for there normals tell better."""
+    """Fit the slope of depth over width to points (P, 3) = (width, height, depth) [m] by robust ridge regression.
+
+    With A = (width, height), n points and the prior width s: slopes = (AᵀA + n s² I)⁻¹ Aᵀ depth. Three rounds reject
+    residuals above three median absolute deviations. The prior shrinks the slope of narrow faces, whose normals
+    are more accurate than the fit.
+    """
     kept = np.ones(len(local), np.bool_)
     slopes = np.zeros(2)
     for _ in range(3):
         middle = local[kept] - local[kept].mean(axis=0)
         A, depth = middle[:, :2], middle[:, 2]
-        slopes = np.linalg.solve(A.T @ A + len(A) * _NARROW**2 * np.eye(2), A.T @ depth)
-        off = local[:, 2] - local[:, :2] @ slopes
-        off = np.abs(off - np.median(off))
-        kept = off <= max(3 * float(np.median(off)), _ROWS)
+        slopes = np.linalg.solve(A.T @ A + len(A) * _WIDTH_PRIOR_M**2 * np.eye(2), A.T @ depth)
+        residual = local[:, 2] - local[:, :2] @ slopes
+        residual = np.abs(residual - np.median(residual))
+        kept = residual <= max(3 * float(np.median(residual)), _SPACING_M)
     return float(slopes[0])
 
 
-def _floor(scene: SegmentedMap, seen: GraspSurface, up: Array) -> float:
-    """Height along ``up`` [m, world] where the target stands."""
-    low = float(np.percentile(seen.points @ up, 1))
-    local = transform_points(inverse(scene.T_world_base), seen.points)
+def _floor(scene: SegmentedMap, measured: GraspSurface, up: Array) -> float:
+    """Return the height along ``up`` [m, world] of the support under the target."""
+    low = float(np.percentile(measured.points @ up, 1))
+    local = transform_points(inverse(scene.T_world_base), measured.points)
     support = scene.under(local)
     if support is None:
-        return low - _BEHIND
+        return low - _DEFAULT_DEPTH_M
     under = float(np.percentile(support.height(local), 1))
     return low - under if 0.0 <= under < 0.03 else low - 0.01
 
 
-def _back(seen: GraspSurface, face: Array, up: Array) -> tuple[float, bool]:
-    """Where along ``face`` [m, world] the target ends behind, and whether its back is the mirror image of its front.
+def _back(measured: GraspSurface, face: Array, up: Array) -> tuple[float, bool]:
+    """Return the coordinate of the back along ``face`` [m, world], and whether the back mirrors the front.
 
-    A flat front is that of a box, as deep as its other sides show; a round one turns away half way to its back. Where
-    nothing of either was seen, a thing is taken to be as deep as it is narrow. Noise of the front shows no depth.
+    A flat front is treated as that of a box whose other sides show its depth. A round front is mirrored, since its
+    silhouette is half way to the back. Without an observation of the depth, the object is as deep as its smaller
+    visible extent, at most 8 cm. Depth within the noise of the front does not count as observed.
     """
-    across = seen.points @ np.stack([up, np.cross(up, face)], axis=1)
-    along = seen.points @ face
-    facing = seen.normals @ face > _FACING
-    bent, noise = _bowl(across[facing], along[facing])
+    across = measured.points @ np.stack([up, np.cross(up, face)], axis=1)
+    along = measured.points @ face
+    facing = measured.normals @ face > _FACING_COSINE
+    bent, noise = _paraboloid(across[facing], along[facing])
     near, far = float(np.percentile(bent, 95)), float(np.percentile(along, 5))
-    if near - far > _SHOWN + _SPREAD * noise:
-        flat = float((near - bent < _SHOWN).mean()) > 0.7
-        return (far, False) if flat else (max(2 * far - near, near - 2 * _BEHIND), True)
+    if near - far > _MIN_OBSERVED_DEPTH_M + _NOISE_QUANTILE * noise:
+        flat = float((near - bent < _MIN_OBSERVED_DEPTH_M).mean()) > 0.7
+        return (far, False) if flat else (max(2 * far - near, near - 2 * _DEFAULT_DEPTH_M), True)
     narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
-    return near - min(narrow, 2 * _BEHIND), False
+    return near - min(narrow, 2 * _DEFAULT_DEPTH_M), False
 
 
-def _bowl(at: Array, heights: Array) -> tuple[Array, float]:
-    """Heights (P,) as a paraboloid over places (P, 2) has them, and the standard deviation from it [m]."""
+def _paraboloid(at: Array, heights: Array) -> tuple[Array, float]:
+    """Fit a paraboloid to heights (P,) [m] over points (P, 2); return its heights and the robust noise [m].
+
+    z = a + b x + c y + d x² + e x y + f y² by least squares; noise = 1.48 median |residual|.
+    """
     x, y = (at - at.mean(axis=0)).T
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     bent = terms @ np.linalg.lstsq(terms, heights, rcond=None)[0]
     return bent, 1.48 * float(np.median(np.abs(heights - bent)))
 
 
-def _sides(
-    seen: GraspSurface, direction: Array, floor: float, *, closed: bool = False, mirrored: bool = False
+def _extruded_sides(
+    measured: GraspSurface, direction: Array, floor: float, *, closed: bool = False, mirrored: bool = False
 ) -> tuple[Array, Array]:
-    """Points and normals (K, 3) of the sides behind the edges of what faces ``direction``, where none was seen.
+    """Extrude sides from the edges of the points that face ``direction``; keep only points on unobserved parts.
 
-    ``closed``: and of the back, at ``floor``, or mirrored at the middle between it and the top.
+    Args:
+        measured: observed surface.
+        direction: (3,) unit direction of the face [world].
+        floor: coordinate along the direction down to which sides reach [m, world].
+        closed: add the back at ``floor``.
+        mirrored: mirror the back at the middle between ``floor`` and the top.
+
+    Returns:
+        Points (K, 3) and normals (K, 3) [world].
     """
     none = np.zeros((0, 3)), np.zeros((0, 3))
-    facing = seen.normals @ direction > _TURNED
-    if facing.sum() < _FEW:
+    facing = measured.normals @ direction > _VISIBLE_COSINE
+    if facing.sum() < _MIN_FACE_POINTS:
         return none
     across = frame_along(direction)
-    flat = seen.points @ across.T  # the last is the height
-    # A disc that is nearly seen from its edge reaches no farther across than that.
-    relief = Relief.of(flat[facing], (seen.spread * (seen.normals @ direction))[facing])
-    below = Relief.of(flat[seen.normals @ direction < -_TURNED], like=relief).heights
+    flat = measured.points @ across.T  # the last coordinate is the height
+    # A disc covers only its projection onto the plane of the map.
+    relief = Relief.of(flat[facing], (measured.spread * (measured.normals @ direction))[facing])
+    below = Relief.of(flat[measured.normals @ direction < -_VISIBLE_COSINE], like=relief).heights
     at, out, top, beyond = relief.edges()
     foot = np.maximum(floor, np.maximum(beyond, below[at[:, 0], at[:, 1]]))
-    rows = [np.arange(h - _ROWS / 2, f, -_ROWS) for h, f in zip(top, foot, strict=True)]
+    rows = [np.arange(h - _SPACING_M / 2, f, -_SPACING_M) for h, f in zip(top, foot, strict=True)]
     count = np.array([len(row) for row in rows])
     if not count.sum():
         return none
@@ -287,14 +320,17 @@ def _sides(
         back = np.c_[relief.at(cells), np.broadcast_to(depth, len(cells))] @ across
         points = np.concatenate([points, back])
         normals = np.concatenate([normals, np.tile(-direction, (len(back), 1))])
-    new = _unseen(points, normals, seen)
+    new = _unseen(points, normals, measured)
     return points[new], normals[new]
 
 
 def _inside(points: Array, normals: Array, *, tube: float) -> NDArray[np.bool_]:
-    """Whether what points (P, 3) face first is another of them from behind (P,): they are within the target.
+    """Return which points (P, 3) are inside of the target: the first point along their normal is met from behind.
 
-    ``tube``: [m] around where they look, as wide as points are apart, for nobody looks out between them.
+    Args:
+        points: (P, 3) [m, world].
+        normals: (P, 3) outward unit normals.
+        tube: radius around the ray along a normal in which it meets a point [m], at least the spacing of the points.
     """
     if not len(points):
         return np.zeros(0, np.bool_)
@@ -304,21 +340,21 @@ def _inside(points: Array, normals: Array, *, tube: float) -> NDArray[np.bool_]:
         a, d = p[k : k + 256], n[k : k + 256]
         ahead = d @ p.T - np.einsum("ij,ij->i", a, d)[:, None]
         aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + square - ahead**2
-        ahead[(ahead < _SEEN) | (aside > tube**2)] = np.inf
+        ahead[(ahead < _OBSERVED_RADIUS_M) | (aside > tube**2)] = np.inf
         first = ahead.argmin(axis=1)
         hit = np.isfinite(ahead[np.arange(len(a)), first])
         found[k : k + 256] = hit & (np.einsum("ij,ij->i", n[first], d) > 0.3)
     return found
 
 
-def _unseen(points: Array, normals: Array, seen: GraspSurface) -> NDArray[np.bool_]:
-    """Whether nothing that was seen within 6 mm of each of points (P, 3) faces the same way (P,)."""
+def _unseen(points: Array, normals: Array, measured: GraspSurface) -> NDArray[np.bool_]:
+    """Return which points (P, 3) have no observed neighbour with a similar normal within 6 mm (P,)."""
     new = np.ones(len(points), np.bool_)
-    reach = max(_SEEN, 2.0 * float(np.median(seen.spread)))
-    for way in (*np.eye(3), *-np.eye(3)):
-        asked, known = normals @ way > 0.5, seen.normals @ way > 0.3
-        if asked.any() and known.any():
-            nearest, square = nearest_of(seen.points[known], points[asked])
-            alike = np.einsum("ij,ij->i", seen.normals[known][nearest], normals[asked]) > 0.5
-            new[np.flatnonzero(asked)[alike & (square < reach**2)]] = False
+    reach = max(_OBSERVED_RADIUS_M, 2.0 * float(np.median(measured.spread)))
+    for axis in (*np.eye(3), *-np.eye(3)):
+        queried, known = normals @ axis > 0.5, measured.normals @ axis > 0.3
+        if queried.any() and known.any():
+            nearest, square = nearest_of(measured.points[known], points[queried])
+            similar = np.einsum("ij,ij->i", measured.normals[known][nearest], normals[queried]) > 0.5
+            new[np.flatnonzero(queried)[similar & (square < reach**2)]] = False
     return new

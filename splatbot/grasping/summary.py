@@ -1,4 +1,4 @@
-"""Grasps as JSON has them."""
+"""Grasp results as JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatbot.protocols import Array
 
 
 def summary(result: GraspResult) -> dict[str, Any]:
-    """A result as JSON has it; lengths in metres, poses as position and quaternion wxyz."""
+    """Return a result as JSON values; lengths in metres, poses as position and quaternion wxyz."""
     return {
         "target": {
             "label": result.target.label,
@@ -43,7 +43,7 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "approach": grasp.approach,
         "terms": dict(grasp.terms),
         "total": grasp.total,
-        "room_m": grasp.room,
+        "room_m": grasp.clearance,
         "q": grasp.q.tolist() if grasp.q is not None else None,
         "q_pregrasp": grasp.q_pregrasp.tolist() if grasp.q_pregrasp is not None else None,
         "approach_path": grasp.approach_path.tolist() if grasp.approach_path is not None else None,

@@ -1,4 +1,4 @@
-"""What was measured of a target's surface, as oriented points: its Gaussians."""
+"""Observed surface of a target as oriented points: the means and shortest axes of its Gaussians."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
-MOST = 1800  # points that are looked at
-_OFTEN = 0.2  # of the keyframes that the best Gaussians are supported by
-_SMOOTH = 0.006  # [m] over which normals are averaged
-_SAME_SIDE, _ALIKE = 0.3, 0.8  # cosines between normals that are averaged; where rims are to stay sharp
-_LONELY = 4.0  # times the usual area of a point; those with more are strays
+MAX_POINTS = 1800  # on a surface; more are subsampled
+_MIN_SUPPORT = 0.2  # observations of a Gaussian, as a fraction of the 90th percentile
+_SMOOTHING_M = 0.006  # standard deviation [m] of the kernel that averages normals
+_SMOOTHING_COSINE = 0.3  # minimum cosine between normals that are averaged
+_SHARP_COSINE = 0.8  # the same where edges stay sharp
+_MAX_AREA_RATIO = 4.0  # area of a point over the median; points above it are strays
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,31 +28,31 @@ class GraspSurface:
 
     Args:
         points: (M, 3) [m, world].
-        normals: (M, 3) unit, outwards.
-        half: (M, 3, 3) principal axes as columns, each as long as its standard deviation [m]; 0 of what is implied.
-        spread: (M,) the largest of them [m]; of what is implied, half of the distance between its points.
-        seen: (M,) whether it was measured; the others are implied.
-        doubt: (M,) standard deviation of where the point is along its normal [m]; of a back whose depth is guessed,
-            that of the guess.
-        center: (3,) middle of its box [m, world].
+        normals: (M, 3) outward unit normals.
+        axes: (M, 3, 3) principal axes as columns, each as long as its standard deviation [m]; 0 for completed points.
+        spread: (M,) largest standard deviation [m]; for completed points half of their spacing.
+        observed: (M,) True for observed points, False for completed points.
+        normal_std: (M,) standard deviation of the point along its normal [m]. It includes the uncertainty of the
+            object's depth for points of a completed back.
+        center: (3,) centre of the bounding box [m, world].
     """
 
     points: Array
     normals: Array
-    half: Array
+    axes: Array
     spread: Array
-    seen: NDArray[np.bool_]
-    doubt: Array
+    observed: NDArray[np.bool_]
+    normal_std: Array
     center: Array
 
     def __len__(self) -> int:
         return len(self.points)
 
     def select(self, chosen: NDArray[np.int64]) -> GraspSurface:
-        """The points that are named, about the same centre."""
-        columns = (self.points, self.normals, self.half, self.spread)
-        points, normals, half, spread = (column[chosen] for column in columns)
-        return GraspSurface(points, normals, half, spread, self.seen[chosen], self.doubt[chosen], self.center)
+        """Return the chosen points with the same centre."""
+        columns = (self.points, self.normals, self.axes, self.spread)
+        points, normals, axes, spread = (column[chosen] for column in columns)
+        return GraspSurface(points, normals, axes, spread, self.observed[chosen], self.normal_std[chosen], self.center)
 
 
 def measured_surface(
@@ -62,21 +63,24 @@ def measured_surface(
     seed: int = 0,
     sharp: bool = False,
 ) -> tuple[GraspSurface, Array]:
-    """The Gaussians ``rows`` (M,) of a scene as points, strays left out, and the area each stands for (K,) [m²].
+    """Return the Gaussians ``rows`` (M,) of a scene as oriented points without strays, and their areas (K,) [m²].
 
-    Normals are the Gaussians' flat axes, averaged over 6 mm, turned to who saw them, or else away from the middle.
+    A normal is the shortest axis of its Gaussian, averaged over neighbours with a Gaussian kernel of 6 mm. It points to
+    the camera that observed the Gaussian, or away from the centre of the target if that camera is unknown.
 
     Args:
-        scene: the map.
-        rows: of the target.
-        observers: (N, 3) where each Gaussian of the map was seen from [m, world], NaN where that is not known.
-        seed: of which Gaussians are kept where there are more than 1800.
-        sharp: average normals with those alike alone: noisier, but the rim of what is low is not rounded by its top.
+        scene: the segmented map.
+        rows: (M,) indices of the target's Gaussians.
+        observers: (N, 3) camera centre from which each Gaussian was observed [m, world], NaN where unknown.
+        seed: seed of the subsampling of more than 1800 Gaussians.
+        sharp: average only nearly parallel normals. Normals are noisier, but the edge of a low object is not rounded
+            by its top.
     """
     rng = np.random.default_rng(seed)
-    seen_by = scene.model.observations.numpy()[rows]  # what few keyframes saw is often smeared beyond an edge
-    rows = rows[seen_by >= _OFTEN * np.percentile(seen_by, 90)] if len(rows) else rows
-    chosen = rows if len(rows) <= MOST else np.sort(rng.choice(rows, MOST, replace=False))
+    # Gaussians with few observations are often flying pixels next to a depth edge.
+    support = scene.model.observations.numpy()[rows]
+    rows = rows[support >= _MIN_SUPPORT * np.percentile(support, 90)] if len(rows) else rows
+    chosen = rows if len(rows) <= MAX_POINTS else np.sort(rng.choice(rows, MAX_POINTS, replace=False))
     model = scene.model.select(torch.from_numpy(chosen))
     points = model.means.detach().double().numpy()
     scales = np.sort(model.scales.detach().double().numpy(), axis=1)
@@ -87,24 +91,24 @@ def measured_surface(
     normals = shortest_axes(model).detach().double().numpy()
     normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
     flatness = 1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12)
-    normals, areas = _smoothed(points, normals, flatness, cosine=_ALIKE if sharp else _SAME_SIDE)
-    doubt = _doubts(model, scales)
-    half = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
-    kept = np.flatnonzero(areas < _LONELY * np.median(areas))
-    apart = np.sqrt(areas)
-    spread = np.where(apart > 2 * scales[:, 2], 1.2 * apart, scales[:, 2])  # where only some of many are looked at
-    seen = GraspSurface(points, normals, half, spread, np.ones(len(points), np.bool_), doubt, center)
-    return seen.select(kept), areas[kept]
+    normals, areas = _smoothed(points, normals, flatness, cosine=_SHARP_COSINE if sharp else _SMOOTHING_COSINE)
+    normal_std = _normal_stds(model, scales)
+    axes = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
+    kept = np.flatnonzero(areas < _MAX_AREA_RATIO * np.median(areas))
+    spacing = np.sqrt(areas)
+    spread = np.where(spacing > 2 * scales[:, 2], 1.2 * spacing, scales[:, 2])  # cover the gaps of a subsample
+    surface = GraspSurface(points, normals, axes, spread, np.ones(len(points), np.bool_), normal_std, center)
+    return surface.select(kept), areas[kept]
 
 
-def _doubts(model: GaussianModel, scales: Array) -> Array:
-    """By the depth fused into them, or of a map from elsewhere their thickness."""
+def _normal_stds(model: GaussianModel, scales: Array) -> Array:
+    """Return standard deviations along the normal (M,) [m]: from depth fusion, else the thickness of the Gaussian."""
     fused = model.uncertainty.detach().double().numpy()
     return np.where(fused > 0, fused, scales[:, 0])
 
 
 def _middle(scene: SegmentedMap, points: Array) -> Array:
-    """Half way between the highest point and what the target stands on."""
+    """Return the centre (3,) [m, world] of the box around the points, extended down to the support plane."""
     local = transform_points(inverse(scene.T_world_base), points)
     low, high = np.percentile(local, [1, 99], axis=0)
     support = scene.under(local)
@@ -114,17 +118,18 @@ def _middle(scene: SegmentedMap, points: Array) -> Array:
 
 
 def _smoothed(points: Array, normals: Array, flatness: Array, *, cosine: float) -> tuple[Array, Array]:
-    """Normals averaged with those of neighbours alike, and the area that each point stands for (M,) [m²].
+    """Average normals with those of similar neighbours, and estimate the area of each point (M,) [m²].
 
-    Round Gaussians have little to say.
+    The weight of a neighbour is w_ij = exp(-|p_i - p_j|² / 2s²) * max(flatness_j, 0.05), so that round Gaussians, whose
+    shortest axis is uncertain, count little. With the kernel density the area is A_i = 2 pi s² / sum_j exp(...).
     """
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
     weight = np.maximum(square[:, None] + square[None] - 2 * (p @ p.T), 0.0)
-    np.exp(weight * (-0.5 / _SMOOTH**2), out=weight)
-    crowd = weight.sum(axis=1)
+    np.exp(weight * (-0.5 / _SMOOTHING_M**2), out=weight)
+    density = weight.sum(axis=1)
     weight *= n @ n.T > cosine
     weight *= np.maximum(flatness, 0.05).astype(np.float32)
     mean = (weight @ n).astype(np.float64)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    return mean, np.asarray(2 * np.pi * _SMOOTH**2 / crowd, dtype=np.float64)
+    return mean, np.asarray(2 * np.pi * _SMOOTHING_M**2 / density, dtype=np.float64)

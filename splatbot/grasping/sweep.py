@@ -1,4 +1,4 @@
-"""The hand on its straight way, against fields of Gaussians."""
+"""Collision of the hand with fields of Gaussians along its straight approach."""
 
 from __future__ import annotations
 
@@ -7,30 +7,29 @@ from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField, boxes_in_collision
 from splatbot.geometry import inverse, rotation_to_quat, transform_points
-from splatbot.grasping.hands import Hands
+from splatbot.grasping.hands import MAX_CLEARANCE_M, Hands
 from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
 
-LOOK = 0.03  # [m] of room beyond which nothing is looked for
-_PLACES = 5  # on the way
-_AT_ONCE = 4096  # hands
-_TOLERANCE = 1e-3  # [m]
+_SAMPLES = 5  # poses along the approach
+_BATCH = 4096  # hands that are evaluated at once
+_TOLERANCE_M = 1e-3  # of box queries, and cut-off of the quick finger test
 
 
-def swept_room(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, *, retreat: float) -> Array:
-    """Of the spheres of the robot's last link, at five places of a way of ``retreat`` [m] (K,) [m], at most 3 cm.
+def swept_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, *, retreat: float) -> Array:
+    """Compute the clearance (K,) [m] of the last link's spheres at five poses of an approach of ``retreat`` [m].
 
-    The certificate that nothing is touched between those places is the arm's own, see
+    Values are clipped to 3 cm. The continuous path between the poses is certified later for the whole arm, see
     :func:`splatbot.planning.cartesian.straight_line`.
     """
-    return _room(robot, hands, field, back=np.linspace(0.0, retreat, _PLACES), cut=LOOK)
+    return _clearance(robot, hands, field, back=np.linspace(0.0, retreat, _SAMPLES), cut=MAX_CLEARANCE_M)
 
 
-def fingers_room(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, hand: HandShape) -> Array:
-    """Of the spheres before the palm alone, where the hand takes hold (K,) [m], at most 1 mm: quick, for many hands."""
-    return _room(robot, hands, field, back=np.zeros(1), cut=_TOLERANCE, ahead=-hand.palm)
+def finger_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, hand: HandShape) -> Array:
+    """Compute the clearance (K,) [m] of the finger spheres at the grasp, clipped to 1 mm; a quick test."""
+    return _clearance(robot, hands, field, back=np.zeros(1), cut=_TOLERANCE_M, ahead=-hand.palm)
 
 
-def _room(
+def _clearance(
     robot: RobotKinematics,
     hands: Hands,
     field: GaussianCollisionField,
@@ -39,12 +38,15 @@ def _room(
     cut: float,
     ahead: float = -np.inf,
 ) -> Array:
-    """(K,) [m], at most ``cut``, at places ``back`` (B,) [m] behind the grasp, of spheres ``ahead`` of a plane [m]."""
+    """Compute clearances (K,) [m], at most ``cut``, at offsets ``back`` (B,) [m] against the approach direction.
+
+    Only spheres with z > ``ahead`` [m] in the frame of the tool count.
+    """
     assert isinstance(robot, HasHand)
     T_tcp_link = inverse(robot.T_link_tcp)
-    room = np.full(len(hands), cut)
+    clearance = np.full(len(hands), cut)
     alike = (np.flatnonzero(hands.opening == opening) for opening in np.unique(hands.opening))
-    for rows in (some[k : k + _AT_ONCE] for some in alike for k in range(0, len(some), _AT_ONCE)):
+    for rows in (some[k : k + _BATCH] for some in alike for k in range(0, len(some), _BATCH)):
         spheres = robot.spheres(float(hands.opening[rows[0]]))
         own = spheres.link == len(robot.chain)
         local, radii = transform_points(T_tcp_link, spheres.centers[own]), spheres.radii[own]
@@ -54,12 +56,15 @@ def _room(
         centers = np.einsum("kij,sj->ksi", T[:, :3, :3], places) + T[:, None, :3, 3]
         wide = np.broadcast_to(np.tile(radii, len(back)), centers.shape[:2])
         away = field.clearance(np.c_[centers.reshape(-1, 3), wide.reshape(-1)], cut=cut).distance
-        room[rows] = np.minimum(away.reshape(len(rows), -1).min(axis=1, initial=cut), cut)
-    return room
+        clearance[rows] = np.minimum(away.reshape(len(rows), -1).min(axis=1, initial=cut), cut)
+    return clearance
 
 
 def touches(field: GaussianCollisionField, hands: Hands, hand: HandShape, *, retreat: float) -> NDArray[np.bool_]:
-    """Whether fingers or palm, as boxes along a way of ``retreat`` [m], may touch a Gaussian (K,); false is certain."""
+    """Return whether fingers or palm, swept as boxes along an approach of ``retreat`` [m], may touch a Gaussian (K,).
+
+    False is certain, True is conservative.
+    """
     if not len(hands):
         return np.zeros(0, np.bool_)
     long = retreat + hand.palm + hand.tip
@@ -75,5 +80,5 @@ def touches(field: GaussianCollisionField, hands: Hands, hand: HandShape, *, ret
     hit = np.zeros(len(hands), np.bool_)
     for centers, size in boxes:
         world = np.einsum("kij,kj->ki", R, centers) + at
-        hit |= boxes_in_collision(field, world, quats, np.tile(size, (len(hands), 1)), tolerance=_TOLERANCE)
+        hit |= boxes_in_collision(field, world, quats, np.tile(size, (len(hands), 1)), tolerance=_TOLERANCE_M)
     return hit

@@ -1,4 +1,4 @@
-"""Targets that carry an AprilTag."""
+"""Targets with an AprilTag."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.grasping.affordance import AffordanceError, Hint, ObservedView, TagHint, Target
-from splatbot.grasping.places import at_point, point_at
+from splatbot.grasping.spatial import at_point, point_at
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
@@ -20,19 +20,19 @@ FAMILIES = {
 
 
 class TagAffordance:
-    """The object that an AprilTag (Olson 2011) is on, by its corners in pictures and the map's own depth there."""
+    """Finds the object with an AprilTag (Olson 2011): tag detection in images, depth from the map."""
 
     @property
     def name(self) -> str:
-        """As results tell it."""
+        """Name of the backend in results."""
         return "apriltag"
 
     def understands(self, hint: Hint) -> bool:
-        """Tags."""
+        """Return whether the hint is a tag."""
         return isinstance(hint, TagHint)
 
     def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
-        """See :class:`splatbot.grasping.affordance.Affordance`."""
+        """Find the object with the tag; see :class:`splatbot.grasping.affordance.Affordance`."""
         if not isinstance(hint, TagHint):
             raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a tag")
         seen: set[int] = set()
@@ -53,10 +53,10 @@ class TagAffordance:
 
 
 def find_tags(view: ObservedView, family: str = "36h11") -> dict[int, Array]:
-    """Corners (4, 2) [px] of the tags in a view's picture, by number.
+    """Detect tags in the image of a view; return their corners (4, 2) [px] by tag id.
 
     Raises:
-        InputError: the family is unknown, or the view has no picture.
+        InputError: the family is unknown, or the view has no image.
     """
     if family not in FAMILIES:
         raise InputError(f"is {family!r}.", field="family", hint=f"one of {', '.join(FAMILIES)}")

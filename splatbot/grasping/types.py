@@ -1,4 +1,4 @@
-"""What grasping answers: ranked grasps with every term of their score, or why there is none."""
+"""Results of grasp sampling: ranked grasps with all score terms, or the reasons for which candidates were rejected."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
-    """A pose of the hand at which it takes hold, and what speaks for it.
+    """A grasp of a parallel-jaw gripper with its score.
 
     Args:
-        T_world_tcp: (4, 4) of the tool: z is the approach, the fingers close along y.
-        width: of the target between the fingers [m].
-        opening: of the fingers as they come [m].
-        contacts: (2, 3) where they touch [m, world].
-        normals: (2, 3) of the surface there, outwards.
-        approach: "top", "side", "front" (side, along the robot's own view) or "free".
-        terms: each in 0..1, 1 is best; see :mod:`splatbot.grasping.score`.
-        total: their weighted mean.
-        room: the least distance of the hand to the target beside its pads, and to all else, on the way [m].
-        T_world_pregrasp: (4, 4) from where it goes straight to the grasp.
-        q: (J,) at the grasp; None: no arm was asked.
-        q_pregrasp: (J,) at the start of the straight approach.
-        approach_path: (K, J) from there to the grasp, certified free of all but the target.
-        rejected: why it will not do; empty: it will.
+        T_world_tcp: (4, 4) pose of the tool; z is the approach direction, the fingers close along y.
+        width: distance between the contacts [m].
+        opening: finger opening during the approach [m].
+        contacts: (2, 3) contact points [m, world].
+        normals: (2, 3) outward surface normals at the contacts [world].
+        approach: "top", "side", "front" (a side approach that points away from the robot base) or "free".
+        terms: score terms, each in 0..1 with 1 the best; see :mod:`splatbot.grasping.score`.
+        total: weighted mean of the terms.
+        clearance: minimum clearance of the hand along the straight approach [m]. Contacts under the pads do not count.
+        T_world_pregrasp: (4, 4) pose of the tool at the start of the straight approach.
+        q: (J,) joint positions at the grasp. If None, reachability by an arm was not checked.
+        q_pregrasp: (J,) joint positions at the pre-grasp.
+        approach_path: (K, J) straight path from the pre-grasp to the grasp. It is certified against the map without
+            the target.
+        rejected: reason for which the grasp is rejected; empty for an accepted grasp.
     """
 
     T_world_tcp: Array
@@ -41,7 +42,7 @@ class Grasp:
     approach: str
     terms: Mapping[str, float]
     total: float
-    room: float
+    clearance: float
     T_world_pregrasp: Array
     q: Array | None = None
     q_pregrasp: Array | None = None
@@ -49,24 +50,28 @@ class Grasp:
     rejected: str = ""
 
     @property
-    def clear(self) -> bool:
-        """Whether hand and arm, at the grasp and on the straight way to it, keep clear of where something moved; True
-        also where nothing did."""
+    def avoids_moving(self) -> bool:
+        """Return whether hand and arm avoid the regions where motion was observed, at the grasp and on its approach.
+
+        The value is True if no motion was observed.
+        """
         return self.terms.get("clear", 1.0) > 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class GraspResult:
-    """Grasps of a target.
+    """Ranked grasps of one target.
 
     Args:
-        target: what was asked for.
-        grasps: best first; may be empty.
-        rejected: how many candidates fell to what, in the order of the tests.
-        best_rejected: of those that came farthest, the best.
-        candidates: how many hands were scored.
-        seconds: by stage.
-        map_version: of the map that was asked.
+        target: the requested target.
+        grasps: accepted grasps, best first; may be empty.
+        rejected: number of rejected candidates for each reason, in the order of the tests.
+        best_rejected: the best of the candidates that passed the most tests. If None, a grasp was accepted or no
+            candidate exists.
+        candidates: number of hand poses that were evaluated.
+        seconds: duration of each stage [s].
+        map_version: version of the map that was searched.
+        notes: remarks on the result, each a sentence.
     """
 
     target: Target
@@ -82,10 +87,10 @@ class GraspResult:
         return bool(self.grasps)
 
     def unwrap(self) -> Grasp:
-        """The best grasp.
+        """Return the best grasp.
 
         Raises:
-            NoGraspError: there is none; it says why.
+            NoGraspError: no candidate was accepted; the message states the reasons.
         """
         if self.grasps:
             return self.grasps[0]
@@ -93,7 +98,7 @@ class GraspResult:
 
 
 class NoGraspError(SplatbotError):
-    """Nothing is left of the candidates; ``result`` tells what each fell to."""
+    """All candidates were rejected; ``result`` holds the number of candidates for each reason."""
 
     http_status = 422
 

@@ -1,4 +1,4 @@
-"""What a surface of oriented points encloses: winding numbers, and with them its volume and where its middle is."""
+"""Volume and centre of mass of a surface of oriented points, by generalized winding numbers."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ import numpy as np
 
 from splatbot.protocols import Array
 
-MOST = 800  # points that a volume is told by
-_CELLS = 3000  # of the grid that is filled, at most
-_INSIDE = 0.5  # winding number, from where on a place is within
-_LEAST = 30  # cells that are a volume
-_SMOOTH = 0.006  # [m] over which the density of points is looked at
-_SAME = 0.3  # cosine between normals of one side
+_MAX_VOLUME_POINTS = 800  # on the surface; more are subsampled
+_MAX_CELLS = 3000  # of the grid over the bounding box
+_INSIDE_WINDING = 0.5  # winding number above which a point is inside
+_MIN_CELLS = 30  # inside cells below which the surface encloses no volume
+_SMOOTHING_M = 0.006  # standard deviation of the kernel that estimates the density of points
+_SAME_SIDE_COSINE = 0.3  # between normals of points on the same side of a thin object
 
 
 def winding_numbers(places: Array, points: Array, normals: Array, areas: Array, *, softened: float) -> Array:
-    """How far places (P, 3) are surrounded by oriented points (M, 3) that stand for ``areas`` (M,) [m²] (P,).
+    """Compute the generalized winding numbers (P,) of oriented points at the queries ``places`` (P, 3).
 
-    Barill et al. 2018: 1 within a closed surface, 0 outside of it, and between for one that has holes.
+    Following Barill et al. 2018, with points p_i, unit normals n_i and areas A_i::
+
+        w(q) = sum_i A_i (p_i - q) · n_i / (4 pi |p_i - q|³)
+
+    It is 1 inside of a closed surface and 0 outside; holes lead to values in between.
 
     Args:
-        places: [m].
-        points, normals: of the surface [m], unit outwards.
-        areas: see there.
-        softened: distance below which a point pulls no more [m].
+        places: (P, 3) query points [m].
+        points: (M, 3) surface points [m].
+        normals: (M, 3) outward unit normals.
+        areas: (M,) area of each point [m²].
+        softened: distance [m] to which smaller distances are clipped, which bounds the singularity.
     """
     middle = points.mean(axis=0)
     p, q = (places - middle).astype(np.float32), (points - middle).astype(np.float32)
@@ -41,11 +46,11 @@ def winding_numbers(places: Array, points: Array, normals: Array, areas: Array, 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """What a surface encloses.
+    """Volume that a surface encloses.
 
     Args:
-        center: (3,) its middle [m], of a thing of one material its centre of mass.
-        size: [m³].
+        center: (3,) centroid [m]; the centre of mass for a uniform density.
+        size: volume [m³].
     """
 
     center: Array
@@ -53,33 +58,34 @@ class Volume:
 
 
 def enclosed_volume(points: Array, normals: Array, *, seed: int = 0) -> Volume:
-    """Of oriented points (M, 3): a grid over their box is filled by winding numbers.
+    """Compute the enclosed volume by the winding numbers of a grid over the bounding box.
 
-    Points that enclose nothing, as a single face, have the middle of their box, and no volume.
+    Points that enclose no volume, such as a single face, yield the centre of their box and the volume 0.
 
     Args:
-        points, normals: on the surface [m], unit outwards.
-        seed: of which points are kept where there are more than 800.
+        points: (M, 3) surface points [m].
+        normals: (M, 3) outward unit normals.
+        seed: seed of the subsampling of more than 800 points.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     none = Volume((low + high) / 2, 0.0)
-    if len(points) > MOST:
-        chosen = np.sort(np.random.default_rng(seed).choice(len(points), MOST, replace=False))
+    if len(points) > _MAX_VOLUME_POINTS:
+        chosen = np.sort(np.random.default_rng(seed).choice(len(points), _MAX_VOLUME_POINTS, replace=False))
         points, normals = points[chosen], normals[chosen]
-    size = float((np.prod(high - low) / _CELLS) ** (1 / 3))
+    size = float((np.prod(high - low) / _MAX_CELLS) ** (1 / 3))
     if not size > 0.0:
         return none
     axes = (np.arange(a + size / 2, b, size) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     around = winding_numbers(grid, points, normals, _areas(points, normals), softened=size)
-    inside = grid[around > _INSIDE]
-    return Volume(inside.mean(axis=0), len(inside) * size**3) if len(inside) >= _LEAST else none
+    inside = grid[around > _INSIDE_WINDING]
+    return Volume(inside.mean(axis=0), len(inside) * size**3) if len(inside) >= _MIN_CELLS else none
 
 
 def _areas(points: Array, normals: Array) -> Array:
-    """That each point stands for (M,) [m²], by how dense its side is there."""
+    """Estimate the area of each point (M,) [m²] from the kernel density of the points on its side."""
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
-    weight = np.exp(np.maximum(square[:, None] + square - 2 * (p @ p.T), 0.0) * (-0.5 / _SMOOTH**2))
-    weight *= n @ n.T > _SAME
-    return np.asarray(2 * np.pi * _SMOOTH**2 / weight.sum(axis=1), dtype=np.float64)
+    weight = np.exp(np.maximum(square[:, None] + square - 2 * (p @ p.T), 0.0) * (-0.5 / _SMOOTHING_M**2))
+    weight *= n @ n.T > _SAME_SIDE_COSINE
+    return np.asarray(2 * np.pi * _SMOOTHING_M**2 / weight.sum(axis=1), dtype=np.float64)

@@ -16,9 +16,9 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
-from splatbot.segmentation.parts import cut_at_steps, local_normals, nearest_of, region
+from splatbot.segmentation.faces import cut_at_steps, local_normals, nearest_of, region
 from splatbot.segmentation.plane import NEAR, Support, find_support, given_support
-from splatbot.segmentation.rooms import cut_in_room
+from splatbot.segmentation.concave_edges import cut_in_room
 from splatbot.workspace import NamedPlace
 
 OPAQUE = 0.3  # fainter Gaussians are no surface

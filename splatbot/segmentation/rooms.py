@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
-from splatbot.segmentation.parts import local_normals, nearest_of
+from splatbot.segmentation.faces import local_normals, nearest_of
 
 _TRIES, _MOST = 150, 16  # points whose planes are tried; planes
 _LEAST = 0.01  # share of the points that a plane must have

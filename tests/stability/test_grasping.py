@@ -14,7 +14,7 @@ from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult, NoGraspError
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
-from tests.unit.grasping.things import colored
+from tests.unit.grasping.objects import colored
 
 COUNT = 60_000
 

@@ -1,4 +1,4 @@
-"""Vision-language models that say where a named thing is, and what it takes to believe them."""
+"""Vision-language models that locate a named object in images, and the checks of their answers."""
 
 from splatbot.grasping.vision.affordance import VisionAffordance
 from splatbot.grasping.vision.endpoint import EndpointModel

@@ -1,4 +1,4 @@
-"""A named object found by a vision-language model, believed only as far as the map bears it out."""
+"""Target selection by a vision-language model whose answers are checked against the map."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.grasping.affordance import Affordance, AffordanceError, Hint, NameHint, ObservedView, Target
-from splatbot.grasping.places import at_point, point_at
+from splatbot.grasping.spatial import at_point, point_at
 from splatbot.grasping.vision.answers import Answer, question_for, read_answers
 from splatbot.grasping.vision.models import Picture, VisionError, VisionModel
 from splatbot.grasping.vision.views import empty_picture, picture_of, scene_views
@@ -18,24 +18,24 @@ from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
 LEAST_CONFIDENCE = 0.5
-_NAME = re.compile(r"[\w ,.'()/-]{1,80}")  # letters, digits and what names are written with: no quotes, no lines
-_ALONE = 0.5  # of the score where there is only one picture to agree with
+_NAME = re.compile(r"[\w ,.'()/-]{1,80}")  # no quotes and no line breaks, against prompt injection
+_SINGLE_VIEW_FACTOR = 0.5  # on the score of a single view, which no other view confirms
 
 
 class VisionAffordance:
-    """A :class:`splatbot.grasping.affordance.Affordance` that shows the map to a model.
+    """A :class:`splatbot.grasping.affordance.Affordance` that queries a vision-language model.
 
-    It is asked where the object is in several pictures and in one more, from which all objects were taken away. Each
-    answer must be a pixel of its picture, with the map's surface there, on a segmented object. The target is the
-    object that more than half of all answers and at least two pictures point at; an answer for the empty picture, or
-    rules that name another object, discredit them all. What a model says is never more than a hint: a model that lies
-    consistently about two objects which rules cannot tell apart is not found out.
+    The model locates the object in several images and in one image of the map without objects. Each answer must be a
+    pixel of its image that shows a segmented object. The target is the object with more than half of all answers, from
+    at least two images. An answer for the image without objects invalidates all answers, and so does a rule-based
+    backend that finds another object. The checks cannot detect a model that consistently confuses two objects which the
+    rules do not distinguish.
 
     Args:
-        model: that is asked.
-        views: that it sees; None: cameras around the objects, as the map renders.
-        rules: another backend, whose answer, where it has one, must be the same object; None: none.
-        attempts: at an answer that can be read.
+        model: the model.
+        views: views that the model sees. If None, the map is rendered from cameras around the objects.
+        rules: a backend that must not find another object. If None, this is not checked.
+        attempts: maximum number of queries until the answer is valid JSON.
 
     Raises:
         InputError: ``attempts`` is not above 0, or there are no views.
@@ -56,19 +56,19 @@ class VisionAffordance:
 
     @property
     def name(self) -> str:
-        """As results tell it."""
+        """Name of the backend in results."""
         return self.model.name
 
     def understands(self, hint: Hint) -> bool:
-        """Names."""
+        """Return whether the hint is a name."""
         return isinstance(hint, NameHint)
 
     def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
-        """See :class:`splatbot.grasping.affordance.Affordance`.
+        """Locate a named object; see :class:`splatbot.grasping.affordance.Affordance`.
 
         Raises:
-            VisionError: the model does not answer, or not what was asked.
-            AffordanceError: what it answers is not borne out by the map.
+            VisionError: the model does not answer, or its answer is invalid.
+            AffordanceError: the map does not confirm the answer.
         """
         if not isinstance(hint, NameHint):
             raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a name")
@@ -79,13 +79,13 @@ class VisionAffordance:
         pictures = [picture_of(scene, view) for view in views]
         empty = secrets.randbelow(len(views) + 1)
         pictures.insert(empty, empty_picture(scene, views[0]))
-        answers = self._asked(name, pictures)
+        answers = self._query(name, pictures)
         if any(answer.view == empty for answer in answers):
             raise VisionError(f"sees {name!r} in a picture without objects.", field=self.name, hint="use another model")
         seen = [a.model_copy(update={"view": a.view - (a.view > empty)}) for a in answers]
         return self._judged(name, scene, views, seen)
 
-    def _asked(self, name: str, pictures: Sequence[Picture]) -> list[Answer]:
+    def _query(self, name: str, pictures: Sequence[Picture]) -> list[Answer]:
         complaint = ""
         for left in reversed(range(self._attempts)):
             try:
@@ -123,12 +123,12 @@ class VisionAffordance:
         if sure < LEAST_CONFIDENCE:
             raise AffordanceError(f"is not sure ({sure:.2f}) of {name!r}.", field=self.name, hint="point at it")
         self._agrees(name, scene, winner)
-        score = sure * (len(won) / len(views) if len(views) > 1 else _ALONE)
+        score = sure * (len(won) / len(views) if len(views) > 1 else _SINGLE_VIEW_FACTOR)
         point = np.mean([at for _, at in won], axis=0)
         return Target(scene.objects[winner].rows, point, _called(scene, winner), self.name, score, tuple(notes), winner)
 
     def _agrees(self, name: str, scene: SegmentedMap, number: int) -> None:
-        """Rules that know the name must mean the same object."""
+        """Raise an error if the rules find another object of this name."""
         if self.rules is None:
             return
         try:
@@ -138,7 +138,7 @@ class VisionAffordance:
         if known not in (-1, number):
             both = (_called(scene, number), _called(scene, known))
             raise AffordanceError(
-                f"says that {name!r} is {both[0]}, but {self.rules.name} says {both[1]}.",
+                f"finds {both[0]} for {name!r}, but {self.rules.name} finds {both[1]}.",
                 field=self.name,
                 hint="point at it",
                 candidates=both,
@@ -150,7 +150,7 @@ def _called(scene: SegmentedMap, number: int) -> str:
 
 
 def _checked_name(text: str) -> str:
-    """A name is words; text that could be read as more is not passed on."""
+    """Return the name if it consists of plain words; reject text that a model could read as an instruction."""
     name = " ".join(text.split(" "))
     if not _NAME.fullmatch(name) or not name.strip():
         raise AffordanceError(

@@ -1,4 +1,4 @@
-"""A model behind HTTP: any endpoint with OpenAI's chat completions, within a time, a size, and no redirects."""
+"""Vision-language model behind an OpenAI-compatible HTTP endpoint, with limits on time, size and redirects."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from splatbot.errors import InputError
 from splatbot.grasping.vision.models import Picture, Question, VisionError, VisionTimeoutError
 
 KEY, URL, MODEL = "SPLATBOT_VLM_KEY", "SPLATBOT_VLM_URL", "SPLATBOT_VLM_MODEL"
-MOST = 1 << 20  # bytes of an answer
-_QUALITY = 90  # of JPEG
+MAX_ANSWER_BYTES = 1 << 20
+_JPEG_QUALITY = 90
 
 
 class EndpointModel:
     """A :class:`splatbot.grasping.vision.VisionModel` at ``URL/chat/completions``.
 
-    The key comes from the environment (SPLATBOT_VLM_KEY) when it is needed, is sent to no other place, never without
-    encryption to another machine, and stands in no message. Proxies of the environment are not used.
+    The key is read from the environment variable SPLATBOT_VLM_KEY for each request. It is sent only to this endpoint,
+    only over TLS unless the endpoint is local, and never appears in a message. Proxies of the environment are ignored.
 
     Args:
-        url: as "https://api.example.com/v1", or "http://127.0.0.1:8000/v1".
-        model: as the endpoint calls it.
-        timeout: for one whole exchange [s].
+        url: base URL such as "https://api.example.com/v1" or "http://127.0.0.1:8000/v1".
+        model: name of the model at the endpoint.
+        timeout: limit for one whole exchange [s].
 
     Raises:
-        InputError: the address or the time-out makes no sense.
+        InputError: the address or the timeout is invalid.
     """
 
     def __init__(self, url: str, model: str, *, timeout: float = 30.0) -> None:
@@ -53,10 +53,10 @@ class EndpointModel:
 
     @classmethod
     def from_environment(cls, *, timeout: float = 30.0) -> EndpointModel:
-        """As SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL say.
+        """Create a model from SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL.
 
         Raises:
-            InputError: they are not set.
+            InputError: a variable is not set.
         """
         missing = [name for name in (URL, MODEL) if not os.environ.get(name)]
         if missing:
@@ -65,19 +65,19 @@ class EndpointModel:
 
     @property
     def name(self) -> str:
-        """As results tell it."""
+        """Name of the model in results."""
         return f"vlm:{self._model}@{self._host}"
 
     def ask(self, question: Question) -> str:
-        """See :class:`splatbot.grasping.vision.VisionModel`.
+        """Send the question; see :class:`splatbot.grasping.vision.VisionModel`.
 
         Raises:
-            VisionTimeoutError: the exchange takes longer than the time-out.
-            VisionError: no connection, a refusal, a redirect, too much, or no chat completion.
+            VisionTimeoutError: the exchange takes longer than the timeout.
+            VisionError: no connection, an HTTP error, a redirect, an answer above 1 MiB, or no chat completion.
         """
         status, data = self._post(json.dumps(_request(self._model, question)).encode())
-        if len(data) > MOST:
-            raise VisionError(f"answers more than {MOST} bytes.", field=self.name)
+        if len(data) > MAX_ANSWER_BYTES:
+            raise VisionError(f"answers more than {MAX_ANSWER_BYTES} bytes.", field=self.name)
         if status != 200:
             again = status == 429 or status >= 500
             raise VisionError(
@@ -92,7 +92,10 @@ class EndpointModel:
         return content
 
     def _post(self, body: bytes) -> tuple[int, bytes]:
-        """Status and body. A timer cuts the connection, for time-outs of sockets begin anew with every byte."""
+        """Send a request and return status and body.
+
+        A timer closes the connection, since socket timeouts restart with every byte.
+        """
         headers, connection = self._headers(), self._connection()
         cut = threading.Event()
         lines: list[socket.socket] = []
@@ -100,8 +103,8 @@ class EndpointModel:
         def give_up() -> None:
             cut.set()
             for line in lines:
-                with contextlib.suppress(OSError):  # it is closed by now
-                    socket.socket.shutdown(line, socket.SHUT_RDWR)  # the line's own, also below TLS
+                with contextlib.suppress(OSError):  # the socket may be closed already
+                    socket.socket.shutdown(line, socket.SHUT_RDWR)  # of the TCP socket, also below TLS
 
         timer = threading.Timer(self._timeout, give_up)
         timer.start()
@@ -110,20 +113,20 @@ class EndpointModel:
             lines.append(connection.sock)
             connection.request("POST", self._path, body, headers)
             response = connection.getresponse()
-            data = response.read(MOST + 1)
+            data = response.read(MAX_ANSWER_BYTES + 1)
         except (OSError, ValueError, http.client.HTTPException) as error:
             if cut.is_set() or isinstance(error, TimeoutError):
-                raise self._late() from None
+                raise self._timed_out() from None
             reason = type(error).__name__
             raise VisionError(f"cannot be reached ({reason}).", field=self.name, hint="check the address") from None
         finally:
             timer.cancel()
             connection.close()
         if cut.is_set():
-            raise self._late()
+            raise self._timed_out()
         return response.status, data
 
-    def _late(self) -> VisionTimeoutError:
+    def _timed_out(self) -> VisionTimeoutError:
         return VisionTimeoutError(
             f"did not answer within {self._timeout:g} s.", field=self.name, hint="give a longer time-out"
         )
@@ -146,7 +149,7 @@ class EndpointModel:
         return found | {"Authorization": f"Bearer {key}"}
 
     def _excerpt(self, data: bytes) -> str:
-        """The beginning of what an endpoint says, without the key, on one line."""
+        """Return the beginning of an answer on one line, without the key."""
         key = os.environ.get(KEY, "")
         text = data[:2000].decode(errors="replace")
         text = "".join(c if c.isprintable() else " " for c in (text.replace(key, "***") if key else text))
@@ -163,7 +166,9 @@ def _request(model: str, question: Question) -> dict[str, Any]:
 
 
 def _data_url(picture: Picture) -> str:
-    ok, encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    ok, encoded = cv2.imencode(
+        ".jpg", np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    )
     if not ok:
         raise InputError(f"of shape {picture.shape} cannot be encoded.", field="picture", hint="give (H, W, 3) uint8")
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()

@@ -1,4 +1,4 @@
-"""A model on this machine, with transformers: any image-text-to-text model in a folder."""
+"""Local vision-language model: any image-text-to-text model of transformers in a folder."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from splatbot.grasping.vision.models import Question, VisionError, VisionTimeout
 
 
 class LocalModel:
-    """A :class:`splatbot.grasping.vision.VisionModel` (Qwen-VL, LLaVA, SmolVLM ...). Nothing is downloaded, and no
-    code from the folder is run.
+    """A :class:`splatbot.grasping.vision.VisionModel` in a folder (Qwen-VL, LLaVA, SmolVLM ...).
+
+    Nothing is downloaded, and no code from the folder is executed.
 
     Args:
         folder: config, weights, tokenizer and processor, as ``save_pretrained`` writes them.
-        tokens: longest answer.
-        timeout: for an answer [s], looked at between tokens.
+        tokens: maximum number of tokens of an answer.
+        timeout: limit for an answer [s], checked after each token.
 
     Raises:
         InputError: there is no such folder, or a number is not above 0.
@@ -34,15 +35,15 @@ class LocalModel:
 
     @property
     def name(self) -> str:
-        """As results tell it."""
+        """Name of the model in results."""
         return f"vlm:{self._folder.name}"
 
     def ask(self, question: Question) -> str:
-        """See :class:`splatbot.grasping.vision.VisionModel`. The first call loads the model.
+        """Answer a question; see :class:`splatbot.grasping.vision.VisionModel`. The first call loads the model.
 
         Raises:
-            VisionTimeoutError: it is not done in time.
-            VisionError: transformers is not installed, the model cannot be loaded, or does not take the question.
+            VisionTimeoutError: the answer takes longer than the timeout.
+            VisionError: transformers is not installed, the model cannot be loaded, or rejects the question.
         """
         import time
 

@@ -1,4 +1,4 @@
-"""What a vision-language model is asked, and how it fails."""
+"""Interface of vision-language models: question, answer and errors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Picture = NDArray[np.uint8]  # (H, W, 3) RGB
 
 
 class VisionError(AffordanceError):
-    """A model gives no answer that can be used; another backend may.
+    """A model gives no usable answer; another backend may find the object.
 
     Args:
-        message: as of :class:`splatbot.errors.SplatbotError`.
-        field: likewise.
-        hint: likewise.
-        again: whether asking again may help.
+        message: see :class:`splatbot.errors.SplatbotError`.
+        field: see :class:`splatbot.errors.SplatbotError`.
+        hint: see :class:`splatbot.errors.SplatbotError`.
+        again: whether another attempt may succeed.
     """
 
     def __init__(self, message: str, *, field: str | None = None, hint: str | None = None, again: bool = False) -> None:
@@ -38,12 +38,12 @@ class VisionTimeoutError(VisionError):
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What is asked.
+    """A question to a model.
 
     Args:
-        rules: how to answer.
-        text: what is wanted.
-        pictures: that the answer is about, numbered from 0.
+        rules: system prompt with the answer format.
+        text: user prompt.
+        pictures: images, numbered from 0.
     """
 
     rules: str
@@ -52,17 +52,17 @@ class Question:
 
 
 class VisionModel(Protocol):
-    """Text from text and pictures."""
+    """A model that answers with text to text and images."""
 
     @property
     def name(self) -> str:
-        """As results tell it."""
+        """Name of the model in results."""
         ...
 
     def ask(self, question: Question) -> str:
-        """Its answer, to be checked.
+        """Return the unchecked answer of the model.
 
         Raises:
-            VisionError: there is none.
+            VisionError: the model gives no answer.
         """
         ...

@@ -1,4 +1,4 @@
-"""Pictures of a scene for a model: from several sides, and one in which there is nothing to find."""
+"""Images of a scene for a vision-language model: from several sides, and one without objects."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from splatbot.grasping.vision.models import Picture
 from splatbot.rasterize.views import colorize, render_view
 from splatbot.segmentation import SegmentedMap
 
-_STEEP = np.radians(50.0)  # of the cameras over the support
-_FIELD = np.radians(50.0)  # horizontal
-_SPREAD = np.radians(35.0)  # between neighbouring cameras, around the up axis
-_ROOM = 1.35  # times the objects' extent that a picture shows
+_ELEVATION = np.radians(50.0)  # of the cameras over the support
+_FIELD_OF_VIEW = np.radians(50.0)  # horizontal
+_AZIMUTH_STEP = np.radians(35.0)  # between neighbouring cameras
+_EXTENT_FACTOR = 1.35  # visible extent over that of the objects
 
 
 def scene_views(
     scene: SegmentedMap, count: int = 3, *, width: int = 640, height: int = 480
 ) -> tuple[ObservedView, ...]:
-    """Cameras around the objects of a scene, from the base's side, that show all of them.
+    """Return cameras on the robot's side of the objects that show all of them.
 
     Raises:
         InputError: the scene has no objects, or ``count`` is not above 0.
     """
     if not scene.objects or count < 1:
         raise InputError("has no objects, or no views are wanted.", field="scene", hint="map a scene with objects")
-    focal = 0.5 * width / np.tan(_FIELD / 2)
+    focal = 0.5 * width / np.tan(_FIELD_OF_VIEW / 2)
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     rows = np.concatenate([o.rows for o in scene.objects])
     points = transform_points(inverse(scene.T_world_base), scene.model.means.detach().double().numpy()[rows])
     center = (points.min(axis=0) + points.max(axis=0)) / 2
-    reach = _ROOM * float(np.linalg.norm(points - center, axis=1).max())
-    away = reach / np.sin(min(_FIELD, 2 * np.arctan(0.5 * height / focal)) / 2)
+    reach = _EXTENT_FACTOR * float(np.linalg.norm(points - center, axis=1).max())
+    away = reach / np.sin(min(_FIELD_OF_VIEW, 2 * np.arctan(0.5 * height / focal)) / 2)
     behind = np.arctan2(-center[1], -center[0])  # from the objects to the base
     views = []
     for k in range(count):
-        turn = behind + (k - (count - 1) / 2) * _SPREAD
-        side = np.array([np.cos(turn) * np.cos(_STEEP), np.sin(turn) * np.cos(_STEEP), np.sin(_STEEP)])
+        turn = behind + (k - (count - 1) / 2) * _AZIMUTH_STEP
+        side = np.array([np.cos(turn) * np.cos(_ELEVATION), np.sin(turn) * np.cos(_ELEVATION), np.sin(_ELEVATION)])
         views.append(ObservedView(camera, scene.T_world_base @ look_at(center + away * side, center)))
     return tuple(views)
 
 
 def picture_of(scene: SegmentedMap, view: ObservedView) -> Picture:
-    """What a view saw, or how the map renders from there."""
+    """Return the image of a view, or a rendering of the map from its pose."""
     return view.rgb if view.rgb is not None else _rendered(scene.model, view)
 
 
 def empty_picture(scene: SegmentedMap, view: ObservedView) -> Picture:
-    """The map from a view, with all of its objects taken away: who still sees one is guessing."""
+    """Render the map without its objects: a model that still finds an object in it is guessing."""
     return _rendered(scene.model.select(torch.from_numpy(scene.labels < 0)), view)
 
 

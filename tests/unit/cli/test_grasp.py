@@ -12,7 +12,7 @@ import pytest
 from splatbot.robots.panda import panda
 from splatbot.workspace import NamedPlace, Workspace
 from tests.unit.cli.conftest import RunCommand
-from tests.unit.grasping.things import BOX, CAN, model
+from tests.unit.grasping.objects import BOX, CAN, model
 
 BASE = ("--base", 0, 0, 0, 1, 0, 0, 0)
 
@@ -91,7 +91,7 @@ def test_what_cannot_be_grasped_is_said_counted_and_drawn(run: RunCommand, map_f
         ((), "give one of them"),
         (("--target", "box", "--point", 0, 0, 0), "are 2"),
         (("--target", "box"), "about equally"),
-        (("--target", "screwdriver"), "no word of the rules"),
+        (("--target", "screwdriver"), "nor in the vocabulary"),
         (("--pixel", 10, 10), "has no pictures"),
         (("--point", 0.3, -0.05, 0.0), "there is no object"),
         (("--target", "red box", "--friction", 9), "friction"),

@@ -21,13 +21,13 @@ Behaviour = Callable[[BaseHTTPRequestHandler, dict[str, Any]], None]
 
 @dataclass
 class FakeEndpoint:
-    """What it was asked, and the way it answers, which may be changed at any time."""
+    """Recorded requests and the behaviour of the endpoint, which tests may replace at any time."""
 
     behave: Behaviour
     url: str = ""
     requests: list[dict[str, Any]] = field(default_factory=list)
     headers: list[dict[str, str]] = field(default_factory=list)
-    over: threading.Event = field(default_factory=threading.Event)  # ends what is slow
+    over: threading.Event = field(default_factory=threading.Event)  # ends slow answers
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def serve(behave: Behaviour) -> Iterator[FakeEndpoint]:
 
 
 def pictures_of(body: dict[str, Any]) -> Pictures:
-    """The pictures of a request, RGB."""
+    """Decode the RGB images of a request."""
     urls = [part["image_url"]["url"] for part in body["messages"][1]["content"] if part["type"] == "image_url"]
     data = [np.frombuffer(base64.b64decode(url.split(",", 1)[1]), np.uint8) for url in urls]
     return [cv2.cvtColor(cv2.imdecode(one, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB).astype(np.uint8) for one in data]  # type: ignore[arg-type]
@@ -75,13 +75,13 @@ def send(handler: BaseHTTPRequestHandler, data: bytes, status: int = 200, **head
 
 
 def say(text: str) -> Behaviour:
-    """A chat completion with this content, whatever is asked."""
+    """Answer every request with a chat completion of this content."""
     data = json.dumps({"choices": [{"message": {"role": "assistant", "content": text}}]}).encode()
     return lambda handler, body: send(handler, data)
 
 
 def point_with(find: Callable[[Pictures], list[dict[str, Any]]]) -> Behaviour:
-    """Answers that look at the pictures."""
+    """Answer each request with the result of ``find`` on its images."""
 
     def behave(handler: BaseHTTPRequestHandler, body: dict[str, Any]) -> None:
         say(json.dumps({"answers": find(pictures_of(body))}))(handler, body)
@@ -90,7 +90,7 @@ def point_with(find: Callable[[Pictures], list[dict[str, Any]]]) -> Behaviour:
 
 
 def by_color(rgb: tuple[float, float, float], confidence: float = 0.9) -> Callable[[Pictures], list[dict[str, Any]]]:
-    """A small vision model: the middle of what has a colour, in each picture that has enough of it."""
+    """Return a small vision model: it finds the centre of a colour in each image with at least 50 such pixels."""
 
     def find(pictures: Pictures) -> list[dict[str, Any]]:
         answers = []
@@ -105,11 +105,11 @@ def by_color(rgb: tuple[float, float, float], confidence: float = 0.9) -> Callab
 
 
 def answer(view: int, u: float, v: float, confidence: float = 0.9) -> dict[str, Any]:
-    return {"view": view, "u": u, "v": v, "label": "thing", "confidence": confidence}
+    return {"view": view, "u": u, "v": v, "label": "object", "confidence": confidence}
 
 
 def drip(endpoint_over: Callable[[], threading.Event], part: bytes, every: float = 0.02) -> Behaviour:
-    """One byte every so many seconds, for ever."""
+    """Send one byte every ``every`` seconds without end."""
 
     def behave(handler: BaseHTTPRequestHandler, body: dict[str, Any]) -> None:
         handler.wfile.write(part)

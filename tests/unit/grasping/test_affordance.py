@@ -1,4 +1,4 @@
-"""Who says where: pixels, points, masks, rectangles, and backends one after the other."""
+"""Targets from pixels, points, masks and rectangles, and the order of backends."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from splatbot.grasping.affordance import (
     Target,
     find_target,
 )
-from splatbot.grasping.places import PlaceAffordance, point_at
-from splatbot.grasping.words import WordAffordance
+from splatbot.grasping.language import LanguageAffordance
+from splatbot.grasping.spatial import SpatialAffordance, point_at
 from splatbot.segmentation import SegmentedMap, segment
-from tests.unit.grasping.things import BALL, BIG, BOX, CAN, colored, scene, target_of
+from tests.unit.grasping.objects import BALL, BIG, BOX, CAN, colored, scene, target_of
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 VIEW = ObservedView(CAMERA, look_at(np.array([0.0, -0.4, 0.6]), np.array([0.5, 0.0, 0.0])))
-PLACE = [PlaceAffordance()]
+PLACE = [SpatialAffordance()]
 
 
 def _pixel(point: tuple[float, float, float]) -> tuple[float, float]:
@@ -45,7 +45,7 @@ def test_a_pixel_shows_the_point_that_is_there() -> None:
 
 
 @pytest.mark.parametrize("solid", [BOX, CAN, BALL])
-def test_a_pixel_and_a_point_on_a_thing_name_its_gaussians(solid: object) -> None:
+def test_a_pixel_and_a_point_on_an_object_select_its_gaussians(solid: object) -> None:
     wanted = target_of(scene(), solid, "it")  # type: ignore[arg-type]
     middle = np.median(scene().model.means.double().numpy()[wanted.rows], axis=0)
     high = tuple(scene().model.means.double().numpy()[wanted.rows].max(axis=0)[2:3])
@@ -57,13 +57,13 @@ def test_a_pixel_and_a_point_on_a_thing_name_its_gaussians(solid: object) -> Non
         np.testing.assert_array_equal(found.rows, wanted.rows)
 
 
-def test_a_point_within_a_thing_names_it_and_says_so() -> None:
-    found = PlaceAffordance().locate(PointHint(np.array(BIG.center)), scene())
+def test_a_point_inside_of_an_object_selects_it_with_a_note() -> None:
+    found = SpatialAffordance().locate(PointHint(np.array(BIG.center)), scene())
     assert found.number == target_of(scene(), BIG, "big").number
-    assert "within" in found.notes[0]
+    assert "inside" in found.notes[0]
 
 
-def test_a_mask_and_a_rectangle_name_what_fills_them() -> None:
+def test_a_mask_and_a_rectangle_select_the_object_that_fills_them() -> None:
     wanted = target_of(scene(), CAN, "can")
     u, v = np.array(
         [_pixel((0.50 + dx, -0.15 + dy, z)) for dx in (-0.02, 0.02) for dy in (-0.02, 0.02) for z in (0.03, 0.12)]
@@ -77,7 +77,7 @@ def test_a_mask_and_a_rectangle_name_what_fills_them() -> None:
         assert found.score > 0.6
 
 
-def test_a_mask_over_two_things_is_refused_and_names_both() -> None:
+def test_a_mask_over_two_objects_is_refused_and_names_both() -> None:
     mask = np.zeros((240, 320), bool)
     for top in ((0.45, 0.10, 0.12), (0.50, -0.15, 0.12)):
         u, v = (round(x) for x in _pixel(top))
@@ -87,8 +87,8 @@ def test_a_mask_over_two_things_is_refused_and_names_both() -> None:
     assert len(caught.value.candidates) >= 2
 
 
-def test_a_mask_of_a_part_of_what_hangs_together_means_that_part() -> None:
-    """Two boxes a centimetre apart in a map too coarse to tell them apart."""
+def test_a_mask_of_a_part_of_connected_objects_selects_that_part() -> None:
+    """Two boxes a centimetre apart are one object in a map that is too coarse to separate them."""
     low, high = Block((0.45, 0.0, 0.03), (0.06, 0.06, 0.06)), Block((0.525, 0.0, 0.03), (0.08, 0.06, 0.06))
     one = segment(colored({"low": low, "high": high}, 24_000, {}), np.eye(4), apart=0.03, cut=False)
     (both,) = one.objects
@@ -98,12 +98,12 @@ def test_a_mask_of_a_part_of_what_hangs_together_means_that_part() -> None:
     found = find_target(MaskHint(mask > 0, VIEW), one, PLACE)
     means = one.model.means.double().numpy()[found.rows]
     own = np.abs(low.distance(means)) < 2e-3
-    assert own.mean() > 0.7  # with what it hides of the other one
+    assert own.mean() > 0.7  # includes the occluded side of the other box
     assert len(found.rows) > 0.5 * (np.abs(low.distance(one.model.means.double().numpy()[both.rows])) < 2e-3).sum()
-    assert "hangs together" in found.notes[0]
+    assert "is connected" in found.notes[0]
     u, v = _pixel((0.45, 0.0, 0.06))
     rectangle = find_target(BoxHint(u - 5, v - 5, u + 5, v + 5, VIEW), one, PLACE)
-    np.testing.assert_array_equal(rectangle.rows, both.rows)  # drawn by hand, it may be smaller than the thing
+    np.testing.assert_array_equal(rectangle.rows, both.rows)  # a hand-drawn rectangle may be smaller than the object
 
 
 @pytest.mark.parametrize("rough", [0.0, 0.003, 0.006])
@@ -121,8 +121,8 @@ def test_a_mask_that_leaves_out_a_neighbour_means_the_larger_one_and_a_rough_one
 
     part = find_target(marked(0.485, 0.565), one, PLACE)
     means = one.model.means.double().numpy()
-    assert (np.abs(high.distance(means[part.rows])) < 2e-3).mean() > 0.7  # with what it hides of the other one
-    assert "hangs together" in part.notes[0]
+    assert (np.abs(high.distance(means[part.rows])) < 2e-3).mean() > 0.7  # includes the occluded side of the other box
+    assert "is connected" in part.notes[0]
     whole = find_target(marked(0.42, 0.565), one, PLACE)
     np.testing.assert_array_equal(whole.rows, both.rows)
 
@@ -147,7 +147,7 @@ def test_hints_that_make_no_sense_are_refused(hint: Hint, message: str) -> None:
         find_target(hint, scene(), PLACE)
 
 
-def test_a_pixel_that_shows_nothing_is_said() -> None:
+def test_a_pixel_that_shows_nothing_is_an_error() -> None:
     up = ObservedView(CAMERA, look_at(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 3.0])))
     with pytest.raises(AffordanceError, match="shows nothing of the map"):
         find_target(PixelHint(10.0, 10.0, up), scene(), PLACE)
@@ -163,14 +163,14 @@ class _Unsure:
         raise AffordanceError("cannot tell.", field="target")
 
 
-def test_the_next_backend_is_asked_and_the_answer_says_who_gave_it() -> None:
-    found = find_target(NameHint("red box"), scene(), [_Unsure(), WordAffordance()])
+def test_the_next_backend_is_queried_and_the_target_names_its_backend() -> None:
+    found = find_target(NameHint("red box"), scene(), [_Unsure(), LanguageAffordance()])
     assert found.backend == "rules"
     assert any("unsure: target: cannot tell." in note for note in found.notes)
 
 
-def test_when_nobody_knows_all_of_them_are_quoted() -> None:
+def test_without_a_target_the_error_of_every_backend_is_quoted() -> None:
     with pytest.raises(AffordanceError, match=r"unsure: .*cannot tell.*\| rules: "):
-        find_target(NameHint("flying saucer"), scene(), [_Unsure(), WordAffordance()])
+        find_target(NameHint("flying saucer"), scene(), [_Unsure(), LanguageAffordance()])
     with pytest.raises(AffordanceError, match="none of 1 backends understands"):
         find_target(NameHint("box"), scene(), PLACE)

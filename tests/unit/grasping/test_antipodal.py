@@ -8,14 +8,14 @@ import pytest
 from splatbot.grasping.antipodal import PairSearch, antipodal_pairs
 from splatbot.grasping.shape_completion import target_surface
 from splatbot.grasping.surface import GraspSurface
-from tests.unit.grasping.things import BALL, BIG, BOX, CAN, THINGS, scene, target_of
+from tests.unit.grasping.objects import BALL, BIG, BOX, CAN, OBJECTS, scene, target_of
 
 FRICTION = 0.5
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def _surface(name: str) -> GraspSurface:
-    return target_surface(scene(), target_of(scene(), THINGS[name], name).rows)
+    return target_surface(scene(), target_of(scene(), OBJECTS[name], name).rows)
 
 
 def _search(name: str, stroke: float = 0.08) -> PairSearch:
@@ -26,7 +26,7 @@ def _search(name: str, stroke: float = 0.08) -> PairSearch:
 def test_contacts_are_on_the_surface_within_a_millimetre_and_a_half(name: str) -> None:
     pairs = _search(name).pairs
     assert len(pairs) > 30
-    off = np.abs(THINGS[name].distance(pairs.contacts.reshape(-1, 3)))
+    off = np.abs(OBJECTS[name].distance(pairs.contacts.reshape(-1, 3)))
     assert np.percentile(off, 95) < 1.5e-3
     assert np.percentile(off, 99) < 3e-3
 
@@ -38,7 +38,7 @@ def test_the_line_between_contacts_lies_in_both_true_friction_cones(name: str) -
     step = 1e-5 * np.eye(3)
     line = pairs.contacts[:, 1] - pairs.contacts[:, 0]
     line /= np.linalg.norm(line, axis=1, keepdims=True)
-    solid = THINGS[name]
+    solid = OBJECTS[name]
     for side, sign in ((0, -1.0), (1, 1.0)):
         at = pairs.contacts[:, side]
         true = np.stack([solid.distance(at + d) - solid.distance(at - d) for d in step], axis=1)
@@ -56,7 +56,7 @@ def test_widths_are_those_of_the_shapes() -> None:
     assert np.median(ball.width[ball.closure > 0.9]) == pytest.approx(2 * BALL.radius, abs=3e-3)
 
 
-def test_what_is_wider_than_the_hand_has_no_pairs_and_its_width_is_told() -> None:
+def test_an_object_wider_than_the_stroke_has_no_pairs_and_its_width_is_reported() -> None:
     found = _search("big")
     assert len(found.pairs) == 0
     assert found.too_wide > 100
@@ -102,7 +102,7 @@ def test_a_map_ten_kilometres_from_its_origin_has_the_same_widths() -> None:
     np.testing.assert_allclose(there.width, here.width, atol=1e-5)
 
 
-def test_contacts_stay_on_what_there_is_of_a_surface() -> None:
+def test_contacts_stay_on_the_observed_surface() -> None:
     """A band of a ball above its equator: the diameters that chords are turned to end below the band."""
     radius, (low, high) = 0.035, np.radians([8.0, 24.0])
     around = np.linspace(0.0, 2 * np.pi, 100, endpoint=False)

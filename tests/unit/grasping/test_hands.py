@@ -1,4 +1,4 @@
-"""What pads touch, against closed forms of circles that meet."""
+"""Contacts of pads, against closed forms of circles in contact."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatbot.grasping.antipodal import Pairs
-from splatbot.grasping.hands import Hands, beside_target, place_hands
+from splatbot.grasping.hands import Hands, measure_hands, place_hands
 from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array, HandShape
 from splatbot.robots.panda import panda
@@ -27,7 +27,7 @@ def _hand() -> HandShape:
 
 
 def _ball(count: int = 1500) -> GraspSurface:
-    """Evenly spread points (Fibonacci) about the origin."""
+    """Return evenly distributed points of a ball around the origin (Fibonacci lattice)."""
     k = np.arange(count) + 0.5
     z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
     n = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
@@ -42,17 +42,19 @@ def _pairs(line: Array) -> Pairs:
 
 
 def _from_above(hand: HandShape, ahead: float, aside: float = 0.0) -> Hands:
-    """On the ball's diameter along y, its middle ``ahead`` of the tool, and ``aside`` along x [m]."""
+    """Place a hand on the ball's diameter along y, the centre ``ahead`` of the tool and ``aside`` along x [m]."""
     pairs = _pairs(np.array([0.0, 1.0, 0.0]))
     hands = place_hands(pairs, hand, rolls=1, depths=1, up=UP, lowest=0.9)
     hands.T[:, :3, 3] = [aside, 0.0, ahead]
-    return beside_target(hands, pairs, _ball(), hand, retreat=0.1, n_sigma=1.0, friction=FRICTION)
+    return measure_hands(hands, pairs, _ball(), hand, retreat=0.1, n_sigma=1.0, friction=FRICTION)
 
 
 @pytest.mark.parametrize("beyond", [-0.012, -0.006, 0.0, 0.003, 0.006, 0.009])
 def test_a_round_finger_end_pushes_a_ball_out_as_two_circles_that_meet(beyond: float) -> None:
-    """Their common normal is on the line of their middles: asin(offset / (both radii)) off the closing direction;
-    what sinks into the pads spreads that."""
+    """Their common normal lies on the line of their centres, inclined by asin(offset / sum of radii).
+
+    The compliance of the pads spreads the contact, hence the tolerance.
+    """
     hand = _hand()
     closure = _from_above(hand, hand.pad + beyond).closure[0]
     turned = np.arcsin(max(beyond, 0.0) / (RADIUS + hand.tip - hand.pad))
@@ -82,13 +84,13 @@ def test_places_that_are_not_opposite_are_outside_of_the_cone() -> None:
     count = 2 * x.size
     normals = np.repeat([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]], x.size, axis=0)
     none, seen = np.zeros((count, 3, 3)), np.ones(count, np.bool_)
-    points, spread, doubt = np.concatenate(sides), np.full(count, 1e-3), np.full(count, 3e-4)
-    surface = GraspSurface(points, normals, none, spread, seen, doubt, np.zeros(3))
+    points, spread, normal_std = np.concatenate(sides), np.full(count, 1e-3), np.full(count, 3e-4)
+    surface = GraspSurface(points, normals, none, spread, seen, normal_std, np.zeros(3))
     contacts = 0.015 * np.array([[[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]]])
     pairs = Pairs(contacts, contacts / 0.015, np.ones(1), np.ones(1), np.zeros(1))
     hands = place_hands(pairs, hand, rolls=1, depths=1, up=UP, lowest=0.9)
     hands.T[:, :3, 3] = [0.0, 0.0, -0.01]
-    closure = beside_target(hands, pairs, surface, hand, retreat=0.1, n_sigma=1.0, friction=FRICTION).closure[0]
+    closure = measure_hands(hands, pairs, surface, hand, retreat=0.1, n_sigma=1.0, friction=FRICTION).closure[0]
     assert closure == pytest.approx(1.0 - np.arctan(0.7) / np.arctan(FRICTION), abs=0.03)
     assert closure < 0.0
 

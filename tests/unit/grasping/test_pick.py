@@ -15,7 +15,7 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import GripperError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.held import covering_spheres
+from splatbot.grasping.attached import covering_spheres
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, within
@@ -98,8 +98,8 @@ def test_in_the_twin_it_is_lifted_and_carried_and_stays_in_the_hand(name: str) -
     ]  # fmt: skip
     assert height(world, name) - before == pytest.approx(OPTIONS.lift, abs=0.01)
     assert {other: height(world, other) for other in others} == pytest.approx(others, abs=2e-3)
-    assert result.opening == pytest.approx(result.unwrap().width, abs=0.012)  # pads give way, most around a ball
-    # What is attached is where the object is: planning takes it along from here.
+    assert result.opening == pytest.approx(result.unwrap().width, abs=0.012)  # pads are compliant, most around a ball
+    # The attached spheres are at the object, so that later plans include it.
     assert result.attached is not None
     assert result.q is not None
     held = RobotSpheres(panda(), attached=result.attached).centers(result.q[None])[0, -len(result.attached) :]
@@ -109,7 +109,7 @@ def test_in_the_twin_it_is_lifted_and_carried_and_stays_in_the_hand(name: str) -
     assert controller.gripper.holds()
 
 
-def test_what_is_held_is_carried_around_what_is_in_the_way() -> None:
+def test_an_attached_object_is_carried_around_obstacles() -> None:
     world = twin()
     controller = TwinController(world)
     assert controller.gripper is not None
@@ -121,7 +121,7 @@ def test_what_is_held_is_carried_around_what_is_in_the_way() -> None:
     assert result.steps[-1].stage is PickStage.CARRY
     np.testing.assert_allclose(controller.position, panda().home, atol=0.01)
     assert height(world, "can") > 0.2
-    # Planning minds the object: a goal at which it alone would be in the table is refused.
+    # The planner refuses a goal at which only the attached object collides with the table.
     assert result.attached is not None
     longer = result.attached.copy()
     longer[:, 2] += panda().tcp(panda().home)[2, 3]
@@ -129,40 +129,40 @@ def test_what_is_held_is_carried_around_what_is_in_the_way() -> None:
     assert planner.plan(panda().home, panda().home + 1e-3).path is None
 
 
-def _spheres_on(way: PickPlan) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (P, S, 3) and radii (P, S) of the arm's moving spheres, all along a way."""
+def _spheres_on(plan: PickPlan) -> tuple[np.ndarray, np.ndarray]:
+    """Sample centres (P, S, 3) and radii (P, S) of the arm's moving spheres along a plan."""
     centers, radii = [], []
-    for leg in (way.there, way.approach, way.free, way.lift):
-        q = leg.path.at(np.linspace(0.0, 1.0, 100))
-        moving = leg.arm.spheres.link > 0
-        centers += list(leg.arm.centers(q)[:, moving])
-        radii += [leg.arm.spheres.radii[moving]] * len(q)
+    for part in (plan.to_pregrasp, plan.approach, plan.lift_off, plan.lift):
+        q = part.path.at(np.linspace(0.0, 1.0, 100))
+        moving = part.arm.spheres.link > 0
+        centers += list(part.arm.centers(q)[:, moving])
+        radii += [part.arm.spheres.radii[moving]] * len(q)
     return np.concatenate(centers), np.concatenate(radii)
 
 
-def test_a_way_goes_around_where_something_moved_and_its_certificate_is_of_both() -> None:
-    start = panda().home + np.eye(7)[0] * 1.2  # on the other side of what is at half way
-    plain = MapPickPlanner(sampler(), target("can"), OPTIONS).to(grasps("can").grasps[0], start)
+def test_a_plan_avoids_moving_regions_and_its_certificate_covers_both() -> None:
+    start = panda().home + np.eye(7)[0] * 1.2  # on the other side of the obstacle
+    plain = MapPickPlanner(sampler(), target("can"), OPTIONS).plan_to(grasps("can").grasps[0], start)
     assert isinstance(plain, PickPlan)
-    assert plain.clear
-    middle = plain.there.arm.forward(plain.there.path.at(np.array([0.5])))[0, -1, :3, 3]
+    assert plain.avoids_moving
+    middle = plain.to_pregrasp.arm.forward(plain.to_pregrasp.path.at(np.array([0.5])))[0, -1, :3, 3]
     moving = np.array([[*middle, 0.04]])
     wary = GraspSampler(scene(), panda(), moving=moving)
     found = wary.sample(target("can"), OPTIONS.grasp)
-    ways = MapPickPlanner(wary, target("can"), replace(OPTIONS, budget_ms=1000.0))
-    grasp = next(g for g in found.grasps if g.clear)
-    cautious, bold = (ways.to(grasp, start, cautious=cautious) for cautious in (True, False))
-    assert isinstance(cautious, PickPlan)
-    assert isinstance(bold, PickPlan)
-    assert cautious.clear
-    assert not bold.clear
-    for way, free in ((cautious, True), (plain, False)):
-        centers, radii = _spheres_on(way)
+    planner = MapPickPlanner(wary, target("can"), replace(OPTIONS, budget_ms=1000.0))
+    grasp = next(g for g in found.grasps if g.avoids_moving)
+    avoiding, direct = (planner.plan_to(grasp, start, avoid_moving=avoid) for avoid in (True, False))
+    assert isinstance(avoiding, PickPlan)
+    assert isinstance(direct, PickPlan)
+    assert avoiding.avoids_moving
+    assert not direct.avoids_moving
+    for plan, free in ((avoiding, True), (plain, False)):
+        centers, radii = _spheres_on(plan)
         assert (np.linalg.norm(centers - middle, axis=1) - radii > moving[0, 3]).all() == free
-        assert all(leg.path.certificate.certified for leg in (way.there, way.approach, way.free, way.lift))
+        assert all(s.path.certificate.certified for s in (plan.to_pregrasp, plan.approach, plan.lift_off, plan.lift))
 
 
-def test_where_no_way_keeps_clear_of_what_moves_it_is_picked_all_the_same_and_says_so() -> None:
+def test_a_pick_without_a_plan_around_moving_regions_is_executed_with_a_note() -> None:
     world = twin()
     controller = TwinController(world)
     assert controller.gripper is not None
@@ -171,7 +171,7 @@ def test_where_no_way_keeps_clear_of_what_moves_it_is_picked_all_the_same_and_sa
     result = Picker(wary, controller, controller.gripper, options=OPTIONS).pick(target("can"))
     assert result, result.reason
     assert result.grasp is not None
-    assert any("something moved" in note for note in result.notes)
+    assert any("motion was observed" in note for note in result.notes)
     clean = with_fake(FakeGripper(width=0.06))
     assert clean.notes == ()
 
@@ -240,13 +240,13 @@ def test_fingers_that_close_on_nothing_open_again() -> None:
 
 def test_an_object_that_slips_out_on_the_way_up_is_lost() -> None:
     gripper = FakeGripper(width=0.06)
-    asked = 0
+    checks = 0
 
     class Slips(Scripted):
         def holds(self) -> bool:
-            nonlocal asked
-            asked += 1
-            return asked == 1
+            nonlocal checks
+            checks += 1
+            return checks == 1
 
     result = with_fake(Slips(gripper))
     assert (result.outcome, result.stage) == (PickOutcome.LOST, PickStage.CHECK)
@@ -271,17 +271,17 @@ def test_an_arm_that_cannot_follow_is_not_followed() -> None:
 
 
 @pytest.mark.parametrize("after", [0, 60, 400])
-def test_told_to_stop_it_stops_and_says_so(after: int) -> None:
-    asked = 0
+def test_a_stop_request_stops_the_pick_and_is_reported(after: int) -> None:
+    polls = 0
 
     def stop() -> bool:
-        nonlocal asked
-        asked += 1
-        return asked > after
+        nonlocal polls
+        polls += 1
+        return polls > after
 
     result = with_fake(FakeGripper(width=0.06), stop=stop)
     assert result.outcome is PickOutcome.STOPPED
-    assert result.steps[-1].note == "it was told to stop"
+    assert result.steps[-1].note == "a stop was requested"
 
 
 def test_with_a_gripper_on_a_serial_port() -> None:
@@ -297,7 +297,7 @@ def test_with_a_gripper_on_a_serial_port() -> None:
         assert (result.outcome, result.stage) == (PickOutcome.GRIPPER_FAILED, PickStage.OPEN)
 
 
-def test_a_target_without_a_way_moves_nothing() -> None:
+def test_a_target_without_a_plan_moves_nothing() -> None:
     """A wall between the arm and the table: hands would fit, but no arm gets there."""
     wall = Tabletop((Block((0.35, 0.0, 0.6), (0.02, 2.0, 1.4)),)).gaussians(30_000)
     plain = scene()
@@ -307,7 +307,7 @@ def test_a_target_without_a_way_moves_nothing() -> None:
     controller = FakeController(panda().home)
     at = controller.position
     result = Picker(GraspSampler(closed, panda()), controller, gripper, options=OPTIONS).pick(target("can"))
-    assert result.outcome in (PickOutcome.NO_GRASP, PickOutcome.NO_WAY)
+    assert result.outcome in (PickOutcome.NO_GRASP, PickOutcome.NO_PLAN)
     assert result.reason
     np.testing.assert_array_equal(controller.position, at)
     assert gripper.opening() == gripper.stroke
@@ -316,7 +316,7 @@ def test_a_target_without_a_way_moves_nothing() -> None:
 def test_spheres_of_a_held_object_cover_it_and_are_few() -> None:
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3)) * [1.0, 0.5, 0.2]
     reach = np.full(len(points), 1e-3)
-    spheres = covering_spheres(points, reach, most=30)
+    spheres = covering_spheres(points, reach, max_spheres=30)
     assert 5 < len(spheres) <= 30
     inside = spheres[None, :, 3] - np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2)
     assert (inside.max(axis=1) >= reach - 1e-12).all()
@@ -324,20 +324,20 @@ def test_spheres_of_a_held_object_cover_it_and_are_few() -> None:
         covering_spheres(points[:0], reach[:0])
 
 
-def test_what_is_within_an_object_is_its_own_and_what_is_beside_or_under_it_is_not() -> None:
+def test_points_inside_of_an_object_belong_to_it_and_points_around_it_do_not() -> None:
     y, z = np.meshgrid(np.linspace(-0.04, 0.04, 9), np.linspace(0.0, 0.08, 9))
     sides = [np.c_[np.full(81, x), y.ravel(), z.ravel()] for x in (-0.04, 0.04)]
     walls = np.concatenate([*sides, *(side[:, [1, 0, 2]] for side in sides)])  # open above and below
     spheres = np.c_[walls, np.full(len(walls), 0.008)]
     floor = np.c_[y.ravel(), z.ravel() - 0.04, np.zeros(81), np.full(81, 0.008)]
     cup = np.concatenate([spheres, floor])
-    asked = np.array([[0.0, 0.0, 0.03], [0.04, 0.01, 0.05], [0.06, 0.0, 0.04], [0.0, 0.0, -0.03], [0.0, 0.0, 0.12]])
-    np.testing.assert_array_equal(within(asked, cup), [True, True, False, False, False])
-    np.testing.assert_array_equal(within(asked, spheres), [False, True, False, False, False])
+    queries = np.array([[0.0, 0.0, 0.03], [0.04, 0.01, 0.05], [0.06, 0.0, 0.04], [0.0, 0.0, -0.03], [0.0, 0.0, 0.12]])
+    np.testing.assert_array_equal(within(queries, cup), [True, True, False, False, False])
+    np.testing.assert_array_equal(within(queries, spheres), [False, True, False, False, False])
 
 
 def test_options_that_make_no_sense_are_refused() -> None:
-    for wrong in ({"lift": 0.0}, {"free": 0.3}, {"speed": 0.0}, {"tries": 0}, {"force": -1.0}, {"budget_ms": 0.0}):
+    for wrong in ({"lift": 0.0}, {"lift_off": 0.3}, {"speed": 0.0}, {"tries": 0}, {"force": -1.0}, {"budget_ms": 0.0}):
         with pytest.raises(InputError, match="options"):
             PickOptions(**wrong)
     with pytest.raises(InputError, match="gripper"):

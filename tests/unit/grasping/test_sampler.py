@@ -1,4 +1,4 @@
-"""Ranked grasps: where the hand is, what it touches, whether the arm gets there, and what is said when it does not."""
+"""Ranked grasps: hand poses, contacts, reachability by the arm, and the reasons of rejected grasps."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
 from splatbot.segmentation import SegmentedMap, segment
-from tests.unit.grasping.things import (
+from tests.unit.grasping.objects import (
     BALL,
     BIG,
     BOX,
     CAN,
+    OBJECTS,
     TABLE,
-    THINGS,
     colored,
     model,
     scene,
@@ -54,27 +54,27 @@ def sampler() -> GraspSampler:
 
 @cache
 def grasped(name: str) -> GraspResult:
-    return sampler().sample(target_of(scene(), THINGS[name], name))
+    return sampler().sample(target_of(scene(), OBJECTS[name], name))
 
 
 @pytest.mark.parametrize("name", ["box", "can", "ball"])
-def test_things_are_grasped_within_reach_and_ranked(name: str) -> None:
+def test_objects_are_grasped_within_reach_and_ranked(name: str) -> None:
     result = grasped(name)
     assert len(result.grasps) >= 3
     totals = [g.total for g in result.grasps]
     assert totals == sorted(totals, reverse=True)
     for g in result.grasps:
         assert set(g.terms) == set(WEIGHTS) - {"near", "clear"}
-        assert g.clear
+        assert g.avoids_moving
         assert all(0.0 <= value <= 1.0 for value in g.terms.values())
         assert g.width <= g.opening <= 0.08
-        assert np.abs(THINGS[name].distance(g.contacts)).max() < 3e-3
+        assert np.abs(OBJECTS[name].distance(g.contacts)).max() < 3e-3
         assert not g.rejected
 
 
 @pytest.mark.parametrize("name", ["box", "can"])
-def test_the_arm_is_at_the_grasp_and_its_straight_way_touches_nothing_true(name: str) -> None:
-    others = Tabletop((TABLE, *(s for key, s in THINGS.items() if key != name)))
+def test_the_arm_is_at_the_grasp_and_its_straight_approach_is_collision_free(name: str) -> None:
+    others = Tabletop((TABLE, *(s for key, s in OBJECTS.items() if key != name)))
     for g in grasped(name).grasps[:4]:
         assert g.q is not None
         assert g.q_pregrasp is not None
@@ -87,24 +87,24 @@ def test_the_arm_is_at_the_grasp_and_its_straight_way_touches_nothing_true(name:
         )
         moving = arm.spheres.link > 0
         centers = arm.centers(between)[:, moving]
-        room = others.distance(centers.reshape(-1, 3)).reshape(centers.shape[:2]) - arm.spheres.radii[moving]
-        assert room.min() > -1e-3
+        clearance = others.distance(centers.reshape(-1, 3)).reshape(centers.shape[:2]) - arm.spheres.radii[moving]
+        assert clearance.min() > -1e-3
 
 
 @pytest.mark.parametrize("name", ["box", "can", "ball"])
-def test_fingers_and_palm_are_outside_of_the_true_thing(name: str) -> None:
+def test_fingers_and_palm_are_outside_of_the_true_object(name: str) -> None:
     hand = panda().hand
     assert hand is not None
     for g in grasped(name).grasps:
         x, z = np.meshgrid(np.linspace(-0.5, 0.5, 7) * hand.width, np.linspace(-hand.palm, hand.tip, 9))
         for sign in (-1.0, 1.0):
             pad = np.stack([x.ravel(), np.full(x.size, sign * g.opening / 2), z.ravel()], axis=1)
-            assert THINGS[name].distance(transform_points(g.T_world_tcp, pad)).min() > 0.0
+            assert OBJECTS[name].distance(transform_points(g.T_world_tcp, pad)).min() > 0.0
         palm = np.c_[0, 0, -hand.palm]
-        assert THINGS[name].distance(transform_points(g.T_world_tcp, palm)).min() > 0.0
+        assert OBJECTS[name].distance(transform_points(g.T_world_tcp, palm)).min() > 0.0
 
 
-def test_top_and_side_are_what_was_asked_for() -> None:
+def test_top_and_side_approaches_follow_the_option() -> None:
     target = target_of(scene(), CAN, "can")
     top = sampler().sample(target, GraspOptions(approach="top")).grasps
     side = sampler().sample(target, GraspOptions(approach="side")).grasps
@@ -114,7 +114,7 @@ def test_top_and_side_are_what_was_asked_for() -> None:
     assert side
 
 
-def test_what_is_too_large_is_refused_with_its_width() -> None:
+def test_a_too_large_object_is_refused_with_its_width() -> None:
     result = grasped("big")
     assert not result
     with pytest.raises(NoGraspError, match=r"farther apart than the hand opens.*120 mm apart.*opens 80 mm"):
@@ -126,28 +126,28 @@ def test_a_wider_hand_takes_it() -> None:
     assert found.unwrap().width == pytest.approx(BIG.size[0], abs=3e-3)
 
 
-def test_where_something_moved_grasps_that_keep_clear_of_it_come_first_and_the_others_say_so() -> None:
+def test_grasps_that_avoid_moving_regions_come_first_and_a_note_reports_the_others() -> None:
     target = target_of(scene(), BOX, "box")
-    side = BOX.center + np.array([-np.sin(BOX.yaw), np.cos(BOX.yaw), 0.0]) * 0.11  # beside its wide face
+    side = BOX.center + np.array([-np.sin(BOX.yaw), np.cos(BOX.yaw), 0.0]) * 0.11  # next to its wide face
     moving = np.array([[*side, 0.06], [*side[:2], side[2] + 0.1, 0.06]])
     wary = GraspSampler(scene(), panda(), moving=moving)
     result = wary.sample(target, GraspOptions(wanted=30))
-    groups = [[g for g in result.grasps if g.clear is clear] for clear in (True, False)]
+    groups = [[g for g in result.grasps if g.avoids_moving is clear] for clear in (True, False)]
     assert all(groups)
     assert f"{len(groups[0])} of {len(result.grasps)} grasps keep clear" in " ".join(result.notes)
     for g in result.grasps:
-        assert g.terms["clear"] == float(g.clear)
+        assert g.terms["clear"] == float(g.avoids_moving)
         assert g.approach_path is not None
         arm = RobotSpheres(panda(), opening=g.opening)
         between = np.concatenate(
             [np.linspace(a, b, 5) for a, b in zip(g.approach_path, g.approach_path[1:], strict=False)]
         )
-        room = np.linalg.norm(arm.centers(between)[:, :, None] - moving[:, :3], axis=-1) - moving[:, 3]
-        assert (room - arm.spheres.radii[:, None]).min() > 0.0 or not g.clear
-    assert result.grasps[0].clear
+        clearance = np.linalg.norm(arm.centers(between)[:, :, None] - moving[:, :3], axis=-1) - moving[:, 3]
+        assert (clearance - arm.spheres.radii[:, None]).min() > 0.0 or not g.avoids_moving
+    assert result.grasps[0].avoids_moving
     assert not any("clear" in g.terms for g in grasped("box").grasps)
     alone = GraspSampler(scene(), panda(), moving=moving, hand_only=True).sample(target).grasps
-    assert all(g.clear == bool(g.terms["clear"]) for g in alone)
+    assert all(g.avoids_moving == bool(g.terms["clear"]) for g in alone)
 
 
 class _Nowhere:
@@ -155,7 +155,7 @@ class _Nowhere:
         return Reached(None, None, 0.0, 0.0, "it is too far", "are too far")
 
 
-def test_without_reach_the_best_is_told_with_its_reason_and_all_are_counted() -> None:
+def test_without_a_reachable_grasp_the_best_is_reported_with_its_reason_and_all_are_counted() -> None:
     sampler = GraspSampler(scene(), panda(), make_reach=lambda around, whole: _Nowhere())
     result = sampler.sample(target_of(scene(), BOX, "box"))
     assert not result.grasps
@@ -166,18 +166,18 @@ def test_without_reach_the_best_is_told_with_its_reason_and_all_are_counted() ->
         result.unwrap()
 
 
-def test_where_few_samples_find_nothing_four_times_as_many_are_looked_at_and_that_is_told() -> None:
+def test_a_search_without_result_is_repeated_with_four_times_the_samples_and_a_note() -> None:
     target = target_of(scene(), CAN, "can")
     found = [sampler().sample(target, GraspOptions(samples=2, seed=seed)) for seed in range(6)]
     assert all(result.grasps for result in found)
-    told = "Nothing was found with 2 samples, so 8 were looked at, with sharper rims."
-    assert 2 <= sum(told in result.notes for result in found) < 6
-    assert not any("were looked at" in note for note in grasped("can").notes)
+    retried = "No grasp was found with 2 samples; 8 samples with sharper edges were searched."
+    assert 2 <= sum(retried in result.notes for result in found) < 6
+    assert not any("were searched" in note for note in grasped("can").notes)
 
 
-def test_there_is_no_second_look_at_what_is_too_large() -> None:
+def test_a_too_large_object_is_not_searched_again() -> None:
     assert not grasped("big")
-    assert not any("were looked at" in note for note in grasped("big").notes)
+    assert not any("were searched" in note for note in grasped("big").notes)
 
 
 class _Sharp(GraspSampler):
@@ -187,7 +187,7 @@ class _Sharp(GraspSampler):
         return super().surface(target, seed=seed, sharp=True)
 
 
-def test_what_was_looked_at_twice_is_counted_twice() -> None:
+def test_candidates_of_both_searches_are_counted() -> None:
     box = target_of(scene(), BOX, "box")
     once = GraspSampler(scene(), panda(), hand_only=True).sample(box, GraspOptions(samples=100))
     more = _Sharp(scene(), panda(), hand_only=True).sample(box, GraspOptions(samples=400))
@@ -196,7 +196,7 @@ def test_what_was_looked_at_twice_is_counted_twice() -> None:
     )
     assert not twice
     assert twice.candidates == once.candidates + more.candidates
-    touch = "hands touch what is around the target"
+    touch = "hands touch the surroundings of the target"
     assert min(once.rejected[touch], more.rejected[touch]) > 0
     for reason, count in more.rejected.items():
         assert twice.rejected[reason] == once.rejected.get(reason, 0) + count
@@ -207,7 +207,7 @@ INNER, OUTER, HIGH, RIM = 0.021, 0.0325, 0.016, 0.0055  # [m] of a low ring
 
 
 def _low_ring() -> SegmentedMap:
-    """A roll of tape on the table as depth sees it, 16 mm high: its rim rounded, few Gaussians on its walls."""
+    """Return a roll of tape on the table as depth shows it, 16 mm high: rounded rim, few Gaussians on its walls."""
     rng = np.random.default_rng(0)
     out = np.where(rng.random(2600) < 0.5, 1.0, -1.0)
     bent = rng.uniform(0.0, np.pi / 2, len(out)) * (rng.random(len(out)) < 0.9)  # from level to up; 0: on the wall
@@ -280,27 +280,27 @@ def test_a_neighbour_on_one_side_turns_the_hand_away_from_it() -> None:
         assert field.clearance(np.c_[at, spheres.radii[own]]).distance.min() > -1e-3
 
 
-def test_sides_that_nobody_saw_are_implied_and_told() -> None:
+def test_unobserved_sides_are_completed_and_reported() -> None:
     above = segment(seen_from_above(model()), np.eye(4))
     result = GraspSampler(above, panda()).sample(target_of(above, BOX, "box"))
     best = result.unwrap()
-    assert any("implied" in note for note in result.notes)
+    assert any("completed" in note for note in result.notes)
     assert best.terms["seen"] < 0.5
     assert best.width == pytest.approx(BOX.size[1], abs=8e-3)
     assert np.abs(BOX.distance(best.contacts)).max() < 4e-3
 
 
-def test_no_bottom_is_implied_half_way_up_what_stands() -> None:
-    """Of a ball that was seen from above and in front, what is implied is its back, and sides down to the table."""
+def test_no_bottom_is_completed_above_the_support() -> None:
+    """A ball that was observed from above and in front gets a back and sides down to the table, but no bottom."""
     points = model().means.double().numpy()
     own = (np.abs(BALL.distance(points)) < 1e-3) & (points[:, 2] > 1e-3)
     shown = (points - BALL.center) @ [0.5, 0.0, 1.0] > -0.2 * BALL.radius
     above = segment(model().select(torch.from_numpy(np.flatnonzero(~own | shown))), np.eye(4))
     surface = target_surface(above, target_of(above, BALL, "ball").rows)
-    implied = surface.points[~surface.seen]
-    assert len(implied) > 100
-    down = surface.normals[~surface.seen][:, 2] < -0.7
-    assert not (down & (implied[:, 2] > 0.01)).any()
+    completed = surface.points[~surface.observed]
+    assert len(completed) > 100
+    down = surface.normals[~surface.observed][:, 2] < -0.7
+    assert not (down & (completed[:, 2] > 0.01)).any()
 
 
 def test_a_ball_is_held_across_its_middle_and_closure_is_that_of_the_pads_there() -> None:
@@ -315,7 +315,7 @@ def test_a_ball_is_held_across_its_middle_and_closure_is_that_of_the_pads_there(
     assert best.terms["closure"] > 0.6
 
 
-def test_no_side_is_implied_where_depth_saw_through() -> None:
+def test_no_side_is_completed_where_depth_saw_through() -> None:
     found = segment(seen_from_above(model()), np.eye(4))
     target = target_of(found, BOX, "box")
     camera = Camera(220.0, 220.0, 159.5, 119.5, 320, 240)
@@ -328,13 +328,13 @@ def test_no_side_is_implied_where_depth_saw_through() -> None:
         ]
         return [(stage.render(camera, T)[1], camera, T) for T in poses]
 
-    implied = [
-        int((~target_surface(found, target.rows, views=known).seen).sum())
+    completed = [
+        int((~target_surface(found, target.rows, views=known).observed).sum())
         for known in ((), views(TABLE, BOX), views(TABLE))
     ]
-    assert implied[0] > 200
-    assert implied[1] > 0.9 * implied[0]
-    assert implied[2] < 0.1 * implied[0]
+    assert completed[0] > 200
+    assert completed[1] > 0.9 * completed[0]
+    assert completed[2] < 0.1 * completed[0]
 
 
 def test_the_same_seed_gives_the_same_grasps() -> None:
@@ -350,22 +350,22 @@ def test_options_out_of_range_are_refused(field: str, value: object) -> None:
         GraspOptions(**{field: value})  # type: ignore[arg-type]
 
 
-def test_a_target_of_nothing_is_refused() -> None:
+def test_an_empty_target_is_refused() -> None:
     with pytest.raises(InputError, match="ghost"):
         sampler().sample(Target(np.zeros(0, np.int64), None, "ghost", "test", 1.0))
 
 
-def test_a_grasp_far_from_what_was_pointed_at_says_so() -> None:
-    """As where two things hang together in the map, and the hand takes the one that was not meant."""
-    box, can = (target_of(scene(), THINGS[name], name) for name in ("box", "can"))
+def test_a_grasp_far_from_the_indicated_point_is_noted() -> None:
+    """Two objects are connected in the map, and the best grasp is on the one that was not indicated."""
+    box, can = (target_of(scene(), OBJECTS[name], name) for name in ("box", "can"))
     at = np.array([0.50, -0.15, 0.12])
     far = sampler().sample(Target(box.rows, at, "both", "place", 1.0))
-    assert any("from what was pointed at" in note for note in far.notes)
+    assert any("from the indicated point" in note for note in far.notes)
     near = sampler().sample(Target(can.rows, at, "can", "place", 1.0))
-    assert not any("from what was pointed at" in note for note in near.notes)
+    assert not any("from the indicated point" in note for note in near.notes)
 
 
-def test_the_rim_of_what_is_low_is_not_rounded_by_its_top_where_only_normals_alike_are_averaged() -> None:
+def test_the_edge_of_a_low_object_stays_sharp_where_only_similar_normals_are_averaged() -> None:
     low = _low_ring()
     off = []
     for sharp in (False, True):

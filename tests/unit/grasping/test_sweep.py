@@ -8,8 +8,8 @@ import pytest
 from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
-from splatbot.grasping.hands import Hands
-from splatbot.grasping.sweep import LOOK, fingers_room, swept_room
+from splatbot.grasping.hands import MAX_CLEARANCE_M, Hands
+from splatbot.grasping.sweep import finger_clearance, swept_clearance
 from splatbot.protocols import Array, HandShape
 from splatbot.robots.panda import panda
 
@@ -23,7 +23,7 @@ def _hands(count: int = 1) -> Hands:
 
 
 def _ball(at: Array) -> GaussianCollisionField:
-    """One ball at a point of the tool's frame [m]."""
+    """Return the field of one ball at a point of the tool's frame [m]."""
     model = GaussianModel.from_activated(
         means=transform_points(T_WORLD_TCP, at[None]),
         quats=np.array([[1.0, 0.0, 0.0, 0.0]]),
@@ -35,7 +35,7 @@ def _ball(at: Array) -> GaussianCollisionField:
 
 
 def _spheres() -> tuple[Array, Array]:
-    """Of hand and fingers, in the tool's frame [m]."""
+    """Return centres and radii of the spheres of hand and fingers in the tool's frame [m]."""
     spheres = panda().spheres(OPENING)
     own = spheres.link == len(panda().chain)
     return transform_points(inverse(panda().T_link_tcp), spheres.centers[own]), spheres.radii[own]
@@ -53,25 +53,25 @@ def test_room_of_the_fingers_is_that_of_their_balls_where_the_hand_takes_hold(y:
     centers, radii = _spheres()
     away = np.linalg.norm(centers - at, axis=1) - radii - RADIUS
     expected = min(1e-3, away[centers[:, 2] > -_hand().palm].min())
-    room = fingers_room(panda(), _hands(3), _ball(at), _hand())
-    np.testing.assert_allclose(room, expected, atol=1e-4)
+    clearance = finger_clearance(panda(), _hands(3), _ball(at), _hand())
+    np.testing.assert_allclose(clearance, expected, atol=1e-4)
 
 
-def test_what_is_in_the_palm_or_on_the_way_is_left_to_the_sweep() -> None:
+def test_obstacles_at_the_palm_or_on_the_approach_are_left_to_the_sweep() -> None:
     for at in (np.array([0.0, 0.0, -_hand().palm - 0.02]), np.array([0.0, 0.03, -0.12])):
-        assert fingers_room(panda(), _hands(), _ball(at), _hand())[0] == 1e-3
-        assert swept_room(panda(), _hands(), _ball(at), retreat=0.1)[0] < 0.0
+        assert finger_clearance(panda(), _hands(), _ball(at), _hand())[0] == 1e-3
+        assert swept_clearance(panda(), _hands(), _ball(at), retreat=0.1)[0] < 0.0
 
 
 def test_the_sweep_has_the_least_room_of_all_its_places() -> None:
     at, back = np.array([0.0, 0.045, -0.05]), np.linspace(0.0, 0.1, 5)
     centers, radii = _spheres()
     places = centers[None] - back[:, None, None] * [0.0, 0.0, 1.0]
-    expected = min(LOOK, (np.linalg.norm(places - at, axis=2) - radii - RADIUS).min())
-    assert swept_room(panda(), _hands(), _ball(at), retreat=0.1)[0] == pytest.approx(expected, abs=1e-4)
+    expected = min(MAX_CLEARANCE_M, (np.linalg.norm(places - at, axis=2) - radii - RADIUS).min())
+    assert swept_clearance(panda(), _hands(), _ball(at), retreat=0.1)[0] == pytest.approx(expected, abs=1e-4)
 
 
 def test_no_hands_have_no_room() -> None:
     field = _ball(np.zeros(3))
-    assert fingers_room(panda(), _hands(0), field, _hand()).shape == (0,)
-    assert swept_room(panda(), _hands(0), field, retreat=0.1).shape == (0,)
+    assert finger_clearance(panda(), _hands(0), field, _hand()).shape == (0,)
+    assert swept_clearance(panda(), _hands(0), field, retreat=0.1).shape == (0,)

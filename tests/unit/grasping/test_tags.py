@@ -11,12 +11,12 @@ import pytest
 from splatbot.errors import InputError
 from splatbot.grasping.affordance import AffordanceError, ObservedView, TagHint
 from splatbot.grasping.tags import FAMILIES, TagAffordance, find_tags
+from tests.unit.grasping.objects import CAN, scene, target_of
 from tests.unit.grasping.test_affordance import VIEW, _pixel
-from tests.unit.grasping.things import CAN, scene, target_of
 
 
 def _picture(number: int, at: tuple[float, float]) -> ObservedView:
-    """Grey, with a tag of 24 pixels."""
+    """Return a view with a grey image that contains a tag of 24 pixels."""
     rgb = np.full((240, 320, 3), 160, np.uint8)
     tag = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(FAMILIES["36h11"]), number, 24)
     u, v = round(at[0]) - 12, round(at[1]) - 12
@@ -25,7 +25,7 @@ def _picture(number: int, at: tuple[float, float]) -> ObservedView:
     return replace(VIEW, rgb=rgb)
 
 
-def test_the_thing_behind_a_tag_is_found() -> None:
+def test_the_object_with_a_tag_is_found() -> None:
     at = _pixel((0.50, -0.15, 0.12))
     view = _picture(7, at)
     corners = find_tags(view)
@@ -35,7 +35,7 @@ def test_the_thing_behind_a_tag_is_found() -> None:
     assert found.number == target_of(scene(), CAN, "can").number
 
 
-def test_another_tag_is_no_answer_and_those_seen_are_told() -> None:
+def test_another_tag_is_no_target_and_the_detected_tags_are_reported() -> None:
     view = _picture(7, _pixel((0.50, -0.15, 0.12)))
     with pytest.raises(AffordanceError, match="these tags are: 7"):
         TagAffordance().locate(TagHint(8, (view,)), scene())

@@ -59,7 +59,7 @@ def test_a_tiny_model_with_random_weights_loads_and_generates(tiny: Path) -> Non
 
 
 def test_the_nonsense_of_a_random_model_is_an_error_not_a_target(tiny: Path) -> None:
-    with pytest.raises(VisionError, match="not asked for"):
+    with pytest.raises(VisionError, match="gives an invalid answer"):
         VisionAffordance(LocalModel(tiny, tokens=12)).locate(NameHint("red box"), scene())
 
 

@@ -1,17 +1,17 @@
-"""What oriented points enclose, against formulas; and what a weight asks of pads."""
+"""Enclosed volume of oriented points, and the friction load of a weight, against formulas."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from splatbot.grasping.score import friction_share
+from splatbot.grasping.score import friction_load
 from splatbot.grasping.volume import enclosed_volume, winding_numbers
 from splatbot.robots.panda import panda
 
 
 def _box(size: tuple[float, float, float], at: tuple[float, float, float], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points on a box, evenly, and their normals."""
+    """Sample points on a box uniformly; return them with their normals."""
     rng = np.random.default_rng(0)
     half = np.asarray(size) / 2
     areas = np.repeat([half[1] * half[2], half[0] * half[2], half[0] * half[1]], 2)
@@ -30,7 +30,7 @@ def _ball(radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
     return radius * normals, normals
 
 
-def test_of_a_box_and_a_ball_it_is_what_formulas_say() -> None:
+def test_volume_and_centre_of_a_box_and_a_ball_agree_with_formulas() -> None:
     box = enclosed_volume(*_box((0.10, 0.06, 0.04), (3.0, -2.0, 1.0), 2000))
     np.testing.assert_allclose(box.center, [3.0, -2.0, 1.0], atol=2e-3)
     assert box.size == pytest.approx(0.10 * 0.06 * 0.04, rel=0.15)
@@ -51,7 +51,7 @@ def test_a_hammers_middle_is_near_its_head_not_in_the_middle_of_its_box() -> Non
     assert found.size == pytest.approx(volumes.sum(), rel=0.15)
 
 
-def test_without_a_bottom_it_is_still_found_and_a_single_face_encloses_nothing() -> None:
+def test_a_volume_without_a_bottom_is_found_and_a_single_face_encloses_nothing() -> None:
     points, normals = _box((0.08, 0.06, 0.10), (0.0, 0.0, 0.0), 2400)
     standing = normals[:, 2] > -0.5
     found = enclosed_volume(points[standing], normals[standing])
@@ -80,5 +80,5 @@ def test_loads_on_the_rim_of_the_limit_surface_take_all_friction_and_half_of_the
     for turn in np.linspace(0.0, 1.5, 7):
         f, tau = f_most * np.cos(turn), tau_most * np.sin(turn)
         aside = np.array([tau / f])
-        np.testing.assert_allclose(friction_share(f, aside, hand, mu), 1.0, rtol=1e-9)
-        np.testing.assert_allclose(friction_share(f / 2, aside, hand, mu), 0.5, rtol=1e-9)
+        np.testing.assert_allclose(friction_load(f, aside, hand, mu), 1.0, rtol=1e-9)
+        np.testing.assert_allclose(friction_load(f / 2, aside, hand, mu), 0.5, rtol=1e-9)

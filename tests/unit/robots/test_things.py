@@ -27,9 +27,9 @@ from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
-from tests.unit.grasping.things import TABLE, THINGS, model
+from tests.unit.grasping.objects import OBJECTS, TABLE, model
 
-VIEWS = tuple(exact_views(Tabletop((TABLE, *THINGS.values())), 8))
+VIEWS = tuple(exact_views(Tabletop((TABLE, *OBJECTS.values())), 8))
 FLYING = np.array([0.56, -0.15, 0.12])  # beside the can, where depth sees through
 
 

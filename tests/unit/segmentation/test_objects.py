@@ -11,7 +11,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import pose_from_quat
 from splatbot.grasping.obstacles import around_target
 from splatbot.segmentation import clusters, segment
-from splatbot.segmentation.parts import cut_at_steps
+from splatbot.segmentation.faces import cut_at_steps
 from splatbot.workspace import NamedPlace
 
 TABLE = Block((0.5, 0.0, -0.02), (0.7, 0.9, 0.04))

@@ -10,7 +10,7 @@ from splatbot.bench.tabletop import Block, Tabletop
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.segmentation import segment
-from splatbot.segmentation.rooms import cut_in_room
+from splatbot.segmentation.concave_edges import cut_in_room
 
 BOARD = Block((0.75, 0.0, -0.01), (0.5, 0.6, 0.02))
 BACK = Block((0.95, 0.0, 0.15), (0.01, 0.5, 0.30))

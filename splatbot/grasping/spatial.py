@@ -1,4 +1,4 @@
-"""Targets from places: a pixel, a point, a mask, a rectangle."""
+"""Targets from spatial hints: a pixel, a point, a mask or a rectangle."""
 
 from __future__ import annotations
 
@@ -22,31 +22,32 @@ from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapObject, SegmentedMap
 from splatbot.segmentation.objects import FEWEST, LARGEST
-from splatbot.segmentation.parts import find_faces, nearest_of
+from splatbot.segmentation.faces import find_faces, nearest_of
 
-NEAR = 0.02  # [m] around a point within which an object's Gaussian must be
-_CLEAR = 0.6  # share of a mask's objects that one must have
-_WITHIN = "it was pointed at within it, not at its surface"
-_BESIDE, _PART = 0.01, 0.15  # [m] beside what a mask marks; share of what shows of an object and is farther, from
-# where on what is marked is a thing of its own, as where it is less than half: masks are rough at their rims
-_TOUCHING = "it hangs together with more in the map: what was marked is taken for it"
-_UNSEGMENTED = "it is no object of its own: what was marked of its faces is taken for it"
+NEAR = 0.02  # [m] maximum distance between an indicated point and a Gaussian of the object
+_MIN_MASK_MAJORITY = 0.6  # of a mask's object pixels that belong to the selected object
+# A mask selects a part of an object if more than this fraction of the object's visible Gaussians is outside of the
+# margin around it. Smaller differences are errors at the boundary of the mask.
+_MASK_MARGIN_M, _MIN_OUTSIDE_FRACTION = 0.01, 0.15
+_WITHIN = "the point is inside of the object, not on its surface"
+_TOUCHING = "the object is connected with others in the map; the target is the marked part"
+_UNSEGMENTED = "it is not a segmented object; the target is the marked part of its faces"
 
 
-class PlaceAffordance:
-    """The segmented object at a place of a picture or of the world."""
+class SpatialAffordance:
+    """Finds the segmented object at a position in an image or in the world."""
 
     @property
     def name(self) -> str:
-        """As results tell it."""
+        """Name of the backend in results."""
         return "place"
 
     def understands(self, hint: Hint) -> bool:
-        """Pixels, points, masks and rectangles."""
+        """Return whether the hint is a pixel, point, mask or rectangle."""
         return isinstance(hint, PixelHint | PointHint | MaskHint | BoxHint)
 
     def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
-        """See :class:`splatbot.grasping.affordance.Affordance`."""
+        """Find the object at the position; see :class:`splatbot.grasping.affordance.Affordance`."""
         if isinstance(hint, PointHint):
             return at_point(scene, _checked_point(hint.point))
         if isinstance(hint, PixelHint):
@@ -59,11 +60,11 @@ class PlaceAffordance:
 
 
 def point_at(scene: SegmentedMap, view: ObservedView, u: float, v: float) -> Array:
-    """What the pixel (u, v) of a view shows of the map (3,) [m, world].
+    """Backproject the pixel (u, v) with the rendered depth of the map to a point (3,) [m, world].
 
     Raises:
-        InputError: the pixel is not in the picture.
-        AffordanceError: there is nothing of the map.
+        InputError: the pixel is outside of the image.
+        AffordanceError: the pixel shows no part of the map.
     """
     c = view.camera
     if not (-0.5 <= u < c.width - 0.5 and -0.5 <= v < c.height - 0.5):
@@ -76,16 +77,16 @@ def point_at(scene: SegmentedMap, view: ObservedView, u: float, v: float) -> Arr
     depth = render_view(scene.model, window, view.T_world_camera, "depth")
     z = float(depth[depth.shape[0] // 2, depth.shape[1] // 2])
     if z <= 0.0:
-        raise AffordanceError(f"({u:g}, {v:g}) shows nothing of the map.", field="pixel", hint="point at a thing")
+        raise AffordanceError(f"({u:g}, {v:g}) shows nothing of the map.", field="pixel", hint="point at an object")
     ray = np.array([(u - c.cx) / c.fx, (v - c.cy) / c.fy, 1.0])
     return transform_points(view.T_world_camera, z * ray)
 
 
 def at_point(scene: SegmentedMap, point: Array, *, backend: str = "place", label: str = "") -> Target:
-    """The object whose Gaussian is nearest to a point (3,) [m, world], or the face of what was not segmented there.
+    """Return the object with the Gaussian nearest to a point (3,) [m, world], or an unsegmented face there.
 
     Raises:
-        AffordanceError: nothing is within 2 cm but what things stand on; what is there is said.
+        AffordanceError: no object or face is within 2 cm; the message names the distance of the nearest object.
     """
     means = scene.model.means.detach().double().numpy()
     away = [float(np.linalg.norm(means[o.rows] - point, axis=1).min()) for o in scene.objects]
@@ -115,18 +116,18 @@ def at_point(scene: SegmentedMap, point: Array, *, backend: str = "place", label
 
 
 def _around(scene: SegmentedMap, point: Array) -> MapObject | None:
-    """The smallest object in whose box a point is, as within a cup of which only the rim was mapped."""
+    """Return the smallest object whose bounding box contains a point, for example a cup with only its rim mapped."""
     local = transform_points(inverse(scene.T_world_base), point)
     found = []
-    for thing in scene.objects:
-        low, high = scene.points[thing.rows].min(axis=0), scene.points[thing.rows].max(axis=0)
+    for candidate in scene.objects:
+        low, high = scene.points[candidate.rows].min(axis=0), scene.points[candidate.rows].max(axis=0)
         if ((local > low) & (local < high)).all():
-            found.append((float(np.prod(high - low)), thing.number))
+            found.append((float(np.prod(high - low)), candidate.number))
     return scene.objects[min(found)[1]] if found else None
 
 
 def _face_at(scene: SegmentedMap, point: Array) -> NDArray[np.int64]:
-    """The Gaussians around a point, if they are a face of their own, as that of a book in a shelf."""
+    """Return the Gaussians of the separate face at a point, such as the spine of a book in a shelf; else no rows."""
     local = transform_points(inverse(scene.T_world_base), point)
     rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < LARGEST / 2).all(axis=1))
     rows = rows[scene.labels[rows] >= -1]
@@ -142,23 +143,23 @@ def _face_at(scene: SegmentedMap, point: Array) -> NDArray[np.int64]:
 
 
 def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *, exact: bool = False) -> Target:
-    """The object that a mask shows; of an ``exact`` one that leaves out much of it, what is marked."""
+    """Return the object that a mask shows; an ``exact`` mask that covers only a part of an object selects the part."""
     c = view.camera
     if mask.shape != (c.height, c.width) or mask.dtype != np.bool_:
         raise InputError(f"is {mask.dtype} {mask.shape}.", field="mask", hint=f"give ({c.height}, {c.width}) booleans")
     seeds = _visible(scene, view, mask)
     if not len(seeds):
-        raise AffordanceError("shows nothing of the map.", field="mask", hint="mark a thing in the picture")
+        raise AffordanceError("shows nothing of the map.", field="mask", hint="mark an object in the image")
     labels = scene.labels[seeds]
     votes = np.bincount(labels[labels >= 0], minlength=len(scene.objects))
     share = votes / len(seeds)
-    if not len(votes) or share.sum() < _CLEAR / 2:
+    if not len(votes) or share.sum() < _MIN_MASK_MAJORITY / 2:
         rows = scene.grown(seeds)
         if not len(rows):
-            raise AffordanceError("shows no object, only what they stand on.", field="mask", hint="mark a thing")
-        return Target(rows, None, "what was marked", "place", 0.5, (_UNSEGMENTED,))
+            raise AffordanceError("shows only supports, no object.", field="mask", hint="mark an object")
+        return Target(rows, None, "marked part", "place", 0.5, (_UNSEGMENTED,))
     k = int(np.argmax(votes))
-    if votes[k] < _CLEAR * votes.sum():
+    if votes[k] < _MIN_MASK_MAJORITY * votes.sum():
         names = tuple(o.name or f"object {o.number}" for o in scene.objects if votes[o.number] > 0.2 * votes.sum())
         raise AffordanceError(
             f"shows {len(names)} objects about equally.", field="mask", hint="mark one of them", candidates=names
@@ -169,8 +170,10 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
         shown = _visible(scene, view, np.ones_like(mask))
         shown = shown[scene.labels[shown] == k]
         own, other = seeds[labels == k], np.setdiff1d(shown, seeds)
-        beside = nearest_of(scene.points[own], scene.points[other])[1] > _BESIDE**2 if len(other) else np.zeros(0)
-        if beside.sum() > _PART * len(shown) or 2 * len(own) < len(shown):
+        outside = (
+            nearest_of(scene.points[own], scene.points[other])[1] > _MASK_MARGIN_M**2 if len(other) else np.zeros(0)
+        )
+        if outside.sum() > _MIN_OUTSIDE_FRACTION * len(shown) or 2 * len(own) < len(shown):
             rows = _nearer(scene.points, found.rows, own, other)
             return Target(rows, None, f"part of {label}", "place", score, (_TOUCHING,), k)
     return Target(found.rows, None, label, "place", score, (), k)
@@ -179,13 +182,13 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
 def _nearer(
     points: Array, rows: NDArray[np.int64], own: NDArray[np.int64], other: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Those of ``rows`` of points (N, 3) that are nearer to one of the rows ``own`` than to any of ``other``."""
+    """Return the ``rows`` of points (N, 3) that are nearer to a point of ``own`` than to all points of ``other``."""
     away = [nearest_of(points[some], points[rows])[1] for some in (own, other)]
     return rows[away[0] < away[1]]
 
 
 def _visible(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows of the solid Gaussians that show in the marked pixels."""
+    """Return the rows of the solid Gaussians that are visible in the marked pixels."""
     c = view.camera
     depth = render_view(scene.model, c, view.T_world_camera, "depth")
     rows = np.flatnonzero(scene.solid)
@@ -206,13 +209,13 @@ def _rectangle(hint: BoxHint) -> NDArray[np.bool_]:
         max(hint.v0, hint.v1),
     )
     if not (high_u >= 0 and high_v >= 0 and low_u <= c.width - 1 and low_v <= c.height - 1):
-        raise InputError("is out of the picture.", field="box", hint=f"give pixels of {c.width}x{c.height}")
+        raise InputError("is outside of the image.", field="box", hint=f"give pixels of {c.width}x{c.height}")
     v, u = np.mgrid[: c.height, : c.width]
     return np.asarray((u >= low_u) & (u <= high_u) & (v >= low_v) & (v <= high_v))
 
 
 def _cropped(c: Camera, u: int, v: int) -> Camera:
-    """The camera with only 9 pixels around (u, v), which renders in no time."""
+    """Return the camera cropped to 9 x 9 pixels around (u, v), which is fast to render."""
     return Camera(c.fx, c.fy, c.cx - u + 4, c.cy - v + 4, 9, 9)
 
 

@@ -1,0 +1,269 @@
+"""Rule-based language queries: names, colours, shapes, sizes and spatial relations. The vocabulary is closed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import InputError
+from splatbot.geometry import inverse, transform_points
+from splatbot.grasping.affordance import AffordanceError, Hint, NameHint, Target
+from splatbot.grasping.spatial import at_point
+from splatbot.protocols import Array
+from splatbot.segmentation import MapObject, SegmentedMap, primitive_fits
+
+COLORS = {
+    "red": (0.75, 0.12, 0.12),
+    "orange": (0.90, 0.50, 0.10),
+    "yellow": (0.90, 0.80, 0.20),
+    "green": (0.20, 0.60, 0.25),
+    "cyan": (0.25, 0.70, 0.75),
+    "blue": (0.15, 0.30, 0.75),
+    "purple": (0.50, 0.20, 0.60),
+    "pink": (0.95, 0.60, 0.70),
+    "brown": (0.45, 0.30, 0.15),
+    "black": (0.08, 0.08, 0.08),
+    "grey": (0.50, 0.50, 0.50),
+    "white": (0.92, 0.92, 0.92),
+}
+SHAPES = {
+    "box": ("box", "cube", "carton", "block", "brick", "book", "packet"),
+    "cylinder": ("cylinder", "can", "cup", "mug", "bottle", "roll", "tape", "tube", "jar", "tin"),
+    "sphere": ("sphere", "ball", "orb", "fruit"),
+}
+SIZES = ("largest", "biggest", "smallest", "tallest", "lowest", "widest", "thinnest", "nearest", "closest", "farthest")
+RELATIONS = ("left of", "right of", "in front of", "behind", "next to", "near")
+_GENERIC = ("thing", "object", "one", "item", "something")
+_STOP_WORDS = (
+    "the",
+    "a",
+    "an",
+    "that",
+    "is",
+    "most",
+    "please",
+    "grasp",
+    "pick",
+    "up",
+    "take",
+    "to",
+    "colored",
+    "coloured",
+)
+_SYNONYMS = {"gray": "grey", "violet": "purple", "magenta": "pink", "turquoise": "cyan", "teal": "cyan", "big": "large"}
+_COLOR_SCALE = 28.0  # CIELAB distance at which the colour score falls to exp(-1/2)
+_SHAPE_SCALE_M = 2.5e-3  # excess fit error at which the shape score falls to exp(-1)
+_MIN_SCORE = 0.3  # of a match
+_TIE_RATIO = 0.75  # of the second score over the best, above which the query is ambiguous
+
+
+@dataclass(frozen=True, eq=False)
+class _ObjectAttributes:
+    """Attributes of the objects of a scene; ``centers`` (K, 3) are in the robot's base frame [m]."""
+
+    scene: SegmentedMap
+    centers: Array
+
+    @classmethod
+    def of(cls, scene: SegmentedMap) -> _ObjectAttributes:
+        centers = np.array([o.center for o in scene.objects]).reshape(-1, 3)
+        return cls(scene, transform_points(inverse(scene.T_world_base), centers))
+
+
+class LanguageAffordance:
+    """Finds objects by names and aliases of the scene file, else by rules on colour, shape, size and relation."""
+
+    @property
+    def name(self) -> str:
+        """Name of the backend in results."""
+        return "rules"
+
+    def understands(self, hint: Hint) -> bool:
+        """Return whether the hint is a text."""
+        return isinstance(hint, NameHint)
+
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
+        """Find the object of a query; see :class:`splatbot.grasping.affordance.Affordance`."""
+        if not isinstance(hint, NameHint):
+            raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give words")
+        text = " ".join(re.findall(r"[a-z0-9_-]+", hint.text.lower()))
+        if not text:
+            raise InputError("is empty.", field="target", hint='give a name, or "red box"')
+        named = _named(scene, text)
+        if named is not None:
+            return named
+        if not scene.objects:
+            raise AffordanceError("is not there: no object stands out of the map.", field=text, hint="point at a place")
+        scores, notes = _scores(_ObjectAttributes.of(scene), text)
+        return _decided(scene, text, scores, notes)
+
+
+def _named(scene: SegmentedMap, text: str) -> Target | None:
+    """Return the object with this name or alias in the scene file; None if no entry has it."""
+    plain = " ".join(word for word in text.split() if word not in _STOP_WORDS)
+    for entry in scene.names:
+        if plain in (other.lower() for other in (entry.name, *entry.aliases)):
+            found = next((o for o in scene.objects if o.name == entry.name), None)
+            if found is None:
+                return at_point(scene, entry.at, backend="scene", label=entry.name)
+            return Target(found.rows, None, entry.name, "scene", 1.0, (), found.number)
+    return None
+
+
+def _decided(scene: SegmentedMap, text: str, scores: Array, notes: tuple[str, ...]) -> Target:
+    order = np.argsort(-scores, kind="stable")
+    best = int(order[0])
+    described = [f"{_described(scene.objects[k])}: {scores[k]:.2f}" for k in order[:4]]
+    if scores[best] < _MIN_SCORE:
+        raise AffordanceError(
+            f"fits none of {len(scores)} objects; the nearest are {'; '.join(described)}.",
+            field=text,
+            hint="use other words, or point at it",
+            candidates=tuple(described),
+        )
+    like = [k for k in order if scores[k] > _TIE_RATIO * scores[best]]
+    if len(like) > 1:
+        raise AffordanceError(
+            f"fits {len(like)} objects about equally: {'; '.join(described[: len(like)])}.",
+            field=text,
+            hint="say more, as left of or largest, or point at it",
+            candidates=tuple(described[: len(like)]),
+        )
+    found = scene.objects[best]
+    return Target(found.rows, None, found.name or text, "rules", float(scores[best]), (*notes, *described), best)
+
+
+def _described(item: MapObject) -> str:
+    """Describe an object by its name, the nearest colour name and its size."""
+    color = min(COLORS, key=lambda name: float(np.linalg.norm(_lab(item.color[None]) - _lab(np.array([COLORS[name]])))))
+    size = " x ".join(f"{100 * x:.0f}" for x in item.size)
+    return f"{item.name or f'object {item.number}'} ({color}, {size} cm)"
+
+
+def _scores(attributes: _ObjectAttributes, text: str) -> tuple[Array, tuple[str, ...]]:
+    """Return the scores (K,) of the objects, 0..1, and a note on the applied rules."""
+    scores = np.ones(len(attributes.scene.objects))
+    notes: list[str] = []
+    for relation in RELATIONS:
+        if f" {relation} " in f" {text} ":
+            text, _, other = text.partition(relation)
+            scores = scores * _relation_scores(attributes, relation, other.strip())
+            notes.append(relation)
+            break
+    best_of: list[str] = []
+    for raw in text.split():
+        word = _SYNONYMS.get(raw, raw)
+        if word in _STOP_WORDS or word in _GENERIC:
+            continue
+        if word in SIZES:
+            best_of.append(word)
+            continue
+        rule = _rule(word)
+        if rule is None:
+            known = ", ".join((*COLORS, *(w for words in SHAPES.values() for w in words), *SIZES, *RELATIONS))
+            raise AffordanceError(
+                f"has {raw!r}, which is neither a name of the scene nor in the vocabulary.",
+                field=text.strip() or raw,
+                hint=f"name it in scene.yaml, point at it, or use: {known}",
+            )
+        scores = scores * rule(attributes)
+        notes.append(word)
+    for word in best_of:  # "largest red" selects the largest of the red objects, not the reddest of the large ones
+        scores = np.where(
+            scores >= _MIN_SCORE, scores * _superlative_scores(attributes, word, scores >= _MIN_SCORE), 0.0
+        )
+        notes.append(word)
+    return scores, (f"rules: {', '.join(notes) or 'any'}",)
+
+
+def _rule(word: str) -> Callable[[_ObjectAttributes], Array] | None:
+    if word in COLORS:
+        return lambda attributes: _color_scores(attributes, word)
+    for kind, words in SHAPES.items():
+        if word in words or word.removesuffix("s") in words:
+            return lambda attributes: np.array(
+                [_shape_score(attributes.scene, o, kind) for o in attributes.scene.objects]
+            )
+    if word in ("large", "small", "tall", "flat"):
+        return lambda attributes: _size_scores(attributes, word)
+    return None
+
+
+def _color_scores(attributes: _ObjectAttributes, word: str) -> Array:
+    away = np.linalg.norm(
+        _lab(np.array([o.color for o in attributes.scene.objects])) - _lab(np.array([COLORS[word]])), axis=1
+    )
+    return np.asarray(np.exp(-0.5 * (away / _COLOR_SCALE) ** 2))
+
+
+def _lab(rgb: Array) -> Array:
+    """Convert colours (K, 3) to CIELAB with halved lightness, since lightness depends on the illumination."""
+    lab = cv2.cvtColor(rgb.astype(np.float32)[None], cv2.COLOR_RGB2LAB)[0].astype(np.float64)
+    return lab * [0.5, 1.0, 1.0]
+
+
+def _shape_score(scene: SegmentedMap, item: MapObject, kind: str) -> float:
+    points = scene.points[item.rows]
+    support = scene.under(points)
+    fits = {
+        f.shape["kind"]: f.error for f in primitive_fits(points, support.offset if support is not None else -np.inf)
+    }
+    return float(np.exp(-(fits[kind] - min(fits.values())) / _SHAPE_SCALE_M))
+
+
+def _size_scores(attributes: _ObjectAttributes, word: str) -> Array:
+    values = _measure(attributes, {"large": "largest", "small": "smallest", "tall": "tallest", "flat": "lowest"}[word])
+    middle = np.median(values)
+    return np.asarray(1.0 / (1.0 + np.exp(-4.0 * (values - middle) / max(abs(middle), 1e-6))))
+
+
+def _superlative_scores(attributes: _ObjectAttributes, word: str, among: NDArray[np.bool_]) -> Array:
+    """Score objects (K,) by a superlative: 1 for the best of ``among``, decreasing with the distance from it."""
+    values = _measure(attributes, word)
+    best = values[among].max() if among.any() else 0.0
+    return np.asarray(np.exp(-(best - values) / (0.2 * max(abs(best), 1e-6))))
+
+
+def _measure(attributes: _ObjectAttributes, word: str) -> Array:
+    sizes = np.array([o.size for o in attributes.scene.objects])
+    away = np.linalg.norm(attributes.centers[:, :2], axis=1)
+    volume = np.cbrt(np.maximum(sizes, 1e-3).prod(axis=1))
+    return {
+        "largest": volume,
+        "biggest": volume,
+        "smallest": -volume,
+        "tallest": sizes[:, 2],
+        "lowest": -sizes[:, 2],
+        "widest": sizes[:, 0],
+        "thinnest": -sizes.min(axis=1),
+        "nearest": -away,
+        "closest": -away,
+        "farthest": away,
+    }[word]
+
+
+def _relation_scores(attributes: _ObjectAttributes, relation: str, other: str) -> Array:
+    """Score objects (K,) by a relation to another object in the robot's base frame: x forward, y to the left."""
+    named = _named(attributes.scene, other)
+    if named is None:
+        scores, _ = _scores(attributes, other)
+        named = _decided(attributes.scene, other, scores, ())
+    at = transform_points(
+        inverse(attributes.scene.T_world_base), attributes.scene.model.means[named.rows].double().numpy()
+    )
+    by = attributes.centers - np.median(at, axis=0)
+    ahead, left = by[:, 0], by[:, 1]
+    away = np.linalg.norm(by[:, :2], axis=1)
+    toward = {"left of": left, "right of": -left, "behind": ahead, "in front of": -ahead}
+    score = np.exp(-away / 0.2)
+    if relation in toward:
+        share = toward[relation] / np.maximum(away, 1e-6)
+        score = np.where(share > 0.5, 0.5 + 0.5 * score, 0.0)
+    if named.number >= 0:
+        score[named.number] = 0.0
+    return np.asarray(score)
