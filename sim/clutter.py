@@ -16,7 +16,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_to_rotation, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap, Support, fit, segment
-from splatbot.segmentation.objects import FEWEST, OPAQUE, solid_rows
+from splatbot.segmentation.objects import FEWEST, MIN_OPACITY, solid_rows
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge, surface_points
 from splatbot.sim.scene import Clutter, Scene, SceneObject
 from splatbot.sim.solids import pose_at, rpy_of
@@ -121,7 +121,7 @@ def _beyond(ellipsoids: Ellipsoids, model: GaussianModel, T_scene_map: Array) ->
     if not len(ellipsoids.centers):
         return np.zeros(1)
     points = surface_points(ellipsoids)
-    field = GaussianCollisionField(model, min_opacity=OPAQUE)
+    field = GaussianCollisionField(model, min_opacity=MIN_OPACITY)
     in_map = transform_points(inverse(T_scene_map), points.reshape(-1, 3))
     room = field.clearance(in_map).distance.reshape(points.shape[:2])
     return np.maximum(room.max(axis=1), 0.0)

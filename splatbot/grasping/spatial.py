@@ -21,8 +21,8 @@ from splatbot.grasping.affordance import (
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapObject, SegmentedMap
-from splatbot.segmentation.objects import FEWEST, LARGEST
 from splatbot.segmentation.faces import find_faces, nearest_of
+from splatbot.segmentation.objects import FEWEST, LARGEST
 
 NEAR = 0.02  # [m] maximum distance between an indicated point and a Gaussian of the object
 _MIN_MASK_MAJORITY = 0.6  # of a mask's object pixels that belong to the selected object

@@ -1,4 +1,4 @@
-"""What a map is made of: a support and the things on it."""
+"""Segmentation of a map into support planes and objects."""
 
 from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.fits import Fit, fit, primitive_fits

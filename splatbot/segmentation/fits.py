@@ -1,4 +1,4 @@
-"""Primitives that fit a cluster of surface points, and how well."""
+"""Fits of primitive shapes to clusters of surface points."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ import numpy as np
 
 from splatbot.protocols import Array
 
-# A hull follows the noise of its points, and has no side that nobody saw: it is taken only where every primitive's
-# error is larger than _PLAIN times the hull's, and by more than noise [m].
-_PLAIN, _NOISE = 1.3, 3e-3
-_FOOT = 0.3  # of a hull's height whose points stand on the floor
-_BARE = 0.25  # of its radius that a ball may stick out over its points
-_TRIM = 1.0  # [%] of the points that may stick out of a box or cylinder on each side
+# A convex hull follows the noise of its points and lacks unobserved sides. It is used only if the error of every
+# primitive exceeds _HULL_ERROR_RATIO times that of the hull plus _HULL_NOISE_M.
+_HULL_ERROR_RATIO, _HULL_NOISE_M = 1.3, 3e-3
+_FOOT_FRACTION = 0.3  # lower part of a hull's height whose points are projected to the floor
+_MAX_UNOBSERVED_CAP = 0.25  # height of a ball above its points, as a fraction of the radius
+_TRIM = 1.0  # [%] of the points outside of a box or cylinder on each side
+_MAX_FLOOR_GAP_M = 0.03  # between a cluster and the floor that it stands on
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A shape for a cluster that stands on the plane z = 0.
+    """A shape that fits a cluster.
 
     Args:
         shape: values of a shape of :mod:`splatbot.sim.solids`, in the object's frame.
-        at: (3,) where the object's frame is [m].
-        error: mean distance of the points from its surface [m].
-        worst: the 95th percentile [m].
+        at: (3,) origin of the object's frame [m].
+        error: mean distance of the points from the surface [m].
+        worst: 95th percentile of the distance [m].
     """
 
     shape: dict[str, Any]
@@ -36,25 +37,27 @@ class Fit:
 
 
 def fit(points: Array, floor: float) -> Fit:
-    """The shape with the least mean error for points (P, 3) [m] that stand on the height ``floor``.
+    """Fit the shape with the smallest mean error to points (P, 3) [m] of an object on the height ``floor`` [m].
 
-    Tried are an upright box, an upright cylinder, a ball and, where they all fail, the convex hull.
+    Candidates are an upright box, an upright cylinder and a ball. If all have a large error, the convex hull is used.
     """
     best = min(primitive_fits(points, floor), key=lambda f: f.error)
     hull = _hull(points, *_heights(points, floor))
-    return hull if best.error > _PLAIN * hull.error + _NOISE else best
+    return hull if best.error > _HULL_ERROR_RATIO * hull.error + _HULL_NOISE_M else best
 
 
 def primitive_fits(points: Array, floor: float) -> list[Fit]:
-    """An upright box, an upright cylinder and a ball for points (P, 3) [m] that stand on the height ``floor``."""
+    """Fit an upright box, an upright cylinder and a ball to points (P, 3) [m] of an object on the height ``floor``."""
     low, high = _heights(points, floor)
     return [_box(points, low, high), _cylinder(points, low, high), _ball(points)]
 
 
 def _heights(points: Array, floor: float) -> tuple[float, float]:
-    """Bottom and top [m]: what begins a little over the floor stands on it."""
+    """Return bottom and top [m]; a cluster that begins less than 3 cm above the floor stands on it."""
     lowest = float(points[:, 2].min())
-    return min(floor, lowest) if floor > lowest - 0.03 else lowest, float(np.percentile(points[:, 2], 100 - _TRIM))
+    return min(floor, lowest) if floor > lowest - _MAX_FLOOR_GAP_M else lowest, float(
+        np.percentile(points[:, 2], 100 - _TRIM)
+    )
 
 
 def _box(points: Array, low: float, high: float) -> Fit:
@@ -82,31 +85,37 @@ def _cylinder(points: Array, low: float, high: float) -> Fit:
 
 
 def _circle(points: Array) -> tuple[Array, float]:
-    """About the middle of the smallest circle, with nearly all points inside: robust to filled lids."""
+    """Fit a circle to points (P, 2): centre of the minimum enclosing circle, radius of nearly all points.
+
+    Points of a filled lid do not bias it.
+    """
     (x, y), _ = cv2.minEnclosingCircle(points.astype(np.float32))
     center = np.array([x, y])
     return center, max(float(np.percentile(np.linalg.norm(points - center, axis=1), 100 - _TRIM)), 1e-3)
 
 
 def _ball(points: Array) -> Fit:
-    """Least squares in |p|² = 2 c·p + (r² - |c|²); infinitely wrong where its top is far over all points.
+    """Fit a sphere with centre c and radius r by linear least squares: |p|² = 2 c·p + (r² - |c|²).
 
-    A ring that lies flat is on the surface of many balls.
+    The error is infinite if the top of the sphere is far above all points, since a flat ring fits many spheres.
     """
     A = np.c_[2 * points, np.ones(len(points))]
     x = np.linalg.lstsq(A, (points**2).sum(axis=1), rcond=None)[0]
     radius = float(np.sqrt(max(x[3] + x[:3] @ x[:3], 1e-6)))
     shape = {"kind": "sphere", "radius": radius}
-    if x[2] + radius > points[:, 2].max() + _BARE * radius:
+    if x[2] + radius > points[:, 2].max() + _MAX_UNOBSERVED_CAP * radius:
         return Fit(shape, x[:3], np.inf, np.inf)
     return _fit(shape, x[:3], np.linalg.norm(points - x[:3], axis=1) - radius)
 
 
 def _hull(points: Array, low: float, high: float) -> Fit:
-    """Down to ``low``, as the others are: clusters begin where the table's noise ends, and would fall and tip."""
+    """Compute the convex hull of the points and of their lower part projected to the height ``low``.
+
+    Clusters begin above the noise of the table. Without the projection a simulated hull would fall and tip over.
+    """
     import open3d as o3d
 
-    foot = points[points[:, 2] < low + _FOOT * (high - low)] * [1.0, 1.0, 0.0] + [0.0, 0.0, low]
+    foot = points[points[:, 2] < low + _FOOT_FRACTION * (high - low)] * [1.0, 1.0, 0.0] + [0.0, 0.0, low]
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.concatenate([points, foot])))
     mesh, _ = cloud.compute_convex_hull()
     middle = points.mean(axis=0)

@@ -1,4 +1,4 @@
-"""A map as a support and the objects on it."""
+"""Segmentation of a map: support planes and the objects on them."""
 
 from __future__ import annotations
 
@@ -16,35 +16,38 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
-from splatbot.segmentation.faces import cut_at_steps, local_normals, nearest_of, region
+from splatbot.segmentation.concave_edges import split_at_concave_edges
+from splatbot.segmentation.faces import local_normals, nearest_of, region, split_at_steps
 from splatbot.segmentation.plane import NEAR, Support, find_support, given_support
-from splatbot.segmentation.concave_edges import cut_in_room
 from splatbot.workspace import NamedPlace
 
-OPAQUE = 0.3  # fainter Gaussians are no surface
-LOWEST, ABOVE = 0.002, 0.008  # [m] over the support; lower is its own noise, of which it has this much at most
-FEWEST, LARGEST = 40, 0.35  # Gaussians of an object; [m] across
-_APART = 0.012  # [m] between Gaussians of one object
-_LEDGE = 0.15  # [m] across, from where on a thing may be a support of others
-_SHARE, _PLANES, _DEEPEST = 0.1, 3, 1  # of its points that its plane has; planes looked at; supports on supports
-_SPACED = 2.2  # times the usual size of Gaussians: in a coarse map they are farther apart
-_AROUND = 0.05  # [m] around what was pointed at that is looked at
-_STRAY = 0.006  # [m] around an object within which faint Gaussians are its own
-_OVER = 0.7  # of what is above a plane that is over it
-_ALONG, _MOSTLY = 0.8, 0.5  # cosine between normals along a plane and its own; share of its points that are so
+MIN_OPACITY = 0.3  # of a Gaussian that represents a surface
+MIN_HEIGHT, MAX_HEIGHT = 0.002, 0.008  # [m] limits of the height above a support below which points are its noise
+FEWEST, LARGEST = 40, 0.35  # minimum number of Gaussians of an object; maximum extent [m]
+_OBJECT_DISTANCE_M = 0.012  # minimum distance between objects
+_MIN_SUPPORT_EXTENT_M = 0.15  # of a cluster that may contain a support
+_MIN_SUPPORT_FRACTION = 0.1  # of a cluster's points that are on its support
+_MAX_PLANES = 3  # planes of a cluster that are tried as supports
+_MAX_NESTED_SUPPORTS = 1  # supports on supports
+_SPACING_FACTOR = 2.2  # minimum object distance over the median size of the Gaussians, for coarse maps
+_SEED_MARGIN_M = 0.05  # around seeds, in which faces are searched
+_STRAY_DISTANCE_M = 0.006  # around an object, within which faint Gaussians belong to it
+_MIN_OVER_FRACTION = 0.7  # of the points above a support that are over its area
+_LEVEL_COSINE, _MIN_LEVEL_FRACTION = 0.8, 0.5  # between point normals and that of a support; of its points
+_MAX_NAME_DISTANCE_M = 0.05  # between a named place and its object
 
 
 @dataclass(frozen=True, eq=False)
 class MapObject:
-    """Gaussians that hang together on the support.
+    """An object instance: connected Gaussians on a support.
 
     Args:
-        number: in its scene, from 0; the one with most Gaussians first.
-        rows: (M,) int64 of the map.
-        center: (3,) of its box [m, world].
-        size: (3,) of its box along its own long side, its own short side, and upwards [m].
+        number: index in its scene, by decreasing number of Gaussians.
+        rows: (M,) int64 indices of its Gaussians in the map.
+        center: (3,) centre of the bounding box [m, world].
+        size: (3,) long side, short side and height of the upright bounding box [m].
         color: (3,) median RGB in 0..1.
-        name: from a scene file; empty: it has none.
+        name: name from a scene file, or empty.
         aliases: other names.
     """
 
@@ -59,16 +62,17 @@ class MapObject:
 
 @dataclass(frozen=True, eq=False)
 class SegmentedMap:
-    """One state of the map and what is in it.
+    """A segmented map: supports and object instances.
 
     Args:
         model: the map.
-        T_world_base: (4, 4), a frame whose z is up; the robot's base, where there is one.
-        support: in that frame; None: there is no level plane.
-        objects: on it.
-        labels: (N,) int32 of the map's Gaussians: the number of its object, -1 for none, -2 - k: of the k-th support.
-        supports: the support, and further ones that stand on it or beside it, as the seat of a stool.
-        map_version: of the map.
+        T_world_base: (4, 4) pose of a frame with z up, usually that of the robot's base.
+        support: largest support plane in that frame. If None, the map has no horizontal plane.
+        objects: the objects.
+        labels: (N,) int32 label of each Gaussian: number of its object, -1 for none, -2 - k for the k-th support.
+        supports: all supports: the largest, and others on it or next to it, such as the seat of a stool.
+        names: named places of a scene file.
+        map_version: version of the map.
     """
 
     model: GaussianModel
@@ -87,21 +91,21 @@ class SegmentedMap:
 
     @cached_property
     def solid(self) -> NDArray[np.bool_]:
-        """Which Gaussians (N,) are a surface that was measured."""
+        """Return which Gaussians (N,) represent an observed surface."""
         return solid_rows(self.model)
 
     def under(self, points: Array) -> Support | None:
-        """The highest support that is not above points (P, 3) of the base's frame [m]; None: there is none."""
+        """Return the highest support below points (P, 3) in the base frame [m], or None without one."""
         low = np.percentile(points, 5, axis=0)
         below = [s for s in self.supports if s.height(low[None])[0] > -NEAR]
         return min(below, key=lambda s: float(s.height(low[None])[0])) if below else None
 
     def grown(self, seeds: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows of the faces that lie mostly in the rows ``seeds``, without the support; for what is no object."""
+        """Return the rows of the faces that lie mostly in ``seeds``, without supports; used for unsegmented objects."""
         if not len(seeds):
             return seeds
         near = self.points[seeds]
-        low, high = np.percentile(near, [2, 98], axis=0) + np.array([[-_AROUND], [_AROUND]])
+        low, high = np.percentile(near, [2, 98], axis=0) + np.array([[-_SEED_MARGIN_M], [_SEED_MARGIN_M]])
         rows = np.flatnonzero(self.solid & ((self.points > low) & (self.points < high)).all(axis=1))
         rows = rows[self.labels[rows] >= -1]
         if len(rows) < FEWEST:
@@ -112,13 +116,13 @@ class SegmentedMap:
 
     @property
     def up(self) -> Array:
-        """(3,) unit, in the world."""
+        """(3,) unit up axis [world]."""
         return np.asarray(self.T_world_base[:3, 2])
 
 
 def solid_rows(model: GaussianModel) -> NDArray[np.bool_]:
-    """Which Gaussians (N,) are a surface that was measured."""
-    return np.asarray((model.opacities.detach().numpy() >= OPAQUE) & (model.observations.numpy() >= 1))
+    """Return which Gaussians (N,) represent an observed surface: opaque and observed by a keyframe."""
+    return np.asarray((model.opacities.detach().numpy() >= MIN_OPACITY) & (model.observations.numpy() >= 1))
 
 
 def segment(
@@ -128,27 +132,28 @@ def segment(
     box: ArrayLike | None = None,
     plane: ArrayLike | None = None,
     names: Sequence[NamedPlace] = (),
-    apart: float = _APART,
+    apart: float = _OBJECT_DISTANCE_M,
     cut: bool = True,
     observers: Array | None = None,
 ) -> SegmentedMap:
-    """Remove the support of a map and gather what stands on it.
+    """Remove the support plane of a map and cluster the remaining Gaussians into objects.
 
     Args:
         source: the map.
-        T_world_base: (4, 4), a frame whose z is up.
-        box: (2, 3) corners of the space that is looked at, in that frame [m]; None: 2 m around.
-        plane: (4,) = (n, d), the support where it is known: n · p + d = 0 [world]; None: it is looked for.
-        names: what a scene file calls things.
-        apart: objects have more than this between their Gaussians [m]; in a coarse map it is more.
-        cut: what hangs together may be several things: one that is wide may be a support of others, and it is cut at
-            steps between level faces. Without, it is one, as a mallet is whose head is higher than its handle.
-        observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known. With them, what
-            hangs together and is too large for a thing, as a shelf with all that leans on its walls, is cut where
-            faces meet at concave edges; without, it is no object.
+        T_world_base: (4, 4) pose of a frame with z up.
+        box: (2, 3) corners of the workspace in that frame [m]. If None, a cube of 4 m around the origin is used.
+        plane: (4,) known support (n, d) with n · p + d = 0 [world]. If None, the support is detected.
+        names: named places of a scene file.
+        apart: minimum distance between the Gaussians of two objects [m]; it is larger in a coarse map.
+        cut: split clusters: a wide one may contain a support with objects on it, and touching objects are split at
+            steps between parallel faces. If False, a cluster is one object, such as a mallet whose head is higher than
+            its handle.
+        observers: (N, 3) camera centre from which each Gaussian was observed [m, world], NaN where unknown. With them,
+            clusters that are too large for an object are split at concave edges, such as a shelf with objects at its
+            walls. If None, such clusters are not objects.
 
     Raises:
-        InputError: nothing of the map is in the box, or the observers are of another map.
+        InputError: the box contains no Gaussians, or the observers do not belong to the map.
     """
     model = source.model if isinstance(source, Snapshot) else source
     T = np.asarray(T_world_base, dtype=np.float64)
@@ -157,10 +162,10 @@ def segment(
         raise InputError(f"is {observers.shape}.", field="observers", hint=f"give ({len(points)}, 3)")
     eyes = None if observers is None else transform_points(inverse(T), observers)
     low, high = np.array([[-2.0] * 3, [2.0] * 3]) if box is None else np.asarray(box, dtype=np.float64)
-    used = np.flatnonzero(solid_rows(model) & ((points >= low - ABOVE) & (points <= high)).all(axis=1))
+    used = np.flatnonzero(solid_rows(model) & ((points >= low - MAX_HEIGHT) & (points <= high)).all(axis=1))
     if not len(used):
         raise InputError(f"has nothing between {low.tolist()} and {high.tolist()}.", field="map", hint="see scene.yaml")
-    apart = max(apart, _SPACED * float(model.scales[torch.from_numpy(used)].amax(dim=1).median()))
+    apart = max(apart, _SPACING_FACTOR * float(model.scales[torch.from_numpy(used)].amax(dim=1).median()))
     support = find_support(points[used]) if plane is None else _known(plane, T, points[used])
     above = used if support is None else used[above_support(support, points[used])]
     labels = np.full(len(model), -1, np.int32)
@@ -170,7 +175,7 @@ def segment(
     objects: list[MapObject] = []
     colors = model.colors.detach().double().numpy()
     for rows in sorted(
-        _things(points, eyes, above, apart, _DEEPEST, labels, supports, cut),
+        _object_rows(points, eyes, above, apart, _MAX_NESTED_SUPPORTS, labels, supports, cut),
         key=lambda rows: (-len(rows), int(rows[0])),
     ):
         labels[rows] = len(objects)
@@ -182,14 +187,14 @@ def segment(
 
 
 def _known(plane: ArrayLike, T_world_base: Array, points: Array) -> Support:
-    """A plane of the world in the base's frame."""
+    """Transform a plane (n, d) with n · p + d = 0 from the world to the base frame."""
     values = np.asarray(plane, dtype=np.float64)
     normal = T_world_base[:3, :3].T @ values[:3]
     offset = -float(values[3] + values[:3] @ T_world_base[:3, 3])
     return given_support(points, normal, offset)
 
 
-def _things(
+def _object_rows(
     points: Array,
     eyes: Array | None,
     used: NDArray[np.int64],
@@ -199,31 +204,31 @@ def _things(
     supports: list[Support],
     cut: bool,
 ) -> list[NDArray[np.int64]]:
-    """Rows of what hangs together; what stands together on a support of its own, as a stool or a shelf, apart."""
+    """Return the rows of each object; clusters on a support of their own, as on a stool or a shelf, are separated."""
     found: list[NDArray[np.int64]] = []
     for part in clusters(points[used], apart=apart):
         rows = used[part]
         wide = float(np.ptp(points[rows], axis=0).max())
-        ledge = _ledge(points[rows]) if cut and deeper and wide > _LEDGE else None
+        ledge = _nested_support(points[rows]) if cut and deeper and wide > _MIN_SUPPORT_EXTENT_M else None
         if ledge is not None:
             on = rows[above_support(ledge, points[rows])]
             supports.append(replace(ledge, inside=np.zeros(0, np.bool_)))
             labels[rows[np.abs(ledge.height(points[rows])) < NEAR]] = -1 - len(supports)
-            found += _things(points, eyes, on, apart, deeper - 1, labels, supports, cut)
+            found += _object_rows(points, eyes, on, apart, deeper - 1, labels, supports, cut)
         elif cut and eyes is not None and wide > LARGEST:
-            parts = cut_in_room(points[rows], eyes[rows], apart=apart, fewest=FEWEST)
+            parts = split_at_concave_edges(points[rows], eyes[rows], apart=apart, fewest=FEWEST)
             found += [rows[some] for some in parts if np.ptp(points[rows[some]], axis=0).max() <= LARGEST]
         elif len(rows) >= FEWEST and wide <= LARGEST:
-            found += [rows[some] for some in cut_at_steps(points[rows], fewest=FEWEST)] if cut else [rows]
+            found += [rows[some] for some in split_at_steps(points[rows], fewest=FEWEST)] if cut else [rows]
     return found
 
 
-def _ledge(points: Array) -> Support | None:
-    """The lowest of the level planes that hold most points (P, 3), if something stands on it."""
+def _nested_support(points: Array) -> Support | None:
+    """Return the lowest of the three largest horizontal planes of a cluster (P, 3) with objects on it, or None."""
     left, best = np.ones(len(points), np.bool_), None
-    for _ in range(_PLANES):
+    for _ in range(_MAX_PLANES):
         plane = find_support(points[left])
-        if plane is None or plane.inside.sum() < _SHARE * len(points):
+        if plane is None or plane.inside.sum() < _MIN_SUPPORT_FRACTION * len(points):
             break
         if (best is None or plane.offset < best.offset) and _holds(plane, points) and _level(plane, points, left):
             best = plane
@@ -235,46 +240,49 @@ def _ledge(points: Array) -> Support | None:
 
 
 def _level(plane: Support, points: Array, left: NDArray[np.bool_]) -> bool:
-    """Whether the plane's points are a face along it, not where it cuts through walls."""
+    """Return whether the inliers form a face along the plane, rather than an intersection of the plane with walls."""
     rows = np.flatnonzero(left)[plane.inside]
     normals = local_normals(points, rows[:: max(1, len(rows) // 300)])
-    return float((np.abs(normals @ plane.normal) > _ALONG).mean()) > _MOSTLY
+    return float((np.abs(normals @ plane.normal) > _LEVEL_COSINE).mean()) > _MIN_LEVEL_FRACTION
 
 
 def _holds(plane: Support, points: Array) -> bool:
-    """Whether what is above the plane is over it, as on a shelf, and not beside it."""
+    """Return whether the points above the plane are over its area, as on a shelf, and not next to it."""
     away = plane.height(points)
-    on = points[away > ABOVE][:, :2].astype(np.float32)
+    on = points[away > MAX_HEIGHT][:, :2].astype(np.float32)
     if len(on) < FEWEST:
         return False
     hull = cv2.convexHull(points[np.abs(away) < NEAR][:, :2].astype(np.float32))
     some = on[:: max(1, len(on) // 200)]
     over = [cv2.pointPolygonTest(hull, (float(x), float(y)), False) >= 0 for x, y in some]
-    return float(np.mean(over)) > _OVER
+    return float(np.mean(over)) > _MIN_OVER_FRACTION
 
 
 def above_support(support: Support, points: Array) -> NDArray[np.bool_]:
-    """Which points (P, 3) are higher than the support's own noise."""
+    """Return which points (P, 3) are higher than three standard deviations of the support's noise.
+
+    The robust standard deviation is 1.48 median |height| of the inliers; the threshold is clipped to 2..8 mm.
+    """
     height = support.height(points)
     near = np.abs(height[np.abs(height) < NEAR])
     noise = 1.48 * float(np.median(near)) if len(near) else 0.0
-    return np.asarray(height > np.clip(3.0 * noise, LOWEST, ABOVE))
+    return np.asarray(height > np.clip(3.0 * noise, MIN_HEIGHT, MAX_HEIGHT))
 
 
 def _with_faint(
     objects: list[MapObject], labels: NDArray[np.int32], points: Array, used: NDArray[np.int64]
 ) -> list[MapObject]:
-    """Objects with the faint and stray Gaussians that lie within 6 mm of them: they are no obstacles of their own."""
+    """Add faint and stray Gaussians within 6 mm of an object to it, so that they are no separate obstacles."""
     if not objects:
         return objects
     own = np.flatnonzero(labels >= 0)
-    low, high = points[own].min(axis=0) - _STRAY, points[own].max(axis=0) + _STRAY
+    low, high = points[own].min(axis=0) - _STRAY_DISTANCE_M, points[own].max(axis=0) + _STRAY_DISTANCE_M
     solid = np.zeros(len(points), np.bool_)
     solid[used] = True
     faint = np.flatnonzero(~solid & ((points > low) & (points < high)).all(axis=1))
     if len(faint):
         nearest, square = nearest_of(points[own], points[faint])
-        near = square < _STRAY**2
+        near = square < _STRAY_DISTANCE_M**2
         labels[faint[near]] = labels[own[nearest[near]]]
     return [replace(o, rows=np.flatnonzero(labels == o.number)) for o in objects]
 
@@ -290,12 +298,12 @@ def _described(number: int, rows: NDArray[np.int64], points: Array, colors: Arra
 def _with_names(
     objects: tuple[MapObject, ...], points: Array, T: Array, names: Sequence[NamedPlace]
 ) -> tuple[MapObject, ...]:
-    """Each place names the object whose Gaussians are nearest, if one is within 5 cm."""
+    """Assign each named place to the object with the nearest Gaussian, within 5 cm."""
     found = list(objects)
     for place in names:
         at = transform_points(inverse(T), place.at)
         away = [float(np.linalg.norm(points[o.rows] - at, axis=1).min()) for o in objects]
-        if away and min(away) < 0.05:
+        if away and min(away) < _MAX_NAME_DISTANCE_M:
             k = int(np.argmin(away))
             found[k] = replace(objects[k], name=place.name, aliases=place.aliases)
     return tuple(found)

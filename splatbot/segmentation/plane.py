@@ -1,4 +1,4 @@
-"""The plane that things stand on."""
+"""Support planes: RANSAC with a least-squares refinement."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-NEAR = 0.01  # [m] that points of the plane are off by at most
-_TRIES = 300
-_TILT = np.cos(np.radians(15.0))  # a support is level
-_SHARE = 0.05  # of all points that a plane must have
+NEAR = 0.01  # [m] maximum distance of an inlier from the plane
+_ITERATIONS = 300  # of RANSAC
+_MAX_SAMPLE = 5000  # points on which RANSAC counts inliers
+_MIN_UP_COSINE = np.cos(np.radians(15.0))  # between the normal of a support and up
+_MIN_INLIER_FRACTION = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Points p with normal · p = offset.
+    """A support plane: points p with normal · p = offset.
 
     Args:
-        normal: (3,) unit, upwards.
+        normal: (3,) upward unit normal.
         offset: [m].
-        error: RMS distance of its points [m].
-        inside: (P,) which points are on it.
+        error: RMS distance of the inliers [m].
+        inside: (P,) inlier mask.
     """
 
     normal: Array
@@ -32,38 +33,44 @@ class Support:
     inside: NDArray[np.bool_]
 
     def height(self, points: Array) -> Array:
-        """Of points (P, 3) above it (P,) [m]."""
+        """Return the heights (P,) [m] of points (P, 3) above the plane."""
         return np.asarray(points @ self.normal - self.offset)
 
 
 def given_support(points: Array, normal: Array, offset: float) -> Support:
-    """A plane normal · p = offset that is known, with those of the points (P, 3) [m] that are on it."""
+    """Return a known plane normal · p = offset with its inliers among points (P, 3) [m]."""
     away = points @ normal - offset
     inside = np.abs(away) < NEAR
     return Support(normal, offset, float(np.sqrt(np.mean(away[inside] ** 2))) if inside.any() else 0.0, inside)
 
 
 def find_support(points: Array, *, seed: int = 0) -> Support | None:
-    """The level plane with most of the points (P, 3) [m, z up]; None if none has 5 % of them.
+    """Find the horizontal plane with the most inliers among points (P, 3) [m, z up].
 
-    RANSAC (Fischler and Bolles 1981), then least squares on the points of the best. Repeatable.
+    RANSAC (Fischler and Bolles 1981) draws three points a, b, c and scores their plane by its inliers::
+
+        n = (b - a) x (c - a) / |(b - a) x (c - a)|,   d = n · a,   inliers: |n · p - d| < 1 cm
+
+    Three rounds of least squares then refit the best plane: n is the right singular vector of the smallest singular
+    value of the centred inliers. The result is deterministic for a seed. Without a plane that has 5 % of the points as
+    inliers, the function returns None.
     """
     if len(points) < 20:
         return None
     rng = np.random.default_rng(seed)
-    sample = points[rng.choice(len(points), min(len(points), 5000), replace=False)]
+    sample = points[rng.choice(len(points), min(len(points), _MAX_SAMPLE), replace=False)]
     best, most = None, 0
-    for _ in range(_TRIES):
+    for _ in range(_ITERATIONS):
         a, b, c = sample[rng.choice(len(sample), 3, replace=False)]
         normal = np.cross(b - a, c - a)
         length = float(np.linalg.norm(normal))
-        if length < 1e-9 or abs(normal[2]) < _TILT * length:
+        if length < 1e-9 or abs(normal[2]) < _MIN_UP_COSINE * length:
             continue
         normal = normal / length * np.sign(normal[2])
         count = int((np.abs(sample @ normal - a @ normal) < NEAR).sum())
         if count > most:
             best, most = (normal, float(a @ normal)), count
-    if best is None or most < _SHARE * len(sample):
+    if best is None or most < _MIN_INLIER_FRACTION * len(sample):
         return None
     return _refined(points, *best)
 

@@ -134,7 +134,7 @@ def test_grasps_that_avoid_moving_regions_come_first_and_a_note_reports_the_othe
     result = wary.sample(target, GraspOptions(wanted=30))
     groups = [[g for g in result.grasps if g.avoids_moving is clear] for clear in (True, False)]
     assert all(groups)
-    assert f"{len(groups[0])} of {len(result.grasps)} grasps keep clear" in " ".join(result.notes)
+    assert f"{len(groups[0])} of {len(result.grasps)} grasps avoid its region" in " ".join(result.notes)
     for g in result.grasps:
         assert g.terms["clear"] == float(g.avoids_moving)
         assert g.approach_path is not None

@@ -211,7 +211,7 @@ def test_a_model_that_is_not_sure_or_sees_nothing_is_an_error(endpoint: FakeEndp
 
 def test_rules_that_know_better_stop_a_model_that_points_elsewhere(endpoint: FakeEndpoint) -> None:
     endpoint.behave = point_with(by_color(GREEN))
-    with pytest.raises(AffordanceError, match="but rules says"):
+    with pytest.raises(AffordanceError, match="but rules finds"):
         backend(endpoint, rules=Rules(number_of(RED))).locate(NameHint("red box"), scene())
     assert backend(endpoint, rules=Rules(number_of(GREEN))).locate(NameHint("can"), scene()).number == number_of(GREEN)
 

@@ -1,4 +1,4 @@
-"""A map as supports and things on them."""
+"""Segmentation of a map into supports and objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import pose_from_quat
 from splatbot.grasping.obstacles import around_target
 from splatbot.segmentation import clusters, segment
-from splatbot.segmentation.faces import cut_at_steps
+from splatbot.segmentation.faces import split_at_steps
 from splatbot.workspace import NamedPlace
 
 TABLE = Block((0.5, 0.0, -0.02), (0.7, 0.9, 0.04))
@@ -23,7 +23,7 @@ def _map(*solids: Block | Can, count: int = 20_000) -> GaussianModel:
     return Tabletop((TABLE, *solids)).gaussians(count)
 
 
-def test_things_on_a_table_are_apart_with_their_sizes() -> None:
+def test_objects_on_a_table_are_separated_with_their_sizes() -> None:
     found = segment(_map(BOX, CAN), np.eye(4))
     assert found.support is not None
     assert abs(found.support.offset) < 1e-3
@@ -35,7 +35,7 @@ def test_things_on_a_table_are_apart_with_their_sizes() -> None:
     assert (found.labels == -2).sum() > 5000
 
 
-def test_a_map_in_another_frame_gives_the_same_things() -> None:
+def test_a_map_in_another_frame_gives_the_same_objects() -> None:
     T = pose_from_quat([0.3, -0.2, 1.0], [0.6, -0.3, 0.2, 0.7])
     model = _map(BOX, CAN)
     moved = model.clone()
@@ -47,7 +47,7 @@ def test_a_map_in_another_frame_gives_the_same_things() -> None:
     np.testing.assert_allclose(there.up, T[:3, 2], atol=1e-9)
 
 
-def test_what_stands_on_a_stool_is_apart_from_it_and_the_stool_is_a_support() -> None:
+def test_an_object_on_a_stool_is_separated_and_the_stool_is_a_support() -> None:
     stool = Can((0.5, 0.0, 0.0), 0.16, 0.20)
     cup = Can((0.5, 0.05, 0.20), 0.03, 0.08)
     found = segment(_map(stool, cup, count=30_000), np.eye(4))
@@ -60,7 +60,7 @@ def test_what_stands_on_a_stool_is_apart_from_it_and_the_stool_is_a_support() ->
 
 
 def _steps(count: int) -> np.ndarray:
-    """Two plates of ``count`` points each, one 3 cm above the other, and the step between them."""
+    """Sample two plates of ``count`` points each, one 3 cm above the other, and the step between them."""
     rng = np.random.default_rng(0)
     low = np.c_[rng.uniform(0.0, 0.1, count), rng.uniform(0, 0.1, count), rng.normal(0.05, 3e-4, count)]
     high = np.c_[rng.uniform(0.1, 0.2, count), rng.uniform(0, 0.1, count), rng.normal(0.08, 3e-4, count)]
@@ -69,23 +69,23 @@ def _steps(count: int) -> np.ndarray:
 
 
 def test_two_boxes_that_touch_are_cut_at_their_step() -> None:
-    parts = cut_at_steps(_steps(600), fewest=40)
+    parts = split_at_steps(_steps(600), fewest=40)
     assert len(parts) == 2
     sides = [rows < 600 for rows in parts]
     assert {round(float(side.mean())) for side in sides} == {0, 1}
 
 
-def test_what_is_too_sparse_to_have_normals_is_not_cut() -> None:
-    (whole,) = cut_at_steps(_steps(100), fewest=20)
+def test_points_too_sparse_for_normals_are_not_split() -> None:
+    (whole,) = split_at_steps(_steps(100), fewest=20)
     assert len(whole) == 210
 
 
-def test_a_mallet_is_one_thing_where_nothing_is_to_be_cut() -> None:
+def test_a_mallet_is_one_object_without_splitting() -> None:
     handle = Block((0.5, 0.0, 0.025), (0.18, 0.026, 0.026))
     head, knob = Block((0.6, 0.0, 0.025), (0.035, 0.07, 0.05)), Block((0.4, 0.0, 0.025), (0.02, 0.05, 0.05))
     top = Block((0.5, 0.0, -0.02), (0.7, 0.9, 0.04))
     model = Tabletop((top, handle, head, knob)).gaussians(30_000)
-    assert len(segment(model, np.eye(4)).objects) > 1  # it is cut at the step from its handle to its knob
+    assert len(segment(model, np.eye(4)).objects) > 1  # split at the step from its handle to its knob
     found = segment(model, np.eye(4), cut=False)
     assert len(found.supports) == 1
     (whole,) = found.objects
@@ -94,17 +94,17 @@ def test_a_mallet_is_one_thing_where_nothing_is_to_be_cut() -> None:
 
 def test_a_box_seen_from_three_sides_stays_whole() -> None:
     points = Tabletop((BOX,)).gaussians(3000).means.double().numpy()
-    assert len(cut_at_steps(points[points[:, 2] > 1e-3], fewest=40)) == 1
+    assert len(split_at_steps(points[points[:, 2] > 1e-3], fewest=40)) == 1
 
 
-def test_names_go_to_the_things_at_their_places() -> None:
+def test_names_go_to_the_objects_at_their_places() -> None:
     names = (NamedPlace("tin", np.array([0.55, -0.15, 0.08]), ("can",)), NamedPlace("ghost", np.array([0.0, 0.0, 2.0])))
     found = segment(_map(BOX, CAN), np.eye(4), names=names)
     assert [o.name for o in found.objects] == ["", "tin"]
     assert found.objects[1].aliases == ("can",)
 
 
-def test_faint_gaussians_around_a_thing_are_its_own() -> None:
+def test_faint_gaussians_around_an_object_belong_to_it() -> None:
     model = _map(BOX, CAN, count=60_000)
     on_can = np.flatnonzero(np.abs(CAN.distance(model.means.double().numpy())) < 1e-3)[::3]
     model.opacity_logits[on_can] = -3.0

@@ -1,4 +1,4 @@
-"""What hangs together and is too large for a thing."""
+"""Segmentation of connected structures that are too large for an object."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatbot.bench.tabletop import Block, Tabletop
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.segmentation import segment
-from splatbot.segmentation.concave_edges import cut_in_room
+from splatbot.segmentation.concave_edges import split_at_concave_edges
 
 BOARD = Block((0.75, 0.0, -0.01), (0.5, 0.6, 0.02))
 BACK = Block((0.95, 0.0, 0.15), (0.01, 0.5, 0.30))
@@ -21,13 +21,13 @@ EYE = np.array([0.2, 0.05, 0.25])
 
 
 def _seen(*solids: Block) -> tuple[GaussianModel, np.ndarray]:
-    """What EYE sees of a shelf, 1 mm off, and which solid each Gaussian is of."""
+    """Return the Gaussians of a shelf that EYE observes, with 1 mm of noise, and the solid of each Gaussian."""
     model = Tabletop((BOARD, BACK, LEFT, RIGHT, *solids)).gaussians(120_000)
     points = model.means.double().numpy()
     away = np.abs(np.stack([s.distance(points) for s in (BOARD, BACK, LEFT, RIGHT, *solids)]))
     normals = _normals(points, (BOARD, BACK, LEFT, RIGHT, *solids), away.argmin(axis=0))
     facing = np.einsum("ij,ij->i", normals, EYE - points) > 0
-    for k, solid in enumerate(solids):  # what is behind them is hidden
+    for k, solid in enumerate(solids):  # points behind them are occluded
         toward = points + (EYE - points) * np.linspace(0.02, 0.5, 60)[:, None, None]
         hidden = (solid.distance(toward.reshape(-1, 3)).reshape(60, -1) < -2e-3).any(axis=0)
         facing &= ~hidden | (away.argmin(axis=0) == 4 + k)
@@ -48,12 +48,12 @@ def _normals(points: np.ndarray, solids: tuple[Block, ...], owner: np.ndarray) -
 
 
 def _shares(rows: np.ndarray, owner: np.ndarray, solid: int) -> tuple[float, float]:
-    """Share of a part that is of a solid, and of the solid that is in the part."""
+    """Compute the fraction of a part that is on a solid, and the fraction of the solid that is in the part."""
     own = owner[rows] == solid
     return float(own.mean()), float(own.sum() / (owner == solid).sum())
 
 
-def test_what_touches_the_walls_of_a_shelf_is_apart_from_them() -> None:
+def test_objects_in_contact_with_the_walls_of_a_shelf_are_separated() -> None:
     model, owner = _seen(BOX, SLAB)
     eyes = np.tile(EYE, (len(model), 1))
     found = segment(model, np.eye(4), observers=eyes)
@@ -65,24 +65,24 @@ def test_what_touches_the_walls_of_a_shelf_is_apart_from_them() -> None:
         assert np.isin(owner[thing.rows], (2, 3)).mean() < 0.2 or len(thing.rows) < 0.2 * (owner == 2).sum()
 
 
-def test_without_who_saw_it_a_shelf_stays_no_object() -> None:
+def test_without_observers_a_shelf_is_no_object() -> None:
     model, _ = _seen(BOX, SLAB)
     assert not [o for o in segment(model, np.eye(4)).objects if o.size.max() > 0.05]
 
 
-def test_faces_that_nobody_is_known_to_have_seen_are_parts_of_their_own() -> None:
+def test_faces_without_a_known_observer_are_parts_of_their_own() -> None:
     model, owner = _seen(BOX)
     rows = np.flatnonzero(owner >= 1)
     points = model.means.double().numpy()[rows]
-    parts = cut_in_room(points, np.full_like(points, np.nan), apart=0.012, fewest=40)
-    assert len(parts) > len(cut_in_room(points, np.tile(EYE, (len(points), 1)), apart=0.012, fewest=40))
+    parts = split_at_concave_edges(points, np.full_like(points, np.nan), apart=0.012, fewest=40)
+    assert len(parts) > len(split_at_concave_edges(points, np.tile(EYE, (len(points), 1)), apart=0.012, fewest=40))
 
 
-def test_a_part_is_no_smaller_than_asked_and_no_row_is_in_two() -> None:
+def test_a_part_has_the_minimum_size_and_no_row_is_in_two() -> None:
     model, owner = _seen(BOX, SLAB)
     rows = np.flatnonzero(owner >= 1)
     points = model.means.double().numpy()[rows]
-    parts = cut_in_room(points, np.tile(EYE, (len(points), 1)), apart=0.012, fewest=40)
+    parts = split_at_concave_edges(points, np.tile(EYE, (len(points), 1)), apart=0.012, fewest=40)
     together = np.concatenate(parts)
     assert len(np.unique(together)) == len(together)
     assert min(map(len, parts)) >= 40

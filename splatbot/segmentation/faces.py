@@ -1,4 +1,4 @@
-"""What hangs together, cut where one thing ends and another begins: at steps between level faces that touch."""
+"""Segmentation of connected points into smooth faces, and of touching objects at steps between parallel faces."""
 
 from __future__ import annotations
 
@@ -10,27 +10,28 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-_REACH, _MOST = 0.012, 24  # [m] and how many neighbours
-_ENOUGH = 6  # of them, itself among them, that a normal is told from; of fewer it is chance
-_COHERENT = 0.9  # length of the mean normal around a point that lies in a face
-_PARALLEL = 0.8  # cosine between normals of one face
-_LEVEL = 0.8  # of a normal along z
-_STEP = 0.006  # [m] along their normal that neighbours of one face are apart at most
-_MEET = 5  # pairs of neighbours of two faces that meet
-_MOSTLY = 0.5  # share of a face that is pointed at
-_LEAST = 0.02  # share of the points that a part must have to be a thing of its own
+_NEIGHBOUR_RADIUS_M = 0.012
+_MAX_NEIGHBOURS = 24
+_MIN_NEIGHBOURS = 6  # median number of neighbours, with the point itself, from which normals are reliable
+_MIN_COHERENCE = 0.9  # length of the mean normal around a point of a face
+_PARALLEL_COSINE = 0.8  # between normals of one face
+_LEVEL_COSINE = 0.8  # between the normal of a horizontal face and z
+_MAX_STEP_M = 0.006  # between neighbours of one face along their normal
+_MIN_CONTACT_PAIRS = 5  # pairs of neighbours between two faces that meet
+_MIN_SEED_FRACTION = 0.5  # of a face's points that are seeds
+_MIN_PART_FRACTION = 0.02  # of all points that a separate part has
 
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """Smooth faces that points belong to.
+    """Smooth faces of points.
 
     Args:
-        owner: (P,) the face of each point, -1 for none.
-        numbers: of the faces.
-        normals: (P, 3) unit; their sign means nothing.
-        index: (P, K) the nearest points of each.
-        near: (P, K) which of them are within 12 mm.
+        owner: (P,) face label of each point, -1 for none.
+        numbers: labels of the faces.
+        normals: (P, 3) unit normals of arbitrary sign.
+        index: (P, K) indices of the nearest neighbours.
+        near: (P, K) True for neighbours within 12 mm.
     """
 
     owner: NDArray[np.int64]
@@ -39,32 +40,32 @@ class Faces:
     index: NDArray[np.int64]
     near: NDArray[np.bool_]
 
-    def touch(self, a: int, b: int) -> bool:
-        """Whether two faces meet."""
+    def adjacent(self, a: int, b: int) -> bool:
+        """Return whether two faces meet."""
         rows = np.flatnonzero(self.owner == a)
-        return bool((self.near[rows] & (self.owner[self.index[rows]] == b)).sum() >= _MEET)
+        return bool((self.near[rows] & (self.owner[self.index[rows]] == b)).sum() >= _MIN_CONTACT_PAIRS)
 
     def axis(self, number: int) -> Array:
-        """The direction (3,) that most normals of a face have, up to its sign."""
+        """Return the dominant normal (3,) of a face, of arbitrary sign: first principal axis of its normals."""
         n = self.normals[self.owner == number]
         return np.asarray(np.linalg.eigh(n.T @ n)[1][:, -1])
 
 
 def find_faces(points: Array, *, fewest: int) -> Faces:
-    """Faces of at least ``fewest`` of points (P, 3) [m].
+    """Find smooth faces of at least ``fewest`` points among points (P, 3) [m].
 
-    A face is what neighbours with parallel normals make up that have no step between them; points at edges, whose
-    normals say nothing, go to the face of their nearest neighbour.
+    A face is a connected component of neighbours with parallel normals and without a step between them. Points at
+    edges, whose normals are not reliable, join the face of their nearest neighbour.
     """
     index, near = _neighbours(points)
     normals = _normals(points, index, near)
     aligned = normals[index] * np.sign(np.einsum("pki,pi->pk", normals[index], normals))[:, :, None]
     mean = np.where(near[:, :, None], aligned, 0.0).sum(axis=1) / np.maximum(near.sum(axis=1), 1)[:, None]
-    flat = np.linalg.norm(mean, axis=1) > _COHERENT
+    flat = np.linalg.norm(mean, axis=1) > _MIN_COHERENCE
     between = points[index] - points[:, None]
     step = np.abs(np.einsum("pki,pki->pk", between, aligned + normals[:, None])) / 2
-    parallel = np.einsum("pki,pi->pk", aligned, normals) > _PARALLEL
-    linked = near & flat[:, None] & flat[index] & parallel & (step < _STEP)
+    parallel = np.einsum("pki,pi->pk", aligned, normals) > _PARALLEL_COSINE
+    linked = near & flat[:, None] & flat[index] & parallel & (step < _MAX_STEP_M)
     label = np.where(flat, _components(len(points), index, linked), -1)
     numbers, counts = np.unique(label[flat], return_counts=True)
     big = [int(k) for k in numbers[counts >= fewest]]
@@ -73,21 +74,25 @@ def find_faces(points: Array, *, fewest: int) -> Faces:
     return Faces(owner, big, normals, index, near)
 
 
-def cut_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
-    """Rows of points (P, 3) [m], largest first, in parts that meet at steps only; one part if they do not fall apart.
+def split_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
+    """Split points (P, 3) [m, z up] at steps between parallel faces; return the rows of each part, largest first.
 
-    Faces that meet at an angle are of one thing, unless one rises from the other as from what it stands on; those that
-    meet at a step between parallel ones are not. Points too sparse to have normals are not cut. z is up.
+    Faces that meet at an angle belong to one object, unless a side rises above a horizontal face. Parallel faces with a
+    step between them belong to different objects. Points that are too sparse for normals are not split.
     """
     if len(points) < 2 * fewest:
         return [np.arange(len(points))]
-    faces = find_faces(points, fewest=max(fewest, int(_LEAST * len(points))))
-    if len(faces.numbers) < 2 or np.median(faces.near.sum(axis=1)) < _ENOUGH:
+    faces = find_faces(points, fewest=max(fewest, int(_MIN_PART_FRACTION * len(points))))
+    if len(faces.numbers) < 2 or np.median(faces.near.sum(axis=1)) < _MIN_NEIGHBOURS:
         return [np.arange(len(points))]
     group = {face: face for face in faces.numbers}
     for i, a in enumerate(faces.numbers):
         for b in faces.numbers[i + 1 :]:
-            if abs(faces.axis(a) @ faces.axis(b)) < _PARALLEL and faces.touch(a, b) and _under(points, faces, a, b):
+            if (
+                abs(faces.axis(a) @ faces.axis(b)) < _PARALLEL_COSINE
+                and faces.adjacent(a, b)
+                and _under(points, faces, a, b)
+            ):
                 old, new = group[b], group[a]
                 group = {face: new if root == old else root for face, root in group.items()}
     roots = sorted(set(group.values()))
@@ -96,39 +101,41 @@ def cut_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
 
 
 def _under(points: Array, faces: Faces, a: int, b: int) -> bool:
-    """Whether a level face of two is the upper one: a side that rises above a top is of another thing."""
+    """Return whether the side of two faces is below the horizontal one; a side above a top is another object."""
     up = [abs(float(faces.axis(k)[2])) for k in (a, b)]
-    if max(up) < _LEVEL:
+    if max(up) < _LEVEL_COSINE:
         return True
     top, side = (a, b) if up[0] >= up[1] else (b, a)
     n = faces.axis(top)
     own, other = points[faces.owner == top], points[faces.owner == side]
-    return float(np.median((other - own.mean(axis=0)) @ (n * np.sign(n[2])))) < _STEP
+    return float(np.median((other - own.mean(axis=0)) @ (n * np.sign(n[2])))) < _MAX_STEP_M
 
 
 def region(points: Array, seeds: NDArray[np.bool_], *, fewest: int) -> NDArray[np.int64]:
-    """Rows of the faces of points (P, 3) [m] that lie mostly in ``seeds`` (P,), and of the seeds near to them."""
+    """Return the rows of the faces of points (P, 3) [m] with more than half of their points in ``seeds`` (P,)."""
     faces = find_faces(points, fewest=fewest)
-    chosen = [k for k in faces.numbers if seeds[faces.owner == k].mean() > _MOSTLY]
+    chosen = [k for k in faces.numbers if seeds[faces.owner == k].mean() > _MIN_SEED_FRACTION]
     return np.flatnonzero(np.isin(faces.owner, chosen))
 
 
 def local_normals(points: Array, rows: NDArray[np.int64] | None = None) -> Array:
-    """Directions (M, 3) in which the neighbours within 12 mm of points (P, 3) [m] spread least; of no sign.
+    """Estimate normals (M, 3) of arbitrary sign from the neighbours within 12 mm of points (P, 3) [m].
 
-    ``rows`` (M,): of these alone; None: of all.
+    Args:
+        points: (P, 3) [m].
+        rows: (M,) points of which the normals are estimated. If None, all.
     """
     return _normals(points, *_neighbours(points, rows))
 
 
 def _neighbours(points: Array, rows: NDArray[np.int64] | None = None) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The nearest of each point, or of those named, (P, K), and which of them are within 12 mm."""
-    index, square = _search(points, points if rows is None else points[rows], min(_MOST, len(points)))
-    return index, square < _REACH**2
+    """Return the nearest neighbours (M, K) of all points or of ``rows``, and a mask of those within 12 mm."""
+    index, square = _search(points, points if rows is None else points[rows], min(_MAX_NEIGHBOURS, len(points)))
+    return index, square < _NEIGHBOUR_RADIUS_M**2
 
 
 def _normals(points: Array, index: NDArray[np.int64], near: NDArray[np.bool_]) -> Array:
-    """Directions (P, 3) in which the neighbours spread least; their sign means nothing."""
+    """Return the eigenvectors (P, 3) of the smallest eigenvalue of the neighbours' covariance: normals by PCA."""
     weight = near[:, :, None].astype(np.float64)
     middle = (points[index] * weight).sum(axis=1) / weight.sum(axis=1)
     away = (points[index] - middle[:, None]) * weight
@@ -136,7 +143,7 @@ def _normals(points: Array, index: NDArray[np.int64], near: NDArray[np.bool_]) -
 
 
 def _components(count: int, index: NDArray[np.int64], linked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The least row that each point (P,) is linked to, over any number of links."""
+    """Label connected components (P,) by their smallest row."""
     a, k = np.nonzero(linked)
     b = index[a, k]
     label = np.arange(count)
@@ -155,7 +162,7 @@ def _nearest_owner(points: Array, owner: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def nearest_of(points: Array, queries: Array) -> tuple[NDArray[np.int64], Array]:
-    """The row of points (P, 3) nearest to each of the queries (Q, 3), and the square of its distance [m²]."""
+    """Return the row of the point nearest to each query (Q, 3), and the squared distances (Q,) [m²]."""
     index, square = _search(points, queries, 1)
     return index[:, 0], square[:, 0]
 
