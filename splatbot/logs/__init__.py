@@ -13,8 +13,8 @@ from splatbot.logs.tum import Missing, TumLog
 
 __all__ = ["Calibration", "Log", "open_log", "record"]
 
-_LOOKED_FOR = (
-    "looked for rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2); "
+_LAYOUTS_HINT = (
+    "known layouts: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2); "
     "`synthetic:tabletop` needs no files"
 )
 
@@ -23,15 +23,15 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
     """Open the log that ``uri`` names; frames are decoded only when read.
 
     Args:
-        uri: a folder in TUM or Replica layout, a recording of ROS topics (`.mcap`, rosbag2 folder, `.bag`; where it has
-            several cameras `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`), or
+        uri: a folder in TUM or Replica layout, or a recording of ROS topics (`.mcap`, rosbag2 folder, `.bag`). Select
+            one of several cameras by `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. Generated logs have the form
             `synthetic:SCENE?trajectory=NAME&frames=N&effects=SPEC;SPEC&...` with the keys of
-            :class:`splatbot.logs.synthetic.Options`.
-        camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration, instead of the log's own.
-        missing: what a colour image without depth means in a TUM log, see :class:`splatbot.logs.tum.TumLog`.
+            :class:`splatbot.logs.synthetic.SyntheticOptions`.
+        camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration that replaces the log's own.
+        missing: treatment of colour images without depth in a TUM log, see :class:`splatbot.logs.tum.TumLog`.
 
     Raises:
-        LogError: nothing there, of unknown layout, or damaged.
+        LogError: the log does not exist, has an unknown layout, or is damaged.
         CameraError: there are no usable intrinsics.
     """
     if str(uri).startswith("synthetic:"):
@@ -40,13 +40,13 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
         return _open_bag(str(uri), camera)
     folder = Path(uri)
     if not folder.is_dir():
-        what = "is a file, logs are folders" if folder.exists() else "does not exist"
-        raise LogError(f"{what}.", file=folder, field="log", hint="give the folder that holds the recording")
+        problem = "is a file, logs are folders" if folder.exists() else "does not exist"
+        raise LogError(f"{problem}.", file=folder, field="log", hint="give the folder that holds the recording")
     if any((folder / name).exists() for name in ("rgb.txt", "depth.txt")):
         return TumLog(folder, camera=camera, missing=missing)
     if (folder / "results").is_dir() and (folder / "traj.txt").exists():
         return ReplicaLog(folder, camera=camera)
-    raise LogError("holds no log of a known layout.", file=folder, field="log", hint=_LOOKED_FOR)
+    raise LogError("holds no log of a known layout.", file=folder, field="log", hint=_LAYOUTS_HINT)
 
 
 def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:

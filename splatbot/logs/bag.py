@@ -46,7 +46,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class _Entry:
-    """A message: its own stamp [s], when it was received [ns], and which of those received just then."""
+    """A message: header stamp [s], receive time [ns], and its index among messages with the same receive time."""
 
     stamp: float
     received: int
@@ -54,16 +54,16 @@ class _Entry:
 
 
 class BagLog(LogBase):
-    """RGB-D frames of a recording of ROS topics; depth is paired with the colour image nearest in time.
+    """RGB-D frames of a recording of ROS topics; each depth image is paired with the colour image nearest in time.
 
-    Colour images without depth within 0.02 s are left out and counted in ``unpaired``. Joints are read from
-    /joint_states, masks (white: may be used) from /camera/mask/image_raw and reference poses from /ground_truth/pose,
-    where those topics are recorded. Frames are decoded when they are read; the file stays open. One thread may read.
+    Colour images without depth within 0.02 s are skipped and counted in ``unpaired``. If recorded, joint positions are
+    read from /joint_states, masks (white pixels are valid) from /camera/mask/image_raw and reference poses from
+    /ground_truth/pose. Frames are decoded on access; the file stays open. The class is not thread-safe.
 
     Args:
         path: the file or folder.
-        camera: intrinsics instead of the recorded CameraInfo.
-        topics: `color`, `depth`, `info`, `joints`: the topics to read where the recording has several.
+        camera: intrinsics that replace the recorded CameraInfo.
+        topics: topics to read by the keys `color`, `depth`, `info` and `joints`, needed if the recording has several.
 
     Raises:
         LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired.
@@ -102,7 +102,7 @@ class BagLog(LogBase):
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """The poses of /ground_truth/pose, T_world_camera; None where there are none."""
+        """Poses T_world_camera of /ground_truth/pose, or None without that topic."""
         if TRUTH not in self._reader.topics:
             return None
         messages = list(self._all(TRUTH))
@@ -132,7 +132,7 @@ class BagLog(LogBase):
 
     @cached_property
     def _joints(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Stamps (N,) [s] and positions (N, J) [rad] of the joint states that name as many joints as the first."""
+        """Stamps (N,) [s] and positions (N, J) [rad] of the joint states with the joint count of the first."""
         topic = self._given.get("joints", JOINTS)
         if topic not in self._reader.topics:
             return None
@@ -153,13 +153,13 @@ class BagLog(LogBase):
         raise LogError("holds no message.", file=self.path, field=topic, hint="give --camera FILE")
 
     def _info_topic(self) -> str:
-        beside = f"{self._color.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
+        sibling = f"{self._color.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
         known = [c.topic for c in self._reader.connections if c.msgtype == "sensor_msgs/msg/CameraInfo"]
-        for topic in (beside, INFO, *(known if len(set(known)) == 1 else ())):
+        for topic in (sibling, INFO, *(known if len(set(known)) == 1 else ())):
             if topic in known:
                 return topic
         raise LogError(
-            f"holds no {beside}.", file=self.path, field="camera", hint="name it (?info=TOPIC) or give --camera FILE"
+            f"holds no {sibling}.", file=self.path, field="camera", hint="name it (?info=TOPIC) or give --camera FILE"
         )
 
     def _open(self) -> AnyReader:
@@ -168,7 +168,7 @@ class BagLog(LogBase):
         try:
             reader = AnyReader([self.path], default_typestore=typestore())
             reader.open()
-        except Exception as error:  # whatever damaged bytes make of the reader
+        except Exception as error:  # damaged bytes raise any exception in the reader
             raise self._damaged(error) from error
         return reader
 
@@ -199,11 +199,11 @@ class BagLog(LogBase):
         for some in fitting:
             if len(some) == 1:
                 return some[0]
-        what = f"several {key} topics ({', '.join(topics)})" if topics else f"no {key} images (topics: {known})"
-        raise LogError(f"holds {what}.", file=self.path, field=key, hint=f"name one: {self.path.name}?{key}=TOPIC")
+        problem = f"several {key} topics ({', '.join(topics)})" if topics else f"no {key} images (topics: {known})"
+        raise LogError(f"holds {problem}.", file=self.path, field=key, hint=f"name one: {self.path.name}?{key}=TOPIC")
 
     def _scan(self) -> dict[str, list[_Entry]]:
-        """The images by topic, in the order of their stamps, from their headers alone."""
+        """Index the images by topic, sorted by stamp; only message headers are parsed."""
         wanted = [c for c in self._reader.connections if c.topic in (self._color, self._depth, MASK)]
         found: dict[str, list[_Entry]] = defaultdict(list)
         seen: dict[tuple[str, int], int] = defaultdict(int)
@@ -243,10 +243,10 @@ class BagLog(LogBase):
         ):
             if nth == entry.nth:
                 return self._reader.deserialize(raw, connection.msgtype)
-        raise LogError("a message is gone.", file=self.path, field=topic, hint="do not change a log while it is read")
+        raise LogError("a message is missing.", file=self.path, field=topic, hint="do not modify a log that is open")
 
     def _all(self, topic: str) -> Iterable[Message]:
-        """The messages of a topic, in the order in which they were received."""
+        """Yield the messages of a topic in the order of their receive times."""
         of_topic = [c for c in self._reader.connections if c.topic == topic]
         try:
             for connection, _, raw in self._reader.messages(of_topic):
@@ -255,7 +255,7 @@ class BagLog(LogBase):
             raise self._damaged(error) from error
 
     def _checked(self, topic: str, read: Callable[[], _T]) -> _T:
-        """What ``read`` makes of a message; its errors name the file and the topic."""
+        """Call ``read`` and add the file and the topic to its errors."""
         try:
             return read()
         except LogError:
@@ -267,12 +267,12 @@ class BagLog(LogBase):
             raise self._damaged(error) from error
 
     def _damaged(self, error: Exception) -> LogError:
-        hint = "copy the recording again, or mend it (`mcap recover`, `rosbag reindex`)"
+        hint = "copy the recording again, or repair it (`mcap recover`, `rosbag reindex`)"
         return LogError(f"cannot be read ({type(error).__name__}: {error}).", file=self.path, field="log", hint=hint)
 
 
 def split_query(uri: str) -> tuple[Path, dict[str, str]]:
-    """The path and the topics of `FILE?color=TOPIC&depth=TOPIC`.
+    """Split `FILE?color=TOPIC&depth=TOPIC` into the path and the topics.
 
     Raises:
         LogError: a key is unknown.

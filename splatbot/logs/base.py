@@ -1,4 +1,4 @@
-"""What every log is: a finite sequence of frames that are decoded when asked for."""
+"""Interface of logs: finite sequences of frames that are decoded on access."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from splatbot.trajectory import Trajectory
 class Log(Protocol):
     """A recorded or generated RGB-D stream.
 
-    A log never hides a bad frame: reading it raises LogError, the other frames stay readable, and what to do about it
-    (stop, skip) is the caller's choice. Iterating is ``read(0), read(1), ...``.
+    Reading a damaged frame raises LogError; the other frames stay readable, and the caller decides whether to stop or
+    to skip the frame. Iteration yields ``read(0), read(1), ...``.
     """
 
     @property
@@ -24,7 +24,7 @@ class Log(Protocol):
 
     @property
     def uri(self) -> str:
-        """What :func:`splatbot.logs.open_log` opens it by."""
+        """Address with which :func:`splatbot.logs.open_log` opens the log."""
         ...
 
     @property
@@ -34,16 +34,16 @@ class Log(Protocol):
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """Reference poses as recorded, at their own stamps; None where there are none.
+        """Reference poses T_world_camera at their own stamps, or None without a reference.
 
         Raises:
-            FormatError: the file that holds them is damaged.
+            FormatError: the file of reference poses is damaged.
         """
         ...
 
     @property
     def effects(self) -> list[dict[str, Any]]:
-        """The account of the simulated sensor effects that the frames go through; empty for a real sensor."""
+        """Records of the simulated sensor effects that are applied to the frames; empty for a real sensor."""
         ...
 
     def __len__(self) -> int: ...
@@ -63,11 +63,11 @@ class Log(Protocol):
 
 
 class LogBase:
-    """The sequence protocol on top of ``__len__`` and ``_decode``; frames are a real sensor's unless told otherwise."""
+    """Implements the sequence protocol with ``__len__`` and ``_decode``; subclasses may report simulated effects."""
 
     @property
     def effects(self) -> list[dict[str, Any]]:
-        """None; see :class:`Log`."""
+        """Empty list; see :class:`Log`."""
         return []
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""What turns a log's images into metres: intrinsics and the unit of depth."""
+"""Calibration of a log: camera intrinsics and the unit of depth."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Calibration:
     """A camera and the unit of its integer depth images.
 
     Args:
-        camera: as recorded, so possibly distorted.
+        camera: recorded camera, possibly with distortion.
         depth_scale: units per metre.
-        file: where it was read from (for messages).
+        file: source file, for error messages.
 
     Raises:
         CameraError: the depth scale is not a positive number.
@@ -45,7 +45,7 @@ def read_calibration(path: str | Path) -> Calibration:
     Other keys are ignored.
 
     Raises:
-        CameraError: the file is missing or no JSON object, or a value is missing or makes no sense.
+        CameraError: the file is missing or not a JSON object, or a value is missing or invalid.
     """
     values = read_object(path)
     distortion = values.get("distortion", [])
@@ -65,10 +65,10 @@ def make_calibration(
     size_keys: tuple[str, str] = ("width", "height"),
     distortion: tuple[float, ...] = (),
 ) -> Calibration:
-    """The calibration that ``values`` of the file ``path`` describe.
+    """Build a calibration from the ``values`` of the file ``path``.
 
     Raises:
-        CameraError: a value is missing or makes no sense.
+        CameraError: a value is missing or invalid.
     """
     fx, fy, cx, cy, scale = (number(path, values, key) for key in ("fx", "fy", "cx", "cy", scale_key))
     width, height = (round(number(path, values, key)) for key in size_keys)
@@ -80,30 +80,30 @@ def make_calibration(
 
 
 def read_object(path: str | Path) -> dict[str, Any]:
-    """The JSON object of a file.
+    """Read the JSON object of a file.
 
     Raises:
-        CameraError: the file is missing or holds none.
+        CameraError: the file is missing or does not contain a JSON object.
     """
     try:
         values = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CameraError(f"cannot be read ({error.strerror}).", file=path, hint="check the path") from error
     except ValueError as error:
-        raise CameraError(f"is not JSON ({error}).", file=path, hint="mend the place it names") from error
+        raise CameraError(f"is not JSON ({error}).", file=path, hint="fix the JSON at the given position") from error
     if not isinstance(values, dict):
         raise CameraError("is no JSON object.", file=path, hint='write {"fx": ..., "fy": ..., ...}')
     return values
 
 
 def number(path: str | Path, values: dict[str, Any], key: str) -> float:
-    """``values[key]`` as a float.
+    """Return ``values[key]`` as a float.
 
     Raises:
-        CameraError: it is missing or no number.
+        CameraError: the value is missing or not a number.
     """
     value = values.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        what = "is missing" if key not in values else f"is {value!r}, no number"
-        raise CameraError(f"{what}.", file=path, field=key, hint=f'add "{key}": a number')
+        problem = "is missing" if key not in values else f"is {value!r}, no number"
+        raise CameraError(f"{problem}.", file=path, field=key, hint=f'add "{key}": a number')
     return float(value)

@@ -1,4 +1,4 @@
-"""Sensor effects as logs know them: something that frames pass through, and an account of it in `effects.json`."""
+"""Interface of simulated sensor effects, and their records in `effects.json`."""
 
 from __future__ import annotations
 
@@ -15,40 +15,40 @@ from splatbot.trajectory import Trajectory
 
 FILE = "effects.json"
 
-# Looked up by name, and only by a log that asks for effects: the core does not depend on the simulator.
+# The simulator is imported by name and only for logs with effects, so that the core does not depend on it.
 _PROVIDER, _MAKE = "splatbot.sim.effects.registry", "make_effects"
 
 Account = dict[str, Any]
-"""Of one effect: name, why, settings, frames, ms_per_frame."""
+"""Record of one effect with the keys name, why, settings, frames and ms_per_frame."""
 
 
 class FrameEffects(Protocol):
-    """What the frames of a log go through."""
+    """A chain of sensor effects that is applied to the frames of a log."""
 
     def __call__(self, frame: Frame) -> Frame:
-        """The frame as the sensor would have given it."""
+        """Apply the effects to an ideal frame."""
         ...
 
     def along(self, path: Trajectory) -> FrameEffects:
-        """The same effects for a camera that moves along ``path``."""
+        """Return the same effects for a camera that moves along ``path``."""
         ...
 
     def kept(self, count: int) -> list[int]:
-        """Those of ``count`` frames that arrive."""
+        """Return the indices of the frames out of ``count`` that are not dropped."""
         ...
 
     def report(self) -> list[Account]:
-        """The account of each effect."""
+        """Return the record of each effect."""
         ...
 
     @property
     def blanks_depth(self) -> bool:
-        """Whether a frame may come out without any depth."""
+        """Return whether the effects may remove all depth of a frame."""
         ...
 
 
 def make_effects(specs: Sequence[str], *, seed: int) -> FrameEffects:
-    """The effects that ``specs`` (`name:option=value,...`) ask for, in their order.
+    """Create the effects of ``specs`` (`name:option=value,...`) in their order.
 
     Raises:
         InputError: an effect or an option is unknown, or a value is out of range.
@@ -58,14 +58,16 @@ def make_effects(specs: Sequence[str], *, seed: int) -> FrameEffects:
 
 
 def write_account(folder: str | Path, *, uri: str, effects: Sequence[Mapping[str, Any]], blanks_depth: bool) -> None:
-    """Write `effects.json` into a recording's folder: where its frames came from and what they went through."""
+    """Write `effects.json` into a recording's folder: the source of the frames and the applied effects."""
     values = {"uri": uri, "blanks_depth": blanks_depth, "effects": list(effects)}
     with atomic_write(Path(folder) / FILE) as file:
         file.write(json.dumps(values, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def read_account(folder: str | Path) -> tuple[list[Account], bool]:
-    """The accounts in a recording's `effects.json`, and whether its frames may lack any depth; none for a real sensor.
+    """Read the records of a recording's `effects.json`, and whether its frames may have no depth.
+
+    Without the file, as for a real sensor, there are no records.
 
     Raises:
         LogError: the file is damaged.
@@ -76,10 +78,10 @@ def read_account(folder: str | Path) -> tuple[list[Account], bool]:
     try:
         values = json.loads(path.read_text(encoding="utf-8-sig"))
         rows, blanks = values["effects"], values.get("blanks_depth", False)
-        sound = isinstance(blanks, bool) and all(_is_account(row) for row in rows)
+        valid = isinstance(blanks, bool) and all(_is_account(row) for row in rows)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        sound = False
-    if not sound:
+        valid = False
+    if not valid:
         raise LogError(
             "is no account of effects.", file=path, field="effects", hint="simulate the log again, or remove the file"
         )

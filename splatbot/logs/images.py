@@ -1,4 +1,4 @@
-"""Colour and depth files to arrays. What a decoder would paper over (a cut file, flipped bytes) is an error here."""
+"""Decoding of colour, depth and mask files. Truncated and corrupt files are errors, even if a decoder accepts them."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _AGAIN = "copy or record the image again, or remove its line from the list"
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
-    """RGB (H, W, 3) of a PNG or JPEG; EXIF orientation is ignored, since intrinsics know nothing of it.
+    """Read the RGB image (H, W, 3) of a PNG or JPEG; EXIF orientation is ignored, since intrinsics do not include it.
 
     Raises:
-        LogError: no such file, truncated or corrupt.
+        LogError: the file is missing, truncated or corrupt.
     """
     image = _decode(path, "colour", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def read_depth(path: Path, units_per_metre: float, *, empty: bool = False) -> NDArray[np.float32]:
-    """Depth (H, W) [m], 0 where missing, of a 16-bit PNG, or of a 32-bit float TIFF that is in metres already.
+    """Read depth (H, W) [m], 0 where missing, from a 16-bit PNG in units or a 32-bit float TIFF in metres.
 
     Raises:
-        LogError: no such file, truncated, corrupt, of another pixel type, or (unless ``empty``) without a valid depth.
+        LogError: the file is missing, truncated, corrupt, of another pixel type, or (unless ``empty``) without depth.
     """
     image = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
@@ -51,7 +51,7 @@ def read_depth(path: Path, units_per_metre: float, *, empty: bool = False) -> ND
             "has no valid depth: every pixel is 0 or NaN.",
             file=path,
             field="depth",
-            hint="remove the frame from rgb.txt and depth.txt, or check what the sensor wrote",
+            hint="remove the frame from rgb.txt and depth.txt, or check the output of the sensor",
         )
     return depth
 
@@ -104,7 +104,7 @@ def _damage(data: bytes) -> str:
 
 
 def _png_damage(data: bytes) -> str:
-    """Why a PNG is not whole: its chunks (length, type, data, CRC) must follow one another up to IEND."""
+    """Return the damage of a PNG, or an empty string: its chunks (length, type, data, CRC) must continue up to IEND."""
     at = len(_PNG)
     while at + 12 <= len(data):
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")

@@ -1,4 +1,4 @@
-"""`rgb.txt` and `depth.txt` of the TUM layout: one `stamp path` a line; and which entries belong together."""
+"""Image lists `rgb.txt` and `depth.txt` of the TUM layout, one `stamp path` per line, and their association."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class IndexEntry:
 
 
 def read_index(path: Path) -> list[IndexEntry]:
-    """The entries of a list file in their order; ``#`` starts a comment.
+    """Read the entries of a list file in their order; ``#`` starts a comment.
 
-    The whole file is checked at once: a slip in it is mended in seconds now, after an hour of mapping it is a loss.
+    The whole file is checked at once, so that an error in the last line does not stop a run after an hour of mapping.
 
     Raises:
         LogError: the file is missing or empty, a line is malformed or the stamps do not increase.
@@ -72,9 +72,10 @@ def _parse(path: Path, number: int, line: str) -> IndexEntry:
 
 
 def associate(a: NDArray[np.float64], b: NDArray[np.float64], max_difference: float) -> list[tuple[int, int]]:
-    """Pairs of indices of increasing stamps (N,) and (M,) [s] that differ by less than ``max_difference``.
+    """Pair the indices of increasing stamps (N,) and (M,) [s] that differ by less than ``max_difference``.
 
-    One to one, closest pairs first, as TUM's `associate.py` does it; returned in the order of ``a``.
+    The pairing is one to one and greedy by the smallest difference, as in TUM's `associate.py`. Pairs are in the order
+    of ``a``.
     """
     first, last = np.searchsorted(b, a - max_difference, "left"), np.searchsorted(b, a + max_difference, "right")
     near = [(abs(a[i] - b[j]), i, j) for i in range(len(a)) for j in range(first[i], last[i])]

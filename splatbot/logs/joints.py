@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from splatbot.errors import LogError
 
 NAME = "joints.txt"
-MAX_GAP = 0.1  # [s] between two lines, or to the first or the last: beyond, the joints are not known
+MAX_GAP = 0.1  # [s] to the neighbouring lines beyond which joint positions are not interpolated
 
 
 class JointRecord:
-    """Joint positions over time, linear in between.
+    """Joint positions over time with linear interpolation.
 
     Args:
-        path: of the file.
+        path: the file.
 
     Raises:
-        LogError: it cannot be read, a line is malformed or of another length, or the stamps do not increase.
+        LogError: the file cannot be read, a line is malformed or of another length, or the stamps do not increase.
     """
 
     def __init__(self, path: Path) -> None:
@@ -37,12 +37,12 @@ class JointRecord:
             except ValueError:
                 row = []
             if len(row) < 2 or not np.isfinite(row).all() or (rows and len(row) != len(rows[0])):
-                what = f"{line.strip()[:80]!r} is malformed"
+                problem = f"{line.strip()[:80]!r} is malformed"
                 hint = "write `stamp q1 q2 ...` (seconds, radians), as many joints in every line"
-                raise LogError(f"{what}.", file=path, field=f"line {number}", hint=hint)
+                raise LogError(f"{problem}.", file=path, field=f"line {number}", hint=hint)
             if rows and row[0] <= rows[-1][0]:
-                what = f"stamp {row[0]:.6f} is not after {rows[-1][0]:.6f}"
-                raise LogError(f"{what}.", file=path, field=f"line {number}", hint="sort the lines and drop doubles")
+                problem = f"stamp {row[0]:.6f} is not after {rows[-1][0]:.6f}"
+                raise LogError(f"{problem}.", file=path, field=f"line {number}", hint="sort the lines and drop doubles")
             rows.append(row)
         if not rows:
             raise LogError("is empty.", file=path, hint="write lines `stamp q1 q2 ...`, or remove it")
@@ -50,24 +50,24 @@ class JointRecord:
         self._stamps, self._joints = table[:, 0], table[:, 1:]
 
     def at(self, stamp: float) -> NDArray[np.float64] | None:
-        """Positions (J,) [rad] then; None where the lines on either side, or the only one, are more than 0.1 s away."""
+        """Interpolate the positions (J,) [rad] at a stamp [s]; None if a neighbouring line is more than 0.1 s away."""
         return interpolate_joints(self._stamps, self._joints, stamp)
 
 
 def interpolate_joints(
     stamps: NDArray[np.float64], joints: NDArray[np.float64], stamp: float
 ) -> NDArray[np.float64] | None:
-    """Positions (J,) at a time of a record (N,) [s], (N, J) [rad], linear in between; see :meth:`JointRecord.at`."""
+    """Interpolate joint positions (N, J) [rad] at stamps (N,) [s] to one stamp; see :meth:`JointRecord.at`."""
     after = int(np.searchsorted(stamps, stamp))
-    beside = stamps[max(after - 1, 0) : after + 1]
-    apart = np.abs(beside - stamp)
-    if apart.min() > 0 and apart.max() > MAX_GAP:
+    neighbours = stamps[max(after - 1, 0) : after + 1]
+    gaps = np.abs(neighbours - stamp)
+    if gaps.min() > 0 and gaps.max() > MAX_GAP:
         return None
     return np.array([np.interp(stamp, stamps, column) for column in joints.T])
 
 
 def find_joints(folder: Path) -> JointRecord | None:
-    """What a log's folder says of joints, None if nothing.
+    """Read `joints.txt` of a log's folder; None without the file.
 
     Raises:
         LogError: `joints.txt` is damaged.

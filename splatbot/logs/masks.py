@@ -1,4 +1,4 @@
-"""Masks of a log in TUM layout: pixels that show the robot itself, or anything else that must not be used."""
+"""Masks of a log in TUM layout, which exclude pixels such as those that show the robot itself."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ MAX_DIFFERENCE = 0.02  # [s], as between colour and depth
 
 
 class MaskSource(Protocol):
-    """Where masks come from."""
+    """Source of the masks of a log."""
 
     def at(self, stamp: float) -> Mask:
-        """The mask (H, W) of the image taken then [s]; True where a pixel may be used."""
+        """Return the mask (H, W) of the image at a stamp [s]; True for valid pixels."""
         ...
 
 
@@ -32,7 +32,7 @@ class FixedMask:
         self._mask = read_mask(path)
 
     def at(self, stamp: float) -> Mask:
-        """The mask, whenever."""
+        """Return the mask; it does not depend on the stamp."""
         return self._mask
 
 
@@ -45,10 +45,10 @@ class ListedMasks:
         self._stamps = np.array([entry.stamp for entry in self._entries])
 
     def at(self, stamp: float) -> Mask:
-        """The mask nearest in time.
+        """Return the mask nearest in time.
 
         Raises:
-            LogError: there is none within 0.02 s, or it cannot be read.
+            LogError: no mask is within 0.02 s, or the mask cannot be read.
         """
         entry = self._nearest(stamp)
         if abs(entry.stamp - stamp) > MAX_DIFFERENCE:
@@ -65,10 +65,10 @@ class ListedMasks:
 
 
 def find_masks(folder: Path) -> MaskSource | None:
-    """What a log's folder says of masks: `mask.txt`, else `mask.png`, else nothing.
+    """Open the masks of a log's folder: `mask.txt`, else `mask.png`, else None.
 
     Raises:
-        LogError: either is damaged.
+        LogError: the file is damaged.
     """
     if (folder / "mask.txt").exists():
         return ListedMasks(folder / "mask.txt")

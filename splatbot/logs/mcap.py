@@ -20,9 +20,9 @@ MASK, JOINTS, TRUTH = "/camera/mask/image_raw", "/joint_states", "/ground_truth/
 
 
 class McapFile:
-    """A recording that is being written; it bears its name only once it is whole.
+    """Writer of a recording; the file appears under its name only when it is complete.
 
-    Until then the messages are in a folder `.NAME.partial` beside it, which a crash leaves behind.
+    Until then the messages are in the folder `.NAME.partial` next to it, which remains after a crash.
 
     Raises:
         LogError: the file exists, or its folder cannot be written to.
@@ -47,7 +47,7 @@ class McapFile:
         """Add a message that was received at a time [ns].
 
         Raises:
-            OSError: the disk is full, or gone.
+            OSError: the disk is full or not available.
         """
         name = type_of(message)
         if (topic, name) not in self._topics:
@@ -69,7 +69,7 @@ class McapFile:
 
 
 def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None) -> Path:
-    """Write a log's frames, intrinsics, joints, masks and reference poses; what is read back is equal, bit for bit.
+    """Write a log's frames, intrinsics, joints, masks and reference poses; reading returns bit-identical frames.
 
     Depth is 32FC1 [m], so nothing is rounded. Stamps are kept to the nanosecond.
 

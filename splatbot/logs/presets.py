@@ -25,10 +25,10 @@ PRESETS = {
 
 
 def find_calibration(camera: str | Path | Calibration) -> Calibration:
-    """The calibration that ``camera`` names: itself, a preset, or a file as `intrinsics.json`.
+    """Return a calibration from a calibration, the name of a preset, or an `intrinsics.json` file.
 
     Raises:
-        CameraError: neither a preset nor a file, or the file is wrong.
+        CameraError: ``camera`` is neither a preset nor a file, or the file is invalid.
     """
     if isinstance(camera, Calibration):
         return camera

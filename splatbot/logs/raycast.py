@@ -1,4 +1,4 @@
-"""Textured meshes, still and moving, seen by casting one ray through each pixel centre."""
+"""Ray casting of static and moving textured meshes, one ray through each pixel centre."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class RaycastSurface:
 
 @dataclass(frozen=True)
 class Moving:
-    """An object that moves, appears or goes.
+    """An object that moves, appears or vanishes.
 
     Args:
-        surfaces: in the object's own frame.
-        pose: T_world_object (4, 4) at a time [s]; None while the object is not there.
+        surfaces: surfaces in the frame of the object.
+        pose: returns T_world_object (4, 4) at a time [s], or None while the object does not exist.
     """
 
     surfaces: Sequence[RaycastSurface]
@@ -42,26 +42,26 @@ class Moving:
 
 
 class RaycastScene:
-    """Surfaces in the world frame, and moving objects by name, under one distant light (Lambert, no shadows)."""
+    """Static surfaces in the world frame and named moving objects under one directional light (Lambert, no shadows)."""
 
     def __init__(self, surfaces: Sequence[RaycastSurface], moving: Mapping[str, Moving] | None = None) -> None:
-        self._still = _Body(surfaces)
-        self._moving = {name: (thing.pose, _Body(thing.surfaces)) for name, thing in (moving or {}).items()}
+        self._static = _Body(surfaces)
+        self._moving = {name: (item.pose, _Body(item.surfaces)) for name, item in (moving or {}).items()}
 
     @property
     def surfaces(self) -> list[RaycastSurface]:
-        """What does not move."""
-        return self._still.surfaces
+        """Static surfaces."""
+        return self._static.surfaces
 
     def objects(self, t: float) -> dict[str, Array]:
-        """T_world_object (4, 4) of each moving object that is there at time ``t`` [s]."""
+        """Return T_world_object (4, 4) of each moving object that exists at time ``t`` [s]."""
         poses = {name: pose(t) for name, (pose, _) in self._moving.items()}
         return {name: T for name, T in poses.items() if T is not None}
 
     def render(
         self, camera: Camera, T_world_camera: Array, t: float = 0.0
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Colour (H, W, 3) and exact depth (H, W) [m] at time ``t`` [s]; both 0 where a ray hits nothing."""
+        """Render colour (H, W, 3) and exact depth (H, W) [m] at time ``t`` [s]; both are 0 where a ray hits nothing."""
         origin, directions = T_world_camera[:3, 3], _directions(camera, T_world_camera[:3, :3])
         colors = np.zeros_like(directions)
         # The directions have z = 1 in the camera frame, so the ray parameter is the depth.
@@ -76,26 +76,32 @@ class RaycastScene:
         return rgb.reshape(*shape, 3), depth.astype(np.float32).reshape(shape)
 
     def reach(self, origin: Array, directions: Array, t: float = 0.0) -> Array:
-        """How far (N,) rays from ``origin`` (3,) [m] along ``directions`` (N, 3) go, in their lengths; inf: no hit."""
+        """Cast rays from ``origin`` (3,) [m] along ``directions`` (N, 3).
+
+        Returns:
+            Ray parameters (N,) at the first hit, in lengths of the directions; infinity without a hit.
+        """
         return np.minimum.reduce([view.reach for view in self._views(origin, directions, t)])
 
     def moving_mask(self, camera: Camera, T_world_camera: Array, t: float) -> NDArray[np.bool_]:
-        """Pixels (H, W) that show a moving object at time ``t`` [s]."""
+        """Return the pixels (H, W) that show a moving object at time ``t`` [s]."""
         views = list(self._views(T_world_camera[:3, 3], _directions(camera, T_world_camera[:3, :3]), t))
         moving = np.minimum.reduce([np.full_like(views[0].reach, np.inf), *(view.reach for view in views[1:])])
         return np.asarray(moving < views[0].reach).reshape(camera.height, camera.width)
 
     def _views(self, origin: Array, directions: Array, t: float) -> list[_View]:
-        """What the rays hit of the still surfaces, and of each moving object by itself."""
-        views = [self._still.cast(origin, directions, _LIGHT)]
-        for name, T in self.objects(t).items():  # into the object's frame: nothing is built anew as it moves
+        """Cast the rays on the static surfaces and on each moving object."""
+        views = [self._static.cast(origin, directions, _LIGHT)]
+        for name, T in self.objects(
+            t
+        ).items():  # rays in the object's frame, so that its acceleration structure is built once
             R, p = T[:3, :3], T[:3, 3]
             views.append(self._moving[name][1].cast((origin - p) @ R, _rotate(directions, R.T), _LIGHT @ R))
         return views
 
 
 class _Body:
-    """Surfaces that move as one. Open3D says which triangle a ray hits, the place is then found in float64."""
+    """Surfaces of one rigid body. Open3D finds the triangle that a ray hits; the hit point is computed in float64."""
 
     def __init__(self, surfaces: Sequence[RaycastSurface]) -> None:
         self.surfaces = list(surfaces)
@@ -111,7 +117,7 @@ class _Body:
         self.normals, self._offsets = np.concatenate(normals), np.concatenate(offsets)
 
     def cast(self, origin: Array, directions: Array, light: Array) -> _View:
-        """What rays from ``origin`` (3,) along ``directions`` (N, 3) hit, all in the body's frame."""
+        """Cast rays from ``origin`` (3,) along ``directions`` (N, 3) in the frame of the body."""
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origin, directions
         hits = self._caster.cast_rays(_tensor(rays))
@@ -127,7 +133,7 @@ class _Body:
 
 @dataclass(frozen=True)
 class _View:
-    """What N rays hit of one body, in its frame: how far, which surface and triangle; slopes: normal · direction."""
+    """Hits of N rays on one body in its frame: ray parameters, surface and triangle ids, slopes normal · direction."""
 
     body: _Body = field(repr=False)
     origin: Array
@@ -139,26 +145,26 @@ class _View:
     slopes: Array
 
     def colors(self, rows: NDArray[np.bool_]) -> Array:
-        """Shaded colours (M, 3) in 0..1 of the rays that a mask (N,) names; they all hit."""
+        """Shade the rays of a mask (N,), all of which hit the body; return colours (M, 3) in 0..1."""
         points = self.origin + self.reach[rows, None] * self.directions[rows]
         ids, colors = self.ids[rows], np.empty_like(points)
         for number, surface in enumerate(self.body.surfaces):
-            seen = ids == number
-            if seen.any():
-                colors[seen] = surface.texture.albedo(points[seen])
-        towards = -np.sign(self.slopes[rows])  # meshes have no inside
+            own = ids == number
+            if own.any():
+                colors[own] = surface.texture.albedo(points[own])
+        towards = -np.sign(self.slopes[rows])  # both sides of a triangle are shaded
         lambert = np.clip(towards * (self.body.normals @ self.light)[self.triangles[rows]], 0.0, 1.0)
         return colors * (_AMBIENT + (1.0 - _AMBIENT) * lambert)[:, None]
 
 
 def _directions(camera: Camera, R_world_camera: Array) -> Array:
-    """Rays (H·W, 3) through the pixel centres, in the world, of depth 1; the float32 rays that a Camera works with."""
+    """Return rays (H·W, 3) of depth 1 through the pixel centres [world], from the float32 rays of the camera model."""
     rays = camera.backproject(np.ones((camera.height, camera.width), np.float32)).reshape(-1, 3)
     return _rotate(rays.astype(np.float64), R_world_camera)
 
 
 def _rotate(vectors: Array, R: Array) -> Array:
-    """``vectors @ R.T`` column by column: three times as fast as BLAS on such a thin product."""
+    """Rotate vectors (N, 3) column by column, which is three times as fast as BLAS for such a thin matrix."""
     x, y, z = vectors.T
     out = np.empty_like(vectors)
     for k in range(3):

@@ -32,15 +32,16 @@ def record(
     depth_scale: float = 5000.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics, poses and, where told, joints.
+    """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics, poses and, if available, joints.
 
-    A frame is listed only once both of its images are on the disk, so what an interrupted recording leaves is a
-    shorter log, not a broken one.
+    A frame is listed only when both of its images are on the disk. An interrupted recording is therefore a shorter but
+    valid log.
 
     Args:
-        frames: one camera's.
-        folder: is created; must hold no recording.
-        ground_truth: T_world_camera; None takes the log's own, where ``frames`` is a log that has one.
+        frames: frames of one camera.
+        folder: folder of the log; it is created and must not contain a recording.
+        ground_truth: reference poses T_world_camera. If None, those of ``frames`` are used if it is a log with a
+            reference.
         depth_scale: units per metre; depth beyond 65535 units is written as missing, and logged.
         progress: called with the number of frames written so far.
 
@@ -72,7 +73,7 @@ def record(
                     lines.write(" ".join(repr(float(v)) for v in (frame.stamp, *frame.joints)) + "\n")
             _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
             _write_png(out / "depth" / name, _to_units(frame, depth_scale))
-            # Depth first: a depth image without colour is harmless, the other way round is an error.
+            # Depth first: a depth image without colour is harmless, but colour without depth is an error.
             for lines, part in ((depths, "depth"), (colors, "rgb")):
                 lines.write(f"{float(frame.stamp)!r} {part}/{name}\n")
                 lines.flush()

@@ -20,11 +20,11 @@ _TYPICAL = 1.5  # [m]
 
 
 class RgbdReader:
-    """Reads the images of one calibrated camera; delivers them undistorted and in metres.
+    """Reads the images of one calibrated camera; frames are undistorted and their depth is in metres.
 
     Args:
         calibration: the camera and the unit of its depth.
-        empty_depth: a depth image without a single valid pixel is meant so (a simulated blackout), no error.
+        empty_depth: accept depth images without a valid pixel, as from a simulated blackout.
     """
 
     def __init__(self, calibration: Calibration, *, empty_depth: bool = False) -> None:
@@ -34,7 +34,7 @@ class RgbdReader:
         self.camera: Camera = self._undistort.camera if self._undistort else calibration.camera
 
     def read(self, index: int, stamp: float, color: Path, depth: Path, mask: NDArray[np.bool_] | None = None) -> Frame:
-        """The frame of two files, and a mask (H, W) of the distorted image.
+        """Read a frame from two files; ``mask`` (H, W) refers to the distorted image.
 
         Raises:
             LogError: a file is damaged, sizes differ, there is no valid depth, or (frame 0) its unit is implausible.

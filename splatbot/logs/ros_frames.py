@@ -1,4 +1,4 @@
-"""A frame's parts as ROS messages, and back: images, intrinsics, joints, poses. Only messages have quaternions xyzw."""
+"""Conversion of frames to ROS messages and back: images, intrinsics, joints, poses. Messages use quaternions xyzw."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ _NANO = 10**9
 
 
 def time_of(seconds: float) -> Message:
-    """builtin_interfaces/Time of a stamp [s], to the nanosecond."""
+    """Convert a stamp [s] to builtin_interfaces/Time, rounded to nanoseconds."""
     sec, nanosec = divmod(round(float(seconds) * _NANO), _NANO)
     return build("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
 
 def seconds_of(time: Message) -> float:
-    """Stamp [s] of a builtin_interfaces/Time or Duration; the float nearest to its nanoseconds."""
+    """Convert a builtin_interfaces/Time or Duration to the nearest float [s]."""
     return (int(time.sec) * _NANO + int(time.nanosec)) / _NANO
 
 
 def header(stamp: float, frame_id: str) -> Message:
-    """std_msgs/Header at a time [s]."""
+    """Build a std_msgs/Header for a stamp [s]."""
     return build("std_msgs/msg/Header", stamp=time_of(stamp), frame_id=frame_id)
 
 
 def image_message(stamp: float, image: NDArray[Any], frame_id: str = "camera") -> Message:
-    """sensor_msgs/Image of colour (H, W, 3) uint8, depth (H, W) float32 [m] or a mask (H, W) bool.
+    """Build a sensor_msgs/Image of colour (H, W, 3) uint8, depth (H, W) float32 [m] or a mask (H, W) bool.
 
     They become rgb8, 32FC1 and mono8 (255 where true).
     """
@@ -56,7 +56,7 @@ def image_message(stamp: float, image: NDArray[Any], frame_id: str = "camera") -
 
 
 def color_of(message: Message) -> NDArray[np.uint8]:
-    """RGB (H, W, 3) of a sensor_msgs/Image or CompressedImage.
+    """Decode the RGB image (H, W, 3) of a sensor_msgs/Image or CompressedImage.
 
     Raises:
         InputError: it is of another encoding, cut short or damaged.
@@ -71,7 +71,7 @@ def color_of(message: Message) -> NDArray[np.uint8]:
 
 
 def depth_of(message: Message) -> NDArray[np.float32]:
-    """Depth (H, W) [m], 0 where missing, of a sensor_msgs/Image or CompressedImage; 16 bits are millimetres.
+    """Decode depth (H, W) [m], 0 where missing, of a sensor_msgs/Image or CompressedImage; 16 bits are millimetres.
 
     Raises:
         InputError: it is of another encoding, cut short or damaged.
@@ -86,7 +86,7 @@ def depth_of(message: Message) -> NDArray[np.float32]:
 
 
 def mask_of(message: Message) -> NDArray[np.bool_]:
-    """Mask (H, W), True where a mono8 image is not black.
+    """Decode a mask (H, W), True where a mono8 image is not black.
 
     Raises:
         InputError: it is of another encoding or cut short.
@@ -97,7 +97,7 @@ def mask_of(message: Message) -> NDArray[np.bool_]:
 
 
 def camera_info_message(stamp: float, camera: Camera, frame_id: str = "camera") -> Message:
-    """sensor_msgs/CameraInfo of an undistorted camera."""
+    """Build a sensor_msgs/CameraInfo of an undistorted camera."""
     k = camera.K
     return build(
         "sensor_msgs/msg/CameraInfo",
@@ -113,7 +113,7 @@ def camera_info_message(stamp: float, camera: Camera, frame_id: str = "camera") 
 
 
 def camera_of(message: Message) -> Camera:
-    """The camera of a sensor_msgs/CameraInfo (of ROS 1 or 2), distorted as it says.
+    """Convert a sensor_msgs/CameraInfo of ROS 1 or 2 to a camera with its distortion.
 
     Raises:
         CameraError: a value makes no sense, or the distortion is of another model.
@@ -129,14 +129,14 @@ def camera_of(message: Message) -> Camera:
 
 
 def joint_state_message(stamp: float, positions: ArrayLike, names: tuple[str, ...] = ()) -> Message:
-    """sensor_msgs/JointState of positions (J,) [rad or m]; unnamed joints are joint1, joint2, ..."""
+    """Build a sensor_msgs/JointState of positions (J,) [rad or m]; unnamed joints are joint1, joint2, ..."""
     q = np.asarray(positions, np.float64)
     names = names or tuple(f"joint{i + 1}" for i in range(len(q)))
     return build("sensor_msgs/msg/JointState", header=header(stamp, ""), name=list(names), position=q)
 
 
 def pose_message(T: ArrayLike) -> Message:
-    """geometry_msgs/Pose of a transform (4, 4)."""
+    """Convert a transform (4, 4) to geometry_msgs/Pose."""
     M = np.asarray(T, np.float64)
     w, *xyz = rotation_to_quat(M[:3, :3]).tolist()
     named = dict(zip("xyz", xyz, strict=True))
@@ -144,12 +144,12 @@ def pose_message(T: ArrayLike) -> Message:
 
 
 def pose_stamped_message(stamp: float, T: ArrayLike, frame_id: str) -> Message:
-    """geometry_msgs/PoseStamped of a transform (4, 4) into ``frame_id``."""
+    """Convert a transform (4, 4) into ``frame_id`` to geometry_msgs/PoseStamped."""
     return build("geometry_msgs/msg/PoseStamped", header=header(stamp, frame_id), pose=pose_message(T))
 
 
 def pose_of(message: Message) -> NDArray[np.float64]:
-    """Transform (4, 4) of a geometry_msgs/Pose or Transform.
+    """Convert a geometry_msgs/Pose or Transform to a transform (4, 4).
 
     Raises:
         InputError: the quaternion is zero or a value is not finite.
@@ -170,7 +170,7 @@ def _xyz(values: ArrayLike) -> dict[str, float]:
 
 
 def _pixels(message: Message, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
-    """Pixels (H, W, channels) of an Image, rows padded or not, of either byte order."""
+    """Return the pixels (H, W, channels) of an Image with any row padding and byte order."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * dtype.itemsize
     data = np.asarray(message.data, np.uint8)

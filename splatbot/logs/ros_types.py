@@ -1,4 +1,4 @@
-"""ROS 2 messages without ROS: built from plain values, checked field by field, to and from CDR (rosbags' typestore)."""
+"""ROS 2 messages without ROS: construction from plain values with field checks, and CDR (rosbags' typestore)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _STRINGS = ("string", "wstring")
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 
-# What the JAZZY store lacks: ros-controls/control_msgs' action as the topics of ROS 1's actionlib.
+# Types that the JAZZY store lacks: the action of ros-controls/control_msgs as topics of ROS 1's actionlib.
 _JOINT_TOLERANCE = "string name\nfloat64 position\nfloat64 velocity\nfloat64 acceleration\n"
 _FOLLOW = "control_msgs/msg/FollowJointTrajectory"
 _STATUS = "std_msgs/Header header\nactionlib_msgs/GoalStatus status\n"
@@ -48,7 +48,7 @@ _MORE = {
 
 @functools.cache
 def typestore() -> Typestore:
-    """The message definitions of ROS 2 Jazzy, and the few more that splatbot speaks."""
+    """Return the message definitions of ROS 2 Jazzy with the additional types of splatbot."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _MORE.items():
         store.register(get_types_from_msg(text, name))
@@ -56,7 +56,7 @@ def typestore() -> Typestore:
 
 
 def full_name(name: str) -> str:
-    """`pkg/msg/Name` of a type's name as ROS 1 (`pkg/Name`) or ROS 2 writes it.
+    """Convert a type name of ROS 1 (`pkg/Name`) or ROS 2 to `pkg/msg/Name`.
 
     Raises:
         InputError: there is no such type.
@@ -69,31 +69,31 @@ def full_name(name: str) -> str:
 
 
 def type_of(message: Message) -> str:
-    """`pkg/msg/Name` of a message."""
+    """Return the type `pkg/msg/Name` of a message."""
     return str(message.__msgtype__)
 
 
 def definition(name: str) -> str:
-    """The text that defines a type, with those that it is made of (the `ros2msg` of MCAP and Foxglove)."""
+    """Return the definition of a type with its dependencies (the `ros2msg` of MCAP and Foxglove)."""
     text, _ = typestore().generate_msgdef(name, ros_version=2)
     return str(text)
 
 
 def to_cdr(message: Message) -> bytes:
-    """The message's bytes on the wire of ROS 2, little-endian."""
+    """Serialize a message to little-endian CDR, the wire format of ROS 2."""
     return bytes(typestore().serialize_cdr(message, type_of(message)))
 
 
 def from_cdr(data: bytes | memoryview, name: str) -> Message:
-    """The message of those bytes."""
+    """Deserialize a message of type ``name`` from CDR."""
     return typestore().deserialize_cdr(data, name)
 
 
 def build(name: str, values: Mapping[str, Any] | None = None, /, **fields: Any) -> Message:
-    """A message of type ``name``; what is not given is 0, empty or false.
+    """Build a message of type ``name``; missing fields are 0, empty or false.
 
-    Values may be numbers, text, arrays, lists, mappings, messages, and for bytes also base64 text; null is NaN in a
-    list of floats, else not given. Times may have ROS 1's `secs` and `nsecs`, and a header's `seq` is passed over.
+    Values may be numbers, text, arrays, lists, mappings or messages. Bytes may also be base64 text. In a list of floats
+    null is NaN; elsewhere it is a missing field. Times may have ROS 1's `secs` and `nsecs`; `seq` of a header is ignored.
 
     Raises:
         InputError: a field is unknown, or its value is of another type.
@@ -102,7 +102,7 @@ def build(name: str, values: Mapping[str, Any] | None = None, /, **fields: Any) 
 
 
 def to_plain(message: Message) -> dict[str, Any]:
-    """The message as nested dictionaries; numeric arrays stay numpy arrays."""
+    """Convert a message to nested dictionaries; numeric arrays stay numpy arrays."""
     return {name: _plain(getattr(message, name)) for name, _ in typestore().fielddefs[type_of(message)][1]}
 
 
@@ -163,7 +163,7 @@ def _base(kind: str, value: Any, path: str) -> Any:
 
 
 def _numbers(kind: str, value: Any, count: int | None, path: str) -> Any:
-    """Numbers (N,) of a ROS type; null in a list of floats is NaN."""
+    """Convert a value to numbers (N,) of a ROS type; null in a list of floats is NaN."""
     dtype = np.dtype({"byte": "uint8", "octet": "uint8", "char": "uint8", "bool": "bool"}.get(kind, kind))
     if value is None:
         return np.zeros(count or 0, dtype)
@@ -193,7 +193,7 @@ def _array(value: Any, dtype: np.dtype[Any], path: str) -> Any:
         limits = np.iinfo(dtype)
         if int(given.min()) < limits.min or int(given.max()) > limits.max:
             raise _wrong(path, "is out of range", f"{dtype} holds {limits.min} to {limits.max}")
-    with np.errstate(over="ignore"):  # a float64 beyond float32 is infinite there
+    with np.errstate(over="ignore"):  # a float64 beyond the range of float32 becomes infinite
         return np.ascontiguousarray(given, dtype)
 
 

@@ -1,4 +1,4 @@
-"""`synthetic:SCENE?frames=N&...`: a ray-cast scene on an exactly known path, through the effects asked for."""
+"""Synthetic logs `synthetic:SCENE?frames=N&...`: ray-cast scenes with exact poses and optional sensor effects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
 from splatbot.logs.effects import Account, FrameEffects, make_effects
 from splatbot.logs.scenes import SCENES, RaycastScene, SceneKind
-from splatbot.logs.trajectories import Shooting, make_path
+from splatbot.logs.trajectories import MotionOptions, make_path
 from splatbot.trajectory import Trajectory
 
 PREFIX = "synthetic:"
@@ -23,17 +23,18 @@ PREFIX = "synthetic:"
 
 @dataclass(frozen=True)
 class SyntheticOptions:
-    """What the query of a synthetic log may set.
+    """Options in the query of a synthetic log.
 
     Args:
-        trajectory: how the camera moves, see :mod:`splatbot.logs.trajectories`; empty for the scene's own.
-        frames: how many the sensor takes; an effect may lose some.
-        width, height: [px]; the field of view stays 62.8° across.
-        rate: frames per second [Hz].
-        arc: angle [deg] over which an orbit swings.
-        event: when something moves or goes in a scene where something does [s].
-        seed: of everything random: a hand's jitter, the effects.
-        effects: what the frames go through, `name:option=value,...` with semicolons between them.
+        trajectory: camera trajectory, see :mod:`splatbot.logs.trajectories`; empty for the default of the scene.
+        frames: number of recorded frames; an effect may drop some.
+        width: [px]; the horizontal field of view stays 62.8°.
+        height: [px].
+        rate: frame rate [Hz].
+        arc: angle of an orbit [deg].
+        event: time [s] at which an object moves or vanishes in dynamic scenes.
+        seed: seed of hand jitter and of the effects.
+        effects: sensor effects, `name:option=value,...` separated by semicolons.
     """
 
     trajectory: str = ""
@@ -59,7 +60,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 
 
 class SyntheticLog(LogBase):
-    """Frames of a scene, rendered when read and kept by nobody; the same ``uri`` gives the same bits.
+    """Frames of a scene, rendered on access without a cache; equal values of ``uri`` give bit-identical frames.
 
     Raises:
         LogError: the scene, the trajectory, an effect or an option is unknown, or a value is out of range.
@@ -91,25 +92,25 @@ class SyntheticLog(LogBase):
         return Camera(f, f, (w - 1) / 2, (h - 1) / 2, w, h)
 
     ground_truth: Trajectory
-    """The exact poses T_world_camera of all frames that the sensor took; z is up."""
+    """Exact poses T_world_camera of all recorded frames; z is up."""
 
     @property
     def effects(self) -> list[Account]:
-        """The account of what the frames went through so far."""
+        """Records of the effects that were applied so far."""
         return self._effects.report() if self._effects is not None else []
 
     @property
     def blanks_depth(self) -> bool:
-        """Whether a frame may be without any depth."""
+        """Return whether a frame may have no depth."""
         return self._effects is not None and self._effects.blanks_depth
 
     @cached_property
     def scene(self) -> RaycastScene:
-        """What is filmed."""
+        """The rendered scene."""
         return self.kind.build(self.options.event)
 
     def objects(self) -> dict[str, Trajectory]:
-        """T_world_object of each moving object, at the stamps of the frames that arrive while it is there."""
+        """Return T_world_object of each moving object at the stamps of the kept frames in which it exists."""
         found: dict[str, tuple[list[float], list[NDArray[np.float64]]]] = {}
         for i in self._kept:
             t = float(self.ground_truth.stamps[i])
@@ -120,7 +121,7 @@ class SyntheticLog(LogBase):
         return {name: Trajectory(np.array(stamps), np.array(poses)) for name, (stamps, poses) in found.items()}
 
     def moving_mask(self, index: int) -> NDArray[np.bool_]:
-        """Pixels (H, W) of frame ``index`` that show a moving object."""
+        """Return the pixels (H, W) of frame ``index`` that show a moving object."""
         i = self._kept[index]
         return self.scene.moving_mask(
             self.camera, self.ground_truth.T_world_camera[i], float(self.ground_truth.stamps[i])
@@ -145,8 +146,8 @@ class SyntheticLog(LogBase):
 
     def _path(self) -> Trajectory:
         o = self.options
-        shooting = Shooting((o.frames - 1) / o.rate, o.rate, np.radians(o.arc), o.seed)
-        path = make_path(o.trajectory or self.kind.trajectory, self.kind.stage, shooting)
+        motion = MotionOptions((o.frames - 1) / o.rate, o.rate, np.radians(o.arc), o.seed)
+        path = make_path(o.trajectory or self.kind.trajectory, self.kind.stage, motion)
         stamps = np.arange(o.frames) / o.rate
         return Trajectory(stamps, np.array([path(float(t)) for t in stamps]))
 
@@ -158,7 +159,7 @@ class SyntheticLog(LogBase):
 
 
 def synthetic_uri(scene: str, options: SyntheticOptions) -> str:
-    """What opens a scene with ``options``; those at their defaults are left out."""
+    """Return the address of a scene with ``options``; default values are omitted."""
     plain = asdict(SyntheticOptions())
     query = [
         f"{key}={quote(str(value), safe=':;,=. ')}" for key, value in asdict(options).items() if value != plain[key]

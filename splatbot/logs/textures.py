@@ -17,13 +17,15 @@ _LATTICE = np.random.default_rng(7).random((_CELLS, _CELLS, _CELLS))
 
 @dataclass(frozen=True)
 class Texture:
-    """Two colours (0..1), mixed by a pattern.
+    """Two colours (0..1) mixed by a pattern.
 
     Args:
-        period: [m], size of a blob, or of two checker squares.
-        kind: "blobs" and "checker" have hard edges and a fine grain, so corners that ORB finds; "soft" fades from one
-            colour to the other over ``period`` and has no corner; "plain" is ``light`` alone.
-        seed: shifts the pattern.
+        light: first colour.
+        dark: second colour.
+        period: size of a blob, or of two checker squares [m].
+        kind: "blobs" and "checker" have hard edges and fine grain, hence corners for ORB. "soft" blends the colours
+            over ``period`` and has no corners. "plain" has the colour ``light`` only.
+        seed: offset of the pattern.
     """
 
     light: Rgb
@@ -33,7 +35,7 @@ class Texture:
     seed: int = 0
 
     def albedo(self, points: Points) -> NDArray[np.float64]:
-        """Colours (N, 3) in 0..1 at points (N, 3) [m]."""
+        """Return the colours (N, 3) in 0..1 at points (N, 3) [m]."""
         if self.kind == "plain":
             return np.broadcast_to(np.array(self.light), points.shape)
         if self.kind == "soft":
@@ -54,7 +56,7 @@ class Texture:
 
 
 def value_noise(points: Points) -> Points:
-    """Smooth noise (N,) in 0..1 with one random value per unit cell; points (N, 3)."""
+    """Evaluate smooth noise (N,) in 0..1 with one random value per unit cell at points (N, 3)."""
     cell = np.floor(points)
     f = points - cell
     f = f * f * (3.0 - 2.0 * f)
@@ -76,6 +78,6 @@ def value_noise(points: Points) -> Points:
 
 
 def _step(x: Points, edge: float, width: float) -> Points:
-    """0 below ``edge``, 1 above, a ramp between: a hard edge would alias into pixels that flicker."""
+    """Step smoothly from 0 below ``edge`` to 1 above it; a hard edge would alias and flicker."""
     t = np.clip((x - edge) / (2.0 * width) + 0.5, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)

@@ -1,4 +1,4 @@
-"""How a camera moves through a scene: poses as exact float64 functions of time."""
+"""Camera trajectories through a scene: poses as exact float64 functions of time."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Stage:
-    """Where a camera may move in a scene; z is up.
+    """Free space of the camera in a scene; z is up.
 
     Args:
-        eye, target: [m], the place to look from and what to look at.
-        ahead: [m], how far the way is free from ``eye`` towards ``target``.
-        circuit_center, circuit_radius: [m], the free circle on which a circuit leads, facing outwards; radius 0: there
-            is none, circuits lead around in front of ``target``, facing it.
-        paths: names of the trajectories that fit in; empty for all.
+        eye: default camera position [m].
+        target: point at which the camera looks [m].
+        ahead: free distance from ``eye`` towards ``target`` [m].
+        circuit_center: centre of the free circle of circuits [m]; the camera faces outwards.
+        circuit_radius: radius of that circle [m]. With 0, circuits move in front of ``target`` and face it.
+        paths: names of the possible trajectories; empty for all.
     """
 
     eye: Point
@@ -42,14 +43,14 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Shooting:
-    """What a trajectory may depend on beside the scene.
+class MotionOptions:
+    """Parameters of a trajectory that do not depend on the scene.
 
     Args:
-        duration: from the first frame to the last [s].
-        rate: frames per second [Hz].
-        arc: angle [rad] over which an orbit swings.
-        seed: of what is random.
+        duration: time from the first frame to the last [s].
+        rate: frame rate [Hz].
+        arc: angle of an orbit [rad].
+        seed: seed of random motion.
     """
 
     duration: float
@@ -58,11 +59,11 @@ class Shooting:
     seed: int = 0
 
 
-def make_path(name: str, stage: Stage, shooting: Shooting) -> Path:
-    """The trajectory ``name`` on a stage.
+def make_path(name: str, stage: Stage, motion: MotionOptions) -> Path:
+    """Create the trajectory ``name`` on a stage.
 
     Raises:
-        InputError: there is none of that name, or it would run into the scene.
+        InputError: the name is unknown, or the trajectory would collide with the scene.
     """
     if name not in TRAJECTORIES:
         raise InputError(f"there is no {name!r}.", field="trajectory", hint=f"trajectories: {', '.join(TRAJECTORIES)}")
@@ -70,17 +71,20 @@ def make_path(name: str, stage: Stage, shooting: Shooting) -> Path:
         raise InputError(
             f"{name!r} does not fit into this scene.", field="trajectory", hint=f"take {', '.join(stage.paths)}"
         )
-    return TRAJECTORIES[name](stage, shooting)
+    return TRAJECTORIES[name](stage, motion)
 
 
-def orbit(stage: Stage, shooting: Shooting) -> Path:
-    """Swings over an arc before the target and back in 8 s, bobbing: at most 0.5° and 8 mm per frame on a table top."""
+def orbit(stage: Stage, motion: MotionOptions) -> Path:
+    """Swing over an arc in front of the target in 8 s with a vertical oscillation.
+
+    The motion is at most 0.5° and 8 mm per frame on a table top.
+    """
     target, offset = np.array(stage.target), np.array(stage.eye) - np.array(stage.target)
     distance, middle = float(np.hypot(offset[0], offset[1])), np.arctan2(offset[1], offset[0])
     scale = distance / 0.80
 
     def pose(t: float) -> Array:
-        azimuth = middle + 0.5 * shooting.arc * np.sin(2 * np.pi * t / 8.0)
+        azimuth = middle + 0.5 * motion.arc * np.sin(2 * np.pi * t / 8.0)
         radius = distance + 0.06 * scale * np.sin(2 * np.pi * t / 5.3)
         height = offset[2] + 0.05 * scale * np.sin(2 * np.pi * t / 6.7)
         eye = target + np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
@@ -89,8 +93,8 @@ def orbit(stage: Stage, shooting: Shooting) -> Path:
     return pose
 
 
-def arm(stage: Stage, _: Shooting) -> Path:
-    """A wrist camera that sweeps 50 x 20 cm without a stop, once in 9 s: at most 0.25 m/s."""
+def arm(stage: Stage, _: MotionOptions) -> Path:
+    """Move a wrist camera over 50 x 20 cm without a stop, with a period of 9 s and at most 0.25 m/s."""
 
     def pose(t: float) -> Array:
         w = 2 * np.pi * t / 9.0
@@ -113,23 +117,29 @@ _STOPS = np.array(  # x, y, z [m] and rotation vector [deg] from home, in the ca
 _MOVE_S, _REST_S = 1.2, 0.4
 
 
-def arm_stops(stage: Stage, _: Shooting) -> Path:
-    """A wrist camera that halts for 0.4 s at each of six views; minimum jerk between them (Flash, Hogan 1985)."""
+def arm_stops(stage: Stage, _: MotionOptions) -> Path:
+    """Move a wrist camera to six views with a stop of 0.4 s at each, by minimum jerk (Flash and Hogan 1985).
+
+    With the normalized time s: x(s) = x0 + (x1 - x0) (10 s³ - 15 s⁴ + 6 s⁵).
+    """
 
     def pose(t: float) -> Array:
-        leg, since = divmod(t, _MOVE_S + _REST_S)
+        segment, since = divmod(t, _MOVE_S + _REST_S)
         s = min(since / _MOVE_S, 1.0)
-        share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-        a, b = _STOPS[int(leg) % len(_STOPS)], _STOPS[(int(leg) + 1) % len(_STOPS)]
-        at = a + share * (b - a)
+        fraction = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        a, b = _STOPS[int(segment) % len(_STOPS)], _STOPS[(int(segment) + 1) % len(_STOPS)]
+        at = a + fraction * (b - a)
         return _moved(stage.home, at[:3], np.radians(at[3:]))
 
     return pose
 
 
-def handheld(stage: Stage, shooting: Shooting) -> Path:
-    """Held in a hand: sway (0.05 to 0.4 Hz, 5 cm and 4° RMS), jitter (0.5 to 6 Hz, 2 mm and 0.3° RMS), both seeded."""
-    rng = np.random.default_rng([shooting.seed, 1])
+def handheld(stage: Stage, motion: MotionOptions) -> Path:
+    """Simulate a handheld camera by random sway and jitter.
+
+    Sway is 5 cm and 4° RMS at 0.05 to 0.4 Hz; jitter is 2 mm and 0.3° RMS at 0.5 to 6 Hz.
+    """
+    rng = np.random.default_rng([motion.seed, 1])
     sway = _band(rng, 0.05, 0.4, np.r_[np.full(3, 0.05), np.full(3, np.radians(4.0))])
     jitter = _band(rng, 0.5, 6.0, np.r_[np.full(3, 0.002), np.full(3, np.radians(0.3))])
 
@@ -140,8 +150,8 @@ def handheld(stage: Stage, shooting: Shooting) -> Path:
     return pose
 
 
-def rotation(stage: Stage, _: Shooting) -> Path:
-    """Turns where it stands: 35° to both sides in 8 s, nodding and rolling a little; the camera centre stays."""
+def rotation(stage: Stage, _: MotionOptions) -> Path:
+    """Rotate by 35° to both sides in 8 s with small pitch and roll; the camera centre does not move."""
 
     def pose(t: float) -> Array:
         yaw, nod = 35.0 * np.sin(2 * np.pi * t / 8.0), 8.0 * np.sin(2 * np.pi * t / 5.0)
@@ -153,9 +163,9 @@ def rotation(stage: Stage, _: Shooting) -> Path:
     return pose
 
 
-def forward(stage: Stage, _: Shooting) -> Path:
-    """Straight on towards the target as far as the way is free, at up to 0.5 m/s, and backwards to the start."""
-    half = np.pi * stage.ahead  # [s] one way; of (1 - cos)/2 the steepest slope is π/2 over it
+def forward(stage: Stage, _: MotionOptions) -> Path:
+    """Move straight towards the target over the free distance at up to 0.5 m/s, and backwards to the start."""
+    half = np.pi * stage.ahead  # [s] one direction; the maximum slope of (1 - cos)/2 is π/2 over it
 
     def pose(t: float) -> Array:
         return _moved(stage.home, [0, 0, 0.5 * stage.ahead * (1.0 - np.cos(np.pi * t / half))], np.zeros(3))
@@ -166,15 +176,15 @@ def forward(stage: Stage, _: Shooting) -> Path:
 _STEP_M, _STEP_DEG, _STEPS = 0.08, 5.0, 6
 
 
-def steps(stage: Stage, shooting: Shooting) -> Path:
-    """8 cm and 5° from every frame to the next, to and fro over six of them to both sides, about a point ahead."""
+def steps(stage: Stage, motion: MotionOptions) -> Path:
+    """Step by 8 cm and 5° per frame, up to six steps to both sides, around a point in front of the camera."""
     pivot = stage.home
     lever = 0.5 * _STEP_M / np.sin(np.radians(0.5 * _STEP_DEG))
     level = pivot[:3, 2] * [1, 1, 0]
     center = pivot[:3, 3] + lever * level / np.linalg.norm(level)
 
     def pose(t: float) -> Array:
-        k = _STEPS - abs((t * shooting.rate + _STEPS) % (4 * _STEPS) - 2 * _STEPS)  # 0, 1 .. 6, 5 .. -6, -5 ..
+        k = _STEPS - abs((t * motion.rate + _STEPS) % (4 * _STEPS) - 2 * _STEPS)  # 0, 1 .. 6, 5 .. -6, -5 ..
         R = so3_exp([0, 0, np.radians(_STEP_DEG * k)])
         T = stage.home
         T[:3, 3] = center + R @ (T[:3, 3] - center)
@@ -184,14 +194,14 @@ def steps(stage: Stage, shooting: Shooting) -> Path:
     return pose
 
 
-def loop(stage: Stage, shooting: Shooting) -> Path:
-    """One circuit in the length of the log; the last pose is the first."""
-    period = shooting.duration or 1.0
+def loop(stage: Stage, motion: MotionOptions) -> Path:
+    """Move on one circuit during the log; the last pose equals the first."""
+    period = motion.duration or 1.0
     return lambda t: _circuit(stage, 2 * np.pi * t / period)
 
 
-def laps(stage: Stage, _: Shooting) -> Path:
-    """The same circuit again and again, 20 s each."""
+def laps(stage: Stage, _: MotionOptions) -> Path:
+    """Repeat the circuit every 20 s."""
     return lambda t: _circuit(stage, 2 * np.pi * t / 20.0)
 
 
@@ -209,13 +219,13 @@ def _circuit(stage: Stage, angle: float) -> Array:
     return look_at(eye, target)
 
 
-TRAJECTORIES: dict[str, Callable[[Stage, Shooting], Path]] = {
+TRAJECTORIES: dict[str, Callable[[Stage, MotionOptions], Path]] = {
     path.__name__: path for path in (orbit, arm, arm_stops, handheld, rotation, forward, steps, loop, laps)
 }
 
 
 def _moved(T: Array, move: Array | list[float], turn: Array) -> Array:
-    """``T`` after a move [m] and a rotation vector [rad], both in its own axes."""
+    """Return ``T`` after a translation [m] and a rotation vector [rad], both in its own axes."""
     out = T.copy()
     out[:3, 3] += T[:3, :3] @ np.asarray(move)
     out[:3, :3] = T[:3, :3] @ so3_exp(turn)
@@ -223,9 +233,10 @@ def _moved(T: Array, move: Array | list[float], turn: Array) -> Array:
 
 
 def _band(rng: np.random.Generator, low: float, high: float, rms: Array) -> Callable[[float], Array]:
-    """A random function of time, values (6,) of the given RMS (6,), without a frequency outside low..high [Hz].
+    """Return a random function of time with values (6,) of the given RMS (6,) and frequencies in low..high [Hz].
 
-    Amplitudes fall with the frequency, as those of a hand do: every octave adds the same speed.
+    It is a sum of 24 sines with random frequencies and phases. Amplitudes are proportional to 1/f, as for a human hand,
+    so that every octave adds the same speed.
     """
     frequencies = np.exp(rng.uniform(np.log(low), np.log(high), (24, 6)))
     phases = rng.uniform(0, 2 * np.pi, (24, 6))

@@ -26,7 +26,7 @@ from splatbot.trajectory import Trajectory
 Missing = Literal["auto", "error", "skip"]
 
 MAX_DIFFERENCE = 0.02  # [s], as TUM's associate.py
-_LOCKSTEP = 1e-3  # [s]
+_SYNCHRONIZED_S = 1e-3  # maximum difference of stamps between synchronized streams
 
 _log = logging.getLogger(__name__)
 
@@ -34,16 +34,19 @@ _log = logging.getLogger(__name__)
 class TumLog(LogBase):
     """A recording in TUM layout; frames are the colour images, each with the depth image nearest in time.
 
-    A colour image without a depth image within 0.02 s is either left out or an error when it is read. ``missing``
-    says which: "skip", "error", or "auto", which looks at the others. Where all differ by less than 1 ms, colour and
-    depth were recorded in lockstep, so a lone colour image means that depth.txt lost a line: error. Otherwise the
-    sensor's two streams ran freely (as TUM's own), drop-outs are normal: skip. Either way they are counted in
-    ``unpaired`` and logged. A depth image without colour is never missed, only logged.
+    ``missing`` defines the treatment of a colour image without a depth image within 0.02 s:
 
-    `mask.png` (for all frames) or `mask.txt` (lines `stamp path`, one mask for each frame) name pixels that may be used
-    (white) and that must not be (black): the gripper in view, the robot's own arm.
+    - "skip": the frame is left out.
+    - "error": reading the frame raises LogError.
+    - "auto": "error" if all other pairs differ by less than 1 ms, since the streams are then synchronized and depth.txt
+      lost a line. Otherwise "skip", since drop-outs are normal for free-running streams such as TUM's own.
 
-    `joints.txt` (lines `stamp q1 q2 ...`) tells the robot's joints, which are interpolated to each frame's stamp.
+    Such images are counted in ``unpaired`` and logged. A depth image without colour is only logged.
+
+    Masks mark valid pixels in white and excluded pixels in black, such as the gripper or the robot's own arm. They are
+    read from `mask.png` for all frames, or from `mask.txt` (lines `stamp path`) for single frames.
+
+    `joints.txt` (lines `stamp q1 q2 ...`) holds the joint positions, which are interpolated to each frame's stamp.
 
     Raises:
         LogError: a list is missing, empty or malformed, nothing can be associated, or `effects.json` is damaged.
@@ -60,7 +63,7 @@ class TumLog(LogBase):
         pairs = self._pair(colors)
         self.unpaired = len(colors) - len(pairs)
         if missing == "auto":
-            lockstep = all(abs(colors[i].stamp - depth.stamp) < _LOCKSTEP for i, depth in pairs.items())
+            lockstep = all(abs(colors[i].stamp - depth.stamp) < _SYNCHRONIZED_S for i, depth in pairs.items())
             missing = "error" if lockstep else "skip"
         kept = [i for i in range(len(colors)) if i in pairs or missing == "error"]
         self._frames: list[tuple[IndexEntry, IndexEntry | None]] = [(colors[i], pairs.get(i)) for i in kept]

@@ -12,9 +12,10 @@ from splatbot.camera import Camera
 
 
 class Undistorter:
-    """Resamples colour bilinearly and depth to the nearest pixel: depths across an edge must not be averaged.
+    """Resamples colour bilinearly and depth to the nearest pixel, since depths across an edge must not be averaged.
 
-    Pixels that the sensor did not see repeat the border's colour (black would be an edge to track) and have no depth.
+    Pixels outside of the recorded image repeat the colour of the border, since black would be an edge for tracking.
+    They have no depth.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -24,16 +25,16 @@ class Undistorter:
         self._map = cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_32FC1)
 
     def color(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) of the distorted camera to (H, W, 3) of ``camera``."""
+        """Resample an image (H, W, 3) of the distorted camera to ``camera``."""
         out = cv2.remap(rgb, *self._map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(out, dtype=np.uint8)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(H, W) of the distorted camera to (H, W) of ``camera``; pixels that the sensor did not see are False."""
+        """Resample a mask (H, W) of the distorted camera to ``camera``; pixels outside of the image are False."""
         out = cv2.remap(mask.astype(np.uint8), *self._map, cv2.INTER_NEAREST, borderValue=0)
         return np.asarray(out > 0)
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) [m] of the distorted camera to (H, W) [m] of ``camera``."""
+        """Resample depth (H, W) [m] of the distorted camera to ``camera``."""
         out = cv2.remap(depth, *self._map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return np.asarray(out, dtype=np.float32)

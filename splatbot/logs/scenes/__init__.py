@@ -17,13 +17,14 @@ __all__ = ["SCENES", "RaycastScene", "RaycastSurface", "SceneKind"]
 
 @dataclass(frozen=True)
 class SceneKind:
-    """How a scene is made and filmed.
+    """Definition of a scene and of its camera motion.
 
     Args:
-        build: makes the scene, given the time [s] of its event (what moves or goes); still scenes ignore it.
-        stage: where a camera may move in it.
-        trajectory: how it moves unless told otherwise.
-        about: a line on what the scene is for.
+        build: builds the scene for the time [s] of its event, such as a moving or vanishing object; static scenes
+            ignore it.
+        stage: free space of the camera in the scene.
+        trajectory: default camera trajectory.
+        about: purpose of the scene in one line.
     """
 
     build: Callable[[float], RaycastScene]
@@ -33,16 +34,20 @@ class SceneKind:
 
 
 SCENES = {
-    "tabletop": SceneKind(lambda _: tabletop(), TABLETOP_STAGE, "orbit", "five things on a table in a corner"),
+    "tabletop": SceneKind(lambda _: tabletop(), TABLETOP_STAGE, "orbit", "five objects on a table in a corner"),
     "tabletop_crossing": SceneKind(
-        tabletop_crossing, TABLETOP_STAGE, "orbit", "a hand-sized object crosses in front of it, from the event on"
+        tabletop_crossing, TABLETOP_STAGE, "orbit", "a hand-sized object crosses in front of it after the event"
     ),
-    "tabletop_removed": SceneKind(tabletop_removed, TABLETOP_STAGE, "orbit", "its carton is gone from the event on"),
+    "tabletop_removed": SceneKind(tabletop_removed, TABLETOP_STAGE, "orbit", "its carton vanishes at the event"),
     "room": SceneKind(lambda _: room(), ROOM_STAGE, "loop", "furniture along the walls of a room of 5 x 4 m"),
-    "wall": SceneKind(lambda _: wall(), WALL_STAGE, "orbit", "flat, with texture: geometry fixes 3 of 6 freedoms"),
-    "wall_soft": SceneKind(lambda _: wall_soft(), WALL_STAGE, "orbit", "flat, colours fade: no corner for ORB"),
-    "wall_blank": SceneKind(lambda _: wall_blank(), WALL_STAGE, "orbit", "flat and of one colour: 3 freedoms unseen"),
+    "wall": SceneKind(
+        lambda _: wall(), WALL_STAGE, "orbit", "flat, with texture: geometry constrains 3 of 6 degrees of freedom"
+    ),
+    "wall_soft": SceneKind(lambda _: wall_soft(), WALL_STAGE, "orbit", "flat, with smooth colours: no corners for ORB"),
+    "wall_blank": SceneKind(
+        lambda _: wall_blank(), WALL_STAGE, "orbit", "flat, of one colour: 3 degrees of freedom are unobservable"
+    ),
     "corridor": SceneKind(
-        lambda _: corridor(), CORRIDOR_STAGE, "forward", "10 m long; its walls do not fix the way on"
+        lambda _: corridor(), CORRIDOR_STAGE, "forward", "10 m long; its walls do not constrain forward motion"
     ),
 }

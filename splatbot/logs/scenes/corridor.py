@@ -15,7 +15,7 @@ _LENGTH, _WIDTH, _HEIGHT, _THICK = 10.0, 1.8, 2.5, 0.1
 
 
 def corridor() -> RaycastScene:
-    """Flat walls: only colour, and the end walls from near, tell how far along the camera is."""
+    """Build a corridor with flat walls: only colour, and the end walls from near, constrain the motion along it."""
     plaster = Texture((0.86, 0.85, 0.80), (0.52, 0.56, 0.60), 0.15, seed=21)
     carpet = Texture((0.45, 0.45, 0.50), (0.25, 0.27, 0.32), 0.10, seed=22)
     ceiling = Texture((0.90, 0.90, 0.90), (0.74, 0.74, 0.72), 0.60, "checker")

@@ -15,7 +15,7 @@ _X, _Y, _Z, _THICK = 5.0, 4.0, 2.6, 0.1
 
 
 def room() -> RaycastScene:
-    """Every direction has texture and relief; the middle, 1.1 m around, is free."""
+    """Build a room with texture and relief in every direction; the centre is free within 1.1 m."""
     return RaycastScene([*_shell(), *_sofa(), *_desk(), *_shelf(), *_cabinet()])
 
 
@@ -32,7 +32,7 @@ def _shell() -> list[RaycastSurface]:
 
 
 def _sofa() -> list[RaycastSurface]:
-    """At +y, with a picture above it."""
+    """Build the sofa at +y, with a picture above it."""
     cloth = Texture((0.30, 0.42, 0.58), (0.18, 0.24, 0.38), 0.05, seed=33)
     cushion = Texture((0.85, 0.60, 0.25), (0.65, 0.30, 0.18), 0.06, "checker", seed=34)
     picture = Texture((0.92, 0.88, 0.70), (0.20, 0.45, 0.42), 0.09, seed=35)
@@ -47,7 +47,7 @@ def _sofa() -> list[RaycastSurface]:
 
 
 def _desk() -> list[RaycastSurface]:
-    """At +x, with a screen, books and a lamp."""
+    """Build the desk at +x, with a screen, books and a lamp."""
     wood = Texture((0.80, 0.62, 0.42), (0.52, 0.36, 0.22), 0.08, seed=36)
     screen = Texture((0.15, 0.30, 0.55), (0.05, 0.06, 0.10), 0.10, "checker", seed=37)
     books = Texture((0.80, 0.25, 0.22), (0.90, 0.88, 0.80), 0.05, seed=38)
@@ -64,7 +64,7 @@ def _desk() -> list[RaycastSurface]:
 
 
 def _shelf() -> list[RaycastSurface]:
-    """At -x: three boards with boxes and balls."""
+    """Build the shelf at -x: three boards with boxes and balls."""
     board = Texture((0.72, 0.70, 0.66), (0.50, 0.46, 0.42), 0.09, seed=40)
     boxes = Texture((0.70, 0.78, 0.30), (0.30, 0.34, 0.16), 0.06, seed=41)
     balls = Texture((0.90, 0.45, 0.55), (0.45, 0.15, 0.30), 0.06, seed=42)
@@ -77,7 +77,7 @@ def _shelf() -> list[RaycastSurface]:
 
 
 def _cabinet() -> list[RaycastSurface]:
-    """At -y, with a plant beside it."""
+    """Build the cabinet at -y, with a plant next to it."""
     paint = Texture((0.78, 0.84, 0.86), (0.44, 0.54, 0.60), 0.06, seed=43)
     pot = Texture((0.74, 0.42, 0.28), (0.50, 0.26, 0.18), 0.06, seed=44)
     leaves = Texture((0.35, 0.65, 0.28), (0.12, 0.30, 0.12), 0.05, seed=45)

@@ -18,12 +18,12 @@ _CROSSING_FROM, _CROSSING_TO = np.array([-0.75, -0.45, 0.28]), np.array([0.75, -
 
 
 def tabletop() -> RaycastScene:
-    """Nothing moves."""
+    """Build the static scene."""
     return RaycastScene([*_furniture(), RaycastSurface(_carton().placed(_CARTON_AT, _CARTON_YAW), _CARTON)])
 
 
 def tabletop_crossing(event: float) -> RaycastScene:
-    """A hand passes half-way between table and camera, from -x to +x, in 2.5 s from ``event`` [s] on."""
+    """Build the scene with a hand that crosses in front of the table from -x to +x, for 2.5 s from ``event`` [s] on."""
     return RaycastScene(
         [*_furniture(), RaycastSurface(_carton().placed(_CARTON_AT, _CARTON_YAW), _CARTON)],
         {"hand": Moving(_hand(), lambda t: _crossing((t - event) / _CROSSING_S))},
@@ -31,7 +31,7 @@ def tabletop_crossing(event: float) -> RaycastScene:
 
 
 def tabletop_removed(event: float) -> RaycastScene:
-    """The carton is there until ``event`` [s]."""
+    """Build the scene with a carton that vanishes at ``event`` [s]."""
     T = np.eye(4)
     T[:3, 3] = _CARTON_AT
     turned = RaycastSurface(_carton().placed([0.0, 0.0, 0.0], _CARTON_YAW), _CARTON)
@@ -66,16 +66,16 @@ def _furniture() -> list[RaycastSurface]:
 
 
 def _hand() -> list[RaycastSurface]:
-    """A palm with four fingers, 18 x 9 x 3 cm, pointing to +x."""
+    """Build a palm with four fingers, 18 x 9 x 3 cm, pointing to +x."""
     skin = Texture((0.85, 0.62, 0.50), (0.70, 0.42, 0.34), 0.03, seed=8)
     fingers = [box([0.08, 0.018, 0.018]).placed([0.09, y, 0.005]) for y in (-0.036, -0.012, 0.012, 0.036)]
     return [RaycastSurface(mesh, skin) for mesh in (box([0.10, 0.09, 0.03]), *fingers)]
 
 
-def _crossing(share: float) -> Array | None:
-    """T_world_hand after a ``share`` of the way; None before and after."""
-    if not 0.0 <= share <= 1.0:
+def _crossing(fraction: float) -> Array | None:
+    """Return T_world_hand after a ``fraction`` of the path; None before and after."""
+    if not 0.0 <= fraction <= 1.0:
         return None
     T = np.eye(4)
-    T[:3, 3] = _CROSSING_FROM + share * (_CROSSING_TO - _CROSSING_FROM)
+    T[:3, 3] = _CROSSING_FROM + fraction * (_CROSSING_TO - _CROSSING_FROM)
     return T

@@ -10,15 +10,15 @@ import pytest
 from splatbot.errors import InputError
 from splatbot.geometry import Array, inverse, so3_log
 from splatbot.logs.scenes import SCENES
-from splatbot.logs.trajectories import TRAJECTORIES, Shooting, Stage, make_path
+from splatbot.logs.trajectories import TRAJECTORIES, MotionOptions, Stage, make_path
 
 STAGE = Stage(eye=(0.0, -0.8, 0.5), target=(0.0, 0.0, 0.0), ahead=0.4)
-LONG = Shooting(duration=300 / 30)
+LONG = MotionOptions(duration=300 / 30)
 
 
-def poses(name: str, *, stage: Stage = STAGE, shooting: Shooting = LONG, frames: int = 301) -> Array:
-    path = make_path(name, stage, shooting)
-    return np.array([path(i / shooting.rate) for i in range(frames)])
+def poses(name: str, *, stage: Stage = STAGE, motion: MotionOptions = LONG, frames: int = 301) -> Array:
+    path = make_path(name, stage, motion)
+    return np.array([path(i / motion.rate) for i in range(frames)])
 
 
 def angle(T_a: Array, T_b: Array) -> float:
@@ -56,7 +56,7 @@ def test_every_step_is_8_cm_and_5_degrees() -> None:
 
 @pytest.mark.parametrize("rate", [10.0, 30.0])
 def test_steps_are_per_frame_at_any_rate(rate: float) -> None:
-    T = poses("steps", shooting=Shooting(duration=1.0, rate=rate), frames=5)
+    T = poses("steps", motion=MotionOptions(duration=1.0, rate=rate), frames=5)
     np.testing.assert_allclose(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1), 0.08, rtol=1e-9)
 
 
@@ -93,7 +93,7 @@ def test_a_hand_trembles_within_its_band_and_by_its_seed() -> None:
     spectrum = np.abs(np.fft.rfft(T[:, 0, 3] * np.hanning(3000))) ** 2
     frequency = np.fft.rfftfreq(3000, 1 / 30)
     assert spectrum[frequency > 6.5].sum() < 1e-6 * spectrum.sum()
-    other = poses("handheld", shooting=Shooting(10.0, seed=1), frames=100)
+    other = poses("handheld", motion=MotionOptions(10.0, seed=1), frames=100)
     assert np.abs(other[:, :3, 3] - T[:100, :3, 3]).max() > 0.01
 
 

@@ -10,7 +10,7 @@ from splatbot.errors import InputError
 from splatbot.geometry import se3_exp
 from splatbot.logs import open_log
 from splatbot.logs.synthetic import SyntheticLog
-from splatbot.logs.trajectories import Shooting, make_path
+from splatbot.logs.trajectories import MotionOptions, make_path
 from splatbot.sim.effects.motion_blur import MotionBlur
 from splatbot.sim.effects.warping import pose_at
 from splatbot.trajectory import Trajectory
@@ -21,7 +21,7 @@ RNG = np.random.default_rng(0)
 
 def rendered(log: SyntheticLog, trajectory: str, t: float, exposure: float) -> NDArray[np.float64]:
     """The mean of 17 renderings while the shutter is open."""
-    path = make_path(trajectory, log.kind.stage, Shooting(2.0))
+    path = make_path(trajectory, log.kind.stage, MotionOptions(2.0))
     times = t + exposure * ((np.arange(17) + 0.5) / 17 - 0.5)
     return np.mean([log.scene.render(log.camera, path(float(s)))[0].astype(float) for s in times], axis=0)
 
