@@ -1,4 +1,4 @@
-"""Fixtures for all tests: where the real data is, and small logs to damage."""
+"""Fixtures for all tests: the folder of the real recordings, and small logs that tests damage."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MakeLog = Callable[..., Path]
 
 @pytest.fixture(autouse=True)
 def logging_as_it_was() -> Iterator[None]:
-    """`serve` logs to a stderr that is gone after its test; a thread of a later test must not write there."""
+    """Restores the log handlers: `serve` logs to a stderr that is closed after its test."""
     root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
     yield
@@ -31,7 +31,7 @@ def logging_as_it_was() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def data_root() -> Path:
-    """Folder of the real recordings: SPLATBOT_TEST_DATA, else shared/data beside the repository."""
+    """Folder of the real recordings: SPLATBOT_TEST_DATA, else shared/data next to the repository."""
     default = Path(__file__).resolve().parents[1].parent / "shared" / "data"
     root = Path(os.environ.get("SPLATBOT_TEST_DATA") or default)
     if not root.is_dir():
@@ -44,7 +44,7 @@ def data_root() -> Path:
 
 @pytest.fixture
 def make_log(tmp_path: Path) -> MakeLog:
-    """Writes a sound TUM log of `frames` small images and returns its folder, for a test to damage."""
+    """Writes a valid TUM log of `frames` small images and returns its folder, for a test to damage."""
 
     def make(frames: int = 5, *, name: str = "log", period: float = 1 / 30, depth_delay: float = 0.0) -> Path:
         folder = tmp_path / name
@@ -87,12 +87,12 @@ def rng() -> np.random.Generator:
 
 
 def color_image(index: int) -> NDArray[np.uint8]:
-    """RGB (48, 64, 3), another one for each frame."""
+    """Return a random RGB image (48, 64, 3) that differs for each frame."""
     return np.random.default_rng(index).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
 def depth_units(index: int) -> NDArray[np.uint16]:
-    """Depth (48, 64) of a slanted plane near 1 m in units of 1/5000 m, with a hole."""
+    """Return the depth (48, 64) of a slanted plane near 1 m in units of 1/5000 m, with a hole."""
     z = 1.0 + 0.002 * np.arange(WIDTH)[None, :] + 0.001 * np.arange(HEIGHT)[:, None] + 0.01 * index
     z[:4, :4] = 0.0
     return np.rint(z * DEPTH_SCALE).astype(np.uint16)

@@ -33,7 +33,7 @@ def small_config(**overrides: Any) -> Config:
 
 @cache
 def tabletop(frames: int = 12, width: int = 160) -> tuple[tuple[Frame, ...], tuple[Array, ...]]:
-    """Frames of the synthetic tabletop and their exact poses (4, 4) in the first camera's frame."""
+    """Return frames of the synthetic tabletop and their exact poses (4, 4) in the frame of the first camera."""
     log = open_log(f"synthetic:tabletop?width={width}&height={width * 3 // 4}&frames={frames}")
     truth = log.ground_truth
     assert truth is not None
@@ -42,7 +42,7 @@ def tabletop(frames: int = 12, width: int = 160) -> tuple[tuple[Frame, ...], tup
 
 
 def wall_depth(camera: Camera, T_world_camera: Array, normal: ArrayLike, distance: float) -> Array:
-    """Exact depth (H, W) [m] of the plane ``normal · x = distance`` of the world frame."""
+    """Compute the exact depth (H, W) [m] of the plane ``normal · x = distance`` in the world frame."""
     n = np.asarray(normal, dtype=np.float64)
     rays = rays_of(camera) @ T_world_camera[:3, :3].T
     depth: Array = (distance - n @ T_world_camera[:3, 3]) / (rays @ n)
@@ -58,7 +58,7 @@ def wall_frame(
     camera: Camera = CAMERA,
     stamp: float = 0.0,
 ) -> Frame:
-    """The wall ``normal · x = distance`` with a smooth pattern that belongs to its points, or of one grey."""
+    """Render the wall ``normal · x = distance`` with a smooth pattern as a function of its points, or in grey."""
     z = wall_depth(camera, T_world_camera, normal, distance)
     points = (rays_of(camera) * z[..., None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     rgb = pattern(points) if textured else np.full(points.shape, 0.6)
@@ -66,13 +66,13 @@ def wall_frame(
 
 
 def rays_of(camera: Camera) -> Array:
-    """Directions (H, W, 3) with z = 1 through the pixels' centres, in the camera frame."""
+    """Return directions (H, W, 3) with z = 1 through the pixel centres in the camera frame."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
 
 
 def pattern(points: Array) -> Array:
-    """RGB (..., 3) in 0..1 of world points (..., 3) [m]: waves of 9 to 30 cm, so that 1 cm is a small part of one."""
+    """Return RGB (..., 3) in 0..1 of world points (..., 3) [m]: waves of 9 to 30 cm, which are smooth over 1 cm."""
     x, y, z = np.moveaxis(points, -1, 0)
     waves = np.stack(
         [np.sin(37 * x + 11 * y) + np.sin(23 * y - 5 * z), np.sin(60 * y + 7 * x), np.cos(41 * x - 29 * y)], -1

@@ -93,7 +93,7 @@ def build(name: str, values: Mapping[str, Any] | None = None, /, **fields: Any) 
     """Build a message of type ``name``; missing fields are 0, empty or false.
 
     Values may be numbers, text, arrays, lists, mappings or messages. Bytes may also be base64 text. In a list of floats
-    null is NaN; elsewhere it is a missing field. Times may have ROS 1's `secs` and `nsecs`; `seq` of a header is ignored.
+    null is NaN; elsewhere it is a missing field. Times may have ROS 1's `secs` and `nsecs`; `seq` is ignored.
 
     Raises:
         InputError: a field is unknown, or its value is of another type.

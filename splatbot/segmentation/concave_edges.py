@@ -37,8 +37,8 @@ class _PlanarFace:
 def split_at_concave_edges(points: Array, observers: Array, *, apart: float, fewest: int) -> list[NDArray[np.int64]]:
     """Split connected points into parts of faces that meet at convex edges; return the rows of each, largest first.
 
-    Objects are locally convex towards the camera (Stein et al. 2014). Two faces that meet therefore belong to different
-    objects if one lies in front of the plane of the other, such as a box and a wall. Remaining points join the nearest
+    Objects are locally convex towards the camera (Stein et al. 2014). Faces that meet belong to different objects
+    if one lies in front of the plane of the other, such as a box and a wall. Remaining points join the nearest
     part. Points far from all parts are clustered.
 
     Args:

@@ -19,7 +19,7 @@ BAD = 2  # the frame that is damaged
 
 
 def frames_before_error(folder: Path, **options: Any) -> tuple[int, LogError]:
-    """How many frames iterating yields before it raises, and the error."""
+    """Count the frames that iteration yields before it raises, and return the error."""
     count = 0
     try:
         for frame in open_log(folder, **options):
@@ -40,7 +40,7 @@ def assert_complete(error: InputError, file: Path, field: str) -> None:
 
 
 def assert_only_frame_is_bad(folder: Path, file: Path, field: str) -> LogError:
-    """Frames before BAD are yielded, BAD raises, the one behind it can still be read."""
+    """Assert that frames before BAD are yielded, BAD raises, and the next frame can still be read."""
     count, error = frames_before_error(folder)
     assert count == BAD
     assert_complete(error, file, field)
@@ -255,15 +255,15 @@ def test_negative_depth(make_log: MakeLog) -> None:
 
 
 @pytest.mark.parametrize(
-    ("image", "what"),
+    ("image", "problem"),
     [(np.full((48, 64), 100, np.uint8), "uint8"), (np.full((48, 64, 3), 100, np.uint8), "3 channel")],
 )
-def test_depth_of_the_wrong_pixel_type(make_log: MakeLog, image: np.ndarray, what: str) -> None:
+def test_depth_of_the_wrong_pixel_type(make_log: MakeLog, image: np.ndarray, problem: str) -> None:
     folder = make_log()
     path = folder / f"depth/{BAD:06d}.png"
     cv2.imwrite(str(path), image)
     error = assert_only_frame_is_bad(folder, path, "depth")
-    assert what in error.message
+    assert problem in error.message
     assert "16-bit PNG" in (error.hint or "")
 
 

@@ -53,7 +53,7 @@ def test_a_recording_gives_back_every_frame_bit_for_bit_with_its_joints_mask_and
 
 def test_mapping_a_recording_gives_the_trajectory_of_the_log_it_was_made_from(tmp_path: Path) -> None:
     scene = open_log("synthetic:tabletop?frames=6&width=160&height=120")
-    # As cameras tell time: ROS knows no third of a nanosecond.
+    # Stamps in microseconds, as cameras have them: ROS cannot represent a third of a nanosecond.
     log = open_log(record((replace(f, stamp=round(f.stamp, 6)) for f in scene), tmp_path / "desk"))
     record_mcap(log, tmp_path / "a.mcap")
     runs = []
@@ -72,7 +72,7 @@ def test_mapping_a_recording_of_a_real_log_gives_the_same_trajectory(data_root: 
     assert (tmp_path / "log/trajectory.tum").read_text() == (tmp_path / "bag/trajectory.tum").read_text()
 
 
-def test_rosbags_own_reader_reads_what_was_recorded(make_log: MakeLog, tmp_path: Path) -> None:
+def test_the_reader_of_rosbags_reads_the_recorded_messages(make_log: MakeLog, tmp_path: Path) -> None:
     log = open_log(make_log())
     record_mcap(log, tmp_path / "a.mcap")
     with AnyReader([tmp_path / "a.mcap"]) as reader:
@@ -153,11 +153,11 @@ def test_of_several_cameras_one_is_named_in_the_uri(make_log: MakeLog, tmp_path:
         open_log(f"{path}?colour=/cam1/color")
 
 
-@pytest.mark.parametrize(("lacks", "told"), [("depth", "no depth images"), ("info", "camera")])
-def test_what_a_recording_lacks_is_named(lacks: str, told: str, make_log: MakeLog, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("lacks", "message"), [("depth", "no depth images"), ("info", "camera")])
+def test_missing_parts_of_a_recording_are_named(lacks: str, message: str, make_log: MakeLog, tmp_path: Path) -> None:
     frame = open_log(make_log())[0]
     path = _write(tmp_path / "a.mcap", frame, **{lacks: False})
-    with pytest.raises(LogError, match=told):
+    with pytest.raises(LogError, match=message):
         open_log(path)
 
 
@@ -188,7 +188,7 @@ def test_flipped_bytes_raise_nothing_but_log_errors(make_log: MakeLog, tmp_path:
     assert failed >= 10
 
 
-def test_a_recording_never_overwrites_and_bears_its_name_only_when_whole(make_log: MakeLog, tmp_path: Path) -> None:
+def test_a_recording_never_overwrites_and_has_its_name_only_when_complete(make_log: MakeLog, tmp_path: Path) -> None:
     frame = open_log(make_log())[0]
     out = McapFile(tmp_path / "a.mcap")
     out.write(COLOR, image_message(0.0, frame.rgb), 0)

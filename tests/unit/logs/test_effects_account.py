@@ -1,4 +1,4 @@
-"""What a synthetic log went through: the same bits from the same address, and an account that travels along."""
+"""Effects of synthetic logs: equal addresses give equal bits, and recordings keep the records of the effects."""
 
 from __future__ import annotations
 

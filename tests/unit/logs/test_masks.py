@@ -1,4 +1,4 @@
-"""Masks of a TUM folder: one for all frames or one for each, and clear words about what is wrong with them."""
+"""Masks of a TUM folder: one for all frames or one for each, and clear messages for invalid masks."""
 
 from __future__ import annotations
 

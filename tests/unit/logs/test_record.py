@@ -1,4 +1,4 @@
-"""Recording: what is written is read back, and an interrupted recording is a shorter log."""
+"""Recording: frames are read back as written, and an interrupted recording is a shorter log."""
 
 from __future__ import annotations
 

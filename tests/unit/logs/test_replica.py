@@ -19,7 +19,7 @@ PARAMS = {"camera": {"w": 64, "h": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy":
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Four frames in `room0`, cam_params.json beside it as in the published archive."""
+    """Four frames in `room0`, cam_params.json next to it as in the published archive."""
     room = tmp_path / "room0"
     (room / "results").mkdir(parents=True)
     for i in range(4):

@@ -1,4 +1,4 @@
-"""The scenes: depth and poses exact everywhere, texture as promised, moving things where they are said to be."""
+"""Scenes: exact depth and poses, texture with corners where intended, and moving objects at their exact poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def synthetic(query: str) -> SyntheticLog:
 
 
 def world_points(log: SyntheticLog, index: int) -> NDArray[np.float64]:
-    """What frame ``index`` sees (N, 3) [m], in float64 and in the world."""
+    """Backproject frame ``index`` to world points (N, 3) [m] in float64."""
     frame, c = log[index], log.camera
     v, u = np.nonzero(frame.valid)
     z = frame.depth[v, u].astype(np.float64)
@@ -35,14 +35,14 @@ def world_points(log: SyntheticLog, index: int) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_two_frames_agree_on_where_a_point_is_to_10_micrometres(name: str) -> None:
-    """What one frame saw, the other's camera sees at that very place, unless something is in front of it."""
+    """A point of one frame is visible from the other camera at the same position, unless it is occluded."""
     log = synthetic(f"{name}?frames=60&{SIZE}")
     seen = world_points(log, 20)
     eye = log.ground_truth.T_world_camera[40, :3, 3]
     share = log.scene.reach(eye, seen - eye, float(log.ground_truth.stamps[40]))
     error = np.abs(share - 1.0) * np.linalg.norm(seen - eye, axis=1)
     clear = error < 1e-3
-    assert clear.mean() > 0.8  # the rest is hidden from there
+    assert clear.mean() > 0.8  # the others are occluded
     assert error[clear].max() < 1e-5
 
 
@@ -51,8 +51,8 @@ def test_every_scene_shows_depth_everywhere_on_every_path_that_fits() -> None:
         for path in kind.stage.paths or TRAJECTORIES:
             log = synthetic(f"{name}?trajectory={path}&frames=90&width=32&height=24")
             depth = np.stack([log[i].depth for i in range(0, 90, 10)])
-            assert depth[depth > 0].min() > 0.2, (name, path)  # no camera inside a thing
-            assert depth.max() < 13.1, (name, path)  # what 16 bits hold
+            assert depth[depth > 0].min() > 0.2, (name, path)  # no camera is inside of an object
+            assert depth.max() < 13.1, (name, path)  # the range of 16 bits
             assert np.mean(depth > 0) > 0.95, (name, path)
 
 

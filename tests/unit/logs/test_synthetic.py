@@ -38,7 +38,7 @@ def test_the_table_top_is_at_z_zero_in_the_true_world() -> None:
     for i in (0, 40, 119):
         points = transform_points(truth.T_world_camera[i], log.camera.backproject(log[i].depth)).reshape(-1, 3)
         above = points[(np.abs(points[:, :2]) < [0.59, 0.39]).all(axis=1) & (points[:, 2] > -0.5), 2]  # not the floor
-        assert np.mean(np.abs(above) < 2e-6) > 0.7  # the rest are the things on the table
+        assert np.mean(np.abs(above) < 2e-6) > 0.7  # the rest are the objects on the table
         assert above.min() > -2e-6
         assert 0.1 < above.max() < 0.15
 

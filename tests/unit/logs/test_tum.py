@@ -1,4 +1,4 @@
-"""TUM layout: what is read from a sound log."""
+"""TUM layout: reading of valid logs."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_a_free_running_sensor_drops_colour_without_depth_and_says_how_many(
     assert [frame.index for frame in log] == [0, 1, 2, 3, 4]
 
 
-def test_a_lockstep_log_may_be_told_to_skip(make_log: MakeLog, drop_line: Callable[[Path, int], str]) -> None:
+def test_a_synchronized_log_skips_on_request(make_log: MakeLog, drop_line: Callable[[Path, int], str]) -> None:
     folder = make_log(6)
     drop_line(folder / "depth.txt", 4)
     assert len(list(open_log(folder, missing="skip"))) == 5
@@ -180,7 +180,7 @@ def test_real_logs_open_whole(data_root: Path, name: str, frames: int, valid: fl
     assert last.index == frames - 1
 
 
-def test_an_unknown_folder_lists_what_was_looked_for(tmp_path: Path) -> None:
+def test_an_unknown_folder_lists_the_known_layouts(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"rgb\.txt.*traj\.txt.*synthetic:"):
         open_log(tmp_path)
     with pytest.raises(LogError, match="does not exist"):
