@@ -11,9 +11,9 @@ from typing import Any
 from splatbot.camera import Camera
 from splatbot.errors import SplatbotError
 from splatbot.frame import Frame
+from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of
-from splatbot.logs.tum import MAX_DIFFERENCE
 from splatbot.logs.undistort import Undistorter
 from splatbot.services.bus import Bus
 from splatbot.services.problems import BusyError
@@ -105,7 +105,7 @@ class FramePairs:
             return None
         stamp, other = seconds_of(message.header.stamp), self._waiting[DEPTH if topic == COLOR else COLOR]
         nearest = min(other, key=lambda known: abs(known - stamp), default=None)
-        if self._camera is None or nearest is None or abs(nearest - stamp) > MAX_DIFFERENCE:
+        if self._camera is None or nearest is None or abs(nearest - stamp) > MAX_STAMP_DIFFERENCE_S:
             self._waiting[topic][stamp] = message
             while len(self._waiting[topic]) > _WAITING:
                 self._waiting[topic].popitem(last=False)

@@ -18,7 +18,7 @@ _DIRECTION_STD_RAD = 0.25  # standard deviation of the random change of closing 
 _LEVEL_RAD = 0.05  # inclination below which a closing direction is horizontal
 _STEP_SIZES = (1.0, 0.5, 0.25)  # of the rounds of refinement
 _MIDPOINT_WEIGHT = 0.1  # weight of the contacts' midpoint relative to the lines along their normals
-_CHUNK = 64
+_LINES_PER_CHUNK = 64  # lines that are tested at once
 
 Array32 = NDArray[np.float32]
 
@@ -151,15 +151,15 @@ def _exits(surface: GraspSurface, origin: Array, closing: Array, cosine: float) 
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
     tube = _tube(surface)
     end, away = np.zeros_like(origin), np.full(len(origin), np.inf)
-    for k in range(0, len(origin), _CHUNK):
-        o, c = origin[k : k + _CHUNK].astype(np.float32), closing[k : k + _CHUNK].astype(np.float32)
+    for k in range(0, len(origin), _LINES_PER_CHUNK):
+        o, c = origin[k : k + _LINES_PER_CHUNK].astype(np.float32), closing[k : k + _LINES_PER_CHUNK].astype(np.float32)
         along = c @ p.T - np.einsum("ij,ij->i", c, o)[:, None]
         square = ((o**2).sum(axis=1)[:, None] - 2 * (o @ p.T)) + (p**2).sum(axis=1)[None]
         hit = (square - along**2 < tube) & (along > _MIN_WIDTH_M) & (c @ n.T > cosine)
         along[~hit] = np.inf
         nearest = along.argmin(axis=1)
-        away[k : k + _CHUNK] = along[np.arange(len(nearest)), nearest]
-        end[k : k + _CHUNK] = surface.points[nearest]
+        away[k : k + _LINES_PER_CHUNK] = along[np.arange(len(nearest)), nearest]
+        end[k : k + _LINES_PER_CHUNK] = surface.points[nearest]
     return end, away
 
 
@@ -237,15 +237,15 @@ def _plane(surface: GraspSurface, at: Array, out: Array) -> tuple[Array, Array, 
     trust = np.where(surface.observed, 1.0, _COMPLETED_WEIGHT).astype(np.float32)
     values = np.c_[surface.points, surface.normals, surface.observed, surface.normal_std]
     total, meets = np.zeros((len(at), values.shape[1] + 1)), np.zeros(len(at), np.bool_)
-    for k in range(0, len(at), _CHUNK):
-        a, o = at[k : k + _CHUNK].astype(np.float32), out[k : k + _CHUNK].astype(np.float32)
+    for k in range(0, len(at), _LINES_PER_CHUNK):
+        a, o = at[k : k + _LINES_PER_CHUNK].astype(np.float32), out[k : k + _LINES_PER_CHUNK].astype(np.float32)
         square = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + (p**2).sum(axis=1)[None]
         facing = o @ n.T > 0.3
         offset = square - (o @ p.T - np.einsum("ij,ij->i", o, a)[:, None]) ** 2
-        meets[k : k + _CHUNK] = (facing & (offset < tube) & (square < (2 * PAD) ** 2)).any(axis=1)
+        meets[k : k + _LINES_PER_CHUNK] = (facing & (offset < tube) & (square < (2 * PAD) ** 2)).any(axis=1)
         weight = trust * np.exp(np.minimum(-0.5 / PAD**2 * square, 0.0)) * facing
         weight[square > (2.5 * PAD) ** 2] = 0.0
-        total[k : k + _CHUNK] = np.c_[weight @ values.astype(np.float32), weight.sum(axis=1)]
+        total[k : k + _LINES_PER_CHUNK] = np.c_[weight @ values.astype(np.float32), weight.sum(axis=1)]
     count = np.maximum(total[:, -1:], 1e-9)
     mean = total[:, :-1] / count
     normal = _unit(mean[:, 3:6])

@@ -14,7 +14,7 @@ from splatbot.protocols import Array, HandShape
 MAX_PROTRUSION_M = 0.006  # of the target under a pad beyond the planned contact
 PAD_GAP_M = 0.003  # between each pad and the target during the approach
 OPENING_STEP_M = 0.002  # finger openings are rounded up to multiples of it
-_CHUNK = 32  # hands that are evaluated at once
+_HANDS_PER_CHUNK = 32  # hands that are evaluated at once
 _QUICK_POINTS = 250  # surface points of the quick palm test
 _COMPLETION_TOLERANCE_M = 0.003  # error of completed points, by which they are shrunk
 _CONTACT_TOLERANCE_M = 0.003  # distance between a pad and a surface point in contact
@@ -100,12 +100,12 @@ def palm_free(hands: Hands, surface: GraspSurface, hand: HandShape, *, retreat: 
     step = max(1, len(surface) // _QUICK_POINTS)
     p = (surface.points[::step] - surface.center).astype(np.float32)
     free = np.ones(len(hands), np.bool_)
-    for k in range(0, len(hands), 32 * _CHUNK):
-        T = hands.T[k : k + 32 * _CHUNK]
+    for k in range(0, len(hands), 32 * _HANDS_PER_CHUNK):
+        T = hands.T[k : k + 32 * _HANDS_PER_CHUNK]
         axes, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - surface.center).astype(np.float32)
         x, y, z = (axes[:, :, i] @ p.T - np.einsum("ij,ij->i", axes[:, :, i], at)[:, None] for i in range(3))
         across = (np.abs(x) < hand.palm_size[0] / 2) & (np.abs(y) < hand.palm_size[1] / 2)
-        free[k : k + 32 * _CHUNK] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(axis=1)
+        free[k : k + 32 * _HANDS_PER_CHUNK] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(axis=1)
     return free
 
 
@@ -139,17 +139,17 @@ def measure_hands(
     tolerance = np.where(surface.observed, 0.0, _COMPLETION_TOLERANCE_M).astype(np.float32)
     out = [np.empty(len(hands)) for _ in range(5)]
     half = (pairs.width[hands.pair] / 2).astype(np.float32)
-    for k in range(0, len(hands), _CHUNK):
-        T = hands.T[k : k + _CHUNK]
+    for k in range(0, len(hands), _HANDS_PER_CHUNK):
+        T = hands.T[k : k + _HANDS_PER_CHUNK]
         R, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - center).astype(np.float32)
         local, reach = [], []
         for i in range(3):
             u = np.ascontiguousarray(R[:, :, i])
             local.append(u @ p.T - np.einsum("ij,ij->i", u, at)[:, None])
             reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)) - tolerance)
-        found = _measured(local, reach, half[k : k + _CHUNK, None], hand, retreat)
+        found = _measured(local, reach, half[k : k + _HANDS_PER_CHUNK, None], hand, retreat)
         for into, values in zip(out, (*found, _closure(local, tolerance, hand, np.arctan(friction))), strict=True):
-            into[k : k + _CHUNK] = values
+            into[k : k + _HANDS_PER_CHUNK] = values
     opening, clearance, protrusion, coverage, closure = out
     return replace(
         hands, opening=opening, clearance=clearance, protrusion=protrusion, pad_coverage=coverage, closure=closure

@@ -20,7 +20,7 @@ from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 from splatbot.segmentation.faces import nearest_of
 
-_INSIDE_WINDING = 0.45  # winding number above which a point is inside of the observed surface
+_COMPLETION_WINDING = 0.45  # winding number above which a point is inside of the observed surface
 _FACING_COSINE = 0.7  # minimum cosine between a direction and the normals of a face that points in it
 _VISIBLE_COSINE = 0.1  # minimum cosine between a direction and the normals that are visible from it
 _SAME_FACE_COSINE = 0.7  # between normals of one face
@@ -88,7 +88,7 @@ def target_surface(
         kept = kept[~face.hides(points[kept], back)]
     winding = winding_numbers(points[kept], measured.points, measured.normals, areas, softened=_SPACING_M)
     evidence = evidence_at(points[kept], views)
-    kept = kept[(winding < _INSIDE_WINDING) & ~(evidence.seen_through & (evidence.passes >= _MIN_THROUGH_VIEWS))]
+    kept = kept[(winding < _COMPLETION_WINDING) & ~(evidence.seen_through & (evidence.passes >= _MIN_THROUGH_VIEWS))]
     kept = kept[~_inside(points[kept], normals[kept], tube=_TUBE_M * np.sqrt(every))]
     return GraspSurface(
         np.concatenate([measured.points, points[kept]]),

@@ -16,7 +16,7 @@ from splatbot.segmentation import SegmentedMap
 
 MAX_POINTS = 1800  # on a surface; more are subsampled
 _MIN_SUPPORT = 0.2  # observations of a Gaussian, as a fraction of the 90th percentile
-_SMOOTHING_M = 0.006  # standard deviation [m] of the kernel that averages normals
+SMOOTHING_M = 0.006  # standard deviation [m] of the kernel that averages normals
 _SMOOTHING_COSINE = 0.3  # minimum cosine between normals that are averaged
 _SHARP_COSINE = 0.8  # the same where edges stay sharp
 _MAX_AREA_RATIO = 4.0  # area of a point over the median; points above it are strays
@@ -126,10 +126,10 @@ def _smoothed(points: Array, normals: Array, flatness: Array, *, cosine: float) 
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
     weight = np.maximum(square[:, None] + square[None] - 2 * (p @ p.T), 0.0)
-    np.exp(weight * (-0.5 / _SMOOTHING_M**2), out=weight)
+    np.exp(weight * (-0.5 / SMOOTHING_M**2), out=weight)
     density = weight.sum(axis=1)
     weight *= n @ n.T > cosine
     weight *= np.maximum(flatness, 0.05).astype(np.float32)
     mean = (weight @ n).astype(np.float64)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    return mean, np.asarray(2 * np.pi * _SMOOTHING_M**2 / density, dtype=np.float64)
+    return mean, np.asarray(2 * np.pi * SMOOTHING_M**2 / density, dtype=np.float64)

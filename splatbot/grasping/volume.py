@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatbot.grasping.surface import SMOOTHING_M
 from splatbot.protocols import Array
 
 _MAX_VOLUME_POINTS = 800  # on the surface; more are subsampled
 _MAX_CELLS = 3000  # of the grid over the bounding box
 _INSIDE_WINDING = 0.5  # winding number above which a point is inside
 _MIN_CELLS = 30  # inside cells below which the surface encloses no volume
-_SMOOTHING_M = 0.006  # standard deviation of the kernel that estimates the density of points
 _SAME_SIDE_COSINE = 0.3  # between normals of points on the same side of a thin object
 
 
@@ -86,6 +86,6 @@ def _areas(points: Array, normals: Array) -> Array:
     """Estimate the area of each point (M,) [m²] from the kernel density of the points on its side."""
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
-    weight = np.exp(np.maximum(square[:, None] + square - 2 * (p @ p.T), 0.0) * (-0.5 / _SMOOTHING_M**2))
+    weight = np.exp(np.maximum(square[:, None] + square - 2 * (p @ p.T), 0.0) * (-0.5 / SMOOTHING_M**2))
     weight *= n @ n.T > _SAME_SIDE_COSINE
-    return np.asarray(2 * np.pi * _SMOOTHING_M**2 / weight.sum(axis=1), dtype=np.float64)
+    return np.asarray(2 * np.pi * SMOOTHING_M**2 / weight.sum(axis=1), dtype=np.float64)

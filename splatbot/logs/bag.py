@@ -20,7 +20,7 @@ from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration
-from splatbot.logs.index import associate
+from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
 from splatbot.logs.joints import interpolate_joints
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS, MASK, TRUTH
 from splatbot.logs.presets import find_calibration
@@ -35,7 +35,6 @@ from splatbot.logs.ros_frames import (
     seconds_of,
 )
 from splatbot.logs.ros_types import Message, typestore
-from splatbot.logs.tum import MAX_DIFFERENCE
 from splatbot.logs.undistort import Undistorter
 from splatbot.trajectory import Trajectory
 
@@ -226,10 +225,10 @@ class BagLog(LogBase):
     def _pair(self) -> list[tuple[_Entry, _Entry]]:
         colors, depths = self._index[self._color], self._index[self._depth]
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, depths))
-        pairs = [(colors[i], depths[j]) for i, j in associate(a, b, MAX_DIFFERENCE)]
+        pairs = [(colors[i], depths[j]) for i, j in associate(a, b, MAX_STAMP_DIFFERENCE_S)]
         if not pairs:
             raise LogError(
-                f"no stamp of {self._depth} is within {MAX_DIFFERENCE} s of one of {self._color}.",
+                f"no stamp of {self._depth} is within {MAX_STAMP_DIFFERENCE_S} s of one of {self._color}.",
                 file=self.path,
                 field="stamps",
                 hint="record both with the same clock",

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from splatbot.errors import LogError
 
+MAX_STAMP_DIFFERENCE_S = 0.02  # between associated images, as in TUM's associate.py
+
 
 @dataclass(frozen=True)
 class IndexEntry:

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from splatbot.errors import LogError
 from splatbot.logs.images import read_mask
-from splatbot.logs.index import IndexEntry, read_index
+from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, IndexEntry, read_index
 
 Mask = NDArray[np.bool_]
-
-MAX_DIFFERENCE = 0.02  # [s], as between colour and depth
 
 
 class MaskSource(Protocol):
@@ -51,9 +49,9 @@ class ListedMasks:
             LogError: no mask is within 0.02 s, or the mask cannot be read.
         """
         entry = self._nearest(stamp)
-        if abs(entry.stamp - stamp) > MAX_DIFFERENCE:
+        if abs(entry.stamp - stamp) > MAX_STAMP_DIFFERENCE_S:
             raise LogError(
-                f"no mask within {MAX_DIFFERENCE} s of stamp {stamp:.6f}.",
+                f"no mask within {MAX_STAMP_DIFFERENCE_S} s of stamp {stamp:.6f}.",
                 file=self._path,
                 field="stamps",
                 hint="list a mask for every image (white where it may be used), or give one `mask.png` for all",

@@ -16,7 +16,7 @@ from splatbot.frame import Frame
 from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration, read_calibration
 from splatbot.logs.effects import read_account
-from splatbot.logs.index import IndexEntry, associate, read_index
+from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, IndexEntry, associate, read_index
 from splatbot.logs.joints import find_joints
 from splatbot.logs.masks import find_masks
 from splatbot.logs.presets import PRESETS, find_calibration
@@ -25,7 +25,6 @@ from splatbot.trajectory import Trajectory
 
 Missing = Literal["auto", "error", "skip"]
 
-MAX_DIFFERENCE = 0.02  # [s], as TUM's associate.py
 _SYNCHRONIZED_S = 1e-3  # maximum difference of stamps between synchronized streams
 
 _log = logging.getLogger(__name__)
@@ -111,10 +110,10 @@ class TumLog(LogBase):
 
     def _pair(self, colors: list[IndexEntry]) -> dict[int, IndexEntry]:
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))
-        pairs = {i: self._depths[j] for i, j in associate(a, b, MAX_DIFFERENCE)}
+        pairs = {i: self._depths[j] for i, j in associate(a, b, MAX_STAMP_DIFFERENCE_S)}
         if not pairs:
             raise LogError(
-                f"no stamp is within {MAX_DIFFERENCE} s of one in rgb.txt (colour {a[0]:.3f}..{a[-1]:.3f} s, "
+                f"no stamp is within {MAX_STAMP_DIFFERENCE_S} s of one in rgb.txt (colour {a[0]:.3f}..{a[-1]:.3f} s, "
                 f"depth {b[0]:.3f}..{b[-1]:.3f} s).",
                 file=self.folder / "depth.txt",
                 field="stamps",
@@ -125,8 +124,8 @@ class TumLog(LogBase):
     def _no_partner(self, color: IndexEntry) -> LogError:
         before = [entry.line for entry in self._depths if entry.stamp < color.stamp]
         return LogError(
-            f"no depth image within {MAX_DIFFERENCE} s of stamp {color.stamp:.6f} ({color.path}, line {color.line} "
-            "of rgb.txt).",
+            f"no depth image within {MAX_STAMP_DIFFERENCE_S} s of stamp {color.stamp:.6f} "
+            f"({color.path}, line {color.line} of rgb.txt).",
             file=self.folder / "depth.txt",
             field=f"after line {before[-1]}" if before else "first line",
             hint="restore the line, remove that image from rgb.txt, or leave such frames out: --on-bad-frame skip",

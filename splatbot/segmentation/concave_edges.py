@@ -12,7 +12,7 @@ from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.faces import local_normals, nearest_of
 
 _PLANE_CANDIDATES = 150  # points whose tangent planes are scored
-_MAX_SAMPLE = 4000  # points on which inliers are counted
+_MAX_INLIER_SAMPLE = 4000  # points on which inliers are counted
 _MAX_PLANES = 16
 _MIN_PLANE_FRACTION = 0.01  # of the points that are inliers of a plane
 _INLIER_DISTANCE_M = 0.008
@@ -106,7 +106,7 @@ def _oriented(points: Array, observers: Array, rows: NDArray[np.int64], normal: 
 
 def _largest_plane(points: Array, normals: Array, rng: np.random.Generator) -> tuple[Array, float]:
     """Return the tangent plane with the most inliers among random points, refitted to its inliers."""
-    sample = rng.choice(len(points), min(len(points), _MAX_SAMPLE), replace=False)
+    sample = rng.choice(len(points), min(len(points), _MAX_INLIER_SAMPLE), replace=False)
     p, n = points[sample], normals[sample]
     candidates = [(n[k], float(p[k] @ n[k])) for k in range(min(_PLANE_CANDIDATES, len(p)))]
     plane = candidates[int(np.argmax([_inliers(some, p, n).sum() for some in candidates]))]

@@ -27,13 +27,13 @@ FEWEST, LARGEST = 40, 0.35  # minimum number of Gaussians of an object; maximum 
 _OBJECT_DISTANCE_M = 0.012  # minimum distance between objects
 _MIN_SUPPORT_EXTENT_M = 0.15  # of a cluster that may contain a support
 _MIN_SUPPORT_FRACTION = 0.1  # of a cluster's points that are on its support
-_MAX_PLANES = 3  # planes of a cluster that are tried as supports
+_MAX_SUPPORT_PLANES = 3  # planes of a cluster that are tried as supports
 _MAX_NESTED_SUPPORTS = 1  # supports on supports
 _SPACING_FACTOR = 2.2  # minimum object distance over the median size of the Gaussians, for coarse maps
 _SEED_MARGIN_M = 0.05  # around seeds, in which faces are searched
 _STRAY_DISTANCE_M = 0.006  # around an object, within which faint Gaussians belong to it
 _MIN_OVER_FRACTION = 0.7  # of the points above a support that are over its area
-_LEVEL_COSINE, _MIN_LEVEL_FRACTION = 0.8, 0.5  # between point normals and that of a support; of its points
+_MIN_SUPPORT_COSINE, _MIN_LEVEL_FRACTION = 0.8, 0.5  # between point normals and that of a support; of its points
 _MAX_NAME_DISTANCE_M = 0.05  # between a named place and its object
 
 
@@ -226,7 +226,7 @@ def _object_rows(
 def _nested_support(points: Array) -> Support | None:
     """Return the lowest of the three largest horizontal planes of a cluster (P, 3) with objects on it, or None."""
     left, best = np.ones(len(points), np.bool_), None
-    for _ in range(_MAX_PLANES):
+    for _ in range(_MAX_SUPPORT_PLANES):
         plane = find_support(points[left])
         if plane is None or plane.inside.sum() < _MIN_SUPPORT_FRACTION * len(points):
             break
@@ -243,7 +243,7 @@ def _level(plane: Support, points: Array, left: NDArray[np.bool_]) -> bool:
     """Return whether the inliers form a face along the plane, rather than an intersection of the plane with walls."""
     rows = np.flatnonzero(left)[plane.inside]
     normals = local_normals(points, rows[:: max(1, len(rows) // 300)])
-    return float((np.abs(normals @ plane.normal) > _LEVEL_COSINE).mean()) > _MIN_LEVEL_FRACTION
+    return float((np.abs(normals @ plane.normal) > _MIN_SUPPORT_COSINE).mean()) > _MIN_LEVEL_FRACTION
 
 
 def _holds(plane: Support, points: Array) -> bool:

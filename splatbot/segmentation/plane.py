@@ -11,7 +11,7 @@ from splatbot.protocols import Array
 
 NEAR = 0.01  # [m] maximum distance of an inlier from the plane
 _ITERATIONS = 300  # of RANSAC
-_MAX_SAMPLE = 5000  # points on which RANSAC counts inliers
+_MAX_RANSAC_SAMPLE = 5000  # points on which RANSAC counts inliers
 _MIN_UP_COSINE = np.cos(np.radians(15.0))  # between the normal of a support and up
 _MIN_INLIER_FRACTION = 0.05
 
@@ -58,7 +58,7 @@ def find_support(points: Array, *, seed: int = 0) -> Support | None:
     if len(points) < 20:
         return None
     rng = np.random.default_rng(seed)
-    sample = points[rng.choice(len(points), min(len(points), _MAX_SAMPLE), replace=False)]
+    sample = points[rng.choice(len(points), min(len(points), _MAX_RANSAC_SAMPLE), replace=False)]
     best, most = None, 0
     for _ in range(_ITERATIONS):
         a, b, c = sample[rng.choice(len(sample), 3, replace=False)]

@@ -11,7 +11,7 @@ CORRIDOR_STAGE = Stage(
     eye=(0.0, 0.6, 1.3), target=(0.0, 9.0, 1.3), ahead=7.0, paths=("forward", "handheld", "rotation", "steps")
 )
 
-_LENGTH, _WIDTH, _HEIGHT, _THICK = 10.0, 1.8, 2.5, 0.1
+_LENGTH, _WIDTH, _HEIGHT, _WALL_THICKNESS = 10.0, 1.8, 2.5, 0.1
 
 
 def corridor() -> RaycastScene:
@@ -21,18 +21,23 @@ def corridor() -> RaycastScene:
     ceiling = Texture((0.90, 0.90, 0.90), (0.74, 0.74, 0.72), 0.60, "checker")
     door = Texture((0.62, 0.44, 0.28), (0.42, 0.28, 0.16), 0.12, seed=23)
     sides = [
-        RaycastSurface(box([_THICK, _LENGTH, _HEIGHT]).placed([x * (_WIDTH + _THICK) / 2, _LENGTH / 2, 0.0]), plaster)
+        RaycastSurface(
+            box([_WALL_THICKNESS, _LENGTH, _HEIGHT]).placed([x * (_WIDTH + _WALL_THICKNESS) / 2, _LENGTH / 2, 0.0]),
+            plaster,
+        )
         for x in (-1, 1)
     ]
     ends = [
-        RaycastSurface(box([_WIDTH, _THICK, _HEIGHT]).placed([0.0, y, 0.0]), door)
-        for y in (-_THICK / 2, _LENGTH + _THICK / 2)
+        RaycastSurface(box([_WIDTH, _WALL_THICKNESS, _HEIGHT]).placed([0.0, y, 0.0]), door)
+        for y in (-_WALL_THICKNESS / 2, _LENGTH + _WALL_THICKNESS / 2)
     ]
     return RaycastScene(
         [
             *sides,
             *ends,
-            RaycastSurface(box([_WIDTH, _LENGTH, _THICK]).placed([0.0, _LENGTH / 2, -_THICK]), carpet),
-            RaycastSurface(box([_WIDTH, _LENGTH, _THICK]).placed([0.0, _LENGTH / 2, _HEIGHT]), ceiling),
+            RaycastSurface(
+                box([_WIDTH, _LENGTH, _WALL_THICKNESS]).placed([0.0, _LENGTH / 2, -_WALL_THICKNESS]), carpet
+            ),
+            RaycastSurface(box([_WIDTH, _LENGTH, _WALL_THICKNESS]).placed([0.0, _LENGTH / 2, _HEIGHT]), ceiling),
         ]
     )

@@ -11,7 +11,7 @@ ROOM_STAGE = Stage(
     eye=(0.0, -1.0, 1.30), target=(0.0, 1.4, 0.70), ahead=1.2, circuit_center=(0.0, 0.0, 1.30), circuit_radius=0.85
 )
 
-_X, _Y, _Z, _THICK = 5.0, 4.0, 2.6, 0.1
+_X, _Y, _Z, _WALL_THICKNESS = 5.0, 4.0, 2.6, 0.1
 
 
 def room() -> RaycastScene:
@@ -24,10 +24,16 @@ def _shell() -> list[RaycastSurface]:
     boards = Texture((0.66, 0.50, 0.34), (0.42, 0.30, 0.20), 0.16, seed=32)
     ceiling = Texture((0.92, 0.92, 0.90), (0.78, 0.78, 0.76), 0.50, "checker")
     return [
-        RaycastSurface(box([_X, _Y, _THICK]).placed([0, 0, -_THICK]), boards),
-        RaycastSurface(box([_X, _Y, _THICK]).placed([0, 0, _Z]), ceiling),
-        *(RaycastSurface(box([_X, _THICK, _Z]).placed([0, y * (_Y + _THICK) / 2, 0]), paper) for y in (-1, 1)),
-        *(RaycastSurface(box([_THICK, _Y, _Z]).placed([x * (_X + _THICK) / 2, 0, 0]), paper) for x in (-1, 1)),
+        RaycastSurface(box([_X, _Y, _WALL_THICKNESS]).placed([0, 0, -_WALL_THICKNESS]), boards),
+        RaycastSurface(box([_X, _Y, _WALL_THICKNESS]).placed([0, 0, _Z]), ceiling),
+        *(
+            RaycastSurface(box([_X, _WALL_THICKNESS, _Z]).placed([0, y * (_Y + _WALL_THICKNESS) / 2, 0]), paper)
+            for y in (-1, 1)
+        ),
+        *(
+            RaycastSurface(box([_WALL_THICKNESS, _Y, _Z]).placed([x * (_X + _WALL_THICKNESS) / 2, 0, 0]), paper)
+            for x in (-1, 1)
+        ),
     ]
 
 
