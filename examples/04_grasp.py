@@ -5,8 +5,8 @@ import numpy as np
 from splatbot import GaussianModel
 from splatbot.bench.tabletop import Block, Can, Tabletop
 from splatbot.grasping.affordance import NameHint, find_target
+from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.sampler import GraspSampler
-from splatbot.grasping.words import WordAffordance
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
 
@@ -24,7 +24,7 @@ model = GaussianModel.from_activated(
 
 scene = segment(model, np.eye(4))  # the robot base is the origin
 print(f"{len(scene.objects)} objects on {len(scene.supports)} support")
-target = find_target(NameHint("blue can"), scene, [WordAffordance()])
+target = find_target(NameHint("blue can"), scene, [LanguageAffordance()])
 print(f"target: {target.label}, {len(target.rows)} Gaussians, found by {target.backend}")
 
 result = GraspSampler(scene, panda()).sample(target)
