@@ -252,7 +252,7 @@ class Slam:
             stages = clock.ms["prepare"] + sum(estimate.stage_ms.values())
             if not self.config.mapping.threaded:  # with a thread, the submission is all that tracking waits for
                 stages += mapping_ms
-            self._tracker.note_rest(clock.total_ms - stages)
+            self._tracker.record_overhead(clock.total_ms - stages)
         return result
 
 

@@ -1,4 +1,4 @@
-"""Directions in which a frame says nothing of the camera's pose: along a corridor, across a blank wall."""
+"""Directions in which a frame does not constrain the pose, e.g. along a corridor or across a blank wall."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class WeakDirections:
     """Twists (t [m], ω [rad]) in the camera's frame that an alignment hardly constrains.
 
     Args:
-        strong: (6, 6) projection that takes the weak directions out of a twist.
-        direction: (3,) unit vector of the translation that is known the least.
-        ratio: information of the translation in that direction over that in the strongest.
+        strong: (6, 6) projection that removes the weak directions from a twist.
+        direction: (3,) unit vector of the translation with the least information.
+        ratio: information of the translation in that direction over that in the strongest one.
     """
 
     strong: Array
@@ -28,30 +28,38 @@ class WeakDirections:
 
     @property
     def reason(self) -> str:
-        """What to tell the user."""
+        """Message for the user."""
         x, y, z = self.direction
         return (
             f"translation is hardly constrained along ({x:+.2f}, {y:+.2f}, {z:+.2f}) of the camera "
-            f"(information ratio {self.ratio:.4f}): the prediction stands in"
+            f"(information ratio {self.ratio:.4f}): the prediction replaces it"
         )
 
-    def known_part(self, found: Alignment) -> Alignment:
-        """The alignment without what it claims of the weak directions: there it fits noise of the normals."""
+    def known_part(self, alignment: Alignment) -> Alignment:
+        """Remove the information in the weak directions, PᵀHP: there the alignment fits the noise of the normals."""
         P = self.strong
         return replace(
-            found,
-            information=P.T @ found.information @ P,
-            curvature=P.T @ found.curvature @ P,
-            spread=P.T @ found.spread @ P,
+            alignment,
+            information=P.T @ alignment.information @ P,
+            curvature=P.T @ alignment.curvature @ P,
+            spread=P.T @ alignment.spread @ P,
         )
 
 
 def weak_directions(information: Array, distance: float, min_ratio: float) -> WeakDirections | None:
-    """The weak directions of an information matrix (6, 6); None where the translation is constrained all around.
+    """Find the weak directions by the eigenvalues of the information (Zhang, Kaess and Singh 2016).
 
-    The test is on the translation block, whose eigenvalue ratio tells healthy frames from corridors and walls where the
-    ratio of the whole matrix does not. What is weak is then told by the whole matrix, with rotations scaled by the
-    typical ``distance`` [m] of the surfaces, so that both count by how far they move what is seen.
+    The test uses the translation block H_tt: λ_min(H_tt) ≤ ``min_ratio`` λ_max(H_tt). The ratio of the whole matrix
+    does not separate healthy frames from corridors and walls. The weak directions are then those eigenvectors of the
+    whole matrix, with rotations scaled by the distance, whose eigenvalue is at most ``min_ratio`` λ_max(H_tt).
+
+    Args:
+        information: (6, 6) of the twist (t [m], ω [rad]).
+        distance: typical distance [m] of the surfaces. It converts rotations to the motion of the surfaces.
+        min_ratio: smallest ratio of eigenvalues of a constrained direction.
+
+    Returns:
+        The weak directions, or None if the translation is constrained in all directions.
     """
     values, vectors = np.linalg.eigh(information[:3, :3])
     if values[0] > min_ratio * values[2]:

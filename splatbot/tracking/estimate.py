@@ -1,4 +1,4 @@
-"""What tracking says of one frame."""
+"""Result of tracking one frame."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.tracking.budget import Budget
 from splatbot.tracking.features import Features
 from splatbot.tracking.health import Health, Verdict
+from splatbot.tracking.hypothesis import ScoredHypothesis
 from splatbot.tracking.uncertainty import Uncertainty
 
 Array = NDArray[np.float64]
@@ -16,18 +18,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """Pose of one frame, who found it, and how much it is to be believed.
+    """Pose of one frame with its verdict and uncertainty.
 
     Args:
         T_world_camera: (4, 4); the world is the first camera.
-        verdict: "ok", "degraded" (tracked, with ``reasons`` to doubt it) or "lost".
-        reasons: what speaks against the pose, or was found wrong on the way to it.
-        stage: the stages that led to it.
-        uncertainty: of the pose; see :attr:`covariance`.
-        health: how well it explains the frame.
-        features: keypoints of the frame, where they were looked for.
+        verdict: "ok", "degraded" (tracked, with ``reasons`` for doubt) or "lost".
+        reasons: reasons for the verdict, and findings such as a rejected prior.
+        stage: stages that led to the pose.
+        uncertainty: uncertainty of the pose, see :attr:`covariance`.
+        health: agreement of the pose with the frame.
+        features: keypoints of the frame. If None, no stage has detected them.
         stage_ms: milliseconds by stage.
-        skipped: stages that there was no time for.
+        skipped: stages that did not fit the remaining time.
     """
 
     T_world_camera: Array
@@ -40,12 +42,29 @@ class PoseEstimate:
     stage_ms: dict[str, float] = field(default_factory=dict)
     skipped: tuple[str, ...] = ()
 
+    @classmethod
+    def create(
+        cls, pose: ScoredHypothesis, uncertainty: Uncertainty, features: Features | None, budget: Budget
+    ) -> PoseEstimate:
+        """Create the estimate from the best hypothesis and the time that was spent."""
+        return cls(
+            T_world_camera=pose.T_world_camera,
+            verdict=pose.verdict,
+            reasons=pose.reasons,
+            stage=pose.hypothesis.stage,
+            uncertainty=uncertainty,
+            health=pose.health,
+            features=features,
+            stage_ms=budget.ms,
+            skipped=tuple(budget.skipped),
+        )
+
     @property
     def covariance(self) -> Array:
-        """(6, 6) float64 of the twist ξ = (translation [m], rotation [rad]) in the camera's frame.
+        """Covariance (6, 6) float64 of the twist ξ = (translation [m], rotation [rad]) in the camera's frame.
 
         T_world_camera exp(ξ) is the true pose, where the first camera is the world. It grows along the chain of
-        keyframes. Meaningless where the verdict is "lost".
+        keyframes. It has no meaning if the verdict is "lost".
         """
         return self.uncertainty.covariance
 

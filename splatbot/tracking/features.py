@@ -1,4 +1,4 @@
-"""Sparse features: ORB keypoints with depth, and the pose from matching them with keyframes (PnP in RANSAC)."""
+"""ORB keypoints with depth, and the pose from their matches with keyframes by PnP in RANSAC."""
 
 from __future__ import annotations
 
@@ -17,17 +17,41 @@ from splatbot.tracking.prepare import Image
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# Minimal trust in a pose from features: fewer inliers than this, or a smaller share, happens by chance.
-MIN_INLIERS = 20
-_MAX_REPROJECTION = 3.0  # [px]
-_SCALE_FACTOR = 1.2  # from one level of ORB's pyramid to the next
-_MATCH_RATIO = 0.8  # Lowe's ratio test
-_MIN_SPREAD = 0.05  # standard deviation of matched pixels across their narrowest direction [image width]
-_TILES = 8  # across the image, that keypoints are spread over
-_CROWD = 2.0  # times its share of them that a tile has at most
-_TO_CHOOSE_FROM = 2  # times as many keypoints as are kept
-_PATCH = 31  # [px] that an ORB descriptor looks at on the finest level
-_MATCH_BITS = 64  # descriptors that differ in more of their 256 bits are strangers
+
+@dataclass(frozen=True)
+class FeatureParameters:
+    """Empirical constants of detection, matching and PnP."""
+
+    min_inliers: int = 20
+    """Number of inliers [1] below which a pose from features may be a coincidence."""
+    max_reprojection: float = 3.0
+    """Largest reprojection error [px] of an inlier. A larger one accepts wrong matches."""
+    scale_factor: float = 1.2
+    """Ratio [1] between levels of ORB's pyramid."""
+    fast_threshold: int = 10
+    """Grey difference [0..255] of a FAST corner. A smaller one detects noise in dark images."""
+    max_ratio: float = 0.8
+    """Largest ratio [1] of the best to the second best distance (Lowe 2004). A larger one adds ambiguous matches."""
+    min_spread: float = 0.05
+    """Smallest standard deviation [image width] of matched pixels along their narrowest direction. Matches in one
+    corner of the image hardly constrain the pose."""
+    tiles: int = 8
+    """Number of tiles [1] across the image for the distribution of keypoints."""
+    crowding: float = 2.0
+    """Largest share of keypoints in a tile, relative to its equal share [1]. A larger one concentrates them."""
+    oversampling: int = 2
+    """Number of detected keypoints per selected one [1]. More of them spread better and take longer."""
+    patch: int = 31
+    """Side [px] of the patch of an ORB descriptor on the finest level."""
+    max_hamming: int = 64
+    """Largest Hamming distance [bit of 256] of two descriptors that match."""
+    ransac_iterations: int = 500
+    """Largest number of RANSAC iterations [1]."""
+    ransac_confidence: float = 0.9999
+    """Probability [1] that RANSAC finds a sample without outliers."""
+
+
+PARAMETERS = FeatureParameters()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +61,9 @@ class Features:
     Args:
         pixels: (N, 2).
         descriptors: (N, 32) uint8.
-        points: (N, 3) [m] in the camera frame, NaN where there is no depth.
-        scales: (N,) size [px] of a pixel of the pyramid's level that each was found on: it is placed that much worse.
+        points: (N, 3) [m] in the camera frame, NaN without depth.
+        scales: (N,) size [px] of a pixel of the pyramid level on which each keypoint was detected. The standard
+            deviation of the keypoint is proportional to it.
     """
 
     pixels: NDArray[np.float32]
@@ -48,7 +73,7 @@ class Features:
 
     @classmethod
     def none(cls) -> Features:
-        """Those of an image without any."""
+        """Return an empty set of keypoints."""
         return cls(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3)), np.zeros(0, np.float32))
 
     def __len__(self) -> int:
@@ -57,13 +82,14 @@ class Features:
 
 @dataclass(frozen=True)
 class FeaturePose:
-    """T_world_camera (4, 4) from features, and the matches that agree with it.
+    """Pose from features with its inlier matches.
 
     Args:
+        T_world_camera: (4, 4).
         points: (M, 3) [m], world frame.
         pixels: (M, 2).
-        sigmas: (M,) of the pixels [px].
-        matches: how many there were.
+        sigmas: (M,) standard deviations of the pixels [px].
+        matches: number of matches with outliers.
     """
 
     T_world_camera: Array
@@ -76,17 +102,27 @@ class FeaturePose:
 def detect(
     rgb: NDArray[np.uint8], depth: Image, camera: Camera, n_features: int, mask: NDArray[np.bool_] | None = None
 ) -> Features:
-    """ORB keypoints of an image, with 3-D points where a depth of the same surface lies within two pixels.
+    """Detect ORB keypoints (Rublee et al. 2011), with 3-D points if depth of the same surface lies within two pixels.
 
-    They are spread over the image, see :func:`spread`. None is nearer to a pixel that ``mask`` (H, W) leaves out than
-    its descriptor reaches.
+    The keypoints are distributed over the image, see :func:`spread`. No descriptor on the finest level reaches a masked
+    pixel.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) [m], 0 if missing.
+        camera: camera of the image.
+        n_features: largest number of keypoints.
+        mask: (H, W), False for pixels to ignore. If None, all pixels are used.
     """
+    p = PARAMETERS
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     usable = None
     if mask is not None:
-        gray[~mask] = 128  # coarse levels of ORB's pyramid reach further than the margin: let them see nothing there
-        usable = cv2.erode(mask.astype(np.uint8), np.ones((_PATCH, _PATCH), np.uint8))
-    orb = cv2.ORB.create(nfeatures=_TO_CHOOSE_FROM * n_features, scaleFactor=_SCALE_FACTOR, fastThreshold=10)
+        gray[~mask] = 128  # descriptors on coarse levels reach further than the eroded margin
+        usable = cv2.erode(mask.astype(np.uint8), np.ones((p.patch, p.patch), np.uint8))
+    orb = cv2.ORB.create(
+        nfeatures=p.oversampling * n_features, scaleFactor=p.scale_factor, fastThreshold=p.fast_threshold
+    )
     found = orb.detect(gray, usable)
     if not found:
         return Features.none()
@@ -105,9 +141,9 @@ def detect(
 
 
 def _pixels(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where keypoints are in the image (N, 2), and the scales (N,) of their levels."""
-    scales = np.float32(_SCALE_FACTOR) ** np.array([k.octave for k in keypoints], dtype=np.float32)
-    # OpenCV scales a level's coordinates about the corner pixel's centre, the level itself is scaled about its corner.
+    """Return the pixels (N, 2) of keypoints and the scales (N,) of their levels."""
+    scales = np.float32(PARAMETERS.scale_factor) ** np.array([k.octave for k in keypoints], dtype=np.float32)
+    # OpenCV scales the coordinates of a level about the centre of the corner pixel, but the level about its corner.
     corners = np.array(cv2.KeyPoint.convert(keypoints), dtype=np.float32).reshape(-1, 2)
     return corners + 0.5 * (scales[:, None] - 1), scales
 
@@ -119,18 +155,23 @@ def spread(
     width: int,
     count: int,
 ) -> Index:
-    """Indices of at most ``count`` keypoints at pixels (N, 2): the strongest that are not more than a tile's part.
+    """Select keypoints that are distributed over the image (Mur-Artal et al. 2015, sec. V-A), and return their indices.
 
-    A tile has at most ``_CROWD`` times its share while others have some left. Those ``known`` (N,), whose depth is,
-    come first: only they anchor a pose.
+    The strongest keypoints often lie on one textured object. There, a rotation and a translation of the camera cause
+    similar motions of pixels, and so does a rolling shutter. Their small common errors become centimetres of the pose.
+    So a tile has at most ``PARAMETERS.crowding`` times its share while other tiles have keypoints left.
 
-    The strongest of all are often together on one textured thing. There a turn and a shift of the camera look alike,
-    and so does a shutter that rolls while it moves, which stretches the image: small errors of all of them become
-    centimetres of the pose. Every part of the image together tells these apart (Mur-Artal et al. 2015, sec. V-A).
+    Args:
+        pixels: (N, 2).
+        strengths: (N,) detector responses.
+        known: (N,) True if the keypoint has depth. These come first, because only they constrain a pose in the map.
+        width: width of the image [px].
+        count: largest number of keypoints.
     """
-    across, down = (pixels * (_TILES / width)).astype(np.intp).T
-    tile = down * (_TILES + 1) + across
-    crowd = max(1, int(_CROWD * count / max(len(np.unique(tile)), 1)))
+    p = PARAMETERS
+    across, down = (pixels * (p.tiles / width)).astype(np.intp).T
+    tile = down * (p.tiles + 1) + across
+    crowd = max(1, int(p.crowding * count / max(len(np.unique(tile)), 1)))
     order = np.lexsort((-strengths, ~known, tile))
     begins = np.r_[0, np.flatnonzero(np.diff(tile[order])) + 1]
     rank = np.empty(len(order), np.intp)
@@ -140,7 +181,12 @@ def spread(
 
 @dataclass(frozen=True)
 class Expectation:
-    """Where a frame should be, T_world_camera (4, 4), and how far its features may lie from there: ``radius`` [px]."""
+    """Expected pose of a frame.
+
+    Args:
+        T_world_camera: (4, 4).
+        radius: largest distance [px] of a feature from its pixel at this pose.
+    """
 
     T_world_camera: Array
     radius: float
@@ -152,14 +198,53 @@ def match_pose(
     camera: Camera,
     expected: Expectation | None = None,
 ) -> FeaturePose | None:
-    """Pose of ``current`` from 2D-3D matches with keyframes given as (features, T_world_camera).
+    """Estimate the pose of a frame from 2D-3D matches with keyframes.
 
-    A keyframe's points are looked for near to where they are expected, or everywhere. Then P3P in RANSAC (Gao et al.
-    2003) and Levenberg-Marquardt on the inliers; OpenCV's RANSAC is seeded alike on every call, so the result is
-    repeatable. None when too few matches agree. Near to an expectation, also None when those that do pile up at the
-    edge of the search, or in one corner of the image: it was wrong, and what was found is a choice that agrees with it.
+    P3P in RANSAC (Gao et al. 2003; Fischler and Bolles 1981) selects the inliers. Levenberg-Marquardt then minimises
+    their reprojection error Σ ‖π(T X_j) - u_j‖². OpenCV seeds its RANSAC with the same number in each call, so the
+    result is repeatable.
+
+    Args:
+        current: keypoints of the frame.
+        keyframes: features and T_world_camera (4, 4) of each keyframe.
+        camera: camera of the frame.
+        expected: expected pose, near whose pixels the points are searched for. If None, the whole image is searched.
+
+    Returns:
+        The pose, or None if too few matches agree. With an expected pose, the inliers must not accumulate at the border
+        of the search or in one corner of the image. Such inliers indicate a wrong expectation.
     """
-    pixels, points, sigmas = [], [], []
+    image, world, sigmas = _matches(current, keyframes, camera, expected)
+    if len(image) < PARAMETERS.min_inliers:
+        return None
+    found, r, t, inliers = cv2.solvePnPRansac(
+        world,
+        image,
+        camera.K,
+        None,
+        iterationsCount=PARAMETERS.ransac_iterations,
+        reprojectionError=PARAMETERS.max_reprojection,
+        confidence=PARAMETERS.ransac_confidence,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    if not found or inliers is None or len(inliers) < PARAMETERS.min_inliers:
+        return None
+    agree = inliers[:, 0]
+    r, t = cv2.solvePnPRefineLM(world[agree], image[agree], camera.K, None, r, t)
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3] = cv2.Rodrigues(r)[0]
+    T_camera_world[:3, 3] = t[:, 0]
+    if not np.isfinite(T_camera_world).all():
+        return None
+    pose = FeaturePose(inverse(T_camera_world), world[agree], image[agree], sigmas[agree], len(image))
+    return pose if expected is None or _confirms(pose, camera, expected) else None
+
+
+def _matches(
+    current: Features, keyframes: Sequence[tuple[Features, Array]], camera: Camera, expected: Expectation | None
+) -> tuple[Array, Array, Array]:
+    """Match features with keyframes, and return pixels (M, 2), world points (M, 3) and σ (M,) [px] of the matches."""
+    pixels, points, sigmas = [np.zeros((0, 2), np.float32)], [np.zeros((0, 3))], [np.zeros(0, np.float32)]
     for features, T_world_keyframe in keyframes:
         anchored = np.flatnonzero(np.isfinite(features.points[:, 2]))
         world = transform_points(T_world_keyframe, features.points[anchored])
@@ -174,59 +259,24 @@ def match_pose(
         pixels.append(current.pixels[query])
         points.append(world[train])
         sigmas.append(np.maximum(current.scales[query], features.scales[anchored[train]]))
-    if not pixels:
-        return None
-    found = _pose_from_matches(
-        np.concatenate(pixels).astype(np.float64),
-        np.concatenate(points),
-        np.concatenate(sigmas).astype(np.float64),
-        camera,
-    )
-    if found is None or expected is None:
-        return found
-    return found if _is_believable(found, camera, expected) else None
+    return np.concatenate(pixels).astype(np.float64), np.concatenate(points), np.concatenate(sigmas).astype(np.float64)
 
 
-def _is_believable(found: FeaturePose, camera: Camera, expected: Expectation) -> bool:
-    """Whether a pose from a search near to an expectation is more than a choice that agrees with it."""
+def _confirms(found: FeaturePose, camera: Camera, expected: Expectation) -> bool:
+    """Return True if the inliers lie inside the search radius and are distributed over the image."""
     shift = camera.project(transform_points(inverse(expected.T_world_camera), found.points)) - found.pixels
     inside = np.percentile(np.linalg.norm(shift, axis=1), 80) < 0.5 * expected.radius
     narrowest = np.sqrt(max(np.linalg.eigvalsh(np.cov(found.pixels.T))[0], 0.0))
-    return bool(inside and narrowest > _MIN_SPREAD * camera.width)
+    return bool(inside and narrowest > PARAMETERS.min_spread * camera.width)
 
 
 def _match(
     current: Features, descriptors: NDArray[np.uint8], expected: NDArray[np.float32], radius: float
 ) -> tuple[Index, Index]:
-    """Indices of current keypoints, and of those expected at pixels (M, 2) with descriptors (M, 32) that they match."""
+    """Match descriptors (M, 32) expected at pixels (M, 2), and return indices of keypoints and of descriptors."""
+    p = PARAMETERS
     found = _native.match_near(
-        expected, descriptors, current.pixels, current.descriptors, radius, _MATCH_BITS, _MATCH_RATIO
+        expected, descriptors, current.pixels, current.descriptors, radius, p.max_hamming, p.max_ratio
     )
     train = np.flatnonzero(found >= 0)
     return found[train].astype(np.intp), train
-
-
-def _pose_from_matches(image: Array, world: Array, sigmas: Array, camera: Camera) -> FeaturePose | None:
-    """PnP of pixels (M, 2), σ (M,), and points (M, 3)."""
-    if len(image) < MIN_INLIERS:
-        return None
-    found, r, t, inliers = cv2.solvePnPRansac(
-        world,
-        image,
-        camera.K,
-        None,
-        iterationsCount=500,
-        reprojectionError=_MAX_REPROJECTION,
-        confidence=0.9999,
-        flags=cv2.SOLVEPNP_P3P,
-    )
-    if not found or inliers is None or len(inliers) < MIN_INLIERS:
-        return None
-    agree = inliers[:, 0]
-    r, t = cv2.solvePnPRefineLM(world[agree], image[agree], camera.K, None, r, t)
-    T_camera_world = np.eye(4)
-    T_camera_world[:3, :3] = cv2.Rodrigues(r)[0]
-    T_camera_world[:3, 3] = t[:, 0]
-    if not np.isfinite(T_camera_world).all():
-        return None
-    return FeaturePose(inverse(T_camera_world), world[agree], image[agree], sigmas[agree], len(image))

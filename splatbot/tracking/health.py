@@ -1,4 +1,4 @@
-"""Is this pose to be believed? A score to choose between candidates and a verdict with reasons."""
+"""Health of a pose: a score to select the best hypothesis, and a verdict with reasons."""
 
 from __future__ import annotations
 
@@ -19,31 +19,43 @@ from splatbot.tracking.reference import Reference
 Array = NDArray[np.float64]
 Verdict = Literal["ok", "degraded", "lost"]
 
-_SATURATION = 6.0  # a residual of this many σ, or none at all, counts as an outlier
-_INLIER = 3.0  # [σ]
-# A frame of less contrast than this share of the reference's shows nothing: a covered lens, the dark, a lost image. The
-# exposure fit would explain it by a gain near 0, at any pose.
-_MIN_CONTRAST = 0.1
-# On a table, or before a wall, depth agrees wherever the camera slides along it; colour does not. Nor does most of
-# what has little texture disagree, so what counts is where grey is steep.
-_FEW_PHOTOMETRIC = 0.55
-_FEW_EDGES = 0.5
-# With fewer inliers of any kind, another pose may explain the frame better.
-_EXPLAINED = 0.6
+
+@dataclass(frozen=True)
+class HealthParameters:
+    """Empirical thresholds of the verdict."""
+
+    saturation: float = 6.0
+    """Largest residual [σ] in the score. A missing residual has this value too."""
+    inlier: float = 3.0
+    """Largest residual [σ] of an inlier. A larger value accepts more wrong poses."""
+    min_contrast: float = 0.1
+    """Share [1] of the reference's contrast below which an image is blank: a covered lens, or darkness. The exposure
+    fit would explain such an image at any pose by a gain of almost 0."""
+    min_photometric: float = 0.55
+    """Share [1] of photometric inliers below which a pose is degraded. On a plane, depth agrees at any pose
+    along it."""
+    min_edge: float = 0.5
+    """Share [1] of photometric inliers, weighted by the gradient, below which a pose is degraded. Pixels without
+    texture agree at most poses."""
+    explained: float = 0.6
+    """Share [1] of inliers of each kind from which no other pose is searched for."""
+
+
+PARAMETERS = HealthParameters()
 
 
 @dataclass(frozen=True)
 class Health:
-    """How well a pose explains the frame.
+    """Agreement of a pose with the frame.
 
     Args:
-        overlap: share of the reference points that the frame sees, by colour or depth.
-        photometric_inliers: share of those whose grey agrees within 3 σ.
-        edge_inliers: the same, each point weighed by how steep grey is there; 1 where it is nowhere steep.
-        geometric_inliers: share of those with depth whose depth agrees within 3 σ; 1 where none has depth.
-        score: mean residual [σ], saturated; smaller is better, comparable between poses of one frame.
-        contrast: standard deviation of the frame's grey at those points over that of the reference's; 1 where the
-            reference has none.
+        overlap: share of the reference points that the frame observes, by colour or depth.
+        photometric_inliers: share of them whose grey agrees within 3 σ.
+        edge_inliers: the same share, with each point weighted by its gradient of grey. It is 1 without gradients.
+        geometric_inliers: share of the points with depth whose depth agrees within 3 σ. It is 1 without depth.
+        score: mean saturated residual [σ]. Smaller is better. It is comparable between poses of one frame.
+        contrast: standard deviation of the frame's grey at the points, relative to that of the reference. It is 1 if
+            the reference has a single grey.
     """
 
     overlap: float
@@ -55,14 +67,23 @@ class Health:
 
 
 def is_explained(health: Health) -> bool:
-    """Whether a pose explains the frame so well that no other need be looked for."""
-    return min(health.photometric_inliers, health.edge_inliers, health.geometric_inliers) >= _EXPLAINED
+    """Return True if a pose explains the frame, so that no other pose is searched for."""
+    inliers = min(health.photometric_inliers, health.edge_inliers, health.geometric_inliers)
+    return inliers >= PARAMETERS.explained
 
 
 def measure(
     level: Level, index: int, references: Sequence[Reference], T_world_camera: Array, config: TrackingConfig
 ) -> Health:
-    """Score a pose of a frame against references on one level; only exposure is fitted."""
+    """Measure the health of a pose against references on one level, with the exposure fitted to each of them.
+
+    Args:
+        level: level of the frame's pyramid.
+        index: index of this level.
+        references: sampled pixels of the keyframes.
+        T_world_camera: (4, 4).
+        config: settings of tracking.
+    """
     T_camera_world = inverse(T_world_camera)
     photo, depth, slope, here, there = [], [], [], [], []
     for reference in references:
@@ -76,23 +97,23 @@ def measure(
         here.append(found.photometric[seen] * config.sensor.sigma_gray + found.gain * there[-1] + found.offset)
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)
     seen, ranged = np.isfinite(r_photo), np.isfinite(r_depth)
-    agree, steep = r_photo[seen] < _INLIER, np.concatenate(slope)[seen].astype(np.float64)
+    agree, steep = r_photo[seen] < PARAMETERS.inlier, np.concatenate(slope)[seen].astype(np.float64)
     return Health(
         overlap=float(seen.mean()) if len(seen) else 0.0,
         photometric_inliers=float(agree.mean()) if len(agree) else 0.0,
         edge_inliers=float(steep @ agree / steep.sum()) if steep.sum() > 0 else 1.0,
-        geometric_inliers=float((r_depth[ranged] < _INLIER).mean()) if ranged.any() else 1.0,
-        score=float(np.mean([_saturated(r_photo), _saturated(r_depth)])) if len(seen) else _SATURATION,
+        geometric_inliers=float((r_depth[ranged] < PARAMETERS.inlier).mean()) if ranged.any() else 1.0,
+        score=float(np.mean([_saturated(r_photo), _saturated(r_depth)])) if len(seen) else PARAMETERS.saturation,
         contrast=_contrast(np.concatenate(here), np.concatenate(there)),
     )
 
 
 def _saturated(residuals: NDArray[np.floating[Any]]) -> float:
-    return float(np.fmin(residuals, _SATURATION).mean())  # NaN, too, is saturated
+    return float(np.fmin(residuals, PARAMETERS.saturation).mean())  # fmin replaces NaN by the saturation
 
 
 def _contrast(gray: Array, reference_gray: Array) -> float:
-    """Ratio of the standard deviations of grey values (N,); 1 where the reference is of one colour."""
+    """Compute the ratio of the standard deviations of grey values (N,), or 1 if the reference has a single grey."""
     spread = float(reference_gray.std()) if len(reference_gray) else 0.0
     return float(gray.std()) / spread if spread > 1e-6 else 1.0
 
@@ -100,19 +121,26 @@ def _contrast(gray: Array, reference_gray: Array) -> float:
 def verdict_of(
     health: Health, information: Array, weak: WeakDirections | None, config: TrackingConfig
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """The verdict and what speaks against a pose that was found with an information matrix (6, 6)."""
+    """Return the verdict of a pose and its reasons.
+
+    Args:
+        health: agreement of the pose with the frame.
+        information: (6, 6) of the alignment.
+        weak: directions that the frame does not constrain. If None, it constrains all of them.
+        config: settings of tracking.
+    """
     lost, doubts = [], []
-    # Comparisons are written so that NaN speaks against the pose.
+    # The negated comparisons are True for NaN.
     if not health.overlap >= config.min_overlap:
         lost.append(f"only {health.overlap:.0%} of the reference is seen")
     inliers = float(np.min([health.photometric_inliers, health.geometric_inliers]))
     if not inliers >= config.min_inliers:
         lost.append(f"only {inliers:.0%} of the residuals are inliers")
-    if not health.contrast >= _MIN_CONTRAST:
+    if not health.contrast >= PARAMETERS.min_contrast:
         lost.append(f"the image is blank: {health.contrast:.0%} of the reference's contrast")
-    if not health.photometric_inliers >= _FEW_PHOTOMETRIC:
+    if not health.photometric_inliers >= PARAMETERS.min_photometric:
         doubts.append(f"only {health.photometric_inliers:.0%} of the colours agree")
-    elif not health.edge_inliers >= _FEW_EDGES:
+    elif not health.edge_inliers >= PARAMETERS.min_edge:
         doubts.append(f"only {health.edge_inliers:.0%} of the colours agree where there are edges")
     if not np.isfinite(information).all():
         lost.append("the alignment is not finite")

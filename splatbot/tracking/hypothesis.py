@@ -1,4 +1,4 @@
-"""A pose that some stages propose, and what the health check makes of it."""
+"""Pose hypotheses that tracking stages propose, and their scores."""
 
 from __future__ import annotations
 
@@ -19,36 +19,57 @@ from splatbot.tracking.uncertainty import alignment_covariance
 
 Array = NDArray[np.float64]
 
+_REFINED = "+direct"
+
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """A pose, the stages that led to it, and the keyframes that it was aligned to."""
+class Hypothesis:
+    """A pose of the frame that a tracking stage proposes.
+
+    Args:
+        stage: names of the stages that led to the pose, joined by "+".
+        alignment: the pose with the information of the last alignment.
+        keyframes: keyframes that the frame is aligned to.
+    """
 
     stage: str
-    found: Alignment
-    views: Sequence[TrackedKeyframe]
+    alignment: Alignment
+    keyframes: Sequence[TrackedKeyframe]
 
     @property
     def T_world_camera(self) -> Array:
-        """(4, 4)."""
-        return self.found.T_world_camera
+        """Pose (4, 4)."""
+        return self.alignment.T_world_camera
 
     @property
     def references(self) -> list[Reference]:
-        """What it was aligned to."""
-        return [view.reference for view in self.views]
+        """Sampled pixels of the keyframes."""
+        return [keyframe.reference for keyframe in self.keyframes]
+
+    @property
+    def is_refined(self) -> bool:
+        """True if the direct stage has refined the pose."""
+        return self.stage.endswith(_REFINED)
+
+    def refined(self, alignment: Alignment) -> Hypothesis:
+        """Return the hypothesis with the pose of the direct stage."""
+        return replace(self, stage=self.stage + _REFINED, alignment=alignment)
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredHypothesis:
-    """A candidate after the health check.
+    """A hypothesis with its health, verdict and covariance.
 
     Args:
-        weak: directions that the frame says nothing of; None where there are none.
+        hypothesis: the pose hypothesis.
+        health: agreement of the pose with the frame.
+        verdict: "ok", "degraded" or "lost".
+        reasons: reasons for a verdict other than "ok".
+        weak: directions that the frame does not constrain. If None, it constrains all of them.
         covariance: (6, 6) of the pose against its keyframes, in the camera's frame.
     """
 
-    candidate: Candidate
+    hypothesis: Hypothesis
     health: Health
     verdict: Verdict
     reasons: tuple[str, ...]
@@ -57,35 +78,35 @@ class ScoredHypothesis:
 
     @property
     def T_world_camera(self) -> Array:
-        """(4, 4)."""
-        return self.candidate.T_world_camera
+        """Pose (4, 4)."""
+        return self.hypothesis.T_world_camera
 
-    def corrected(self, T_world_camera: Array, covariance: Array) -> ScoredHypothesis:
-        """The same with a pose and covariance that more than the frame speaks for."""
-        candidate = replace(self.candidate, found=self.candidate.found.at(T_world_camera))
-        return replace(self, candidate=candidate, covariance=covariance)
+    def with_pose(self, T_world_camera: Array, covariance: Array) -> ScoredHypothesis:
+        """Replace the pose (4, 4) and its covariance (6, 6), e.g. after fusion with a prior."""
+        hypothesis = replace(self.hypothesis, alignment=self.hypothesis.alignment.at(T_world_camera))
+        return replace(self, hypothesis=hypothesis, covariance=covariance)
 
-    def noted(self, *reasons: str) -> ScoredHypothesis:
-        """The same with more reasons."""
+    def with_reasons(self, *reasons: str) -> ScoredHypothesis:
+        """Append reasons to those of the verdict."""
         return replace(self, reasons=self.reasons + reasons)
 
-    def doubted(self, reason: str) -> ScoredHypothesis:
-        """The same, "degraded" at best, for a reason."""
-        return replace(self.noted(reason), verdict="degraded" if self.verdict == "ok" else self.verdict)
+    def degraded(self, reason: str) -> ScoredHypothesis:
+        """Lower the verdict "ok" to "degraded" and append the reason."""
+        return replace(self.with_reasons(reason), verdict="degraded" if self.verdict == "ok" else self.verdict)
 
 
-def score(prepared: PreparedFrame, candidate: Candidate, config: TrackingConfig) -> Health:
-    """How well a candidate explains the frame, on the second finest level."""
+def measure_hypothesis(prepared: PreparedFrame, hypothesis: Hypothesis, config: TrackingConfig) -> Health:
+    """Measure the health of a hypothesis on the second finest pyramid level."""
     index = min(1, len(prepared.levels) - 1)
-    return measure(prepared.levels[index], index, candidate.references, candidate.T_world_camera, config)
+    return measure(prepared.levels[index], index, hypothesis.references, hypothesis.T_world_camera, config)
 
 
-def judge(prepared: PreparedFrame, candidates: Sequence[Candidate], config: TrackingConfig) -> ScoredHypothesis:
-    """The candidate that explains the frame best, with its verdict and covariance."""
-    scored = [(candidate, score(prepared, candidate, config)) for candidate in candidates]
+def select_best(prepared: PreparedFrame, hypotheses: Sequence[Hypothesis], config: TrackingConfig) -> ScoredHypothesis:
+    """Return the hypothesis with the smallest mean residual, with its verdict and covariance."""
+    scored = [(hypothesis, measure_hypothesis(prepared, hypothesis, config)) for hypothesis in hypotheses]
     best, health = min(scored, key=lambda pair: pair[1].score)
-    weak = None
-    if np.isfinite(best.found.information).all():
-        weak = weak_directions(best.found.information, typical_depth(prepared), config.min_eigen_ratio)
-    verdict, reasons = verdict_of(health, best.found.information, weak, config)
-    return ScoredHypothesis(best, health, verdict, reasons, weak, alignment_covariance(best.found))
+    information, weak = best.alignment.information, None
+    if np.isfinite(information).all():
+        weak = weak_directions(information, typical_depth(prepared), config.min_eigen_ratio)
+    verdict, reasons = verdict_of(health, information, weak, config)
+    return ScoredHypothesis(best, health, verdict, reasons, weak, alignment_covariance(best.alignment))

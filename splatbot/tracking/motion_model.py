@@ -1,4 +1,4 @@
-"""Where the camera should be before the frame is looked at."""
+"""Prediction of the camera pose before the frame is aligned."""
 
 from __future__ import annotations
 
@@ -12,17 +12,36 @@ from splatbot.geometry import adjoint, inverse, se3_exp, se3_log
 
 Array = NDArray[np.float64]
 
-# How far a camera strays from constant velocity in a time dt: rest + half the predicted motion + acceleration dt²/2.
-_REST = 5e-3  # [m] and [rad]
-_ACCELERATION = 2.0  # [m/s²]
-_ANGULAR_ACCELERATION = 4.0  # [rad/s²]
+
+@dataclass(frozen=True)
+class MotionModelParameters:
+    """Empirical constants of the constant-velocity model.
+
+    The standard deviation of the predicted translation is ``rest + |predicted motion| / 2 + acceleration dt² / 2``,
+    and that of the rotation likewise. Larger values let alignment move the pose further from the prediction.
+    """
+
+    rest: float = 5e-3
+    """Standard deviation [m] and [rad] of a camera that does not move."""
+    acceleration: float = 2.0
+    """Unmodelled acceleration [m/s²]."""
+    angular_acceleration: float = 4.0
+    """Unmodelled angular acceleration [rad/s²]."""
+    max_gap: float = 3.0
+    """Gap between frames, in previous intervals [1], after which the velocity is no longer used."""
+
+
+PARAMETERS = MotionModelParameters()
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """T_world_camera (4, 4) expected, and the covariance (6, 6) of its twist (t [m], ω [rad]) in the camera's frame.
+    """Predicted pose: the motion prior of the constant-velocity model, or the robot prior of a frame.
 
-    ``absolute`` says that it is known against the world, and not against the frame before.
+    Args:
+        T_world_camera: (4, 4).
+        covariance: (6, 6) of the twist (t [m], ω [rad]) in the camera's frame.
+        absolute: True if the pose is known in the world. If False, it is relative to the previous frame.
     """
 
     T_world_camera: Array
@@ -31,77 +50,76 @@ class Prediction:
 
 
 class ConstantVelocity:
-    """Predicts that the last motion goes on, in proportion to the time passed.
+    """Constant-velocity motion model: the last twist continues, in proportion to the time that has passed.
 
-    A gap of more than ``max_gap`` times the last interval, or a lost frame, forgets the velocity.
+    A lost frame, or a gap of more than ``PARAMETERS.max_gap`` times the last interval, resets the velocity to zero.
     """
-
-    max_gap = 3.0
 
     def __init__(self) -> None:
         self._last: tuple[float, Array] | None = None
         self._twist: Array = np.zeros(6)  # of T_previous_last
         self._interval = 0.0
-        self._reckoned: tuple[Array, Array] | None = None  # pose and covariance of a frame that only a robot told of
+        self._dead_reckoning: tuple[Array, Array] | None = None  # pose and covariance of a lost frame by robot priors
 
     @property
     def T_world_camera(self) -> Array:
-        """The last known pose (4, 4)."""
+        """Last known pose (4, 4)."""
         return self._last[1] if self._last is not None else np.eye(4)
 
     def predict(self, stamp: float) -> Array:
-        """T_world_camera (4, 4) expected at a time [s]."""
+        """Return the expected T_world_camera (4, 4) at a time [s]."""
         return self.T_world_camera @ se3_exp(self._motion(stamp))
 
-    def prediction(self, stamp: float, last_covariance: Array) -> Prediction:
-        """The same with its covariance; ``last_covariance`` (6, 6) is that of the last known pose."""
+    def motion_prior(self, stamp: float, last_covariance: Array) -> Prediction:
+        """Predict the pose at a time [s] with its covariance; ``last_covariance`` (6, 6) is that of the last pose."""
         motion = self._motion(stamp)
         dt = max(stamp - self._last[0], 0.0) if self._last is not None else 0.0
-        shift = _REST + 0.5 * float(np.linalg.norm(motion[:3])) + 0.5 * _ACCELERATION * dt**2
-        turn = min(_REST + 0.5 * float(np.linalg.norm(motion[3:])) + 0.5 * _ANGULAR_ACCELERATION * dt**2, np.pi)
-        strays = np.diag([shift**2] * 3 + [turn**2] * 3)
+        p = PARAMETERS
+        shift = p.rest + 0.5 * float(np.linalg.norm(motion[:3])) + 0.5 * p.acceleration * dt**2
+        turn = min(p.rest + 0.5 * float(np.linalg.norm(motion[3:])) + 0.5 * p.angular_acceleration * dt**2, np.pi)
+        process_noise = np.diag([shift**2] * 3 + [turn**2] * 3)
         T = self.T_world_camera @ se3_exp(motion)
-        return Prediction(T, _moved(last_covariance, motion) + strays)
+        return Prediction(T, _transported(last_covariance, motion) + process_noise)
 
-    def told(self, prior: PosePrior, last_covariance: Array) -> Prediction:
-        """What a robot says of this frame; relative motions of lost frames add up until a pose is known again."""
+    def robot_prior(self, prior: PosePrior, last_covariance: Array) -> Prediction:
+        """Return the pose that the robot reports; relative motions of lost frames accumulate until one is tracked."""
         if prior.T_world_camera is not None:
             return Prediction(prior.T_world_camera, prior.covariance, absolute=True)
         step = np.eye(4) if prior.T_previous_camera is None else prior.T_previous_camera
-        T, covariance = self._reckoned or (self.T_world_camera, last_covariance)
-        return Prediction(T @ step, _moved(covariance, se3_log(step)) + prior.covariance)
+        T, covariance = self._dead_reckoning or (self.T_world_camera, last_covariance)
+        return Prediction(T @ step, _transported(covariance, se3_log(step)) + prior.covariance)
 
     def update(self, stamp: float, T_world_camera: Array) -> None:
-        """Tell the pose that a frame was found to have."""
+        """Update the velocity with the estimated pose (4, 4) of a frame."""
         if self._last is not None:
             self._interval = stamp - self._last[0]
             self._twist = se3_log(inverse(self._last[1]) @ T_world_camera)
         self._last = (stamp, T_world_camera)
-        self._reckoned = None
+        self._dead_reckoning = None
 
     def move(self, T_new_old: Array) -> None:
-        """The world was moved: the last pose is another, the motion is the same."""
+        """Move the last pose with a correction (4, 4) of the map; the velocity stays."""
         if self._last is not None:
             self._last = (self._last[0], T_new_old @ self._last[1])
-        if self._reckoned is not None:
-            self._reckoned = (T_new_old @ self._reckoned[0], self._reckoned[1])
+        if self._dead_reckoning is not None:
+            self._dead_reckoning = (T_new_old @ self._dead_reckoning[0], self._dead_reckoning[1])
 
-    def forget_velocity(self, told: Prediction | None = None) -> None:
-        """After a lost frame: start again from rest at the last known pose, or from where a robot says it is."""
+    def forget_velocity(self, robot_prior: Prediction | None = None) -> None:
+        """Restart from rest after a lost frame, at the last known pose or at the pose that the robot reports."""
         self._interval = 0.0
-        if told is not None:
-            self._reckoned = (told.T_world_camera, told.covariance)
+        if robot_prior is not None:
+            self._dead_reckoning = (robot_prior.T_world_camera, robot_prior.covariance)
 
     def _motion(self, stamp: float) -> Array:
-        """Twist (6,) from the last pose to a time [s]."""
+        """Compute the twist (6,) from the last pose to a time [s]."""
         if self._last is None or self._interval <= 0:
             return np.zeros(6)
         ratio = (stamp - self._last[0]) / self._interval
-        return ratio * self._twist if 0 < ratio <= self.max_gap else np.zeros(6)
+        return ratio * self._twist if 0 < ratio <= PARAMETERS.max_gap else np.zeros(6)
 
 
-def _moved(covariance: Array, motion: Array) -> Array:
-    """A covariance (6, 6) of one camera's frame in that of another, ``motion`` (6,) away."""
+def _transported(covariance: Array, motion: Array) -> Array:
+    """Transport a covariance (6, 6) to the frame of a camera that has moved by a twist (6,): Ad Σ Adᵀ."""
     A = adjoint(se3_exp(-motion))
     moved: Array = A @ covariance @ A.T
     return moved

@@ -1,4 +1,4 @@
-"""Keyframes as tracking sees them, and which of them are near."""
+"""Interface of a keyframe for tracking, and the keyframes nearest to a pose."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class TrackedKeyframe(Protocol):
-    """What the tracker asks of a keyframe."""
+    """Attributes of a keyframe that tracking uses."""
 
     @property
     def features(self) -> Features: ...
@@ -26,13 +26,13 @@ class TrackedKeyframe(Protocol):
 
 
 def pose_distance(T_world_a: Array, T_world_b: Array) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between two poses."""
+    """Compute the distance [m] and the angle [rad] between two poses (4, 4)."""
     T_a_b = inverse(T_world_a) @ T_world_b
     return float(np.linalg.norm(T_a_b[:3, 3])), float(np.linalg.norm(so3_log(T_a_b[:3, :3])))
 
 
 def order_by_distance(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[int]:
-    """Indices of keyframes, nearest first; one radian counts as half a metre."""
+    """Order keyframes by their distance to a pose (4, 4), and return their indices; one radian counts as 0.5 m."""
     if not keyframes:
         return []
     poses = np.stack([keyframe.reference.T_world_camera for keyframe in keyframes])
@@ -44,5 +44,5 @@ def order_by_distance(keyframes: Sequence[TrackedKeyframe], T_world_camera: Arra
 
 
 def nearest(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array, n: int) -> list[TrackedKeyframe]:
-    """The n nearest keyframes."""
+    """Return the n keyframes nearest to a pose (4, 4)."""
     return [keyframes[k] for k in order_by_distance(keyframes, T_world_camera)[:n]]

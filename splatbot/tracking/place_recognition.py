@@ -1,8 +1,9 @@
-"""Which keyframes show the same place as a frame: by their features alone, wherever the camera is thought to be."""
+"""Place recognition: keyframes that show the same place as a frame, by their descriptors and without a pose."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -11,43 +12,57 @@ from numpy.typing import NDArray
 from splatbot import _native
 from splatbot.tracking.features import Features
 
-_COUNT = 400  # descriptors of an image that vote
-_BITS, _RATIO = 50, 0.8  # as for matching, but stricter: a vote has no geometry to confirm it
+
+@dataclass(frozen=True)
+class PlaceRecognitionParameters:
+    """Empirical constants of the comparison. It is stricter than feature matching, which geometry verifies."""
+
+    max_descriptors: int = 400
+    """Number of descriptors [1] per image. More of them take quadratically longer."""
+    max_hamming: int = 50
+    """Largest Hamming distance [bit] of two descriptors that match. A larger one adds wrong matches."""
+    max_ratio: float = 0.8
+    """Largest ratio [1] of the best to the second best distance (Lowe 2004). A larger one adds ambiguous matches."""
+
+
+PARAMETERS = PlaceRecognitionParameters()
 
 
 class HasFeatures(Protocol):
-    """What is compared of a keyframe."""
+    """Attributes of a keyframe that place recognition uses."""
 
     @property
     def features(self) -> Features: ...
 
 
 def votes(features: Features, keyframes: Sequence[HasFeatures]) -> NDArray[np.int64]:
-    """For each keyframe the number (K,) of descriptors that find a partner in ``features``, clearly their best.
+    """Count for each keyframe the descriptors (K,) that match one of ``features`` unambiguously.
 
-    Every keyframe is compared, 400 descriptors with 400: 0.4 ms each, which for hundreds of keyframes is less than any
-    index costs to keep.
+    Each keyframe is compared by brute force, which takes 0.4 ms for 400 descriptors. For hundreds of keyframes this is
+    faster than the maintenance of an index.
     """
-    mine = _some(features)
-    return np.array([_count(_some(keyframe.features), mine) for keyframe in keyframes], dtype=np.int64)
+    descriptors = _subset(features)
+    return np.array([_count(_subset(keyframe.features), descriptors) for keyframe in keyframes], dtype=np.int64)
 
 
 def likeliest(features: Features, keyframes: Sequence[HasFeatures], count: int) -> list[int]:
-    """Indices of at most ``count`` keyframes, most votes first; of equal ones the later first."""
+    """Return the indices of at most ``count`` keyframes, most votes first; of equal ones, the later first."""
     found = votes(features, keyframes)
     order = np.lexsort((-np.arange(len(found)), -found))
     return [int(k) for k in order[:count]]
 
 
-def _some(features: Features) -> NDArray[np.uint8]:
-    """Descriptors (<= 400, 32), evenly from all: they come in the order of their scales."""
-    step = max(1, len(features) // _COUNT)
-    return np.ascontiguousarray(features.descriptors[::step][:_COUNT])
+def _subset(features: Features) -> NDArray[np.uint8]:
+    """Select descriptors (<= 400, 32) at equal steps, because they are sorted by their scales."""
+    step = max(1, len(features) // PARAMETERS.max_descriptors)
+    return np.ascontiguousarray(features.descriptors[::step][: PARAMETERS.max_descriptors])
 
 
-def _count(theirs: NDArray[np.uint8], mine: NDArray[np.uint8]) -> int:
-    if len(theirs) == 0 or len(mine) == 0:
+def _count(queries: NDArray[np.uint8], train: NDArray[np.uint8]) -> int:
+    if len(queries) == 0 or len(train) == 0:
         return 0
-    anywhere = np.zeros((len(theirs), 2), np.float32), np.zeros((len(mine), 2), np.float32)
-    found = _native.match_near(anywhere[0], theirs, anywhere[1], mine, np.inf, _BITS, _RATIO)
+    origins = np.zeros((len(queries), 2), np.float32), np.zeros((len(train), 2), np.float32)
+    found = _native.match_near(
+        origins[0], queries, origins[1], train, np.inf, PARAMETERS.max_hamming, PARAMETERS.max_ratio
+    )
     return int((np.asarray(found) >= 0).sum())

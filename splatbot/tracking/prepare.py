@@ -1,4 +1,4 @@
-"""From a raw frame to what tracking works on: a pyramid of grey and depth, without pixels that would mislead it."""
+"""Pyramid of grey and depth of a frame, without pixels that would bias the pose."""
 
 from __future__ import annotations
 
@@ -17,17 +17,32 @@ from splatbot.frame import Frame
 
 Image = NDArray[np.float32]
 
-_FLYING_STEP = 0.03  # share of its depth by which a flying pixel differs from both surfaces
-# Where depth jumps by more than this share and this many σ between neighbours, two surfaces meet.
-_JUMP_STEP, _JUMP_SIGMAS = 0.02, 8.0  # the bend of three noisy depths has 2.4 times the noise of one
-_LEAST_SIDE = 12  # [px] of a level; alignment needs an inside, and a border of one pixel is none
+
+@dataclass(frozen=True)
+class PrepareParameters:
+    """Empirical constants of the preparation."""
+
+    flying_step: float = 0.03
+    """Relative difference of depth [1] by which a flying pixel differs from both of its neighbours. A smaller value
+    removes more pixels of slanted surfaces."""
+    jump_step: float = 0.02
+    """Relative difference of depth [1] between neighbours at an occluding edge. A smaller value masks more grey."""
+    jump_sigmas: float = 8.0
+    """The same difference [σ]. The second difference of three noisy depths has 2.4 times the noise of one."""
+    min_side: int = 12
+    """Smallest side [px] of a level. Alignment needs an interior, and the border is one pixel wide."""
+    smoothing: float = 0.7
+    """σ [px] of the Gaussian that removes the noise of grey. A larger value blurs edges."""
+
+
+PARAMETERS = PrepareParameters()
 
 
 @dataclass(frozen=True)
 class Level:
     """One pyramid level: grey (H, W) in 0..1, depth (H, W) [m] with 0 missing, and the camera of that size.
 
-    Grey is NaN where it may not be used: masked, or on the finest level of a frame mixed of two surfaces.
+    Grey is NaN if it is masked, or if it mixes two surfaces on the finest level of a frame.
     """
 
     gray: Image
@@ -37,10 +52,13 @@ class Level:
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame, its plausible depth (H, W) [m] at full size, and its pyramid, finest level first.
+    """A frame with its plausible depth and its pyramid; masked pixels have no depth, and their grey is NaN.
 
-    What the frame's mask leaves out has no depth, and NaN as its grey. ``started`` is :func:`time.perf_counter` when
-    work on the frame began.
+    Args:
+        frame: the frame.
+        depth: (H, W) [m] plausible depth at full size, 0 if missing.
+        levels: the pyramid, finest level first.
+        started: :func:`time.perf_counter` when work on the frame began.
     """
 
     frame: Frame
@@ -50,73 +68,76 @@ class PreparedFrame:
 
 
 def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
-    """The pyramid of a frame; its finest level is at most ``config.max_width`` pixels wide.
+    """Compute the pyramid of a frame, whose finest level is at most ``config.max_width`` pixels wide.
 
-    It has ``config.n_levels`` levels, or fewer where the next would be smaller than 12 pixels. The finest decides the
-    pose and has no grey along occluding edges.
+    It has ``config.n_levels`` levels, or fewer if the next would be smaller than 12 pixels. The finest level determines
+    the pose, and has no grey along occluding edges.
     """
     started = time.perf_counter()
     depth = usable_depth(frame, config)
     gray = np.multiply(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.float32(1 / 255), dtype=np.float32)
     if frame.mask is not None:
-        gray[~frame.mask] = np.nan  # and so is all that is smoothed or interpolated from it
+        gray[~frame.mask] = np.nan  # smoothing and interpolation propagate it
     level = Level(gray, depth, frame.camera)
     while level.camera.width > config.max_width:
         level = halve(level)
     levels = [Level(smoothed(level.gray), level.depth, level.camera)]
-    while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * _LEAST_SIDE:
+    while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * PARAMETERS.min_side:
         levels.append(halve(levels[-1]))
     levels[0] = Level(gray_of_one_surface(levels[0], config), levels[0].depth, levels[0].camera)
     return PreparedFrame(frame, depth, tuple(levels), started)
 
 
 def gray_of_one_surface(level: Level, config: TrackingConfig) -> Image:
-    """Grey (H, W), NaN along occluding edges: where inverse depth bends from pixel to pixel, more than noise explains.
+    """Return grey (H, W) with NaN along occluding edges.
 
-    Along a plane it is linear, however slanted that is and however few pixels there are.
+    An edge is a second difference of inverse depth that noise does not explain. Along a plane, inverse depth is linear
+    in the pixel coordinates for any slant.
 
-    Smoothing and interpolation mix the grey of two surfaces there, and from elsewhere others meet. The errors of such
-    pixels do not average out: a few per cent of all, they would pull the pose along with the parallax.
+    At an edge, smoothing and interpolation mix the grey of two surfaces, and other surfaces meet there in other views.
+    These pixels are a few percent of the image. Their errors do not average out, and would bias the pose with the
+    parallax.
     """
-    floor, quad = (_JUMP_SIGMAS * sigma for sigma in (config.sensor.sigma_depth_floor, config.sensor.sigma_depth_quad))
-    return np.asarray(_native.gray_of_one_surface(level.depth, level.gray, _JUMP_STEP, floor, quad))
+    p, sensor = PARAMETERS, config.sensor
+    floor, quad = p.jump_sigmas * sensor.sigma_depth_floor, p.jump_sigmas * sensor.sigma_depth_quad
+    return np.asarray(_native.gray_of_one_surface(level.depth, level.gray, p.jump_step, floor, quad))
 
 
 def smoothed(gray: Image) -> Image:
-    """Grey (H, W) without the finest of its noise, as alignment takes it."""
-    return np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.7), dtype=np.float32)
+    """Smooth grey (H, W) for alignment by a Gaussian."""
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), PARAMETERS.smoothing), dtype=np.float32)
 
 
 def valid_depth(depth: Image, near: float, far: float) -> Image:
-    """Depth (H, W) [m] with implausible pixels set to 0: out of range, or flying between two surfaces.
+    """Set implausible depth (H, W) [m] to 0: out of range, or flying between two surfaces.
 
-    A flying pixel is nearer than one neighbour and farther than the opposite one by more than 3 % of its range;
-    a single missing row of neighbours, as registration leaves in upsampled depth, does not count against a pixel.
+    A flying pixel is nearer than one neighbour and farther than the opposite one by more than 3 % of its range. A
+    single missing row of neighbours, which registration leaves in upsampled depth, does not invalidate a pixel.
     """
-    return np.asarray(_native.valid_depth(np.ascontiguousarray(depth), near, far, _FLYING_STEP))
+    return np.asarray(_native.valid_depth(np.ascontiguousarray(depth), near, far, PARAMETERS.flying_step))
 
 
 def usable_depth(frame: Frame, config: TrackingConfig) -> Image:
-    """Depth (H, W) [m] of a frame with 0 where it is implausible (see :func:`valid_depth`) or masked."""
+    """Return the depth (H, W) [m] of a frame, 0 if it is implausible (see :func:`valid_depth`) or masked."""
     depth = valid_depth(frame.depth, config.sensor.min_depth, config.sensor.max_depth)
     return depth if frame.mask is None else np.where(frame.mask, depth, np.float32(0))
 
 
 def valid_share(prepared: PreparedFrame) -> float:
-    """Share of the pixels that have a usable depth."""
+    """Return the share of the pixels with a usable depth."""
     depth = prepared.levels[0].depth
     return float(np.count_nonzero(depth > 0)) / depth.size
 
 
 def typical_depth(prepared: PreparedFrame) -> float:
-    """Median depth [m] of what is seen; 1 where nothing has a depth."""
+    """Return the median depth [m] of the coarsest level, or 1 if no pixel has a depth."""
     coarse = prepared.levels[-1].depth
     measured = coarse[coarse > 0]
     return float(np.median(measured)) if len(measured) else 1.0
 
 
 def halve(level: Level) -> Level:
-    """The next coarser level: grey averaged, depth as :func:`halve_depth` has it."""
+    """Compute the next coarser level: the mean of grey, and depth by :func:`halve_depth`."""
     height, width = level.gray.shape[0] // 2, level.gray.shape[1] // 2
     crop = level.gray[: 2 * height, : 2 * width]
     gray = np.asarray(cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
@@ -126,12 +147,12 @@ def halve(level: Level) -> Level:
 
 
 def halve_depth(depth: Image) -> Image:
-    """Half the size of a depth image [m]: the mean over the nearest surface of each 2x2 block; 0 where none is."""
+    """Halve the size of a depth image [m]: the mean over the nearest surface of each 2x2 block, 0 without depth."""
     return np.asarray(_native.halve_depth(np.ascontiguousarray(depth)))
 
 
 def with_depth(levels: Sequence[Level], depth: Image) -> tuple[Level, ...]:
-    """The same pyramid with another depth (H, W) [m] on its finest level, and what follows from it on the others."""
+    """Replace the depth of a pyramid by a depth (H, W) [m] of its finest level."""
     out = []
     for level in levels:
         out.append(Level(level.gray, depth, level.camera))
@@ -140,6 +161,6 @@ def with_depth(levels: Sequence[Level], depth: Image) -> tuple[Level, ...]:
 
 
 def normals_of(depth: Image, camera: Camera) -> Image:
-    """Unit normals (H, W, 3) towards the camera by central differences; zero where a neighbour is missing or far."""
+    """Compute unit normals (H, W, 3) towards the camera by central differences, zero without near neighbours."""
     c = camera
     return np.asarray(_native.normals_of(np.ascontiguousarray(depth, np.float32), c.fx, c.fy, c.cx, c.cy))

@@ -1,4 +1,4 @@
-"""How far a pose may be from the truth: from the residuals of its alignment, and from the keyframes it rests on."""
+"""Covariance of a pose from the residuals of its alignment and from the keyframes that it is aligned to."""
 
 from __future__ import annotations
 
@@ -13,26 +13,35 @@ from splatbot.tracking.align import Alignment
 
 Array = NDArray[np.float64]
 
-# Information that any pose has: it is within some 30 m and turns of where it was looked for.
-_LEAST = 1e-3
-# An image cannot be placed on another more exactly [px]: interpolation and blur shift all of it, which no cell shows.
-_PLACEMENT = 0.025
-# Neighbouring cells err together in part, so the spread says less than there is by this factor.
-_BETWEEN_CELLS = 1.25
-# Calibration of lens and depth is good to this share: such an error is the same in every frame, so along a path it adds
-# up, and does not average out.
-_CALIBRATION = 0.07e-3
+
+@dataclass(frozen=True)
+class UncertaintyParameters:
+    """Empirical constants of the covariance. Larger values increase it; docs/tracking.md has the NEES."""
+
+    min_information: float = 1e-3
+    """Information [1/m²] and [1/rad²] of any pose: alignment finds it within about 30 m of its start."""
+    image_shift: float = 0.025
+    """Standard deviation [px] of a shift of the whole image by interpolation and blur. It is common to all cells, so
+    the spread between them does not contain it."""
+    cell_correlation: float = 1.25
+    """Factor [1] on the spread, because the errors of adjacent cells are correlated."""
+    calibration: float = 0.07e-3
+    """Relative error [1] of the calibration of lens and depth. It is the same in all frames, so it accumulates along a
+    path and does not average out."""
+
+
+PARAMETERS = UncertaintyParameters()
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How well T_world_camera is known, where the world is the first camera.
+    """Uncertainty of T_world_camera, where the world is the first camera.
 
     Args:
         random: (6, 6) covariance of the twist ξ = (translation [m], rotation [rad]) in the camera's frame for which
-            T_world_camera exp(ξ) is the true pose; of what differs from frame to frame.
-        moved: length [m] of the chain of keyframes from the first one to here.
-        turned: the same of rotations [rad].
+            T_world_camera exp(ξ) is the true pose, without the error of calibration.
+        moved: length [m] of the chain of keyframes from the first one to the camera.
+        turned: angle [rad] of the rotations along this chain.
     """
 
     random: Array = field(default_factory=lambda: np.zeros((6, 6)))
@@ -41,36 +50,52 @@ class Uncertainty:
 
     @property
     def covariance(self) -> Array:
-        """(6, 6) of the same twist, errors of calibration included."""
-        shift, turn = (_CALIBRATION * self.moved) ** 2 / 3, (_CALIBRATION * self.turned) ** 2 / 3
+        """Covariance (6, 6) of the same twist with the error of calibration."""
+        shift = (PARAMETERS.calibration * self.moved) ** 2 / 3
+        turn = (PARAMETERS.calibration * self.turned) ** 2 / 3
         return self.random + np.diag([shift] * 3 + [turn] * 3)
 
 
-def alignment_covariance(found: Alignment) -> Array:
-    """Covariance (6, 6) of a pose against its references, twist (t [m], ω [rad]) in the camera's frame.
+def alignment_covariance(alignment: Alignment) -> Array:
+    """Compute the covariance (6, 6) of a pose against its references, of the twist (t [m], ω [rad]) in the camera.
 
-    Cluster-robust (Huber 1967; Liang and Zeger 1986) over the n cells of the image, with the factor for few clusters:
-    C⁻¹ S C⁻¹ n/(n - 6), C the curvature and S the spread; plus the noise model's own H⁻¹, whose share (6/n)² is all of
-    it where cells are too few to tell, plus a shift of the whole image, taken for a turn about each axis. Where H says
-    nothing the covariance is large, and finite; NaN where H is.
+    The cluster-robust sandwich estimator (Huber 1967; Liang and Zeger 1986) treats the n cells of the image as
+    clusters: residuals within a cell are correlated. With the curvature C of the robust cost, the gradient g_k of the
+    residuals in cell k and the information H of the noise model::
+
+        S = Σ_k g_k g_kᵀ
+        Σ = (6/n)² H⁻¹ + f n/(n - 6) C⁻¹ S C⁻¹ + Σ_shift
+
+    The factor n/(n - 6) corrects for few clusters, and f is ``PARAMETERS.cell_correlation``. H⁻¹ replaces the estimate
+    if the cells are too few for it. Σ_shift is a shift of the whole image, expressed as a rotation about each axis. The
+    covariance is large but finite in directions without information. It is NaN if H is not finite.
     """
-    if not np.isfinite(found.information).all():
+    if not np.isfinite(alignment.information).all():
         return np.full((6, 6), np.nan)
-    few = _BETWEEN_CELLS * found.cells / max(found.cells - 6, 1)
-    share = min(1.0, (6 / max(found.cells, 1)) ** 2)
-    model = np.linalg.inv(found.information + _LEAST * np.eye(6))
-    C_inverse = np.linalg.inv(found.curvature + _LEAST * np.eye(6))
-    shift = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * (_PLACEMENT / found.focal) ** 2
-    return _symmetric(np.asarray(share * model + few * C_inverse @ found.spread @ C_inverse + shift, dtype=np.float64))
+    p, cells = PARAMETERS, alignment.cells
+    few_clusters = p.cell_correlation * cells / max(cells - 6, 1)
+    model_share = min(1.0, (6 / max(cells, 1)) ** 2)
+    model = np.linalg.inv(alignment.information + p.min_information * np.eye(6))
+    C_inverse = np.linalg.inv(alignment.curvature + p.min_information * np.eye(6))
+    shift = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * (p.image_shift / alignment.focal) ** 2
+    sandwich = few_clusters * C_inverse @ alignment.spread @ C_inverse
+    return _symmetric(np.asarray(model_share * model + sandwich + shift, dtype=np.float64))
 
 
 def world_uncertainty(
     T_world_camera: Array, against_references: Array, references: Sequence[tuple[Array, Uncertainty]]
 ) -> Uncertainty:
-    """Uncertainty in the world of a pose of known covariance (6, 6) against keyframes (T_world_keyframe, its own).
+    """Compute the uncertainty of a pose in the world from its covariance against keyframes and from theirs.
 
-    The keyframes' errors are taken as if each carried an equal part of the pose: cov(Σ ξ/n) ≤ Σ cov(ξ)/n, whatever
-    they have in common.
+    Each of the n keyframes contributes an equal part of the pose. The bound cov(Σ ξ_k / n) ≤ Σ cov(ξ_k) / n holds for
+    any correlation between them, so with the adjoint A_k of T_camera_keyframe::
+
+        Σ_world = Σ + Σ_k A_k Σ_k A_kᵀ / n
+
+    Args:
+        T_world_camera: (4, 4).
+        against_references: (6, 6) covariance of the pose against the keyframes.
+        references: T_world_keyframe (4, 4) and uncertainty of each keyframe.
     """
     random, moved, turned = against_references.copy(), 0.0, 0.0
     for T_world_keyframe, known in references:

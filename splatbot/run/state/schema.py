@@ -25,9 +25,8 @@ from splatbot.mapping.posegraph import Edge, PoseGraph
 from splatbot.mapping.refine import Refiner
 from splatbot.optimize.adam import GaussianAdam
 from splatbot.slam import FrameResult, Slam
-from splatbot.tracking.budget import Costs
+from splatbot.tracking.budget import CostModel
 from splatbot.tracking.features import Features
-from splatbot.tracking.gicp import GicpStage
 from splatbot.tracking.motion_model import ConstantVelocity
 from splatbot.tracking.reference import Reference, ReferencePoints
 from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidate
@@ -126,24 +125,21 @@ TYPES: Mapping[str, SavedType] = {
             "config",
             "motion",
             lost="_lost",
-            uncertainties="_known",
+            uncertainties="_keyframe_uncertainty",
             last_covariance="_last_covariance",
             costs="_costs",
-            gicp="_wide",
             place_search="_search",
-            relocalization_candidate="_sighting",
+            relocalization_candidate="_candidate",
         ),
+        transient=frozenset({"_stages"}),
         create=lambda config: Tracker(config.tracking),
     ),
     "motion_model": SavedType(
         ConstantVelocity,
-        _fields(last="_last", twist="_twist", interval="_interval", dead_reckoning="_reckoned"),
+        _fields(last="_last", twist="_twist", interval="_interval", dead_reckoning="_dead_reckoning"),
         create=lambda _: ConstantVelocity(),
     ),
-    "stage_costs": SavedType(Costs, _fields(frame="_frame", runs="_runs"), create=lambda _: Costs()),
-    "gicp": SavedType(
-        GicpStage, _fields("config"), frozenset({"_clouds"}), create=lambda config: GicpStage(config.tracking)
-    ),
+    "stage_costs": SavedType(CostModel, _fields(frame="_frame", runs="_runs"), create=lambda _: CostModel()),
     "place_search": SavedType(PlaceSearch, _fields(next="_next"), create=lambda _: PlaceSearch()),
     "relocalization_candidate": _dataclass(RelocalizationCandidate),
     "uncertainty": _dataclass(Uncertainty),

@@ -1,4 +1,4 @@
-"""The anytime contract: what does not fit is not started, and what is skipped is told."""
+"""The anytime contract: a stage that does not fit is not started, and skipped stages are reported."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatbot.config import Config, TrackingConfig, load_config
 from splatbot.logs import open_log
 from splatbot.mapping.mapper import Mapper
 from splatbot.slam import Slam
-from splatbot.tracking.budget import BOLD, CAREFUL, Budget, Costs, table_ms
+from splatbot.tracking.budget import DEADLINE_QUANTILE, LOST_QUANTILE, Budget, CostModel, table_ms
 from tests.unit.tracking.test_tracker import Run
 
 
@@ -24,15 +24,15 @@ def test_a_budget_buys_pixels_steps_and_keypoints_by_one_table() -> None:
     assert [row.n_features for row in rows] == sorted(row.n_features for row in rows)
 
 
-def test_what_is_given_is_not_changed_by_the_budget_and_null_leaves_it_to_it() -> None:
+def test_given_efforts_override_those_of_the_budget_and_null_restores_them() -> None:
     given = load_config(environ={}, overrides={"tracking.budget_ms": 30, "expert.tracking.n_pixels": 777})
     assert (given.tracking.n_pixels, given.tracking.n_features) == (777, TrackingConfig(budget_ms=30).n_features)
     left = load_config(environ={}, overrides={"tracking.budget_ms": 300, "expert.tracking.n_pixels": None})
     assert left.tracking.n_pixels == TrackingConfig(budget_ms=300).n_pixels
 
 
-def test_the_95th_percentile_of_recent_runs_is_what_a_stage_is_expected_to_cost() -> None:
-    costs = Costs()
+def test_the_expected_cost_of_a_stage_is_the_95th_percentile_of_recent_runs() -> None:
+    costs = CostModel()
     for i in range(40):
         costs.record("direct", 1000.0, 2.0 * table_ms("direct", 1000.0) if i % 10 == 0 else table_ms("direct", 1000.0))
     assert costs.expected_ms("direct", 1000.0) == pytest.approx(2.0 * table_ms("direct", 1000.0))
@@ -42,11 +42,11 @@ def test_the_95th_percentile_of_recent_runs_is_what_a_stage_is_expected_to_cost(
     assert costs.expected_ms("direct", 1000.0) == pytest.approx(table_ms("direct", 1000.0))
 
 
-def test_one_slow_run_locks_no_stage_out_and_two_do_until_they_are_forgotten() -> None:
-    costs = Costs()
+def test_one_slow_run_excludes_no_stage_and_two_do_until_they_are_forgotten() -> None:
+    costs = CostModel()
     slow, usual = 20.0 * table_ms("detect", 500), table_ms("detect", 500)
     costs.begin_frame()
-    costs.record("detect", 500, slow)  # cold caches, or another program
+    costs.record("detect", 500, slow)  # by cold caches or another program
     assert costs.expected_ms("detect", 500) <= 1.5 * usual
     costs.record("detect", 500, usual)
     assert costs.expected_ms("detect", 500) == pytest.approx(usual)
@@ -59,18 +59,19 @@ def test_one_slow_run_locks_no_stage_out_and_two_do_until_they_are_forgotten() -
     assert costs.expected_ms("detect", 500) == pytest.approx(1.5 * usual)
 
 
-def test_what_was_slow_now_and_then_is_tried_while_lost() -> None:
-    costs = Costs()
+def test_stages_that_were_slow_at_times_are_started_while_lost() -> None:
+    costs = CostModel()
     for slowness in (1.0, 8.0, 1.0, 8.0, 1.0):
         costs.record("detect", 500, slowness * table_ms("detect", 500))
-    careful, bold = (Budget(30.0, costs, time.perf_counter(), share) for share in (CAREFUL, BOLD))
-    assert not careful.fits(("detect", 500))
-    assert bold.fits(("detect", 500))
-    assert not bold.fits(("detect", 500), ("detect", 8000))
+    quantiles = DEADLINE_QUANTILE, LOST_QUANTILE
+    tracked, lost = (Budget(30.0, costs, time.perf_counter(), quantile) for quantile in quantiles)
+    assert not tracked.fits(("detect", 500))
+    assert lost.fits(("detect", 500))
+    assert not lost.fits(("detect", 500), ("detect", 8000))
 
 
 def test_time_that_has_passed_is_not_left() -> None:
-    budget = Budget(50.0, Costs(), time.perf_counter() - 0.045)
+    budget = Budget(50.0, CostModel(), time.perf_counter() - 0.045)
     assert budget.left_ms <= 5.0
     assert not budget.fits(("detect", 2000))
     counted = Budget(50.0, None, time.perf_counter() - 10.0)
@@ -80,14 +81,14 @@ def test_time_that_has_passed_is_not_left() -> None:
     assert counted.left_ms == pytest.approx(50.0 - table_ms("rest", 1) - table_ms("detect", 1000))
 
 
-def test_what_most_frames_cost_beside_their_stages_is_kept_free() -> None:
-    costs = Costs()
-    for ms in (7.0, 3.0, 7.0, 7.0, 60.0):  # the last makes a keyframe of it
+def test_the_overhead_of_most_frames_outside_the_stages_is_reserved() -> None:
+    costs = CostModel()
+    for ms in (7.0, 3.0, 7.0, 7.0, 60.0):  # the last frame becomes a keyframe
         costs.record("rest", 1, ms)
     assert Budget(30.0, costs, time.perf_counter()).left_ms == pytest.approx(23.0, abs=0.5)
 
 
-def test_the_slam_tells_its_tracker_what_its_own_work_on_a_frame_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_slam_reports_its_own_overhead_to_the_tracker(monkeypatch: pytest.MonkeyPatch) -> None:
     slow = 0.03
 
     class SlowMapper(Mapper):
@@ -102,11 +103,11 @@ def test_the_slam_tells_its_tracker_what_its_own_work_on_a_frame_costs(monkeypat
     slam = Slam(config)
     for frame in open_log("synthetic:tabletop?frames=4&width=160&height=120"):
         slam.process(frame)
-    assert slam._tracker._costs.expected_ms("rest", 1, BOLD) > 1e3 * slow  # type: ignore[union-attr]
+    assert slam._tracker._costs.expected_ms("rest", 1, LOST_QUANTILE) > 1e3 * slow  # type: ignore[union-attr]
 
 
-def test_without_time_for_features_the_frame_is_tracked_without_and_says_so() -> None:
-    """The table's costs: 5 ms are enough for alignment and not for finding keypoints."""
+def test_without_time_for_features_the_frame_is_tracked_and_reports_them_as_skipped() -> None:
+    """By the table, 5 ms suffice for alignment but not for the detection of keypoints."""
     run = Run(tracking__budget_ms=5)
     estimate = run.track(run.frames[1])
     assert estimate.verdict == "ok"
@@ -124,7 +125,7 @@ def test_with_little_time_there_are_fewer_keypoints() -> None:
     assert len(few) < 0.7 * len(many)
 
 
-def test_slow_stages_are_left_out_once_they_are_known_to_be_slow() -> None:
+def test_slow_stages_are_skipped_once_their_runs_are_recorded() -> None:
     run = Run(tracking__deterministic=False, tracking__budget_ms=1000)
     assert "features" in run.track(run.frames[1]).stage_ms
     costs = run.tracker._costs
@@ -145,8 +146,8 @@ def test_counted_work_gives_the_same_bits_however_slow_the_machine(monkeypatch: 
     assert np.array_equal(poses, again)
 
 
-def test_a_lost_camera_is_found_within_a_small_budget_by_keyframes_in_turn() -> None:
-    """One keyframe at a time fits; the one that shows the frame is not the latest."""
+def test_a_lost_camera_relocalizes_within_a_small_budget_by_one_keyframe_after_the_other() -> None:
+    """One keyframe at a time fits, and the keyframe that shows the frame is not the latest."""
     run = Run(width=320, tracking__budget_ms=14, tracking__n_features=400)
     for i in (2, 4, 6, 8, 10, 11):
         run.keyframes.append(run.keyframe(run.prepare(run.frames[i]), run.poses[i]))

@@ -1,4 +1,4 @@
-"""Recovery: any keyframe may be where the camera is found, and two frames have to agree on it."""
+"""Relocalization: the camera is found among all keyframes, and two frames have to agree."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from tests.unit.tracking.test_tracker import Run
 
 
 def blacked(frame: Frame) -> Frame:
+    """Return a frame without light and without depth."""
     return replace(frame, rgb=np.zeros_like(frame.rgb), depth=np.zeros_like(frame.depth))
 
 
 def lost_run(**overrides: object) -> Run:
-    """Keyframes along the path; lost at its far end."""
+    """Create a run with keyframes along the path that is lost at its far end."""
     run = Run(width=320, **overrides)
     for i in (4, 8, 11):
         run.keyframes.append(run.keyframe(run.prepare(run.frames[i]), run.poses[i]))
@@ -27,7 +28,7 @@ def lost_run(**overrides: object) -> Run:
     return run
 
 
-def test_a_camera_carried_off_is_found_among_all_keyframes_and_believed_on_the_second_frame() -> None:
+def test_a_moved_camera_is_found_among_all_keyframes_and_confirmed_by_the_second_frame() -> None:
     run = lost_run()
     first = run.track(replace(run.frames[1], stamp=2.0))
     assert first.verdict == "lost"
@@ -37,8 +38,8 @@ def test_a_camera_carried_off_is_found_among_all_keyframes_and_believed_on_the_s
     assert run.error(second, 2)[0] < 2e-3
 
 
-def test_two_frames_that_cannot_both_be_right_are_not_believed() -> None:
-    """Found at one end of the path, then at once at the other, a third of a metre away."""
+def test_two_frames_that_contradict_each_other_are_not_accepted() -> None:
+    """The camera is found at one end of the path, and 1 ms later at the other end, 0.3 m away."""
     run = lost_run()
     assert run.track(replace(run.frames[1], stamp=2.0)).verdict == "lost"
     jumped = run.track(replace(run.frames[11], stamp=2.001))
@@ -50,5 +51,5 @@ def test_two_frames_that_cannot_both_be_right_are_not_believed() -> None:
 
 @pytest.mark.parametrize(("moved", "dt", "agrees"), [(0.05, 1 / 30, True), (0.3, 1 / 30, False), (0.3, 0.5, True)])
 def test_a_camera_moves_at_the_speed_of_an_arm_or_a_hand(moved: float, dt: float, agrees: bool) -> None:
-    sighting = RelocalizationCandidate(1.0, np.eye(4))
-    assert sighting.agrees(1.0 + dt, se3_exp([moved, 0, 0, 0, 0, 0])) is agrees
+    candidate = RelocalizationCandidate(1.0, np.eye(4))
+    assert candidate.agrees(1.0 + dt, se3_exp([moved, 0, 0, 0, 0, 0])) is agrees

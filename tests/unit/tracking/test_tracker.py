@@ -1,4 +1,4 @@
-"""The tracker: poses to a bound, the best candidate, and lost frames that leave no trace."""
+"""The tracker: accuracy of poses, the best hypothesis, and lost frames that do not change its state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.rgbd import Array, small_config, tabletop, wall_frame
 
 @dataclass(frozen=True)
 class View:
-    """A keyframe as the tracker sees it."""
+    """A keyframe with the attributes that the tracker uses."""
 
     features: Features
     reference: Reference
@@ -92,7 +92,7 @@ def test_a_first_frame_without_depth_or_without_an_image_is_refused_with_the_rea
 
 
 @pytest.mark.parametrize("has_depth", [False, True])
-def test_black_frames_are_lost_with_the_reason_and_the_second_good_one_is_believed(has_depth: bool) -> None:
+def test_black_frames_are_lost_with_the_reason_and_the_second_good_one_is_accepted(has_depth: bool) -> None:
     run = Run()
     for i in (1, 2):
         run.track(run.frames[i])
@@ -102,8 +102,8 @@ def test_black_frames_are_lost_with_the_reason_and_the_second_good_one_is_believ
         assert estimate.verdict == "lost"
         assert any("blank" in reason for reason in estimate.reasons)
         assert np.isfinite(estimate.T_world_camera).all()
-    sighted = run.track(run.frames[5])
-    assert (sighted.verdict, sighted.reasons) == ("lost", ("found again, the next frame must confirm it",))
+    candidate = run.track(run.frames[5])
+    assert (candidate.verdict, candidate.reasons) == ("lost", ("found again, the next frame must confirm it",))
     found = run.track(run.frames[6])
     assert found.verdict == "ok"
     assert run.error(found, 6)[0] < 1.5e-3
@@ -117,8 +117,8 @@ def test_a_lost_frame_does_not_move_the_prediction() -> None:
     assert np.array_equal(run.tracker.motion.predict(run.frames[3].stamp), before)
 
 
-def test_features_find_a_camera_that_was_carried_off_and_the_health_check_takes_them() -> None:
-    """The prediction is 30 cm and 17° off: beyond what alignment can pull back."""
+def test_features_find_a_camera_far_from_its_prediction_and_the_health_selects_them() -> None:
+    """The prediction is wrong by 30 cm and 17°, from which alignment does not converge."""
     run = Run(width=320)
     run.tracker.motion.update(run.frames[4].stamp, run.poses[4] @ se3_exp([0.3, 0, 0, 0, 0.3, 0]))
     run.tracker.motion.forget_velocity()
