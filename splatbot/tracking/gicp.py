@@ -41,10 +41,6 @@ class GicpRegistration:
     def __init__(self) -> None:
         self._clouds: WeakKeyDictionary[Features, Cloud] = WeakKeyDictionary()
 
-    def __getstate__(self) -> dict[str, object]:
-        """Return the state without the clouds, which are computed from the keyframes again."""
-        return {"_clouds": WeakKeyDictionary()}
-
     def register(
         self, prepared: PreparedFrame, keyframe: TrackedKeyframe, T_world_camera: Array, n_points: int
     ) -> Array | None:

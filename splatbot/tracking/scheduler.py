@@ -6,7 +6,7 @@ initial stages alone still gets a pose.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from splatbot.tracking.budget import DEADLINE_QUANTILE, LOST_QUANTILE, Budget, CostModel
@@ -37,11 +37,28 @@ class StageScheduler:
 
     def best_hypothesis(self, prediction: Prediction) -> ScoredHypothesis:
         """Return the best pose that the stages find from a prediction within the remaining time."""
-        self._problem.begin(prediction)
-        start = self._start()
-        hypotheses = self._refine([start, *self._propose(start)])
+        problem, stages = self._problem, self._stages.proposals
+        problem.begin(prediction)
+        start, proposals = self._start(), dict[str, Hypothesis]()
+        needed = (stage for stage in stages if stage.is_needed(problem))  # depends on the stages before it
+        for stage, effort in self._affordable(needed, start):
+            hypothesis = stage.run(problem, start, effort)
+            if hypothesis is not None:
+                proposals[hypothesis.stage] = hypothesis  # replaces an earlier one of the same name
+        hypotheses = self._refine([start, *proposals.values()])
         best = self._score(hypotheses)
-        best = self._search_again(hypotheses, best)
+        again = [stage for stage in stages if stage.is_needed_again(problem, best)]
+        n_runs, n_scored = 0, len(hypotheses)
+        for stage, effort in self._affordable(again, best.hypothesis):
+            n_runs += 1
+            hypothesis = stage.run(problem, best.hypothesis, effort)
+            if hypothesis is not None:
+                chosen = self._choose_effort(self._stages.refinement, hypothesis, len(hypotheses) + 1)
+                hypotheses.append(self._refine_one(hypothesis, *chosen))
+        if len(hypotheses) > n_scored:
+            best = self._score(hypotheses)
+        if n_runs < len(again):
+            best = best.degraded("another pose may explain the frame better: no time was left for it")
         if not best.hypothesis.is_refined:
             best = best.degraded("not aligned on fine levels: no time was left for them")
         return best
@@ -50,26 +67,26 @@ class StageScheduler:
         """Run the initial stages one after the other, and check the pose that they lead to."""
         problem = self._problem
         for stage in self._stages.initial:
-            cost = stage.cost(problem, problem.start, 1)
-            with self._charged(stage, cost):
+            with self._charged(stage, stage.cost(problem, problem.start, 1)):
                 problem.start = stage.run(problem, problem.start, 1) or problem.start
         problem.is_uncertain = problem.is_lost or self._moves_fast() or not self._explains(problem.start)
         return problem.start
 
-    def _propose(self, start: Hypothesis) -> list[Hypothesis]:
-        """Run the proposal stages that are needed and fit; a later hypothesis of the same name replaces the earlier."""
-        found: dict[str, Hypothesis] = {}
-        for stage in self._stages.proposals:
-            for _ in range(stage.repetitions(self._problem) if stage.is_needed(self._problem) else 0):
-                effort, cost = self._choose_effort(stage, start)
+    def _affordable(
+        self, stages: Iterable[TrackingStage], hypothesis: Hypothesis
+    ) -> Iterator[tuple[TrackingStage, int]]:
+        """Yield the stages that fit the remaining time, with their effort; the caller runs each before the next.
+
+        The time of the caller is charged to the stage. Stages that do not fit are recorded as skipped.
+        """
+        for stage in stages:
+            for _ in range(stage.repetitions(self._problem)):
+                effort, cost = self._choose_effort(stage, hypothesis)
                 if effort is None:
                     self.budget.skip(stage.skipped_name)
                     break
                 with self._charged(stage, cost):
-                    hypothesis = stage.run(self._problem, start, effort)
-                if hypothesis is not None:
-                    found[hypothesis.stage] = hypothesis
-        return list(found.values())
+                    yield stage, effort
 
     def _refine(self, proposals: list[Hypothesis]) -> list[Hypothesis]:
         """Refine the proposals, the start hypothesis first, as long as the scoring of all of them still fits."""
@@ -82,7 +99,7 @@ class StageScheduler:
         return refined
 
     def _refine_one(self, hypothesis: Hypothesis, effort: int | None, cost: StageCost) -> Hypothesis:
-        """Refine one hypothesis with an effort; if None, keep it as it is."""
+        """Refine a hypothesis with an effort; if it is None, keep the hypothesis unrefined."""
         stage, problem = self._stages.refinement, self._problem
         if effort is None:
             self.budget.skip(stage.skipped_name)
@@ -97,24 +114,6 @@ class StageScheduler:
         kind, units = self._problem.scoring_work
         with self.budget.run(kind, units * len(hypotheses)):
             return select_best(self._problem.prepared, hypotheses, self._problem.config)
-
-    def _search_again(self, hypotheses: list[Hypothesis], best: ScoredHypothesis) -> ScoredHypothesis:
-        """Run stages again from a best pose that does not explain the frame, and score their hypotheses with it."""
-        for stage in self._stages.proposals:
-            if not stage.is_needed_again(self._problem, best):
-                continue
-            effort, cost = self._choose_effort(stage, best.hypothesis)
-            if effort is None:
-                self.budget.skip(stage.skipped_name)
-                best = best.degraded("another pose may explain the frame better: no time was left for it")
-                continue
-            with self._charged(stage, cost):
-                hypothesis = stage.run(self._problem, best.hypothesis, effort)
-            if hypothesis is not None:
-                chosen = self._choose_effort(self._stages.refinement, hypothesis, len(hypotheses) + 1)
-                hypotheses.append(self._refine_one(hypothesis, *chosen))
-                best = self._score(hypotheses)
-        return best
 
     def _choose_effort(
         self, stage: TrackingStage, hypothesis: Hypothesis, scorings: int = 0

@@ -187,7 +187,12 @@ def test_a_new_stage_in_the_list_is_scheduled_charged_and_scored(
     start_at(TRUE @ se3_exp(np.array([0.3, 0.0, 0.0, 0.0, 0.3, 0.0])), monkeypatch)
     charged: list[tuple[str, float]] = []
     run = Budget.run
-    monkeypatch.setattr(Budget, "run", lambda self, *work, **names: charged.append(work) or run(self, *work, **names))
+
+    def charge(budget: Budget, kind: str, units: float, under: str | None = None) -> Any:
+        charged.append((kind, units))
+        return run(budget, kind, units, under)
+
+    monkeypatch.setattr(Budget, "run", charge)
     tracking = Run(tracking__features="needed", tracking__gicp="never", tracking__features_motion=10.0)
     monkeypatch.setattr(feature_stages.KeypointStage, "is_needed", lambda self, problem: False)
     estimate = tracking.track(tracking.frames[NEXT])
@@ -226,8 +231,8 @@ def test_at_most_six_functions_lie_between_the_slam_and_opencv(monkeypatch: pyte
 
     def counted(function: Any) -> Any:
         def call(*args: Any, **kwargs: Any) -> Any:
-            names = [frame.function for frame in inspect.stack(context=0)[1:]]
-            depths.append(names.index("process"))
+            functions = [frame.function for frame in inspect.stack(context=0)[1:]]
+            depths.append(functions.index("process"))
             return function(*args, **kwargs)
 
         return call
