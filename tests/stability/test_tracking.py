@@ -1,4 +1,4 @@
-"""Hard cases of tracking and mapping, each held to a bound (see docs/stability.md)."""
+"""Hard cases of tracking and mapping, each with a bound (see docs/stability.md)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from splatbot.slam import Slam
 from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import Array, small_config, tabletop
 
-BEGUN = 4  # frames before the trouble
+BEGUN = 4  # frames before the hard case
 
 
 def begun() -> tuple[Slam, list[Frame], Sequence[Array]]:
-    """A run over the first frames, the frames to come, and all true poses."""
+    """Return a run over the first frames, the remaining frames, and all true poses."""
     frames, poses = tabletop()
     slam = Slam(small_config())
     for frame in frames[:BEGUN]:
@@ -28,7 +28,7 @@ def begun() -> tuple[Slam, list[Frame], Sequence[Array]]:
 
 
 def error_of(slam: Slam, poses: Sequence[Array]) -> tuple[float, float]:
-    """Distance [m] and angle [rad] of the last pose from the truth."""
+    """Return the distance [m] and the angle [rad] of the last pose from the truth."""
     result = slam.results[-1]
     assert result.T_world_camera is not None, result.reasons
     return pose_distance(poses[result.index], result.T_world_camera)

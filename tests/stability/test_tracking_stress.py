@@ -1,4 +1,4 @@
-"""Hard logs: every frame is within a bound of the truth, or is reported; what nobody can see changes no map."""
+"""Hard logs: each frame is within a bound of the truth or reported, and lost frames do not change the map."""
 
 from __future__ import annotations
 
@@ -98,14 +98,14 @@ def test_errors_are_as_large_as_the_covariances_say(log: str) -> None:
 
 
 def test_poses_before_a_wall_are_no_nearer_to_it_than_they_say() -> None:
-    """A wall seen once, at 640x480: the blend of its noise lies 0.9 mm before it (NEES / 6 of 5 where poses follow)."""
+    """The blend of a wall observed once at 640x480 is 0.9 mm too near: NEES / 6 is 5 in poses that follow it."""
     seldom_refined = load_config(environ={}, overrides={"mapping.refine_iterations": 2})
     log = "wall_soft?trajectory=handheld&effects=depth_noise&seed=1&frames=16"
     assert nees_of(log, seldom_refined, width=640) < 2.0
 
 
 def test_poses_around_a_wall_of_soft_colours_err_no_more_than_they_say() -> None:
-    """What comes into view anew is seen once: where its blend lies before it, all the way round adds up."""
+    """Each new strip of the wall is observed once, and the bias of its blend accumulates around the wall."""
     seldom_refined = load_config(environ={}, overrides={"mapping.refine_iterations": 2})
     log = "wall_soft?effects=depth_noise&seed=1&frames=40"
     assert 0.3 < nees_of(log, seldom_refined, width=640) < 1.5

@@ -39,7 +39,7 @@ class Problem:
     offset: float = -0.03
 
     def native(self, photometric: bool, geometric: bool) -> tuple[Array, Array, float, int, Array, Array]:
-        """What the kernel answers."""
+        """Return the result of the native kernel."""
         u, v = np.meshgrid(np.arange(float(CAMERA.width)), np.arange(float(CAMERA.height)))
         return _native.linearize_alignment(
             self.gray(u, v).astype(np.float32),
@@ -55,43 +55,43 @@ class Problem:
         )
 
     def photometric(self, state: Array) -> Array:
-        """Residuals (N,) of grey at a state: twist (6,) on the left of T, gain, offset."""
+        """Compute the residuals (N,) of grey at a state: twist (6,) on the left of T, gain, offset."""
         q = transform_points(se3_exp(state[:6]) @ self.T, self.points)
         u, v = np.moveaxis(CAMERA.project(q), -1, 0)
         return self.gray(u, v) - (state[6] * self.reference_gray + state[7])
 
     def geometric(self, state: Array, observed: Array, normals: Array) -> Array:
-        """Distances (N,) from the moved points to the planes through the points observed on their rays."""
+        """Compute the distances (N,) of the moved points from the planes through the observed points of their rays."""
         q = transform_points(se3_exp(state[:6]) @ self.T, self.points)
         return np.asarray((normals * (observed - q)).sum(1))
 
 
 def jacobian(residuals: Callable[[Array], Array], state: Array) -> Array:
-    """(N, len(state)) by central differences."""
+    """Compute the Jacobian (N, len(state)) by central differences."""
     steps = STEP * np.eye(len(state))
     return np.stack([(residuals(state + s) - residuals(state - s)) / (2 * STEP) for s in steps], axis=1)
 
 
 def normal_equations(J: Array, r: Array, sigma: Array) -> tuple[Array, Array]:
-    """H and g of Student-t weighted residuals."""
+    """Compute H and g of residuals with the weights of Student's t."""
     w = (NU + 1) / (NU + (r / sigma) ** 2) / sigma**2
     return (J * w[:, None]).T @ J, J.T @ (w * r)
 
 
 def damped(H: Array) -> Array:
-    """H with the damping of a step."""
+    """Add the damping of a step to H."""
     return np.asarray(H + 1e-5 * np.trace(H) / 6 * np.eye(6), dtype=np.float64)
 
 
 def assert_close(got: Array, want: Array, tolerance: float = 1e-5) -> None:
-    """Each entry to a share of what Cauchy and Schwarz allow it."""
+    """Compare each entry relative to its Cauchy-Schwarz bound."""
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want))) if want.ndim == 2 else np.abs(want).max()
     assert np.abs((got - want) / np.maximum(scale, 1e-12)).max() < tolerance
 
 
 @pytest.fixture
 def problem(rng: np.random.Generator) -> Problem:
-    """200 points near a wall at 1 m, off by 1 cm and 1°, before an image that is bilinear in its pixels."""
+    """200 points near a wall at 1 m, displaced by 1 cm and 1°, in front of an image that is bilinear in its pixels."""
     n = 200
     pixels = rng.uniform([15, 15], [145, 105], (n, 2))
     rays = np.stack([(pixels[:, 0] - CAMERA.cx) / CAMERA.fx, (pixels[:, 1] - CAMERA.cy) / CAMERA.fy, np.ones(n)], 1)
@@ -250,7 +250,7 @@ OFFSETS = {
 
 
 def aligned(frame: Level | tuple[Level, ...], reference: Reference, T: Array, photometric: bool = True) -> Array:
-    """The pose after the coarse and the fine pass, as the tracker runs them."""
+    """Return the pose after the coarse and the fine pass of the tracker."""
     levels = frame if isinstance(frame, tuple) else (frame,)
     for _ in range(2):
         T = align(levels, [reference], T, CONFIG, photometric=photometric, finest=0, gate=GATE).T_world_camera

@@ -28,7 +28,7 @@ def matched(current: Features, *keyframes: tuple[Features, Array]) -> FeaturePos
 
 
 def noise_image(seed: int) -> np.ndarray:
-    """Blocks of random grey: corners everywhere."""
+    """Create blocks of random grey, which have corners everywhere."""
     small = np.random.default_rng(seed).integers(0, 256, (30, 40, 1), dtype=np.uint8)
     return np.ascontiguousarray(np.kron(small, np.ones((4, 4, 3), np.uint8)))
 
@@ -56,7 +56,7 @@ def test_the_matches_that_are_kept_agree_with_the_pose_to_three_pixels() -> None
     assert errors.max() < 5.0
 
 
-def test_the_pose_is_the_same_bit_for_bit_when_asked_again() -> None:
+def test_the_pose_is_the_same_bit_for_bit_in_a_second_call() -> None:
     first, second = (matched(view(6)[0], view(0), view(3)) for _ in range(2))
     assert first is not None
     assert second is not None
@@ -77,7 +77,7 @@ def test_a_third_of_false_matches_changes_little() -> None:
     assert pose_distance(truth, found.T_world_camera)[0] < 8e-3
 
 
-def test_no_pose_is_made_up_from_an_unrelated_image_from_few_matches_or_from_nothing() -> None:
+def test_there_is_no_pose_from_an_unrelated_image_from_few_matches_or_without_keypoints() -> None:
     keyframe = view(0)
     camera = tabletop(width=WIDTH)[0][0].camera
     blank = detect(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32), CAMERA, 500)
@@ -136,7 +136,7 @@ def test_keypoints_whose_window_spans_two_surfaces_have_no_point() -> None:
 def matches_by_brute_force(
     expected: Array, wanted: NDArray[np.uint8], found: Array, have: NDArray[np.uint8], radius: float
 ) -> NDArray[np.int32]:
-    """Lowe's ratio test on Hamming distances within a radius; each found keypoint goes to whom it resembles most."""
+    """Apply Lowe's ratio test to Hamming distances within a radius; each keypoint matches its nearest descriptor."""
     bits = np.unpackbits(wanted[:, None] ^ have[None], axis=-1).sum(-1).astype(int)
     bits[np.linalg.norm(expected[:, None] - found[None], axis=-1) > radius] = 257
     out = np.full(len(wanted), -1, np.int32)
@@ -196,7 +196,7 @@ def test_matches_in_one_corner_of_the_image_are_believed_only_when_searched_for_
     assert match_pose(current, views, camera, Expectation(truth, 12.0)) is not None
 
 
-def test_keypoints_are_spread_though_one_thing_has_the_strongest_of_all() -> None:
+def test_keypoints_are_spread_although_one_object_has_the_strongest_of_all() -> None:
     rng = np.random.default_rng(0)
     crowd, others = rng.uniform([80, 80], [159, 159], (2000, 2)), rng.uniform([0, 0], [640, 480], (2000, 2))
     pixels = np.concatenate([crowd, others]).astype(np.float32)

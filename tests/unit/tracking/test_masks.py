@@ -1,4 +1,4 @@
-"""Masked pixels have no say in tracking, whatever they show."""
+"""Masked pixels do not influence tracking."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 
 def gripper(frame: Frame, seed: int | None = None) -> tuple[Frame, Mask]:
-    """The frame with a gripper 25 cm before the camera that stays where it is in the image; and the mask of it."""
+    """Add a gripper 25 cm in front of the camera at fixed pixels, and return the frame and the mask."""
     mask = np.ones(frame.depth.shape, bool)
     height, width = frame.depth.shape
     mask[height // 2 :, width // 4 : 3 * width // 4] = False
@@ -56,7 +56,7 @@ def test_a_gripper_in_view_ruins_tracking_unless_it_is_masked() -> None:
     assert errors[1] < 2e-3 < errors[0]
 
 
-def test_what_is_behind_the_mask_changes_no_bit_of_the_pose() -> None:
+def test_masked_pixels_change_no_bit_of_the_pose() -> None:
     poses = []
     for seed in (1, 2):
         run = Run(width=320)

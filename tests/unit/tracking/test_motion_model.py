@@ -14,13 +14,13 @@ START = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 
 
 
 def pose(stamp: float) -> np.ndarray:
-    """Where a camera of constant body twist is: by the matrix exponential."""
+    """Compute the pose of a camera of constant body twist by the matrix exponential."""
     M = np.zeros((4, 4))
     M[:3, :3], M[:3, 3] = skew(TWIST[3:]), TWIST[:3]
     return np.asarray(START @ expm(M * stamp))
 
 
-def told(*stamps: float) -> ConstantVelocity:
+def updated(*stamps: float) -> ConstantVelocity:
     motion = ConstantVelocity()
     for stamp in stamps:
         motion.update(stamp, pose(stamp))
@@ -30,10 +30,10 @@ def told(*stamps: float) -> ConstantVelocity:
 @pytest.mark.parametrize("stamps", [(0.0, 0.1, 0.2), (0.0, 0.1, 0.25), (5.0, 5.3, 5.31), (0.0, 0.02, 0.08)])
 def test_a_constant_twist_is_continued_exactly_at_even_and_uneven_stamps(stamps: tuple[float, float, float]) -> None:
     *known, next_stamp = stamps
-    np.testing.assert_allclose(told(*known).predict(next_stamp), pose(next_stamp), atol=1e-12)
+    np.testing.assert_allclose(updated(*known).predict(next_stamp), pose(next_stamp), atol=1e-12)
 
 
-def test_nothing_known_predicts_the_origin_and_one_pose_predicts_rest() -> None:
+def test_without_a_pose_the_origin_is_predicted_and_with_one_pose_rest() -> None:
     motion = ConstantVelocity()
     np.testing.assert_array_equal(motion.predict(3.0), np.eye(4))
     motion.update(3.0, START)
@@ -41,30 +41,30 @@ def test_nothing_known_predicts_the_origin_and_one_pose_predicts_rest() -> None:
 
 
 def test_after_a_lost_frame_the_camera_is_expected_where_it_was_last_seen() -> None:
-    motion = told(0.0, 0.1)
+    motion = updated(0.0, 0.1)
     motion.forget_velocity()
     np.testing.assert_array_equal(motion.predict(0.3), pose(0.1))
 
 
 def test_the_first_pose_after_a_lost_frame_gives_the_velocity_back() -> None:
-    motion = told(0.0, 0.1)
+    motion = updated(0.0, 0.1)
     motion.forget_velocity()
     motion.update(0.3, pose(0.3))
     np.testing.assert_allclose(motion.predict(0.4), pose(0.4), atol=1e-12)
 
 
 def test_a_long_gap_forgets_the_velocity_and_a_short_one_does_not() -> None:
-    motion = told(0.0, 0.1)
+    motion = updated(0.0, 0.1)
     np.testing.assert_allclose(motion.predict(0.1 + 0.29), pose(0.39), atol=1e-12)
     np.testing.assert_array_equal(motion.predict(0.1 + 0.31), pose(0.1))
 
 
 @pytest.mark.parametrize("stamps", [(1.0, 1.0), (2.0, 1.0)])
 def test_stamps_that_do_not_increase_predict_rest(stamps: tuple[float, float]) -> None:
-    motion = told(*stamps)
+    motion = updated(*stamps)
     for stamp in (0.5, *stamps, 3.0):
         np.testing.assert_array_equal(motion.predict(stamp), pose(stamps[1]))
 
 
 def test_a_stamp_that_repeats_predicts_the_same_pose() -> None:
-    np.testing.assert_array_equal(told(0.0, 0.1).predict(0.1), pose(0.1))
+    np.testing.assert_array_equal(updated(0.0, 0.1).predict(0.1), pose(0.1))

@@ -28,7 +28,7 @@ NEAR, FAR = 0.2, 6.0
 
 
 def two_walls(step_at: int = 80) -> NDArray[np.float32]:
-    """A wall at 1 m on the left, one at 1.5 m on the right."""
+    """Create the depth of a wall at 1 m on the left and one at 1.5 m on the right."""
     depth = np.full((120, 160), 1.0, np.float32)
     depth[:, step_at:] = 1.5
     return depth
@@ -54,7 +54,7 @@ def test_a_sharp_step_loses_no_pixel() -> None:
     assert np.array_equal(valid_depth(two_walls(), NEAR, FAR), two_walls())
 
 
-def test_one_missing_row_costs_its_neighbours_nothing() -> None:
+def test_one_missing_row_does_not_invalidate_its_neighbours() -> None:
     depth = wall_depth(CAMERA, np.eye(4), (0.0, -0.5, 0.9), 1.0).astype(np.float32)
     depth[60] = 0
     depth[:, 41] = 0
@@ -145,7 +145,7 @@ def test_a_normal_needs_a_pixel_with_four_measured_neighbours(shape: tuple[int, 
     assert not normals_of(np.full(shape, np.nan, np.float32), camera).any()
 
 
-def test_the_pyramid_halves_and_starts_at_most_as_wide_as_asked() -> None:
+def test_the_pyramid_halves_and_starts_with_at_most_the_configured_width() -> None:
     frames, _ = tabletop()
     config = small_config(tracking__max_width=100, tracking__n_levels=3).tracking
     levels = prepare(frames[0], config).levels
@@ -165,7 +165,7 @@ def test_grey_is_left_out_on_both_sides_of_an_occluding_edge_and_nowhere_else() 
     assert np.array_equal(left_out, expected)
 
 
-def test_grey_stays_on_slanted_surfaces_on_noisy_ones_and_beside_holes(rng: np.random.Generator) -> None:
+def test_grey_stays_on_slanted_surfaces_on_noisy_ones_and_next_to_holes(rng: np.random.Generator) -> None:
     R = np.eye(4)
     R[:3, :3] = so3_exp([0, 0.4, 0])
     depth = wall_depth(CAMERA, R, (0.0, 0.0, 1.0), 1.5)

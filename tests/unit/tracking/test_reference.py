@@ -1,4 +1,4 @@
-"""What later frames are aligned to: points on smooth surface, where image gradients are, about as many as asked."""
+"""Sampled pixels of keyframes: on smooth surfaces, at image gradients, and about as many as configured."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def test_points_lie_on_the_surface_with_its_normal_and_the_grey_of_their_pixel()
 
 
 @pytest.mark.parametrize("n_pixels", [100, 400, 1200, 4800])
-def test_about_as_many_pixels_are_taken_as_asked_for(n_pixels: int) -> None:
+def test_about_as_many_pixels_are_sampled_as_configured(n_pixels: int) -> None:
     level = prepare(wall_frame(np.eye(4)), small_config().tracking).levels[0]
     assert 0.6 * n_pixels <= len(sample_level(level, n_pixels).points) <= 1.2 * n_pixels
 
 
-def test_no_point_lies_beside_an_occlusion_boundary() -> None:
+def test_no_point_lies_next_to_an_occlusion_boundary() -> None:
     frames, _ = tabletop()
     level = prepare(frames[0], small_config().tracking).levels[0]
     depth = np.full(level.depth.shape, 1.0, np.float32)
@@ -47,7 +47,7 @@ def test_the_strongest_edge_of_a_tile_is_taken() -> None:
     depth = wall_depth(CAMERA, np.eye(4), (0, 0, 1), 1.0).astype(np.float32)
     sampled = sample_level(Level(gray, depth, CAMERA), 100)
     pixels = CAMERA.project(sampled.points)
-    assert np.abs(pixels - [37, 53]).max(axis=1).min() < 1.5  # beside the bright pixel, where its gradient is
+    assert np.abs(pixels - [37, 53]).max(axis=1).min() < 1.5  # next to the bright pixel, at its gradient
 
 
 def test_a_level_without_depth_gives_no_points() -> None:

@@ -1,4 +1,4 @@
-"""Covariances of poses: calibrated where the noise is known, composed as random errors compose, finite everywhere."""
+"""Covariances of poses: calibrated for known noise, composed like random errors, and always finite."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GATE = CONFIG.sensor.max_depth_difference
 
 
 def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: float, depth_noise: float) -> Level:
-    """Three textured walls that meet, with white noise."""
+    """Render textured walls that form a corner, with white noise."""
     depths = [wall_depth(CAMERA, T_world_camera, n, d) for n, d in (((0.5, 0, 1), 1.2), ((-0.5, 0.4, 1), 1.2))]
     z = np.minimum(*depths) + depth_noise * rng.standard_normal((120, 160))
     exact = np.minimum(*depths)
@@ -31,11 +31,10 @@ def corner_levels(T_world_camera: Array, rng: np.random.Generator, gray_noise: f
     return Level(gray.astype(np.float32), z.astype(np.float32), CAMERA)
 
 
-def test_the_spread_of_the_residuals_tells_the_error_whatever_the_noise_model_says() -> None:
+def test_the_spread_of_the_residuals_measures_the_error_for_any_noise_model() -> None:
     """White noise of other strengths than configured: C⁻¹ S C⁻¹ alone has a NEES / 6 near 1."""
-    config = TrackingConfig(
-        n_pixels=2000, sensor=SensorConfig(depth_sigma_scale=1.0)
-    )  # all the noise there is is the pixels' own
+    # The noise of the pixels is the only one.
+    config = TrackingConfig(n_pixels=2000, sensor=SensorConfig(depth_sigma_scale=1.0))
     rng, T = np.random.default_rng(1), se3_exp([0.004, -0.003, 0.005, 0.004, -0.003, 0.002])
     for gray_noise, depth_noise in ((0.01, 0.002), (0.04, 0.0005)):
         values = []
