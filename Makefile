@@ -29,7 +29,7 @@ help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-11s %s\n", $$1, $$2 }'
 
 .PHONY: demo
-demo: $(INSTALL_STAMP) ## record a synthetic table top, map it, serve it, ask it; then see runs/demo/report.html
+demo: $(INSTALL_STAMP) ## record a synthetic table top, map it, serve it and query it; then see runs/demo/report.html
 	$(BIN)/splatbot demo --out runs/demo
 
 .PHONY: serve
