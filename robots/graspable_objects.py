@@ -17,7 +17,7 @@ from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.results.folder import RunFolder
 from splatbot.results.observers import observers
-from splatbot.results.views import thinned_views
+from splatbot.results.views import subsampled_views
 from splatbot.robots.in_view import reopen_log
 from splatbot.segmentation import SegmentedMap, segment
 from splatbot.workspace import Workspace
@@ -30,7 +30,7 @@ class MeasuredMap:
     Args:
         state: without what more frames saw through than saw.
         observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known; None: nowhere is.
-        views: the recording's depth, thinned.
+        views: the recording's depth, subsampled.
         notes: what was not asked, and why.
     """
 
@@ -77,7 +77,7 @@ def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
     notes: tuple[str, ...] = ()
     views: tuple[DepthView, ...] = ()
     try:
-        views = thinned_views(run, reopen_log(run))
+        views = subsampled_views(run, reopen_log(run))
     except SplatbotError as error:
         name = f"{Path(error.file).name}: " if error.file else ""  # the folder is nobody's business
         why = f"the run's log cannot be read: {name}{error.message}"

@@ -1,4 +1,4 @@
-"""The bodies of a twin as MuJoCo draws them, with soft edges and depth."""
+"""The bodies of a twin rendered by MuJoCo, with antialiased edges and depth."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from splatbot.sim.view import TwinView
 from splatbot.sim.world import MAP_GROUP, World
 
 FINER = 2  # samples along a pixel's side
-_BACKGROUND = 0.999  # share of the far plane's distance from which on nothing was hit
-_SAME = 0.02  # relative difference of depth of one surface within a pixel
+_BACKGROUND = 0.999  # fraction of the far plane's distance beyond which a sample is background
+_SURFACE_TOLERANCE = 0.02  # relative difference of depth within one surface in a pixel
 
 
 class BodiesView:
-    """MuJoCo's renderer behind a pinhole camera anywhere.
+    """MuJoCo's renderer with a general pinhole camera.
 
-    Each pixel is the mean of 2 x 2 samples of which it is known whether they hit anything: MuJoCo's own multisampling
-    would mix edges with the background's colour.
+    Each pixel is the mean of 2 x 2 samples, each of which is known to hit a body or not. MuJoCo's own multisampling
+    would mix edges with the background colour.
 
     Args:
         world: a compiled scene.
         camera: any pinhole.
-        map_too: draw what stands for the map's Gaussians as well.
+        map_too: also draw the collision geometry of the map.
 
     Raises:
-        NativeError: nothing can be drawn on this machine.
+        NativeError: rendering is not available on this machine.
     """
 
     def __init__(self, world: World, camera: Camera, *, map_too: bool) -> None:
@@ -42,16 +42,16 @@ class BodiesView:
         self._far = _BACKGROUND * float(m.vis.map.zfar * m.stat.extent)
         self._shown = mujoco.MjvOption()
         self._shown.geomgroup[MAP_GROUP] = int(map_too)
-        self._shown.sitegroup[:] = 0  # marks, such as that of the tool, which no camera sees
+        self._shown.sitegroup[:] = 0  # markers such as that of the tool, which a real camera does not see
         try:
             self._renderer = mujoco.Renderer(m, height, width)
-        except Exception as error:  # EGL, OSMesa and GLFW each fail with their own kinds
+        except Exception as error:  # EGL, OSMesa and GLFW raise different types
             raise NativeError(
                 f"MuJoCo cannot draw here: {error}.", field="camera", hint="install libegl1 and set MUJOCO_GL=egl"
             ) from error
 
     def view(self, data: Any, T_world_camera: Array) -> TwinView:
-        """What is seen of the bodies from a pose (4, 4)."""
+        """Render the bodies from a pose (4, 4)."""
         self._aim(data, T_world_camera)
         self._renderer.disable_depth_rendering()
         color = self._renderer.render().astype(np.float32) / 255.0
@@ -63,7 +63,7 @@ class BodiesView:
         return TwinView(shown, alpha, _nearest(_pixels(np.where(hit, depth, np.float32(np.inf)))), alpha)
 
     def robot(self, data: Any, T_world_camera: Array) -> NDArray[np.float32]:
-        """Share (H, W) of each pixel in which the robot is foremost of what is drawn from a pose (4, 4)."""
+        """Compute the fraction (H, W) of each pixel in which the robot is the foremost body, from a pose (4, 4)."""
         self._aim(data, T_world_camera)
         self._renderer.enable_segmentation_rendering()
         number, kind = np.moveaxis(self._renderer.render(), -1, 0)
@@ -72,13 +72,13 @@ class BodiesView:
         return _pixels((geom & self._of_robot[np.where(geom, number, 0)]).astype(np.float32)).mean(axis=-1)
 
     def close(self) -> None:
-        """Give the drawing context back."""
+        """Release the rendering context."""
         self._renderer.close()
 
     def _aim(self, data: Any, T: Array) -> None:
         self._renderer.update_scene(data, scene_option=self._shown)
         c = self.camera
-        for eye in self._renderer.scene.camera:  # both of a pair that is averaged
+        for eye in self._renderer.scene.camera:  # a stereo pair that MuJoCo averages
             near = eye.frustum_near
             eye.pos, eye.forward, eye.up = T[:3, 3], T[:3, 2], -T[:3, 1]
             eye.frustum_center = near * (0.5 * (c.width - 1) - c.cx) / c.fx
@@ -88,16 +88,16 @@ class BodiesView:
 
 
 def _pixels(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W, 4) samples of each pixel."""
+    """Group the samples of each pixel: (H, W, 4)."""
     height, width = samples.shape[0] // FINER, samples.shape[1] // FINER
     grouped = samples.reshape(height, FINER, width, FINER).transpose(0, 2, 1, 3)
     return grouped.reshape(height, width, FINER * FINER)
 
 
 def _nearest(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (H, W) of the nearest surface among samples (H, W, S): no mean over an edge."""
+    """Average the depth (H, W) of the nearest surface among samples (H, W, S), so that no mean crosses an edge."""
     nearest = samples.min(axis=-1)
-    same = samples <= (1.0 + _SAME) * nearest[..., None]
+    same = samples <= (1.0 + _SURFACE_TOLERANCE) * nearest[..., None]
     total = np.where(same & np.isfinite(samples), samples, 0.0).sum(axis=-1)
     return np.where(np.isfinite(nearest), total / np.maximum(same.sum(axis=-1), 1), np.float32(np.inf)).astype(
         np.float32

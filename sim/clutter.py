@@ -1,4 +1,4 @@
-"""A Gaussian map in a scene: a table, fitted objects, and merged ellipsoids for what is left."""
+"""A Gaussian map in a simulated scene: a table, fitted objects, and merged ellipsoids for the rest."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from splatbot.sim.maps.ellipsoids import Ellipsoids, merge, surface_points
 from splatbot.sim.scene import Clutter, Scene, SceneObject
 from splatbot.sim.solids import pose_at, rpy_of
 
-_TABLE = 0.02  # [m] thick; what is below its top was hardly seen
+_TABLE_THICKNESS = 0.02  # [m]; depth below the table top is hardly observed
 _RIM = 0.5  # [%] of the table's Gaussians that may lie beyond its edge on each side
-_BESIDE = 0.03  # [m] from a thing that may move: what is left of the map there is of the thing
-_ON_TABLE = -2  # as segmentation labels them
+_STRAY_DISTANCE = 0.03  # [m] from a movable object within which remaining Gaussians belong to it
+_ON_TABLE = -2  # label of segmentation
 
 
 @dataclass(frozen=True, eq=False)
 class MapParts:
-    """What a map became.
+    """Collision geometry made from a map.
 
     Args:
         model: the map, in its own frame.
-        objects: table and fitted objects, as a scene has them.
+        objects: table and fitted objects, as scene objects.
         ellipsoids: the rest.
-        notes: each with its geometric error against the map, in words.
+        notes: description of each part with its geometric error against the map.
         labels: (N,) of the map's Gaussians: -2 left out, -1 ellipsoids, 0 the table, k the k-th fitted object.
     """
 
@@ -47,15 +47,15 @@ class MapParts:
 
 
 def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
-    """Table, objects and ellipsoids of a map.
+    """Convert a map to table, objects and ellipsoids.
 
     Args:
         model: the map.
-        clutter: which part of it, and where it is.
-        base: (3,) of the robot, near which ellipsoids are small [m].
+        clutter: which part of the map is used, and its pose.
+        base: (3,) of the robot [m], near which ellipsoids are small.
 
     Raises:
-        InputError: nothing of the map is in the part that is used.
+        InputError: the used part of the map has no Gaussians.
     """
     T_scene_map = pose_at(clutter.at, clutter.rpy)
     R = T_scene_map[:3, :3]
@@ -88,14 +88,14 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     beyond = 1e3 * np.percentile(_beyond(rest, model, T_scene_map), [50, 95])
     notes.append(
         f"clutter: {len(left)} Gaussians as {len(rest.centers)} ellipsoids, "
-        f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm), which reach "
-        f"{beyond[0]:.1f} mm beyond the field (95 %: {beyond[1]:.1f} mm)"
+        f"{1e3 * rest.error:.1f} mm from them (95 %: {1e3 * rest.worst:.1f} mm), which extend "
+        f"{beyond[0]:.1f} mm beyond the collision field (95 %: {beyond[1]:.1f} mm)"
     )
     return MapParts(model, tuple(objects), rest, tuple(notes), labels)
 
 
 def load_parts(scene: Scene) -> tuple[Scene, MapParts | None]:
-    """The scene with its map's objects and degree of colours, and the map's parts; without a map, the scene itself."""
+    """Load a scene's map; return the scene with the map's objects, and the parts, or None without a map."""
     if scene.map is None:
         return scene, None
     path = Path(scene.map.file)
@@ -107,7 +107,7 @@ def load_parts(scene: Scene) -> tuple[Scene, MapParts | None]:
 
 
 def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
-    """A geom for each, in the world itself: 2,000 in a body of their own take twice the time, asleep eight times."""
+    """Add a geom for each ellipsoid to the world body: in a body of their own, 2,000 take 2 to 8 times the time."""
     geoms = []
     for center, axes, quat in zip(ellipsoids.centers, ellipsoids.axes, ellipsoids.quats, strict=True):
         geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, pos=center, size=axes, quat=quat)
@@ -117,18 +117,18 @@ def add_ellipsoids(spec: Any, ellipsoids: Ellipsoids) -> list[Any]:
 
 
 def _beyond(ellipsoids: Ellipsoids, model: GaussianModel, T_scene_map: Array) -> Array:
-    """How far (E,) the ellipsoids reach out of what collisions are asked of [m]: a path past them may touch."""
+    """Compute by how much (E,) [m] the ellipsoids extend beyond the collision field that a planner uses."""
     if not len(ellipsoids.centers):
         return np.zeros(1)
     points = surface_points(ellipsoids)
     field = GaussianCollisionField(model, min_opacity=MIN_OPACITY)
     in_map = transform_points(inverse(T_scene_map), points.reshape(-1, 3))
-    room = field.clearance(in_map).distance.reshape(points.shape[:2])
-    return np.maximum(room.max(axis=1), 0.0)
+    clearance = field.clearance(in_map).distance.reshape(points.shape[:2])
+    return np.maximum(clearance.max(axis=1), 0.0)
 
 
 def _in_map(plane: tuple[float, float, float, float], T_scene_map: Array) -> Array:
-    """A plane (n, d) of the scene, n · p + d = 0, in the map's frame (4,)."""
+    """Transform a plane (n, d) of the scene, n · p + d = 0, to the map's frame (4,)."""
     length = float(np.linalg.norm(plane[:3]))
     if length < 1e-6 or plane[2] <= 0:
         raise InputError(f"is {list(plane)}.", field="map.support", hint="give n, d with n upwards")
@@ -137,7 +137,7 @@ def _in_map(plane: tuple[float, float, float, float], T_scene_map: Array) -> Arr
 
 
 def _table(support: Support, on: Array) -> SceneObject:
-    """As far as it was seen: an endless plane would stand in the way of an arm that reaches past the table's edge."""
+    """Fit a box of the observed extent; an infinite plane would obstruct an arm beyond the table's edge."""
     n = support.normal
     along = np.cross([0.0, 1.0, 0.0], n)
     along /= np.linalg.norm(along)
@@ -151,8 +151,8 @@ def _table(support: Support, on: Array) -> SceneObject:
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     low, high = np.percentile(seen @ turn, [_RIM, 100 - _RIM], axis=0)
     axes = flat @ turn
-    at = axes @ ((low + high) / 2) + n * (support.offset - _TABLE / 2)
-    shape = {"kind": "box", "size": [*np.maximum(high - low, _TABLE).tolist(), _TABLE]}
+    at = axes @ ((low + high) / 2) + n * (support.offset - _TABLE_THICKNESS / 2)
+    shape = {"kind": "box", "size": [*np.maximum(high - low, _TABLE_THICKNESS).tolist(), _TABLE_THICKNESS]}
     rpy = rpy_of(np.c_[axes, n])
     return SceneObject.model_validate({"name": "map-table", "shapes": [shape], "at": at.tolist(), "rpy": rpy})
 
@@ -166,11 +166,11 @@ def _add_objects(
     objects: list[SceneObject],
     notes: list[str],
 ) -> None:
-    for thing in scene.objects:
-        points = means[thing.rows[scene.solid[thing.rows]]]
+    for obj in scene.objects:
+        points = means[obj.rows[scene.solid[obj.rows]]]
         found = fit(points, _floor(scene, points))
         number = len(objects)
-        labels[thing.rows] = number
+        labels[obj.rows] = number
         name = f"map-{found.shape['kind']}-{number}"
         values = {"name": name, "shapes": [found.shape], "at": found.at.tolist(), "movable": clutter.movable}
         objects.append(SceneObject.model_validate(values))
@@ -183,7 +183,7 @@ def _add_objects(
 
 
 def _floor(scene: SegmentedMap, points: Array) -> float:
-    """Height of what things stand on [m], under their middle."""
+    """Return the height of the support plane [m] under the centre of points."""
     under = scene.under(points) or scene.support
     assert under is not None
     x, y = points[:, :2].mean(axis=0)
@@ -191,7 +191,7 @@ def _floor(scene: SegmentedMap, points: Array) -> float:
 
 
 def _gather_strays(points: Array, used: np.ndarray, support: Support, labels: np.ndarray) -> None:
-    """Gives what is beside a thing the thing's label: as clutter, which stays where it is, it would nail it down."""
+    """Label Gaussians near a fitted object as the object's; as fixed clutter they would block its motion."""
     here = labels[used]
     loose, fitted = np.flatnonzero((here == -1) & (support.height(points) > 0)), np.flatnonzero(here > 0)
     if not len(fitted):
@@ -199,5 +199,5 @@ def _gather_strays(points: Array, used: np.ndarray, support: Support, labels: np
     for part in np.array_split(loose, max(1, len(loose) * len(fitted) // 1_000_000)):
         away = np.linalg.norm(points[part, None] - points[None, fitted], axis=-1)
         nearest = away.argmin(axis=1)
-        near = away[np.arange(len(part)), nearest] < _BESIDE
+        near = away[np.arange(len(part)), nearest] < _STRAY_DISTANCE
         labels[used[part[near]]] = here[fitted[nearest[near]]]

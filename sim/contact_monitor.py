@@ -1,4 +1,4 @@
-"""What the arm touches, how hard and how deep, and how near it comes to the rest."""
+"""Contacts of the arm with their force and depth, and the clearance of the arm."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from splatbot.sim.world import World
 
-FAR = 0.3  # [m]; more room than this is not told apart
+FAR = 0.3  # [m] largest clearance that is computed
 
 
 @dataclass
-class Touch:
-    """A part of the arm against something, over a run.
+class ContactEvent:
+    """Contacts between a part of the arm and another body over a run.
 
     Args:
         part: a link or a finger.
         other: an object, the map, or another link.
-        first, last: when they touched [s].
-        depth: deepest overlap [m].
+        first, last: first and last time of contact [s].
+        depth: largest penetration [m].
         force: largest normal force [N].
         steps: control periods with contact.
     """
@@ -37,33 +37,33 @@ class Touch:
 
 
 @dataclass(frozen=True)
-class Near:
-    """The least room between the arm and the rest.
+class MinimumClearance:
+    """Minimum clearance between the arm and other bodies over a run.
 
     Args:
-        room: [m], negative where they overlap; ``FAR`` if it was never less.
-        time: [s].
-        part, other: which.
+        value: [m], negative in penetration; ``FAR`` if it was never less.
+        time: [s] of the minimum.
+        part, other: the closest bodies.
     """
 
-    room: float
+    value: float
     time: float
     part: str = ""
     other: str = ""
 
 
 class ContactMonitor:
-    """Gathers contacts of the arm."""
+    """Records contacts of the arm."""
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self._found: dict[tuple[str, str], Touch] = {}
+        self._found: dict[tuple[str, str], ContactEvent] = {}
         self._force = np.zeros(6)
         self.tangential = 0.0
         self.steps = 0
 
-    def look(self, data: Any, time: float) -> None:
-        """Take note of what touches now."""
+    def update(self, data: Any, time: float) -> None:
+        """Record the current contacts."""
         count = int(data.ncon)
         if not count:
             return
@@ -84,20 +84,20 @@ class ContactMonitor:
         force = float(self._force[0])
         known = self._found.get((part, other))
         if known is None:
-            self._found[part, other] = Touch(part, other, time, time, depth, force)
+            self._found[part, other] = ContactEvent(part, other, time, time, depth, force)
             return
         known.steps += known.last < time
         known.last = time
         known.depth, known.force = max(known.depth, depth), max(known.force, force)
 
     @property
-    def found(self) -> list[Touch]:
-        """In the order in which they began."""
-        return sorted(self._found.values(), key=lambda touch: (touch.first, touch.part, touch.other))
+    def found(self) -> list[ContactEvent]:
+        """Contacts in the order of their beginning."""
+        return sorted(self._found.values(), key=lambda contact: (contact.first, contact.part, contact.other))
 
 
-class Room:
-    """The least room between the arm's moving parts and the rest, by bounding spheres and MuJoCo's distances."""
+class ClearanceMonitor:
+    """Minimum clearance between the arm's moving parts and other bodies, by bounding spheres and MuJoCo's distances."""
 
     def __init__(self, world: World) -> None:
         m = world.model
@@ -105,23 +105,25 @@ class Room:
         self._arm = np.flatnonzero(world.of_robot & moving)
         self._rest = np.flatnonzero(~world.of_robot)
         self._planes = np.asarray(m.geom_type)[self._rest] == int(mujoco.mjtGeom.mjGEOM_PLANE)
-        let = set(world.mounted)
+        excluded = set(world.mounted)
         owner = world.owner
-        self._let = np.array([[(owner[i], owner[j]) in let for j in self._rest] for i in self._arm], dtype=np.bool_)
+        self._excluded = np.array(
+            [[(owner[i], owner[j]) in excluded for j in self._rest] for i in self._arm], dtype=np.bool_
+        )
         self._world = world
-        self.least = Near(FAR, 0.0)
+        self.minimum = MinimumClearance(FAR, 0.0)
 
-    def look(self, data: Any, time: float) -> None:
-        """Take note if it is nearer than ever."""
+    def update(self, data: Any, time: float) -> None:
+        """Update the minimum with the current clearance."""
         if not len(self._arm) or not len(self._rest):
             return
         for i, j in self._candidates(data):
-            room = self._distance(data, i, j)
-            if room < self.least.room:
-                self.least = Near(room, time, self._world.owner[i], self._world.owner[j])
+            clearance = self._distance(data, i, j)
+            if clearance < self.minimum.value:
+                self.minimum = MinimumClearance(clearance, time, self._world.owner[i], self._world.owner[j])
 
     def _candidates(self, data: Any) -> NDArray[np.int64]:
-        """Pairs whose bounding spheres are nearer than the least room so far, nearest first."""
+        """Return pairs whose bounding spheres are closer than the minimum so far, closest first."""
         m = self._world.model
         at, radius = np.asarray(data.geom_xpos), np.asarray(m.geom_rbound)
         between = at[self._arm][:, None] - at[self._rest][None]
@@ -130,9 +132,9 @@ class Room:
             normals = np.asarray(data.geom_xmat).reshape(-1, 3, 3)[self._rest[self._planes]][:, :, 2]
             heights = np.einsum("apk,pk->ap", between[:, self._planes], normals)
             gap[:, self._planes] = heights - radius[self._arm][:, None]
-        rows, columns = np.nonzero((gap < self.least.room) & ~self._let)
+        rows, columns = np.nonzero((gap < self.minimum.value) & ~self._excluded)
         order = np.argsort(gap[rows, columns], kind="stable")
         return np.stack([self._arm[rows[order]], self._rest[columns[order]]], axis=-1)
 
     def _distance(self, data: Any, i: int, j: int) -> float:
-        return float(mujoco.mj_geomDistance(self._world.model, data, int(i), int(j), self.least.room, None))
+        return float(mujoco.mj_geomDistance(self._world.model, data, int(i), int(j), self.minimum.value, None))

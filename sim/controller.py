@@ -1,4 +1,4 @@
-"""The twin as a controller: whatever drives a real arm drives the twin's."""
+"""The twin as a controller with the same interface as that of a real arm."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from splatbot.sim.twin import Twin
 
 class TwinController(SteppedController):
     """A :class:`splatbot.protocols.Controller` whose arm is in a twin; each step is one control period of physics.
+    Physics also runs while the arm holds still. After a stop the arm holds its position from the next step on.
+    ``gripper`` controls its fingers, or equals None without a gripper.
 
-    Physics passes while the arm holds still, too. Told to stop, it holds where it is from the next step on. ``gripper``
-    are its fingers, None without any.
+        Args:
+            twin: reset, or in any state.
+            following: largest following error [rad or m], beyond which the controller faults.
 
-    Args:
-        twin: reset, or wherever its arm is.
-        following: largest difference between where the arm is and should be [rad or m], beyond which it faults.
-
-    Raises:
-        InputError: the twin has no robot.
+        Raises:
+            InputError: the twin has no robot.
     """
 
     def __init__(self, twin: Twin, *, following: float = FOLLOWING) -> None:
@@ -41,7 +40,7 @@ class TwinController(SteppedController):
         self._before = trajectory.reference(0.0)[1]
 
     def step(self) -> Feedback:
-        """Let one period pass, whatever the arm does."""
+        """Simulate one control period in any state of motion."""
         if self._state is MotionState.MOVING and not self._stopping:
             return super().step()
         if self._state is MotionState.MOVING:

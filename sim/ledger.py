@@ -1,4 +1,4 @@
-"""What each effect cost a run."""
+"""Computation time of each effect in a run."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class LedgerEntry:
 
     Args:
         name: of the effect.
-        on: whether it was.
-        why: or why not.
-        by: the scene's content, or `forced`, `forbidden`.
-        observable: what changes without it: a figure, or something of the frames; empty for what the sensor leaves out.
-        ms: how much longer physics took with it than without it [ms], below 0 if it saved time; of the sensor, how
-            long it took; None if it was off, or was not measured.
-        us_per_step: the same for a step [us].
+        on: whether it was active.
+        why: reason for or against it.
+        by: origin of the decision: the scene's content, or `forced`, `forbidden`.
+        observable: result or property of the frames that the effect changes; empty for an inactive sensor effect.
+        ms: additional physics time with the effect [ms], negative if it saves time, or time of a sensor effect. It is
+            undefined (None) if the effect was inactive or not measured.
+        us_per_step: the same per step [us].
     """
 
     name: str
@@ -44,17 +44,17 @@ def ledger(
     costs: bool = True,
     sensor: Sequence[Mapping[str, Any]] = (),
 ) -> list[LedgerEntry]:
-    """An entry for every effect; physics that is on is measured by running the motion again without it.
+    """Return an entry for every effect; an active physics effect is measured by a second run without it.
 
     Args:
         twin: that ran.
         result: of that run.
         motion: that it followed.
-        costs: whether to measure; takes a run for each physics effect that is on.
-        sensor: the account of the camera that looked on, see :meth:`TwinCamera.report`.
+        costs: whether to measure, with one run for each active physics effect.
+        sensor: report of the camera, see :meth:`TwinCamera.report`.
     """
     drawn = {row["name"]: (row["ms_per_frame"] or 0.0) * row["frames"] for row in sensor}
-    base = twin.follow(motion).physics_seconds if costs else 0.0  # again: the run itself may have been watched
+    base = twin.follow(motion).physics_seconds if costs else 0.0  # a separate run, because callbacks cost time
     found = []
     for decision in result.decisions:
         physical = decision.name in PHYSICS

@@ -1,4 +1,4 @@
-"""The Gaussian map of a twin as the rasterizer draws it; what was made movable moves with its body."""
+"""The Gaussian map of a twin as rendered by the rasterizer; Gaussians of movable objects move with their bodies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from splatbot.sim.solids import pose_at
 from splatbot.sim.view import TwinView
 from splatbot.sim.world import OBJECT, World
 
-_FAINT = 1.0 / 255.0  # opacity that no pixel shows
+_MIN_ALPHA = 1.0 / 255.0  # opacity below one 8-bit step
 
 
 class MapView:
@@ -36,9 +36,9 @@ class MapView:
         self._sh_degree = world.harmonics
         self._T_world_map = pose_at(world.scene.map.at, world.scene.map.rpy)
         self._loose = [
-            (int(world.model.body(OBJECT + thing.name).id), torch.from_numpy(np.flatnonzero(parts.labels == label)))
-            for label, thing in enumerate(parts.objects)
-            if thing.movable
+            (int(world.model.body(OBJECT + obj.name).id), torch.from_numpy(np.flatnonzero(parts.labels == label)))
+            for label, obj in enumerate(parts.objects)
+            if obj.movable
         ]
         self._T_start_world = {
             body: inverse(pose_from_quat(world.model.body_pos[body], world.model.body_quat[body]))
@@ -46,14 +46,14 @@ class MapView:
         }
 
     def view(self, data: Any, T_world_camera: Array) -> TwinView:
-        """What is seen of the map from a pose (4, 4)."""
+        """Render the map from a pose (4, 4)."""
         T_map_camera = inverse(self._T_world_map) @ T_world_camera
         rgb, alpha, depth = render_rgbd(self._placed(data), self.camera, T_map_camera, sh_degree=self._sh_degree)
-        seen = np.where(alpha > _FAINT, depth, np.float32(np.inf))
+        seen = np.where(alpha > _MIN_ALPHA, depth, np.float32(np.inf))
         return TwinView(rgb, alpha, seen, np.zeros_like(alpha))
 
     def _placed(self, data: Any) -> GaussianModel:
-        """The map with the Gaussians of each movable body where the body is; harmonics are not turned."""
+        """Return the map with the Gaussians of each movable body at the body's pose; harmonics are not rotated."""
         if not self._loose:
             return self._model
         means, quats = self._model.means.clone(), self._model.quats.clone()

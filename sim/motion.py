@@ -1,4 +1,4 @@
-"""How the arm shall move: joints over time, from a trajectory, a file or the moves of a scene."""
+"""Motions of the arm: joints over time, from a trajectory, a file or the moves of a scene."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Sampled(Protocol):
     """A trajectory that can be sampled, as the planner's is."""
 
     def sampled(self, rate: float = ...) -> Any:
-        """:class:`Samples` at a rate [Hz]."""
+        """Sample the trajectory at a rate [Hz]; see :class:`Samples`."""
         ...
 
 
@@ -48,10 +48,10 @@ class JointMotion:
         position: (N, J) [rad or m].
         velocity: (N, J), per s.
         acceleration: (N, J), per s².
-        opening: (N,) of the gripper [m]; None: it stays as it is.
+        opening: (N,) of the gripper [m]. If None, it does not change.
 
     Raises:
-        InputError: shapes do not fit, a value is not finite, or times do not increase from 0.
+        InputError: shapes do not match, a value is not finite, or times do not increase from 0.
     """
 
     time: Array
@@ -74,13 +74,13 @@ class JointMotion:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return float(self.time[-1])
 
     def at(self, t: ArrayLike) -> tuple[Array, Array, Array, Array | None]:
-        """Position, velocity, acceleration (T, J) and opening (T,) at times (T,) [s]; at rest outside.
+        """Return position, velocity, acceleration (T, J) and opening (T,) at times (T,) [s]; at rest outside.
 
-        Positions are the cubics through positions and velocities (Hermite).
+        Positions are cubic Hermite interpolants of positions and velocities.
         """
         x = np.clip(np.asarray(t, dtype=np.float64), 0.0, self.duration)
         inside = ((np.asarray(t) >= 0) & (np.asarray(t) <= self.duration))[:, None]
@@ -95,7 +95,7 @@ class JointMotion:
 
 
 def motion_from_samples(time: ArrayLike, position: ArrayLike, velocity: ArrayLike | None = None) -> JointMotion:
-    """A motion through positions (N, J) at times (N,) [s]; without velocities, by central differences."""
+    """Create a motion through positions (N, J) at times (N,) [s]; missing velocities are central differences."""
     t, q = np.asarray(time, dtype=np.float64), np.asarray(position, dtype=np.float64)
     if t.ndim != 1 or len(t) < 2 or q.ndim != 2 or len(q) != len(t):
         raise InputError(f"are {q.shape} at {t.shape} times.", field="position", hint="give (N, J) at (N,), N >= 2")
@@ -106,13 +106,13 @@ def motion_from_samples(time: ArrayLike, position: ArrayLike, velocity: ArrayLik
 
 
 def motion_from_trajectory(trajectory: Sampled, rate: float = 1000.0) -> JointMotion:
-    """The samples of a planner's trajectory."""
+    """Sample a planner's trajectory."""
     s: Samples = trajectory.sampled(rate)
     return JointMotion(np.asarray(s.time), np.asarray(s.position), np.asarray(s.velocity), np.asarray(s.acceleration))
 
 
 def hold(q: ArrayLike, seconds: float) -> JointMotion:
-    """No motion at all, at a configuration (J,)."""
+    """Create a motion at rest at a configuration (J,)."""
     if not 0 < seconds < np.inf:
         raise InputError(f"is {seconds}.", field="seconds", hint="give a number above 0")
     at = np.tile(np.asarray(q, dtype=np.float64), (2, 1))
@@ -120,10 +120,10 @@ def hold(q: ArrayLike, seconds: float) -> JointMotion:
 
 
 def motion_of(scene: Scene, robot: RobotModel, *, seconds: float = 1.0) -> JointMotion:
-    """The moves of a scene's task: at rest at each, minimum jerk between them; without moves, a hold at home.
+    """Create the motion of a scene's task: minimum jerk between moves, at rest at each; without moves, a hold at home.
 
     Raises:
-        InputError: a place cannot be reached.
+        InputError: a pose cannot be reached.
     """
     start = home_of(scene, robot)
     if not scene.task.moves:
@@ -143,7 +143,7 @@ def motion_of(scene: Scene, robot: RobotModel, *, seconds: float = 1.0) -> Joint
 
 
 def minimum_jerk(t: Array, times: Array, knots: Array, order: int) -> Array:
-    """Value or derivative (T, J) of quintics between knots (K, J), at rest at each (Flash and Hogan 1985)."""
+    """Evaluate minimum-jerk quintics (T, J) or a derivative between knots (K, J), with rests (Flash, Hogan 1985)."""
     i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
     h = (times[i + 1] - times[i])[:, None]
     u = (t - times[i])[:, None] / h
@@ -156,13 +156,13 @@ def minimum_jerk(t: Array, times: Array, knots: Array, order: int) -> Array:
 
 
 def home_of(scene: Scene, robot: RobotModel) -> Array:
-    """Where the arm begins (J,)."""
+    """Return the initial configuration (J,) of the arm."""
     home = scene.robot.home if scene.robot is not None and scene.robot.home else robot.home
     return np.asarray(home, dtype=np.float64)
 
 
 def base_of(scene: Scene) -> Array:
-    """T_world_base (4, 4) of the scene's robot."""
+    """Return T_world_base (4, 4) of the scene's robot."""
     T = np.eye(4)
     if scene.robot is not None:
         T[:3, :3] = rotation_of((0.0, 0.0, scene.robot.yaw))
@@ -188,7 +188,7 @@ def _reach(scene: Scene, robot: RobotModel, at: Sequence[float], rpy: Any, near:
 
 
 def load_motion(path: str | Path, robot: RobotModel) -> JointMotion:
-    """A trajectory file: ROS ``JointTrajectory`` as JSON, or CSV with `time`, `position.JOINT` and `velocity.JOINT`.
+    """Load a trajectory: ROS ``JointTrajectory`` JSON, or CSV with `time`, `position.JOINT` and `velocity.JOINT`.
 
     Raises:
         FormatError: the file cannot be read, or names other joints.

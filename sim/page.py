@@ -1,4 +1,4 @@
-"""A run of the twin as a page that is turned, played, stepped and scrubbed."""
+"""A simulated run of the twin as an interactive page."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import mujoco
 import numpy as np
 
 from splatbot.protocols import Array
-from splatbot.report.moving_page import bytes_of, moving_page, packed, thinned
+from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
 from splatbot.sim.contact_monitor import FAR
 from splatbot.sim.recording import TwinRecording
 from splatbot.sim.solids import rotation_of
 from splatbot.sim.twin import TwinResult
 from splatbot.sim.world import MAP_GROUP, World
 
-_MOST_POINTS = 20_000  # of the map
-_ON_GEOM, _ON_THING = 300, 400  # points on a geom of the arm, and of another body
-_NEAR = 1.6  # [m] around the robot that is shown of a map
-_FLOOR = 0.8  # [m] to each side that is shown of a plane
+_MAX_POINTS = 20_000  # of the map
+_POINTS_PER_ROBOT_GEOM, _POINTS_PER_OBJECT_GEOM = 300, 400
+_CROP_RADIUS = 1.6  # [m] of the map around the robot that is shown
+_FLOOR = 0.8  # [m] half-extent of planes
 _SIZE = 0.006  # [m] of a point
 
 
 def twin_html(recording: TwinRecording, result: TwinResult) -> str:
-    """The page: robot, things and map as points, places where the arm touches, and its room as a curve over time.
+    """Return the page: robot, objects and map as points, contacts, and a curve of the arm's clearance over time.
 
     Args:
         recording: of the run.
-        result: what came of it.
+        result: of the run.
     """
     world = recording.world
     own, tints, body, points, colors = _clouds(world)
@@ -41,8 +41,8 @@ def twin_html(recording: TwinRecording, result: TwinResult) -> str:
         "bodies": int(world.model.nbody),
         "poses": packed(recording.poses, np.float32),
         "soft": packed(recording.soft, np.float32),
-        "touches": [[[round(v, 4) for v in touch] for touch in found] for found in recording.touches],
-        "rooms": np.round(recording.rooms, 5).tolist(),
+        "contacts": [[[round(v, 4) for v in contact] for contact in found] for found in recording.contacts],
+        "clearances": np.round(recording.clearances, 5).tolist(),
         "far": FAR,
         "times": np.round(recording.times, 4).tolist(),
         "middle": [0.35, 0.0, 0.25],
@@ -53,19 +53,23 @@ def twin_html(recording: TwinRecording, result: TwinResult) -> str:
 
 
 def _facts(result: TwinResult) -> str:
-    touched = ", ".join(sorted({touch.other for touch in result.touches})) or "nothing"
-    found = [f"{result.duration:.2f} s", f"touched: {touched}", f"least room {1e3 * result.near.room:.1f} mm"]
+    contacts = ", ".join(sorted({contact.other for contact in result.contacts})) or "none"
+    found = [
+        f"simulated: {result.duration:.2f} s",
+        f"contacts: {contacts}",
+        f"minimum clearance {1e3 * result.clearance.value:.1f} mm",
+    ]
     if result.tracking is not None:
-        found.append(f"tool {1e3 * result.tracking.tcp:.2f} mm off at most")
+        found.append(f"maximum tool error {1e3 * result.tracking.tcp:.2f} mm")
     if result.dropped:
         found.append(f"fell: {', '.join(result.dropped)}")
     return "; ".join((*found, *result.warnings))
 
 
 def _clouds(world: World) -> tuple[Array, Array, np.ndarray, Array, Array]:
-    """Points (P, 3) on the geoms of bodies, their colours and bodies (P,); and points and colours of what stands still.
+    """Sample points (P, 3) on moving bodies with colours and bodies (P,), and points and colours of fixed ones.
 
-    Fitted objects of a map are shown by its Gaussians unless they move.
+    Fitted objects of a map are represented by its Gaussians unless they move.
     """
     m, fixed = world.model, np.asarray(world.model.body_weldid) == 0
     moving: list[tuple[Array, Array, np.ndarray]] = []
@@ -74,7 +78,7 @@ def _clouds(world: World) -> tuple[Array, Array, np.ndarray, Array, Array]:
         number = int(m.geom_bodyid[geom])
         if int(m.geom_group[geom]) == MAP_GROUP and fixed[number]:
             continue
-        points = surface_points(m, geom, _ON_GEOM if world.of_robot[geom] else _ON_THING)
+        points = surface_points(m, geom, _POINTS_PER_ROBOT_GEOM if world.of_robot[geom] else _POINTS_PER_OBJECT_GEOM)
         R = np.zeros(9)
         mujoco.mju_quat2Mat(R, m.geom_quat[geom])
         points = points @ R.reshape(3, 3).T + m.geom_pos[geom]
@@ -91,19 +95,19 @@ def _clouds(world: World) -> tuple[Array, Array, np.ndarray, Array, Array]:
 
 
 def _map_points(world: World) -> tuple[Array, Array]:
-    """Gaussians (P, 3) of the map that stay where they are, around the robot, and their colours (P, 3)."""
+    """Return the fixed Gaussians (P, 3) of the map around the robot, and their colours (P, 3)."""
     if world.parts is None or world.scene.map is None:
         return np.zeros((0, 3)), np.zeros((0, 3))
     model, labels = world.parts.model, world.parts.labels
     means = model.means.double().numpy() @ rotation_of(world.scene.map.rpy).T + world.scene.map.at
-    loose = [label for label, thing in enumerate(world.parts.objects) if thing.movable]
-    rows = np.flatnonzero((np.abs(means).max(axis=1) < _NEAR) & ~np.isin(labels, loose))
-    rows = rows[thinned(len(rows), _MOST_POINTS)]
+    loose = [label for label, obj in enumerate(world.parts.objects) if obj.movable]
+    rows = np.flatnonzero((np.abs(means).max(axis=1) < _CROP_RADIUS) & ~np.isin(labels, loose))
+    rows = rows[evenly_spaced(len(rows), _MAX_POINTS)]
     return means[rows], model.colors.double().numpy()[rows]
 
 
 def surface_points(m: Any, geom: int, count: int) -> Array:
-    """About ``count`` points on a geom's surface (P, 3) [m], in its own frame: along rays from its middle."""
+    """Sample about ``count`` points on a geom's surface (P, 3) [m] in its own frame, along rays from its centre."""
     kind, size = int(m.geom_type[geom]), np.asarray(m.geom_size[geom])
     types = mujoco.mjtGeom
     if kind == int(types.mjGEOM_PLANE):
@@ -112,8 +116,8 @@ def surface_points(m: Any, geom: int, count: int) -> Array:
         return np.stack([x, y, np.zeros_like(x)], axis=1)
     if kind == int(types.mjGEOM_MESH):
         number = int(m.geom_dataid[geom])
-        first, many = int(m.mesh_vertadr[number]), int(m.mesh_vertnum[number])
-        return np.array(m.mesh_vert[first : first + many][thinned(many, count)], dtype=np.float64)
+        first, vertices = int(m.mesh_vertadr[number]), int(m.mesh_vertnum[number])
+        return np.array(m.mesh_vert[first : first + vertices][evenly_spaced(vertices, count)], dtype=np.float64)
     rays = _directions(count)
     across, along = np.hypot(rays[:, 0], rays[:, 1]), np.abs(rays[:, 2])
     with np.errstate(divide="ignore"):
@@ -125,7 +129,7 @@ def surface_points(m: Any, geom: int, count: int) -> Array:
             reach = (size / np.abs(rays)).min(axis=1)
         elif kind == int(types.mjGEOM_CYLINDER):
             reach = np.minimum(size[0] / across, size[1] / along)
-        else:  # a capsule: its side, or the ball at the end
+        else:  # a capsule: its side, or the spherical cap
             side = size[0] / across
             ball = size[1] * along + np.sqrt(np.maximum(size[0] ** 2 - (size[1] * across) ** 2, 0.0))
             reach = np.where(side * along <= size[1], side, ball)
@@ -133,7 +137,7 @@ def surface_points(m: Any, geom: int, count: int) -> Array:
 
 
 def _directions(count: int) -> Array:
-    """Unit vectors (N, 3), evenly spread (Fibonacci's lattice)."""
+    """Return unit vectors (N, 3), evenly spread (Fibonacci lattice)."""
     i = np.arange(count) + 0.5
     z, turn = 1.0 - 2.0 * i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     r = np.sqrt(1.0 - z * z)

@@ -1,4 +1,4 @@
-"""A thing picked in the twin: the scene is scanned, and all that follows knows only that map."""
+"""A pick in the twin: the scene is scanned, and all later stages use only that map."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from splatbot.workspace import NamedPlace
 
 @dataclass(frozen=True, eq=False)
 class TwinPick:
-    """What came of a pick in the twin.
+    """Result of a simulated pick.
 
     Args:
         result: of the pick.
-        target: what was taken for the thing named.
-        rose: how far each movable object really rose [m].
+        target: the object that matched the name.
+        rose: height by which each movable object rose in the simulation [m].
     """
 
     result: PickResult
@@ -34,7 +34,7 @@ class TwinPick:
     rose: dict[str, float]
 
     def summary(self) -> dict[str, Any]:
-        """As JSON can say it."""
+        """Return the result as values for JSON."""
         result, grasp = self.result, self.result.grasp
         return {
             "outcome": result.outcome,
@@ -68,22 +68,22 @@ def pick_in_twin(
     stop: Callable[[], bool] | None = None,
     on_step: Callable[[PickStep], None] | None = None,
 ) -> TwinPick:
-    """Scan the twin's scene, find the thing that is named, and pick it.
+    """Scan the twin's scene, find the named object, and pick it.
 
     Args:
         twin: with an arm that has fingers.
         target: a name of the scene, or words.
-        backends: who find it, asked in turn.
-        options: how.
-        views: of the scan.
-        margin: room [m] that hand and arm keep from the map.
-        home: carry it to where the arm began.
+        backends: affordance detectors, tried in order.
+        options: of the pick.
+        views: number of views of the scan.
+        margin: clearance [m] that hand and arm keep from the map.
+        home: carry the object to the arm's initial configuration.
         seed: of the scan's noise.
-        stop: asked all the time; True ends the pick.
-        on_step: told of each stage that is done.
+        stop: polled continuously; True ends the pick.
+        on_step: called after each stage.
 
     Raises:
-        InputError: the scene has no arm with fingers; nothing, or more than one thing, is of that name.
+        InputError: the scene has no arm with fingers, or the name matches no object or more than one.
     """
     controller, robot = TwinController(twin), twin.world.robot
     if controller.gripper is None or robot is None:
@@ -101,12 +101,12 @@ def pick_in_twin(
 
 
 def scanned(twin: Twin, views: int, seed: int) -> SegmentedMap:
-    """What a scan tells, with the names of the scene's objects."""
-    movable = [thing.name for thing in twin.scene.objects if thing.movable]
+    """Scan the twin and segment the map, with the names of the scene's objects."""
+    movable = [obj.name for obj in twin.scene.objects if obj.movable]
     names = [NamedPlace(name, twin.data.body(f"object/{name}").xipos.copy()) for name in movable]
     return segment(scan(twin, views=views, seed=seed), base_of(twin.scene), names=names)
 
 
 def _heights(twin: Twin) -> dict[str, float]:
-    movable = [thing.name for thing in twin.scene.objects if thing.movable]
+    movable = [obj.name for obj in twin.scene.objects if obj.movable]
     return {name: float(twin.data.body(f"object/{name}").xipos[2]) for name in movable}

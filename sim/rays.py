@@ -1,4 +1,4 @@
-"""Rays cast against the shapes that physics computes with; nothing is drawn."""
+"""Ray casting against the collision geometry of a simulation, without rendering."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Pixels = NDArray[np.int64]
 
 
 def pixel_rays(camera: Camera, rows: Pixels | None = None, columns: Pixels | None = None) -> Array:
-    """Through the centres of those rows' and columns' pixels, by default all (h, w, 3), 1 m along the optical axis."""
+    """Return rays (h, w, 3) through the centres of the given rows' and columns' pixels, with unit depth."""
     rows = np.arange(camera.height) if rows is None else rows
     columns = np.arange(camera.width) if columns is None else columns
     v, u = np.meshgrid(rows, columns, indexing="ij")
@@ -23,13 +23,13 @@ def pixel_rays(camera: Camera, rows: Pixels | None = None, columns: Pixels | Non
 
 
 def cast(model: Any, data: Any, rays: Array, T_world_camera: Array, reach: float) -> tuple[NDArray[np.int32], Array]:
-    """What rays (h, w, 3) of a camera at a pose (4, 4) meet first, as of :func:`pixel_rays`.
+    """Return the first hits of camera rays (h, w, 3) at a pose (4, 4); see :func:`pixel_rays`.
 
     Returns:
-        Numbers of the geoms (h, w), -1 where there is none within ``reach`` [m], and depth along the optical axis
-        (h, w) [m], 0 there.
+        Indices of the geoms (h, w), -1 without a hit within ``reach`` [m], and depth along the optical axis (h, w)
+        [m], 0 without a hit.
     """
-    # A ray is 1 m long along the axis, and MuJoCo counts in lengths of the ray: what it tells is depth.
+    # Rays have unit depth, and MuJoCo reports distances in ray lengths, which are therefore depths.
     world = np.ascontiguousarray(rays.reshape(-1, 3) @ T_world_camera[:3, :3].T)
     geoms, depth = np.full(len(world), -1, np.int32), np.zeros(len(world))
     origin = np.ascontiguousarray(T_world_camera[:3, 3])

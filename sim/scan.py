@@ -1,4 +1,4 @@
-"""A scene is looked at from around with a depth camera: what a robot knows of it before it acts."""
+"""Simulated scan of a scene by a depth camera from several views: the map that a robot has before it acts."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from splatbot.sim.twin import Twin
 from splatbot.tracking.prepare import normals_of
 
 SPACING = 4e-3  # [m] between discs
-_AWAY = 0.65  # [m] of the camera from the middle of the objects
-_STEEP = (np.radians(60.0), np.radians(30.0))  # over the support, in turns
-_FARTHEST = 3.0  # [m] that the camera measures
-_SIGMA = 0.55  # of a disc across, in spacings
-_THICK = 1e-3  # [m]
-_STAND = 0.2  # [m] around the robot's foot that is its stand, and not mapped
-_GRAZING = 0.2  # least cosine between a surface's normal and the ray; flatter ones are measured badly
+_DISTANCE = 0.65  # [m] of the camera from the centre of the objects
+_ELEVATIONS = (np.radians(60.0), np.radians(30.0))  # [rad] over the support, alternating
+_MAX_RANGE = 3.0  # [m] of the camera
+_SIGMA = 0.55  # [spacing] of a disc in its plane
+_THICKNESS = 1e-3  # [m] of a disc
+_BASE_RADIUS = 0.2  # [m] around the robot's base, whose stand is not mapped
+_MIN_COSINE = 0.2  # between surface normal and ray; grazing measurements are inaccurate
 
 
 def scan(twin: Twin, *, views: int = 8, width: int = 320, spacing: float = SPACING, seed: int = 0) -> GaussianModel:
-    """Discs on what the twin holds now, in its world's frame, where a depth camera at exact poses measured them.
+    """Create discs on the surfaces that a depth camera at exact poses measures, in the twin's world frame.
 
-    Depth is cast against the twin's shapes, through the sensor effects of the scene's camera if it has one; the arm and
-    its stand are masked out. Colours are those of the shapes, without light. Nothing is tracked or refined: each disc
-    is the mean of what was measured in a cell of a grid.
+    Depth is cast against the twin's collision geometry, with the sensor effects of the scene's camera if any. The arm
+    and its stand are masked out. Colours are those of the geoms without lighting. There is no tracking and no
+    refinement: each disc is the mean of the measurements in a grid cell.
 
     Args:
-        twin: as it is.
-        views: around the middle of its movable objects.
-        width: of a picture [px]; 3/4 as high.
-        spacing: of the grid [m]: accuracy for time.
+        twin: in its current state.
+        views: number of views around the centre of its movable objects.
+        width: of an image [px]; the height is 3/4 of it.
+        spacing: of the grid [m].
         seed: of the sensor's noise.
 
     Raises:
-        InputError: the scene has nothing but planes, or an argument is out of range.
+        InputError: the scene has only planes, or an argument is out of range.
     """
     if views < 1 or width < 32 or not 1e-3 <= spacing <= 0.1:
         raise InputError("is out of range.", field="scan", hint="give 1 view or more, 32 pixels, 0.001..0.1 m")
@@ -56,40 +56,40 @@ def scan(twin: Twin, *, views: int = 8, width: int = 320, spacing: float = SPACI
     points, normals, colors = (np.concatenate(c) for c in zip(*(
         _measured(frame, poses[frame.index]) for frame in effects.over(frames)), strict=True))  # fmt: skip
     base = base_of(twin.scene)
-    away = np.linalg.norm((points - base[:3, 3])[:, :2], axis=1) > _STAND
+    away = np.linalg.norm((points - base[:3, 3])[:, :2], axis=1) > _BASE_RADIUS
     return discs(*_averaged(points[away], normals[away], colors[away], spacing), spacing)
 
 
 def discs(points: Array, normals: Array, colors: Array, spacing: float) -> GaussianModel:
-    """Thin Gaussians at points (P, 3) [m] across normals (P, 3) that lie about ``spacing`` [m] apart."""
+    """Create thin Gaussians at points (P, 3) [m] with normals (P, 3) and a spacing of about ``spacing`` [m]."""
     return GaussianModel.from_activated(
         means=points,
         quats=rotation_to_quat(_upright(normals)),
-        scales=np.tile([_SIGMA * spacing, _SIGMA * spacing, _THICK], (len(points), 1)),
+        scales=np.tile([_SIGMA * spacing, _SIGMA * spacing, _THICKNESS], (len(points), 1)),
         opacities=np.full(len(points), 0.9),
         colors=colors,
     )
 
 
 def _middle(twin: Twin) -> Array:
-    things = [thing for thing in twin.scene.objects if all(shape.kind != "plane" for shape in thing.shapes)]
-    things = [thing for thing in things if thing.movable] or things
-    if not things:
-        raise InputError("has nothing to look at.", field=twin.scene.name, hint="give it objects")
-    at = np.array([twin.data.body(f"object/{thing.name}").xpos for thing in things])
+    objects = [obj for obj in twin.scene.objects if all(shape.kind != "plane" for shape in obj.shapes)]
+    objects = [obj for obj in objects if obj.movable] or objects
+    if not objects:
+        raise InputError("has no object to scan.", field=twin.scene.name, hint="give it objects")
+    at = np.array([twin.data.body(f"object/{obj.name}").xpos for obj in objects])
     return np.asarray((at.min(axis=0) + at.max(axis=0)) / 2)
 
 
 def _pose(middle: Array, k: int, views: int) -> Array:
-    turn, steep = 2 * np.pi * (k + 0.5) / views, _STEEP[k % len(_STEEP)]
+    turn, steep = 2 * np.pi * (k + 0.5) / views, _ELEVATIONS[k % len(_ELEVATIONS)]
     side = np.array([np.cos(turn) * np.cos(steep), np.sin(turn) * np.cos(steep), np.sin(steep)])
-    return look_at(middle + _AWAY * side, middle)
+    return look_at(middle + _DISTANCE * side, middle)
 
 
 def _frame(twin: Twin, camera: Camera, T_world_camera: Array, index: int) -> Frame:
-    """Depth along the optical axis and colours; the arm is 0 in both."""
+    """Render depth along the optical axis and colours; pixels of the arm are 0 in both."""
     world = twin.world
-    geoms, depth = cast(world.model, twin.data, pixel_rays(camera), T_world_camera, _FARTHEST)
+    geoms, depth = cast(world.model, twin.data, pixel_rays(camera), T_world_camera, _MAX_RANGE)
     hit = (depth > 0) & ~world.of_robot[geoms]
     rgb = np.where(hit[..., None], 255.0 * np.asarray(world.model.geom_rgba)[geoms, :3], 0.0)
     return Frame(
@@ -103,17 +103,17 @@ def _frame(twin: Twin, camera: Camera, T_world_camera: Array, index: int) -> Fra
 
 
 def _measured(frame: Frame, T_world_camera: Array) -> tuple[Array, Array, Array]:
-    """Points (P, 3) [m], their normals (P, 3), in the world, and colours (P, 3), where a normal is known."""
+    """Backproject pixels with a normal to points (P, 3) [m], normals (P, 3) and colours (P, 3) in the world."""
     normals = normals_of(frame.depth, frame.camera).astype(np.float64)
     points = frame.camera.backproject(frame.depth).astype(np.float64)
     rays = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
-    good = (frame.depth > 0) & (-(normals * rays).sum(axis=-1) > _GRAZING)
+    good = (frame.depth > 0) & (-(normals * rays).sum(axis=-1) > _MIN_COSINE)
     R = T_world_camera[:3, :3]
     return transform_points(T_world_camera, points[good]), normals[good] @ R.T, frame.rgb[good] / 255.0
 
 
 def _averaged(points: Array, normals: Array, colors: Array, spacing: float) -> tuple[Array, Array, Array]:
-    """Means over cells of a grid."""
+    """Average points, normals and colours over grid cells."""
     cells = np.floor(points / spacing).astype(np.int64)
     group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)[1:]
     means = []
@@ -122,12 +122,12 @@ def _averaged(points: Array, normals: Array, colors: Array, spacing: float) -> t
         np.add.at(total, group.reshape(-1), values)
         means.append(total / count[:, None])
     length = np.linalg.norm(means[1], axis=1, keepdims=True)
-    kept = length[:, 0] > 0.3  # below, both sides of something thin are in the cell
+    kept = length[:, 0] > 0.3  # shorter means contain both sides of a thin object
     return means[0][kept], (means[1] / np.maximum(length, 1e-9))[kept], means[2][kept]
 
 
 def _upright(normals: Array) -> Array:
-    """Rotations (P, 3, 3) whose z axes are normals (P, 3)."""
+    """Return rotations (P, 3, 3) whose z axes are the normals (P, 3)."""
     other = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     x = np.cross(other, normals)
     x /= np.linalg.norm(x, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What a twin is told: a robot, what stands around it, a camera, what moves, and what the robot is to do (YAML)."""
+"""Description of a simulated scene (YAML): a robot, objects, a camera, moving obstacles, and the robot's task."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class At(Section):
-    """A place of a moving obstacle at a time."""
+class Waypoint(Section):
+    """Position of a moving obstacle at a time."""
 
     t: NotNegative = Field(description="[s]")
     at: Vec3 = Field(description="[m]")
 
 
 class SceneObject(Section):
-    """A body: at rest for ever, free to be moved, or carried along a path."""
+    """A body that is fixed, movable, or carried along a path."""
 
     name: str = Field(min_length=1, pattern=r"^[^/\s]+$")
     shapes: tuple[Shape, ...] = Field(min_length=1)
@@ -43,7 +43,7 @@ class SceneObject(Section):
     movable: bool = Field(default=False, description="free to be pushed, lifted and dropped")
     mass: Positive | None = Field(default=None, description="[kg]; of a movable object, 0.2 if not given")
     friction: NotNegative = Field(default=0.8, description="Coulomb coefficient")
-    path: tuple[At, ...] = Field(default=(), description="places that it is carried through, over and over")
+    path: tuple[Waypoint, ...] = Field(default=(), description="waypoints that it follows, forwards and backwards")
     color: Vec3 = Field(default=(0.65, 0.62, 0.58), description="RGB in 0..1")
 
     @model_validator(mode="after")
@@ -66,12 +66,12 @@ class SceneObject(Section):
 
     @property
     def soft(self) -> bool:
-        """Whether it deforms."""
+        """Return whether the object deforms."""
         return self.shapes[0].kind == "soft"
 
 
 class Motors(Section):
-    """How the arm's drives differ from ideal ones; 0 and None: they do not."""
+    """Deviations of the arm's drives from ideal ones; 0 and None mean no deviation."""
 
     rate: Positive = Field(default=1000.0, le=10_000, description="of the controller [Hz]")
     feedforward: bool = Field(default=True, description="the controller knows gravity and the arm's inertia")
@@ -82,17 +82,17 @@ class Motors(Section):
 
 
 class RobotSection(Section):
-    """Which arm, where it stands."""
+    """Model and pose of the arm."""
 
     model: str = "panda"
     at: Vec3 = (0.0, 0.0, 0.0)
     yaw: float = 0.0
-    home: tuple[float, ...] = Field(default=(), description="where it begins [rad or m]; empty: the model's own")
+    home: tuple[float, ...] = Field(default=(), description="initial joints [rad or m]; empty: the model's own")
     motors: Motors = Motors()
 
 
 class Medium(Section):
-    """What fills the room; MuJoCo's inertia-based drag acts on everything that moves."""
+    """Fluid in the scene; MuJoCo's inertia-based drag acts on every moving body."""
 
     density: NotNegative = Field(default=1.2, description="[kg/m³]; air 1.2")
     viscosity: NotNegative = Field(default=1.8e-5, description="[Pa s]; air 1.8e-5")
@@ -100,7 +100,7 @@ class Medium(Section):
 
 
 class LightChange(Section):
-    """How bright a light is from a time on."""
+    """Brightness of a light from a time on."""
 
     t: NotNegative
     brightness: NotNegative
@@ -115,7 +115,7 @@ class Light(Section):
 
 
 class CameraSection(Section):
-    """A camera that looks on, and what its sensor does to ideal images."""
+    """A camera in the scene with its simulated sensor effects."""
 
     at: Vec3
     look_at: Vec3
@@ -126,13 +126,13 @@ class CameraSection(Section):
 
 
 class Move(Section):
-    """Where the arm shall be at a time: joints, or a place of the tool that points as ``rpy`` says."""
+    """Target of the arm at a time: joints, or a pose of the tool."""
 
     t: Positive = Field(description="[s]")
     joints: tuple[float, ...] = ()
     tcp: Vec3 | None = Field(default=None, description="in the world [m]")
     rpy: Vec3 = Field(default=(3.141592653589793, 0.0, 0.0), description="of the tool [rad]; straight down")
-    opening: NotNegative | None = Field(default=None, description="of the gripper [m]; None: as before")
+    opening: NotNegative | None = Field(default=None, description="of the gripper [m]; by default unchanged")
 
     @model_validator(mode="after")
     def _one(self) -> Move:
@@ -142,7 +142,7 @@ class Move(Section):
 
 
 class SceneTask(Section):
-    """What matters: a kind that says which physics it takes, and the arm's moves."""
+    """The task: a kind, which determines the required physics, and the arm's moves."""
 
     kind: Literal["none", "reach", "push", "grasp", "hang", "wipe", "avoid", "squeeze"] = "none"
     moves: tuple[Move, ...] = ()
@@ -156,26 +156,26 @@ class SceneTask(Section):
 
 
 class Clutter(Section):
-    """A Gaussian map as what stands around."""
+    """A Gaussian map as surroundings of the robot."""
 
     file: str
     low: Vec3 = Field(
         default=(-1.2, -1.2, -0.2), description="corner of the part that is used, in the robot's world [m]"
     )
     high: Vec3 = Field(default=(1.2, 1.2, 1.5), description="the opposite corner [m]")
-    ellipsoids: int = Field(default=2000, ge=0, le=20_000, description="at most so many: accuracy for time")
+    ellipsoids: int = Field(default=2000, ge=0, le=20_000, description="maximum number: accuracy against time")
     at: Vec3 = Field(default=(0.0, 0.0, 0.0), description="of the map's origin [m]")
     rpy: Vec3 = Field(default=(0.0, 0.0, 0.0), description="of the map's axes: roll, pitch, yaw [rad]")
     support: tuple[float, float, float, float] | None = Field(
-        default=None, description="n, d of the plane n · p + d = 0 that things stand on, n upwards; None: it is found"
+        default=None, description="n, d of the support plane n · p + d = 0, n upwards; by default it is estimated"
     )
     movable: bool = Field(default=False, description="whether fitted objects may be moved")
     objects: bool = Field(default=True, description="clusters above the table become primitives or hulls")
-    harmonics: int = Field(default=0, ge=0, exclude=True, description="degree of its colours; known once it is read")
+    harmonics: int = Field(default=0, ge=0, exclude=True, description="degree of its colours, set on loading")
 
 
-class Choice(Section):
-    """Physics and sensor effects that are on or off whatever the scene calls for."""
+class EffectChoice(Section):
+    """Physics and sensor effects that are on or off regardless of the scene's content."""
 
     force: tuple[str, ...] = ()
     forbid: tuple[str, ...] = ()
@@ -193,14 +193,14 @@ class Scene(Section):
     lights: tuple[Light, ...] = ()
     camera: CameraSection | None = None
     task: SceneTask = SceneTask()
-    effects: Choice = Choice()
+    effects: EffectChoice = EffectChoice()
     timestep: float = Field(default=0.002, gt=0, le=0.05, description="longest step [s]: accuracy for time")
     gravity: Vec3 = (0.0, 0.0, -9.81)
     folder: Path = Field(default=Path(), exclude=True, description="that files are named relative to")
 
     @model_validator(mode="after")
     def _fits(self) -> Scene:
-        names = [thing.name for thing in self.objects]
+        names = [obj.name for obj in self.objects]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"objects: {twice[0]!r} is there twice")
@@ -221,20 +221,20 @@ class Scene(Section):
     @property
     def movable(self) -> tuple[SceneObject, ...]:
         """Objects that are free to move."""
-        return tuple(thing for thing in self.objects if thing.movable)
+        return tuple(obj for obj in self.objects if obj.movable)
 
     @property
     def soft(self) -> tuple[SceneObject, ...]:
         """Objects that deform."""
-        return tuple(thing for thing in self.objects if thing.soft)
+        return tuple(obj for obj in self.objects if obj.soft)
 
     @property
     def carried(self) -> tuple[SceneObject, ...]:
-        """Obstacles that move by themselves."""
-        return tuple(thing for thing in self.objects if thing.path)
+        """Obstacles that follow a path."""
+        return tuple(obj for obj in self.objects if obj.path)
 
     def with_effects(self, *, force: Sequence[str] = (), forbid: Sequence[str] = ()) -> Scene:
-        """The scene with more effects forced on or off; the latest word counts."""
+        """Return the scene with more effects forced or forbidden; the latest choice for an effect applies."""
         forced = [n for n in (*self.effects.force, *force) if n not in forbid]
         forbidden = [n for n in (*self.effects.forbid, *forbid) if n not in force]
         values = self.model_dump() | {"effects": {"force": forced, "forbid": forbidden}, "folder": self.folder}
@@ -242,15 +242,15 @@ class Scene(Section):
 
 
 def scene_names() -> tuple[str, ...]:
-    """The scenes that splatbot ships."""
+    """Return the names of the scenes that splatbot ships."""
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 
 
 def load_scene(name: str | Path) -> Scene:
-    """A shipped scene by its name, or that of a YAML file.
+    """Load a shipped scene by its name, or a YAML file.
 
     Raises:
-        ConfigError: there is none, it is no YAML mapping, a key is unknown or a value out of range.
+        ConfigError: the scene does not exist or is no YAML mapping, a key is unknown, or a value is out of range.
     """
     path = _FOLDER / f"{name}.yaml" if str(name) in scene_names() else Path(name)
     if not path.suffix:
@@ -264,7 +264,7 @@ def load_scene(name: str | Path) -> Scene:
 
 
 def make_scene(values: dict[str, Any], *, file: str | Path | None = None) -> Scene:
-    """A scene from its values.
+    """Create a scene from its values.
 
     Raises:
         ConfigError: a key is unknown or a value out of range.

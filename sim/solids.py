@@ -1,4 +1,4 @@
-"""The shapes that objects of a scene are made of, and what they are in MuJoCo."""
+"""Shapes of scene objects, and their MuJoCo geoms."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Geom(BaseModel):
     rpy: Vec3 = Field(default=(0.0, 0.0, 0.0), description="roll, pitch, yaw [rad]")
 
     def geom(self, spec: Any, folder: Path) -> dict[str, Any]:
-        """What ``MjsBody.add_geom`` takes."""
+        """Return the arguments of ``MjsBody.add_geom``."""
         kind, size = self._sizes(spec, folder)
         return {"type": kind, "size": [*size, 0.0, 0.0][:3], "pos": list(self.at), "quat": quat_of(self.rpy)}
 
@@ -33,7 +33,7 @@ class _Geom(BaseModel):
 
 
 class PlaneGeom(_Geom):
-    """An endless plane; its normal is z."""
+    """An infinite plane; its normal is z."""
 
     kind: Literal["plane"]
 
@@ -52,7 +52,7 @@ class BoxGeom(_Geom):
 
 
 class SphereGeom(_Geom):
-    """A ball."""
+    """A sphere."""
 
     kind: Literal["sphere"]
     radius: Positive
@@ -62,7 +62,7 @@ class SphereGeom(_Geom):
 
 
 class CylinderGeom(_Geom):
-    """A cylinder along z about its middle."""
+    """A cylinder along z about its centre."""
 
     kind: Literal["cylinder"]
     radius: Positive
@@ -73,7 +73,7 @@ class CylinderGeom(_Geom):
 
 
 class CapsuleGeom(_Geom):
-    """A capsule along z about its middle; ``height`` without the caps."""
+    """A capsule along z about its centre; ``height`` is without the caps."""
 
     kind: Literal["capsule"]
     radius: Positive
@@ -84,7 +84,7 @@ class CapsuleGeom(_Geom):
 
 
 class EllipsoidGeom(_Geom):
-    """An ellipsoid of three half-axes [m]."""
+    """An ellipsoid with three half-axes [m]."""
 
     kind: Literal["ellipsoid"]
     axes: tuple[Positive, Positive, Positive]
@@ -102,7 +102,7 @@ class MeshGeom(_Geom):
     scale: Positive = 1.0
 
     def geom(self, spec: Any, folder: Path) -> dict[str, Any]:
-        """What ``MjsBody.add_geom`` takes; adds the mesh to ``spec``."""
+        """Add the mesh to ``spec`` and return the arguments of ``MjsBody.add_geom``."""
         name = f"mesh{len(list(spec.meshes))}"
         if self.file is not None:
             path = folder / self.file
@@ -124,7 +124,7 @@ class SoftGeom(_Geom):
 
     Args:
         size: [m].
-        cells: nodes along each side; more bend more finely and cost more.
+        cells: nodes along each side; more nodes bend more finely and cost more.
         young: Young's modulus [Pa].
         poisson: Poisson's ratio.
         density: [kg/m³].
@@ -148,7 +148,7 @@ Shape = Annotated[
 
 
 def rotation_of(rpy: Vec3) -> Array:
-    """Rotation (3, 3) Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Compute the rotation (3, 3) Rz(yaw) Ry(pitch) Rx(roll)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     return np.array(
         [
@@ -160,21 +160,21 @@ def rotation_of(rpy: Vec3) -> Array:
 
 
 def pose_at(at: Vec3, rpy: Vec3) -> Array:
-    """Pose (4, 4) of something that is placed at ``at`` [m] and turned by ``rpy`` [rad]."""
+    """Compute the pose (4, 4) with position ``at`` [m] and orientation ``rpy`` [rad]."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_of(rpy), at
     return T
 
 
 def quat_of(rpy: Vec3) -> list[float]:
-    """Quaternion wxyz of roll, pitch, yaw [rad]."""
+    """Compute the quaternion wxyz of roll, pitch, yaw [rad]."""
     return [float(v) for v in rotation_to_quat(rotation_of(rpy))]
 
 
 def rpy_of(R: Array) -> Vec3:
-    """Roll, pitch, yaw [rad] of a rotation (3, 3): the other way round of :func:`rotation_of`.
+    """Compute roll, pitch, yaw [rad] of a rotation (3, 3), the inverse of :func:`rotation_of`.
 
-    Where the pitch is ±90 degrees, roll and yaw turn about one axis, and the roll is 0.
+    At a pitch of ±90 degrees roll and yaw have the same axis, and the roll is 0.
     """
     across = float(np.hypot(R[0, 0], R[1, 0]))
     pitch = float(np.arctan2(-R[2, 0], across))

@@ -1,4 +1,4 @@
-"""The twin: a planned motion is tried in a scene's physics before the robot moves."""
+"""The twin: physics simulation of a planned motion in a scene before the robot moves."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.contact_monitor import ContactMonitor, Near, Room, Touch
+from splatbot.sim.contact_monitor import ClearanceMonitor, ContactEvent, ContactMonitor, MinimumClearance
 from splatbot.sim.effects.decisions import EffectDecision
 from splatbot.sim.effects.physics import Hook
 from splatbot.sim.following import Follower, targets_of
@@ -24,20 +24,20 @@ from splatbot.sim.object_monitor import ObjectMonitor
 from splatbot.sim.scene import Scene
 from splatbot.sim.world import World, build_world
 
-_ROOM_EVERY = 0.02  # [s] between looks at the room around the arm
-_SOFT_CONTACTS = 0.008  # [s]; with longer steps contacts give way visibly
+_CLEARANCE_PERIOD = 0.02  # [s] between clearance computations
+_MAX_ACCURATE_STEP = 0.008  # [s]; contacts are visibly soft at longer steps
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in ("BADQPOS", "BADQVEL", "BADQACC")]
-_DEEP = 0.005  # [m] of overlap that a result warns of
+_MAX_PENETRATION = 0.005  # [m] without a warning
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """How far the arm was from where it should have been at the ends of the control periods.
+    """Following error of the arm at the ends of the control periods.
 
     Args:
         rms, largest: over joints and time [rad or m].
         final: the largest at the end [rad or m].
-        tcp: largest distance of the tool from its place [m].
+        tcp: largest position error of the tool [m].
     """
 
     rms: float
@@ -48,27 +48,27 @@ class Tracking:
 
 @dataclass(frozen=True)
 class TwinResult:
-    """What happened.
+    """Result of a simulated run.
 
     Args:
-        scene: its name.
-        duration: [s] of the motion.
-        steps: of physics; ``timestep`` [s] each.
+        scene: name.
+        duration: simulated time [s].
+        steps: number of physics steps.
         timestep: [s].
         rate: of the controller [Hz].
-        seconds: that it took [s].
-        physics_seconds: of it in MuJoCo and in the effects [s].
-        real_time: simulated over real time.
-        tracking: None without a robot, or where physics was unstable from the first.
-        touches: what the arm touched.
-        near: the least room around the arm, looked at every 20 ms.
+        seconds: wall-clock time [s].
+        physics_seconds: part of it in MuJoCo and in the effects [s].
+        real_time: ratio of simulated to wall-clock time.
+        tracking: following error. If None, there is no robot, or physics was unstable from the start.
+        contacts: of the arm.
+        clearance: minimum clearance of the arm, computed every 20 ms.
         dropped: objects that fell.
-        moved: how far each movable object ended from where it began [m].
+        moved: distance of each movable object from its start at the end [m].
         figures: observables of the effects, by name.
         decisions: on every effect.
-        warnings: where not to trust it.
-        stopped: [s] at which it was told to stop; None: never.
-        digest: of the state in every control period: equal for equal bits.
+        warnings: limits of validity.
+        stopped: time of a requested stop [s]. If None, the motion was complete.
+        digest: hash of the state in every control period: equal for bit-identical runs.
     """
 
     scene: str
@@ -80,8 +80,8 @@ class TwinResult:
     physics_seconds: float
     real_time: float
     tracking: Tracking | None
-    touches: tuple[Touch, ...]
-    near: Near
+    contacts: tuple[ContactEvent, ...]
+    clearance: MinimumClearance
     dropped: tuple[str, ...]
     moved: dict[str, float]
     figures: dict[str, float]
@@ -92,37 +92,39 @@ class TwinResult:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON takes it."""
-        return asdict(self)
+        """Return the result as values for JSON, with contacts as ``touches`` and the clearance as ``near``."""
+        values = asdict(self)
+        near = values.pop("clearance")
+        return values | {"touches": values.pop("contacts"), "near": {"room": near.pop("value"), **near}}
 
 
 @dataclass
 class _TwinLog:
-    """What a run gathers."""
+    """Data that a run collects."""
 
-    touches: ContactMonitor
-    room: Room
-    things: ObjectMonitor
+    contacts: ContactMonitor
+    clearance: ClearanceMonitor
+    objects: ObjectMonitor
     errors: list[Array] = field(default_factory=list)
     digest: Any = field(default_factory=hashlib.sha256)
     overload: float = 0.0
     physics: float = 0.0
 
 
-# MuJoCo would write every warning into a file in the working directory; results carry what matters of them.
+# MuJoCo would write every warning into a file in the working directory; results contain the relevant ones.
 mujoco.set_mju_user_warning(lambda text: None)
-atexit.register(mujoco.set_mju_user_warning, None)  # else it outlives the modules that it refers to
+atexit.register(mujoco.set_mju_user_warning, None)  # the callback must not outlive this module
 
 
 class Twin:
-    """A scene's physics, and an arm in it that follows motions. Resets are exact; the same seed gives the same bits.
+    """Physics simulation of a scene with an arm that follows motions. Resets are exact; equal seeds give equal bits.
 
     Args:
         scene: see :mod:`splatbot.sim.scene`.
-        robot: instead of the scene's.
-        timestep: longest step [s], instead of the scene's: accuracy for time.
-        seed: displaces movable objects by ``jitter``; 0 leaves them where the scene says.
-        jitter: standard deviation of that displacement, sideways [m].
+        robot: replaces the scene's robot.
+        timestep: longest step [s]; replaces the scene's.
+        seed: of the random displacement of movable objects; 0 for no displacement.
+        jitter: standard deviation of that displacement, horizontal [m].
 
     Raises:
         ConfigError: the scene cannot be built.
@@ -146,7 +148,7 @@ class Twin:
         # A controller slower than physics takes several steps; one that is faster shortens them.
         self.substeps = max(1, int(np.ceil(1.0 / (self.rate * longest) - 1e-9)))
         self.timestep = 1.0 / (self.rate * self.substeps)
-        self._asked_rate = self.rate
+        self._requested_rate = self.rate
         if timestep is not None and timestep > 1.0 / self.rate:
             self.rate, self.substeps, self.timestep = 1.0 / timestep, 1, timestep
         self.world: World = build_world(scene, robot=robot, timestep=self.timestep)
@@ -157,11 +159,11 @@ class Twin:
 
     @property
     def hooks(self) -> tuple[Hook, ...]:
-        """Of the effects that act while it runs."""
+        """Callbacks of the effects."""
         return self.world.hooks
 
     def reset(self, q: Array | None = None) -> None:
-        """Everything as at the beginning, the arm at rest at ``q`` (J,), by default at home."""
+        """Reset the state, with the arm at rest at ``q`` (J,), by default at home."""
         mujoco.mj_resetData(self.world.model, self.data)
         for hook in self.hooks:
             hook.reset()
@@ -178,7 +180,7 @@ class Twin:
         mujoco.mj_forward(self.world.model, self.data)
 
     def advance(self, time: float, q: Array, velocity: Array, acceleration: Array, opening: float | None) -> None:
-        """One control period that begins at ``time`` [s], at whose end the arm shall be at ``q`` (J,)."""
+        """Simulate one control period from ``time`` [s], with the targets ``q`` (J,) at its end."""
         for hook in self.hooks:
             hook.on_step(self.data, time)
         if self.follower is not None:
@@ -188,7 +190,7 @@ class Twin:
         mujoco.mj_step(self.world.model, self.data, self.substeps)
 
     def stop(self) -> None:
-        """Ends the motion that another thread, or a callback, follows, within one control period."""
+        """Stop the motion within one control period; callable from other threads and callbacks."""
         self._stop = True
 
     def follow(
@@ -197,18 +199,18 @@ class Twin:
         *,
         progress: Callable[[float], None] | None = None,
         watch: Callable[[Any, float], None] | None = None,
-        until_touch: bool = False,
+        until_contact: bool = False,
     ) -> TwinResult:
         """Follow a motion from a reset.
 
         Args:
             motion: by default the moves of the scene's task.
-            progress: called about fifty times with the share that is done; may call :meth:`stop`.
-            watch: called with MuJoCo's data and the time [s] after every control period, to look and not to touch.
-            until_touch: stop when the arm touches anything.
+            progress: called about fifty times with the completed fraction; may call :meth:`stop`.
+            watch: called with MuJoCo's data and the time [s] after every control period; must not change the data.
+            until_contact: stop at the first contact of the arm.
 
         Raises:
-            InputError: the motion is of another robot.
+            InputError: the motion has another number of joints.
         """
         if motion is None:
             motion = self._own_motion()
@@ -217,10 +219,12 @@ class Twin:
         self.reset(motion.position[0] if self.follower is not None else None)
         count = max(1, round(motion.duration * self.rate))
         log = _TwinLog(
-            ContactMonitor(self.world), Room(self.world), ObjectMonitor(self.world, self.data, 1.0 / self.rate)
+            ContactMonitor(self.world),
+            ClearanceMonitor(self.world),
+            ObjectMonitor(self.world, self.data, 1.0 / self.rate),
         )
         begin = clock.perf_counter()
-        done = self._run(motion, count, log, progress, watch, until_touch)
+        done = self._run(motion, count, log, progress, watch, until_contact)
         return self._result(motion, done, count, log, clock.perf_counter() - begin)
 
     def _run(
@@ -230,13 +234,13 @@ class Twin:
         log: _TwinLog,
         progress: Callable[[float], None] | None,
         watch: Callable[[Any, float], None] | None,
-        until_touch: bool,
+        until_contact: bool,
     ) -> int:
         period = 1.0 / self.rate
         q, v, a, opening = targets_of(motion, count, period)
-        every, tell = max(1, round(_ROOM_EVERY * self.rate)), max(1, count // 50)
+        every, report_every = max(1, round(_CLEARANCE_PERIOD * self.rate)), max(1, count // 50)
         limits = np.maximum(np.abs(self.world.model.actuator_forcerange).max(axis=1), 1e-9)
-        log.room.look(self.data, 0.0)
+        log.clearance.update(self.data, 0.0)
         for k in range(count):
             now = (k + 1) * period
             start = clock.perf_counter()
@@ -249,14 +253,14 @@ class Twin:
             if self.follower is not None:
                 log.errors.append(self.data.qpos[self.follower.qpos] - q[k])
                 log.overload = max(log.overload, float((np.abs(self.data.actuator_force) / limits).max()))
-            log.touches.look(self.data, now)
-            log.things.look(self.data)
+            log.contacts.update(self.data, now)
+            log.objects.update(self.data)
             log.digest.update(self.data.qpos.tobytes())
             if (k + 1) % every == 0:
-                log.room.look(self.data, now)
-            if progress is not None and (k + 1) % tell == 0:
+                log.clearance.update(self.data, now)
+            if progress is not None and (k + 1) % report_every == 0:
                 progress((k + 1) / count)
-            if self._stop or (until_touch and log.touches.found):
+            if self._stop or (until_contact and log.contacts.found):
                 return k + 1
         return count
 
@@ -264,17 +268,17 @@ class Twin:
         simulated = done / self.rate
         tracking = self._tracking(motion, log, done) if self.follower is not None else None
         figures = {
-            "contact_steps": float(log.touches.steps),
-            "tangential_n": log.touches.tangential,
+            "contact_steps": float(log.contacts.steps),
+            "tangential_n": log.contacts.tangential,
             "overload": log.overload,
             "tracking_rms": tracking.rms if tracking is not None else 0.0,
             "opening": self.follower.opening(self.data) if self.follower is not None else 0.0,
-            "deformation": log.things.deformation,
-            "travelled": log.things.travelled,
-            "obstacle_travel": log.things.obstacle_travel,
+            "deformation": log.objects.deformation,
+            "travelled": log.objects.travelled,
+            "obstacle_travel": log.objects.obstacle_travel,
             "light": float(np.sum(self.world.model.light_diffuse))
             + float(self.world.model.vis.headlight.diffuse.sum()),
-            "asleep": log.things.asleep,
+            "asleep": log.objects.asleep,
             "harmonics": float(self.world.harmonics),
         }
         return TwinResult(
@@ -287,10 +291,10 @@ class Twin:
             physics_seconds=log.physics,
             real_time=simulated / max(seconds, 1e-9),
             tracking=tracking,
-            touches=tuple(log.touches.found),
-            near=log.room.least,
-            dropped=log.things.dropped,
-            moved=log.things.moved(self.data),
+            contacts=tuple(log.contacts.found),
+            clearance=log.clearance.minimum,
+            dropped=log.objects.dropped,
+            moved=log.objects.moved(self.data),
             figures=figures,
             decisions=self.world.decisions,
             warnings=self._warnings(log),
@@ -305,32 +309,32 @@ class Twin:
         if not len(errors):
             return None
         q = motion.at(np.arange(1, done + 1) / self.rate)[0]
-        reached, wanted = (self.world.robot.tcp(at[:: max(1, done // 200)])[:, :3, 3] for at in (q + errors, q))
+        reached, target = (self.world.robot.tcp(at[:: max(1, done // 200)])[:, :3, 3] for at in (q + errors, q))
         return Tracking(
             rms=float(np.sqrt(np.mean(errors**2))),
             largest=float(np.abs(errors).max()),
             final=float(np.abs(errors[-1]).max()),
-            tcp=float(np.linalg.norm(reached - wanted, axis=-1).max()),
+            tcp=float(np.linalg.norm(reached - target, axis=-1).max()),
         )
 
     def _broken(self) -> bool:
-        """Whether MuJoCo met values that are not finite or beyond all bounds, and began anew or went on with them."""
+        """Return whether MuJoCo reported invalid values or the state is not finite."""
         return any(self.data.warning[kind].number for kind in _BAD) or not np.isfinite(self.data.qpos).all()
 
     def _warnings(self, log: _TwinLog) -> tuple[str, ...]:
         found = []
         if self._broken():
             found.append(f"physics became unstable and was stopped: take steps below {1e3 * self.timestep:g} ms")
-        if self.timestep > _SOFT_CONTACTS and "contact" in self.world.on:
-            found.append(f"steps of {1e3 * self.timestep:g} ms: contacts give way; 2 ms are right")
-        if self.rate < self._asked_rate:
+        if self.timestep > _MAX_ACCURATE_STEP and "contact" in self.world.on:
+            found.append(f"steps of {1e3 * self.timestep:g} ms: contacts are too soft; use 2 ms")
+        if self.rate < self._requested_rate:
             found.append(
                 f"steps of {1e3 * self.timestep:g} ms: the controller runs at {self.rate:g} Hz, "
-                f"not at {self._asked_rate:g}"
+                f"not at {self._requested_rate:g}"
             )
-        deepest = max((touch.depth for touch in log.touches.found), default=0.0)
-        if deepest > _DEEP:
-            found.append(f"contacts overlap by {1e3 * deepest:.1f} mm: forces are rough")
+        deepest = max((contact.depth for contact in log.contacts.found), default=0.0)
+        if deepest > _MAX_PENETRATION:
+            found.append(f"contacts overlap by {1e3 * deepest:.1f} mm: forces are inaccurate")
         return tuple(found)
 
     def _own_motion(self) -> JointMotion:
@@ -352,7 +356,7 @@ class Twin:
         if self.seed == 0 or self._jitter == 0:
             return
         rng = np.random.default_rng(self.seed)
-        for thing in self.scene.movable:
-            address = int(self.world.model.body(f"object/{thing.name}").jntadr[0])
+        for obj in self.scene.movable:
+            address = int(self.world.model.body(f"object/{obj.name}").jntadr[0])
             at = int(self.world.model.jnt_qposadr[address])
             self.data.qpos[at : at + 2] += self._jitter * rng.standard_normal(2)

@@ -1,4 +1,4 @@
-"""A film of a twin (MP4)."""
+"""A simulated video of a twin (MP4)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ FPS = 25.0
 
 
 class Video:
-    """Writes what the twin's camera sees, 25 frames a second; a frame that the sensor loses shows the last one again.
+    """Writes the view of the twin's camera at 25 frames per second.
+
+    A frame that the sensor drops repeats the previous one.
 
     Raises:
         InputError: the file cannot be written.
@@ -30,7 +32,7 @@ class Video:
         self.frames = 0
 
     def __call__(self, data: Any, time: float) -> None:
-        """Draw a frame if it is time."""
+        """Write a frame if the next one is due."""
         if time * FPS < self.frames:
             return
         frame = self._camera.frame(data, self.frames, time)
@@ -40,10 +42,10 @@ class Video:
         self.frames += 1
 
     def report(self) -> list[dict[str, Any]]:
-        """The account of the sensor's effects."""
+        """Return the report of the sensor's effects."""
         return self._camera.report()
 
     def close(self) -> None:
-        """Finish the file."""
+        """Close the file."""
         self._file.release()
         self._camera.close()

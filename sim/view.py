@@ -1,4 +1,4 @@
-"""Pictures with depth, and one in front of the other."""
+"""Rendered images with depth, and their composition."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class TwinView:
-    """What a camera sees of a part of the world; behind it is nothing.
+    """View of a part of the world on a transparent background.
 
     Args:
-        color: (H, W, 3) RGB in 0..1, times ``alpha``.
-        alpha: (H, W) share of the pixel that is covered.
-        depth: (H, W) along the optical axis [m]; infinite where nothing is seen.
-        bodies: (H, W) share of the pixel that shows bodies of the simulation, not the map.
+        color: (H, W, 3) RGB in 0..1, premultiplied by ``alpha``.
+        alpha: (H, W) fraction of the pixel that is covered.
+        depth: (H, W) along the optical axis [m]; infinite where the pixel is empty.
+        bodies: (H, W) fraction of the pixel that shows bodies of the simulation, not the map.
     """
 
     color: Image
@@ -29,17 +29,17 @@ class TwinView:
     bodies: Image
 
     def rgb(self) -> NDArray[np.uint8]:
-        """(H, W, 3) over black."""
+        """Return the image (H, W, 3) on black."""
         return np.rint(255.0 * self.color.clip(0.0, 1.0)).astype(np.uint8)
 
     def measured(self, reach: float) -> Image:
-        """Depth (H, W) [m] as a frame has it: 0 where the pixel is mostly empty, or beyond ``reach`` [m]."""
+        """Return depth (H, W) [m] as in a frame: 0 where the pixel is mostly empty, or beyond ``reach`` [m]."""
         seen = (self.alpha >= MIN_ALPHA) & (self.depth <= reach)
         return np.where(seen, self.depth, np.float32(0))
 
 
 def composite(a: TwinView, b: TwinView) -> TwinView:
-    """Both, in each pixel the nearer over the farther (Porter and Duff 1984): soft edges stay soft."""
+    """Composite two views per pixel by depth with the over operator (Porter and Duff 1984), which keeps soft edges."""
     first = a.depth <= b.depth
 
     def pick(x: Image, y: Image) -> tuple[Image, Image]:

@@ -1,4 +1,4 @@
-"""A scene as a MuJoCo model: bodies first, then the physics that is on, one effect at a time."""
+"""A scene as a MuJoCo model: bodies first, then the active effects, one at a time."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from splatbot.sim.solids import quat_of
 OBJECT = "object/"
 CAMERA = "camera"
 MAP = "map"
-MAP_GROUP = 2  # of geoms that stand for the map's Gaussians, which may be drawn instead
+MAP_GROUP = 2  # of the map's collision geometry, which rendering can hide
 _MOVABLE_MASS = 0.2  # [kg]
 
 
 @dataclass
 class Draft:
-    """A model that is being made.
+    """A model under construction.
 
     Args:
-        scene: what it is of.
-        spec: MuJoCo's specification, without any physics that an effect stands for.
+        scene: description.
+        spec: MuJoCo's specification, without the physics of effects.
         robot: the arm, or None.
-        robot_bodies: its bodies.
-        bodies: each object's body, by its name.
-        map_geoms: of the map's clutter, in the world itself.
+        robot_bodies: bodies of the arm.
+        bodies: body of each object, by name.
+        map_geoms: of the map's clutter, in the world body.
     """
 
     scene: Scene
@@ -54,17 +54,17 @@ class World:
     """A compiled scene.
 
     Args:
-        scene: what it is of.
+        scene: description.
         robot: the arm, or None.
-        spec: what was compiled.
+        spec: the compiled specification.
         model: MuJoCo's model.
-        decisions: on every effect, why it is on or off.
-        hooks: of the effects that act while the twin runs.
-        owner: (G,) what each geom belongs to: a link, a finger, an object, or the map.
-        of_robot: (G,) whether it is the robot's.
-        mounted: parts of the arm that stand in something fixed at home, as (link, object): they are let.
-        parts: what the map became; None without one.
-        notes: on that, in words.
+        decisions: on every effect, with the reason.
+        hooks: callbacks of the effects.
+        owner: (G,) name of the link, finger, object or map that each geom belongs to.
+        of_robot: (G,) whether the geom belongs to the robot.
+        mounted: pairs (link, object) that overlap at home, whose contacts are excluded.
+        parts: collision geometry of the map. If None, there is no map.
+        notes: on that conversion.
     """
 
     scene: Scene
@@ -81,12 +81,12 @@ class World:
 
     @property
     def on(self) -> tuple[str, ...]:
-        """The effects that are on."""
+        """Names of the active effects."""
         return tuple(d.name for d in self.decisions if d.on)
 
     @property
     def harmonics(self) -> int:
-        """Degree to which a camera evaluates the colours of the map."""
+        """Spherical harmonics degree at which a camera renders the map."""
         return self.parts.model.sh_degree if self.parts is not None and "view_color" in self.on else 0
 
 
@@ -95,8 +95,8 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
 
     Args:
         scene: see :mod:`splatbot.sim.scene`.
-        robot: instead of the scene's.
-        timestep: instead of the scene's [s].
+        robot: replaces the scene's.
+        timestep: replaces the scene's [s].
 
     Raises:
         ConfigError: the scene cannot be built; MuJoCo's reason is in the message.
@@ -107,8 +107,8 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
     if parts is not None and len(parts.ellipsoids.centers):
         draft.map_geoms = add_ellipsoids(draft.spec, parts.ellipsoids)
     if parts is not None:
-        stand_ins = [geom for thing in parts.objects for geom in draft.bodies[thing.name].geoms]
-        for geom in (*draft.map_geoms, *stand_ins):
+        replaced = [geom for obj in parts.objects for geom in draft.bodies[obj.name].geoms]
+        for geom in (*draft.map_geoms, *replaced):
             geom.group = MAP_GROUP
     decisions = effects_for(scene)
     on = [physics_effect(d.name) for d in decisions if d.on and d.name in PHYSICS]
@@ -129,8 +129,8 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
 
 
 def _notes(parts: MapParts | None, mounted: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
-    lets = tuple(f"{link} stands in {other} at home: contacts of the two are left out" for link, other in mounted)
-    return (parts.notes if parts is not None else ()) + lets
+    excluded = tuple(f"{link} overlaps {other} at home: contacts of the two are left out" for link, other in mounted)
+    return (parts.notes if parts is not None else ()) + excluded
 
 
 def _draft(scene: Scene, robot: RobotModel | None) -> Draft:
@@ -149,8 +149,8 @@ def _draft(scene: Scene, robot: RobotModel | None) -> Draft:
     if scene.camera is not None:
         _add_camera(spec, scene.camera)
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    for thing in scene.objects:
-        draft.bodies[thing.name] = _add_object(draft, thing)
+    for obj in scene.objects:
+        draft.bodies[obj.name] = _add_object(draft, obj)
     return draft
 
 
@@ -168,7 +168,7 @@ def _place_robot(draft: Draft, arm: RobotModel) -> None:
     base.pos, base.quat = list(section.at), quat_of((0.0, 0.0, section.yaw))
     for actuator in draft.spec.actuators:
         actuator.forcelimited = int(mujoco.mjtLimited.mjLIMITED_FALSE)
-        # The controller adds what gravity and inertia take to its targets, which may lie beyond the joints' limits.
+        # The controller adds feedforward of gravity and inertia to its targets, which may exceed the joint limits.
         if actuator.name != "opening":
             actuator.ctrllimited = int(mujoco.mjtLimited.mjLIMITED_FALSE)
     for body in draft.robot_bodies:
@@ -185,16 +185,16 @@ def _add_camera(spec: Any, section: CameraSection) -> None:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = section.width, section.height
 
 
-def _add_object(draft: Draft, thing: SceneObject) -> Any:
+def _add_object(draft: Draft, obj: SceneObject) -> Any:
     body = draft.spec.worldbody.add_body(
-        name=OBJECT + thing.name, pos=list(thing.path[0].at if thing.path else thing.at), quat=quat_of(thing.rpy)
+        name=OBJECT + obj.name, pos=list(obj.path[0].at if obj.path else obj.at), quat=quat_of(obj.rpy)
     )
-    if thing.movable or thing.soft:
+    if obj.movable or obj.soft:
         body.add_freejoint()
-    for shape in thing.shapes:
+    for shape in obj.shapes:
         geom = body.add_geom(**shape.geom(draft.spec, draft.scene.folder))
-        geom.rgba, geom.condim = [*thing.color, 1.0], 1
-        geom.friction = [thing.friction, 0.005, 0.0001]
+        geom.rgba, geom.condim = [*obj.color, 1.0], 1
+        geom.friction = [obj.friction, 0.005, 0.0001]
         if shape.kind == "soft":
             geom.density = shape.density
     return body
@@ -205,18 +205,18 @@ def _compiled(draft: Draft) -> Any:
         model = draft.spec.compile()
     except ValueError as error:
         raise ConfigError(
-            f"cannot be built: {str(error).splitlines()[0]}.", field=draft.scene.name, hint="mend the object it names"
+            f"cannot be built: {str(error).splitlines()[0]}.", field=draft.scene.name, hint="fix that object"
         ) from error
-    for thing in draft.scene.movable:
-        body = model.body(OBJECT + thing.name)
-        body.inertia[:] *= (thing.mass or _MOVABLE_MASS) / float(body.mass[0])
-        body.mass[:] = thing.mass or _MOVABLE_MASS
+    for obj in draft.scene.movable:
+        body = model.body(OBJECT + obj.name)
+        body.inertia[:] *= (obj.mass or _MOVABLE_MASS) / float(body.mass[0])
+        body.mass[:] = obj.mass or _MOVABLE_MASS
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 
 def _mounts(draft: Draft, model: Any) -> tuple[tuple[str, str], ...]:
-    """Excludes contacts of the first moving link, which turns in its place, with the fixed things it stands in."""
+    """Exclude contacts of the first moving link, which rotates in place, with fixed bodies that it overlaps at home."""
     if draft.robot is None:
         return ()
     fixed = [draft.bodies[t.name] for t in draft.scene.objects if t.name in draft.bodies and not (t.movable or t.path)]
@@ -228,13 +228,13 @@ def _mounts(draft: Draft, model: Any) -> tuple[tuple[str, str], ...]:
     if draft.map_geoms:
         fixed.append(draft.spec.worldbody)
     for body in fixed:
-        if _meet(model, data, link, model.body(body.name)):
+        if _overlap(model, data, link, model.body(body.name)):
             draft.spec.add_exclude(bodyname1=link.name, bodyname2=body.name)
             found.append((str(link.name), _owner(body.name)))
     return tuple(found)
 
 
-def _meet(model: Any, data: Any, a: Any, b: Any) -> bool:
+def _overlap(model: Any, data: Any, a: Any, b: Any) -> bool:
     pairs = [(i, j) for i in _geoms(a) for j in _geoms(b)]
     return any(mujoco.mj_geomDistance(model, data, i, j, 1e-3, None) < 1e-3 for i, j in pairs)
 
@@ -254,7 +254,7 @@ def _owner(body: str) -> str:
 
 
 def robot_joints(model: Any, robot: RobotModel) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Where the arm's joints stand in qpos, in the velocities and among the actuators: three of (J,)."""
+    """Return the indices (J,) of the arm's joints in qpos, in the velocities, and among the actuators."""
     names: Sequence[str] = robot.chain.names
     joints = [model.joint(name) for name in names]
     qpos = np.array([int(j.qposadr[0]) for j in joints], dtype=np.int64)
@@ -264,7 +264,7 @@ def robot_joints(model: Any, robot: RobotModel) -> tuple[NDArray[np.int64], NDAr
 
 
 def gripper_joints(model: Any, robot: RobotModel) -> tuple[list[int], list[int], int]:
-    """Where the fingers stand in qpos and in the velocities, and their actuator.
+    """Return the indices of the fingers in qpos and in the velocities, and their actuator.
 
     Raises:
         InputError: the robot has no gripper.

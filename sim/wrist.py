@@ -1,4 +1,4 @@
-"""What a camera on an arm's wrist sees: a scene, and the arm itself in view, with its joints and exact poses."""
+"""Simulated log of a camera on an arm's wrist: the scene and the arm itself, with joints and exact poses."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ T_PANDA_CAMERA = np.array(
 
 
 class WristLog(LogBase):
-    """Frames from a camera on the last link of a moving arm; each tells the joints.
+    """Simulated frames with joints from a camera on the last link of a moving arm.
 
     Args:
-        robot: of capsules, which are what is seen of it.
+        robot: rendered as its capsules.
         joints: (F, J) of each frame.
         surfaces: of the scene, in its own frame.
-        T_scene_base: (4, 4) where the arm stands in it.
+        T_scene_base: (4, 4) pose of the arm's base in the scene.
         T_link_camera: (4, 4), the camera on the last link.
-        width: [px]
-        rate: frames a second.
-        moving: what else moves in the scene.
+        width: [px].
+        rate: of the frames [Hz].
+        moving: moving objects in the scene, by name.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class WristLog(LogBase):
         T = T_scene_base @ robot.fk(joints)
         stamps = np.arange(len(joints)) / rate
         self.ground_truth = Trajectory(stamps, T[:, -1] @ T_link_camera)
-        links = {f"link {k}": Moving(found, _pose_of(stamps, T[:, k])) for k, found in _seen_links(robot).items()}
+        links = {f"link {k}": Moving(found, _pose_of(stamps, T[:, k])) for k, found in _link_surfaces(robot).items()}
         self.scene = RaycastScene(surfaces, links | dict(moving or {}))
 
     def __len__(self) -> int:
@@ -75,7 +75,7 @@ class WristLog(LogBase):
         return Frame(stamp, rgb, depth, self.camera, index, joints=self.joints[index].copy(), source=f"wrist#{index}")
 
     def shows_robot(self, index: int) -> NDArray[np.bool_]:
-        """Pixels (H, W) of a frame in which the arm, or what else moves, is seen."""
+        """Return the pixels (H, W) of a frame that show the arm or a moving object."""
         stamp = float(self.ground_truth.stamps[index])
         return self.scene.moving_mask(self.camera, self.ground_truth.T_world_camera[index], stamp)
 
@@ -84,8 +84,8 @@ def _pose_of(stamps: Array, poses: Array) -> Callable[[float], Array]:
     return lambda t: np.asarray(poses[int(np.argmin(np.abs(stamps - t)))])
 
 
-def _seen_links(robot: RobotModel) -> dict[int, list[RaycastSurface]]:
-    """Capsules of each link that has any; the fingers open on the last one."""
+def _link_surfaces(robot: RobotModel) -> dict[int, list[RaycastSurface]]:
+    """Create surfaces from the capsules of each link, with the fingers open on the last one."""
     found: dict[int, list[RaycastSurface]] = {}
     for number, shape in enumerate(robot.shapes):
         if isinstance(shape, Capsule):
@@ -107,7 +107,7 @@ def _seen_links(robot: RobotModel) -> dict[int, list[RaycastSurface]]:
 
 
 def capsule_mesh(start: ArrayLike, end: ArrayLike, radius: float) -> TriangleMesh:
-    """A capsule between two points (3,) [m]."""
+    """Create a mesh of a capsule between two points (3,) [m]."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(b - a))
     turn = np.linspace(-np.pi / 2, np.pi / 2, 24)

@@ -1,1 +1,1 @@
-"""How far the twin is from what it stands for: from a recorded log (sim-to-real), from a held-out twin (sim-to-sim)."""
+"""Comparison of the twin with a recorded log (sim-to-real) and with a held-out twin (sim-to-sim)."""

@@ -1,4 +1,4 @@
-"""Whether one simulation ranks policies as another does: Pearson's r and SIMPLER's MMRV, with bootstrap intervals."""
+"""Agreement of two simulations on the ranking of policies: Pearson's r and SIMPLER's MMRV, with bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 
-LEVEL = 0.95  # of all intervals
-_Z = 1.959963984540054  # of the normal distribution at that level
+LEVEL = 0.95  # confidence level of all intervals
+_Z = 1.959963984540054  # quantile of the normal distribution at that level
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure with the interval that holds it in 95 of 100 repetitions; None where it is not defined.
+    """A statistic with its 95 % confidence interval; undefined values (None) have a note.
 
     Args:
-        value: the figure.
+        value: the statistic.
         low, high: ends of the interval.
-        note: why a figure, or some of the resamples that the interval comes from, is not defined; empty if all are.
+        note: reason why the statistic or some of the resamples are undefined; empty if all are defined.
     """
 
     value: float | None
@@ -37,11 +37,11 @@ class PolicyScore:
     """One policy in both twins.
 
     Args:
-        name: the policy's.
-        trials: how many.
-        in_map, in_held_out: share of the trials with success in the twin of the map, and in the held-out one.
-        drop: the first less the second.
-        refused: trials in which the policy gave no motion; a failure in both.
+        name: of the policy.
+        trials: number of trials.
+        in_map, in_held_out: success rate in the twin of the map, and in the held-out one.
+        drop: ``in_map`` minus ``in_held_out``.
+        refused: trials in which the policy returned no motion; each is a failure in both twins.
     """
 
     name: str
@@ -54,13 +54,13 @@ class PolicyScore:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Success of several policies in the twin of the map against that in the held-out twin.
+    """Success rates of several policies in the twin of the map and in the held-out twin.
 
     Args:
-        policies: one by one.
-        drop: mean over them.
-        pearson: correlation of the success shares over the policies.
-        mmrv: mean maximum rank violation, 0 for equal ranks.
+        policies: scores of each policy.
+        drop: mean over the policies.
+        pearson: correlation of the success rates over the policies.
+        mmrv: mean maximum rank violation; 0 for equal ranks.
     """
 
     policies: tuple[PolicyScore, ...]
@@ -71,47 +71,55 @@ class Agreement:
 
 @dataclass(frozen=True)
 class ReliabilityRow:
-    """Motions whose promised clearance is in one bin, against what was measured.
+    """Simulated clearance of motions whose certified clearance is in one bin.
 
     Args:
         low, high: the bin [m]; ``high`` may be infinity.
-        count: of motions.
-        kept: share of them with at least the clearance that was promised.
-        touched: of them, how many touched.
-        promised, measured: medians [m].
-        worst: largest shortfall of measured against promised [m]; negative where all had more.
+        count: number of motions.
+        kept: fraction of motions with at least the certified clearance.
+        in_contact: number of motions with a contact.
+        promised, measured: median certified and simulated clearance [m].
+        worst: largest shortfall of the simulated clearance [m]; negative if every motion exceeds its certificate.
     """
 
     low: float
     high: float
     count: int
     kept: Interval
-    touched: int
+    in_contact: int
     promised: float
     measured: float
     worst: float
 
 
 def pearson(a: ArrayLike, b: ArrayLike) -> float | None:
-    """Correlation of two rows (P,) of numbers; None for fewer than two of them, or where one does not vary."""
+    """Compute Pearson's correlation of two rows (P,) of numbers.
+
+    Returns:
+        The coefficient, or None for fewer than two numbers or for a constant row.
+    """
     x, y = _pair(a, b)
     if len(x) < 2:
         return None
     x, y = x - x.mean(), y - y.mean()
     length = float(np.linalg.norm(x) * np.linalg.norm(y))
-    # The mean of equal numbers may differ from them in the last bit.
+    # Rounding: the mean of equal numbers may differ from them in the last bit.
     if length <= 1e-12:
         return None
     return float(np.clip(x @ y / length, -1.0, 1.0))
 
 
 def mean_maximum_rank_violation(simulated: ArrayLike, real: ArrayLike) -> float | None:
-    """MMRV of SIMPLER (Li et al. 2024, eq. 1): for each policy, the worst ``|real_i - real_j|`` over those that the
-    simulation ranks otherwise; the mean over policies. 0 is best, 1 worst; None without policies.
+    """Compute SIMPLER's MMRV (Li et al. 2024, eq. 1).
+
+    MMRV = 1/P Σ_i max_j |real_i - real_j| · [sim_i < sim_j ≠ real_i < real_j]. 0 is best and 1 is worst.
 
     Args:
-        simulated: (P,) success in the simulation that is judged.
-        real: (P,) success in what it stands for.
+        simulated: (P,) success rates in the evaluated simulation.
+        real: (P,) success rates in the reference.
+
+    Returns:
+        The measure, or None without policies.
     """
     sim, truth = _pair(simulated, real)
     if not len(sim):
@@ -121,7 +129,7 @@ def mean_maximum_rank_violation(simulated: ArrayLike, real: ArrayLike) -> float 
 
 
 def wilson(successes: int, trials: int) -> Interval:
-    """A share with Wilson's score interval (Wilson 1927): of use for 0 and for all successes too."""
+    """Compute a success rate with Wilson's score interval (Wilson 1927), which is also valid for rates 0 and 1."""
     if trials < 1:
         return Interval(None, None, None, "no trials")
     p, z2 = successes / trials, _Z**2
@@ -139,24 +147,24 @@ def agreement(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Agreement:
-    """Scores of P policies over T trials, the same ones for all policies and both twins.
+    """Compute scores of P policies over T trials, which are the same for all policies and both twins.
 
-    Intervals are percentiles over resampled trials (Efron and Tibshirani 1993, ch. 13): what belongs to one trial is
+    Intervals are percentiles over resampled trials (Efron and Tibshirani 1993, ch. 13): the results of one trial are
     drawn together. The same seed gives the same intervals.
 
     Args:
         names: of the policies.
         in_map, in_held_out: (P, T) bool, success.
-        refused: (P, T) bool, whether there was no motion at all.
-        resamples: how many.
+        refused: (P, T) bool, whether the policy returned no motion.
+        resamples: number of bootstrap resamples.
         seed: of the resampling.
 
     Raises:
         InputError: shapes do not fit, or there is no policy or no trial.
     """
     a, b = (np.asarray(x, dtype=np.bool_) for x in (in_map, in_held_out))
-    none = np.zeros_like(a) if refused is None else np.asarray(refused, dtype=np.bool_)
-    if a.ndim != 2 or a.shape != b.shape or a.shape != none.shape or len(names) != len(a) or not a.size:
+    no_motion = np.zeros_like(a) if refused is None else np.asarray(refused, dtype=np.bool_)
+    if a.ndim != 2 or a.shape != b.shape or a.shape != no_motion.shape or len(names) != len(a) or not a.size:
         raise InputError(f"are {a.shape} and {b.shape}.", field="trials", hint="give (P, T) of each, P and T above 0")
     picks = np.random.default_rng(seed).integers(0, a.shape[1], (resamples, a.shape[1]))
     shares_a, shares_b = a.mean(axis=1), b.mean(axis=1)
@@ -169,7 +177,7 @@ def agreement(
             wilson(int(a[i].sum()), a.shape[1]),
             wilson(int(b[i].sum()), a.shape[1]),
             _interval(float(shares_a[i] - shares_b[i]), list(drops[i])),
-            int(none[i].sum()),
+            int(no_motion[i].sum()),
         )
         for i, name in enumerate(names)
     )
@@ -184,18 +192,18 @@ def agreement(
 def reliability(
     promised: ArrayLike,
     measured: ArrayLike,
-    touched: ArrayLike,
+    in_contact: ArrayLike,
     edges: Sequence[float] = (0.0, 0.005, 0.01, 0.02, 0.05, np.inf),
 ) -> tuple[ReliabilityRow, ...]:
-    """Bins of promised clearance against what was measured; empty bins are left out.
+    """Compare certified with simulated clearance in bins; empty bins are left out.
 
     Args:
-        promised, measured: (M,) [m] of each motion.
-        touched: (M,) bool.
+        promised, measured: (M,) certified and simulated clearance [m] of each motion.
+        in_contact: (M,) bool.
         edges: of the bins [m], ascending.
     """
     p, m = _pair(promised, measured)
-    hit = np.asarray(touched, dtype=np.bool_)
+    hit = np.asarray(in_contact, dtype=np.bool_)
     rows = []
     for low, high in pairwise(edges):
         here = (p >= low) & (p < high)

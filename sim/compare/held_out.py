@@ -1,4 +1,4 @@
-"""A held-out twin: true shapes, and physics unlike what the map's twin assumes, drawn anew for each trial."""
+"""The held-out twin: true shapes, and physics that differs from that of the map's twin in each trial."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Spread:
-    """How far the held-out physics may be from the nominal one; each is drawn evenly.
+    """Ranges of the held-out physics, each drawn uniformly unless stated otherwise.
 
     Args:
-        friction: factor of every coefficient.
+        friction: factor of every friction coefficient.
         mass: factor of every movable object's mass.
-        gain: factor of the drives' stiffness and damping, which the controller does not know of.
+        gain: factor of the drives' stiffness and damping; the controller does not know it.
         lag: time constant of the drives [s].
         latency: of commands [s].
-        joint_friction: as a share of the torque limits.
+        joint_friction: fraction of the torque limits.
         backlash: [rad].
-        base: standard deviation of where the base really is, in each direction [m]; ``yaw`` how it is turned [rad].
+        base: standard deviation of the normally distributed base position error, per axis [m].
+        yaw: standard deviation of the normally distributed base yaw error [rad].
     """
 
     friction: Range = (0.35, 1.2)
@@ -43,7 +44,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class HeldOutPhysics:
-    """What was drawn of a :class:`Spread`; ``base`` is (x, y, z) [m] and ``yaw`` [rad] off."""
+    """One draw of :class:`Spread`; ``base`` is the position error (x, y, z) [m] and ``yaw`` the yaw error [rad]."""
 
     friction: float
     mass: float
@@ -57,7 +58,7 @@ class HeldOutPhysics:
 
 
 def draw(spread: Spread, seed: int) -> HeldOutPhysics:
-    """The physics of one trial; the same seed gives the same."""
+    """Draw the physics of one trial; the same seed gives the same physics."""
     rng = np.random.default_rng(seed)
     names = ("friction", "mass", "gain", "lag", "latency", "joint_friction", "backlash")
     values = {name: float(rng.uniform(*getattr(spread, name))) for name in names}
@@ -66,12 +67,12 @@ def draw(spread: Spread, seed: int) -> HeldOutPhysics:
 
 
 def held_out_scene(scene: Scene, physics: HeldOutPhysics) -> Scene:
-    """The scene with that physics, all effects on."""
+    """Return the scene with that physics and all effects enabled."""
     values = scene.model_dump()
-    for thing in values["objects"]:
-        thing["friction"] *= physics.friction
-        if thing["movable"]:
-            thing["mass"] = (thing["mass"] or 0.2) * physics.mass
+    for obj in values["objects"]:
+        obj["friction"] *= physics.friction
+        if obj["movable"]:
+            obj["mass"] = (obj["mass"] or 0.2) * physics.mass
     if scene.robot is not None:
         robot = values["robot"]
         robot["at"] = tuple(a + b for a, b in zip(robot["at"], physics.base, strict=True))
@@ -85,17 +86,17 @@ def held_out_scene(scene: Scene, physics: HeldOutPhysics) -> Scene:
 
 
 class HeldOutTwin(Twin):
-    """A twin whose drives are weaker or stiffer than its controller knows, and hear commands late.
+    """A twin whose drives differ from the controller's model and receive commands command.
 
     Args:
-        scene: of the true shapes.
-        physics: what differs.
-        seed: as of :class:`splatbot.sim.twin.Twin`.
+        scene: with the true shapes.
+        physics: the deviation from nominal physics.
+        seed: as in :class:`splatbot.sim.twin.Twin`.
     """
 
     def __init__(self, scene: Scene, physics: HeldOutPhysics, *, seed: int = 0) -> None:
         self.physics = physics
-        self._late: deque[tuple[Array, Array, Array, float | None]] = deque()
+        self._delayed: deque[tuple[Array, Array, Array, float | None]] = deque()
         super().__init__(held_out_scene(scene, physics), seed=seed)
         self._periods = round(physics.latency * self.rate)
         if self.follower is not None and self.world.robot is not None:
@@ -105,14 +106,14 @@ class HeldOutTwin(Twin):
             model.actuator_biasprm[motors, 1:3] *= physics.gain
 
     def reset(self, q: Array | None = None) -> None:
-        """Also forgets the commands that are on their way."""
-        self._late.clear()
+        """Reset the twin and discard the delayed commands."""
+        self._delayed.clear()
         super().reset(q)
 
     def advance(self, time: float, q: Array, velocity: Array, acceleration: Array, opening: float | None) -> None:
-        """One control period with the command of as many periods ago as commands are late; the first one until then."""
-        self._late.append((q, velocity, acceleration, opening))
-        late = self._late[0]
-        if len(self._late) > self._periods:
-            self._late.popleft()
-        super().advance(time, *late)
+        """Simulate one control period with the delayed command; before the latency has passed, with the first."""
+        self._delayed.append((q, velocity, acceleration, opening))
+        command = self._delayed[0]
+        if len(self._delayed) > self._periods:
+            self._delayed.popleft()
+        super().advance(time, *command)

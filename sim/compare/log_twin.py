@@ -25,25 +25,25 @@ from splatbot.workspace import Workspace, find_workspace, fit_workspace
 KIND = "sim-to-real"
 _SHOWN = 3  # frames whose images are kept
 
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
 class LogComparison:
-    """A log against its twin.
+    """Comparison of a log with its twin.
 
     Args:
         log, map: their names.
         robot: the twin's arm.
-        frames: of the log, and how many of them were compared.
-        poses: where the camera's poses come from, in words.
+        frames: number of frames of the log.
+        poses: description of the source of the camera poses.
         base: of the arm in the map.
-        support: height of what things stand on over the base [m], and its RMS error [m]; None: no level plane in reach.
-        views: one for each frame that was compared.
-        shown: images of a few, by frame.
-        replay: of the arm's motion; None where the log tells of none, or it was interrupted before.
-        notes: where not to trust it.
-        interrupted: whether somebody stopped it: then this is what was done until then.
+        support: height of the support plane over the base [m] and its RMS error [m]. If None, there is no such plane.
+        views: one for each compared frame.
+        shown: images of a few frames, by frame.
+        replay: of the arm's motion. If None, the log has no motion, or the comparison was interrupted.
+        notes: limits of validity.
+        interrupted: whether the user stopped the comparison; the results until then are kept.
     """
 
     log: str
@@ -60,7 +60,7 @@ class LogComparison:
     interrupted: bool
 
     def summary(self) -> dict[str, Any]:
-        """Means over the frames, and over the held-out ones among them; None where there is nothing to average."""
+        """Return means over all frames and over the held-out ones; an empty mean is undefined (None)."""
         names = [name for name in asdict(self.views[0]) if name not in ("index", "held_out")] if self.views else []
         parts = {"all": self.views, "held_out": [view for view in self.views if view.held_out]}
         found: dict[str, Any] = {
@@ -78,7 +78,7 @@ class LogComparison:
         return found
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON takes it, images left out."""
+        """Return the comparison as values for JSON, without images."""
         base = {
             "T_world_base": self.base.T_world_base.tolist(),
             "source": self.base.source,
@@ -96,7 +96,7 @@ class LogComparison:
                 "support": None if self.support is None else {"height_m": self.support[0], "rms_m": self.support[1]},
                 "summary": self.summary(),
                 "views": [asdict(view) for view in self.views],
-                "replay": None if self.replay is None else asdict(self.replay),
+                "replay": None if self.replay is None else self.replay.to_dict(),
                 "notes": list(self.notes),
                 "interrupted": self.interrupted,
             }
@@ -109,20 +109,20 @@ def compare_log(
     robot: RobotModel,
     *,
     frames: int = 0,
-    tell: Tell = lambda what, share: None,
+    on_progress: OnProgress = lambda step, share: None,
 ) -> LogComparison:
-    """A log against the twin of its map: images at recorded poses, and the arm's motion done again.
+    """Compare a log with the twin of its map: images at recorded poses, and a replay of the arm's motion.
 
-    The camera's poses are those that the arm tells (tool poses and mount, or joints and mount); without them those that
-    were tracked, and the base is that of the log's scene.yaml, or proposed from the map. Ctrl-C ends it early with what
-    was done.
+    The camera poses come from the arm: tool poses and mount, or joints and mount. Without them they are the tracked
+    ones, and the base is that of the log's scene.yaml or fitted to the map. Ctrl-C ends the comparison early and keeps
+    the results so far.
 
     Args:
-        log: the recording, with what the run left out masked.
-        run: what mapped it.
+        log: the recording, with the masks of the run.
+        run: the run that mapped it.
         robot: the twin's arm.
-        frames: how many to compare, evenly spaced; 0: all.
-        tell: told what goes on, and the share of it that is done.
+        frames: number of evenly spaced frames to compare; 0 for all.
+        on_progress: called with the current step and the completed fraction.
 
     Raises:
         InputError: log and run have no frame in common.
@@ -139,21 +139,21 @@ def compare_log(
         )
     by_arm = {i: T for i in known if (T := record.camera_at(stamps[i], robot)) is not None}
     place = find_workspace(run.path) or record.workspace
-    base = base_in_map(by_arm, tracked, record.source) if by_arm else _told_base(place, model)
+    base = base_in_map(by_arm, tracked, record.source) if by_arm else _base_without_arm(place, model)
     poses = by_arm or {i: np.asarray(inverse(base.T_world_base) @ T) for i, T in tracked.items() if i < len(log)}
     around = surroundings(model, run.map, base.T_world_base, robot, place.support_plane)
     gaps = {i: pose_gap(base.T_world_base @ T, tracked[i]) for i, T in poses.items() if i in tracked}
-    looks = _LogLooks(log, poses, gaps, {row.index for row in run.load_frames() if row.held_out})
-    notes = [] if around.support is not None else ["no level plane within the arm's reach: nothing stands on anything"]
+    views = _LogViews(log, poses, gaps, {row.index for row in run.load_frames() if row.held_out})
+    notes = [] if around.support is not None else ["no level plane within the arm's reach: there is no support plane"]
     done: Replay | None = None
     interrupted = False
     try:
         twin = TwinViews(around)
         notes += twin.world.notes
-        looks.through(twin, _spread(sorted(poses), frames), tell)
-        tell("the arm's motion", 0.0)
+        views.compare_all(twin, _spread(sorted(poses), frames), on_progress)
+        on_progress("the arm's motion", 0.0)
         done = _replay(record, [stamps.get(i, np.nan) for i in range(len(log))], around, robot)
-        tell("the arm's motion", 1.0)
+        on_progress("the arm's motion", 1.0)
     except KeyboardInterrupt:
         interrupted = True
     return LogComparison(
@@ -161,11 +161,11 @@ def compare_log(
         map=run.path.resolve().name,
         robot=robot.name,
         frames=len(log),
-        poses=record.source if by_arm else "as tracked: the log does not tell the arm's",
+        poses=record.source if by_arm else "tracked: the log does not record the arm's poses",
         base=base,
         support=None if around.support is None else (around.support.offset, around.support.error),
-        views=tuple(looks.views),
-        shown=looks.shown,
+        views=tuple(views.views),
+        shown=views.shown,
         replay=done,
         notes=tuple(notes),
         interrupted=interrupted,
@@ -173,13 +173,13 @@ def compare_log(
 
 
 @dataclass
-class _LogLooks:
-    """Frames beside the twin's images, as far as they were looked at.
+class _LogViews:
+    """Frames of a log with the twin's images, as far as they were compared.
 
     Args:
-        log: of the frames.
+        log: with the frames.
         poses: T_base_camera (4, 4) by frame.
-        gaps: from the tracked ones [m, rad].
+        gaps: differences [m, rad] to the tracked poses.
         held_out: frames that were kept out of the map.
     """
 
@@ -190,7 +190,7 @@ class _LogLooks:
     views: list[ViewAgreement] = field(default_factory=list)
     shown: dict[int, SeenView] = field(default_factory=dict)
 
-    def through(self, twin: TwinViews, chosen: Sequence[int], tell: Tell) -> None:
+    def compare_all(self, twin: TwinViews, chosen: Sequence[int], on_progress: OnProgress) -> None:
         keep = set(_spread(chosen, _SHOWN))
         for k, index in enumerate(chosen):
             view, seen = twin.compare(
@@ -199,7 +199,7 @@ class _LogLooks:
             self.views.append(view)
             if index in keep:
                 self.shown[index] = seen
-            tell("frames", (k + 1) / len(chosen))
+            on_progress("frames", (k + 1) / len(chosen))
 
 
 def _replay(record: ArmRecord, stamps: Sequence[float], around: Surroundings, robot: RobotModel) -> Replay | None:
@@ -207,23 +207,23 @@ def _replay(record: ArmRecord, stamps: Sequence[float], around: Surroundings, ro
     return None if knots is None else replay(knots, Twin(around.scene(robot.name), robot=robot))
 
 
-def _told_base(place: Workspace, model: GaussianModel) -> BaseInMap:
+def _base_without_arm(place: Workspace, model: GaussianModel) -> BaseInMap:
     if place.T_world_base is not None:
         T, source = place.T_world_base, "scene.yaml"
     else:
         proposed = fit_workspace(model).T_world_base
         assert proposed is not None
-        T, source = proposed, "proposed from the map: the log does not tell the arm's poses"
+        T, source = proposed, "fitted to the map: the log does not record the arm's poses"
     return BaseInMap(T, np.zeros((0, 2)), (), (), source)
 
 
 def _stamps(log: Log, run: RunFolder) -> dict[int, float]:
-    """Stamps [s] of the frames that the run read, by their position in the log."""
+    """Return the stamps [s] of the frames that the run read, by their position in the log."""
     return {row.index: row.stamp for row in run.load_frames() if row.stamp is not None}
 
 
 def _spread(items: Sequence[int], count: int) -> list[int]:
-    """``count`` of them, evenly spaced, both ends among them; all for 0."""
+    """Return ``count`` evenly spaced items with both ends, or all items for 0."""
     if count <= 0 or count >= len(items):
         return list(items)
     return [items[round(k)] for k in np.linspace(0, len(items) - 1, count)]

@@ -1,4 +1,4 @@
-"""A comparison as one self-contained HTML page: sim-to-real of a log, sim-to-sim of a held-out twin."""
+"""Comparisons as self-contained HTML pages: sim-to-real of a log, sim-to-sim of a held-out twin."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from splatbot.sim.compare.trials import TrialResults
 from splatbot.sim.compare.views import SeenView, ViewAgreement
 
 _GAIN = 3.0  # of difference images
-_STOPPED = '<section class="banner warn"><b>Interrupted</b>; this is what was done until then.</section>\n'
+_STOPPED = '<section class="banner warn"><b>Interrupted</b>; these are the results until then.</section>\n'
 
 
 def log_rows(found: LogComparison) -> list[tuple[str, str]]:
-    """The figures of a sim-to-real comparison as names and values."""
+    """Format the results of a sim-to-real comparison as names and values."""
     s = found.summary()
     rows = [
         ("camera poses", found.poses),
         ("base in the map", found.base.source + _residual(s, found.base.left_out)),
-        ("support", "none within reach" if found.support is None else _support(*found.support)),
+        ("support plane", "no plane within reach" if found.support is None else _support(*found.support)),
     ]
     for part, name in (("all", "frames"), ("held_out", "held-out frames")):
         v = s[part]
@@ -44,14 +44,14 @@ def log_rows(found: LogComparison) -> list[tuple[str, str]]:
                 "  depth L1, whole image",
                 f"{metres(v['depth_l1_m'])}, median {metres(v['depth_median_m'])}, covers {percent(v['coverage'])}",
             ),
-            ("  depth L1, part simulated", f"{metres(v['part_l1_m'])}; shapes {metres(v['physics_l1_m'])}"),
-            ("  silhouette IoU", f"{number(v['iou'], 3)}; shapes {number(v['physics_iou'], 3)}"),
+            ("  depth L1, simulated part", f"{metres(v['part_l1_m'])}; collision geometry {metres(v['physics_l1_m'])}"),
+            ("  silhouette IoU", f"{number(v['iou'], 3)}; collision geometry {number(v['physics_iou'], 3)}"),
         ]
     return [*rows, *_replay_rows(found, s)]
 
 
 def log_section(found: LogComparison) -> list[str]:
-    """The parts of a page on a log."""
+    """Return the sections of a page on a log."""
     rows = log_rows(found)
     replayed = found.replay
     return [
@@ -65,23 +65,23 @@ def log_section(found: LogComparison) -> list[str]:
         ),
         section("Over the frames", image(frames_plot(found.views), "figures over the frames"), _rings()),
         section(
-            "The arm's motion, done again",
+            "Replay of the arm's motion",
             image(replay_plot(replayed), "tool error over the frames"),
             note(html.escape("; ".join((replayed.source, *replayed.notes)))),
         )
         if replayed is not None
         else "",
-        section("What the map became", *(note(html.escape(text)) for text in found.notes)),
+        section("Conversion of the map", *(note(html.escape(text)) for text in found.notes)),
     ]
 
 
 def log_html(found: LogComparison) -> str:
-    """The page of a sim-to-real comparison."""
+    """Return the page of a sim-to-real comparison."""
     return document(f"{found.log}: {KIND}", f"twin of {found.map}, arm {found.robot}", log_section(found))
 
 
 def policy_rows(found: TrialResults) -> list[tuple[str, ...]]:
-    """The policies of a sim-to-sim comparison as cells; the last rows are the measures over all of them."""
+    """Format the policies of a sim-to-sim comparison as cells; the last rows are measures over all policies."""
     agreed = found.agreement()
     if agreed is None:
         return []
@@ -95,13 +95,13 @@ POLICY_HEAD = ("policy", "success, map's twin", "success, held-out twin", "drop"
 
 
 def promise_rows(found: TrialResults) -> list[tuple[str, ...]]:
-    """Promised clearance against that in the held-out twin, as cells."""
+    """Format certified clearance against that simulated in the held-out twin as cells."""
     return [
         (
             f"{1e3 * row.low:g} to {1e3 * row.high:g} mm" if np.isfinite(row.high) else f"{1e3 * row.low:g} mm or more",
             str(row.count),
             _share(row.kept),
-            str(row.touched),
+            str(row.in_contact),
             metres(row.promised),
             metres(row.measured),
             f"{-1e3 * row.worst:+.1f} mm",
@@ -111,23 +111,23 @@ def promise_rows(found: TrialResults) -> list[tuple[str, ...]]:
 
 
 PROMISE_HEAD = (
-    "promised",
+    "certified",
     "motions",
     "kept",
-    "touched",
-    "median promised",
-    "median measured",
-    "worst against promised",
+    "with contact",
+    "median certified",
+    "median simulated",
+    "worst excess over certified",
 )
 
 
 def trials_title(found: TrialResults) -> str:
-    """What the figures are of, in a line."""
+    """Return a heading of the results in one line."""
     return f"{SIM_TO_SIM}: {found.task}, the map's twin against the held-out twin, {len(found.cases)} cases"
 
 
 def trials_section(found: TrialResults) -> list[str]:
-    """The parts of a page on policies in two twins."""
+    """Return the sections of a page on policies in two twins."""
     agreed = found.agreement()
     whys = Counter((trial.policy, trial.why_held_out) for trial in found.trials if trial.why_held_out)
     failures = [(policy, why, str(n)) for (policy, why), n in whys.most_common(40)]
@@ -136,20 +136,18 @@ def trials_section(found: TrialResults) -> list[str]:
         section(
             html.escape(trials_title(found)),
             table(POLICY_HEAD, policy_rows(found)),
-            note("Shares and differences with 95 % intervals: Wilson's for shares, others over resampled cases."),
+            note("Rates and differences have 95 % intervals: Wilson's for rates, bootstrap over cases for others."),
             image(policies_plot(agreed), "success in both twins") if agreed is not None else "",
         ),
-        section(f"Promised clearance, {html.escape(found.task)}", table(PROMISE_HEAD, promise_rows(found))),
-        details(
-            f"What went wrong in the held-out twin, {html.escape(found.task)}", table(("policy", "why", ""), failures)
-        ),
+        section(f"Certified clearance, {html.escape(found.task)}", table(PROMISE_HEAD, promise_rows(found))),
+        details(f"Failures in the held-out twin, {html.escape(found.task)}", table(("policy", "reason", ""), failures)),
     ]
 
 
 def trials_html(results: Sequence[TrialResults]) -> str:
-    """The page of a sim-to-sim comparison."""
+    """Return the page of a sim-to-sim comparison."""
     parts = [part for found in results for part in trials_section(found)]
-    return document(f"held-out twin: {SIM_TO_SIM}", "policies that see only a map, in its twin and in another", parts)
+    return document(f"held-out twin: {SIM_TO_SIM}", "policies that use only a map, in its twin and in another", parts)
 
 
 def _share(interval: Interval) -> str:
@@ -171,10 +169,10 @@ def _tiles(found: LogComparison) -> list[tuple[str, str]]:
     return [
         (count(v["frames"]), "frames"),
         (decibels(v.get("psnr_db")), "PSNR"),
-        (metres(v.get("part_l1_m")), "depth L1, part simulated"),
-        (metres(v.get("physics_l1_m")), "depth L1 of the shapes"),
+        (metres(v.get("part_l1_m")), "depth L1, simulated part"),
+        (metres(v.get("physics_l1_m")), "depth L1 of the collision geometry"),
         (number(v.get("iou"), 3), "silhouette IoU"),
-        (metres(s.get("replay_most_m")), "tool off at most"),
+        (metres(s.get("replay_most_m")), "maximum tool error"),
     ]
 
 
@@ -185,20 +183,20 @@ def _view(view: ViewAgreement, seen: SeenView) -> str:
         (colour_png(seen.twin_rgb), f"twin, {decibels(view.psnr_db)}"),
         (difference_png(seen.rgb, seen.twin_rgb, gain=_GAIN), f"difference, times {_GAIN:g}"),
         (depth_png(seen.depth, span), f"recorded depth, {span[0]:.2f} to {span[1]:.2f} m"),
-        (depth_png(seen.twin_depth, span), f"twin's depth, off by {metres(view.depth_median_m)} (median)"),
+        (depth_png(seen.twin_depth, span), f"twin's depth, median error {metres(view.depth_median_m)}"),
         (
             depth_png(_as_large(seen.shape_depth, seen.depth), span),
-            f"shapes of physics, off by {metres(view.physics_l1_m)}",
+            f"collision geometry, mean error {metres(view.physics_l1_m)}",
         ),
     ]
-    if seen.stands is not None and seen.twin_stands is not None:
-        text = f"what stands up: both white, only recorded red, only twin blue; IoU {number(view.iou, 3)}"
-        images.append((colour_png(silhouettes(seen.stands, seen.twin_stands)), text))
+    if seen.above is not None and seen.twin_above is not None:
+        text = f"above the support: both white, only recorded red, only twin blue; IoU {number(view.iou, 3)}"
+        images.append((colour_png(silhouettes(seen.above, seen.twin_above)), text))
     return pictures(images)
 
 
 def silhouettes(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Two masks (H, W) as a picture (H, W, 3): both white, only the first red, only the second blue."""
+    """Draw two masks (H, W) as an image (H, W, 3): both white, only the first red, only the second blue."""
     picture = np.zeros((*a.shape, 3), np.uint8)
     picture[a & b], picture[a & ~b], picture[b & ~a] = (235, 235, 235), (217, 81, 95), (63, 134, 208)
     return picture
@@ -210,16 +208,14 @@ def _as_large(small: NDArray[np.float32], like: NDArray[np.float32]) -> NDArray[
 
 
 def _rings() -> str:
-    return note(
-        "Rings: frames that were kept out of the map. Depth is compared in the part of the scene that is simulated."
-    )
+    return note("Rings: frames that were kept out of the map. Depth is compared in the simulated part of the scene.")
 
 
 def _residual(summary: dict[str, float | None], left_out: Sequence[int]) -> str:
     away, turn, median = (summary[f"base_{name}"] for name in ("residual_m", "residual_rad", "median_m"))
     if away is None or turn is None:
         return ""
-    without = f"; contradict each other in frames {', '.join(map(str, left_out))}" if left_out else ""
+    without = f"; the two poses are inconsistent in frames {', '.join(map(str, left_out))}" if left_out else ""
     return (
         f"; the arm's and the tracked camera differ by {metres(median)} (median), {metres(away)} and "
         f"{np.degrees(turn):.2f} deg RMS{without}"
@@ -232,16 +228,16 @@ def _support(height: float, error: float) -> str:
 
 def _replay_rows(found: LogComparison, summary: dict[str, float | None]) -> list[tuple[str, str]]:
     if found.replay is None:
-        return [("action replay", "none: the log tells neither joints nor tool poses")]
+        return [("action replay", "not available: the log records neither joints nor tool poses")]
     rows = [("action replay", f"{found.replay.source}: {found.replay.reached} of {found.replay.poses} poses")]
     if found.replay.errors:
-        rows += [(f"  tool off, {what}", _gap(summary, what)) for what in ("mean", "most")]
-    touched = ", ".join(f"{touch.part} and {touch.other}" for touch in found.replay.touches)
-    return [*rows, ("  touched", touched or "nothing"), ("  least room", metres(found.replay.room) or NONE)]
+        rows += [(f"  tool error, {key}", _gap(summary, key)) for key in ("mean", "most")]
+    contacts = ", ".join(f"{contact.part} and {contact.other}" for contact in found.replay.contacts)
+    return [*rows, ("  contacts", contacts or "none"), ("  minimum clearance", metres(found.replay.clearance) or NONE)]
 
 
-def _gap(summary: dict[str, float | None], what: str) -> str:
-    away, turn = summary[f"replay_{what}_m"], summary[f"replay_{what}_rad"]
+def _gap(summary: dict[str, float | None], key: str) -> str:
+    away, turn = summary[f"replay_{key}_m"], summary[f"replay_{key}_rad"]
     assert away is not None
     assert turn is not None
     return f"{1e3 * away:.3f} mm, {np.degrees(turn):.4f} deg"

@@ -1,4 +1,4 @@
-"""Plots of a comparison: figures over the frames of a log, and policies in one twin against the other."""
+"""Plots of a comparison: errors over the frames of a log, and success of policies in two twins."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from splatbot.sim.compare.views import ViewAgreement
 
 @styled
 def frames_plot(views: Sequence[ViewAgreement]) -> bytes | None:
-    """Depth error, PSNR and silhouettes over the frames; held-out frames are rings."""
+    """Plot depth error, PSNR and silhouette IoU over the frames; held-out frames are rings."""
     if not views:
         return None
     fig, (depth, colour, shape) = figure(3, height=2.8)
     _curve(depth, views, "part_l1_m", 1e3, BLUE, "Gaussians")
-    _curve(depth, views, "physics_l1_m", 1e3, ORANGE, "shapes of physics")
+    _curve(depth, views, "physics_l1_m", 1e3, ORANGE, "collision geometry")
     _curve(colour, views, "psnr_db", 1.0, BLUE, "Gaussians")
     _curve(shape, views, "iou", 1.0, BLUE, "Gaussians")
-    _curve(shape, views, "physics_iou", 1.0, ORANGE, "shapes of physics")
+    _curve(shape, views, "physics_iou", 1.0, ORANGE, "collision geometry")
     for ax, label in zip((depth, colour, shape), ("depth L1 [mm]", "PSNR [dB]", "silhouette IoU"), strict=True):
         ax.set_xlabel("frame")
         ax.set_ylabel(label)
@@ -35,14 +35,14 @@ def frames_plot(views: Sequence[ViewAgreement]) -> bytes | None:
 
 @styled
 def replay_plot(replay: Replay) -> bytes | None:
-    """Where the tool came, against where it was recorded, over the frames."""
+    """Plot the difference of the simulated tool pose to the recorded one over the frames."""
     if not replay.errors:
         return None
     fig, axes = figure(2, height=2.4)
     index = [error.index for error in replay.errors]
     for ax, values, label, color in (
-        (axes[0], [1e3 * error.position_m for error in replay.errors], "tool off [mm]", BLUE),
-        (axes[1], [np.degrees(error.angle_rad) for error in replay.errors], "tool turned [deg]", GREEN),
+        (axes[0], [1e3 * error.position_m for error in replay.errors], "tool position error [mm]", BLUE),
+        (axes[1], [np.degrees(error.angle_rad) for error in replay.errors], "tool rotation error [deg]", GREEN),
     ):
         ax.plot(index, values, color=color, linewidth=1.3, marker=".", markersize=4)
         ax.set_ylim(bottom=0)
@@ -53,7 +53,7 @@ def replay_plot(replay: Replay) -> bytes | None:
 
 @styled
 def policies_plot(agreement: Agreement) -> bytes:
-    """Success in the twin of the map against success in the held-out one, with intervals."""
+    """Plot success in the twin of the map against success in the held-out one, with intervals."""
     fig, (ax,) = figure(width=5.0, height=4.2)
     ax.plot([0, 1], [0, 1], color=INK, linewidth=0.8, linestyle="--")
     for k, score in enumerate(agreement.policies):

@@ -1,8 +1,8 @@
-"""Pushing a thing across the table by closed fingers: the task, and policies that differ in height, speed and aim."""
+"""Pushing an object across the table with closed fingers: the task, and policies."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,31 +10,31 @@ import numpy as np
 from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.compare.trials import PolicyAction
+from splatbot.sim.compare.trials import MapTask, PolicyAction
 from splatbot.sim.motion import minimum_jerk, motion_from_samples
 from splatbot.sim.scene import SceneObject
 from splatbot.sim.solids import CapsuleGeom, CylinderGeom, Shape, SphereGeom, rotation_of
 from splatbot.sim.twin import Twin, TwinResult
 from splatbot.sim.world import OBJECT
 
-NEAR = 0.03  # [m] from the goal that counts as there
-_UPRIGHT = float(np.cos(0.5))  # a thing that leans more has tipped over
-_TIP = 0.01  # [m] that the fingers' tips are ahead of the tool's frame
-_TILT = np.pi / 4  # of the tool from straight down, forwards: the fingers, not the hand, meet the thing
-_LOWEST = 0.03  # [m] of the tool over the table
-_RUN = 0.05  # [m] before contact
-_OVER = 0.25  # [m] over the table that the tool comes from
-_APPROACH, _DOWN, _REST = 2.0, 1.0, 0.5  # [s]
-_POSTURES = 8  # above the thing that are tried
+NEAR = 0.03  # [m] from the goal within which the task succeeds
+_UPRIGHT = float(np.cos(0.5))  # an object that leans by more than 0.5 rad has tipped over
+_TIP = 0.01  # [m] from the tool frame to the finger tips
+_TILT = np.pi / 4  # [rad] of the tool from straight down, so that the fingers and not the hand make contact
+_MIN_HEIGHT = 0.03  # [m] of the tool over the table
+_RUN_UP = 0.05  # [m] before contact
+_START_HEIGHT = 0.25  # [m] over the table
+_APPROACH, _DESCENT, _REST = 2.0, 1.0, 0.5  # [s]
+_MAX_POSTURES = 8  # postures above the object that are tried
 _RATE = 50.0  # [Hz] of the samples; between them a motion is a cubic
 
 
 @dataclass(frozen=True, eq=False)
 class PushCase:
-    """A thing that shall go ``distance`` [m] along ``direction`` (2,), over a table at height 0 in the base's frame.
+    """An object to be moved by ``distance`` [m] along ``direction`` (2,), on a table at height 0 in the base frame.
 
     Args:
-        believed: the thing as the map has it; None: the map does not have it.
+        believed: the object as in the map. If None, the map lacks it.
         true: its name in the held-out twin.
         direction: (2,) unit vector.
         distance: [m].
@@ -49,81 +49,71 @@ class PushCase:
 
 
 @dataclass(frozen=True, eq=False)
-class PushTask:
-    """The task: the thing ends upright within 3 cm of its goal, counted from where it stands in each twin.
+class PushTask(MapTask[PushCase]):
+    """The task: the object ends upright within 3 cm of its goal, relative to its start in each twin.
 
-    Args:
-        cases: what to push.
-        map_twin: of the map, whose things are movable.
-        held_out: gives the held-out twin of a case.
+    :class:`splatbot.sim.compare.trials.MapTask` describes the fields.
     """
 
-    cases: Sequence[PushCase]
-    map_twin: Twin
-    held_out: Callable[[PushCase], Twin]
     name: str = "push"
 
-    def twins(self, case: PushCase) -> tuple[Twin, Twin]:
-        """See :class:`splatbot.sim.compare.trials.Task`."""
-        return self.map_twin, self.held_out(case)
-
     def failure(self, case: PushCase, twin: Twin, result: TwinResult) -> str:
-        """That the thing tipped over, or how far it is from where it should be."""
+        """Return that the object tipped over, or its distance from the goal; empty after success."""
         name = case.true if twin is not self.map_twin else case.believed.name if case.believed is not None else ""
-        things = {thing.name: thing for thing in twin.world.scene.movable}
-        if name not in things:
+        objects = {obj.name: obj for obj in twin.world.scene.movable}
+        if name not in objects:
             return "the map lacks it"
         if result.stopped is not None:
             return "; ".join(result.warnings) or "stopped"
         body = twin.data.body(OBJECT + name)
         if float(np.asarray(body.xmat)[8]) < _UPRIGHT:
             return "tipped over"
-        went = np.asarray(body.xpos)[:2] - np.asarray(things[name].at)[:2]
-        off = went - case.distance * case.direction
-        if np.linalg.norm(off) <= NEAR:
+        moved = np.asarray(body.xpos)[:2] - np.asarray(objects[name].at)[:2]
+        error = moved - case.distance * case.direction
+        if np.linalg.norm(error) <= NEAR:
             return ""
-        along = float(off @ case.direction)
-        aside = float(np.linalg.norm(off - along * case.direction))
-        return f"{1e3 * abs(along):.0f} mm {'beyond' if along > 0 else 'short'}, {1e3 * aside:.0f} mm aside"
+        along = float(error @ case.direction)
+        lateral = float(np.linalg.norm(error - along * case.direction))
+        return f"{1e3 * abs(along):.0f} mm {'beyond' if along > 0 else 'short'}, {1e3 * lateral:.0f} mm lateral"
 
 
 @dataclass(frozen=True, eq=False)
 class Pusher:
-    """Comes down behind the thing and moves straight.
+    """Policy that descends behind the object and pushes along a straight line.
 
     Args:
         name: of the policy.
         robot: the arm.
-        height: of the tool, as a share of the thing's height.
-        speed: mean of the tool's [m/s].
-        aside: of the thing's middle that the tool aims [m].
+        height: of the tool, as a fraction of the object's height.
+        speed: mean tool speed [m/s].
+        offset: lateral distance [m] of the push line from the object's centre.
     """
 
     name: str
     robot: RobotModel
     height: float
     speed: float
-    aside: float = 0.0
+    offset: float = 0.0
 
     def act(self, case: PushCase) -> PolicyAction | None:
-        """The motion; None if the map lacks the thing, or the arm does not get there."""
+        """Return the motion, or None if the map lacks the object or the arm cannot reach."""
         if case.believed is None:
             return None
         d = np.append(case.direction, 0.0)
         back, tall = extents(case.believed, d)
-        middle = np.asarray(case.believed.at) * [1, 1, 0] + self.aside * np.array([-d[1], d[0], 0.0])
-        z = np.array([0.0, 0.0, max(_LOWEST, self.height * tall)])
-        begin, end = middle - (back + _TIP + _RUN) * d + z, middle + (case.distance - back - _TIP) * d + z
-        above = np.array([begin[0], begin[1], _OVER])
+        middle = np.asarray(case.believed.at) * [1, 1, 0] + self.offset * np.array([-d[1], d[0], 0.0])
+        z = np.array([0.0, 0.0, max(_MIN_HEIGHT, self.height * tall)])
+        begin, end = middle - (back + _TIP + _RUN_UP) * d + z, middle + (case.distance - back - _TIP) * d + z
+        above = np.array([begin[0], begin[1], _START_HEIGHT])
         z_tool = np.sin(_TILT) * d - np.array([0.0, 0.0, np.cos(_TILT)])
-        y_tool = np.array([d[1], -d[0], 0.0])  # as at home: the other way round the wrist is near its limits
+        y_tool = np.array([d[1], -d[0], 0.0])  # as at home: the opposite sign is near the wrist's limits
         return self._motion(above, begin, end, np.stack([np.cross(y_tool, z_tool), y_tool, z_tool], axis=1))
 
     def _motion(self, above: Array, begin: Array, end: Array, R: Array) -> PolicyAction | None:
-        """The first of several postures above the thing from which the whole way is within the joints' limits."""
+        """Return the motion from the first posture above the object whose whole path is within the joint limits."""
         stretch = max(float(np.linalg.norm(end - begin)) / self.speed, 2 / _RATE)
-        times, places = _way([(above, begin, _DOWN), (begin, end, stretch), (end, end, _REST)])
-        for first in solve_ik(self.robot, _pose(R, above), near=self.robot.home).q[:_POSTURES]:
+        times, places = _sampled_lines([(above, begin, _DESCENT), (begin, end, stretch), (end, end, _REST)])
+        for first in solve_ik(self.robot, _pose(R, above), near=self.robot.home).q[:_MAX_POSTURES]:
             q = self._along(first, places, R)
             if q is not None:
                 t = np.arange(0.0, _APPROACH, 1 / _RATE)
@@ -142,8 +132,8 @@ class Pusher:
         return np.array(found[1:])
 
 
-def _way(lines: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array]:
-    """Times (N,) [s] and places (N, 3) on lines (from, to, seconds), at rest at the end of each."""
+def _sampled_lines(lines: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array]:
+    """Sample times (N,) [s] and positions (N, 3) on lines (from, to, seconds), with rest at the end of each."""
     times, places, now = [], [], 0.0
     for a, b, seconds in lines:
         t = np.linspace(0.0, seconds, max(3, round(seconds * _RATE)), endpoint=False)
@@ -160,27 +150,27 @@ def _pose(R: Array, at: Array) -> Array:
 
 
 def push_policies(robot: RobotModel) -> tuple[Pusher, ...]:
-    """Six ways to push."""
+    """Return six pushing policies."""
     return (
         Pusher("low, slow", robot, 0.35, 0.08),
         Pusher("low, fast", robot, 0.35, 0.4),
         Pusher("high, slow", robot, 0.85, 0.08),
         Pusher("high, fast", robot, 0.85, 0.4),
-        Pusher("low, slow, 2 cm aside", robot, 0.35, 0.08, 0.02),
-        Pusher("low, slow, 4 cm aside", robot, 0.35, 0.08, 0.04),
+        Pusher("low, slow, 2 cm offset", robot, 0.35, 0.08, 0.02),
+        Pusher("low, slow, 4 cm offset", robot, 0.35, 0.08, 0.04),
     )
 
 
-def extents(thing: SceneObject, direction: Array) -> tuple[float, float]:
-    """How far a thing reaches from its middle against ``direction`` (3,), and its top over the table [m]."""
-    R = rotation_of(thing.rpy)
-    back = max(_support(shape, -direction @ R) for shape in thing.shapes)
-    top = max(_support(shape, np.array([0.0, 0.0, 1.0]) @ R) for shape in thing.shapes)
-    return back, thing.at[2] + top
+def extents(obj: SceneObject, direction: Array) -> tuple[float, float]:
+    """Compute the extent [m] of an object from its centre against ``direction`` (3,), and its height over the table."""
+    R = rotation_of(obj.rpy)
+    back = max(_support(shape, -direction @ R) for shape in obj.shapes)
+    top = max(_support(shape, np.array([0.0, 0.0, 1.0]) @ R) for shape in obj.shapes)
+    return back, obj.at[2] + top
 
 
 def _support(shape: Shape, direction: Array) -> float:
-    """How far a shape reaches in a direction (3,) of its object's frame [m] (the support function)."""
+    """Evaluate the support function of a shape [m] in a direction (3,) of its object's frame."""
     n = direction @ rotation_of(shape.rpy)
     away = float(np.asarray(shape.at) @ direction)
     if shape.kind == "box" or shape.kind == "soft":

@@ -1,8 +1,7 @@
-"""Reaching a configuration among things without touching any: the task, and policies from careful to none at all."""
+"""Reaching a configuration without contact: the task, and policies from a careful planner to a straight line."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,18 +10,18 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.planning import Certificate, GaussianRRTStar, Path, time_path
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
-from splatbot.sim.compare.trials import PolicyAction
+from splatbot.sim.compare.trials import MapTask, PolicyAction
 from splatbot.sim.motion import motion_from_trajectory
 from splatbot.sim.twin import Twin, TwinResult
 
-_ARRIVED = 0.02  # [rad] from the goal in every joint
-_AMPLE_MS = 10_000.0  # iterations end a search, not the time: equal calls give equal paths
-_CUTS = 100  # shortcuts that are tried
+_GOAL_TOLERANCE = 0.02  # [rad] in every joint
+_BUDGET_MS = 10_000.0  # ample: iterations end a search, not time, so equal calls give equal paths
+_CUTS = 100  # shortcut attempts
 
 
 @dataclass(frozen=True, eq=False)
 class ReachCase:
-    """From a configuration (J,) to another, with the search's seed."""
+    """Start and goal configuration (J,), and the seed of the search."""
 
     start: Array
     goal: Array
@@ -30,43 +29,33 @@ class ReachCase:
 
 
 @dataclass(frozen=True, eq=False)
-class ReachTask:
-    """The task: at the goal in the end, and nothing touched on the way.
+class ReachTask(MapTask[ReachCase]):
+    """The task: reach the goal without any contact.
 
-    Args:
-        cases: what to reach.
-        map_twin: of the map; the same for all cases.
-        held_out: gives the held-out twin of a case.
+    :class:`splatbot.sim.compare.trials.MapTask` describes the fields.
     """
 
-    cases: Sequence[ReachCase]
-    map_twin: Twin
-    held_out: Callable[[ReachCase], Twin]
     name: str = "reach"
 
-    def twins(self, case: ReachCase) -> tuple[Twin, Twin]:
-        """See :class:`splatbot.sim.compare.trials.Task`."""
-        return self.map_twin, self.held_out(case)
-
     def failure(self, case: ReachCase, twin: Twin, result: TwinResult) -> str:
-        """What was touched, or that physics broke, or that a joint is more than 20 mrad from the goal."""
-        if result.touches:
-            first = result.touches[0]
-            return f"{first.part} touches {first.other} at {first.first:.2f} s"
+        """Return the first contact, a failure of the simulation, or the distance from the goal; empty after success."""
+        if result.contacts:
+            first = result.contacts[0]
+            return f"contact of {first.part} with {first.other} at {first.first:.2f} s"
         if result.stopped is not None or twin.follower is None:
             return "; ".join(result.warnings) or "stopped"
-        off = float(np.abs(np.asarray(twin.data.qpos)[twin.follower.qpos] - case.goal).max())
-        return f"{1e3 * off:.0f} mrad from the goal" if off > _ARRIVED else ""
+        error = float(np.abs(np.asarray(twin.data.qpos)[twin.follower.qpos] - case.goal).max())
+        return f"{1e3 * error:.0f} mrad from the goal" if error > _GOAL_TOLERANCE else ""
 
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """Certified paths.
+    """Policy that follows a certified path.
 
     Args:
         name: of the policy.
         planner: with its margin.
-        speed: share of the joints' limits of velocity and acceleration.
+        speed: fraction of the joint limits of velocity and acceleration.
         iterations: of the search.
     """
 
@@ -76,19 +65,19 @@ class Planned:
     iterations: int = 1500
 
     def act(self, case: ReachCase) -> PolicyAction | None:
-        """The best path found, or none."""
+        """Return the best path found, or None."""
         path = _path(self.planner, case, self.iterations)
         return None if path is None else _timed(self.planner, path, self.speed, certified=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Shortcut:
-    """A planned path, cut shorter by edges of which only a few configurations are looked at.
+    """Policy that shortcuts a planned path by edges that are checked at a few configurations only.
 
     Args:
         name: of the policy.
         planner: of the first path.
-        samples: looked at on each edge, ends included.
+        samples: configurations that are checked on each edge, ends included.
         iterations: of the search.
     """
 
@@ -98,7 +87,7 @@ class Shortcut:
     iterations: int = 1500
 
     def act(self, case: ReachCase) -> PolicyAction | None:
-        """A path whose edges are free where they were looked at."""
+        """Return a path whose edges are free at the checked configurations."""
         path = _path(self.planner, case, self.iterations)
         if path is None:
             return None
@@ -109,7 +98,7 @@ class Shortcut:
         return _timed(self.planner, _uncertified(q), 1.0, certified=False)
 
     def _cut(self, q: Array, rng: np.random.Generator) -> Array:
-        """Two places on the path, joined straight if that looks free."""
+        """Connect two random positions on the path by an edge if its samples are free."""
         steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(steps)])
         low, high = np.sort(rng.uniform(0.0, along[-1], 2))
@@ -123,12 +112,12 @@ class Shortcut:
 
 @dataclass(frozen=True, eq=False)
 class Direct:
-    """No planner: straight to the goal in joint space, or by way of a posture.
+    """Policy without a planner: straight to the goal in joint space, or via a posture.
 
     Args:
         name: of the policy.
-        planner: whose arm it is; its map is not asked.
-        via: (J,) a posture on the way; None: none.
+        planner: of the arm; its map is not used.
+        via: (J,) a posture between start and goal. If None, the motion is straight.
     """
 
     name: str
@@ -136,7 +125,7 @@ class Direct:
     via: Array | None = None
 
     def act(self, case: ReachCase) -> PolicyAction | None:
-        """Always something."""
+        """Return the motion; there always is one."""
         stops = [case.start, case.goal] if self.via is None else [case.start, self.via, case.goal]
         return _timed(self.planner, _uncertified(np.array(stops)), 1.0, certified=False)
 
@@ -144,30 +133,30 @@ class Direct:
 def reach_policies(
     field: GaussianCollisionField, robot: RobotModel, T_world_base: Array, own_margin: float
 ) -> tuple[Planned | Shortcut | Direct, ...]:
-    """Eight policies, from the planner with the map's own margin to a straight line.
+    """Return eight policies, from the planner with the map's own margin to a straight line.
 
     Args:
-        field: the map.
+        field: of the map.
         robot: the arm.
         T_world_base: (4, 4).
-        own_margin: the error of the map's surfaces, as its own depth tells [m].
+        own_margin: error [m] of the map's surfaces against its own depth images.
     """
-    bare = GaussianRRTStar(field, robot, T_world_base=T_world_base)
-    little, wide = (GaussianRRTStar(field, robot, T_world_base=T_world_base, margin=m) for m in (0.005, own_margin))
+    no_margin = GaussianRRTStar(field, robot, T_world_base=T_world_base)
+    small, wide = (GaussianRRTStar(field, robot, T_world_base=T_world_base, margin=m) for m in (0.005, own_margin))
     return (
         Planned("planned, the map's own margin", wide),
-        Planned("planned, 5 mm margin", little),
-        Planned("planned, no margin", bare),
-        Planned("planned, no margin, third of the speed", bare, speed=1 / 3),
-        Shortcut("shortcuts, 8 samples an edge", bare, 8),
-        Shortcut("shortcuts, ends of an edge only", bare, 2),
-        Direct("by way of home", bare, robot.home),
-        Direct("straight line", bare),
+        Planned("planned, 5 mm margin", small),
+        Planned("planned, no margin", no_margin),
+        Planned("planned, no margin, third of the speed", no_margin, speed=1 / 3),
+        Shortcut("shortcuts, 8 samples an edge", no_margin, 8),
+        Shortcut("shortcuts, ends of an edge only", no_margin, 2),
+        Direct("via home", no_margin, robot.home),
+        Direct("straight line", no_margin),
     )
 
 
 def _path(planner: GaussianRRTStar, case: ReachCase, iterations: int) -> Path | None:
-    return planner.plan(case.start, case.goal, budget_ms=_AMPLE_MS, seed=case.seed, iterations=iterations).path
+    return planner.plan(case.start, case.goal, budget_ms=_BUDGET_MS, seed=case.seed, iterations=iterations).path
 
 
 def _uncertified(waypoints: Array) -> Path:
@@ -176,7 +165,7 @@ def _uncertified(waypoints: Array) -> Path:
 
 
 def _timed(planner: GaussianRRTStar, path: Path, speed: float, *, certified: bool) -> PolicyAction:
-    """With the map's certificate, or, of a path that was never certified, without asking the map."""
+    """Time-parameterize a path; without ``certified`` the map is not used."""
     arm: RobotSpheres = planner.arm
     field = planner.field if certified else None
     trajectory = time_path(path, arm, field, velocity_scale=speed, acceleration_scale=speed)

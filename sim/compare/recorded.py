@@ -1,4 +1,4 @@
-"""What a log tells of the arm that was there: tool poses, joints, and its camera's poses in the frame of its base."""
+"""The arm's data in a log: tool poses, joints, and camera poses in the base frame."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from splatbot.workspace import Workspace, find_workspace
 TOOL_POSES = "ee_poses.txt"
 _MOUNT = "ee_T_camera"
 _INTRINSICS = "intrinsics.json"
-_OUTLIER, _ALIKE = 3.0, np.array([1e-3, 2e-3])  # times the median gap; [m], [rad] that are never too much
-_ROUNDS = 4
-_NEAR = 0.01  # [s] that a pose's stamp may be off its frame's
+_OUTLIER = 3.0  # times the median difference
+_TOLERANCE = np.array([1e-3, 2e-3])  # [m], [rad] differences that are never outliers
+_ITERATIONS = 4
+_MAX_STAMP_ERROR = 0.01  # [s] between the stamps of a pose and a frame
 
 
 @dataclass(frozen=True, eq=False)
 class ArmRecord:
-    """What is in a log's folder beside its images.
+    """The arm's data in a log's folder.
 
     Args:
-        tool: T_base_tool at their own stamps; None: not recorded.
-        T_tool_camera: (4, 4), the camera on the tool; None: not known.
-        joints: over time; None: not recorded.
+        tool: T_base_tool at their own stamps. If None, they are not recorded.
+        T_tool_camera: (4, 4) of the camera on the tool. If None, it is not known.
+        joints: joint positions over time. If None, they are not recorded.
         workspace: ``scene.yaml`` of the log, or an empty one.
     """
 
@@ -42,14 +43,14 @@ class ArmRecord:
     workspace: Workspace = field(default_factory=Workspace)
 
     def tool_at(self, stamp: float) -> Array | None:
-        """T_base_tool (4, 4) as recorded within 10 ms of a stamp [s]."""
+        """Return T_base_tool (4, 4) as recorded within 10 ms of a stamp [s], or None."""
         if self.tool is None or not len(self.tool):
             return None
         k = int(np.argmin(np.abs(self.tool.stamps - stamp)))
-        return self.tool.T_world_camera[k] if abs(float(self.tool.stamps[k]) - stamp) <= _NEAR else None
+        return self.tool.T_world_camera[k] if abs(float(self.tool.stamps[k]) - stamp) <= _MAX_STAMP_ERROR else None
 
     def camera_at(self, stamp: float, robot: RobotModel) -> Array | None:
-        """T_base_camera (4, 4) then, by the tool's pose or else by the joints; None where the log does not tell."""
+        """Return T_base_camera (4, 4) from the tool's pose or else from the joints, or None if neither is recorded."""
         T_base_tool = self.tool_at(stamp)
         if T_base_tool is not None and self.T_tool_camera is not None:
             return np.asarray(T_base_tool @ self.T_tool_camera)
@@ -59,10 +60,10 @@ class ArmRecord:
         return np.asarray(robot.fk(q)[self.workspace.camera_link] @ mount)
 
     def joints_at(self, stamp: float, robot: RobotModel) -> Array | None:
-        """Joints (J,) then; None where they are not known.
+        """Return the joint positions (J,) at a stamp [s], or None if they are not known.
 
         Raises:
-            InputError: they are those of an arm with another number of joints.
+            InputError: the arm in the log has another number of joints.
         """
         q = None if self.joints is None else self.joints.at(stamp)
         if q is not None and len(q) != len(robot):
@@ -73,7 +74,7 @@ class ArmRecord:
 
     @property
     def source(self) -> str:
-        """Where camera poses come from, in words; empty if they are not told."""
+        """Description of the source of camera poses; empty if there is no source."""
         if self.tool is not None and self.T_tool_camera is not None:
             return f"{TOOL_POSES} and {_MOUNT} of {_INTRINSICS}"
         if self.joints is not None and self.workspace.T_link_camera is not None:
@@ -82,11 +83,11 @@ class ArmRecord:
 
 
 def read_arm(folder: str | Path) -> ArmRecord:
-    """What a log's folder tells of an arm; of a log that is no folder, nothing.
+    """Read the arm's data from a log's folder; a log that is no folder has none.
 
     Raises:
         FormatError: a file is damaged.
-        LogError: `joints.txt` is.
+        LogError: `joints.txt` is damaged.
     """
     place = Path(folder)
     if not place.is_dir():
@@ -97,15 +98,15 @@ def read_arm(folder: str | Path) -> ArmRecord:
 
 @dataclass(frozen=True, eq=False)
 class BaseInMap:
-    """Where the arm's base is in a map.
+    """Pose of the arm's base in a map.
 
     Args:
         T_world_base: (4, 4).
-        residuals: (F, 2) by frame, of the camera's pose by the arm against that by tracking [m, rad]; empty where the
-            base is not known by poses.
+        residuals: (F, 2) differences of the camera's pose by the arm to that by tracking [m, rad]; empty if the base
+            does not come from poses.
         frames: (F,) of the log.
-        left_out: of them, those whose two poses contradict each other, as after a tracking failure.
-        source: how it is known, in words.
+        left_out: frames whose two poses are inconsistent, as after a tracking failure.
+        source: description of the source.
     """
 
     T_world_base: Array
@@ -116,14 +117,15 @@ class BaseInMap:
 
 
 def base_in_map(T_base_camera: Mapping[int, Array], T_world_camera: Mapping[int, Array], source: str) -> BaseInMap:
-    """The base from one camera's poses in both frames: mean rotation (chordal L2; Hartley et al. 2013), mean place.
+    """Estimate the base from one camera's poses in both frames by the mean rotation and mean position.
 
-    Frames that differ by more than three times the median from it are left out.
+    The rotation is the chordal L2 mean (Hartley et al. 2013). Frames that differ from it by more than three times the
+    median are outliers.
 
     Args:
-        T_base_camera: (4, 4) by frame of the log, as the arm has it.
-        T_world_camera: (4, 4) by frame, as tracked.
-        source: of the first, in words.
+        T_base_camera: (4, 4) by frame of the log, from the arm.
+        T_world_camera: (4, 4) by frame, from tracking.
+        source: description of the source of the first.
 
     Raises:
         InputError: no frame has both.
@@ -131,16 +133,16 @@ def base_in_map(T_base_camera: Mapping[int, Array], T_world_camera: Mapping[int,
     frames = sorted(set(T_base_camera) & set(T_world_camera))
     if not frames:
         raise InputError(
-            f"has no frame in common with the arm's poses ({len(T_world_camera)} tracked, {len(T_base_camera)} told).",
+            f"has no frame in common with the arm's poses ({len(T_world_camera)} and {len(T_base_camera)} frames).",
             field="map",
             hint="give the run that mapped this log",
         )
     theirs, ours = (np.array([poses[i] for i in frames]) for poses in (T_base_camera, T_world_camera))
     kept = np.ones(len(frames), np.bool_)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         T = _between(theirs[kept], ours[kept])
         gaps = np.array([pose_gap(T @ a, b) for a, b in zip(theirs, ours, strict=True)])
-        limit = np.maximum(_OUTLIER * np.median(gaps, axis=0), _ALIKE)
+        limit = np.maximum(_OUTLIER * np.median(gaps, axis=0), _TOLERANCE)
         again = (gaps <= limit).all(axis=1)
         if (again == kept).all():
             break
@@ -157,13 +159,13 @@ def _between(theirs: Array, ours: Array) -> Array:
 
 
 def pose_gap(a: Array, b: Array) -> tuple[float, float]:
-    """How far two poses (4, 4) are apart [m, rad]."""
+    """Compute the distance of two poses (4, 4) [m, rad]."""
     turn = so3_log(inverse(a)[:3, :3] @ b[:3, :3])
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(np.linalg.norm(turn))
 
 
 def _mount(path: Path) -> Array | None:
-    """``ee_T_camera`` of a log's intrinsics."""
+    """Read ``ee_T_camera`` from a log's intrinsics."""
     if not path.exists():
         return None
     value = read_object(path).get(_MOUNT)

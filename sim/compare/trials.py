@@ -1,10 +1,10 @@
-"""Sim-to-sim: policies that see only the map, tried in the map's twin and in a held-out one."""
+"""Sim-to-sim: policies that use only the map, evaluated in the map's twin and in a held-out twin."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,11 @@ CaseIn = TypeVar("CaseIn", contravariant=True)
 
 @dataclass(frozen=True, eq=False)
 class PolicyAction:
-    """What a policy does.
+    """Motion of a policy.
 
     Args:
         motion: of the arm.
-        promised: clearance from everything [m] that the policy answers for; None: it promises nothing.
+        promised: certified clearance [m]. If None, the motion is not certified.
     """
 
     motion: JointMotion
@@ -35,52 +35,71 @@ class PolicyAction:
 
 
 class Policy(Protocol[CaseIn]):
-    """Decides on a motion from the map alone; the same case gives the same motion, which both twins then follow."""
+    """Chooses a motion from the map alone; equal cases give equal motions, which both twins then follow."""
 
     @property
     def name(self) -> str:
-        """As tables have it."""
+        """Name in tables."""
         ...
 
     def act(self, case: CaseIn) -> PolicyAction | None:
-        """The motion for a case; None: the policy refuses."""
+        """Return the motion for a case, or None if the policy refuses."""
         ...
 
 
 class PolicyTask(Protocol[Case]):
-    """What is to be done, in cases that differ, and whether it was."""
+    """A task with its cases and its success criterion."""
 
     @property
     def name(self) -> str:
-        """As tables have it."""
+        """Name in tables."""
         ...
 
     @property
     def cases(self) -> Sequence[Case]:
-        """One for each trial."""
+        """One case for each trial."""
         ...
 
     def twins(self, case: Case) -> tuple[Twin, Twin]:
-        """The twin of the map and the held-out twin."""
+        """Return the twin of the map and the held-out twin."""
         ...
 
     def failure(self, case: Case, twin: Twin, result: TwinResult) -> str:
-        """Why a motion that a twin has just followed did not do it, in a few words; empty if it did."""
+        """Return the reason why the motion that a twin has just followed failed; empty after success."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class MapTask(Generic[Case]):
+    """The common part of tasks with one twin of the map.
+
+    Args:
+        cases: one for each trial.
+        map_twin: of the map; the same for all cases.
+        held_out: creates the held-out twin of a case.
+    """
+
+    cases: Sequence[Case]
+    map_twin: Twin
+    held_out: Callable[[Case], Twin]
+
+    def twins(self, case: Case) -> tuple[Twin, Twin]:
+        """Implement :meth:`PolicyTask.twins`."""
+        return self.map_twin, self.held_out(case)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A policy in one case.
+    """Result of a policy in one case.
 
     Args:
-        policy, case: which.
-        refused: there was no motion.
+        policy, case: name and number.
+        refused: whether the policy returned no motion.
         in_map, in_held_out: success.
-        promised: clearance [m]; None: nothing was promised.
-        room_map, room_held_out: least room around the arm [m]; None without a motion.
-        touched: whether the arm touched anything in the held-out twin.
-        why_map, why_held_out: what went wrong there, in words; empty after success.
+        promised: certified clearance [m]. If None, the motion is not certified.
+        clearance_map, clearance_held_out: minimum simulated clearance of the arm [m], or None without a motion.
+        in_contact: whether the arm had a contact in the held-out twin.
+        why_map, why_held_out: reason of the failure; empty after success.
     """
 
     policy: str
@@ -89,11 +108,17 @@ class Trial:
     in_map: bool
     in_held_out: bool
     promised: float | None = None
-    room_map: float | None = None
-    room_held_out: float | None = None
-    touched: bool = False
+    clearance_map: float | None = None
+    clearance_held_out: float | None = None
+    in_contact: bool = False
     why_map: str = ""
     why_held_out: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the trial as values for JSON; the clearances are ``room_*`` and the contact is ``touched`` there."""
+        values = asdict(self)
+        old = {"room_map": "clearance_map", "room_held_out": "clearance_held_out", "touched": "in_contact"}
+        return values | {key: values.pop(name) for key, name in old.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +129,7 @@ class TrialResults:
         task: its name.
         policies: their names.
         trials: of every policy in every case that was done.
-        interrupted: whether somebody stopped it.
+        interrupted: whether the user stopped the trials.
     """
 
     task: str
@@ -115,25 +140,25 @@ class TrialResults:
 
     @property
     def cases(self) -> tuple[int, ...]:
-        """Those in which every policy was tried."""
+        """Cases in which every policy was tried."""
         return tuple(sorted({trial.case for trial in self.trials}))
 
     def agreement(self) -> Agreement | None:
-        """How far the twins agree on the policies; None before the first case was done."""
+        """Compute the agreement of the twins on the policies, or None before the first case."""
         if not self.trials:
             return None
         rows = [self._column(name) for name in ("in_map", "in_held_out", "refused")]
         return agreement(self.policies, *rows, seed=self.seed)
 
     def reliability(self) -> tuple[ReliabilityRow, ...]:
-        """Promised clearance against that in the held-out twin."""
-        made = [t for t in self.trials if t.promised is not None and t.room_held_out is not None]
+        """Compare certified clearance with that simulated in the held-out twin."""
+        made = [t for t in self.trials if t.promised is not None and t.clearance_held_out is not None]
         return reliability(
-            [t.promised or 0.0 for t in made], [t.room_held_out or 0.0 for t in made], [t.touched for t in made]
+            [t.promised or 0.0 for t in made], [t.clearance_held_out or 0.0 for t in made], [t.in_contact for t in made]
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON takes it."""
+        """Return the results as values for JSON."""
         found = self.agreement()
         return without_nan(
             {
@@ -141,8 +166,8 @@ class TrialResults:
                 "task": self.task,
                 "cases": len(self.cases),
                 "agreement": None if found is None else asdict(found),
-                "reliability": [asdict(row) for row in self.reliability()],
-                "trials": [asdict(trial) for trial in self.trials],
+                "reliability": [_with_old_key(asdict(row)) for row in self.reliability()],
+                "trials": [trial.to_dict() for trial in self.trials],
                 "interrupted": self.interrupted,
             }
         )
@@ -157,21 +182,21 @@ def run_trials(
     policies: Sequence[Policy[Case]],
     *,
     seed: int = 0,
-    tell: Callable[[str, float], None] = lambda what, share: None,
+    on_progress: Callable[[str, float], None] = lambda step, share: None,
 ) -> TrialResults:
-    """Every policy in every case, each motion in both twins. Ctrl-C ends it with the cases that are whole.
+    """Run every policy in every case, each motion in both twins. Ctrl-C ends the trials and keeps complete cases.
 
     Raises:
-        InputError: two policies have one name, or there is none.
+        InputError: two policies have the same name, or there are no policies.
     """
     names = tuple(policy.name for policy in policies)
     if not names or len(set(names)) < len(names):
-        raise InputError(f"are {', '.join(names) or 'none'}.", field="policies", hint="give each a name of its own")
+        raise InputError(f"are {', '.join(names) or 'none'}.", field="policies", hint="give each a unique name")
     done: list[Trial] = []
     interrupted = False
     try:
         for number, case in enumerate(task.cases):
-            tell(f"{task.name}, case {number + 1} of {len(task.cases)}", number / len(task.cases))
+            on_progress(f"{task.name}, case {number + 1} of {len(task.cases)}", number / len(task.cases))
             in_map, held_out = task.twins(case)
             done += [_trial(task, policy, case, number, in_map, held_out) for policy in policies]
     except KeyboardInterrupt:
@@ -196,22 +221,26 @@ def _trial(
         in_map=not why_map,
         in_held_out=not why_held_out,
         promised=attempt.promised,
-        room_map=believed.near.room,
-        room_held_out=found.near.room,
-        touched=bool(found.touches),
+        clearance_map=believed.clearance.value,
+        clearance_held_out=found.clearance.value,
+        in_contact=bool(found.contacts),
         why_map=why_map,
         why_held_out=why_held_out,
     )
 
 
+def _with_old_key(row: dict[str, Any]) -> dict[str, Any]:
+    return row | {"touched": row.pop("in_contact")}
+
+
 def join(a: TrialResults, b: TrialResults) -> TrialResults:
-    """The trials of both, as of one task with the cases of the one after those of the other.
+    """Join two results of one task; the cases of ``b`` follow those of ``a``.
 
     Raises:
-        InputError: they are of other policies.
+        InputError: the policies or tasks differ.
     """
     if a.policies != b.policies or a.task != b.task:
-        raise InputError("are of different tasks or policies.", field="results", hint="join what belongs together")
+        raise InputError("are of different tasks or policies.", field="results", hint="join results of one task")
     after = 1 + max(a.cases, default=-1)
     later = tuple(replace(trial, case=trial.case + after) for trial in b.trials)
     return TrialResults(a.task, a.policies, (*a.trials, *later), a.interrupted or b.interrupted, a.seed)

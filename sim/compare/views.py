@@ -1,4 +1,4 @@
-"""The twin's images at a log's recorded poses beside what the camera saw: colour, depth, and what stands up."""
+"""The twin's images at a log's recorded poses against the camera's: colour, depth, and silhouettes."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.solids import rpy_of
 from splatbot.sim.world import World, build_world
 
-ABOVE = 0.01  # [m] over the support from which something stands up; below is the sensor's noise
-_OPAQUE = 0.3  # fainter Gaussians are no surface
-_UNDER = 0.05  # [m] below the support that the twin still holds
-_RAYS = 160  # across an image, of the physics' shapes
-_MISSED = 20.0  # [m]; farther is nothing
+ABOVE = 0.01  # [m] over the support plane; lower points are sensor noise of the plane
+_MIN_OPACITY = 0.3  # of Gaussians that count as surface
+_BELOW_SUPPORT = 0.05  # [m] of the map below the support plane that the twin keeps
+_RAYS = 160  # across an image of the collision geometry
+_MAX_RANGE = 20.0  # [m]
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class ViewAgreement:
-    """One frame against the twin. Figures are None where there is nothing to compare.
+    """Agreement of one frame with the twin. Values without pixels to compare are undefined (None).
 
     Args:
         index: of the frame in the log.
-        held_out: whether it was kept out of the map.
+        held_out: whether the frame was kept out of the map.
         psnr_db: of the Gaussians' colour.
-        depth_l1_m, depth_median_m: difference of the Gaussians' depth to the sensor's over the whole image.
-        coverage: share of the sensor's pixels for which the Gaussians have a depth.
-        part_l1_m: the mean difference again, in the part of the scene that is simulated.
-        physics_l1_m, physics_coverage: there, of the shapes that physics computes with.
-        iou, physics_iou: of what stands above the support, as the Gaussians and the shapes have it.
-        camera_m, camera_rad: the camera's recorded pose against the tracked one; None where it was not tracked.
+        depth_l1_m, depth_median_m: error of the Gaussians' depth against the sensor over the whole image.
+        coverage: fraction of the sensor's pixels for which the Gaussians have a depth.
+        part_l1_m: mean depth error in the simulated part of the scene.
+        physics_l1_m, physics_coverage: error and coverage of the collision geometry in that part.
+        iou, physics_iou: of the silhouettes above the support plane, for the Gaussians and the collision geometry.
+        camera_m, camera_rad: difference of the recorded to the tracked camera pose. If None, the frame was not tracked.
     """
 
     index: int
@@ -66,13 +66,13 @@ class ViewAgreement:
 
 @dataclass(frozen=True, eq=False)
 class SeenView:
-    """The images of one frame: colour (H, W, 3) uint8, depth [m], what stands up; the shapes' are coarser.
+    """The images of one frame: colour (H, W, 3) uint8, depth [m], silhouettes; those of the geometry are coarser.
 
     Args:
         rgb, depth: recorded.
         twin_rgb, twin_depth: rendered from the Gaussians.
-        shape_depth: of the shapes of physics (h, w).
-        stands, twin_stands: masks (H, W); None without a support.
+        shape_depth: of the collision geometry (h, w).
+        above, twin_above: masks (H, W) of pixels above the support plane. If None, there is no support plane.
     """
 
     rgb: NDArray[np.uint8]
@@ -80,20 +80,20 @@ class SeenView:
     twin_rgb: NDArray[np.uint8]
     twin_depth: NDArray[np.float32]
     shape_depth: NDArray[np.float32]
-    stands: Mask | None
-    twin_stands: Mask | None
+    above: Mask | None
+    twin_above: Mask | None
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """A map as the twin has it, in the frame of the arm's base.
+    """The part of a map that the twin simulates, in the frame of the arm's base.
 
     Args:
         model: the map.
         T_world_base: (4, 4).
-        support: what things stand on, in the base's frame; None: no level plane is within reach.
-        low, high: (3,) corners of the part of the map that the twin simulates [m].
-        values: the scene's, as :func:`splatbot.sim.scene.make_scene` takes them.
+        support: support plane in the base frame. If None, no level plane is within reach.
+        low, high: (3,) corners of the simulated part [m].
+        values: of the scene, for :func:`splatbot.sim.scene.make_scene`.
     """
 
     model: GaussianModel
@@ -104,16 +104,16 @@ class Surroundings:
     values: dict[str, Any]
 
     def scene(self, robot: str | None = None) -> Scene:
-        """The twin's scene, with an arm at the origin or without."""
+        """Create the twin's scene, with an arm at the origin or without."""
         arm = None if robot is None else {"model": robot}
         return make_scene({**self.values, "robot": arm})
 
     def inside(self, points: Array) -> Mask:
-        """Whether points (..., 3) in the base's frame are in the part that is simulated."""
+        """Return whether points (..., 3) [m] in the base frame are in the simulated part."""
         return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=-1))
 
-    def stands(self, points: Array) -> Mask:
-        """Whether they are above the support, too."""
+    def above_support(self, points: Array) -> Mask:
+        """Return whether points (..., 3) [m] in the base frame are in the simulated part above the support plane."""
         if self.support is None:
             return np.zeros(points.shape[:-1], np.bool_)
         return np.asarray(self.inside(points) & (self.support.height(points) > ABOVE))
@@ -122,26 +122,26 @@ class Surroundings:
 def surroundings(
     model: GaussianModel, file: Path, T_world_base: Array, robot: RobotModel, plane: Array | None = None
 ) -> Surroundings:
-    """The part of a map within an arm's reach, and the level plane there.
+    """Extract the part of a map within an arm's reach, and the support plane there.
 
     Args:
         model: the map.
-        file: that it is in.
+        file: of the map.
         T_world_base: (4, 4) of the arm.
         robot: the arm, whose reach bounds the part.
-        plane: (n, d) that things stand on, n · p + d = 0 in the map's frame; None: it is sought.
+        plane: (n, d) of the support plane n · p + d = 0 in the map's frame. If None, it is estimated.
     """
     T_base_world = inverse(T_world_base)
     points = transform_points(T_base_world, model.means.detach().double().numpy())
     shoulder, reach = _reach(robot)
-    near = (np.linalg.norm(points - shoulder, axis=1) < reach) & (model.opacities.detach().numpy() >= _OPAQUE)
+    near = (np.linalg.norm(points - shoulder, axis=1) < reach) & (model.opacities.detach().numpy() >= _MIN_OPACITY)
     if plane is None:
         support = find_support(points[near])
     else:
         support = given_support(points[near], plane[:3] @ T_world_base[:3, :3], -float(plane @ T_world_base[:, 3]))
     low, high = shoulder - reach, shoulder + reach
     if support is not None:
-        low[2] = support.offset / support.normal[2] - _UNDER
+        low[2] = support.offset / support.normal[2] - _BELOW_SUPPORT
     clutter: dict[str, Any] = {
         "file": str(file.resolve()),
         "at": T_base_world[:3, 3].tolist(),
@@ -155,10 +155,10 @@ def surroundings(
 
 
 class TwinViews:
-    """Looks at the twin from where a log's camera was. The arm itself is left out of its images.
+    """Renders the twin from the camera poses of a log. The arm itself is not in its images.
 
     Args:
-        around: the map.
+        around: the simulated part of the map.
     """
 
     def __init__(self, around: Surroundings) -> None:
@@ -170,7 +170,7 @@ class TwinViews:
     def compare(
         self, frame: Frame, T_base_camera: Array, *, held_out: bool, gap: tuple[float, float] | None
     ) -> tuple[ViewAgreement, SeenView]:
-        """A frame beside the twin's images from ``T_base_camera`` (4, 4); masked pixels are left out of the figures."""
+        """Compare a frame with the twin's images from ``T_base_camera`` (4, 4); masked pixels are left out."""
         T_world_camera = self._around.T_world_base @ T_base_camera
         rgb = render_view(self._around.model, frame.camera, T_world_camera, "rgb")
         depth = render_view(self._around.model, frame.camera, T_world_camera, "depth")
@@ -179,12 +179,12 @@ class TwinViews:
         rows, columns = _grid(frame.camera)
         coarse = np.ix_(rows, columns)
         rays = pixel_rays(frame.camera, rows, columns)
-        shapes = cast(self.world.model, self._data, rays, T_base_camera, _MISSED)[1].astype(np.float32)
+        shapes = cast(self.world.model, self._data, rays, T_base_camera, _MAX_RANGE)[1].astype(np.float32)
         points = _points(sensor, frame.camera, T_base_camera)
         part = np.where(self._around.inside(points), sensor, np.float32(0))
-        stands = self._around.stands(points) & (sensor > 0)
-        theirs = self._around.stands(_points(depth, frame.camera, T_base_camera)) & (depth > 0)
-        physics = self._around.stands(_points(shapes, frame.camera, T_base_camera, rows, columns)) & (shapes > 0)
+        above = self._around.above_support(points) & (sensor > 0)
+        twin_above = self._around.above_support(_points(depth, frame.camera, T_base_camera)) & (depth > 0)
+        physics = self._around.above_support(_points(shapes, frame.camera, T_base_camera, rows, columns)) & (shapes > 0)
         whole, physical = depth_error(depth, sensor), depth_error(shapes, part[coarse])
         found = ViewAgreement(
             index=frame.index,
@@ -196,8 +196,8 @@ class TwinViews:
             part_l1_m=depth_error(depth, part).l1,
             physics_l1_m=physical.l1,
             physics_coverage=physical.coverage,
-            iou=overlap(stands, theirs, sensor > 0),
-            physics_iou=overlap(stands[coarse], physics, sensor[coarse] > 0),
+            iou=overlap(above, twin_above, sensor > 0),
+            physics_iou=overlap(above[coarse], physics, sensor[coarse] > 0),
             camera_m=None if gap is None else gap[0],
             camera_rad=None if gap is None else gap[1],
         )
@@ -208,14 +208,14 @@ class TwinViews:
             colorize(rgb, "rgb"),
             depth,
             shapes,
-            stands if known else None,
-            theirs & (sensor > 0) if known else None,
+            above if known else None,
+            twin_above & (sensor > 0) if known else None,
         )
         return found, seen
 
 
 def overlap(a: Mask, b: Mask, among: Mask) -> float | None:
-    """Intersection over union of two masks among some pixels; None where both are empty."""
+    """Compute the intersection over union of two masks among some pixels, or None if both are empty."""
     union = int(((a | b) & among).sum())
     return int((a & b & among).sum()) / union if union else None
 
@@ -232,12 +232,12 @@ def _points(
     rows: Pixels | None = None,
     columns: Pixels | None = None,
 ) -> Array:
-    """What a depth image, of all pixels or of those, shows (h, w, 3), in the base's frame [m]."""
+    """Backproject a depth image, at all pixels or the given ones, to points (h, w, 3) in the base frame [m]."""
     return transform_points(T_base_camera, pixel_rays(camera, rows, columns) * depth[..., None].astype(np.float64))
 
 
 def _reach(robot: RobotModel) -> tuple[Array, float]:
-    """Where the arm's second joint is at home (3,), and how far from there its tool gets [m]."""
+    """Return the position (3,) of the arm's second joint at home, and the tool's largest distance from it [m]."""
     shoulder = np.asarray(robot.fk(robot.home)[min(2, len(robot)), :3, 3])
     tools = robot.tcp(robot.random(2000, np.random.default_rng(0)))[:, :3, 3]
     return shoulder, float(np.linalg.norm(tools - shoulder, axis=1).max())

@@ -1,4 +1,4 @@
-"""Motors follow their commands with a delay of first order."""
+"""First-order lag of the arm's actuators."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from splatbot.sim.effects.physics import PhysicsEffect
+from splatbot.sim.effects.physics import MotorEffect
 
 if TYPE_CHECKING:
-    from splatbot.sim.scene import Scene
     from splatbot.sim.world import Draft
 
 
-class ActuatorLag(PhysicsEffect):
-    """A low-pass filter before each motor of the arm, integrated exactly."""
+class ActuatorLag(MotorEffect):
+    """First-order lag of the arm's actuators: τ da/dt = u - a, with command u and activation a.
+
+    The time constant τ [s] is ``robot.motors.lag`` of the scene. MuJoCo integrates the filter exactly
+    (``dyntype="filterexact"``).
+    """
 
     name = "actuator_lag"
-    cost = "a state for each motor"
+    cost = "one activation state for each actuator"
     observable = "tracking_rms"
+    parameter = "lag"
+    quantity = "lag"
 
-    def called_for(self, scene: Scene) -> str:
-        """The scene gives a time constant."""
-        lag = scene.robot.motors.lag if scene.robot is not None else 0.0
-        return f"motors lag by {1e3 * lag:g} ms" if lag > 0 else ""
-
-    def not_called_for(self, scene: Scene) -> str:
-        """There is none."""
-        return "no lag is given" if scene.robot is not None else "there is no robot"
+    def describe(self, value: float) -> str:
+        """Describe the parameter's effect in a reason."""
+        return f"motors lag by {1e3 * value:g} ms"
 
     def build(self, draft: Draft) -> None:
-        """MuJoCo's exact filter."""
+        """Give each actuator of the arm MuJoCo's exact first-order filter."""
         motors = draft.scene.robot.motors if draft.scene.robot is not None else None
         if motors is None or motors.lag == 0:
             return

@@ -1,4 +1,4 @@
-"""Play between motor and joint: after a turn the joint waits until the gap is crossed."""
+"""Backlash of the gears: after a reversal the joint rests until the motor has crossed the gap."""
 
 from __future__ import annotations
 
@@ -7,48 +7,48 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatbot.protocols import Array
-from splatbot.sim.effects.physics import Hook, PhysicsEffect
+from splatbot.sim.effects.physics import Hook, MotorEffect
 
 if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
 
 
-class Play(Hook):
-    """The play operator: the output moves only when the input leaves a gap around it (Visintin 1994, ch. III)."""
+class PlayOperator(Hook):
+    """Play operator y = clip(y, u - gap / 2, u + gap / 2) (Visintin 1994, ch. III)."""
 
     def __init__(self, gap: float) -> None:
         self._half = gap / 2
         self._at: Array | None = None
 
     def reset(self) -> None:
-        """The joint is in the middle of its gap."""
+        """Place each joint in the middle of its gap."""
         self._at = None
 
     def on_targets(self, targets: Array) -> Array:
-        """Targets (J,) as the joints feel them."""
+        """Return the targets (J,) [rad] behind the backlash."""
         self._at = targets if self._at is None else np.clip(self._at, targets - self._half, targets + self._half)
         return self._at
 
 
-class Backlash(PhysicsEffect):
-    """Hysteresis of the targets."""
+class Backlash(MotorEffect):
+    """Hysteresis of the joint targets by the play operator (Visintin 1994, ch. III).
+
+    The gap [rad] is ``robot.motors.backlash`` of the scene, the same for each joint.
+    """
 
     name = "backlash"
-    cost = "a clamp for each joint, once a control period"
+    cost = "one clamp for each joint and control period"
     observable = "tracking_rms"
+    parameter = "backlash"
+    quantity = "backlash"
 
-    def called_for(self, scene: Scene) -> str:
-        """The scene gives a gap."""
-        gap = scene.robot.motors.backlash if scene.robot is not None else 0.0
-        return f"gears have a play of {1e3 * gap:g} mrad" if gap > 0 else ""
-
-    def not_called_for(self, scene: Scene) -> str:
-        """There is none."""
-        return "no play is given" if scene.robot is not None else "there is no robot"
+    def describe(self, value: float) -> str:
+        """Describe the parameter's effect in a reason."""
+        return f"gears have a backlash of {1e3 * value:g} mrad"
 
     def hook(self, model: Any, scene: Scene) -> Hook | None:
-        """Keeps where each joint is in its gap."""
-        return Play(scene.robot.motors.backlash) if scene.robot is not None else None
+        """Create the play operator, which stores the position of each joint in its gap."""
+        return PlayOperator(scene.robot.motors.backlash) if scene.robot is not None else None
 
 
 EFFECT = Backlash()

@@ -1,4 +1,4 @@
-"""What a sensor effect is, and the account of those that are on."""
+"""Protocol of sensor effects, and the sequence of effects of a run with its cost."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from splatbot.frame import Frame
 from splatbot.trajectory import Trajectory
 
 Observable = Literal["colors", "depth", "stamps", "arrivals"]
-"""What of a stream of frames an effect changes."""
+"""Property of a frame stream that an effect changes."""
 
-# Fields of an effect's dataclass that no user sets: what it is called, who asked for it, how the camera moved.
+# Fields of an effect's dataclass that are no settings: its name, the reason for it, and the camera path.
 _NO_SETTINGS = ("name", "why", "path")
 
 
 class Effect(Protocol):
-    """Something that a real sensor does to an ideal frame; a frozen dataclass whose fields are its settings.
+    """Simulated deviation of a real sensor from an ideal frame; a frozen dataclass whose fields are its settings.
 
-    ``cost`` says what it computes for a frame; ``observable`` what of the frames changes with it.
+    ``cost`` describes the computation per frame, ``observable`` the property of the frames that changes.
     """
 
     cost: ClassVar[str]
@@ -32,25 +32,25 @@ class Effect(Protocol):
 
     @property
     def name(self) -> str:
-        """Short name; what the registry knows it by."""
+        """Short name, as in the registry."""
         ...
 
     @property
     def why(self) -> str:
-        """Who asked for it, in a few words; appears in the run's account."""
+        """Short reason for the effect; it appears in the run's report."""
         ...
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame as the sensor would have given it: a pure function of both, ``frame`` is not written to."""
+        """Simulate the sensor's frame: a pure function of ``frame`` and ``rng`` that does not write to ``frame``."""
         ...
 
 
 @runtime_checkable
 class FollowsPath(Protocol):
-    """An effect that needs to know how the camera moves."""
+    """An effect that requires the camera path."""
 
     def along(self, path: Trajectory) -> Effect:
-        """The effect for a camera that moves along ``path``."""
+        """Return the effect for a camera that moves along ``path``."""
         ...
 
 
@@ -59,7 +59,7 @@ class DropsFrames(Protocol):
     """An effect that loses whole frames."""
 
     def drops(self, index: int, generator: Callable[[int], np.random.Generator]) -> bool:
-        """Whether frame ``index`` is lost; ``generator(k)`` gives the k-th frame's generator, the same every time."""
+        """Return whether frame ``index`` is lost; ``generator(k)`` is the generator of frame k."""
         ...
 
 
@@ -69,15 +69,16 @@ class BlanksDepth(Protocol):
 
     @property
     def blanks_depth(self) -> bool:
-        """Whether this one does."""
+        """Return whether the effect can remove all depth of a frame."""
         ...
 
 
 class Effects:
-    """Effects in the order in which they happen to a frame; without any, frames pass untouched.
+    """Effects in the order in which they act on a frame; without effects, frames pass unchanged.
 
-    For each frame each effect draws from its own generator, seeded by ``seed``, the frame's index and the effect's
-    name: frame 7 is the same whether or not frame 6 was asked for, and one effect more changes no other's draws.
+    Each effect draws from its own generator for each frame. The generator is seeded by ``seed``, the frame's index and
+    the effect's name. A frame is therefore independent of the other frames that are read, and an additional effect does
+    not change the draws of the others.
     """
 
     def __init__(self, effects: Sequence[Effect], *, seed: int = 0) -> None:
@@ -88,7 +89,7 @@ class Effects:
         self._streams = _streams([effect.name for effect in self.effects])
 
     def __call__(self, frame: Frame) -> Frame:
-        """The frame after all effects."""
+        """Apply all effects to a frame."""
         for i, effect in enumerate(self.effects):
             start = time.perf_counter()
             frame = effect.apply(frame, self._generator(i, frame.index))
@@ -97,24 +98,24 @@ class Effects:
         return frame
 
     def over(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The frames of a stream that arrive, after all effects, one at a time."""
+        """Yield the frames of a stream that arrive, after all effects, one at a time."""
         return (self(frame) for frame in frames if not self._drops(frame.index))
 
     def along(self, path: Trajectory) -> Effects:
-        """The same effects for a camera that moves along ``path``, with a fresh account."""
+        """Return the same effects for a camera that moves along ``path``, with a new cost count."""
         return Effects([e.along(path) if isinstance(e, FollowsPath) else e for e in self.effects], seed=self.seed)
 
     def kept(self, count: int) -> list[int]:
-        """Those of ``count`` frames that arrive."""
+        """Return the indices of those of ``count`` frames that arrive."""
         return [index for index in range(count) if not self._drops(index)]
 
     @property
     def blanks_depth(self) -> bool:
-        """Whether a frame may come out without any depth."""
+        """Return whether a frame can lose all depth."""
         return any(isinstance(effect, BlanksDepth) and effect.blanks_depth for effect in self.effects)
 
     def report(self) -> list[dict[str, Any]]:
-        """For each effect: name, why, settings, frames and ms_per_frame (None before the first frame)."""
+        """Return for each effect: name, why, settings, frames and ms_per_frame (None before the first frame)."""
         per_frame = [1e3 * s / self._frames if self._frames else None for s in self._seconds]
         return [
             {"name": e.name, "why": e.why, "settings": settings(e), "frames": self._frames, "ms_per_frame": ms}
@@ -131,11 +132,23 @@ class Effects:
         return np.random.default_rng([self.seed, index, *self._streams[effect]])
 
 
-def check_span(at: int, until: int) -> None:
-    """Frames ``at`` up to ``until``, or for ever if that is 0.
+def check_fields(effect: object, *names: str, hint: str, low: float = 0.0, high: float = np.inf) -> None:
+    """Check that fields of an effect are finite and in ``low`` to ``high``, both included.
 
     Raises:
-        InputError: there are none.
+        InputError: a value is out of range; ``hint`` describes the range.
+    """
+    for name in names:
+        value = getattr(effect, name)
+        if not (np.isfinite(value) and low <= value <= high):
+            raise InputError(f"is {value}.", field=name, hint=hint)
+
+
+def check_span(at: int, until: int) -> None:
+    """Check that frames ``at`` up to ``until`` exist, where 0 means no end.
+
+    Raises:
+        InputError: the span is empty.
     """
     if at < 0:
         raise InputError(f"is {at}.", field="at", hint="give a frame number >= 0")
@@ -144,12 +157,12 @@ def check_span(at: int, until: int) -> None:
 
 
 def settings(effect: Effect | type) -> dict[str, Any]:
-    """The settings of an effect; of a class, their defaults."""
+    """Return the settings of an effect, or the default settings of a class."""
     if not is_dataclass(effect):
         return {}
     return {f.name: getattr(effect, f.name) for f in fields(effect) if f.name not in _NO_SETTINGS}
 
 
 def _streams(names: Sequence[str]) -> list[tuple[int, int]]:
-    """Per effect a number of its name, and how many of that name came before it."""
+    """Return for each effect a hash of its name, and the number of earlier effects with the same name."""
     return [(zlib.crc32(name.encode()), names[:i].count(name)) for i, name in enumerate(names)]

@@ -1,4 +1,4 @@
-"""Bodies that meet do not pass through each other; who may meet whom is in masks."""
+"""Contact between bodies, with bit masks for the pairs that can collide."""
 
 from __future__ import annotations
 
@@ -12,45 +12,49 @@ if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
     from splatbot.sim.world import Draft
 
-FIXED, MOVABLE, ROBOT = 1, 2, 4  # bits: what does not give way, what does, the arm
-MEETS = {FIXED: 0, MOVABLE: FIXED | MOVABLE, ROBOT: FIXED | MOVABLE | ROBOT}
+FIXED, MOVABLE, ROBOT = 1, 2, 4  # bits of ``contype`` and ``conaffinity``
+COLLIDES_WITH = {FIXED: 0, MOVABLE: FIXED | MOVABLE, ROBOT: FIXED | MOVABLE | ROBOT}
 
 
 class Contact(PhysicsEffect):
-    """MuJoCo's collision detection and contact solver; fixed things are never tested against each other."""
+    """MuJoCo's collision detection and contact solver; two fixed bodies are never tested against each other.
+
+    Geoms collide if ``contype & conaffinity`` of the pair is not zero. Without the effect bodies pass through each
+    other. Contact softness is MuJoCo's default ``solref`` and ``solimp``.
+    """
 
     name = "contact"
-    cost = "collision detection and a solver for what touches"
+    cost = "collision detection, and a solver for the contacts"
     observable = "contact_steps"
 
-    def called_for(self, scene: Scene) -> str:
-        """Something can move and meet something else."""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if two bodies can collide."""
         if scene.movable or scene.soft:
             return f"{names_of((*scene.movable, *scene.soft))} can be pushed, and rest on something"
         if scene.robot is not None and (scene.objects or scene.map is not None):
-            return "the arm moves among things"
+            return "the arm moves among objects"
         return ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """Nothing can meet."""
-        return "there is nothing that could be touched"
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if no two bodies can collide."""
+        return "no two bodies can collide"
 
     def build(self, draft: Draft) -> None:
-        """Masks for every geom, and the flag that had kept contacts off."""
+        """Set the masks of every geom and enable contacts."""
         draft.spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         for body in draft.robot_bodies:
             _mask(body.geoms, ROBOT)
-        for thing in draft.scene.objects:
-            if thing.name in draft.bodies:
-                _mask(draft.bodies[thing.name].geoms, MOVABLE if thing.movable or thing.soft else FIXED)
+        for obj in draft.scene.objects:
+            if obj.name in draft.bodies:
+                _mask(draft.bodies[obj.name].geoms, MOVABLE if obj.movable or obj.soft else FIXED)
         for flex in draft.spec.flexes:
-            flex.contype, flex.conaffinity = MOVABLE, MEETS[MOVABLE] | ROBOT
+            flex.contype, flex.conaffinity = MOVABLE, COLLIDES_WITH[MOVABLE] | ROBOT
         _mask(draft.map_geoms, FIXED)
 
 
 def _mask(geoms: Any, kind: int) -> None:
     for geom in geoms:
-        geom.contype, geom.conaffinity = kind, MEETS[kind]
+        geom.contype, geom.conaffinity = kind, COLLIDES_WITH[kind]
 
 
 EFFECT = Contact()

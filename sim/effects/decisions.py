@@ -1,4 +1,4 @@
-"""Whether an effect is on, why, and who said so."""
+"""The decision whether an effect is active, with its reason."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EffectDecision:
-    """Whether an effect is on, why, and who said so: the scene's content, or `forced`, `forbidden`."""
+    """State of an effect (active or not), the reason, and its origin: the scene's content, `forced` or `forbidden`."""
 
     name: str
     on: bool
@@ -19,10 +19,10 @@ class EffectDecision:
     by: str = "scene"
 
 
-def decide(name: str, scene: Scene, called_for: str, not_called_for: str) -> EffectDecision:
-    """What becomes of an effect that the scene calls for, or does not (empty), each with its reason."""
+def decide(name: str, scene: Scene, reason_on: str, reason_off: str) -> EffectDecision:
+    """Decide on an effect that the scene requires if ``reason_on`` is not empty; forbid and force take precedence."""
     if name in scene.effects.forbid:
-        return EffectDecision(name, False, f"forbidden by the scene; {called_for or not_called_for}", "forbidden")
-    if name in scene.effects.force and not called_for:
-        return EffectDecision(name, True, f"forced by the scene; {not_called_for}", "forced")
-    return EffectDecision(name, bool(called_for), called_for or not_called_for)
+        return EffectDecision(name, False, f"forbidden by the scene; {reason_on or reason_off}", "forbidden")
+    if name in scene.effects.force and not reason_on:
+        return EffectDecision(name, True, f"forced by the scene; {reason_off}", "forced")
+    return EffectDecision(name, bool(reason_on), reason_on or reason_off)

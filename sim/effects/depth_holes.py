@@ -1,4 +1,4 @@
-"""Depth that is missing in blobs, as on dark, shiny or transparent things."""
+"""Missing depth in blobs, as on dark, shiny or transparent objects."""
 
 from __future__ import annotations
 
@@ -11,20 +11,19 @@ from numpy.typing import NDArray
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable
+from splatbot.sim.effects.base import Observable, check_fields
 
 
 @dataclass(frozen=True)
 class DepthHoles:
-    """Blobs without depth, others in every frame; colour is untouched.
+    """Simulated blobs without depth, different in every frame; colour is unchanged.
 
-    Smooth noise is cut at the height that leaves out the asked-for share of the valid pixels, so each frame loses
-    exactly that.
+    Smooth noise is thresholded at the quantile ``share`` of the valid pixels, so each frame loses exactly that share.
 
     Args:
         share: of the pixels with depth that lose it, 0..1.
         size: typical width of a blob [px].
-        why: who asked for it.
+        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
@@ -32,7 +31,7 @@ class DepthHoles:
 
     share: float = 0.4
     size: float = 40.0
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "depth_holes"
     cost: ClassVar[str] = "smooth noise, and a partial sort of the pixels"
     observable: ClassVar[Observable] = "depth"
@@ -40,11 +39,10 @@ class DepthHoles:
     def __post_init__(self) -> None:
         if not 0 <= self.share < 1:
             raise InputError(f"is {self.share}.", field="share", hint="give a share in 0..1, 1 excluded")
-        if not (np.isfinite(self.size) and self.size >= 1):
-            raise InputError(f"is {self.size}.", field="size", hint="give at least 1 pixel")
+        check_fields(self, "size", low=1.0, hint="give at least 1 pixel")
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame without the depth in the blobs."""
+        """Remove the depth inside the blobs."""
         valid = frame.valid
         lost = round(self.share * int(valid.sum()))
         if not lost:
@@ -55,7 +53,7 @@ class DepthHoles:
         return replace(frame, depth=depth)
 
     def _smooth_noise(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
-        """Noise (H, W) with blobs of the size, and a little fine noise that frays their rims."""
+        """Return noise (H, W) with blobs of width ``size``; a little fine noise makes their borders irregular."""
         coarse = [int(np.ceil(2 * n / self.size)) + 1 for n in shape]
         noise = cv2.resize(rng.standard_normal(coarse, np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
         return np.asarray(noise + 0.05 * rng.standard_normal(shape, np.float32), dtype=np.float32)

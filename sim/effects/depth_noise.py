@@ -1,4 +1,4 @@
-"""How depth cameras err: noise that grows with distance and tilt, a finite step, and holes along edges."""
+"""Errors of depth cameras: noise that grows with distance and tilt, quantization, and holes along edges."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable
+from splatbot.sim.effects.base import Observable, check_fields
 
-_STEEPEST = np.radians(85.0)  # beyond, the fit of the noise has no data and soon no bound
+_MAX_TILT = np.radians(85.0)  # [rad] the fit of the noise has no data beyond, and diverges
 
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """Axial noise of structured-light and stereo cameras, quantisation and edge holes; colour is untouched.
+    """Simulated axial noise of depth cameras, quantization and edge holes; colour is unchanged.
+
+    The standard deviation is that of :func:`axial_sigma` (Nguyen, Izadi, Lovell 2012, eq. 3), for structured-light and
+    stereo cameras.
 
     Args:
-        strength: multiple of the published noise; 0 leaves quantisation and holes.
-        step: the sensor's resolution [m]; 0 for none.
-        edge_loss: share of the pixels near a depth edge that come back without depth, 0..1.
-        edge_jump: what counts as an edge: a jump by this share of the nearer depth,
-        edge_reach: within this many pixels.
-        why: who asked for it.
+        strength: factor of the published standard deviation; 0 leaves quantization and holes.
+        step: quantization step [m]; 0 for none.
+        edge_loss: fraction of the pixels near a depth edge that lose their depth, 0..1.
+        edge_jump: relative depth step that counts as an edge.
+        edge_reach: distance [px] from an edge within which depth is lost.
+        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
@@ -38,20 +40,17 @@ class DepthNoise:
     edge_loss: float = 0.5
     edge_jump: float = 0.03
     edge_reach: int = 2
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "depth_noise"
     cost: ClassVar[str] = "a random number, a tilt and a rounding for each pixel"
     observable: ClassVar[Observable] = "depth"
 
     def __post_init__(self) -> None:
-        for name in ("strength", "step", "edge_jump", "edge_reach"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise InputError(f"is {getattr(self, name)}.", field=name, hint="give a finite number >= 0")
-        if not 0 <= self.edge_loss <= 1:
-            raise InputError(f"is {self.edge_loss}.", field="edge_loss", hint="give a share in 0..1")
+        check_fields(self, "strength", "step", "edge_jump", "edge_reach", hint="give a finite number >= 0")
+        check_fields(self, "edge_loss", high=1.0, hint="give a share in 0..1")
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """A frame with depth as a sensor would measure it; pixels without depth stay without."""
+        """Add noise to the depth; pixels without depth stay without."""
         z = frame.depth.astype(np.float64)
         lost = self._edges(frame.depth) & (rng.random(z.shape) < self.edge_loss)
         z += self.strength * axial_sigma(z, tilts(frame.camera, frame.depth)) * rng.standard_normal(z.shape)
@@ -68,18 +67,18 @@ class DepthNoise:
 
 
 def axial_sigma(depth: NDArray[np.float64], tilt: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-    """Standard deviation [m] of a depth [m] of a surface tilted away from the sensor by ``tilt`` [rad].
+    """Compute the standard deviation [m] of depth [m] on a surface tilted away from the sensor by ``tilt`` [rad].
 
     Nguyen, Izadi, Lovell 2012, eq. 3: 0.0012 + 0.0019 (z - 0.4)² + 0.0001 / √z · θ² / (π/2 - θ)².
     """
-    slant = (tilt / (np.pi / 2 - np.minimum(tilt, _STEEPEST))) ** 2
+    slant = (tilt / (np.pi / 2 - np.minimum(tilt, _MAX_TILT))) ** 2
     return np.asarray(0.0012 + 0.0019 * (depth - 0.4) ** 2 + 0.0001 / np.sqrt(np.maximum(depth, 1e-3)) * slant)
 
 
 def tilts(camera: Camera, depth: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Angle (H, W) [rad] between each pixel's ray and its surface's normal; 0 where there is no depth.
+    """Compute the angle (H, W) [rad] between each pixel's ray and its surface normal; 0 without depth.
 
-    The depth's slope is the lesser of those to both sides, so that an edge does not pass for a steep surface.
+    The depth slope is the smaller of the two one-sided slopes, so that a depth edge does not count as a steep surface.
     """
     z = depth.astype(np.float64)
     across, down = (_slope(z, axis) for axis in (1, 0))

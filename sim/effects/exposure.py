@@ -7,17 +7,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_span
+from splatbot.sim.effects.base import Observable, check_fields, check_span
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """Colours times a gain, plus an offset, clipped to 0..255; depth is untouched.
+    """Simulated change of exposure: v' = clip(gain v + offset, 0, 255); depth is unchanged.
 
-    Applied to the 8-bit values as they are, without a camera's response curve: the affine model that photometric
-    trackers fit (Engel, Koltun, Cremers 2018, section 2.1).
+    The affine model is the one that photometric trackers fit (Engel, Koltun, Cremers 2018, section 2.1). It applies to
+    8-bit values. The camera's response curve is not modelled.
 
     Args:
         step: gain from frame ``at`` on; 1 for none.
@@ -25,7 +24,7 @@ class Exposure:
         at: first frame of the step.
         until: first frame after it; 0 for never.
         drift: doublings of the gain per second, from stamp 0 on; negative darkens.
-        why: who asked for it.
+        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
@@ -36,21 +35,18 @@ class Exposure:
     at: int = 0
     until: int = 0
     drift: float = 0.0
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "exposure"
     cost: ClassVar[str] = "a table look-up"
     observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.step) and self.step >= 0):
-            raise InputError(f"is {self.step}.", field="step", hint="give a finite gain >= 0")
-        for name in ("offset", "drift"):
-            if not np.isfinite(getattr(self, name)):
-                raise InputError(f"is {getattr(self, name)}.", field=name, hint="give a finite number")
+        check_fields(self, "step", hint="give a finite gain >= 0")
+        check_fields(self, "offset", "drift", low=-np.inf, hint="give a finite number")
         check_span(self.at, self.until)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame in its new brightness."""
+        """Change the brightness of the frame."""
         stepped = frame.index >= self.at and not (self.until and frame.index >= self.until)
         gain = float(2.0 ** np.clip(self.drift * frame.stamp, -64, 64)) * (self.step if stepped else 1.0)
         offset = self.offset if stepped else 0.0

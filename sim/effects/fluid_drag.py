@@ -1,4 +1,4 @@
-"""Air or water slows what moves through it."""
+"""Drag of air or water on moving bodies."""
 
 from __future__ import annotations
 
@@ -10,26 +10,29 @@ if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
     from splatbot.sim.world import Draft
 
-_VACUUM = 1e-300  # [kg/m³]: MuJoCo computes the forces, and they change no bit
+_VACUUM = 1e-300  # [kg/m³]: MuJoCo computes the forces, and they change no bit of the state
 
 
 class FluidDrag(PhysicsEffect):
-    """MuJoCo's inertia-box drag on every body."""
+    """Drag and viscous resistance by MuJoCo's inertia-box fluid model on every body.
+
+    Density [kg/m³], viscosity [Pa s] and wind [m/s] are those of ``medium`` in the scene.
+    """
 
     name = "fluid_drag"
-    cost = "two forces for each body that moves"
+    cost = "two forces for each moving body"
     observable = "travelled"
 
-    def called_for(self, scene: Scene) -> str:
-        """The scene has a medium."""
-        return f"the room is filled with {scene.medium.density:g} kg/m³" if scene.medium is not None else ""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if the scene has a medium."""
+        return f"the scene is filled with {scene.medium.density:g} kg/m³" if scene.medium is not None else ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """It has none."""
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if the scene has no medium."""
         return "no medium is given"
 
     def build(self, draft: Draft) -> None:
-        """The medium; if forced without one, a vacuum, in full."""
+        """Set the medium; if it is forced without one, compute the forces of a vacuum."""
         medium, option = draft.scene.medium, draft.spec.option
         option.density = _VACUUM if medium is None else medium.density
         option.viscosity = 0.0 if medium is None else medium.viscosity

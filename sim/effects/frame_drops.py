@@ -10,17 +10,17 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable
+from splatbot.sim.effects.base import Observable, check_fields
 
 
 @dataclass(frozen=True)
 class FrameDrops:
-    """Loses frames at random; the others keep their stamps, so the gap shows.
+    """Simulated random loss of frames; the others keep their stamps.
 
     Args:
-        rate: share of the frames that is lost, 0..1.
-        burst: frames that are lost together: the stream is cut into groups of this many, each lost as a whole.
-        why: who asked for it.
+        rate: fraction of the frames that is lost, 0..1.
+        burst: frames that are lost together: each group of this many consecutive frames is kept or lost as a whole.
+        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
@@ -28,7 +28,7 @@ class FrameDrops:
 
     rate: float = 0.1
     burst: int = 1
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "frame_drops"
     cost: ClassVar[str] = "a random number for a frame"
     observable: ClassVar[Observable] = "arrivals"
@@ -36,13 +36,12 @@ class FrameDrops:
     def __post_init__(self) -> None:
         if not 0 <= self.rate < 1:
             raise InputError(f"is {self.rate}.", field="rate", hint="give a share in 0..1, 1 excluded")
-        if self.burst < 1:
-            raise InputError(f"is {self.burst}.", field="burst", hint="give at least 1 frame")
+        check_fields(self, "burst", low=1, hint="give at least 1 frame")
 
     def drops(self, index: int, generator: Callable[[int], np.random.Generator]) -> bool:
-        """Whether frame ``index`` is lost; decided without looking at it, so that it need not be rendered."""
+        """Return whether frame ``index`` is lost; the decision does not need the image, so no image is rendered."""
         return bool(generator(index // self.burst).random() < self.rate)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """What arrives is whole."""
+        """Return the frame unchanged."""
         return frame

@@ -1,4 +1,4 @@
-"""Surfaces that touch resist sliding; without it everything is ice."""
+"""Friction between bodies in contact; without it they slide freely."""
 
 from __future__ import annotations
 
@@ -14,26 +14,29 @@ _FINGERS = ("finger1", "finger2")
 
 
 class Friction(PhysicsEffect):
-    """Three rows a contact instead of one; four where fingers hold, so that they also resist turning."""
+    """Coulomb friction: contacts of ``condim`` 3 instead of 1, and 4 at the fingers, which adds torsional friction.
+
+    The coefficients are those of the objects in the scene.
+    """
 
     name = "friction"
-    cost = "three to four rows in the solver for each contact instead of one"
+    cost = "three to four solver rows for each contact instead of one"
     observable = "tangential_n"
 
-    def called_for(self, scene: Scene) -> str:
-        """Something movable touches, or the task rubs."""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if an object can move or the task rubs on a surface."""
         if scene.movable or scene.soft:
-            return f"what holds and stops {names_of((*scene.movable, *scene.soft))} is friction"
+            return f"friction holds and stops {names_of((*scene.movable, *scene.soft))}"
         if scene.task.kind == "wipe":
             return "the tool rubs on a surface"
         return ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """Nothing slides."""
-        return "nothing movable touches anything"
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if no surface slides on another."""
+        return "no movable object is in contact"
 
     def build(self, draft: Draft) -> None:
-        """Friction for every geom; the coefficients are the objects' own."""
+        """Set ``condim`` of every geom; the coefficients are those of the objects."""
         for body in draft.robot_bodies:
             for geom in body.geoms:
                 geom.condim = 4 if body.name in _FINGERS else 3

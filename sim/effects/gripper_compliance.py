@@ -1,4 +1,4 @@
-"""Fingers give way: their servo is a spring and their pads are rubber."""
+"""Compliance of the gripper: its servo acts as a spring, and its pads are rubber."""
 
 from __future__ import annotations
 
@@ -10,38 +10,42 @@ if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
     from splatbot.sim.world import Draft
 
-_STIFF = 2000.0  # [N/m] of the servo where the scene gives none
-_PAD_SOLREF = (0.005, 1.0)  # rubber: contacts that settle in 5 ms; slower ones let 70 N sink 7 mm into 50 g
+_DEFAULT_STIFFNESS = 2000.0  # [N/m] of the servo if the scene gives none
+_PAD_SOLREF = (0.005, 1.0)  # [s] time constant, damping ratio; at 10 ms a force of 70 N sinks 7 mm into a 50 g object
 _PAD_SOLIMP = (0.8, 0.95, 0.002, 0.5, 2.0)
-_HOLDING = ("grasp", "hang", "squeeze")
+_GRASPING_TASKS = ("grasp", "hang", "squeeze")
 
 
 class GripperCompliance(PhysicsEffect):
-    """A softer servo and softer contacts of the fingers."""
+    """Softer finger servo and softer finger contacts.
+
+    The servo is a spring of ``robot.motors.finger_stiffness`` [N/m]. The pads use MuJoCo's ``solref`` and ``solimp`` of
+    rubber.
+    """
 
     name = "gripper_compliance"
-    cost = "nothing by itself; softer contacts overlap more"
+    cost = "no additional computation; softer contacts have more overlap"
     observable = "opening"
 
-    def called_for(self, scene: Scene) -> str:
-        """The task holds something, or the scene gives a stiffness."""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if the task grasps an object or the scene gives a stiffness."""
         if scene.robot is None:
             return ""
         if scene.robot.motors.finger_stiffness is not None:
             return f"the fingers' servo has {scene.robot.motors.finger_stiffness:g} N/m"
-        if scene.task.kind in _HOLDING:
-            return f"to {scene.task.kind} takes pads that give way"
+        if scene.task.kind in _GRASPING_TASKS:
+            return f"to {scene.task.kind} requires compliant pads"
         return ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """Nothing is held."""
-        return "nothing is held" if scene.robot is not None else "there is no robot"
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if the task grasps no object."""
+        return "the task grasps no object" if scene.robot is not None else "there is no robot"
 
     def build(self, draft: Draft) -> None:
-        """Rubber pads; the servo's gain."""
+        """Set the contact parameters of the pads and the gain of the servo."""
         if draft.robot is None or draft.robot.gripper is None or draft.scene.robot is None:
             return
-        stiffness = draft.scene.robot.motors.finger_stiffness or _STIFF
+        stiffness = draft.scene.robot.motors.finger_stiffness or _DEFAULT_STIFFNESS
         servo = draft.spec.actuator("opening")
         servo.gainprm[0], servo.biasprm[1] = stiffness, -stiffness
         for body in draft.robot_bodies:

@@ -1,34 +1,33 @@
-"""Joints stick a little: dry friction of bearings and gears."""
+"""Dry friction of the joints' bearings and gears."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from splatbot.sim.effects.physics import PhysicsEffect
+from splatbot.sim.effects.physics import MotorEffect
 
 if TYPE_CHECKING:
-    from splatbot.sim.scene import Scene
     from splatbot.sim.world import Draft
 
 
-class JointFriction(PhysicsEffect):
-    """A row in the solver for each joint."""
+class JointFriction(MotorEffect):
+    """Coulomb friction of each joint, by MuJoCo's ``frictionloss`` [N m].
+
+    The friction is ``robot.motors.friction``, a fraction of the joint's maximum torque.
+    """
 
     name = "joint_friction"
-    cost = "a row in the solver for each joint"
+    cost = "one solver row for each joint"
     observable = "tracking_rms"
+    parameter = "friction"
+    quantity = "joint friction"
 
-    def called_for(self, scene: Scene) -> str:
-        """The scene gives it."""
-        share = scene.robot.motors.friction if scene.robot is not None else 0.0
-        return f"joints rub with {100 * share:g} % of their torque" if share > 0 else ""
-
-    def not_called_for(self, scene: Scene) -> str:
-        """There is none."""
-        return "no friction of joints is given" if scene.robot is not None else "there is no robot"
+    def describe(self, value: float) -> str:
+        """Describe the parameter's effect in a reason."""
+        return f"joints have friction of {100 * value:g} % of their torque"
 
     def build(self, draft: Draft) -> None:
-        """``frictionloss`` of the arm's joints."""
+        """Set ``frictionloss`` of the arm's joints."""
         if draft.robot is None or draft.scene.robot is None:
             return
         share = draft.scene.robot.motors.friction

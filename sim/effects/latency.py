@@ -1,4 +1,4 @@
-"""Frames that arrive late, and are stamped then."""
+"""Frames that arrive late and are stamped on arrival."""
 
 from __future__ import annotations
 
@@ -7,23 +7,22 @@ from typing import ClassVar
 
 import numpy as np
 
-from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable
+from splatbot.sim.effects.base import Observable, check_fields
 
 
 @dataclass(frozen=True)
 class Latency:
-    """A frame's stamp is the time at which it arrives, not that at which it was taken; its images stay those.
+    """Simulated latency: the stamp is the arrival time t + delay + U(0, jitter), and the images are those of t.
 
-    What is paired with it by stamp (joints, poses) is then later than the images, as with a driver that stamps on
-    arrival. A twin's camera holds the frame back until then, and adds the joints of that moment. Effects that ask
-    where the camera was at the stamp (motion_blur, rolling_shutter) belong before it.
+    Joints and poses that are paired by stamp are therefore later than the images, as with a driver that stamps on
+    arrival. A twin's camera delays the frame and adds the joints of the arrival time. Effects that need the camera pose
+    at the stamp (motion_blur, rolling_shutter) must come before this one.
 
     Args:
-        delay: least time on the way [s].
-        jitter: at most this is added, evenly [s]; below the time between frames, else they overtake each other.
-        why: who asked for it.
+        delay: minimum latency [s].
+        jitter: range [s] of the uniform random addition. It must be below the frame period, or frames change order.
+        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
@@ -31,16 +30,14 @@ class Latency:
 
     delay: float = 0.05
     jitter: float = 0.0
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "latency"
     cost: ClassVar[str] = "a random number for a frame"
     observable: ClassVar[Observable] = "stamps"
 
     def __post_init__(self) -> None:
-        for name in ("delay", "jitter"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise InputError(f"is {getattr(self, name)}.", field=name, hint="give seconds >= 0")
+        check_fields(self, "delay", "jitter", hint="give seconds >= 0")
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame with its time of arrival."""
+        """Stamp the frame with its arrival time."""
         return replace(frame, stamp=frame.stamp + self.delay + self.jitter * float(rng.random()))

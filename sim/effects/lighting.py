@@ -1,4 +1,4 @@
-"""Lamps, with shadows, that may be dimmed; without it a headlight at the camera."""
+"""Lamps with shadows and changing brightness; without the effect a headlight at the camera."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 class Dimmer(Hook):
-    """Sets each lamp's brightness; MuJoCo reads it when it draws."""
+    """Sets the brightness of each lamp; MuJoCo reads it when it renders."""
 
     def __init__(self, model: Any, lights: tuple[Light, ...]) -> None:
         self._model = model
         self._changes = [(i, light) for i, light in enumerate(lights) if light.changes]
 
     def on_step(self, data: Any, time: float) -> None:
-        """The latest change counts."""
+        """Apply the latest change of each lamp up to ``time`` [s]."""
         for i, light in self._changes:
             value = light.brightness
             for change in light.changes:
@@ -30,24 +30,27 @@ class Dimmer(Hook):
 
 
 class Lighting(PhysicsEffect):
-    """Costs when images are drawn, not when physics is stepped."""
+    """MuJoCo lights with shadows at the positions [m] and brightnesses (0..1) of the scene's ``lights``.
+
+    It costs rendering time, not physics time.
+    """
 
     name = "lighting"
-    cost = "a pass for shadows in each drawn image"
+    cost = "a shadow pass for each rendered image"
     observable = "light"
 
-    def called_for(self, scene: Scene) -> str:
-        """A camera looks, and lamps are given."""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if the scene has a camera and lamps."""
         if scene.lights and scene.camera is not None:
             return f"a camera sees {len(scene.lights)} lamps"
         return ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """No lamp, or nobody looks."""
-        return "no camera looks" if scene.camera is None else "no lamp is given"
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if the scene has no lamps or no camera."""
+        return "there is no camera" if scene.camera is None else "no lamp is given"
 
     def build(self, draft: Draft) -> None:
-        """The lamps look down at the origin, and the headlight goes."""
+        """Add the lamps, directed at the origin, and dim the headlight."""
         if not draft.scene.lights:
             return
         draft.spec.visual.headlight.diffuse = [0.15] * 3
@@ -57,7 +60,7 @@ class Lighting(PhysicsEffect):
             lamp.diffuse, lamp.castshadow = [light.brightness] * 3, True
 
     def hook(self, model: Any, scene: Scene) -> Hook | None:
-        """A dimmer where something changes."""
+        """Create a hook that changes the brightness of lamps."""
         return Dimmer(model, scene.lights)
 
 

@@ -1,4 +1,4 @@
-"""Colours that smear because the camera moves while the shutter is open."""
+"""Colour blur by camera motion during the exposure."""
 
 from __future__ import annotations
 
@@ -9,59 +9,57 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable
+from splatbot.sim.effects.base import Observable, check_fields
 from splatbot.sim.effects.warping import flow, grid, motion_during
 from splatbot.trajectory import Trajectory
 
-_STILL_PX = 0.1  # a smear that no pixel shows
+_MIN_BLUR_PX = 0.1  # [px] below this no pixel changes
 
 
 @dataclass(frozen=True)
 class MotionBlur:
-    """The mean of sub-exposures, each the frame warped by where its own depth says the pixels would be.
+    """Simulated motion blur: the mean of sub-exposures, each the frame warped by its own depth and the camera motion.
 
-    Warping instead of rendering every sub-exposure anew makes it work for any source that knows its path (a ray caster,
-    the twin, a recording with ground truth), at the cost of one warp per sub-exposure. The frame's stamp is the middle
-    of the exposure. The warp is right to first order in the motion; what a near edge hides at the stamp is smeared from
-    the edge itself. Pixels without depth count as infinitely far. Depth is untouched, and objects that move on their
-    own are not smeared by that. 8-bit values are averaged as they are, without a camera's response curve.
+    Warping works for any source with a known camera path: a ray caster, the twin, or a recording with ground truth. It
+    costs one warp per sub-exposure. The frame's stamp is the middle of the exposure.
+
+    Limits: the warp is first order in the motion, and surfaces that an edge hides at the stamp take the colour of the
+    edge. Pixels without depth count as infinitely far. Depth is unchanged, and moving objects are not blurred by their
+    own motion. 8-bit values are averaged without the camera's response curve.
 
     Args:
-        exposure: how long the shutter is open [s].
-        samples: most sub-exposures; fewer where the longest smear [px] is shorter than that.
-        why: who asked for it.
-        path: how the camera moves.
+        exposure: exposure time [s].
+        samples: maximum number of sub-exposures; there are fewer if the longest blur [px] is shorter.
+        why: reason for the effect.
+        path: camera path.
 
     Raises:
-        InputError: an argument is out of range; when applied: the path is not known.
+        InputError: an argument is out of range; on application, if the path is not known.
     """
 
     exposure: float = 0.02
     samples: int = 32
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "motion_blur"
     path: Trajectory | None = None
-    cost: ClassVar[str] = "a warp for each pixel of smear, at most `samples`"
+    cost: ClassVar[str] = "one warp for each pixel of blur, at most `samples`"
     observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.exposure) and self.exposure >= 0):
-            raise InputError(f"is {self.exposure}.", field="exposure", hint="give seconds >= 0")
-        if self.samples < 2:
-            raise InputError(f"is {self.samples}.", field="samples", hint="give at least 2")
+        check_fields(self, "exposure", hint="give seconds >= 0")
+        check_fields(self, "samples", low=2, hint="give at least 2")
 
     def along(self, path: Trajectory) -> MotionBlur:
-        """The blur of a camera that moves along ``path``."""
+        """Return the blur of a camera that moves along ``path``."""
         return replace(self, path=path)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame with smeared colours."""
+        """Smear the colours of the frame."""
         ends = motion_during(self.path, frame.stamp, self.exposure, effect=self.name)
         flows = [flow(frame.camera, frame.depth, T_now_then) for T_now_then in ends]
         longest = float(np.abs(flows[0]).max() + np.abs(flows[1]).max())
-        if longest < _STILL_PX:
+        if longest < _MIN_BLUR_PX:
             return frame
         count = int(np.clip(np.ceil(longest) + 1, 2, self.samples))
         return replace(frame, rgb=_mean_along(frame.rgb, flows, count))

@@ -1,4 +1,4 @@
-"""Obstacles that are carried along a path, whatever stands in their way."""
+"""Obstacles that follow a prescribed path regardless of contacts."""
 
 from __future__ import annotations
 
@@ -14,50 +14,53 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 
-def place_on(thing: SceneObject, time: float) -> Array:
-    """Where (3,) [m] an object is on its path at a time [s]: linear between places, there and back again."""
-    times, places = np.array([p.t for p in thing.path]), np.array([p.at for p in thing.path])
+def position_on_path(obj: SceneObject, time: float) -> Array:
+    """Interpolate the position (3,) [m] of an object on its path at ``time`` [s], forwards and then backwards."""
+    times, places = np.array([p.t for p in obj.path]), np.array([p.at for p in obj.path])
     length = times[-1]
     t = time % (2 * length)
     t = t if t <= length else 2 * length - t
     return np.array([np.interp(t, times, column) for column in places.T])
 
 
-class Carried(Hook):
-    """Puts each obstacle where its path says, there and back again."""
+class PathFollower(Hook):
+    """Moves each obstacle along its path and back."""
 
     def __init__(self, paths: list[tuple[int, SceneObject]]) -> None:
         self._paths = paths
 
     def on_step(self, data: Any, time: float) -> None:
-        """Where they are now."""
-        for body, thing in self._paths:
-            data.mocap_pos[body] = place_on(thing, time)
+        """Set the position of each obstacle at ``time`` [s]."""
+        for body, obj in self._paths:
+            data.mocap_pos[body] = position_on_path(obj, time)
 
 
 class MovingObstacles(PhysicsEffect):
-    """Bodies whose pose is set each control period; they push, and nothing pushes them."""
+    """Kinematic obstacles (MuJoCo mocap bodies), whose position is set in each control period.
+
+    They push other bodies and are not pushed. The path is piecewise linear through waypoints (time [s], position [m]).
+    """
 
     name = "moving_obstacles"
-    cost = "an interpolation for each obstacle, and contacts that keep changing"
+    cost = "one interpolation for each obstacle, and changing contacts"
     observable = "obstacle_travel"
 
-    def called_for(self, scene: Scene) -> str:
-        """Something has a path."""
-        return f"{names_of(scene.carried)} moves by itself" if scene.carried else ""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if an obstacle has a path."""
+        return f"{names_of(scene.carried)} moves on a path" if scene.carried else ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """Nothing has."""
-        return "nothing moves by itself"
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if no obstacle has a path."""
+        return "no object moves on a path"
 
     def build(self, draft: Draft) -> None:
-        """Bodies that may be placed at any time."""
-        for thing in draft.scene.carried:
-            draft.bodies[thing.name].mocap = True
+        """Make the obstacles mocap bodies."""
+        for obj in draft.scene.carried:
+            draft.bodies[obj.name].mocap = True
 
     def hook(self, model: Any, scene: Scene) -> Hook | None:
-        """Carries them."""
-        return Carried([(int(model.body(f"object/{t.name}").mocapid[0]), t) for t in scene.carried])
+        """Create the hook that moves the obstacles."""
+        return PathFollower([(int(model.body(f"object/{t.name}").mocapid[0]), t) for t in scene.carried])
 
 
 EFFECT = MovingObstacles()

@@ -1,4 +1,4 @@
-"""What a physics effect is, and which of them a scene calls for."""
+"""Protocol of physics effects, and the decision which of them a scene requires."""
 
 from __future__ import annotations
 
@@ -29,66 +29,89 @@ PHYSICS = (
     "view_color",
     "sleep",
 )
-"""The names, in the order in which they are built; each is a module of this package."""
+"""Names in the order in which effects are built; each is a module of this package."""
 
 
 class Hook:
-    """What an effect does while a twin runs; does nothing unless overridden. Counts its calls."""
+    """Callbacks of an effect while a twin runs; the base class changes no state."""
 
     def reset(self) -> None:
-        """The run begins anew."""
+        """Reset the state at the start of a run."""
 
     def on_targets(self, targets: Array) -> Array:
-        """The joints' targets (J,) as they reach the motors."""
+        """Transform the joint targets (J,) [rad] on their path to the motors."""
         return targets
 
     def on_step(self, data: Any, time: float) -> None:
-        """Before the physics of a control period that begins at ``time`` [s]."""
+        """Update the simulation before the physics of a control period that begins at ``time`` [s]."""
 
 
 class PhysicsEffect:
-    """Physics that can be left out.
+    """A physical phenomenon that can be left out of the simulation.
 
-    ``name`` is its module's; ``cost`` says what it makes MuJoCo do; ``observable`` names the figure of a run that
-    changes when a scene that calls for it goes without.
+    ``name`` is that of its module, ``cost`` describes the computation in MuJoCo. ``observable`` names the result of a
+    run that changes if a scene that requires the effect runs without it.
     """
 
     name: str
     cost: str
     observable: str
 
-    def called_for(self, scene: Scene) -> str:
-        """Why the scene needs it; empty if it does not."""
+    def reason_on(self, scene: Scene) -> str:
+        """Return the reason why the scene requires the effect, or an empty string."""
         raise NotImplementedError
 
-    def not_called_for(self, scene: Scene) -> str:
-        """Why not, in a few words."""
+    def reason_off(self, scene: Scene) -> str:
+        """Return the reason why the scene does not require the effect."""
         raise NotImplementedError
 
     def build(self, draft: Draft) -> None:
-        """Put it into the model."""
+        """Add the effect to the model."""
 
     def hook(self, model: Any, scene: Scene) -> Hook | None:
-        """What it does while the twin runs, if anything."""
+        """Create the callbacks of the effect, or None if it has none."""
         return None
+
+
+class MotorEffect(PhysicsEffect):
+    """An effect that the scene requires if one of the ``robot.motors`` parameters is above zero.
+
+    ``parameter`` names that parameter, ``quantity`` describes it.
+    """
+
+    parameter: str
+    quantity: str
+
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if the scene gives the parameter."""
+        value = 0.0 if scene.robot is None else float(getattr(scene.robot.motors, self.parameter))
+        return self.describe(value) if value > 0 else ""
+
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if the scene does not give the parameter."""
+        return f"no {self.quantity} is given" if scene.robot is not None else "there is no robot"
+
+    def describe(self, value: float) -> str:
+        """Describe the parameter's effect in a reason."""
+        raise NotImplementedError
 
 
 @cache
 def physics_effect(name: str) -> PhysicsEffect:
-    """The effect of a name of :data:`PHYSICS`; its module is imported now."""
+    """Import and return the effect of a name in :data:`PHYSICS`."""
     effect: PhysicsEffect = importlib.import_module(f"splatbot.sim.effects.{name}").EFFECT
     return effect
 
 
 def effects_for(scene: Scene) -> tuple[EffectDecision, ...]:
-    """A decision on every effect: physics in the order of :data:`PHYSICS`, then the camera's sensor."""
+    """Decide on every effect: physics in the order of :data:`PHYSICS`, then the sensor effects of the camera."""
     physics = (physics_effect(name) for name in PHYSICS)
-    decided = (decide(e.name, scene, e.called_for(scene), e.not_called_for(scene)) for e in physics)
+    decided = (decide(e.name, scene, e.reason_on(scene), e.reason_off(scene)) for e in physics)
     return (*decided, *sensor_effects_for(scene))
 
 
-def names_of(things: Any, most: int = 3) -> str:
-    """Names of a few objects, as in "cup, box and 4 more"."""
-    names = [thing.name for thing in things]
+def names_of(objects: Any, most: int = 3) -> str:
+    """Join the names of a few objects, as in "cup, box and 4 more"."""
+    names = [obj.name for obj in objects]
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

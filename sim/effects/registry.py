@@ -1,4 +1,4 @@
-"""Sensor effects by name. An effect's module is imported only when somebody asks for it."""
+"""Sensor effects by name. The module of an effect is imported only when the effect is used."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _CLASSES = {
 }
 
 EFFECTS = tuple(_CLASSES)
-"""The names, in the order in which a sensor would do them."""
+"""Names in the order in which the effects occur in a sensor."""
 
 
 def effect_class(name: str) -> type[Any]:
-    """The class of an effect.
+    """Return the class of an effect.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: the name is unknown.
     """
     if name not in _CLASSES:
         raise InputError(f"there is no {name!r}.", field="effect", hint=f"effects: {', '.join(EFFECTS)}")
@@ -42,7 +42,11 @@ def effect_class(name: str) -> type[Any]:
 
 
 def make_effect(spec: str, *, why: str = "") -> Effect:
-    """The effect that ``spec`` describes: `name`, or `name:option=value,option=value`; ``why`` is the spec if empty.
+    """Create the effect of ``spec``: `name`, or `name:option=value,option=value`.
+
+    Args:
+        spec: name and settings.
+        why: reason for the effect. If empty, it is the spec.
 
     Raises:
         InputError: the name or an option is unknown, or a value is no number or out of range.
@@ -59,14 +63,14 @@ def make_effect(spec: str, *, why: str = "") -> Effect:
             )
         values[key] = _value(name, key, value, type(known[key]))
     try:
-        made: Effect = kind(why=why or f"asked for as {spec}", **values)
+        made: Effect = kind(why=why or f"requested as {spec}", **values)
     except InputError as error:
         raise InputError(error.message, field=f"effect {name}: {error.field}", hint=error.hint) from error
     return made
 
 
 def make_effects(specs: Sequence[str], *, seed: int = 0, why: str = "") -> Effects:
-    """The effects of several specs, in their order; see :func:`make_effect`."""
+    """Create the effects of several specs in their order; see :func:`make_effect`."""
     return Effects([make_effect(spec, why=why) for spec in specs], seed=seed)
 
 
@@ -74,8 +78,8 @@ def _value(name: str, key: str, text: str, kind: type) -> Any:
     try:
         return kind(text)
     except ValueError as error:
-        what = "a whole number" if kind is int else "a number"
-        raise InputError(f"is {text!r}.", field=f"effect {name}: {key}", hint=f"give {what}") from error
+        expected = "a whole number" if kind is int else "a number"
+        raise InputError(f"is {text!r}.", field=f"effect {name}: {key}", hint=f"give {expected}") from error
 
 
 def _written(name: str, known: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Images that shear because their lines are read one after the other."""
+"""Image shear by a shutter that reads the lines one after the other."""
 
 from __future__ import annotations
 
@@ -9,69 +9,69 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import Array, inverse
-from splatbot.sim.effects.base import Observable
+from splatbot.sim.effects.base import Observable, check_fields
 from splatbot.sim.effects.warping import color_at, depth_at, flow, grid, motion_during
 from splatbot.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
 class RollingShutter:
-    """Each line of colour and depth as seen when it is read, from top to bottom; the stamp is that of the middle line.
+    """Simulated rolling shutter: each line of colour and depth as seen at its readout time, from top to bottom.
 
-    The frame is warped by its own depth and the camera's motion, as :class:`MotionBlur` does it, so any source that
-    knows its path will do. What was hidden behind a near edge at the stamp shows the edge's colour instead, pixels
-    without depth count as infinitely far, and things that move on their own do not shear.
+    The stamp is that of the middle line. The frame is warped by its own depth and the camera motion, as in
+    :class:`MotionBlur`, so any source with a known camera path works.
+
+    Limits: surfaces hidden by an edge at the stamp take the colour of the edge. Pixels without depth count as
+    infinitely far. Moving objects are not sheared by their own motion.
 
     Args:
         readout: time from the first line to the last [s].
-        why: who asked for it.
-        path: how the camera moves.
+        why: reason for the effect.
+        path: camera path.
 
     Raises:
-        InputError: the time is out of range; when applied: the path is not known.
+        InputError: the time is out of range; on application, if the path is not known.
     """
 
     readout: float = 0.02
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "rolling_shutter"
     path: Trajectory | None = None
     cost: ClassVar[str] = "two warps of depth and one of colour"
     observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.readout) and self.readout >= 0):
-            raise InputError(f"is {self.readout}.", field="readout", hint="give seconds >= 0")
+        check_fields(self, "readout", hint="give seconds >= 0")
 
     def along(self, path: Trajectory) -> RollingShutter:
-        """The shutter of a camera that moves along ``path``."""
+        """Return the shutter of a camera that moves along ``path``."""
         return replace(self, path=path)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame as it is read, line by line."""
+        """Warp the frame line by line."""
         ends = motion_during(self.path, frame.stamp, self.readout, effect=self.name)
         depth, camera = frame.depth, frame.camera
         at = grid(*depth.shape)
-        for _ in range(2):  # by the depth of where it looks, which is known better the second time
+        for _ in range(2):  # the second iteration uses the depth at the position that the first one found
             at = grid(*depth.shape) + _by_line([flow(camera, depth_at(depth, at), T) for T in ends])
         seen = depth_at(depth, at)
-        when = seen + _by_line([_nearer(camera, seen, at, T) for T in ends])
-        return replace(frame, rgb=color_at(frame.rgb, at), depth=np.where(seen > 0, np.maximum(when, 0), 0))
+        depth_then = seen + _by_line([_depth_change(camera, seen, at, T) for T in ends])
+        return replace(frame, rgb=color_at(frame.rgb, at), depth=np.where(seen > 0, np.maximum(depth_then, 0), 0))
 
 
 def _by_line(ends: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """What (H, W[, K]) is at the first and at the last line's time, at each line's own."""
+    """Interpolate values (H, W[, K]) of the first and last line's readout times to that of each line."""
     first, last = ends
     share = np.linspace(-1.0, 1.0, len(first), dtype=np.float32).reshape(-1, *[1] * (first.ndim - 1))
     return np.where(share < 0, -share * first, share * last)
 
 
-def _nearer(
+def _depth_change(
     camera: Camera, depth: NDArray[np.float32], at: NDArray[np.float32], T_now_then: Array
 ) -> NDArray[np.float32]:
-    """How much deeper (H, W) [m] points at places (H, W, 2) of the view now lie in the view then."""
+    """Compute the change of depth (H, W) [m] from now to then of points at pixels (H, W, 2) of the view now."""
     R, t = inverse(T_now_then)[2, :3], inverse(T_now_then)[2, 3]
     x, y = (at[..., 0] - camera.cx) / camera.fx, (at[..., 1] - camera.cy) / camera.fy
     return np.asarray(depth * (R[0] * x + R[1] * y + R[2] - 1.0) + t, dtype=np.float32)

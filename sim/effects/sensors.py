@@ -1,4 +1,4 @@
-"""Which sensor effects a scene's camera goes through, and why; none of their modules is imported for that."""
+"""Sensor effects of a scene's camera with their reasons; their modules are not imported."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 
 def sensor_effects_for(scene: Scene) -> tuple[EffectDecision, ...]:
-    """A decision on every sensor effect, in the order of :data:`EFFECTS`."""
+    """Decide on every sensor effect, in the order of :data:`EFFECTS`."""
     named = {_name(spec): spec for spec in (scene.camera.sensor if scene.camera is not None else ())}
-    absent = "no camera looks" if scene.camera is None else "the camera's sensor does not name it"
+    absent = "there is no camera" if scene.camera is None else "the camera's sensor does not name it"
     return tuple(
         decide(name, scene, f"the camera's sensor names {named[name]}" if name in named else "", absent)
         for name in EFFECTS
@@ -22,7 +22,7 @@ def sensor_effects_for(scene: Scene) -> tuple[EffectDecision, ...]:
 
 
 def sensor_specs(scene: Scene) -> tuple[str, ...]:
-    """The specs of the sensor's effects in their order, less what is forbidden; what is forced comes last."""
+    """Return the specs of the sensor's effects in order, without forbidden ones; forced ones come last."""
     if scene.camera is None:
         return ()
     kept = tuple(spec for spec in scene.camera.sensor if _name(spec) not in scene.effects.forbid)

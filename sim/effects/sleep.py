@@ -1,4 +1,4 @@
-"""What lies still is not computed until something wakes it."""
+"""Sleeping of bodies at rest, which MuJoCo does not simulate until they are disturbed."""
 
 from __future__ import annotations
 
@@ -14,28 +14,31 @@ if TYPE_CHECKING:
 
 
 class Sleep(PhysicsEffect):
-    """MuJoCo's sleeping islands; saves time and costs the last millimetres of creep."""
+    """MuJoCo's sleeping islands (``mjENBL_SLEEP``): bodies at rest are skipped until a contact or force wakes them.
+
+    It saves time, and suppresses the last millimetres of creep.
+    """
 
     name = "sleep"
-    cost = "less than nothing: it saves the steps of what rests"
+    cost = "negative: bodies at rest are skipped"
     observable = "asleep"
 
-    def called_for(self, scene: Scene) -> str:
-        """Movable things will come to rest."""
-        if scene.soft:  # a flex that sleeps wakes with stale elastic forces
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if movable objects come to rest."""
+        if scene.soft:  # a flex that wakes up has stale elastic forces
             return ""
         if scene.medium is not None and any(scene.medium.wind):
             return ""
-        return "movable things come to rest, and what rests need not be computed" if scene.movable else ""
+        return "movable objects come to rest, and bodies at rest can be skipped" if scene.movable else ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """Nothing can rest."""
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if no body can come to rest."""
         if scene.soft:
-            return "soft bodies are to stay awake"
-        return "in the wind nothing rests" if scene.movable else "there is nothing movable to rest"
+            return "soft bodies must stay awake"
+        return "in wind no body comes to rest" if scene.movable else "there is no movable object"
 
     def build(self, draft: Draft) -> None:
-        """MuJoCo's flag."""
+        """Set MuJoCo's flag."""
         draft.spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 

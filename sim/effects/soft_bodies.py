@@ -1,4 +1,4 @@
-"""Bodies that deform, by MuJoCo's flexes; without it they are rigid boxes."""
+"""Deformable bodies as MuJoCo flexes; without the effect they are rigid boxes."""
 
 from __future__ import annotations
 
@@ -16,44 +16,47 @@ if TYPE_CHECKING:
 
 
 class SoftBodies(PhysicsEffect):
-    """Finite elements of a grid in place of a rigid box."""
+    """Linear elastic finite elements on a grid (MuJoCo flex, trilinear) in place of a rigid box.
+
+    Young's modulus [Pa], Poisson ratio, density [kg/m³] and grid cells are those of the scene's soft shape.
+    """
 
     name = "soft_bodies"
-    cost = "elastic forces and degrees of freedom for each corner of each body"
+    cost = "elastic forces and degrees of freedom for each grid corner of each body"
     observable = "deformation"
 
-    def called_for(self, scene: Scene) -> str:
-        """There is something soft."""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if the scene has soft objects."""
         return f"{names_of(scene.soft)} deform" if scene.soft else ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """Nothing is."""
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if all objects are rigid."""
         return "everything is rigid"
 
     def build(self, draft: Draft) -> None:
-        """The rigid stand-ins make way; stiff springs call for an integrator that knows them."""
+        """Replace the rigid boxes by flexes, with an integrator that is stable for stiff springs."""
         if draft.scene.soft:
             kinds = mujoco.mjtIntegrator
             draft.spec.option.integrator = getattr(kinds, "mjINT_DISCRETE", kinds.mjINT_IMPLICITFAST)
-        for thing in draft.scene.soft:
-            draft.spec.delete(draft.bodies.pop(thing.name))
-            _attach(draft, thing)
+        for obj in draft.scene.soft:
+            draft.spec.delete(draft.bodies.pop(obj.name))
+            _attach(draft, obj)
 
 
-def _attach(draft: Draft, thing: SceneObject) -> None:
-    shape = thing.shapes[0]
+def _attach(draft: Draft, obj: SceneObject) -> None:
+    shape = obj.shapes[0]
     assert isinstance(shape, SoftGeom)
     size, cells = np.array(shape.size), np.array(shape.cells)
     radius = float(0.1 * (size / (cells - 1)).min())
     spacing = (size - 2 * radius) / (cells - 1)
     mass = float(size.prod() * shape.density)
     grid = f'type="grid" dim="3" dof="trilinear" count="{_text(cells)}" spacing="{_text(spacing)}"'
-    text = f"""<mujoco><worldbody><body name="{thing.name}">
-      <flexcomp name="{thing.name}" {grid} mass="{mass:.9g}" radius="{radius:.9g}" rgba="{_text(thing.color)} 1">
-        <contact selfcollide="none" friction="{thing.friction:.9g} 0.005 0.0001"/>
+    text = f"""<mujoco><worldbody><body name="{obj.name}">
+      <flexcomp name="{obj.name}" {grid} mass="{mass:.9g}" radius="{radius:.9g}" rgba="{_text(obj.color)} 1">
+        <contact selfcollide="none" friction="{obj.friction:.9g} 0.005 0.0001"/>
         <elasticity young="{shape.young:.9g}" poisson="{shape.poisson:.9g}" damping="0.002"/>
       </flexcomp></body></worldbody></mujoco>"""
-    frame = draft.spec.worldbody.add_frame(pos=list(thing.at), quat=quat_of(thing.rpy))
+    frame = draft.spec.worldbody.add_frame(pos=list(obj.at), quat=quat_of(obj.rpy))
     draft.spec.attach(mujoco.MjSpec.from_string(text), frame=frame, prefix="object/")
 
 

@@ -1,4 +1,4 @@
-"""Motors give no more than they can."""
+"""Limits of the motors' torques."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
     from splatbot.sim.world import Draft
 
-_PRESSING = ("grasp", "hang", "wipe", "squeeze")
+_CONTACT_TASKS = ("grasp", "hang", "wipe", "squeeze")
 
 
 class TorqueLimits(PhysicsEffect):
-    """Clamped motor forces: those of the robot's description."""
+    """Actuator forces [N m], clamped to the limits of the robot's description."""
 
     name = "torque_limits"
-    cost = "a clamp for each motor"
+    cost = "one clamp for each motor"
     observable = "overload"
 
-    def called_for(self, scene: Scene) -> str:
-        """The task presses on something, so that motors would push as hard as their error is large."""
-        if scene.robot is not None and scene.task.kind in _PRESSING:
-            return f"to {scene.task.kind} is to press, and motors stop at their limits"
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if the task presses on an object, so that position errors would create large torques."""
+        if scene.robot is not None and scene.task.kind in _CONTACT_TASKS:
+            return f"to {scene.task.kind} creates contact forces, and motors stop at their limits"
         return ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """The arm moves freely."""
-        return "the arm presses on nothing" if scene.robot is not None else "there is no robot"
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if the arm moves freely."""
+        return "the task creates no contact forces" if scene.robot is not None else "there is no robot"
 
     def build(self, draft: Draft) -> None:
-        """The ranges are in the specification already."""
+        """Enable the limits; their ranges are already in the specification."""
         for actuator in draft.spec.actuators:
             actuator.forcelimited = int(mujoco.mjtLimited.mjLIMITED_TRUE)
 

@@ -1,4 +1,4 @@
-"""Colours of a map that change with the direction they are seen from; without it each Gaussian has one."""
+"""View-dependent colours of a map; without the effect each Gaussian has one colour."""
 
 from __future__ import annotations
 
@@ -12,28 +12,31 @@ if TYPE_CHECKING:
 
 
 class ViewColor(PhysicsEffect):
-    """Costs when images are drawn, not when physics is stepped; the camera's map evaluates degree 0 where it is off."""
+    """Spherical harmonics of the Gaussians up to the map's degree (Kerbl et al. 2023); degree 0 without the effect.
+
+    It costs rendering time, not physics time.
+    """
 
     name = "view_color"
-    cost = "spherical harmonics of each Gaussian in view, in each drawn image"
+    cost = "spherical harmonics of each visible Gaussian, in each rendered image"
     observable = "harmonics"
 
-    def called_for(self, scene: Scene) -> str:
-        """A camera sees a map whose harmonics go beyond degree 0."""
+    def reason_on(self, scene: Scene) -> str:
+        """Return a reason if the scene has a camera and a map with harmonics beyond degree 0."""
         if scene.camera is not None and scene.map is not None and scene.map.harmonics:
             return f"a camera sees a map with colours of degree {scene.map.harmonics}"
         return ""
 
-    def not_called_for(self, scene: Scene) -> str:
-        """No map, nobody looks, or colours that do not change."""
+    def reason_off(self, scene: Scene) -> str:
+        """Return a reason if there is no map, no camera, or no view-dependent colour."""
         if scene.map is None:
             return "there is no map"
         if scene.camera is None:
-            return "no camera looks"
+            return "there is no camera"
         return "the map's colours are of degree 0"
 
     def build(self, draft: Draft) -> None:
-        """Nothing of it is in the physics; see :class:`splatbot.sim.map_view.MapView`."""
+        """Leave the physics unchanged; see :class:`splatbot.sim.map_view.MapView` for the rendering."""
 
 
 EFFECT = ViewColor()

@@ -1,4 +1,4 @@
-"""Where a camera that moves sees things a moment earlier or later."""
+"""Warps of a frame to the view of the same camera a moment earlier or later."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from splatbot.errors import InputError
 from splatbot.geometry import Array, inverse, se3_exp, se3_log
 from splatbot.trajectory import Trajectory
 
-_SURFACE = 0.02  # share of its depth by which neighbours of one surface differ
+_SURFACE_TOLERANCE = 0.02  # relative difference of depth between neighbouring pixels of one surface
 
 
 def motion_during(path: Trajectory | None, stamp: float, seconds: float, *, effect: str) -> list[Array]:
-    """T_now_then (4, 4) half of ``seconds`` before and after ``stamp`` [s].
+    """Return T_now_then (4, 4) of the times ``seconds / 2`` before and after ``stamp`` [s].
 
     Raises:
         InputError: the path is not known.
@@ -27,7 +27,7 @@ def motion_during(path: Trajectory | None, stamp: float, seconds: float, *, effe
 
 
 def pose_at(path: Trajectory, t: float) -> Array:
-    """T_world_camera (4, 4) at ``t`` [s]: constant twist between neighbours, and on beyond the ends."""
+    """Interpolate T_world_camera (4, 4) at ``t`` [s] with constant twist between poses; extrapolate beyond the ends."""
     if len(path) == 1:
         return path.T_world_camera[0]
     i = int(np.clip(np.searchsorted(path.stamps, t, "right") - 1, 0, len(path) - 2))
@@ -37,36 +37,36 @@ def pose_at(path: Trajectory, t: float) -> Array:
 
 
 def flow(camera: Camera, depth: NDArray[np.float32], T_now_then: Array) -> NDArray[np.float32]:
-    """How far (H, W, 2) [px] from a pixel of the view then lies, in the view now, what it shows."""
+    """Compute the displacement (H, W, 2) [px] of each pixel of the view then to the view now."""
     rays = camera.backproject(np.ones_like(depth))
     R, t = T_now_then[:3, :3].astype(np.float32), T_now_then[:3, 3].astype(np.float32)
-    nearness = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    inverse_depth = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
     # x/z of R·ray·depth + t, divided by the depth so that infinitely far is a number
-    x, y, z = (R[k, 0] * rays[..., 0] + R[k, 1] * rays[..., 1] + R[k, 2] + t[k] * nearness for k in range(3))
-    z = np.maximum(z, np.float32(1e-3))  # what would be behind the camera goes out of the image
+    x, y, z = (R[k, 0] * rays[..., 0] + R[k, 1] * rays[..., 1] + R[k, 2] + t[k] * inverse_depth for k in range(3))
+    z = np.maximum(z, np.float32(1e-3))  # points behind the camera leave the image
     u = (x / z - rays[..., 0]) * np.float32(camera.fx)
     v = (y / z - rays[..., 1]) * np.float32(camera.fy)
     return np.stack([u, v], axis=-1)
 
 
 def grid(height: int, width: int) -> NDArray[np.float32]:
-    """Each pixel's own place (H, W, 2)."""
+    """Return the coordinates (H, W, 2) of each pixel."""
     return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
 
 
 def color_at(rgb: NDArray[np.uint8], at: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) at places (H, W, 2) [px], between pixels; the border's outside."""
+    """Interpolate colours (H, W, 3) at positions (H, W, 2) [px]; outside, the border colour repeats."""
     found = cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found, dtype=np.uint8)
 
 
 def depth_at(depth: NDArray[np.float32], at: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (H, W) [m] at places (H, W, 2) [px]: between pixels of one surface, the nearest's at an edge; 0 outside."""
-    nearest, between = (_remapped(depth, at, how) for how in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
+    """Sample depth (H, W) [m] at (H, W, 2) [px]: linear on one surface, nearest at edges, 0 outside."""
+    nearest, linear = (_remapped(depth, at, mode) for mode in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
     whole = _remapped((depth > 0).astype(np.float32), at, cv2.INTER_LINEAR) > 0.999
-    return np.where(whole & (np.abs(between - nearest) <= _SURFACE * nearest), between, nearest)
+    return np.where(whole & (np.abs(linear - nearest) <= _SURFACE_TOLERANCE * nearest), linear, nearest)
 
 
-def _remapped(image: NDArray[np.float32], at: NDArray[np.float32], how: int) -> NDArray[np.float32]:
-    found = cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+def _remapped(image: NDArray[np.float32], at: NDArray[np.float32], mode: int) -> NDArray[np.float32]:
+    found = cv2.remap(image, at[..., 0], at[..., 1], mode, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray(found, dtype=np.float32)

@@ -7,22 +7,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_span
+from splatbot.sim.effects.base import Observable, check_fields, check_span
 
 
 @dataclass(frozen=True)
 class WhiteBalance:
-    """Each colour channel times a gain of its own, clipped to 0..255; depth is untouched.
+    """Simulated white balance: v' = clip(gain v, 0, 255) with one gain per channel; depth is unchanged.
 
-    Gains for channels are what white balance is (von Kries 1902); 8-bit values are taken as they are.
+    This is the diagonal model of von Kries (1902), applied to 8-bit values without the camera's response curve.
 
     Args:
         red, green, blue: gains from frame ``at`` on.
         at: first frame of the shift.
         until: first frame after it; 0 for never.
-        why: who asked for it.
+        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
@@ -33,19 +32,17 @@ class WhiteBalance:
     blue: float = 0.85
     at: int = 0
     until: int = 0
-    why: str = "asked for"
+    why: str = "requested"
     name: str = "white_balance"
     cost: ClassVar[str] = "a table look-up for each channel"
     observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
-        for name in ("red", "green", "blue"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise InputError(f"is {getattr(self, name)}.", field=name, hint="give a finite gain >= 0")
+        check_fields(self, "red", "green", "blue", hint="give a finite gain >= 0")
         check_span(self.at, self.until)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame in its shifted colours."""
+        """Multiply the colours by the gains."""
         if frame.index < self.at or (self.until and frame.index >= self.until):
             return frame
         gains = np.array([self.red, self.green, self.blue])

@@ -1,1 +1,1 @@
-"""From a Gaussian map to physics: the table, objects on it, and ellipsoids for the rest."""
+"""Conversion of a Gaussian map to collision geometry: the table, objects on it, and ellipsoids for the rest."""

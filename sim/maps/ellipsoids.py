@@ -9,11 +9,11 @@ import numpy as np
 from splatbot.geometry import quat_to_rotation, rotation_to_quat
 from splatbot.protocols import Array
 
-REACH = 0.9  # [m] from the base, as far as an arm of this size reaches
-_TANGENT, _NORMAL = 2.2, 1.0  # sigmas: wide enough to close gaps, thin enough not to lift what rests on them
-_THINNEST = 1e-3  # [m]
-_FINEST = 0.005  # [m] cell where there are few Gaussians
-_GROWTH = 1.15  # from one size of cells to the next
+REACH = 0.9  # [m] from the base; reach of an arm of this size
+_TANGENT, _NORMAL = 2.2, 1.0  # [sigma] half-axes: wide enough to close gaps, thin enough not to lift resting objects
+_MIN_AXIS = 1e-3  # [m]
+_MIN_CELL = 0.005  # [m]
+_GROWTH = 1.15  # factor between tried cell sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Ellipsoids:
 
 
 def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: int) -> Ellipsoids:
-    """At most ``limit`` ellipsoids for Gaussians; each has the mean and covariance of those in its cell of space.
+    """Merge Gaussians to at most ``limit`` ellipsoids, with the mean and covariance of those in each cell.
 
     Cells have one size within 0.9 m of ``base`` and grow with the distance beyond.
 
@@ -45,12 +45,12 @@ def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: 
         covariances: (N, 3, 3) [m²].
         weights: (N,).
         base: (3,) of the robot [m].
-        limit: how many there may be.
+        limit: maximum number.
     """
     empty = np.zeros((0, 3))
     if limit == 0 or not len(means):
         return Ellipsoids(empty, empty, np.zeros((0, 4)), 0.0, 0.0)
-    size = _FINEST
+    size = _MIN_CELL
     while True:
         cell = _cells(means, base, size)
         if int(cell.max()) < limit:
@@ -67,7 +67,7 @@ def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: 
     values, R = np.linalg.eigh(merged.reshape(-1, 3, 3))
     R[np.linalg.det(R) < 0, :, 0] *= -1
     axes = np.sqrt(np.maximum(values, 0)) * [_NORMAL, _TANGENT, _TANGENT]
-    axes = np.maximum(axes, _THINNEST)
+    axes = np.maximum(axes, _MIN_AXIS)
     distance = np.abs(_distance(np.einsum("nij,ni->nj", R[cell], away), axes[cell]))
     return Ellipsoids(
         centers, axes, rotation_to_quat(R), float(distance.mean()), float(np.percentile(distance, 95))
@@ -75,7 +75,7 @@ def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: 
 
 
 def surface_points(ellipsoids: Ellipsoids) -> Array:
-    """Points (E, 14, 3) of their surfaces [m]: the ends of the axes, and the middles of the octants."""
+    """Sample points (E, 14, 3) on the surfaces [m]: the ends of the axes, and the centres of the octants."""
     corners = np.stack(np.meshgrid(*3 * [[-1.0, 1.0]], indexing="ij"), axis=-1).reshape(-1, 3) / np.sqrt(3)
     directions = np.concatenate([np.eye(3), -np.eye(3), corners])
     local = ellipsoids.axes[:, None] * directions
@@ -85,7 +85,7 @@ def surface_points(ellipsoids: Ellipsoids) -> Array:
 
 
 def _cells(means: Array, base: Array, size: float) -> np.ndarray:
-    """A number for each Gaussian's cell: shells of doubling cells, by distance beyond the reach."""
+    """Assign a cell number to each Gaussian; cells double in size in shells beyond the reach."""
     beyond = np.maximum(np.linalg.norm(means - base, axis=1) - REACH, 0.0)
     shell = np.minimum(np.ceil(np.log2(1.0 + beyond / (0.5 * REACH))), 6).astype(np.int64)
     index = np.floor(means / (size * 2.0**shell)[:, None]).astype(np.int64)
@@ -93,9 +93,9 @@ def _cells(means: Array, base: Array, size: float) -> np.ndarray:
 
 
 def _distance(p: Array, axes: Array) -> Array:
-    """Signed distance of points to axis-aligned ellipsoids, to first order (Quilez): k0 (k0 - 1) / k1.
+    """Approximate the signed distance of points to axis-aligned ellipsoids to first order (Quilez): k0 (k0 - 1) / k1.
 
-    Inside, no point is farther from the surface than along the shortest axis.
+    Inside, the distance is limited to that along the shortest axis.
     """
     k0 = np.linalg.norm(p / axes, axis=1)
     k1 = np.maximum(np.linalg.norm(p / axes**2, axis=1), 1e-12)

@@ -1,4 +1,4 @@
-"""A scene of a map whose `scene.yaml` says where the robot stands in it, what is down and where the table is."""
+"""A scene from a map and its `scene.yaml`, which gives the base pose, gravity and support plane."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ _MAP = "map.ply"
 
 
 def placed_scene(place: Path) -> dict[str, Any]:
-    """What :func:`splatbot.sim.scene.make_scene` takes: the map, in the frame of the robot's base.
+    """Return the values for :func:`splatbot.sim.scene.make_scene`: the map in the frame of the robot's base.
 
     Args:
-        place: a run's folder, or a map file; without a `scene.yaml` beside it, a file's own frame is the base's.
+        place: a run's folder, or a map file. Without a `scene.yaml` next to a map
+            file, its own frame is that of the base.
 
     Raises:
-        InputError: it is a folder without a map, or a run that does not say where the robot stands.
+        InputError: the folder has no map, or the run has no base pose.
         FormatError: the `scene.yaml` is damaged.
     """
     file = place / _MAP if place.is_dir() else place
@@ -33,7 +34,7 @@ def placed_scene(place: Path) -> dict[str, Any]:
     if known is None or known.T_world_base is None:
         if place.is_dir():
             hint = "write a scene.yaml: splatbot info RUN --fit-plane estimates one"
-            raise InputError("does not say where the robot stands.", file=place, field="T_world_base", hint=hint)
+            raise InputError("does not define the base pose.", field="T_world_base", file=place, hint=hint)
         return values
     return values | _placed(values["map"], known, inverse(known.T_world_base))
 

@@ -1,1 +1,1 @@
-"""Picking trials: seeded scenes, each scanned, mapped, and picked from by stacks that know nothing but the scan."""
+"""Simulated picking trials: seeded scenes, each scanned, mapped, and picked from by stacks that use only the scan."""

@@ -1,4 +1,4 @@
-"""RRT-Connect and shortcuts that ask at single configurations whether they are free, as most stacks do."""
+"""RRT-Connect and shortcuts with collision checks at discrete configurations, as in most motion planning stacks."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-Free = Callable[[Array], NDArray[np.bool_]]  # of configurations (C, J)
+Free = Callable[[Array], NDArray[np.bool_]]  # configurations (C, J) -> free (C,)
 
-RESOLUTION = 1 / 32  # [rad] between the configurations of an edge that are asked
-_STEP = 0.6  # [rad] that a tree grows at once
-_CUTS = 40  # shortcuts that are tried
+RESOLUTION = 1 / 32  # [rad] between the checked configurations of an edge
+_STEP = 0.6  # [rad] extension of a tree
+_CUTS = 40  # shortcut attempts
 
 
 def edge_free(free: Free, a: Array, b: Array) -> bool:
-    """Whether the configurations on the straight edge between two (J,) are free, ``b`` included."""
+    """Return whether the configurations on the straight edge between two (J,) are free, ``b`` included."""
     count = max(1, int(np.ceil(np.linalg.norm(b - a) / RESOLUTION)))
     shares = np.arange(1, count + 1) / count
     return bool(free(a + shares[:, None] * (b - a)).all())
 
 
 def connect(free: Free, lower: Array, upper: Array, start: Array, goal: Array, *, seconds: float, seed: int) -> Array:
-    """Waypoints (N, J) of a path made shorter, N = 0 if none was found in time (Kuffner and LaValle 2000).
+    """Plan a shortcut path by RRT-Connect (Kuffner and LaValle 2000): waypoints (N, J), N = 0 without a path in time.
 
     Args:
-        free: says which configurations are.
-        lower, upper: (J,) limits of the joints.
+        free: returns which configurations are free.
+        lower, upper: (J,) joint limits.
         start, goal: (J,), both free.
-        seconds: to find a first path in.
+        seconds: time limit [s] of the first path.
         seed: of the samples.
     """
     until = time.perf_counter() + seconds
@@ -53,7 +53,7 @@ def connect(free: Free, lower: Array, upper: Array, start: Array, goal: Array, *
 
 
 def shortened(free: Free, path: Array, rng: np.random.Generator) -> Array:
-    """The path (N, J) after attempts to join two places on it straight."""
+    """Shorten a path (N, J) by straight connections between two random positions on it."""
     for _ in range(_CUTS):
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         low, high = np.sort(rng.uniform(0.0, along[-1], 2))
@@ -68,11 +68,11 @@ class _Tree:
         self.nodes, self.parents = [root], [-1]
 
     def extend(self, free: Free, to: Array) -> int | None:
-        """One step towards a configuration; the new node, or None if that is not free."""
+        """Extend the tree by one step towards a configuration; return the new node, or None if it is not free."""
         nearest = int(np.argmin(np.linalg.norm(np.array(self.nodes) - to, axis=1)))
-        way = to - self.nodes[nearest]
-        length = float(np.linalg.norm(way))
-        end = self.nodes[nearest] + way * min(1.0, _STEP / max(length, 1e-12))
+        direction = to - self.nodes[nearest]
+        length = float(np.linalg.norm(direction))
+        end = self.nodes[nearest] + direction * min(1.0, _STEP / max(length, 1e-12))
         if length < 1e-9 or not edge_free(free, self.nodes[nearest], end):
             return None
         self.nodes.append(end)
@@ -80,7 +80,7 @@ class _Tree:
         return len(self.nodes) - 1
 
     def reach(self, free: Free, to: Array, until: float) -> int | None:
-        """Steps towards a configuration until it is there; None if something is between."""
+        """Extend the tree until it reaches a configuration; return its node, or None if an obstacle is in between."""
         while time.perf_counter() < until:
             node = self.extend(free, to)
             if node is None:

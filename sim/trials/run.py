@@ -1,4 +1,4 @@
-"""Many trials, over processes; each is written down when it is done, and what was done is not done again."""
+"""Simulated trials in parallel processes; each result is written when it is complete, and is not computed again."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from splatbot.sim.trials.trial import TrialRow, run_trial
 
 FILE = "trials.jsonl"
 STACKS = ("gaussians", "mesh", "cloud")
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 
 class TrialError(SplatbotError):
-    """A trial ended by an error of the program, which says nothing of the grasp."""
+    """A trial ended by an error of the program, which is no result about the grasp."""
 
 
 @dataclass(frozen=True)
 class TrialsPlan:
-    """What to run.
+    """Trials to run.
 
     Args:
         family: of :data:`splatbot.sim.trials.scenes.FAMILIES`.
-        trials: seeds, from ``first`` on.
+        trials: number of seeds, from ``first`` on.
         stacks: names of :data:`STACKS`.
-        first: seed.
-        jobs: processes.
+        first: first seed.
+        jobs: number of processes.
         frames, width: of each scan.
-        videos: whether to film what failed.
+        videos: whether to record videos of failures.
 
     Raises:
         InputError: a value is out of range, or a name unknown.
@@ -67,15 +67,15 @@ class TrialsPlan:
 
     @property
     def seeds(self) -> range:
-        """In their order."""
+        """Seeds in their order."""
         return range(self.first, self.first + self.trials)
 
 
 def stack_of(name: str) -> Stack:
-    """A stack by its name.
+    """Return a stack by its name.
 
     Raises:
-        InputError: python-fcl, which the others need, is not installed.
+        InputError: python-fcl, which the other stacks need, is not installed.
     """
     if name == "gaussians":
         return GaussianStack()
@@ -86,36 +86,38 @@ def stack_of(name: str) -> Stack:
     return MeshStack() if name == "mesh" else CloudStack()
 
 
-def run_trials(plan: TrialsPlan, folder: Path, *, tell: Tell = lambda what, share: None) -> tuple[list[TrialRow], bool]:
-    """All trials of a plan that ``folder`` does not have yet.
+def run_trials(
+    plan: TrialsPlan, folder: Path, *, on_progress: OnProgress = lambda step, share: None
+) -> tuple[list[TrialRow], bool]:
+    """Run all trials of a plan that ``folder`` does not contain yet.
 
     Returns:
         The rows of the plan in the order of seeds and stacks, and whether Ctrl-C ended it early.
 
     Raises:
         FormatError: the file in the folder is damaged.
-        TrialError: a trial failed; those before it are written.
+        TrialError: a trial failed; earlier results are in the file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / FILE
-    # Rows of another scan are of another trial, and stay in the file beside these.
+    # Rows of another scan resolution belong to other trials, and stay in the file.
     same = (row for row in read_rows(path) if (row.frames, row.pixels) == (plan.frames, plan.width))
     done = {(row.family, row.seed, row.stack): row for row in same}
     for name in plan.stacks:
         stack_of(name)
-    wanted = [(seed, tuple(n for n in plan.stacks if (plan.family, seed, n) not in done)) for seed in plan.seeds]
-    wanted = [(seed, names) for seed, names in wanted if names]
+    pending = [(seed, tuple(n for n in plan.stacks if (plan.family, seed, n) not in done)) for seed in plan.seeds]
+    pending = [(seed, names) for seed, names in pending if names]
     interrupted = False
-    count = len(plan.seeds) - len(wanted)
+    count = len(plan.seeds) - len(pending)
     try:
         with path.open("a", encoding="utf-8") as file:
-            for rows in _results(plan, folder, wanted):
+            for rows in _results(plan, folder, pending):
                 for row in rows:
                     done[row.family, row.seed, row.stack] = row
                     file.write(json.dumps(row.to_dict()) + "\n")
                 file.flush()
                 count += 1
-                tell(f"{plan.family}, {count} of {len(plan.seeds)} scenes", count / len(plan.seeds))
+                on_progress(f"{plan.family}, {count} of {len(plan.seeds)} scenes", count / len(plan.seeds))
     except KeyboardInterrupt:
         interrupted = True
     keys = ((plan.family, seed, name) for name in plan.stacks for seed in plan.seeds)
@@ -123,7 +125,7 @@ def run_trials(plan: TrialsPlan, folder: Path, *, tell: Tell = lambda what, shar
 
 
 def read_rows(path: Path) -> list[TrialRow]:
-    """The rows of a file, none if it is not there; a last line that was cut short is left out.
+    """Read the rows of a file, or none if it does not exist; an incomplete last line is removed.
 
     Raises:
         FormatError: a line before the last is no row.
@@ -144,12 +146,14 @@ def read_rows(path: Path) -> list[TrialRow]:
     return rows
 
 
-def _results(plan: TrialsPlan, folder: Path, wanted: Sequence[tuple[int, tuple[str, ...]]]) -> Iterator[list[TrialRow]]:
-    jobs = [(plan, str(folder), seed, names) for seed, names in wanted]
+def _results(
+    plan: TrialsPlan, folder: Path, pending: Sequence[tuple[int, tuple[str, ...]]]
+) -> Iterator[list[TrialRow]]:
+    jobs = [(plan, str(folder), seed, names) for seed, names in pending]
     if plan.jobs == 1 or len(jobs) < 2:
         yield from map(_job, jobs)
         return
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes that begin now, which are as many as was asked for
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the new processes; their number is the user's choice
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(plan.jobs, len(jobs)), mp_context=context, initializer=begin_worker) as pool:
         futures = {pool.submit(_job, job) for job in jobs}
@@ -164,7 +168,7 @@ def _results(plan: TrialsPlan, folder: Path, wanted: Sequence[tuple[int, tuple[s
 
 
 def begin_worker() -> None:
-    """One thread a process, which ends with the one that began it, even if that was killed."""
+    """Limit a process to one thread, and end it when its parent ends, even if the parent was killed."""
     torch.set_num_threads(1)
     threading.Thread(target=_follow_parent, daemon=True).start()
 

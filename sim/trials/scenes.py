@@ -1,4 +1,4 @@
-"""Seeded table tops to pick from: single convex things, or cups, tools and clutter, with something that moves."""
+"""Seeded table-top scenes to pick from: single convex objects, or cups, tools and clutter with a moving obstacle."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from splatbot.sim.world import OBJECT
 FAMILIES = ("tabletop", "isolated")
 TABLE, OBSTACLE = "table", "obstacle"
 SENSOR = ("depth_noise", "depth_holes:share=0.05")
-_AREA = ((0.36, -0.26), (0.64, 0.26))  # [m] corners of where things stand
-_BETWEEN = (0.02, 0.05)  # [m] of room between the things of a table top; drawn
+_AREA = ((0.36, -0.26), (0.64, 0.26))  # [m] corners of the area with objects
+_SPACING = (0.02, 0.05)  # [m] range of the clearance between objects
 _MASS = (0.1, 0.5)  # [kg]
 _FRICTION = (0.5, 0.9)
-_SETTLE = 1.5  # [s] until all is at rest
-_EVERY = 5  # of the table tops, one has something that moves
+_SETTLE = 1.5  # [s] until all objects are at rest
+_MOVING_EVERY = 5  # every n-th table top has a moving obstacle
 _TRIES = 300
 _COLORS = (
     (0.85, 0.20, 0.18), (0.20, 0.45, 0.85), (0.95, 0.75, 0.15), (0.25, 0.65, 0.35), (0.60, 0.30, 0.70),
@@ -33,15 +33,15 @@ _COLORS = (
 
 @dataclass(frozen=True, eq=False)
 class TrialScene:
-    """What a trial is about.
+    """Scene and target of a trial.
 
     Args:
-        scene: of the twin, everything at rest; the robot's base is its origin.
-        target: name of what is to be picked.
-        kind: of the target, in a word.
+        scene: of the twin, with all objects at rest; the robot's base is its origin.
+        target: name of the object to pick.
+        kind: of the target.
         seed: of this scene.
         family: of :data:`FAMILIES`.
-        moving: whether something moves through it.
+        moving: whether an obstacle moves through the scene.
     """
 
     scene: Scene
@@ -54,8 +54,15 @@ class TrialScene:
 
 @dataclass(frozen=True)
 class _TrialObject:
-    """Something that may stand on the table: its shapes about its origin, the origin's height as it stands, how far it
-    reaches from there sideways [m], and whether the hand goes around it."""
+    """An object on the table.
+
+    Args:
+        kind: of object.
+        shapes: in its own frame.
+        height: of its origin over the table [m].
+        radius: horizontal extent from its origin [m].
+        fits: whether the hand fits around it.
+    """
 
     kind: str
     shapes: tuple[dict[str, Any], ...]
@@ -65,21 +72,21 @@ class _TrialObject:
 
 
 def make_trial(seed: int, family: str = "tabletop") -> TrialScene:
-    """The scene of a seed; the same seed gives the same.
+    """Create the scene of a seed; the same seed gives the same scene.
 
-    Things come to rest by physics before they are looked at.
+    Physics brings all objects to rest before the scan.
 
     Raises:
-        InputError: there is no such family.
+        InputError: the family is unknown.
     """
     if family not in FAMILIES:
         raise InputError(f"is {family!r}.", field="scenes", hint=f"one of {', '.join(FAMILIES)}")
     rng = np.random.default_rng((FAMILIES.index(family), seed))
-    things = [_CONVEX[seed % len(_CONVEX)](rng)] if family == "isolated" else _table_top(rng)
-    moving = family == "tabletop" and seed % _EVERY == _EVERY - 1
-    placed = _placed(things, rng)
+    items = [_CONVEX[seed % len(_CONVEX)](rng)] if family == "isolated" else _table_top(rng)
+    moving = family == "tabletop" and seed % _MOVING_EVERY == _MOVING_EVERY - 1
+    placed = _placed(items, rng)
     values = [value for _, value in placed]
-    k = int(rng.choice([k for k, (thing, _) in enumerate(placed) if thing.fits]))
+    k = int(rng.choice([k for k, (item, _) in enumerate(placed) if item.fits]))
     objects = [{"name": TABLE, "shapes": [{"kind": "plane"}], "color": [0.55, 0.45, 0.35]}, *values]
     if moving:
         objects.append(_obstacle(rng))
@@ -95,10 +102,10 @@ def make_trial(seed: int, family: str = "tabletop") -> TrialScene:
 
 
 def _table_top(rng: np.random.Generator) -> list[_TrialObject]:
-    things = [_cup(rng), _tool(rng), _can(rng), _box(rng)]
+    items = [_cup(rng), _tool(rng), _can(rng), _box(rng)]
     more: list[Callable[[np.random.Generator], _TrialObject]] = [_cup, _tool, _ball, _book, _box, _lying]
     chosen = rng.choice(len(more), int(rng.integers(1, 4)), replace=False)
-    return things + [more[k](rng) for k in chosen]
+    return items + [more[k](rng) for k in chosen]
 
 
 def _box(rng: np.random.Generator) -> _TrialObject:
@@ -136,7 +143,7 @@ def _book(rng: np.random.Generator) -> _TrialObject:
 
 
 def _cup(rng: np.random.Generator) -> _TrialObject:
-    """Hollow and open at the top: staves around a bottom."""
+    """Create a cup, hollow and open at the top: staves around a bottom."""
     r, h, wall, staves = float(rng.uniform(0.028, 0.035)), float(rng.uniform(0.07, 0.11)), 0.004, 16
     middle = r - wall / 2
     wide = 2 * middle * np.tan(np.pi / staves) + wall / 2
@@ -150,7 +157,7 @@ def _cup(rng: np.random.Generator) -> _TrialObject:
 
 
 def _tool(rng: np.random.Generator) -> _TrialObject:
-    """A mallet that lies: a handle between a head and a knob, which keep it off the table."""
+    """Create a mallet that lies on the table: a handle between a head and a knob, which keep it off the table."""
     r, length, head = float(rng.uniform(0.011, 0.015)), float(rng.uniform(0.13, 0.18)), float(rng.uniform(0.04, 0.05))
     shapes: tuple[dict[str, Any], ...] = (
         {"kind": "cylinder", "radius": r, "height": length, "rpy": [0.0, np.pi / 2, 0.0]},
@@ -163,41 +170,41 @@ def _tool(rng: np.random.Generator) -> _TrialObject:
 _CONVEX: tuple[Callable[[np.random.Generator], _TrialObject], ...] = (_box, _can, _ball, _lying, _box, _egg)
 
 
-def _placed(things: list[_TrialObject], rng: np.random.Generator) -> list[tuple[_TrialObject, dict[str, Any]]]:
-    """Scene objects at places that are drawn until they keep clear of each other; what finds none is left out."""
+def _placed(items: list[_TrialObject], rng: np.random.Generator) -> list[tuple[_TrialObject, dict[str, Any]]]:
+    """Place objects at random without overlap; an object without a free place is left out."""
     taken: list[tuple[Array, float]] = []
     found: list[tuple[_TrialObject, dict[str, Any]]] = []
     colors = rng.permutation(len(_COLORS))
-    for k, thing in enumerate(things):
-        apart = float(rng.uniform(*_BETWEEN))
-        at = _free_place(thing.radius + apart, taken, rng)
+    for k, item in enumerate(items):
+        apart = float(rng.uniform(*_SPACING))
+        at = _free_place(item.radius + apart, taken, rng)
         if at is None:
             continue
-        taken.append((at, thing.radius))
+        taken.append((at, item.radius))
         value = {
-            "name": f"{thing.kind.replace(' ', '-')}-{k}",
-            "shapes": thing.shapes,
-            "at": [*at.tolist(), thing.height + 5e-4],
+            "name": f"{item.kind.replace(' ', '-')}-{k}",
+            "shapes": item.shapes,
+            "at": [*at.tolist(), item.height + 5e-4],
             "rpy": [0.0, 0.0, float(rng.uniform(-np.pi, np.pi))],
             "movable": True,
             "mass": float(rng.uniform(*_MASS)),
             "friction": float(rng.uniform(*_FRICTION)),
             "color": _COLORS[colors[k % len(_COLORS)]],
         }
-        found.append((thing, value))
+        found.append((item, value))
     return found
 
 
-def _free_place(room: float, taken: list[tuple[Array, float]], rng: np.random.Generator) -> Array | None:
+def _free_place(distance: float, taken: list[tuple[Array, float]], rng: np.random.Generator) -> Array | None:
     for _ in range(_TRIES):
         at = rng.uniform(*np.array(_AREA))
-        if all(np.linalg.norm(at - other) > room + radius for other, radius in taken):
+        if all(np.linalg.norm(at - other) > distance + radius for other, radius in taken):
             return at
     return None
 
 
 def _obstacle(rng: np.random.Generator) -> dict[str, Any]:
-    """Somebody's lower arm that goes to and fro at the table's far side or beside it, over the things."""
+    """Create an obstacle like a person's forearm that moves along the table's far side, over the objects."""
     side, speed = float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.05, 0.15))
     z = float(rng.uniform(0.22, 0.30))
     ends = [[0.75, side * 0.40, z], [0.45, side * 0.40, z]]
@@ -210,7 +217,7 @@ def _obstacle(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _settled(scene: Scene) -> Scene:
-    """The scene with its movable things where physics brings them to rest."""
+    """Return the scene with its movable objects at rest."""
     twin = Twin(scene)
     assert twin.follower is not None
     q = np.array(twin.data.qpos[twin.follower.qpos])
@@ -218,9 +225,9 @@ def _settled(scene: Scene) -> Scene:
     for k in range(round(_SETTLE * twin.rate)):
         twin.advance(k / twin.rate, q, still, still, None)
     values = scene.model_dump()
-    for thing in values["objects"]:
-        if thing["movable"]:
-            body = twin.data.body(OBJECT + thing["name"])
-            thing["at"] = tuple(np.asarray(body.xpos).tolist())
-            thing["rpy"] = rpy_of(np.asarray(body.xmat).reshape(3, 3))
+    for item in values["objects"]:
+        if item["movable"]:
+            body = twin.data.body(OBJECT + item["name"])
+            item["at"] = tuple(np.asarray(body.xpos).tolist())
+            item["rpy"] = rpy_of(np.asarray(body.xmat).reshape(3, 3))
     return make_scene({**values, "folder": scene.folder})

@@ -1,4 +1,4 @@
-"""Shaking what is held."""
+"""Shaking of a held object."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from splatbot.protocols import Array, KinematicChain
 
 RATE = 3.0  # [Hz]
 SECONDS = 2.0
-SHARE = 0.6  # of the joints' limits of acceleration
+SHARE = 0.6  # fraction of the joints' acceleration limits
 
 
 @dataclass(frozen=True, eq=False)
 class Shake:
-    """Every joint to and fro about where it is, growing at the start and fading at the end.
+    """Sinusoidal motion of every joint about its position, with a smooth start and end.
 
     Accelerations stay within ``SHARE`` of the joints' limits in the middle, and joints within their ranges.
 
     Args:
         chain: of the arm.
-        q: (J,) about which.
+        q: (J,) centre of the motion.
         duration: [s].
     """
 
@@ -31,13 +31,13 @@ class Shake:
 
     @property
     def amplitude(self) -> Array:
-        """Of each joint (J,) [rad]; every other one moves the other way."""
+        """Amplitude of each joint (J,) [rad]; signs alternate."""
         most = SHARE * self.chain.acceleration / (2 * np.pi * RATE) ** 2
         inside = np.minimum(self.q - self.chain.lower, self.chain.upper - self.q)
         return np.asarray(np.minimum(most, np.maximum(inside, 0.0)) * (-1.0) ** np.arange(len(self.q)))
 
     def reference(self, t: float) -> tuple[Array, Array]:
-        """See :class:`splatbot.protocols.TimedPath`."""
+        """Implement :meth:`splatbot.protocols.TimedPath.reference`."""
         x = float(np.clip(t, 0.0, self.duration))
         w, grow = 2 * np.pi * RATE, np.pi / self.duration
         swell, turn = np.sin(grow * x) ** 2, np.sin(w * x)
@@ -46,6 +46,6 @@ class Shake:
 
 
 def strength(shake: Shake, tool: Array) -> float:
-    """The largest acceleration of a tool's place [m/s²]; ``tool`` are its places (N, 3) [m] at N even times."""
+    """Compute the largest acceleration of a tool [m/s²] from its positions (N, 3) [m] at N equally spaced times."""
     step = shake.duration / (len(tool) - 1)
     return float(np.linalg.norm(np.diff(tool, n=2, axis=0), axis=1).max() / step**2)

@@ -1,4 +1,4 @@
-"""Ways among meshes and octrees: the arm's capsules by python-fcl, configuration by configuration."""
+"""Paths among meshes and octrees: the arm's capsules against them by python-fcl at discrete configurations."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from splatbot.robots.robot import RobotModel
 from splatbot.robots.shapes import Capsule
 from splatbot.sim.trials.discrete import RESOLUTION, Free, connect
 
-SECONDS = 2.0  # to find a first path in
+SECONDS = 2.0  # [s] time limit of the first path
 _SEEDS = 8  # of inverse kinematics
 
 
 @dataclass(frozen=True, eq=False)
 class SolidWorld:
-    """What an arm must not touch, as python-fcl's geometries.
+    """Obstacles of an arm as python-fcl geometries.
 
     Args:
-        points: (P, 3) that it was made of [m].
-        whole: all of it.
-        around: without some, given their rows.
+        points: (P, 3) of the surface [m].
+        whole: geometry of all points.
+        around: returns the geometry without the given rows.
     """
 
     points: Array
@@ -48,10 +48,10 @@ class SolidWorld:
 
 
 class SolidArm:
-    """An arm's capsules, all but the base's, against one of python-fcl's geometries and against itself.
+    """An arm's capsules, except those of the base, against a python-fcl geometry and against itself.
 
     Args:
-        robot: of capsules.
+        robot: with capsules.
         T_world_base: (4, 4).
         opening: of the fingers [m].
         world: the geometry.
@@ -69,7 +69,7 @@ class SolidArm:
                        (*_capsules(fcl, robot, opening), *_held(fcl, robot, attached))]  # fmt: skip
 
     def free(self, q: Array) -> NDArray[np.bool_]:
-        """Which of configurations (C, J) touch nothing."""
+        """Return which configurations (C, J) are without contact."""
         good = ~self.spheres.check(None, q).in_collision
         poses = self.spheres.forward(q)
         for c in np.flatnonzero(good):
@@ -82,12 +82,12 @@ class SolidArm:
 
 
 class SolidReach:
-    """Whether the arm gets to a grasp; see :class:`splatbot.grasping.reach.Reach`.
+    """Reachability check of grasps; see :class:`splatbot.grasping.reach.Reach`.
 
     Args:
         robot: the arm.
         T_world_base: (4, 4).
-        world: what is around.
+        world: obstacles.
         rows: of the target.
     """
 
@@ -96,7 +96,7 @@ class SolidReach:
         self._around = world.around(rows)
 
     def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
-        """See :class:`splatbot.grasping.reach.Reach`."""
+        """Implement :meth:`splatbot.grasping.reach.Reach.reach`."""
         near = SolidArm(self.robot, self.T, opening, self._around)
         far = SolidArm(self.robot, self.T, opening, self.world.whole)
         chain = self.robot.chain
@@ -118,13 +118,13 @@ class SolidReach:
 
 
 class SolidPickPlanner:
-    """Ways to grasps; see :class:`splatbot.grasping.pick_planner.PickPlanner`.
+    """Planner of paths to grasps; see :class:`splatbot.grasping.pick_planner.PickPlanner`.
 
     Args:
         sampler: of the grasps.
-        target: that is to be picked.
-        options: how.
-        world: what is around.
+        target: object to pick.
+        options: of the pick.
+        world: obstacles.
     """
 
     def __init__(self, sampler: GraspSampler, target: Target, options: PickOptions, world: SolidWorld) -> None:
@@ -135,10 +135,10 @@ class SolidPickPlanner:
         self._object = target_spheres(sampler, target)
         own = within(world.points, self._object)
         own[target.rows] = True
-        self._beside = world.around(np.flatnonzero(own))
+        self._without_object = world.around(np.flatnonzero(own))
 
     def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
-        """See :class:`splatbot.grasping.pick_planner.PickPlanner`; of what moved nothing is known here."""
+        """Plan a pick; see :class:`splatbot.grasping.pick_planner.PickPlanner`."""
         if grasp.q_pregrasp is None:
             return "no posture is known"
         opening = min(grasp.opening, self.s.hand.stroke)
@@ -153,12 +153,12 @@ class SolidPickPlanner:
         if approach is None:
             return "its approach is blocked"
         q = approach[-1]
-        closed = SolidArm(self.robot, self._T, grasp.width, self._beside)
+        closed = SolidArm(self.robot, self._T, grasp.width, self._without_object)
         attached = in_hand(closed.spheres, q, self._object)
         lift_off = straight(closed, closed.free, q, raised(self.s, closed.spheres, q, self.o.lift_off))
         if lift_off is None:
             return "it cannot be lifted"
-        loaded = SolidArm(self.robot, self._T, grasp.width, self._beside, attached)
+        loaded = SolidArm(self.robot, self._T, grasp.width, self._without_object, attached)
         top = raised(self.s, closed.spheres, lift_off[-1], self.o.lift - self.o.lift_off)
         lift = straight(loaded, loaded.free, lift_off[-1], top)
         if lift is None:
@@ -175,8 +175,8 @@ class SolidPickPlanner:
         )
 
     def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
-        """See :class:`splatbot.grasping.pick_planner.PickPlanner`."""
-        loaded = SolidArm(self.robot, self._T, plan.grasp.width, self._beside, plan.attached)
+        """Plan the motion after a pick; see :class:`splatbot.grasping.pick_planner.PickPlanner`."""
+        loaded = SolidArm(self.robot, self._T, plan.grasp.width, self._without_object, plan.attached)
         path = self._connect(loaded, start, np.asarray(goal.q, dtype=np.float64))
         return "no path was found" if path is None else _segment(path, loaded)
 
@@ -189,7 +189,7 @@ class SolidPickPlanner:
 
 
 def straight(arm: SolidArm, free: Free, start: Array, T_world_end: Array) -> Array | None:
-    """Configurations (K, J) along the tool's straight line, if all of them are free."""
+    """Return the configurations (K, J) along the tool's straight line, if all of them are free."""
     line = straight_line(arm.spheres, None, start, T_world_end)
     if not line or line.path is None:
         return None
@@ -197,7 +197,7 @@ def straight(arm: SolidArm, free: Free, start: Array, T_world_end: Array) -> Arr
 
 
 def _segment(path: Array, arm: SolidArm) -> Segment:
-    """Close waypoints, so that corners are hardly rounded: how far that may go nobody knows here."""
+    """Sample the waypoints densely, so that corners are hardly rounded; the deviation is not certified."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     parts = [
         a + np.linspace(0.0, 1.0, max(1, int(np.ceil(length / (4 * RESOLUTION)))), endpoint=False)[:, None] * (b - a)

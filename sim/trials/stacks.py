@@ -1,4 +1,4 @@
-"""What the stacks of a trial have in common: the scan goes in, grasps and ways to them come out."""
+"""Common interface of the stacks of a trial: from a scan to grasps and paths to them."""
 
 from __future__ import annotations
 
@@ -22,113 +22,113 @@ from splatbot.planning import JointGoal
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.segmentation import SegmentedMap, segment
-from splatbot.sim.trials.look import Look
+from splatbot.sim.trials.scan import TrialScan
 
-LIFT = 0.18  # [m]; 15 cm are asked for
-BUDGET_MS = 28.0  # of the search for a way
-_OFTEN = 3  # keyframes that must support what is no air
+LIFT = 0.18  # [m]; success requires 0.15 m
+BUDGET_MS = 28.0  # [ms] of the path search
+_MIN_OBSERVATIONS = 3  # keyframes that must support a Gaussian
 OPTIONS = PickOptions(lift=LIFT, budget_ms=BUDGET_MS, tries=8, grasp=GraspOptions())
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
-    """What a stack made of a scan.
+class StackMap:
+    """A stack's representation of a scan.
 
     Args:
-        scene: its surface, segmented.
-        towards: for a target, who samples its grasps and who finds ways to them.
-        world_bytes: of what it plans in.
-        seconds: that building it took.
+        scene: its segmented surface.
+        planners: returns the grasp sampler and the pick planner for a target.
+        world_bytes: size of the representation used for planning [bytes].
+        seconds: build time [s].
     """
 
     scene: SegmentedMap
-    towards: Callable[[Target], tuple[GraspSampler, PickPlanner]]
+    planners: Callable[[Target], tuple[GraspSampler, PickPlanner]]
     world_bytes: int
     seconds: float
 
 
 class Stack(Protocol):
-    """A way to represent what was seen."""
+    """A perception and planning stack."""
 
     @property
     def name(self) -> str:
-        """As tables have it."""
+        """Name in tables."""
         ...
 
-    def learn(self, look: Look) -> Knowledge:
-        """Make a world of a scan."""
+    def learn(self, scan: TrialScan) -> StackMap:
+        """Build a map from a scan."""
         ...
 
 
 class GaussianStack:
-    """The Gaussians of the map, certified all along."""
+    """The Gaussians of the map, with certified paths."""
 
     name = "gaussians"
 
-    def learn(self, look: Look) -> Knowledge:
-        """See :class:`Stack`."""
+    def learn(self, scan: TrialScan) -> StackMap:
+        """Implement :meth:`Stack.learn`."""
         begin = time.perf_counter()
-        # Flying pixels at edges and ghosts of what moved: more frames saw through them than saw them.
-        evidence = gather_evidence(look.snapshot.model, look.views)
+        # Removes flying pixels at edges and traces of moving objects, which more frames contradict than support.
+        evidence = gather_evidence(scan.snapshot.model, scan.views)
         solid = np.flatnonzero(~evidence.seen_through)
-        moving = find_moving(look.snapshot.model, evidence)
-        model = look.snapshot.model.select(torch.from_numpy(solid))
-        scene = segment(model, look.T_world_base, cut=False)
-        observers = look.observers[solid]
+        moving = find_moving(scan.snapshot.model, evidence)
+        model = scan.snapshot.model.select(torch.from_numpy(solid))
+        scene = segment(model, scan.T_world_base, cut=False)
+        observers = scan.observers[solid]
         sampler = GraspSampler(
-            scene, panda(), observers=observers, views=look.views, min_observations=_OFTEN, moving=moving
+            scene, panda(), observers=observers, views=scan.views, min_observations=_MIN_OBSERVATIONS, moving=moving
         )
-        seconds = look.seconds + time.perf_counter() - begin
+        seconds = scan.seconds + time.perf_counter() - begin
         world = model.nbytes + sampler.field.nbytes
-        return Knowledge(scene, lambda target: (sampler, MapPickPlanner(sampler, target, OPTIONS)), world, seconds)
+        return StackMap(scene, lambda target: (sampler, MapPickPlanner(sampler, target, OPTIONS)), world, seconds)
 
 
 @dataclass(frozen=True, eq=False)
 class StackDecision:
-    """A target, grasps of it, and the way to one.
+    """A target, its grasps, and the paths to them.
 
     Args:
-        target: as it was found.
+        target: as found.
         sampler: of its grasps.
         grasps: of it.
-        ways: to them, each looked for once.
-        seconds: to the ranked list.
+        planner: of paths to the grasps, each planned once.
+        seconds: until the ranked list of grasps [s].
     """
 
     target: Target
     sampler: GraspSampler
     grasps: GraspResult
-    ways: PickPlanner
+    planner: PickPlanner
     seconds: float
 
 
-def decide(known: Knowledge, look: Look) -> StackDecision:
-    """Find what was clicked at, and grasps of it.
+def decide(known: StackMap, scan: TrialScan) -> StackDecision:
+    """Find the object under the click, and grasps of it.
 
     Raises:
-        AffordanceError: there is nothing.
+        AffordanceError: there is no object.
     """
-    target = find_target(look.hint, known.scene, [SpatialAffordance()])
-    sampler, ways = known.towards(target)
+    target = find_target(scan.hint, known.scene, [SpatialAffordance()])
+    sampler, planner = known.planners(target)
     begin = time.perf_counter()
     grasps = sampler.sample(target, OPTIONS.grasp)
-    return StackDecision(target, sampler, grasps, _Remembered(ways), time.perf_counter() - begin)
+    return StackDecision(target, sampler, grasps, _CachedPlanner(planner), time.perf_counter() - begin)
 
 
-class _Remembered:
-    """Ways that are found once, so that two twins follow the same."""
+class _CachedPlanner:
+    """Plans each path once, so that two twins follow the same path."""
 
-    def __init__(self, ways: PickPlanner) -> None:
-        self._ways = ways
+    def __init__(self, planner: PickPlanner) -> None:
+        self._planner = planner
         self._found: dict[tuple[int, bool], PickPlan | str] = {}
 
     def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
-        """As when it was first asked."""
+        """Return the plan of the first call for a grasp."""
         key = id(grasp), avoid_moving
         if key not in self._found:
-            self._found[key] = self._ways.plan_to(grasp, start, avoid_moving=avoid_moving)
+            self._found[key] = self._planner.plan_to(grasp, start, avoid_moving=avoid_moving)
         return self._found[key]
 
     def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
-        """Asked anew."""
-        return self._ways.plan_carry(plan, start, goal)
+        """Plan the motion after a pick without caching."""
+        return self._planner.plan_carry(plan, start, goal)

@@ -1,4 +1,4 @@
-"""The objects of a twin's scene as textured meshes, for a camera that looks at them."""
+"""The objects of a twin's scene as textured meshes for a simulated camera."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from splatbot.sim.scene import SceneObject
 from splatbot.sim.solids import BoxGeom, CapsuleGeom, CylinderGeom, EllipsoidGeom, Shape, SphereGeom, pose_at
 from splatbot.sim.wrist import capsule_mesh
 
-_DARK = 0.7  # of the second colour
+_DARK = 0.7  # brightness of the second colour relative to the first
 _PERIOD = 0.03  # [m] of the pattern
 
 
-def surfaces_of(thing: SceneObject, *, placed: bool = True, seed: int = 0) -> list[RaycastSurface]:
-    """Meshes of an object's shapes, where the scene puts it, or in its own frame; mottled in its colour.
+def surfaces_of(obj: SceneObject, *, placed: bool = True, seed: int = 0) -> list[RaycastSurface]:
+    """Convert an object's shapes to meshes with a pattern in its colour, in the scene's frame or in its own.
 
     Raises:
         InputError: a shape has no mesh here: planes, hulls and soft bodies.
     """
-    r, g, b = thing.color
+    r, g, b = obj.color
     texture = Texture((r, g, b), (_DARK * r, _DARK * g, _DARK * b), _PERIOD, seed=seed)
-    T = pose_at(thing.at, thing.rpy) if placed else np.eye(4)
+    T = pose_at(obj.at, obj.rpy) if placed else np.eye(4)
     found = []
-    for shape in thing.shapes:
-        mesh = _mesh(shape, thing.name)
+    for shape in obj.shapes:
+        mesh = _mesh(shape, obj.name)
         vertices = transform_points(T @ pose_at(shape.at, shape.rpy), mesh.vertices)
         found.append(RaycastSurface(TriangleMesh(vertices, mesh.triangles), texture))
     return found
 
 
 def _mesh(shape: Shape, name: str) -> TriangleMesh:
-    """About the shape's middle."""
+    """Convert a shape to a mesh about its centre."""
     if isinstance(shape, BoxGeom):
         return box(shape.size).placed([0.0, 0.0, -shape.size[2] / 2])
     if isinstance(shape, CylinderGeom):
@@ -47,4 +47,4 @@ def _mesh(shape: Shape, name: str) -> TriangleMesh:
         return TriangleMesh(ball.vertices * np.asarray(shape.axes), ball.triangles)
     if isinstance(shape, CapsuleGeom):
         return capsule_mesh([0.0, 0.0, -shape.height / 2], [0.0, 0.0, shape.height / 2], shape.radius)
-    raise InputError(f"is a {shape.kind}.", field=name, hint="give boxes, cylinders, balls, ellipsoids or capsules")
+    raise InputError(f"is a {shape.kind}.", field=name, hint="give boxes, cylinders, spheres, ellipsoids or capsules")

@@ -1,4 +1,4 @@
-"""What trials came to: shares with intervals, times, sizes, and what failures were."""
+"""Summary of simulated trials: success rates with intervals, times, sizes, and causes of failure."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from splatbot.sim.trials.shake import RATE, Shake, strength
 from splatbot.sim.trials.trial import TrialRow
 
 _MEGA = 1e6
-_SAMPLES = 2001  # of the shaking
+_SAMPLES = 2001  # of the shaking motion
 
 
 def summaries(rows: Sequence[TrialRow]) -> list[dict[str, Any]]:
-    """One for each stack, in the order of their first rows."""
+    """Summarize each stack, in the order of their first rows."""
     return [summary([row for row in rows if row.stack == name]) for name in dict.fromkeys(row.stack for row in rows)]
 
 
 def summary(rows: Sequence[TrialRow]) -> dict[str, Any]:
-    """Of one stack's rows: success in reality with its interval, in the ideal twin, the drop, medians, failures."""
-    reality, ideal = (sum(getattr(row, twin).success for row in rows) for twin in ("reality", "ideal"))
-    share = wilson(reality, len(rows))
+    """Summarize one stack: success in the held-out and the ideal twin with interval and drop, medians, failures."""
+    held_out, ideal = (sum(getattr(row, twin).success for row in rows) for twin in ("held_out", "ideal"))
+    share = wilson(held_out, len(rows))
     return {
         "stack": rows[0].stack,
         "trials": len(rows),
-        "successes": reality,
+        "successes": held_out,
         "success": share.value,
         "low": share.low,
         "high": share.high,
         "ideal": ideal / len(rows),
-        "drop": (ideal - reality) / len(rows),
-        "touched_others": sum(bool(row.reality.touched) for row in rows),
+        "drop": (ideal - held_out) / len(rows),
+        "touched_others": sum(bool(row.held_out.touched) for row in rows),
         "plan_ms": _median(rows, lambda row: row.plan_ms),
         "grasp_ms": _median(rows, lambda row: row.grasp_ms),
         "build_s": _median(rows, lambda row: row.build_s),
         "world_mb": (_median(rows, lambda row: row.world_bytes) or 0.0) / _MEGA,
-        "failures": dict(Counter(row.reality.failure for row in rows if row.reality.failure).most_common()),
+        "failures": dict(Counter(row.held_out.failure for row in rows if row.held_out.failure).most_common()),
         "by_kind": _by_kind(rows),
     }
 
 
 def physics(trial: TrialScene) -> dict[str, Any]:
-    """What the twins of trials compute with: without it success means nothing."""
+    """Return the physics parameters of the trials' twins, on which success rates depend."""
     twin = HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
     option, robot = twin.world.model.opt, twin.world.robot
     assert robot is not None
@@ -61,7 +61,7 @@ def physics(trial: TrialScene) -> dict[str, Any]:
         "cone": "elliptic" if option.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC) else "pyramidal",
         "impratio": float(option.impratio),
         "timestep_ms": 1e3 * twin.timestep,
-        "friction": sorted({thing.friction for thing in trial.scene.movable}),
+        "friction": sorted({obj.friction for obj in trial.scene.movable}),
         "shake_hz": RATE,
         "shake_m_s2": round(strength(shake, places[:, :3, 3]), 1),
         "held_out_friction": spread.friction,
@@ -72,7 +72,7 @@ def physics(trial: TrialScene) -> dict[str, Any]:
 
 
 def table_rows(found: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
-    """Words for a table; see :data:`HEAD`."""
+    """Format table rows; see :data:`HEAD`."""
     return [
         (
             str(one["stack"]),
@@ -92,8 +92,8 @@ def table_rows(found: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
 HEAD = (
     "stack",
     "held",
-    "% in reality (95 %)",
-    "% ideal",
+    "% held-out twin (95 %)",
+    "% ideal twin",
     "drop",
     "plan [ms]",
     "grasps [ms]",
@@ -110,7 +110,7 @@ def _median(rows: Sequence[TrialRow], value: Callable[[TrialRow], float | None])
 def _by_kind(rows: Sequence[TrialRow]) -> dict[str, str]:
     kinds = dict.fromkeys(row.kind for row in rows)
     return {
-        kind: f"{sum(r.reality.success for r in rows if r.kind == kind)} of {sum(r.kind == kind for r in rows)}"
+        kind: f"{sum(r.held_out.success for r in rows if r.kind == kind)} of {sum(r.kind == kind for r in rows)}"
         for kind in sorted(kinds)
     }
 

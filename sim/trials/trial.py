@@ -1,4 +1,4 @@
-"""One trial: a scene is scanned once; each stack decides from the scan alone, and its pick is tried in two twins."""
+"""One simulated trial: one scan of a scene, a decision of each stack from it, and the picks in two twins."""
 
 from __future__ import annotations
 
@@ -21,19 +21,18 @@ from splatbot.sim.camera import TwinCamera
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.contact_monitor import ContactMonitor
 from splatbot.sim.controller import TwinController
-from splatbot.sim.trials.look import Look, UnseenError, look
+from splatbot.sim.trials.scan import TrialScan, UnseenError, scan_scene
 from splatbot.sim.trials.scenes import TABLE, TrialScene
 from splatbot.sim.trials.shake import Shake
-from splatbot.sim.trials.stacks import OPTIONS, Knowledge, Stack, StackDecision, decide
+from splatbot.sim.trials.stacks import OPTIONS, Stack, StackDecision, StackMap, decide
 from splatbot.sim.twin import Twin
 from splatbot.sim.video import Video
 from splatbot.sim.world import OBJECT
 
-RISE = 0.15  # [m] that a thing must be lifted
-KEPT = 0.12  # [m] over where it stood, after it was shaken
-_TAKEN_FOR = 0.04  # [m] between a target's middle and that of what was found
-_EVERY = 5  # control periods between looks at what touches
-_TWINS = ("ideal", "reality")
+RISE = 0.15  # [m] lift that success requires
+KEPT = 0.12  # [m] height over the start that success requires after shaking
+_TARGET_TOLERANCE = 0.04  # [m] between the centres of the target and the found object
+_CONTACT_EVERY = 5  # control periods between checks for contacts
 
 Watch = Callable[[Any, float], None]
 
@@ -41,13 +40,13 @@ Watch = Callable[[Any, float], None]
 class Failure(StrEnum):
     """Why a trial failed."""
 
-    PERCEPTION = "perception"  # what was clicked at was not found, or taken for something else
-    GRASP = "grasp"  # no hand fits it, or the fingers closed on nothing
-    IK = "ik"  # hands fit, the arm does not get there
-    PLAN = "plan"  # no way
-    SLIP = "slip"  # it was held, and fell
-    COLLISION = "collision"  # something else was touched before
-    CONTROL = "control"  # the arm did not follow
+    PERCEPTION = "perception"  # the clicked object was not found, or confused with another
+    GRASP = "grasp"  # no grasp fits, or the fingers closed without contact
+    IK = "ik"  # grasps fit, but the arm cannot reach them
+    PLAN = "plan"  # no path was found
+    SLIP = "slip"  # the object was held, and fell
+    COLLISION = "collision"  # another object was in contact before
+    CONTROL = "control"  # the arm did not follow the motion
 
 
 @dataclass(frozen=True)
@@ -55,13 +54,14 @@ class TwinPickResult:
     """A pick in one twin.
 
     Args:
-        success: lifted and still held after it was shaken.
+        success: lifted and still held after shaking.
         failure: of :class:`Failure`, empty after success.
-        outcome: of the pick, "dropped" where it was lost in the shaking.
-        reason: in words.
-        rose: how far the target was lifted [m]; ``kept``: how far above its place it is after shaking [m].
-        touched: what the arm touched beside the target.
-        opening: of the fingers on it [m]; None: they did not get there.
+        outcome: of the pick; "dropped" if the object was lost during shaking.
+        reason: description of the failure.
+        rose: height by which the target was lifted [m].
+        kept: height over its start after shaking [m].
+        touched: objects other than the target with which the arm had contact.
+        opening: of the fingers on the target [m]. If None, they did not reach it.
     """
 
     success: bool
@@ -76,20 +76,20 @@ class TwinPickResult:
 
 @dataclass(frozen=True)
 class TrialRow:
-    """A stack in one scene.
+    """Result of a stack in one scene.
 
     Args:
-        seed, family, stack: which.
+        seed, family, stack: of the trial.
         kind: of the target.
-        moving: whether something moved through the scene.
-        ideal: in the twin of the scene as it is described.
-        reality: in a held-out twin: other friction, masses, gains and delays, every effect on.
-        plan_ms: that the search for the way took; None: there was none.
-        grasp_ms: to the ranked list.
-        build_s: to make the stack's world of the frames, mapping included; None: none was made.
-        world_bytes: of that world; None likewise.
-        width_mm: of the grasp; None: there was none.
-        frames, pixels: of the scan, and how wide its pictures are [px].
+        moving: whether an obstacle moved through the scene.
+        ideal: in the twin of the scene as described.
+        held_out: in a held-out twin with other friction, masses, gains and delays, and all effects.
+        plan_ms: time of the path search [ms]. If None, there was no search.
+        grasp_ms: time until the ranked list of grasps [ms].
+        build_s: time to build the stack's map from the frames, mapping included [s]. If None, no map was built.
+        world_bytes: size of that map [bytes], or None without one.
+        width_mm: of the grasp [mm]. If None, there was no grasp.
+        frames, pixels: number of frames of the scan, and their width [px].
     """
 
     seed: int
@@ -98,7 +98,7 @@ class TrialRow:
     kind: str
     moving: bool
     ideal: TwinPickResult
-    reality: TwinPickResult
+    held_out: TwinPickResult
     plan_ms: float | None
     grasp_ms: float | None
     build_s: float | None
@@ -108,15 +108,18 @@ class TrialRow:
     pixels: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON takes it."""
-        return asdict(self)
+        """Return the row as values for JSON; the held-out twin is ``reality`` there."""
+        values = asdict(self)
+        return values | {"reality": values.pop("held_out")}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrialRow:
-        """The other way round of :meth:`to_dict`."""
+        """Create a row from the values of :meth:`to_dict`."""
+        values = {**values}
+        values["held_out"] = values.pop("reality")
         twins = {
             name: TwinPickResult(**{**values[name], "touched": tuple(values[name]["touched"])})
-            for name in ("ideal", "reality")
+            for name in ("ideal", "held_out")
         }
         return cls(**{**values, **twins})
 
@@ -124,24 +127,24 @@ class TrialRow:
 def run_trial(
     trial: TrialScene, stacks: Sequence[Stack], *, frames: int = 32, width: int = 320, videos: Path | None = None
 ) -> list[TrialRow]:
-    """Scan a scene, and let each stack pick its target. One that no picture shows is a failure of each.
+    """Scan a scene, and let each stack pick its target. A target that no image shows is a failure of each stack.
 
     Args:
         trial: the scene.
-        stacks: who picks.
-        frames, width: of the scan, see :func:`splatbot.sim.trials.look.look`.
-        videos: folder for films of picks that failed in reality; None: none are made.
+        stacks: the stacks.
+        frames, width: of the scan, see :func:`splatbot.sim.trials.scan.scan_scene`.
+        videos: folder for videos of picks that failed in the held-out twin. If None, no videos are recorded.
     """
     try:
-        seen = look(trial, frames=frames, width=width)
+        seen = scan_scene(trial, frames=frames, width=width)
     except UnseenError as error:
         both = _no_target(error)
         return [_row(stack, trial, (frames, width), None, None, None, both, both) for stack in stacks]
     return [pick_with(stack, trial, seen, videos=videos) for stack in stacks]
 
 
-def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | None = None) -> TrialRow:
-    """One stack's pick of what was seen, in both twins."""
+def pick_with(stack: Stack, trial: TrialScene, seen: TrialScan, *, videos: Path | None = None) -> TrialRow:
+    """Run one stack's pick from a scan in both twins."""
     known = stack.learn(seen)
     scan = len(seen.frames), seen.frames[0].camera.width
     try:
@@ -151,31 +154,31 @@ def pick_with(stack: Stack, trial: TrialScene, seen: Look, *, videos: Path | Non
         return _row(stack, trial, scan, known, None, None, both, both)
     results = []
     mistaken = _mistaken(known, decision.target, trial)
-    for twin in (Twin(trial.scene), _reality(trial)):
+    for twin in (Twin(trial.scene), _held_out_twin(trial)):
         results.append(attempt(decision, trial, twin, mistaken=mistaken))
-    (ideal, first), (reality, _) = results
-    if videos is not None and not reality.success:
+    (ideal, first), (held_out, _) = results
+    if videos is not None and not held_out.success:
         _film(decision, trial, videos / f"{trial.family}-{trial.seed}-{stack.name}.mp4")
-    return _row(stack, trial, scan, known, decision, first, ideal, reality)
+    return _row(stack, trial, scan, known, decision, first, ideal, held_out)
 
 
 def attempt(
     decision: StackDecision, trial: TrialScene, twin: Twin, *, mistaken: bool = False, watch: Watch | None = None
 ) -> tuple[TwinPickResult, PickResult]:
-    """The pick in a twin, then the shaking.
+    """Run the pick in a twin, then shake.
 
     Args:
-        decision: what to pick and how.
+        decision: target, grasps and planner.
         trial: the scene.
         twin: of it.
-        mistaken: whether the decision is about something else than the trial's target.
+        mistaken: whether the decision is about another object than the trial's target.
         watch: called with MuJoCo's data and the time [s] after every control period.
     """
     controller = _Watched(twin, watch)
     assert controller.gripper is not None
     before = _height(twin, trial.target)
     picker = Picker(
-        decision.sampler, controller, controller.gripper, options=OPTIONS, make_planner=lambda target: decision.ways
+        decision.sampler, controller, controller.gripper, options=OPTIONS, make_planner=lambda target: decision.planner
     )
     result = picker.pick(decision.target, grasps=decision.grasps)
     rose = _height(twin, trial.target) - before
@@ -199,10 +202,10 @@ def attempt(
 
 
 class _Watched(TwinController):
-    """A twin's controller that takes note of what its arm touches."""
+    """A twin's controller that records the contacts of its arm."""
 
     def __init__(self, twin: Twin, watch: Watch | None) -> None:
-        self._touches, self._periods, self._watch = ContactMonitor(twin.world), 0, watch
+        self._contacts, self._periods, self._watch = ContactMonitor(twin.world), 0, watch
         super().__init__(twin)
 
     def _advance(self, q: Array, velocity: Array, acceleration: Array) -> None:
@@ -210,22 +213,22 @@ class _Watched(TwinController):
         self._periods += 1
         if self._watch is not None:
             self._watch(self.twin.data, self._clock)
-        if self._periods % _EVERY == 0:
-            self._touches.look(self.twin.data, self._clock)
+        if self._periods % _CONTACT_EVERY == 0:
+            self._contacts.update(self.twin.data, self._clock)
 
     def touched(self, target: str) -> tuple[str, ...]:
-        """The things but the target that the arm has touched."""
-        things = {thing.name for thing in self.twin.scene.objects} - {target}
-        return tuple(sorted({touch.other for touch in self._touches.found} & things))
+        """Return the objects other than the target with which the arm had contact."""
+        names = {obj.name for obj in self.twin.scene.objects} - {target}
+        return tuple(sorted({contact.other for contact in self._contacts.found} & names))
 
 
-def _reality(trial: TrialScene) -> HeldOutTwin:
+def _held_out_twin(trial: TrialScene) -> HeldOutTwin:
     return HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
 
 
 def _film(decision: StackDecision, trial: TrialScene, path: Path) -> None:
-    """The pick in reality once more, with a camera."""
-    twin = _reality(trial)
+    """Record the pick in the held-out twin again, with a camera."""
+    twin = _held_out_twin(trial)
     video = Video(path, TwinCamera(twin.world, seed=trial.seed))
     try:
         attempt(decision, trial, twin, watch=video)
@@ -250,13 +253,13 @@ def _failure(result: PickResult, touched: tuple[str, ...], mistaken: bool) -> Fa
     return Failure.COLLISION if touched and result.stage not in late else Failure.CONTROL
 
 
-def _mistaken(known: Knowledge, target: Target, trial: TrialScene) -> bool:
-    """Whether what was found is not where the target is."""
+def _mistaken(known: StackMap, target: Target, trial: TrialScene) -> bool:
+    """Return whether the found object is not at the target's position."""
     points = known.scene.model.means.detach().double().numpy()[target.rows]
     found = transform_points(inverse(known.scene.T_world_base), points)
     middle = (found.min(axis=0) + found.max(axis=0))[:2] / 2
-    true = next(np.asarray(thing.at) for thing in trial.scene.objects if thing.name == trial.target)
-    return bool(np.linalg.norm(middle - true[:2]) > _TAKEN_FOR)
+    true = next(np.asarray(obj.at) for obj in trial.scene.objects if obj.name == trial.target)
+    return bool(np.linalg.norm(middle - true[:2]) > _TARGET_TOLERANCE)
 
 
 def _no_target(error: SplatbotError) -> TwinPickResult:
@@ -271,11 +274,11 @@ def _row(
     stack: Stack,
     trial: TrialScene,
     scan: tuple[int, int],
-    known: Knowledge | None,
+    known: StackMap | None,
     decision: StackDecision | None,
     result: PickResult | None,
     ideal: TwinPickResult,
-    reality: TwinPickResult,
+    held_out: TwinPickResult,
 ) -> TrialRow:
     planned = None if result is None or result.planning_seconds is None else 1e3 * result.planning_seconds
     return TrialRow(
@@ -285,7 +288,7 @@ def _row(
         kind=trial.kind,
         moving=trial.moving,
         ideal=ideal,
-        reality=reality,
+        held_out=held_out,
         plan_ms=planned,
         grasp_ms=None if decision is None else 1e3 * decision.seconds,
         build_s=None if known is None else known.seconds,

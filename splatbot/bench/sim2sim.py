@@ -18,7 +18,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_err
 from splatbot.formats.ply import save_ply
 from splatbot.geometry import inverse
 from splatbot.protocols import Array
-from splatbot.results.margin import REACH, SHARE
+from splatbot.results.margin import RADIUS, SHARE
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.compare.push import PushCase, PushTask, push_policies
@@ -86,7 +86,7 @@ class MappedTable:
 
     def own_margin(self, field: GaussianCollisionField) -> float:
         """The error [m] of the map's surfaces near the arm, as its own depth tells."""
-        around = [*self.mapped.T_map_scene[:3, 3], REACH]
+        around = [*self.mapped.T_map_scene[:3, 3], RADIUS]
         return surface_error(field, self.mapped.views(), around=around).share(SHARE)
 
 
@@ -146,7 +146,7 @@ def _reach(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
         cases, Twin(place.map_scene(movable=False)), lambda case: HeldOutTwin(true, draw(Spread(), case.seed))
     )
     policies = reach_policies(field, robot, place.mapped.T_map_scene, place.own_margin(field))
-    return run_trials(task, policies, seed=plan.seed, tell=tell)
+    return run_trials(task, policies, seed=plan.seed, on_progress=tell)
 
 
 def _push(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
@@ -161,7 +161,7 @@ def _push(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
         match = _believed(believed, middle_of(place.table.solids[index]))
         cases.append(PushCase(match, f"thing{index}", direction, DISTANCE, place.seed + k))
     task = PushTask(cases, map_twin, lambda case: HeldOutTwin(true, draw(Spread(), case.seed)))
-    return run_trials(task, push_policies(panda()), seed=plan.seed, tell=tell)
+    return run_trials(task, push_policies(panda()), seed=plan.seed, on_progress=tell)
 
 
 _TRY = {"reach": _reach, "push": _push}

@@ -92,7 +92,7 @@ def _compare_log(
     from splatbot.sim.compare.page import log_html, log_rows
 
     run = RunFolder(map)
-    found = compare_log(reopen_log(run, uri=log), run, load_robot(robot), frames=frames, tell=tell)
+    found = compare_log(reopen_log(run, uri=log), run, load_robot(robot), frames=frames, on_progress=tell)
     _write(folder, "sim2real", json, found.to_dict(), log_html(found))
     if not quiet:
         print_table(log_rows(found), title=f"{KIND}: {found.log} against the twin of {found.map}")

@@ -110,7 +110,7 @@ def _record(log: SyntheticLog, out: Path, *, quiet: bool) -> None:
     with _progress(len(log), quiet=quiet) as show:
         record(frames(), out, ground_truth=log.ground_truth, progress=show)
     for name, path in log.objects().items():
-        save_trajectory(path, out / "objects" / f"{name}.tum", what="T_world_object")
+        save_trajectory(path, out / "objects" / f"{name}.tum", pose_name="T_world_object")
 
 
 @contextmanager

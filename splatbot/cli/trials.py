@@ -65,7 +65,7 @@ def trials(
     plan = TrialsPlan(scenes, count, stacks, first, jobs, frames, width, videos)
     folder = out if out is not None else Path("runs") / "trials"
     with shares(quiet) as tell:
-        rows, interrupted = run_trials(plan, folder, tell=tell)
+        rows, interrupted = run_trials(plan, folder, on_progress=tell)
     found = summaries(rows)
     values = {
         "scenes": scenes,

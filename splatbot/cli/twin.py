@@ -117,7 +117,7 @@ def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
 def _harm(scene: Scene, result: TwinResult) -> bool:
     """Whether the arm touched what its task does not speak of touching, or something fell or went wrong."""
     may_touch = scene.task.kind in ("push", "grasp", "hang", "wipe", "squeeze")
-    return bool((result.touches and not may_touch) or any("unstable" in text for text in result.warnings))
+    return bool((result.contacts and not may_touch) or any("unstable" in text for text in result.warnings))
 
 
 @contextmanager
@@ -197,13 +197,13 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
         console.print(
             f"tracking: {1e3 * t.rms:.2f} mrad RMS, {1e3 * t.largest:.2f} at most; tool {1e3 * t.tcp:.2f} mm at most"
         )
-    near = result.near
+    near = result.clearance
     where = f" ({near.part} and {near.other} at {near.time:.2f} s)" if near.part else " or more"
-    console.print(f"room around the arm: {1e3 * near.room:.1f} mm{where}")
-    for touch in result.touches:
+    console.print(f"minimum clearance of the arm: {1e3 * near.value:.1f} mm{where}")
+    for contact in result.contacts:
         console.print(
-            f"touch: {touch.part} and {touch.other}, {touch.first:.3f} to {touch.last:.3f} s, "
-            f"{1e3 * touch.depth:.2f} mm deep, {touch.force:.1f} N"
+            f"contact: {contact.part} and {contact.other}, {contact.first:.3f} to {contact.last:.3f} s, "
+            f"{1e3 * contact.depth:.2f} mm deep, {contact.force:.1f} N"
         )
     for name in result.dropped:
         console.print(f"fell: {name}")

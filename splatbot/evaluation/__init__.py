@@ -1,4 +1,4 @@
-"""How good a trajectory, an image or a depth image is."""
+"""Error measures of trajectories, images and depth images."""
 
 from splatbot.evaluation.consistency import Consistency, nees
 from splatbot.evaluation.geometry import DepthError, depth_error

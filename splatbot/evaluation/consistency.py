@@ -1,4 +1,4 @@
-"""Whether an estimate errs as much as it says it may: normalised estimation error squared (Bar-Shalom et al. 2001)."""
+"""Consistency of pose covariances: normalized estimation error squared, NEES (Bar-Shalom et al. 2001)."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """Normalised errors of a trajectory.
+    """Normalized errors of a trajectory: NEES / 6 = ξᵀ C⁻¹ ξ / 6, 1 in the mean for correct covariances.
+
 
     Args:
-        mean: NEES / 6 over the frames: 1 where the covariances are right, larger where they are too small.
-        median: of the same; 0.89 where the errors are Gaussian.
+        mean: over the frames. It exceeds 1 if the covariances are too small.
+        median: over the frames; 0.89 for Gaussian errors.
         stamps: (M,) [s].
         values: (M,) ξᵀ C⁻¹ ξ / 6.
     """
@@ -40,18 +41,24 @@ def nees(
     reference_covariance: Array | None = None,
     max_difference: float = MAX_DIFFERENCE,
 ) -> Consistency:
-    """Compare errors with covariances (N, 6, 6), one for each pose of ``estimate``.
+    """Compare pose errors with their covariances by NEES / 6 = ξᵀ C⁻¹ ξ / 6.
 
-    ``covariances`` are of the twist ξ = (translation [m], rotation [rad]) in the camera's frame; T_world_camera exp(ξ)
-    is the truth and the first pose the world: trajectories are aligned by their first common frame, which is left out.
-    ``reference_covariance`` (6, 6) is added to each: what the reference itself may be off.
+    The trajectories are aligned by their first common frame, which is left out of the result. The error
+    ξ = log(T_estimated⁻¹ T_true) is a twist (translation [m], rotation [rad]) in the camera frame.
+
+    Args:
+        reference: true poses.
+        estimate: estimated poses, N of them.
+        covariances: (N, 6, 6) of the estimate's ξ.
+        reference_covariance: (6, 6) of the reference's own error, added to each. If None, the reference is exact.
+        max_difference: largest difference [s] of the stamps of associated frames.
 
     Raises:
         InputError: fewer than two frames can be associated, shapes differ, or a covariance is not positive definite.
     """
     if covariances.shape != (len(estimate), 6, 6):
         raise InputError(
-            f"are {covariances.shape} for {len(estimate)} poses.", field="covariances", hint="give (N, 6, 6)"
+            f"have shape {covariances.shape} for {len(estimate)} poses.", field="covariances", hint="give (N, 6, 6)"
         )
     of_reference, of_estimate = associate(reference, estimate, max_difference)
     if len(of_reference) < 2:
@@ -63,8 +70,8 @@ def nees(
     for T_true, T, C in zip(truth[1:], poses[1:], covariances[of_estimate][1:] + extra, strict=True):
         if not np.isfinite(C).all() or np.linalg.eigvalsh(C)[0] <= 0:
             raise InputError("one is not positive definite.", field="covariances", hint="give covariances of full rank")
-        off = se3_log(inverse(T) @ T_estimate_reference @ T_true)
-        values.append(float(off @ np.linalg.solve(C, off)) / 6)
+        error = se3_log(inverse(T) @ T_estimate_reference @ T_true)
+        values.append(float(error @ np.linalg.solve(C, error)) / 6)
     return Consistency(
         float(np.mean(values)), float(np.median(values)), estimate.stamps[of_estimate[1:]], np.array(values)
     )

@@ -1,4 +1,4 @@
-"""Depth images fused by Open3D into truncated signed distances: a surface that owes nothing to the Gaussians."""
+"""Surface from depth images by TSDF fusion with Open3D: a reference that is independent of the Gaussians."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from splatbot.camera import Camera
 from splatbot.geometry import inverse
 from splatbot.protocols import Array
 
-SEEN = 3.0  # measurements that a voxel of the surface takes
-_TRUNCATION = 8.0  # voxels; Open3D's own
-_BLOCKS = 20_000  # of 16 voxels a side; the table of them grows
+MIN_WEIGHT = 3.0  # measurements of a voxel that the extracted surface requires
+_TRUNCATION = 8.0  # [voxels] truncation distance; Open3D's default
+_BLOCKS = 20_000  # initial capacity [blocks of 16³ voxels]; the hash table grows
 
 
 class DepthFusion:
-    """Weighted averages of signed distances along rays (Curless and Levoy 1996), by Open3D's voxel blocks.
+    """Truncated signed distance field (TSDF) with weighted averages along rays (Curless and Levoy 1996).
 
     Args:
-        voxel: [m].
-        farthest: depth [m] from which on nothing counts.
+        voxel: edge length [m].
+        farthest: depth [m] from which measurements are ignored.
     """
 
     def __init__(self, voxel: float, farthest: float) -> None:
@@ -31,7 +31,7 @@ class DepthFusion:
         self._farthest = farthest
 
     def add(self, depth: NDArray[np.float32], camera: Camera, T_world_camera: Array) -> None:
-        """Take in one image (H, W) [m] of z-depth; missing depth is 0 or not finite."""
+        """Integrate one z-depth image (H, W) [m]; missing depth is 0 or not finite."""
         known = np.isfinite(depth) & (depth < self._farthest)
         image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(np.where(known, depth, 0).astype(np.float32)))
         K, T_camera_world = (o3d.core.Tensor.from_numpy(m) for m in (camera.K, inverse(T_world_camera)))
@@ -39,16 +39,16 @@ class DepthFusion:
         self._grid.integrate(blocks, image, K, T_camera_world, 1.0, self._farthest, _TRUNCATION)
 
     def points(self) -> Array:
-        """The surface as points (N, 3) [m, world] that were measured :data:`SEEN` times or more."""
-        points: Array = self._grid.extract_point_cloud(SEEN).point.positions.numpy().astype(np.float64)
+        """Return the surface points (N, 3) [m, world] with at least :data:`MIN_WEIGHT` measurements."""
+        points: Array = self._grid.extract_point_cloud(MIN_WEIGHT).point.positions.numpy().astype(np.float64)
         return points
 
     def mesh(self) -> Any:
-        """The same surface as an ``open3d.geometry.TriangleMesh`` with normals (marching cubes).
+        """Return the same surface as an ``open3d.geometry.TriangleMesh`` with normals (marching cubes).
 
-        Vertices whose triangles have no area, as where a distance is 0 at a voxel, have no normal and are left out.
+        Vertices whose triangles all have zero area have no normal and are left out.
         """
-        mesh = self._grid.extract_triangle_mesh(SEEN).to_legacy()
+        mesh = self._grid.extract_triangle_mesh(MIN_WEIGHT).to_legacy()
         mesh.compute_vertex_normals()
         lengths = np.linalg.norm(np.asarray(mesh.vertex_normals), axis=1)
         mesh.remove_vertices_by_mask(~(lengths > 0.5))

@@ -1,4 +1,4 @@
-"""How near a rendered depth image is to a measured one."""
+"""Errors of a rendered depth image against a measured one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from splatbot.errors import InputError
 
 @dataclass(frozen=True)
 class DepthError:
-    """Absolute difference of two depth images over the pixels that both have.
+    """Absolute difference of two depth images over the pixels that are valid in both.
 
     Args:
-        l1: mean [m]; None where the two share no pixel.
-        median: [m]; None likewise.
-        coverage: share of the reference's pixels that the image has, 0..1; None where the reference has none.
+        l1: mean [m], or None if the images share no valid pixel.
+        median: [m], or None if the images share no valid pixel.
+        coverage: fraction of the reference's valid pixels that the image covers, 0..1. If None, the reference has none.
     """
 
     l1: float | None
@@ -26,7 +26,7 @@ class DepthError:
 
 
 def depth_error(depth: ArrayLike, reference: ArrayLike) -> DepthError:
-    """Compare depth images (H, W) [m]; 0, NaN and infinity are missing.
+    """Compare two depth images (H, W) [m]; 0, NaN and infinity mean missing depth.
 
     Raises:
         InputError: the shapes differ.
@@ -36,9 +36,9 @@ def depth_error(depth: ArrayLike, reference: ArrayLike) -> DepthError:
         raise InputError(f"is {a.shape}, the reference {b.shape}.", field="depth", hint="compare images of one size")
     has_a, has_b = (np.isfinite(x) & (x > 0) for x in (a, b))
     both = has_a & has_b
-    wanted, shared = int(has_b.sum()), int(both.sum())
-    coverage = shared / wanted if wanted else None
-    if not shared:
+    n_reference, n_shared = int(has_b.sum()), int(both.sum())
+    coverage = n_shared / n_reference if n_reference else None
+    if not n_shared:
         return DepthError(None, None, coverage)
     difference = np.abs(a[both] - b[both])
     return DepthError(float(difference.mean()), float(np.median(difference)), coverage)

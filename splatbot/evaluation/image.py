@@ -1,4 +1,4 @@
-"""How near a rendered image is to a photograph: PSNR and SSIM."""
+"""Errors of a rendered image against a photograph: PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -15,10 +15,14 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def psnr(image: ArrayLike, reference: ArrayLike) -> float:
-    """Peak signal-to-noise ratio [dB] of images of one shape, uint8 or float in 0..1; infinite where they are equal.
+    """Compute the peak signal-to-noise ratio -10 log10(MSE) [dB] of two images; equal images give infinity.
+
+    Args:
+        image: uint8, or float in 0..1.
+        reference: of the same shape; uint8, or float in 0..1.
 
     Raises:
-        InputError: the shapes differ or a type is neither.
+        InputError: the shapes differ, or a type is neither uint8 nor float.
     """
     a, b = _pair(image, reference)
     mse = float(np.mean((a - b) ** 2))
@@ -26,12 +30,13 @@ def psnr(image: ArrayLike, reference: ArrayLike) -> float:
 
 
 def ssim(image: ArrayLike, reference: ArrayLike) -> float:
-    """Structural similarity of images (H, W[, C]), uint8 or float in 0..1 (Wang et al. 2004).
+    """Compute the structural similarity of images (H, W[, C]), uint8 or float in 0..1 (Wang et al. 2004).
 
-    Gaussian window of 11x11 pixels, σ 1.5, only where it lies inside the image; mean over pixels and channels.
+    The Gaussian window has 11 x 11 pixels and σ = 1.5 pixels. The mean is over all windows inside the image and all
+    channels.
 
     Raises:
-        InputError: the shapes differ, a type is neither, or the image is smaller than the window.
+        InputError: the shapes differ, a type is neither uint8 nor float, or the image is smaller than the window.
     """
     a, b = _pair(image, reference)
     if min(a.shape[:2]) < _WINDOW:

@@ -1,4 +1,4 @@
-"""Whether depth lies on its colour: edges of the one against edges of the other."""
+"""Registration of depth to colour: the offset between depth edges and intensity edges."""
 
 from __future__ import annotations
 
@@ -10,72 +10,73 @@ from numpy.typing import NDArray
 
 from splatbot.frame import Frame
 
-_RANGE = 0.02  # of the width, each way, that is searched
-_JUMP = 0.06  # share of its depth by which what is behind an edge is farther
-_STRONG = 8.0  # [grey value/px]: stronger edges of grey count alike, or a few would decide
-_NEAR = 0.4  # of the range: what is as near to the highest peak belongs to it
-_LEAST_EDGES = 500  # [px] of all frames
-_AGREE = 2  # [px] between what all frames find and what every second one does
-_CLEAR = 1.25  # times any other offset; textures that repeat, and depth without edges in its colour, give no such peak
+_SEARCH_RANGE = 0.02  # fraction of the image width, in each direction
+_DEPTH_JUMP = 0.06  # relative depth step at an edge
+_MAX_GRADIENT = 8.0  # [grey value/px]; the clamp keeps few strong edges from dominating
+_PEAK_RADIUS = 0.4  # fraction of the search range: offsets this near the maximum belong to its peak
+_MIN_EDGES = 500  # [px] over all frames
+_MAX_DISAGREEMENT = 2  # [px] between the offset of all frames and that of every second frame
+_PEAK_RATIO = 1.25  # peak to second peak; repeated textures and depth without colour edges stay below it
 
 
 def depth_offset(frames: Iterable[Frame]) -> tuple[int, int] | None:
-    """Pixels (u, v) by which depth images are to be shifted so that their edges lie on those of colour.
+    """Estimate the offset (u, v) [px] by which depth images must be shifted to align with colour.
 
-    The near sides of jumps in depth are laid over how steep grey is, at every offset up to 2 % of the width, and the
-    one counts at which grey is steepest in the mean over all frames. It tells what is amiss for all pixels alike, as a
-    camera matrix or an extrinsic that is off; sensors widen near things by a pixel or two.
+    The mask of near sides of depth edges is cross-correlated with the gradient magnitude of the grey image. Offsets up
+    to 2 % of the image width are searched, and the maximum of the mean over all frames is returned. It measures an
+    offset common to all pixels, such as that of a wrong camera matrix or extrinsic. Depth sensors themselves widen near
+    objects by one or two pixels.
 
     Returns:
-        None where it can not be told: few edges, no offset clearly better than all others, or every second frame
-        finds another than the rest.
+        The offset. It is None if the estimate is not reliable: few edges, no distinct peak, or a disagreement between
+        even and odd frames.
     """
-    reach, edges, halves = 0, 0, [np.zeros(0), np.zeros(0)]
+    radius, edges, halves = 0, 0, [np.zeros(0), np.zeros(0)]
     for k, frame in enumerate(frames):
-        reach = reach or _reach(frame)
-        near = _near_sides(frame, reach)
+        radius = radius or _search_radius(frame)
+        near = _near_sides(frame, radius)
         edges += int(near.sum())
-        part = _correlation(near, _steepness(frame.rgb), reach)
+        part = _correlation(near, _gradient_magnitude(frame.rgb), radius)
         halves[k % 2] = halves[k % 2] + part if k > 1 else part
-    if edges < _LEAST_EDGES or not halves[1].size:
+    if edges < _MIN_EDGES or not halves[1].size:
         return None
     total = halves[0] + halves[1]
     peak, first, second = (np.array(np.unravel_index(values.argmax(), values.shape)) for values in (total, *halves))
-    if np.abs([first - peak, second - peak]).max() > _AGREE:
+    if np.abs([first - peak, second - peak]).max() > _MAX_DISAGREEMENT:
         return None
     rows, columns = np.indices(total.shape)
-    others = total[np.hypot(rows - peak[0], columns - peak[1]) > _NEAR * reach]
-    v, u = (peak - reach).tolist()
-    return (u, v) if total.max() > _CLEAR * max(float(others.max()), 0.0) else None
+    others = total[np.hypot(rows - peak[0], columns - peak[1]) > _PEAK_RADIUS * radius]
+    v, u = (peak - radius).tolist()
+    return (u, v) if total.max() > _PEAK_RATIO * max(float(others.max()), 0.0) else None
 
 
-def _reach(frame: Frame) -> int:
-    """How far is searched [px]; no farther than the image is, however low."""
+def _search_radius(frame: Frame) -> int:
+    """Return the search radius [px], limited by the image size."""
     height, width = frame.depth.shape
-    return min(max(2, round(_RANGE * width)), (min(height, width) - 1) // 2)
+    return min(max(2, round(_SEARCH_RANGE * width)), (min(height, width) - 1) // 2)
 
 
 def _near_sides(frame: Frame, margin: int) -> NDArray[np.bool_]:
-    """(H, W): has a depth, as all around it have, and one of those is farther; not within ``margin`` of the border."""
+    """Return the mask (H, W) of near sides of depth edges, at least ``margin`` pixels inside the image."""
     window = np.ones((3, 3), np.uint8)
     depth = frame.depth if frame.mask is None else np.where(frame.mask, frame.depth, np.float32(0))
-    near = (cv2.erode(depth, window) > 0) & (cv2.dilate(depth, window) > (1 + _JUMP) * depth)
+    near = (cv2.erode(depth, window) > 0) & (cv2.dilate(depth, window) > (1 + _DEPTH_JUMP) * depth)
     inside = np.zeros_like(near)
     inside[margin:-margin, margin:-margin] = near[margin:-margin, margin:-margin]
     return inside
 
 
-def _steepness(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(H, W): length of grey's gradient, up to a limit; of mean 0 and, unless all is of one grey, of deviation 1."""
+def _gradient_magnitude(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Compute the clamped gradient magnitude (H, W) of the grey image, normalized to mean 0 and deviation 1."""
     gray = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
-    steep = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) / 8
-    steep = np.minimum(steep, np.float32(_STRONG))
-    centered: NDArray[np.float32] = steep - steep.mean()
+    gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)) / 8
+    gradient = np.minimum(gradient, np.float32(_MAX_GRADIENT))
+    centered: NDArray[np.float32] = gradient - gradient.mean()
     return centered / max(float(centered.std()), 1e-6)
 
 
-def _correlation(mask: NDArray[np.bool_], image: NDArray[np.float32], reach: int) -> NDArray[np.float64]:
-    """(2R + 1, 2R + 1): sums of ``image`` over ``mask`` shifted by -R..R rows and columns, R being ``reach``."""
+def _correlation(mask: NDArray[np.bool_], image: NDArray[np.float32], radius: int) -> NDArray[np.float64]:
+    """Correlate ``mask``, shifted by -R..R rows and columns, with ``image``: (2R + 1, 2R + 1), R = ``radius``."""
     product = np.fft.rfft2(mask.astype(np.float64)).conj() * np.fft.rfft2(image.astype(np.float64))
-    shifts = np.arange(-reach, reach + 1)
+    shifts = np.arange(-radius, radius + 1)
     return np.fft.irfft2(product, s=mask.shape)[np.ix_(shifts, shifts)]

@@ -1,4 +1,4 @@
-"""How far an estimated camera path is from a reference: ATE and RPE (Sturm et al. 2012), as `evo` computes them."""
+"""Errors of an estimated trajectory against a reference: ATE and RPE (Sturm et al. 2012), as `evo` computes them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatbot.trajectory import Trajectory
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-MAX_DIFFERENCE = 0.01  # [s], evo's
+MAX_DIFFERENCE = 0.01  # [s] between associated stamps; evo's default
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class AbsoluteError:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Relative pose error between neighbouring associated frames.
+    """Relative pose error between consecutive associated frames.
 
     Args:
         trans_rmse, rot_rmse: [m], [rad].
@@ -58,7 +58,10 @@ class RelativeError:
 def associate(
     reference: Trajectory, estimate: Trajectory, max_difference: float = MAX_DIFFERENCE
 ) -> tuple[Index, Index]:
-    """Indices (M,) of the poses of each that belong together: for each of the shorter, the nearest of the longer.
+    """Associate the poses of two trajectories by their stamps: for each of the shorter, the nearest of the longer.
+
+    Returns:
+        Indices (M,) into the reference and (M,) into the estimate.
 
     Raises:
         InputError: no stamps are within ``max_difference`` [s].
@@ -81,7 +84,10 @@ def associate(
 
 
 def align(reference: Array, estimate: Array) -> Array:
-    """Rigid transform (4, 4) that takes points (N, 3) [m] nearest to others (N, 3) (Umeyama 1991, without scale)."""
+    """Compute the rigid transform (4, 4) that aligns points (N, 3) [m] to a reference (N, 3) [m] by least squares.
+
+    Umeyama (1991), without scale.
+    """
     mean_r, mean_e = reference.mean(axis=0), estimate.mean(axis=0)
     U, _, Vt = np.linalg.svd((reference - mean_r).T @ (estimate - mean_e))
     S = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
@@ -94,7 +100,7 @@ def align(reference: Array, estimate: Array) -> Array:
 def absolute_error(
     reference: Trajectory, estimate: Trajectory, max_difference: float = MAX_DIFFERENCE
 ) -> AbsoluteError:
-    """ATE; equal to `evo_ape tum reference estimate -a`.
+    """Compute the ATE; equal to `evo_ape tum reference estimate -a`.
 
     Raises:
         InputError: no stamps are within ``max_difference`` [s].
@@ -117,7 +123,7 @@ def absolute_error(
 def relative_error(
     reference: Trajectory, estimate: Trajectory, max_difference: float = MAX_DIFFERENCE
 ) -> RelativeError:
-    """RPE per frame; equal to `evo_rpe tum reference estimate --delta 1 --delta_unit f`.
+    """Compute the RPE per frame; equal to `evo_rpe tum reference estimate --delta 1 --delta_unit f`.
 
     Raises:
         InputError: fewer than two frames can be associated.
@@ -133,12 +139,12 @@ def relative_error(
 
 
 def _steps(poses: Array) -> list[Array]:
-    """Motion (4, 4) from each pose (N, 4, 4) to the next, in the frame of the former."""
+    """Return the motion (4, 4) from each pose (N, 4, 4) to the next, in the frame of the earlier one."""
     return [inverse(a) @ b for a, b in pairwise(poses)]
 
 
 def _nearest(stamps: Array, among: Array) -> Index:
-    """For each stamp the index of the nearest among others (increasing); the earlier where two are as near."""
+    """Return for each stamp the index of the nearest of ``among`` (increasing); ties go to the earlier one."""
     right = np.clip(np.searchsorted(among, stamps), 1, max(len(among) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(among) - 1)

@@ -1,4 +1,4 @@
-"""Map and trajectory files. Readers go by content, writers by suffix."""
+"""Map and trajectory files. Readers detect the format from the content, writers from the suffix."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from splatbot.errors import FormatError
 
-if TYPE_CHECKING:  # torch takes seconds to import, and trajectories need none of it
+if TYPE_CHECKING:  # importing torch takes seconds, and trajectories do not need it
     from splatbot.gaussians import GaussianModel
 
 __all__ = ["WRITTEN", "load_gaussians", "save_gaussians"]
 
 WRITTEN = ("ply",)
-"""Suffixes of the formats that maps are written in."""
+"""Suffixes of the formats in which maps are written."""
 
 _KNOWN = "3DGS PLY (.ply)"
 
@@ -33,12 +33,12 @@ def load_gaussians(path: str | Path) -> GaussianModel:
         from splatbot.formats.ply import load_ply
 
         return load_ply(path)
-    what = f"begins with {magic!r}" if magic else "is empty"
-    raise FormatError(f"{what}: of no known format.", file=path, field="format", hint=f"known formats: {_KNOWN}")
+    found = f"begins with {magic!r}" if magic else "is empty"
+    raise FormatError(f"{found}, which is no known format.", file=path, field="format", hint=f"known formats: {_KNOWN}")
 
 
 def save_gaussians(model: GaussianModel, path: str | Path) -> None:
-    """Write a map in the format that the suffix names; ``path`` is replaced only once the file is whole.
+    """Write a map in the format of the suffix; ``path`` is replaced only once the file is complete.
 
     Raises:
         FormatError: the suffix is unknown.

@@ -1,7 +1,13 @@
 """The PLY layout of 3D Gaussian Splatting (Kerbl et al. 2023), which every viewer opens.
 
-Properties of the `vertex` element, float32: x y z, nx ny nz (always zero), f_dc_0..2, f_rest_* (channel-major: all of
-red, then green, then blue), opacity (logit), scale_0..2 (natural logarithm), rot_0..3 (wxyz).
+The `vertex` element has these float32 properties:
+
+- x y z: mean;
+- nx ny nz: always zero;
+- f_dc_0..2, f_rest_*: spherical harmonics, channel-major (all of red, then green, then blue);
+- opacity: logit;
+- scale_0..2: natural logarithm;
+- rot_0..3: quaternion wxyz.
 """
 
 from __future__ import annotations
@@ -26,14 +32,14 @@ _MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
 _DC = [f"f_dc_{i}" for i in range(3)]
 _SCALES, _QUATS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 _REST_COUNTS = (0, 9, 24, 45, 72)  # 3 ((degree + 1)² - 1)
-_BOOKKEEPING = {"observations": 1, "anchors": -1, "uncertainty": 0, "misses": 0}  # and what their absence means
+_BOOKKEEPING = {"observations": 1, "anchors": -1, "uncertainty": 0, "misses": 0}  # with the value if absent
 
 
 def load_ply(path: str | Path) -> GaussianModel:
     """Read a 3DGS PLY of SH degree 0 to 4, with or without normals; other properties are ignored.
 
-    Zero quaternions become the identity, and infinite opacities and scales of exactly 0 (whose logarithm is -inf) the
-    nearest finite ones, each with a logged warning.
+    Zero quaternions become the identity. Infinite opacities, and scales of exactly 0 (logarithm -inf), become the
+    nearest finite ones. Each replacement logs a warning.
 
     Raises:
         FormatError: no such file, truncated, a property is missing, or a value is NaN or infinite.
@@ -53,7 +59,7 @@ def load_ply(path: str | Path) -> GaussianModel:
     table = _table(vertex, names)
     n_rest = len(rest)
     means, dc, f_rest, opacity, log_scales, quats = np.split(table, np.cumsum([3, 3, n_rest, 1, 3]), axis=1)
-    _mend(path, opacity, log_scales, quats)
+    _replace_degenerate(path, opacity, log_scales, quats)
     _check_finite(path, table, names)
     sh = np.concatenate([dc[:, None, :], f_rest.reshape(len(table), 3, n_rest // 3).transpose(0, 2, 1)], axis=1)
     return GaussianModel(
@@ -67,12 +73,12 @@ def load_ply(path: str | Path) -> GaussianModel:
 
 
 def save_ply(model: GaussianModel, path: str | Path, *, normals: bool = True, bookkeeping: bool = False) -> None:
-    """Write a binary little-endian 3DGS PLY whose stored values are ``model``'s bits.
+    """Write a binary little-endian 3DGS PLY that stores the values of ``model`` bit for bit.
 
     Args:
-        normals: write nx ny nz (zero), as the original does; readers of a fixed layout expect them.
-        bookkeeping: append int `observations`, `anchors` and `misses` and float `uncertainty`. Readers that go by the
-            header skip them; those that assume the original's layout would not, hence the default.
+        normals: write nx ny nz (zero) as the original does, because readers of a fixed layout expect them.
+        bookkeeping: append int `observations`, `anchors` and `misses` and float `uncertainty`. Readers that use the
+            header skip them. Readers that assume the original layout fail on them, hence the default.
     """
     n = len(model)
     sh = model.sh.detach().numpy()
@@ -130,7 +136,7 @@ def _rest_names(path: str | Path, present: list[str]) -> list[str]:
 
 
 def _table(vertex: PlyElement, names: list[str]) -> Table:
-    """The named properties as columns (N, P); one pass over memory where all properties are float32."""
+    """Return the named properties as columns (N, P), in one pass over memory if all properties are float32."""
     data = vertex.data
     if {data.dtype[name] for name in data.dtype.names} == {np.dtype("<f4")}:
         order = [data.dtype.names.index(name) for name in names]
@@ -149,8 +155,8 @@ def _column(vertex: PlyElement, present: list[str], name: str, default: int) -> 
     return torch.from_numpy(vertex[name].astype(kind))
 
 
-def _mend(path: str | Path, opacity: Table, log_scales: Table, quats: Table) -> None:
-    """Replace in place the values that have a plain meaning although no optimiser could have made them."""
+def _replace_degenerate(path: str | Path, opacity: Table, log_scales: Table, quats: Table) -> None:
+    """Replace degenerate values with a clear meaning in place: zero quaternions, zero scales, infinite opacities."""
     zero = ~quats.any(axis=1)
     flat = np.isneginf(log_scales)
     sure = np.isinf(opacity)
@@ -158,13 +164,13 @@ def _mend(path: str | Path, opacity: Table, log_scales: Table, quats: Table) -> 
     log_scales[flat] = np.log(SCALE_MIN)
     bound = np.log(OPACITY_MAX / (1.0 - OPACITY_MAX)), np.log(OPACITY_MIN / (1.0 - OPACITY_MIN))
     opacity[sure] = np.where(opacity[sure] > 0, *bound)
-    for count, what in (
+    for count, replacement in (
         (zero.sum(), "zero quaternions became the identity"),
         (flat.sum(), f"scales of 0 became {SCALE_MIN} m"),
         (sure.sum(), "infinite opacities became the nearest finite ones"),
     ):
         if count:
-            _log.warning("%s: %d %s", path, count, what)
+            _log.warning("%s: %d %s", path, count, replacement)
 
 
 def _check_finite(path: str | Path, table: Table, names: list[str]) -> None:

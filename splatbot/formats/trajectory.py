@@ -1,4 +1,7 @@
-"""TUM trajectories: `stamp tx ty tz qx qy qz qw` a line; the only place where their xyzw becomes wxyz and back.
+"""TUM trajectories: one line `stamp tx ty tz qx qy qz qw` per pose.
+
+Quaternions are converted between xyzw (file) and wxyz (memory) only here.
+
 
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 """
@@ -52,19 +55,19 @@ def _parse(path: str | Path, number: int, line: str) -> list[float]:
             f"{line.strip()[:80]!r} is not a pose.",
             file=path,
             field=f"line {number}",
-            hint=f"write {_LAYOUT}, finite, the quaternion not zero, or remove the line",
+            hint=f"write {_LAYOUT} with finite values and a nonzero quaternion, or remove the line",
         )
     return row
 
 
-def save_trajectory(trajectory: Trajectory, path: str | Path, *, what: str = "T_world_camera") -> None:
-    """Write a TUM trajectory: stamps exact, the rest with 12 digits; of an empty one, the heading only.
+def save_trajectory(trajectory: Trajectory, path: str | Path, *, pose_name: str = "T_world_camera") -> None:
+    """Write a TUM trajectory: exact stamps, other values with 12 digits; an empty one has only the heading.
 
-    ``what`` names the poses in the heading, where they are not a camera's.
+    ``pose_name`` names the poses in the heading.
     """
     quats = rotation_to_quat(trajectory.T_world_camera[:, :3, :3])
     values = np.hstack([trajectory.positions, quats[:, [1, 2, 3, 0]]])
     with atomic_write(path) as file:
-        file.write(f"# timestamp tx ty tz qx qy qz qw ({what})\n".encode())
+        file.write(f"# timestamp tx ty tz qx qy qz qw ({pose_name})\n".encode())
         for stamp, row in zip(trajectory.stamps, values, strict=True):
             file.write(f"{float(stamp)!r} {' '.join(f'{v:.12g}' for v in row)}\n".encode())

@@ -1,4 +1,4 @@
-"""A run as one self-contained HTML page."""
+"""The report of a run: one self-contained HTML page."""
 
 from splatbot.report.page import report_html
 

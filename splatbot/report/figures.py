@@ -1,4 +1,4 @@
-"""The plots of a run report. Each takes plain rows and returns PNG bytes, or None when there is nothing to plot."""
+"""Plots of a run report. Each takes plain rows and returns PNG bytes, or None if there is nothing to plot."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BANDS = {
 
 @styled
 def trajectory_plot(trajectory: Trajectory, track: TrajectoryScore | None) -> bytes | None:
-    """The path from above and from the side; coloured by its error over the reference, where there is one."""
+    """Plot the trajectory from above and from the side, coloured by its error if there is a reference."""
     if len(trajectory) == 0:
         return None
     fig, axes = figure(2, height=4.0)
@@ -48,7 +48,7 @@ def trajectory_plot(trajectory: Trajectory, track: TrajectoryScore | None) -> by
 
 @styled
 def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes | None:
-    """Position error of every tracked frame over time, with the frames that were lost or in doubt as bands."""
+    """Plot the position error of every tracked frame over time, with bands for lost and degraded frames."""
     stamps = [row.stamp for row in rows if row.stamp is not None]
     if track is None or not stamps:
         return None
@@ -58,7 +58,7 @@ def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes
     ate = track.absolute
     ax.plot(ate.stamps - t0, 1e3 * ate.errors, color=BLUE, linewidth=1.3, marker=".", markersize=4)
     ax.axhline(1e3 * ate.rmse, color=GREEN, linewidth=1.2, linestyle="--", label="ATE RMSE")
-    ax.set_ylim(0.0, 1.2e3 * max(ate.max, 1e-6))  # the legend stands above the curve
+    ax.set_ylim(0.0, 1.2e3 * max(ate.max, 1e-6))  # leaves space above the curve for the legend
     ax.set_xlabel("time [s]")
     ax.set_ylabel("position error [mm]")
     ax.legend(loc="upper left", ncols=4)
@@ -67,7 +67,7 @@ def error_plot(rows: Sequence[FrameRow], track: TrajectoryScore | None) -> bytes
 
 @styled
 def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
-    """Milliseconds of every frame, stacked by stage; what no stage accounts for is "other"."""
+    """Plot the time of every frame [ms], stacked by stage; the remainder outside all stages is "other"."""
     done = [row for row in rows if row.processed]
     if not done:
         return None
@@ -81,7 +81,7 @@ def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
         color = INK if name == "other" else SERIES[k % len(SERIES)]
         ax.bar(x, values, bottom=base, width=1.0, color=color, label=name, linewidth=0)
         base = base + values
-    # One slow frame (the first, a relocalisation) must not flatten all others.
+    # One slow frame, such as the first or a relocalization, must not flatten all others.
     top = max(1.25 * float(np.percentile(base, 98)), 1e-3)
     ax.set_ylim(0, min(top, 1.05 * float(base.max()) + 1e-3))
     ax.set_xlabel("frame")
@@ -92,7 +92,7 @@ def stages_plot(rows: Sequence[FrameRow]) -> bytes | None:
 
 @styled
 def gaussians_plot(rows: Sequence[FrameRow]) -> bytes | None:
-    """Size of the map over the frames, keyframes marked."""
+    """Plot the size of the map over the frames, with keyframes marked."""
     done = [row for row in rows if row.processed]
     if not done:
         return None
@@ -113,10 +113,10 @@ def gaussians_plot(rows: Sequence[FrameRow]) -> bytes | None:
 
 
 def bands(rows: Sequence[FrameRow]) -> list[tuple[str, float, float]]:
-    """Spans of time (verdict, from, to) [s] of neighbouring frames that were not "ok".
+    """Return time spans (verdict, from, to) [s] of consecutive frames whose verdict is not "ok".
 
-    A frame's span reaches half way to its neighbours. One that could not be read has no stamp and fills the gap
-    between those that have.
+    A frame's span extends half-way to its neighbours. A frame that could not be read has no stamp and fills the gap
+    between its neighbours.
     """
     stamped = [row.stamp for row in rows if row.stamp is not None]
     if not stamped:

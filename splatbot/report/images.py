@@ -8,23 +8,23 @@ from numpy.typing import NDArray
 
 from splatbot.rasterize.views import colorize
 
-MAX_WIDTH = 360  # [px]; five such images stand in a row
+MAX_WIDTH = 360  # [px]; five such images fit side by side
 
 
 def colour_png(rgb: NDArray[np.uint8]) -> bytes:
-    """An image (H, W, 3) uint8, made smaller where it is wide."""
+    """Encode an image (H, W, 3) uint8, downsampled to at most :data:`MAX_WIDTH`."""
     return _encode(_fit(rgb, cv2.INTER_AREA))
 
 
 def difference_png(a: NDArray[np.uint8], b: NDArray[np.uint8], *, gain: float = 3.0) -> bytes:
-    """|a - b| of two images (H, W, 3), the mean over the channels times ``gain``: dark is equal."""
+    """Encode |a - b| of two images (H, W, 3), the mean over the channels times ``gain``; dark means equal."""
     mean = np.abs(a.astype(np.float32) - b.astype(np.float32)).mean(axis=2)
     grey = np.clip(gain * mean, 0, 255).astype(np.uint8)
     return _encode(_fit(cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), cv2.INTER_AREA))
 
 
 def depth_png(depth: NDArray[np.float32], depth_range: tuple[float, float]) -> bytes:
-    """Depth (H, W) [m], red (near) to blue (far) over ``depth_range``; missing depth (0) is transparent."""
+    """Encode depth (H, W) [m], red (near) to blue (far) over ``depth_range``; missing depth (0) is transparent."""
     rgb = colorize(depth, "depth", depth_range=depth_range)
     opaque = np.where(depth > 0, 255, 0).astype(np.uint8)
     return _encode(_fit(np.dstack([rgb, opaque]), cv2.INTER_NEAREST))

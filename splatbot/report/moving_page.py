@@ -1,4 +1,4 @@
-"""Pages on which something moves and can be turned, played, stepped and scrubbed; nothing is fetched."""
+"""Self-contained pages with an animated 3D view that can be rotated, played, stepped and scrubbed."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 
 def moving_page(title: str, facts: str, data: Mapping[str, Any], script: str, *, curve: bool = False) -> str:
-    """The page: a canvas, controls for time, and the two scripts that draw.
+    """Return the page: a canvas, time controls, and the two scripts that draw.
 
     Args:
-        title: above it.
-        facts: beside that.
-        data: for the scripts; ``times`` [s], ``middle`` (3,) and ``distance`` [m] are the stage's.
-        script: file beside this one that draws a moment; see ``stage.js``.
-        curve: leave room for a curve below.
+        title: heading.
+        facts: text next to the heading.
+        data: for the scripts. ``stage.js`` uses ``times`` [s], ``middle`` (3,) and ``distance`` [m].
+        script: file in this folder that draws one time step; see ``stage.js``.
+        curve: add a canvas for a clearance curve below the view.
     """
     folder = resources.files("splatbot.report")
     own, stage = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stage.js"))
-    chart = '<canvas id="curve" title="room around the arm; red: it touches"></canvas>\n' if curve else ""
+    chart = '<canvas id="curve" title="clearance of the arm; red: contact"></canvas>\n' if curve else ""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>
 body {{ margin: 0; font: 14px system-ui, sans-serif; background: #16181d; color: #e8e8ea; height: 100vh;
@@ -37,8 +37,8 @@ footer {{ display: flex; gap: 12px; align-items: center; }} input {{ flex: 1; }}
 </style></head><body>
 <header><b>{html.escape(title)}</b> &nbsp; {html.escape(facts)}</header>
 <canvas id="view"></canvas>
-{chart}<footer><button id="back" title="a step back">&#9664;</button><button id="play">play</button>
-<button id="on" title="a step on">&#9654;</button><input id="time" type="range" min="0" value="0">
+{chart}<footer><button id="back" title="one step back">&#9664;</button><button id="play">play</button>
+<button id="on" title="one step forward">&#9654;</button><input id="time" type="range" min="0" value="0">
 <span id="label"></span></footer>
 <script type="application/json" id="data">{json.dumps(data)}</script>
 <script>{own}</script>
@@ -48,15 +48,15 @@ footer {{ display: flex; gap: 12px; align-items: center; }} input {{ flex: 1; }}
 
 
 def packed(values: NDArray[np.generic], kind: type) -> str:
-    """An array as text."""
+    """Encode an array as base64 text of its little-endian values."""
     return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
 
 
-def thinned(count: int, most: int) -> NDArray[np.int64]:
-    """At most ``most`` rows of ``count``, evenly spread."""
+def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most ``most`` evenly spaced indices below ``count``."""
     return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
 
 
 def bytes_of(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Colours in 0..1 as 0..255."""
+    """Convert colours in 0..1 to 0..255."""
     return (255 * np.clip(colors, 0, 1)).astype(np.uint8)

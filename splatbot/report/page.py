@@ -1,4 +1,4 @@
-"""The HTML of a run report: everything inline, nothing fetched."""
+"""The HTML page of a run report, with all content inline."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def report_html(
     views: ViewScores,
     map_page: str | None = None,
 ) -> str:
-    """The page of one run, as text.
+    """Return the HTML page of one run.
 
     Args:
         rows: one per frame of the log.
         metrics: the contents of ``metrics.json``.
-        config: what the run was told.
+        config: configuration of the run.
         trajectory: the tracked poses.
-        track: the trajectory against its reference, where there is one.
+        track: score of the trajectory. If None, there is no reference.
         views: the held-out views.
-        map_page: file beside the report that shows the map, to be turned.
+        map_page: file next to the report with the interactive map. If None, there is no such file.
     """
     name = str(metrics["log"]["name"])
     parts = [
@@ -50,10 +50,10 @@ def report_html(
         _tiles(metrics),
         section("Trajectory", image(trajectory_plot(trajectory, track), "trajectory"), _no_reference(track)),
         section("Error over time", image(error_plot(rows, track), "position error over time")),
-        section("Frames in doubt", _doubts(rows)),
+        section("Degraded and lost frames", _verdicts(rows)),
         section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
         section("Time per frame", image(stages_plot(rows), "milliseconds per stage"), _stages(metrics), _pace(metrics)),
-        section("Map", _turned(map_page), image(gaussians_plot(rows), "Gaussians over frames")),
+        section("Map", _map_frame(map_page), image(gaussians_plot(rows), "Gaussians over frames")),
         section("Simulated sensor effects", _effects(metrics["effects"])),
         details("Configuration", f"<pre>{html.escape(config.to_yaml())}</pre>"),
         details("Versions", table(("", ""), _versions())),
@@ -68,7 +68,7 @@ def _banner(metrics: Mapping[str, Any]) -> str:
     if metrics["interrupted"]:
         return (
             f'<section class="banner warn"><b>Interrupted</b> after {metrics["frames"]} of '
-            f"{metrics['log']['frames']} frames; this is what was mapped until then.</section>\n"
+            f"{metrics['log']['frames']} frames; the report covers the part mapped until then.</section>\n"
         )
     return ""
 
@@ -90,23 +90,23 @@ def _tiles(metrics: Mapping[str, Any]) -> str:
 
 def _no_reference(track: TrajectoryScore | None) -> str:
     if track is not None:
-        return note("The estimate is aligned to the reference by a rigid motion (no scale); the dot is the start.")
-    return note("No reference poses: there is no trajectory error to show. The dot is the start.")
+        return note("The estimate is aligned to the reference by a rigid transform. The dot is the start.")
+    return note("Without reference poses there is no trajectory error. The dot is the start.")
 
 
-def _turned(page: str | None) -> str:
+def _map_frame(page: str | None) -> str:
     if page is None:
         return ""
     name = html.escape(page)
     return (
         f'<iframe src="{name}" title="the map" loading="lazy" style="width:100%;height:28rem;border:0"></iframe>\n'
-        + note(f'Drag to turn it, or open <a href="{name}">{name}</a>, which lies beside this page.')
+        + note(f'Drag to rotate it, or open <a href="{name}">{name}</a>, which is in the same folder.')
     )
 
 
-def _doubts(rows: Sequence[FrameRow]) -> str:
-    doubts = Counter((row.verdict, reason) for row in rows if row.verdict != "ok" for reason in row.reasons or ("",))
-    return table(("verdict and reason", "frames"), [(f"{v}: {r}", str(n)) for (v, r), n in doubts.most_common(12)])
+def _verdicts(rows: Sequence[FrameRow]) -> str:
+    counts = Counter((row.verdict, reason) for row in rows if row.verdict != "ok" for reason in row.reasons or ("",))
+    return table(("verdict and reason", "frames"), [(f"{v}: {r}", str(n)) for (v, r), n in counts.most_common(12)])
 
 
 def _view(view: ShownView) -> str:
@@ -116,7 +116,7 @@ def _view(view: ShownView) -> str:
         (colour_png(view.rendered_rgb), f"map, {decibels(view.score.psnr_db)}"),
         (difference_png(view.rgb, view.rendered_rgb, gain=_GAIN), f"difference, times {_GAIN:g}"),
         (depth_png(view.depth, span), f"sensor depth, {span[0]:.2f} to {span[1]:.2f} m"),
-        (depth_png(view.rendered_depth, span), f"map depth, off by {metres(view.score.depth_median_m)}"),
+        (depth_png(view.rendered_depth, span), f"map depth, median error {metres(view.score.depth_median_m)}"),
     ]
     return pictures(images)
 
@@ -127,7 +127,7 @@ def _views_note(metrics: Mapping[str, Any], views: ViewScores) -> str:
     return note(
         f"Mean over {len(views.scores)} frames that were tracked but never mapped: PSNR "
         f"{decibels(metrics['psnr_holdout_db'])} over whole images, depth L1 {metres(metrics['depth_l1_m'])} where "
-        f"both have depth; the map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
+        f"both have depth. The map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
     )
 
 
@@ -157,6 +157,6 @@ def _versions() -> list[tuple[str, str]]:
     for package in _PACKAGES:
         try:
             found.append((package, metadata.version(package)))
-        except metadata.PackageNotFoundError:  # as when run from a checkout that is not installed
+        except metadata.PackageNotFoundError:  # for example in a checkout that is not installed
             found.append((package, "not installed"))
     return found

@@ -1,4 +1,4 @@
-"""What pages of HTML are put together from: everything inline, nothing fetched."""
+"""Building blocks of HTML pages with all content inline."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatbot.report.theme import data_uri
 
 
 def document(title: str, subtitle: str, parts: Iterable[str]) -> str:
-    """A whole page of parts that are HTML already; titles are not."""
+    """Return a whole HTML page; ``parts`` are HTML, the titles are plain text."""
     css = resources.files("splatbot.report").joinpath("style.css").read_text(encoding="utf-8")
     name = html.escape(title)
     return (
@@ -22,28 +22,28 @@ def document(title: str, subtitle: str, parts: Iterable[str]) -> str:
 
 
 def section(title: str, *parts: str) -> str:
-    """A titled part; nothing where it would be empty."""
+    """Return a titled section, or an empty string if its body is empty."""
     body = "".join(parts)
     return f"<section><h2>{title}</h2>\n{body}</section>\n" if body else ""
 
 
 def details(title: str, body: str) -> str:
-    """A part that opens when it is asked to."""
+    """Return a section that is collapsed until the reader opens it."""
     return f"<section><details><summary>{title}</summary>{body}</details></section>\n"
 
 
 def note(text: str) -> str:
-    """A remark; ``text`` is HTML."""
+    """Return a remark; ``text`` is HTML."""
     return f'<p class="note">{text}</p>'
 
 
 def image(data: bytes | None, text: str) -> str:
-    """An inline PNG with its description; nothing without one."""
+    """Return an inline PNG with its description, or an empty string if there is no image."""
     return f'<img alt="{html.escape(text)}" src="{data_uri(data)}">' if data is not None else ""
 
 
 def pictures(images: Iterable[tuple[bytes, str]]) -> str:
-    """Captioned PNGs side by side."""
+    """Return captioned PNGs side by side."""
     figures = "".join(
         f"<figure>{image(data, text)}<figcaption>{html.escape(text)}</figcaption></figure>" for data, text in images
     )
@@ -51,13 +51,13 @@ def pictures(images: Iterable[tuple[bytes, str]]) -> str:
 
 
 def tiles(values: Iterable[tuple[str, str]]) -> str:
-    """Figures (value, label) in large letters."""
+    """Return figures (value, label) in large letters."""
     cells = "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in values)
     return f'<div class="tiles">{cells}</div>\n'
 
 
 def table(head: Iterable[str], rows: Sequence[Iterable[str]]) -> str:
-    """A table of plain text; nothing without rows."""
+    """Return a table of plain text, or an empty string if there are no rows."""
     if not rows:
         return ""
     lines = ["".join(f"<th>{html.escape(cell)}</th>" for cell in head)]

@@ -1,4 +1,4 @@
-"""A planned trajectory among the Gaussians, as a picture and as a page that turns; nothing is fetched."""
+"""A planned trajectory in the map, as an image and as an interactive page."""
 
 from __future__ import annotations
 
@@ -12,65 +12,66 @@ from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view, to_png
-from splatbot.report.balls import balls
-from splatbot.report.moving_page import bytes_of, moving_page, packed, thinned
+from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
+from splatbot.report.sphere_gaussians import sphere_gaussians
 
-_MOST_POINTS = 40_000
-_NEAR = 1.6  # [m] around the base that is shown
+_MAX_POINTS = 40_000
+_CROP_RADIUS = 1.6  # [m] of the map around the base that is shown
 _FRAMES = 80
-_GHOSTS = 5  # postures in the picture
-_EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # of the picture, from the base [m]
+_GHOSTS = 5  # postures in the image
+_EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # camera of the image, in the base frame [m]
 
 
 def plan_html(
     model: GaussianModel, arm: RobotSpheres, field: GaussianCollisionField, trajectory: JointTrajectory, *, title: str
 ) -> str:
-    """The page: the map's Gaussians as points around the arm's spheres, with a slider for time.
+    """Return the page: the map's Gaussians as points, the arm as spheres, and a slider for time.
 
     Args:
         model: the map.
-        arm: the robot, with its base's pose.
-        field: the map as the arm avoids it.
-        trajectory: what was planned.
-        title: above it.
+        arm: collision spheres of the robot with the pose of its base.
+        field: collision field of the map.
+        trajectory: the planned trajectory.
+        title: heading.
     """
     times = np.linspace(0.0, trajectory.duration, _FRAMES)
     q = trajectory.at(times).position
-    T_base_world = inverse(arm.T_world_base)  # the page's up is the base's z
+    T_base_world = inverse(arm.T_world_base)  # the page's up direction is the z axis of the base
     points, colors = _nearby(model, T_base_world)
     centers = transform_points(T_base_world, arm.centers(q).reshape(-1, 3))
     last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])
     tool = centers.reshape(_FRAMES, -1, 3)[:, last]
-    rooms = np.minimum(arm.clearance(field, q, cut=0.5).distance, 0.5)
+    clearances = np.minimum(arm.clearance(field, q, cut=0.5).distance, 0.5)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     document = {
         "points": packed(points, np.float32),
         "colors": packed(colors, np.uint8),
-        "balls": packed(centers, np.float32),
+        "spheres": packed(centers, np.float32),
         "radii": arm.spheres.radii.round(4).tolist(),
         "tool": packed(tool, np.float32),
         "times": times.round(4).tolist(),
-        "rooms": rooms.round(4).tolist(),
+        "clearances": clearances.round(4).tolist(),
         "middle": middle.round(3).tolist(),
         "distance": 2.2,
         "size": 0.006,
     }
     c = trajectory.certificate
     facts = (
-        f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, room all along at least "
+        f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, clearance at least "
         f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm; map version {c.map_version}"
     )
     return moving_page(title, facts, document, "plan_view.js")
 
 
 def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: JointTrajectory, *, width: int = 960) -> bytes:
-    """The map with the arm at the start (blue), at the end (orange) and between, rendered as Gaussians."""
+    """Render the map with the arm at the start (blue), at the end (orange) and in between."""
     times = np.linspace(0.0, trajectory.duration, _GHOSTS)
     centers = arm.centers(trajectory.at(times).position)
     share = np.linspace(0.0, 1.0, _GHOSTS)[:, None]
     hues = (1 - share) * np.array([0.15, 0.45, 0.9]) + share * np.array([0.95, 0.5, 0.1])
     ghosts = [
-        balls(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35) for i in range(_GHOSTS)
+        sphere_gaussians(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35)
+        for i in range(_GHOSTS)
     ]
     near = _within(model, inverse(arm.T_world_base))
     import torch
@@ -83,15 +84,15 @@ def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: JointTrajector
 
 
 def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:
-    """Rows of the Gaussians around the base; all of them if there are none."""
+    """Return indices of the Gaussians around the base, or of all Gaussians if none is near."""
     at = transform_points(T_base_world, model.means.double().numpy())
-    rows = np.flatnonzero(np.abs(at).max(axis=1) < _NEAR)
+    rows = np.flatnonzero(np.abs(at).max(axis=1) < _CROP_RADIUS)
     return rows if len(rows) else np.arange(len(model))
 
 
 def _nearby(model: GaussianModel, T_base_world: Array) -> tuple[Array, NDArray[np.uint8]]:
-    """Means (P, 3) around the base, in its frame, and their colours (P, 3)."""
+    """Return the means (P, 3) around the base, in the base frame, and their colours (P, 3)."""
     rows = _within(model, T_base_world)
-    rows = rows[thinned(len(rows), _MOST_POINTS)]
+    rows = rows[evenly_spaced(len(rows), _MAX_POINTS)]
     means = transform_points(T_base_world, model.means.double().numpy()[rows])
     return means, bytes_of(model.colors.double().numpy()[rows])

@@ -1,13 +1,13 @@
-// Points on a canvas, drawn far to near, and time: drag turns, wheel zooms, the slider scrubs; buttons, space and arrow
-// keys play and step; #t=1.5 at the end of the address begins there. A page's own script, run before, gives
-// scene(put, at), which puts points and balls of moment `at`, and caption(at).
+// Draws points far to near on a canvas and animates them: drag rotates, wheel zooms, the slider scrubs; buttons, space and
+// arrow keys play and step; #t=1.5 at the end of the address starts at that time [s]. The page's own script runs first and
+// defines scene(drawPoint, at), which draws the points of time step `at`, and caption(at).
 "use strict";
 const canvas = document.getElementById("view"), slider = document.getElementById("time"), label = document.getElementById("label");
 const pen = canvas.getContext("2d"), steps = data.times.length, button = document.getElementById("play");
 let yaw = 3.6, pitch = 0.5, distance = data.distance, playing = false;
 slider.max = steps - 1;
 
-function basis() {  // camera axes in the world of z up
+function basis() {  // camera axes in a z-up world
   const c = Math.cos(pitch), s = Math.sin(pitch), a = Math.cos(yaw), b = Math.sin(yaw);
   return [[-b, a, 0], [s * a, s * b, -c], [-c * a, -c * b, -s]];
 }
@@ -16,7 +16,7 @@ function draw() {
   const w = (canvas.width = canvas.clientWidth), h = (canvas.height = canvas.clientHeight), f = 0.9 * Math.min(w, h);
   const [x, y, z] = basis(), m = data.middle, at = Number(slider.value);
   const shown = [];
-  const put = (px, py, pz, radius, r, g, b) => {
+  const drawPoint = (px, py, pz, radius, r, g, b) => {
     const d = [px - m[0], py - m[1], pz - m[2]];
     const depth = distance + d[0] * z[0] + d[1] * z[1] + d[2] * z[2];
     if (depth < 0.05) return;
@@ -25,7 +25,7 @@ function draw() {
     const size = (f * radius) / depth;
     if (u > -size && v > -size && u < w + size && v < h + size) shown.push([depth, u, v, size, r, g, b]);
   };
-  scene(put, at);
+  scene(drawPoint, at);
   shown.sort((a, b) => b[0] - a[0]);
   pen.fillStyle = "#16181d";
   pen.fillRect(0, 0, w, h);
@@ -60,14 +60,14 @@ function step(by) {
   go(Number(slider.value) + by);
 }
 
-let held = null;
-canvas.addEventListener("pointerdown", (e) => { held = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
-canvas.addEventListener("pointerup", () => { held = null; });
+let dragged = null;
+canvas.addEventListener("pointerdown", (e) => { dragged = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
+canvas.addEventListener("pointerup", () => { dragged = null; });
 canvas.addEventListener("pointermove", (e) => {
-  if (!held) return;
-  yaw -= 0.01 * (e.clientX - held[0]);
-  pitch = Math.max(-1.5, Math.min(1.5, pitch + 0.01 * (e.clientY - held[1])));
-  held = [e.clientX, e.clientY];
+  if (!dragged) return;
+  yaw -= 0.01 * (e.clientX - dragged[0]);
+  pitch = Math.max(-1.5, Math.min(1.5, pitch + 0.01 * (e.clientY - dragged[1])));
+  dragged = [e.clientX, e.clientY];
   draw();
 });
 canvas.addEventListener("wheel", (e) => { e.preventDefault(); distance *= Math.exp(0.001 * e.deltaY); draw(); }, { passive: false });
@@ -76,7 +76,7 @@ button.addEventListener("click", () => play(!playing));
 document.getElementById("back").addEventListener("click", () => step(-1));
 document.getElementById("on").addEventListener("click", () => step(1));
 window.addEventListener("keydown", (e) => {
-  if (e.target === slider && e.key !== " ") return;  // it moves by itself
+  if (e.target === slider && e.key !== " ") return;  // the slider handles these keys
   if (e.key === " ") play(!playing);
   else if (e.key === "ArrowLeft") step(-1);
   else if (e.key === "ArrowRight") step(1);

@@ -1,4 +1,4 @@
-"""Colours and figures that read well on a light and on a dark page."""
+"""Colours and figure styles that are legible on light and dark pages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 P = ParamSpec("P")
 R = TypeVar("R")
 
-INK = "#838b96"  # grey of middling lightness: figures are transparent and must show on both pages
+INK = "#838b96"  # mid grey: figures are transparent and must be legible on light and dark pages
 GRID = "#838b9640"
 BLUE, ORANGE, GREEN, RED, PURPLE, TEAL = "#3f86d0", "#e0912f", "#3fa372", "#d9515f", "#8f74d1", "#2ba5a5"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, TEAL, "#c2699e", "#a3893c", "#6d9bb8", "#b3724f", "#7fa650")
@@ -36,7 +36,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def styled(plot: Callable[P, R]) -> Callable[P, R]:
-    """A plotting function that runs in this theme, and leaves matplotlib's global settings as they were."""
+    """Decorate a plotting function so that it runs in this theme without changing matplotlib's global settings."""
 
     @wraps(plot)
     def inner(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -47,7 +47,7 @@ def styled(plot: Callable[P, R]) -> Callable[P, R]:
 
 
 def figure(columns: int = 1, *, width: float = 9.0, height: float = 3.0) -> tuple[Figure, list[Axes]]:
-    """A figure of ``columns`` plots side by side, ``width`` x ``height`` [inch]."""
+    """Create a figure of ``columns`` plots side by side, ``width`` x ``height`` [inch]."""
     fig = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(fig)
     axes = [fig.add_subplot(1, columns, i + 1) for i in range(columns)]
@@ -59,12 +59,12 @@ def figure(columns: int = 1, *, width: float = 9.0, height: float = 3.0) -> tupl
 
 
 def png(fig: Figure, *, dpi: int = 140) -> bytes:
-    """The figure as PNG, its background transparent."""
+    """Encode the figure as a PNG with a transparent background."""
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png", dpi=dpi, transparent=True)
     return buffer.getvalue()
 
 
 def data_uri(image: bytes) -> str:
-    """A PNG as the address of an inline image."""
+    """Encode a PNG as a data URI."""
     return "data:image/png;base64," + base64.b64encode(image).decode()

@@ -1,47 +1,47 @@
-// Points of a map and of bodies that move as they did in the twin, what touched, and a curve of the arm's room.
+// Draws the points of a map and of simulated bodies, the contacts, and a curve of the clearance of the arm.
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 const points = new Float32Array(bytes(data.points)), colors = new Uint8Array(bytes(data.colors));
 const own = new Float32Array(bytes(data.own)), tints = new Uint8Array(bytes(data.tints)), body = new Uint16Array(bytes(data.body));
-const poses = new Float32Array(bytes(data.poses)), soft = new Float32Array(bytes(data.soft)), many = data.bodies;
+const poses = new Float32Array(bytes(data.poses)), soft = new Float32Array(bytes(data.soft)), bodyCount = data.bodies;
 const chart = document.getElementById("curve");
 
-function scene(put, at) {
+function scene(drawPoint, at) {
   for (let i = 0; i < points.length; i += 3) {
-    put(points[i], points[i + 1], points[i + 2], data.size, colors[i], colors[i + 1], colors[i + 2]);
+    drawPoint(points[i], points[i + 1], points[i + 2], data.size, colors[i], colors[i + 1], colors[i + 2]);
   }
   for (let i = 0; i < body.length; ++i) {
-    const k = 12 * (at * many + body[i]), x = own[3 * i], y = own[3 * i + 1], z = own[3 * i + 2];  // rows of (R | t)
+    const k = 12 * (at * bodyCount + body[i]), x = own[3 * i], y = own[3 * i + 1], z = own[3 * i + 2];  // rows of (R | t)
     const [px, py, pz] = [0, 4, 8].map((r) => poses[k + r] * x + poses[k + r + 1] * y + poses[k + r + 2] * z + poses[k + r + 3]);
-    put(px, py, pz, data.size, tints[3 * i], tints[3 * i + 1], tints[3 * i + 2]);
+    drawPoint(px, py, pz, data.size, tints[3 * i], tints[3 * i + 1], tints[3 * i + 2]);
   }
   const corners = soft.length / data.times.length;
-  for (let i = at * corners; i < (at + 1) * corners; i += 3) put(soft[i], soft[i + 1], soft[i + 2], 0.008, 120, 200, 140);
-  for (const [x, y, z, force] of data.touches[at]) put(x, y, z, 0.008 + 0.0004 * Math.min(50, force), 255, 60, 60);
+  for (let i = at * corners; i < (at + 1) * corners; i += 3) drawPoint(soft[i], soft[i + 1], soft[i + 2], 0.008, 120, 200, 140);
+  for (const [x, y, z, force] of data.contacts[at]) drawPoint(x, y, z, 0.008 + 0.0004 * Math.min(50, force), 255, 60, 60);
   curve(at);
 }
 
 function caption(at) {
-  const hard = data.touches[at].reduce((most, touch) => Math.max(most, touch[3]), 0);
-  const touching = data.touches[at].length ? `, touching with ${hard.toFixed(1)} N` : "";
-  const room = data.rooms[at] >= data.far ? `${(1e3 * data.far).toFixed(0)} mm or more` : `${(1e3 * data.rooms[at]).toFixed(1)} mm`;
-  return `room ${room}${touching}`;
+  const maxForce = data.contacts[at].reduce((most, contact) => Math.max(most, contact[3]), 0);
+  const contact = data.contacts[at].length ? `, contact force ${maxForce.toFixed(1)} N` : "";
+  const clearance = data.clearances[at] >= data.far ? `${(1e3 * data.far).toFixed(0)} mm or more` : `${(1e3 * data.clearances[at]).toFixed(1)} mm`;
+  return `clearance ${clearance}${contact}`;
 }
 
 function curve(at) {
   const w = (chart.width = chart.clientWidth), h = (chart.height = chart.clientHeight), pen = chart.getContext("2d");
-  const last = data.times.length - 1, least = Math.min(0, ...data.rooms);
-  const x = (i) => (last ? (w * i) / last : 0), y = (room) => 4 + (h - 8) * (1 - (room - least) / (data.far - least));
+  const last = data.times.length - 1, least = Math.min(0, ...data.clearances);
+  const x = (i) => (last ? (w * i) / last : 0), y = (clearance) => 4 + (h - 8) * (1 - (clearance - least) / (data.far - least));
   pen.fillStyle = "#16181d";
   pen.fillRect(0, 0, w, h);
   pen.fillStyle = "rgba(255,60,60,0.35)";
-  data.touches.forEach((found, i) => { if (found.length) pen.fillRect(x(i) - 0.5 * x(1), 0, Math.max(1, x(1)), h); });
+  data.contacts.forEach((found, i) => { if (found.length) pen.fillRect(x(i) - 0.5 * x(1), 0, Math.max(1, x(1)), h); });
   const line = (style, from, to) => { pen.strokeStyle = style; pen.beginPath(); pen.moveTo(...from); pen.lineTo(...to); pen.stroke(); };
   line("#555", [0, y(0)], [w, y(0)]);
   pen.strokeStyle = "#7ab7ff";
   pen.beginPath();
-  data.rooms.forEach((room, i) => (i ? pen.lineTo(x(i), y(room)) : pen.moveTo(x(i), y(room))));
+  data.clearances.forEach((clearance, i) => (i ? pen.lineTo(x(i), y(clearance)) : pen.moveTo(x(i), y(clearance))));
   pen.stroke();
   line("#eee", [x(at), 0], [x(at), h]);
 }

@@ -1,1 +1,1 @@
-"""What a run leaves behind and how good it is."""
+"""Output files of a run and their scores."""

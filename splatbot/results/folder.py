@@ -1,4 +1,4 @@
-"""The folder that a run leaves behind: configuration, trajectory, frames, metrics, map and report."""
+"""The output folder of a run: configuration, trajectory, frames, metrics, map and report."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ _NOT_A_RUN = "give a folder that `splatbot map` wrote"
 
 @dataclass(frozen=True)
 class FrameRow:
-    """One line of ``frames.jsonl``: what became of one frame of the log.
+    """One line of ``frames.jsonl``: the result of one frame of the log.
 
     Args:
         index: position in the log.
-        stamp: time [s]; None for a frame that could not be read.
+        stamp: time [s], or None if the frame could not be read.
         verdict: as in :class:`splatbot.slam.FrameResult`, "skipped" when the frame could not be read, or
             "dropped" when a paced run had no time for it.
-        reasons: why it is not "ok".
-        stage: the tracking stage whose pose was taken.
+        reasons: causes of a verdict other than "ok".
+        stage: the tracking stage that produced the pose.
         ms: wall-clock milliseconds for tracking and mapping, without reading the file.
         stage_ms: milliseconds by stage.
         keyframe: whether the frame entered the map.
-        held_out: whether the frame was kept out of the map, to be scored against it.
-        gaussians: size of the map afterwards.
+        held_out: whether the frame was kept out of the map for scoring.
+        gaussians: size of the map after the frame.
         late: whether, in a paced run, the next frame arrived before this one was done.
-        covariance: of the pose, as in :class:`splatbot.slam.FrameResult`: the 21 values of the upper triangle, by rows;
-            None where there is no pose.
-        skipped: tracking stages that there was no time for.
+        covariance: of the pose, as in :class:`splatbot.slam.FrameResult`: the 21 values of the upper triangle by
+            rows; or None if there is no pose.
+        skipped: tracking stages that were left out for lack of time.
     """
 
     index: int
@@ -59,17 +59,17 @@ class FrameRow:
 
     @property
     def processed(self) -> bool:
-        """Whether the frame was looked at."""
+        """Return whether tracking processed the frame."""
         return self.verdict not in ("skipped", "dropped")
 
     @property
     def tracked(self) -> bool:
-        """Whether the frame has a pose."""
+        """Return whether the frame has a pose."""
         return self.verdict in ("ok", "degraded")
 
 
 class RunFolder:
-    """Paths of a run's files, and reading and writing them. Every file is replaced as a whole."""
+    """Paths of a run's files, with reading and writing. Every file is replaced atomically."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -83,7 +83,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
-        """The folder, made if need be; files of an earlier run stay until :meth:`save` replaces them.
+        """Create the folder if it does not exist; files of an earlier run stay until :meth:`save` replaces them.
 
         Raises:
             InputError: the folder cannot be made or written to.
@@ -109,10 +109,10 @@ class RunFolder:
         model: GaussianModel,
         metrics: Mapping[str, Any],
     ) -> None:
-        """Write all but the report. An older report goes first: it would describe another map."""
+        """Write all files but the report. An older report is deleted because it describes another map."""
         self.report.unlink(missing_ok=True)
         self.map_page.unlink(missing_ok=True)
-        save_ply(model, self.map, bookkeeping=True)  # what was never observed must not collide later
+        save_ply(model, self.map, bookkeeping=True)  # unobserved Gaussians must stay marked for collision checks
         self._save_trajectory(trajectory)
         lines = [json.dumps(asdict(row)) for row in rows]
         _write_text(self.frames, "\n".join([*lines, ""]))
@@ -132,12 +132,12 @@ class RunFolder:
         _write_text(self.map_page, html)
 
     def load_config(self) -> Config:
-        """The configuration that the run used; the present environment does not change it."""
+        """Load the configuration of the run; the current environment variables do not change it."""
         self._require(self.config)
         return load_config(self.config, environ={})
 
     def load_metrics(self) -> dict[str, Any]:
-        """``metrics.json``.
+        """Load ``metrics.json``.
 
         Raises:
             FormatError: the file is missing or damaged.
@@ -151,7 +151,7 @@ class RunFolder:
         return metrics
 
     def load_frames(self) -> list[FrameRow]:
-        """The rows of ``frames.jsonl``.
+        """Load the rows of ``frames.jsonl``.
 
         Raises:
             FormatError: the file is missing or a line is damaged.
@@ -171,21 +171,21 @@ class RunFolder:
         return rows
 
     def load_trajectory(self) -> Trajectory:
-        """The poses of the tracked frames."""
+        """Load the poses of the tracked frames."""
         return Trajectory.load(self._require(self.trajectory))
 
     def load_poses(self) -> dict[int, NDArray[np.float64]]:
-        """T_world_camera (4, 4) of every tracked frame, by its position in the log.
+        """Load T_world_camera (4, 4) of every tracked frame, by its position in the log.
 
         Raises:
-            FormatError: ``frames.jsonl`` and ``trajectory.tum`` do not belong together.
+            FormatError: ``frames.jsonl`` and ``trajectory.tum`` do not match.
         """
         rows = [row for row in self.load_frames() if row.tracked]
         indices = [row.index for row in rows]
         trajectory = self.load_trajectory() if rows else None
         poses = list(trajectory.T_world_camera) if trajectory is not None else []
         if trajectory is not None and len(rows) < len(poses) and self._was_killed():
-            poses = poses[: len(rows)]  # between writing the one file and the other
+            poses = poses[: len(rows)]  # killed between writing the two files
         if len(indices) != len(poses):
             raise FormatError(
                 f"has {len(poses)} poses, {self.frames.name} has {len(indices)} tracked frames.",
@@ -195,7 +195,7 @@ class RunFolder:
         return dict(zip(indices, poses, strict=True))
 
     def load_covariances(self) -> NDArray[np.float64] | None:
-        """Covariances (N, 6, 6) of the tracked frames; None of a run that did not write them."""
+        """Load the covariances (N, 6, 6) of the tracked frames, or None if the run did not write them."""
         packed = [row.covariance for row in self.load_frames() if row.tracked]
         if not packed or any(values is None or len(values) != 21 for values in packed):
             return None
@@ -205,7 +205,7 @@ class RunFolder:
         return full
 
     def _was_killed(self) -> bool:
-        """Whether the run neither ended nor was interrupted."""
+        """Return whether the run neither ended nor was interrupted."""
         return self.metrics.is_file() and not self.load_metrics().get("finished", True)
 
     def _save_trajectory(self, trajectory: Trajectory) -> None:

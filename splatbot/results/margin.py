@@ -1,4 +1,4 @@
-"""The room to keep from a run's map, as the run's own depth tells."""
+"""Collision margin of a run's map from the run's own depth images."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from splatbot.logs import Log
 from splatbot.results.folder import RunFolder
 from splatbot.results.views import depth_views
 
-REACH = 1.0  # [m] around the base
-SHARE = 0.999  # of what was measured whose error it holds
+RADIUS = 1.0  # [m] around the base
+SHARE = 0.999  # quantile of the surface error
 
 
 def own_margin(run: str | Path, log: Log, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
-    """The error [m] of 99.9 % of what the run measured within a metre of a base, without what mapping leaves out.
+    """Return the 99.9 % quantile [m] of the map's surface error within 1 m of a robot's base.
+
+    The error is measured with the depth that mapping used.
 
     Args:
         run: folder of the run.
-        log: that it read, with what it left out masked.
-        field: of the run's map.
+        log: the log of the run, with the same masks.
+        field: collision field of the run's map.
         T_world_base: (4, 4) pose of the robot's base.
 
     Raises:
         FormatError: the folder is damaged.
         LogError: the log is damaged.
-        InputError: nothing was measured there.
+        InputError: no depth was measured there.
     """
     views = depth_views(RunFolder(run), log)
-    return surface_error(field, views, around=[*T_world_base[:3, 3], REACH]).share(SHARE)
+    return surface_error(field, views, around=[*T_world_base[:3, 3], RADIUS]).share(SHARE)

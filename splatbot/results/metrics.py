@@ -1,4 +1,4 @@
-"""What a run cost and how it went, under the names that other programs read from ``metrics.json``."""
+"""Costs and counts of a run, under the stable keys of ``metrics.json``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PERCENTILES = (50, 95, 99)
 
 
 def cost_metrics(rows: Sequence[FrameRow]) -> dict[str, Any]:
-    """Counts and times of the frames that were processed."""
+    """Count the processed frames and summarize their times."""
     done = [row for row in rows if row.processed]
     return {
         "frames": len(done),
@@ -35,14 +35,14 @@ def cost_metrics(rows: Sequence[FrameRow]) -> dict[str, Any]:
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float | None]:
-    """The 50th, 95th and 99th percentile; None of nothing."""
+    """Compute the 50th, 95th and 99th percentile, or None for an empty sequence."""
     if not values:
         return {f"p{p}": None for p in _PERCENTILES}
     return {f"p{p}": float(v) for p, v in zip(_PERCENTILES, np.percentile(values, _PERCENTILES), strict=True)}
 
 
 def stage_percentiles(rows: Sequence[FrameRow]) -> dict[str, dict[str, float | None]]:
-    """By stage: percentiles [ms] over the frames in which it ran, their number and the sum [ms]."""
+    """Compute for each stage the percentiles [ms] over its frames, their number and the sum [ms]."""
     spent = {name: [row.stage_ms[name] for row in rows if name in row.stage_ms] for name in stage_names(rows)}
     return {
         name: {**percentiles(values), "frames": len(values), "total": float(sum(values))}
@@ -51,7 +51,7 @@ def stage_percentiles(rows: Sequence[FrameRow]) -> dict[str, dict[str, float | N
 
 
 def stage_names(rows: Sequence[FrameRow]) -> list[str]:
-    """Names of all stages, in the order of the frame that ran the most of them."""
+    """Return the names of all stages, in the order of the frame with the most stages."""
     fullest = max(rows, key=lambda row: len(row.stage_ms), default=None)
     return list(
         dict.fromkeys([*(fullest.stage_ms if fullest else ()), *(name for row in rows for name in row.stage_ms)])
@@ -59,13 +59,13 @@ def stage_names(rows: Sequence[FrameRow]) -> list[str]:
 
 
 def peak_rss_bytes() -> int:
-    """The largest resident memory of this process so far [bytes]."""
+    """Return the peak resident memory of this process [bytes]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
+    return peak if sys.platform == "darwin" else peak * 1024  # Linux reports KiB
 
 
 def without_nan(value: Any) -> Any:
-    """The same with null for numbers that JSON does not have."""
+    """Replace NaN and infinity, which JSON cannot represent, by None."""
     if isinstance(value, Mapping):
         return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

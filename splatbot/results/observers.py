@@ -1,4 +1,4 @@
-"""Where the Gaussians of a run's map were seen from."""
+"""Camera positions from which the Gaussians of a run's map were observed."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from splatbot.results.folder import RunFolder
 
 
 def observers(run: RunFolder, model: GaussianModel) -> NDArray[np.float64]:
-    """Positions (N, 3) [m, world] of the keyframe that created each Gaussian; NaN where that is not known.
+    """Return the position (N, 3) [m, world] of the keyframe that created each Gaussian; NaN if it is unknown.
 
     Raises:
         FormatError: the folder is damaged.
     """
     poses = run.load_poses()
     keyframes = [row.index for row in run.load_frames() if row.keyframe]
-    known = np.full((len(keyframes) + 1, 3), np.nan)  # the last is for what no keyframe created
+    known = np.full((len(keyframes) + 1, 3), np.nan)  # the last row is for Gaussians without a keyframe
     for number, index in enumerate(keyframes):
         if index in poses:
             known[number] = poses[index][:3, 3]

@@ -1,4 +1,4 @@
-"""Scoring a finished run again, from its folder and its log."""
+"""Scoring of a finished run from its folder and its log."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from splatbot.trajectory import Trajectory
 
 
 def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) -> dict[str, Any]:
-    """The accuracy figures of ``metrics.json``, computed anew.
+    """Compute the accuracy figures of ``metrics.json`` again.
 
     Args:
         folder: the run.
         log: the recording that it mapped.
-        reference: poses to compare with; None takes the log's own.
+        reference: poses to compare with. If None, the ground truth of the log is used.
 
     Raises:
         FormatError: a file of the run is missing or damaged, or the log is too short to be the one that was mapped.

@@ -1,4 +1,4 @@
-"""How good a run is: its trajectory against the reference, its map against frames it has not seen."""
+"""Scores of a run: its trajectory against the reference, its map against held-out frames."""
 
 from __future__ import annotations
 
@@ -51,15 +51,21 @@ class TrajectoryScore:
 def score_trajectory(
     estimate: Trajectory, reference: Trajectory | None, covariances: NDArray[np.float64] | None = None
 ) -> TrajectoryScore | None:
-    """Compare trajectories after SE(3) alignment; None where no stamps belong together or there is no reference.
+    """Compare trajectories after SE(3) alignment.
 
-    ``covariances`` (N, 6, 6) are those of the estimated poses, see :func:`splatbot.evaluation.nees`.
+    Args:
+        estimate: estimated poses.
+        reference: true poses. If None, there is no score.
+        covariances: (N, 6, 6) of the estimated poses, see :func:`splatbot.evaluation.nees`.
+
+    Returns:
+        The score, or None if no stamps match or there is no reference.
     """
     if reference is None or len(estimate) == 0:
         return None
     try:
         absolute = absolute_error(reference, estimate)
-    except InputError:  # a reference of another time says nothing about this part of the log
+    except InputError:  # the reference covers another time span than this part of the log
         return None
     associated = np.isin(estimate.stamps, absolute.stamps)
     during = (reference.stamps >= estimate.stamps[0] - 0.1) & (reference.stamps <= estimate.stamps[-1] + 0.1)
@@ -74,7 +80,7 @@ def score_trajectory(
 
 
 def trajectory_metrics(score: TrajectoryScore | None) -> dict[str, float | None]:
-    """The trajectory's part of ``metrics.json``; null without a reference."""
+    """Return the trajectory's part of ``metrics.json``, with None for each value without a reference."""
     relative = score.relative if score else None
     return {
         "ate_rmse_m": score.absolute.rmse if score else None,
@@ -126,7 +132,7 @@ class ViewScores:
     shown: list[ShownView] = field(default_factory=list)
 
     def metrics(self) -> dict[str, float | None]:
-        """The views' part of ``metrics.json``: the median depth error is the median over views, the rest means."""
+        """Return the views' part of ``metrics.json``: the median over views for the median depth error, else means."""
         return {
             "psnr_holdout_db": _mean([s.psnr_db for s in self.scores]),
             "ssim_holdout": _mean([s.ssim for s in self.scores]),

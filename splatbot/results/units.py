@@ -1,4 +1,4 @@
-"""Numbers as people read them; a dash where there is none."""
+"""Readable numbers with units; a dash for a missing value."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ NONE = "-"
 
 
 def metres(value: float | None) -> str:
-    """A length [m] in mm, cm or m."""
+    """Format a length [m] in mm, cm or m."""
     if value is None:
         return NONE
     if abs(value) < 0.02:
@@ -15,7 +15,7 @@ def metres(value: float | None) -> str:
 
 
 def milliseconds(value: float | None) -> str:
-    """A time [ms] in ms, or in s from ten seconds on."""
+    """Format a time [ms] in ms, or in s from 10 s on."""
     if value is None:
         return NONE
     if value >= 1e4:
@@ -24,27 +24,27 @@ def milliseconds(value: float | None) -> str:
 
 
 def decibels(value: float | None) -> str:
-    """A ratio [dB]."""
+    """Format a ratio [dB]."""
     return NONE if value is None else f"{value:.1f} dB"
 
 
 def percent(value: float | None) -> str:
-    """A share 0..1 in %."""
+    """Format a fraction 0..1 in %."""
     return NONE if value is None else f"{100 * value:.0f} %"
 
 
 def count(value: int | None) -> str:
-    """A number with thousands set apart."""
+    """Format a number with thousands separators."""
     return NONE if value is None else f"{value:,}"
 
 
 def megabytes(value: float | None) -> str:
-    """Bytes in MB (10⁶), or GB from a thousand on."""
+    """Format bytes in MB (10⁶ bytes), or in GB from 1000 MB on."""
     if value is None:
         return NONE
     return f"{value / 1e9:.2f} GB" if value >= 1e9 else f"{value / 1e6:.1f} MB"
 
 
 def number(value: float | None, digits: int) -> str:
-    """A bare number with so many digits after the point."""
+    """Format a number with ``digits`` decimals."""
     return NONE if value is None else f"{value:.{digits}f}"

@@ -1,4 +1,4 @@
-"""The depth that a run measured, with the poses that it found."""
+"""Depth images that a run used, with the poses that it estimated."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.tracking.prepare import usable_depth
 
-_FRAMES = 40  # that are given at least, if there are as many
-_KEPT, _PIXELS = 40, 640 * 480  # frames that are kept at most, and pixels of each
+_MIN_FRAMES = 40  # if the run has that many
+_MAX_FRAMES, _MAX_PIXELS = 40, 640 * 480  # of views that stay in memory
 
 
 def depth_views(run: RunFolder, log: Log) -> Iterator[DepthView]:
-    """40 to 79 frames of a run, or all that have a pose, evenly spread: their depth as far as it is used.
+    """Yield 40 to 79 evenly spaced frames of a run, or all that have a pose, with the depth that tracking uses.
 
     Args:
-        run: the folder.
-        log: that it read, with what it left out masked.
+        run: folder of the run.
+        log: the log of the run, with the same masks.
 
     Raises:
         FormatError: the folder is damaged.
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    return _views(run, log, poses, sorted(poses)[:: max(1, len(poses) // _FRAMES)])
+    return _views(run, log, poses, sorted(poses)[:: max(1, len(poses) // _MIN_FRAMES)])
 
 
-def thinned_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
-    """At most 40 frames, evenly spread, of at most 640 x 480 pixels each, to be kept: 49 MB.
+def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
+    """Return at most 40 evenly spaced frames of at most 640 x 480 pixels each (49 MB), to stay in memory.
 
-    Larger depth images keep every second, third ... pixel of both axes as it is: a mean over an edge is depth of
-    nothing.
+    Larger depth images keep every n-th pixel of both axes. Pixels are not averaged, because a mean across an edge is
+    not the depth of any surface.
 
     Raises:
         FormatError: the folder is damaged.
@@ -44,19 +44,19 @@ def thinned_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
     """
     poses = run.load_poses()
     indices = sorted(poses)
-    spread = np.linspace(0, len(indices) - 1, min(_KEPT, len(indices))).round().astype(int)
-    return tuple(thinned(view) for view in _views(run, log, poses, [indices[k] for k in spread]))
+    spread = np.linspace(0, len(indices) - 1, min(_MAX_FRAMES, len(indices))).round().astype(int)
+    return tuple(subsampled(view) for view in _views(run, log, poses, [indices[k] for k in spread]))
 
 
-def thinned(view: DepthView) -> DepthView:
-    """Every second, third ... pixel of both axes, so that at most 640 x 480 are left."""
+def subsampled(view: DepthView) -> DepthView:
+    """Keep every n-th pixel of both axes so that at most 640 x 480 remain."""
     depth, camera, T = view
-    step = int(np.ceil(np.sqrt(depth.size / _PIXELS)))
+    step = int(np.ceil(np.sqrt(depth.size / _MAX_PIXELS)))
     if step <= 1:
         return view
     kept = np.ascontiguousarray(depth[::step, ::step])
     height, width = kept.shape
-    # Pixel (step i, step j) is now (i, j); its centre is where it was.
+    # Pixel (n i, n j) becomes (i, j); its ray does not change.
     small = Camera(camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, width, height)
     return kept, small, T
 

@@ -19,7 +19,7 @@ from splatbot.bench.truth import Truth
 from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_error
 from splatbot.planning import GaussianRRTStar, PlanResult, PlanStatus
 from splatbot.protocols import Array
-from splatbot.results.margin import REACH, SHARE
+from splatbot.results.margin import RADIUS, SHARE
 from splatbot.robots.panda import panda
 
 MARGINS = (0.0, 0.005, 0.02)  # [m] beside the map's own
@@ -43,14 +43,14 @@ def add_map(results: Results, mapped: FilmedMap) -> float:
     """What the map is like; returns the margin [m] that it asks for itself."""
     case = "mapped noisy log"
     field = GaussianCollisionField(mapped.snapshot)
-    own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], REACH]).share(SHARE)
+    own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], RADIUS]).share(SHARE)
     drift = mapped.drift()
     results.add(case, "frames", float(len(drift)), "")
     results.add(case, "lost", float(np.isnan(drift).sum()), f"of {len(drift)}")
     results.add(case, "camera off, median", 1e3 * float(np.nanmedian(drift)), "mm")
     results.add(case, "camera off, most", 1e3 * float(np.nanmax(drift)), "mm")
     results.add(case, "Gaussians", float(len(field)), "")
-    results.add(case, f"surface error within {REACH:g} m, as its depth tells, {SHARE:.1%}", 1e3 * own, "mm")
+    results.add(case, f"surface error within {RADIUS:g} m, as its depth tells, {SHARE:.1%}", 1e3 * own, "mm")
     return own
 
 

@@ -84,13 +84,13 @@ def try_paths(
         planned += 1
         certified += path.certificate.certified
         result = twin.follow(timed(path.waypoints, robot.chain))
-        touched += bool(result.touches)
-        least = min(least, result.near.room)
+        touched += bool(result.contacts)
+        least = min(least, result.clearance.value)
         simulated, spent = simulated + result.duration, spent + result.seconds
         into = push(path.waypoints, robot, table, DEPTH)
         if into is not None:
             pushed += 1
-            seen += bool(twin.follow(timed(into, robot.chain), until_touch=True).touches)
+            seen += bool(twin.follow(timed(into, robot.chain), until_contact=True).contacts)
     return PathTrials(planned, asked, certified, touched, float(least), pushed, seen, simulated / max(spent, 1e-9))
 
 

@@ -39,7 +39,7 @@ def test_a_log_without_an_arm_is_compared_at_tracked_poses(
     assert answer.code == 0, answer.err
     found = json.loads((tmp_path / "out" / "sim2real.json").read_text())
     assert found["kind"] == "sim-to-real"
-    assert found["poses"].startswith("as tracked")
+    assert found["poses"].startswith("tracked")
     assert found["replay"] is None
     assert found["summary"]["all"]["frames"] == 3
     page = (tmp_path / "out" / "sim2real.html").read_text()

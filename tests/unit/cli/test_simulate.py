@@ -44,7 +44,7 @@ def test_the_account_says_what_was_on_why_and_what_it_cost(run: RunCommand, tmp_
     assert run("simulate", "tabletop", "--frames", 8, *SIZE, *HARD, "--out", tmp_path / "r", "--quiet").code == 0
     rows = open_log(tmp_path / "r").effects
     assert [row["name"] for row in rows] == ["exposure", "depth_noise", "blackout"]
-    assert rows[0]["why"] == "asked for as exposure:step=2,at=4"
+    assert rows[0]["why"] == "requested as exposure:step=2,at=4"
     assert all(row["frames"] == 8 and row["ms_per_frame"] > 0 for row in rows)
 
 
@@ -64,10 +64,10 @@ def test_a_run_names_the_effects_of_its_log(
     monkeypatch.setattr("splatbot.run.job.Slam", slam)
     assert run("map", log, "--out", tmp_path / "run", "--save-every", 0, "--quiet").code == 0
     (row,) = json.loads((tmp_path / "run/metrics.json").read_text())["effects"]
-    assert (row["name"], row["why"]) == ("depth_noise", "asked for as depth_noise")
+    assert (row["name"], row["why"]) == ("depth_noise", "requested as depth_noise")
     assert row["frames"] >= 9
     assert row["ms_per_frame"] > 0
-    assert "asked for as depth_noise" in (tmp_path / "run/report.html").read_text()
+    assert "requested as depth_noise" in (tmp_path / "run/report.html").read_text()
 
 
 def test_without_an_effect_none_is_on(run: RunCommand, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def test_the_result_holds_tracking_touches_and_the_ledger_with_costs(run: RunCom
     assert effects["backlash"]["by"] == "forbidden"
     assert effects["backlash"]["ms"] is None
     assert all(isinstance(entry["ms"], float) for entry in effects.values() if entry["on"])
-    assert "room around the arm" in answer.out
+    assert "minimum clearance of the arm" in answer.out
 
 
 def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path
     (tmp_path / "plan.csv").write_text("\n".join([",".join(header), *rows]))
     answer = run("twin", "--map", tmp_path / "map.ply", "--trajectory", tmp_path / "plan.csv", "--no-costs")
     assert answer.code == 1
-    assert "touch: " in answer.out
+    assert "contact: " in answer.out
     assert " and map" in answer.out
     assert "Gaussians as" in answer.out
 

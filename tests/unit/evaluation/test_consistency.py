@@ -14,7 +14,7 @@ SIGMAS = np.array([1e-3, 2e-3, 3e-3, 1e-3, 2e-3, 5e-4])
 
 
 def trajectories(n: int, seed: int, scale: float = 1.0) -> tuple[Trajectory, Trajectory, np.ndarray]:
-    """A path, the same seen from its first pose with random errors, and their covariances."""
+    """Return a path, the same path from its first pose with random errors, and the covariances of the errors."""
     rng, stamps = np.random.default_rng(seed), np.arange(n) / 30
     truth = np.array([se3_exp([0.01 * i, 0.002 * i, -0.005 * i, 0.01 * i, 0, 0.02 * i]) for i in range(n)])
     world = se3_exp([1, 2, 3, 0.1, 0.2, 0.3])
@@ -44,7 +44,7 @@ def test_errors_of_the_reference_itself_are_taken_into_account() -> None:
 
 def test_covariances_that_cannot_be_are_refused() -> None:
     reference, estimate, covariances = trajectories(5, 3)
-    with pytest.raises(InputError, match=r"are \(4, 6, 6\) for 5 poses"):
+    with pytest.raises(InputError, match=r"have shape \(4, 6, 6\) for 5 poses"):
         nees(reference, estimate, covariances[1:])
     covariances[2, 0, 0] = -1
     with pytest.raises(InputError, match="not positive definite"):

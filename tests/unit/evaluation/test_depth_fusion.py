@@ -1,4 +1,4 @@
-"""Depth fused into one surface: where it was measured, without what one image alone has seen."""
+"""Fusion of depth images to one surface: it covers the measured surface and omits measurements of a single image."""
 
 from __future__ import annotations
 

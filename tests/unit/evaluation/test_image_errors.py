@@ -30,7 +30,7 @@ def test_uint8_and_float_images_may_be_mixed(rng: np.random.Generator) -> None:
 
 
 def direct_ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Wang et al. 2004, equations 13 to 15, window by window."""
+    """Compute SSIM window by window (Wang et al. 2004, equations 13 to 15)."""
     x = np.arange(11) - 5
     w = np.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 1.5**2))
     w /= w.sum()

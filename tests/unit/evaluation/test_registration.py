@@ -13,16 +13,16 @@ SIZE = (240, 320)
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, SIZE[1], SIZE[0])
 
 
-def frame(shift: tuple[int, int] = (0, 0), *, things: int = 12, textured: bool = True, steps: bool = True) -> Frame:
-    """Things of one grey before a darker wall, 1 and 2 m away; depth lies ``shift`` (u, v) off its colour."""
+def frame(shift: tuple[int, int] = (0, 0), *, objects: int = 12, textured: bool = True, steps: bool = True) -> Frame:
+    """Return objects of one grey before a darker wall, 1 and 2 m away; depth is shifted by ``shift`` (u, v)."""
     rng = np.random.default_rng(0)
     gray = np.full(SIZE, 60, np.uint8)
     depth = np.full(SIZE, 2.0, np.float32)
-    for _ in range(things):
+    for _ in range(objects):
         v, u, size = rng.integers(20, 190), rng.integers(20, 270), rng.integers(15, 40)
-        thing = np.s_[v : v + size, u : u + size]
-        gray[thing] = rng.integers(90, 220) if textured else 60
-        depth[thing] = 1.0 if steps else 2.0
+        patch = np.s_[v : v + size, u : u + size]
+        gray[patch] = rng.integers(90, 220) if textured else 60
+        depth[patch] = 1.0 if steps else 2.0
     depth = np.roll(depth, shift[::-1], (0, 1))
     return Frame(0.0, np.repeat(gray[..., None], 3, 2), depth, CAMERA)
 
@@ -30,13 +30,13 @@ def frame(shift: tuple[int, int] = (0, 0), *, things: int = 12, textured: bool =
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2), (-5, 4), (0, 6)])
 def test_a_shift_of_depth_is_found_and_taken_back_by_the_answer(shift: tuple[int, int]) -> None:
     u, v = depth_offset([frame(shift)] * 2) or (99, 99)
-    # The near side of an edge is a pixel inside the thing: grey is steepest on both sides of it alike.
+    # The near side of an edge is a pixel inside the object: the grey gradient is equally large on both sides of it.
     assert abs(u + shift[0]) <= 1
     assert abs(v + shift[1]) <= 1
 
 
 def test_frames_that_tell_too_little_each_tell_it_together() -> None:
-    sparse = frame((4, 0), things=2)
+    sparse = frame((4, 0), objects=2)
     assert depth_offset([sparse] * 2) is None
     u, v = depth_offset([sparse] * 6) or (99, 99)
     assert abs(u + 4) <= 1

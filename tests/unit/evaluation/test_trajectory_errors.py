@@ -20,7 +20,7 @@ from splatbot.trajectory import Trajectory
 
 
 def walk(rng: np.random.Generator, n: int = 120, noise: float = 0.0) -> Trajectory:
-    """A random walk from a random start, 30 Hz."""
+    """Return a random walk from a random start at 30 Hz."""
     T = se3_exp(rng.normal(size=6))
     poses = []
     for _ in range(n):
@@ -30,7 +30,7 @@ def walk(rng: np.random.Generator, n: int = 120, noise: float = 0.0) -> Trajecto
 
 
 def disturbed(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
-    """Another world frame, pose noise of 2 cm and 0.02 rad, stamps off by up to 4 ms."""
+    """Return a trajectory in another world frame, with pose noise of 2 cm and 0.02 rad and stamp noise up to 4 ms."""
     T_other = se3_exp(rng.normal(size=6))
     sigma = np.array([0.02] * 6)
     poses = [T_other @ T @ se3_exp(rng.normal(size=6) * sigma) for T in trajectory.T_world_camera]
@@ -38,7 +38,7 @@ def disturbed(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
 
 
 def evo(tmp_path: Path, command: str, reference: Trajectory, estimate: Trajectory, *flags: str) -> dict[str, float]:
-    """Statistics that `evo_ape` or `evo_rpe` prints, with all their digits."""
+    """Return the statistics that `evo_ape` or `evo_rpe` prints, with all digits."""
     reference.save(tmp_path / "reference.tum")
     estimate.save(tmp_path / "estimate.tum")
     result = tmp_path / f"{command}{len(list(tmp_path.iterdir()))}.zip"

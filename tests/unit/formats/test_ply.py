@@ -1,4 +1,4 @@
-"""3DGS PLY: bit-identical storage, and what a damaged file is answered with."""
+"""3DGS PLY: bit-identical storage, and errors for damaged files."""
 
 from __future__ import annotations
 

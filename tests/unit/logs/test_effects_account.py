@@ -78,7 +78,7 @@ def test_an_address_made_of_options_opens_a_log_with_those_options() -> None:
 def test_the_account_of_a_recording_is_read_back(make_log: Callable[..., Path]) -> None:
     folder = make_log(3)
     assert open_log(folder).effects == []
-    rows = [{"name": "depth_noise", "why": "asked for", "settings": {"step": 0.1}, "frames": 3, "ms_per_frame": 1.5}]
+    rows = [{"name": "depth_noise", "why": "requested", "settings": {"step": 0.1}, "frames": 3, "ms_per_frame": 1.5}]
     write_account(folder, uri="synthetic:tabletop", effects=rows, blanks_depth=False)
     assert open_log(folder).effects == rows
 

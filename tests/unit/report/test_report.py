@@ -1,4 +1,4 @@
-"""The report: self-contained, true to the metrics, and honest about what is missing."""
+"""The report: self-contained, consistent with the metrics, and explicit about missing data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
 class Page(HTMLParser):
-    """What a browser would find: text, images, addresses and tags left open."""
+    """Content of a page as a browser finds it: text, images, addresses and unclosed tags."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ def test_without_a_reference_the_page_says_so_and_shows_no_error(make_log: MakeL
     (folder / "groundtruth.txt").unlink()
     map_log(open_log(folder), out=tmp_path / "run", slam=OracleSlam(truth))
     page = Page((tmp_path / "run" / "report.html").read_text())
-    assert "No reference poses" in page.all_text
+    assert "Without reference poses" in page.all_text
     assert "Error over time" not in page.all_text
 
 
@@ -136,14 +136,14 @@ def test_a_run_of_one_frame_has_a_report(make_log: MakeLog, tmp_path: Path) -> N
 
 
 def test_simulated_effects_are_named_with_the_reason_and_a_real_sensor_has_none(log: Log, tmp_path: Path) -> None:
-    effects = Effects([DepthNoise(why="asked for by a test")])
+    effects = Effects([DepthNoise(why="requested by a test")])
     effects(log.read(0))
     assert log.ground_truth is not None
     for name, account in (("simulated", effects.report()), ("real", [])):
         map_log(log, out=tmp_path / name, slam=OracleSlam(log.ground_truth), effects=account)
     simulated, real = (Page(RunFolder(tmp_path / name).report.read_text()).all_text for name in ("simulated", "real"))
     assert "Simulated sensor effects" in simulated
-    assert "asked for by a test" in simulated
+    assert "requested by a test" in simulated
     assert "Simulated sensor effects" not in real
 
 

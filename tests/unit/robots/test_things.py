@@ -20,7 +20,7 @@ from splatbot.collision.visibility import measured_depths
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.results.folder import FrameRow, RunFolder
-from splatbot.results.views import thinned
+from splatbot.results.views import subsampled
 from splatbot.robots.graspable_objects import MeasuredMap, measured_map, run_of, things_of
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime
@@ -56,7 +56,7 @@ def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     run.save(config=Config(), rows=rows, trajectory=Trajectory(stamps, poses), model=full, metrics={})
     Workspace(T_world_base=np.eye(4)).save(run.path / "scene.yaml")
     monkeypatch.setattr("splatbot.robots.graspable_objects.reopen_log", lambda run: None)
-    monkeypatch.setattr("splatbot.robots.graspable_objects.thinned_views", lambda run, log: VIEWS)
+    monkeypatch.setattr("splatbot.robots.graspable_objects.subsampled_views", lambda run, log: VIEWS)
     return run.path
 
 
@@ -135,11 +135,11 @@ def test_a_map_is_measured_once_for_all_questions(run_folder: Path, monkeypatch:
 
 
 def test_thinned_depth_is_of_the_same_places() -> None:
-    """Points on a wall that is not level: what a thinned image says of them is what the whole one says."""
+    """Points on a wall that is not level: what a subsampled image says of them is what the whole one says."""
     camera = Camera(900.0, 900.0, 641.3, 352.1, 1280, 720)
     v, u = np.mgrid[0:720, 0:1280]
     depth = (1.0 + 1e-4 * u + 2e-4 * v).astype(np.float32)
-    small, few, _ = thinned((depth, camera, np.eye(4)))
+    small, few, _ = subsampled((depth, camera, np.eye(4)))
     assert small.size <= 640 * 480
     assert small.shape == (few.height, few.width)
     z = depth[200:600:7, 100:1200:13].astype(np.float64).ravel()
@@ -149,4 +149,4 @@ def test_thinned_depth_is_of_the_same_places() -> None:
     assert len(rows) == len(points)
     assert np.abs(measured - own).max() < 4e-4  # the slope over the one pixel that is left out
     whole = (depth[:480, :640].copy(), Camera(900.0, 900.0, 320.0, 240.0, 640, 480), np.eye(4))
-    assert thinned(whole) is whole
+    assert subsampled(whole) is whole

@@ -1,4 +1,4 @@
-"""Programs that draw: in a process of their own, as MUJOCO_GL must be set before mujoco is imported."""
+"""Programs that render, in their own process, because MUJOCO_GL must be set before mujoco is imported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 
 def run_drawing(program: str, *words: str) -> list[str]:
-    """The lines that a program prints; the test is skipped, with the reason, where MuJoCo cannot draw."""
+    """Return the lines that a program prints; skip the test with the reason if MuJoCo cannot render."""
     env = {**os.environ, "MUJOCO_GL": "egl"}
     done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, env=env)
     if done.returncode != 0 and ("MuJoCo cannot draw here" in done.stderr or "OpenGL" in done.stderr):

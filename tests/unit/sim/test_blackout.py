@@ -1,4 +1,4 @@
-"""Blackout: as many black frames as asked for, from the frame on that was named."""
+"""Blackout: the given number of black frames, from the given frame on."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_the_table_is_found_to_a_tenth_of_a_millimetre_and_level() -> None:
 
 
 def test_the_table_ends_where_it_was_seen_to_end() -> None:
-    """An arm that reaches past its edge and lower touches nothing; on an endless plane it would."""
+    """An arm that reaches past its edge and lower has no contact; on an infinite plane it would."""
     (table,) = (t for t in parts().objects if t.name == "map-table")
     (shape,) = table.shapes
     assert isinstance(shape, BoxGeom)
@@ -82,33 +82,33 @@ def test_what_no_depth_supports_is_air_to_physics_as_it_is_to_the_field() -> Non
     assert set(seen.labels[-50:].tolist()) != {-2}
 
 
-def test_ellipsoids_reach_little_beyond_what_collisions_are_asked_of() -> None:
-    """Measured on the field itself: what the note says holds at points of the surface that it did not look at."""
+def test_ellipsoids_extend_little_beyond_what_the_collision_field() -> None:
+    """Compare the note with points of the surface that the conversion did not sample, on the field itself."""
     found = parts().ellipsoids
     field = GaussianCollisionField(scanned(), min_opacity=0.3)
     rng = np.random.default_rng(0)
-    ways = rng.standard_normal((60, 3))
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    directions = rng.standard_normal((60, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     R = quat_to_rotation(found.quats)
-    points = found.centers[:, None] + np.einsum("eij,epj->epi", R, found.axes[:, None] * ways)
-    room = field.clearance(points.reshape(-1, 3)).distance.reshape(len(R), -1).max(axis=1)
-    assert np.percentile(room, 95) < 0.012
+    points = found.centers[:, None] + np.einsum("eij,epj->epi", R, found.axes[:, None] * directions)
+    distance = field.clearance(points.reshape(-1, 3)).distance.reshape(len(R), -1).max(axis=1)
+    assert np.percentile(distance, 95) < 0.012
     (note,) = (note for note in parts().notes if note.startswith("clutter"))
-    told = float(note.split("beyond the field (95 %: ")[1].split(" mm")[0])
-    assert 1e3 * float(np.percentile(room, 95)) == pytest.approx(told, abs=2.0)
+    reported = float(note.split("beyond the collision field (95 %: ")[1].split(" mm")[0])
+    assert 1e3 * float(np.percentile(distance, 95)) == pytest.approx(reported, abs=2.0)
 
 
 def test_things_on_the_table_are_what_they_are() -> None:
-    kinds = sorted(thing.shapes[0].kind for thing in parts().objects)
+    kinds = sorted(obj.shapes[0].kind for obj in parts().objects)
     assert kinds == ["box", "box", "cylinder", "sphere"]
-    by_kind = {thing.shapes[0].kind: thing for thing in parts().objects if thing.name != "map-table"}
+    by_kind = {obj.shapes[0].kind: obj for obj in parts().objects if obj.name != "map-table"}
     np.testing.assert_allclose(by_kind["sphere"].at, BALL.center, atol=2e-3)
     np.testing.assert_allclose(by_kind["cylinder"].at, [0.60, -0.20, 0.06], atol=4e-3)
     np.testing.assert_allclose(by_kind["box"].at, CARTON.center, atol=4e-3)
     np.testing.assert_allclose(sorted(by_kind["box"].shapes[0].size), sorted(CARTON.size), atol=6e-3)  # type: ignore[union-attr]
 
 
-def test_the_rest_is_at_most_as_many_ellipsoids_as_asked_for_and_near_the_surface() -> None:
+def test_the_rest_is_at_most_as_many_ellipsoids_as_the_limit_and_near_the_surface() -> None:
     """How far the ellipsoids' flat sides are from the true surfaces: of the wall, and of the table's rim and bottom."""
     found = parts().ellipsoids
     assert 200 < len(found.centers) <= 2000
@@ -140,16 +140,16 @@ def test_fewer_ellipsoids_are_larger_and_err_more() -> None:
     assert few.error > 1.5 * many.error
 
 
-def test_a_scene_of_a_map_runs_and_the_arm_touches_its_wall(tmp_path: Path) -> None:
+def test_a_scene_of_a_map_runs_and_the_arm_hits_its_wall(tmp_path: Path) -> None:
     scanned().save(tmp_path / "scan.ply")
     moves = [{"t": 1.5, "tcp": [0.75, 0.0, 0.45], "rpy": [0.0, 1.5707963, 0.0]}, {"t": 2.5, "tcp": [0.80, 0.0, 0.45],
              "rpy": [0.0, 1.5707963, 0.0]}]  # fmt: skip
     scene = make_scene(
         {"name": "scan", "map": {"file": str(tmp_path / "scan.ply")}, "task": {"kind": "reach", "moves": moves}}
     )
-    result = Twin(scene).follow(until_touch=True)
-    assert result.near.room < 0.12
-    assert len(result.notes) == 5  # the arm stands beside the table, not in it
+    result = Twin(scene).follow(until_contact=True)
+    assert result.clearance.value < 0.12
+    assert len(result.notes) == 5  # the arm stands next to the table, not in it
 
 
 def test_a_part_of_the_map_without_gaussians_is_an_error() -> None:
@@ -194,12 +194,12 @@ def test_harmonics_are_evaluated_only_where_a_camera_sees_some(
 
 
 def test_strays_of_a_thing_that_may_move_go_with_it() -> None:
-    """Gaussians that hang together with nothing, 3 cm beside the carton and farther; as clutter they would hold it."""
+    """Isolated Gaussians 3 cm next to the carton and farther; as clutter they would block it."""
     strays = scanned().select(torch.arange(3))
     strays.means[:] = torch.tensor([[0.45, 0.10, 0.147], [0.36, 0.10, 0.06], [0.45, 0.30, 0.12]])
     model = GaussianModel.concatenate([scanned(), strays])
     held, free = (map_parts(model, Clutter(file="scan.ply", movable=m), np.zeros(3)) for m in (False, True))
-    kinds = [thing.shapes[0].kind if thing.name != "map-table" else "" for thing in free.objects]
+    kinds = [obj.shapes[0].kind if obj.name != "map-table" else "" for obj in free.objects]
     carton = kinds.index("box")
     assert held.labels[-3:].tolist() == [-1, -1, -1]
     assert free.labels[-3] == carton

@@ -1,4 +1,4 @@
-"""Statistics over policies against scipy, and against cases worked out by hand."""
+"""Statistics over policies against scipy, and against cases computed by hand."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_same_seed_gives_the_same_intervals_and_paired_trials_stay_paired(rn
     first, again, other = (agreement(names, a, b, seed=seed) for seed in (3, 3, 4))
     assert first == again
     assert first.pearson != other.pearson
-    # Equal in every trial: no resample tells the twins apart, as it would if trials were drawn apart for each.
+    # Equal results in every trial: no resample may separate the twins, as independent resampling of each would.
     same = agreement(names, a, a)
     assert (same.drop.value, same.drop.low, same.drop.high) == (0.0, 0.0, 0.0)
     assert (same.mmrv.low, same.mmrv.high) == (0.0, 0.0)
@@ -101,7 +101,7 @@ def test_promises_are_compared_bin_by_bin() -> None:
     promised = [0.001, 0.004, 0.012, 0.015, 0.2]
     measured = [0.002, -0.003, 0.012, 0.014, 0.3]
     rows = reliability(promised, measured, [False, True, False, False, False])
-    assert [(row.low, row.count, row.touched) for row in rows] == [(0.0, 2, 1), (0.01, 2, 0), (0.05, 1, 0)]
+    assert [(row.low, row.count, row.in_contact) for row in rows] == [(0.0, 2, 1), (0.01, 2, 0), (0.05, 1, 0)]
     assert [row.kept.value for row in rows] == [0.5, 0.5, 1.0]
     assert rows[0].worst == pytest.approx(0.007)
     assert rows[2].worst == pytest.approx(-0.1)

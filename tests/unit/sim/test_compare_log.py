@@ -1,4 +1,4 @@
-"""A log against its twin, where all is known: shapes, the arm's base, and the arm's motion."""
+"""A log against its twin with known shapes, base pose and arm motion."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_frame_that_was_tracked_wrong_does_not_move_the_base(rng: np.random.Ge
 
 
 def test_without_a_common_frame_the_error_says_how_many_there_are() -> None:
-    with pytest.raises(InputError, match=r"no frame in common .* \(1 tracked, 2 told\)"):
+    with pytest.raises(InputError, match=r"no frame in common .* \(1 and 2 frames\)"):
         base_in_map({0: np.eye(4), 1: np.eye(4)}, {7: np.eye(4)}, "test")
 
 
@@ -107,8 +107,8 @@ def test_the_twin_of_exact_surfaces_shows_what_the_camera_saw(tmp_path: Path) ->
     assert found.iou > 0.78  # discs of 1 cm fray the outlines
     assert found.physics_iou is not None
     assert found.physics_iou > 0.9
-    assert seen.stands is not None
-    assert 0.02 < seen.stands.mean() < 0.3
+    assert seen.above is not None
+    assert 0.02 < seen.above.mean() < 0.3
 
 
 def test_a_thing_that_the_map_lacks_costs_overlap_and_depth(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_plane_that_the_log_names_counts_in_the_maps_frame(tmp_path: Path) -> 
     assert given.support is not None
     assert sought.support.offset == pytest.approx(0.0, abs=2e-3)
     assert given.support.offset == pytest.approx(0.02)
-    table = next(thing for thing in TwinViews(given).world.scene.objects if thing.name == "map-table")
+    table = next(obj for obj in TwinViews(given).world.scene.objects if obj.name == "map-table")
     (shape,) = table.shapes
     assert isinstance(shape, BoxGeom)
     assert table.at[2] + shape.size[2] / 2 == pytest.approx(0.02)
@@ -154,7 +154,7 @@ def test_without_a_level_plane_silhouettes_are_not_made_up(tmp_path: Path) -> No
     view, seen = TwinViews(found).compare(frame(), EYE, held_out=False, gap=None)
     assert view.iou is None
     assert view.physics_iou is None
-    assert seen.stands is None
+    assert seen.above is None
 
 
 def test_overlap_is_intersection_over_union_where_it_counts() -> None:
@@ -178,11 +178,11 @@ def test_tool_poses_are_done_again_by_ik_to_a_tenth_of_a_millimetre() -> None:
     assert (found.source, found.poses, found.reached, found.slower) == (BY_IK, 4, 4, 1.0)
     assert [error.index for error in found.errors] == [1, 2, 3]
     assert max(error.position_m for error in found.errors) < 1e-4
-    assert any("stands in" in note for note in found.notes)
+    assert any("replaces the arm" in note for note in found.notes)
 
 
-def test_a_tool_pose_that_was_told_wrong_is_seen_as_error(tmp_path: Path) -> None:
-    """Recorded joints are followed, and their tool compared with the poses that were recorded beside them."""
+def test_a_tool_pose_that_is_recorded_wrong_is_seen_as_error(tmp_path: Path) -> None:
+    """Recorded joints are followed, and their tool poses compared with the poses recorded next to them."""
     q, tool = _tools(31, 1 / 30)
     lines = [f"{t:.6f} " + " ".join(f"{x:.8f}" for x in row) for t, row in zip(tool.stamps, q, strict=True)]
     (tmp_path / "joints.txt").write_text("\n".join(lines) + "\n")
@@ -196,7 +196,7 @@ def test_a_tool_pose_that_was_told_wrong_is_seen_as_error(tmp_path: Path) -> Non
     assert found.source == RECORDED
     assert len(found.errors) == 30
     assert [error.position_m for error in found.errors] == pytest.approx([0.005] * 30, abs=2e-3)
-    assert not any("stands in" in note for note in found.notes)
+    assert not any("replaces the arm" in note for note in found.notes)
 
 
 def test_poses_beyond_the_arms_reach_are_counted_not_invented() -> None:
@@ -206,7 +206,7 @@ def test_poses_beyond_the_arms_reach_are_counted_not_invented() -> None:
     assert knots is not None
     found = replay(knots, Twin(make_scene({"name": "bare"})))
     assert (found.poses, found.reached, found.errors) == (3, 0, ())
-    assert "nothing to do again" in found.notes[0]
+    assert "a replay needs two" in found.notes[0]
 
 
 def test_a_log_without_an_arm_has_no_knots(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The page of policies in two twins says what it compares, with intervals, promises and what went wrong."""
+"""The page of policies in two twins: heading, intervals, certified clearances and failures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Policies in two twins: what differs between the twins, what policies do, and how results are kept."""
+"""Policies in two twins: differences of the twins, motions of the policies, and storage of results."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_planned_path_arrives_and_the_straight_line_hits_the_wall() -> None:
     assert planned.promised >= 0.01
     assert not straight.in_map
     assert not straight.in_held_out
-    assert "touches thing1" in straight.why_held_out
+    assert "with thing1" in straight.why_held_out
     assert straight.promised is None
 
 
@@ -146,22 +146,22 @@ def test_a_start_within_the_wall_is_refused() -> None:
 
 def _can(height: float, friction: float = 0.5) -> Scene:
     can = {"kind": "cylinder", "radius": 0.04, "height": height}
-    things = [
+    items = [
         {"name": "table", "shapes": [{"kind": "plane"}]},
         {"name": "can", "shapes": [can], "at": [0.5, 0.0, height / 2], "movable": True, "friction": friction},
     ]
-    return make_scene({"name": "push", "objects": things})
+    return make_scene({"name": "push", "objects": items})
 
 
 def test_a_low_slow_push_brings_a_can_to_its_goal_and_an_aimless_one_does_not() -> None:
     scene = _can(0.10)
     case = PushCase(scene.objects[1], "can", np.array([1.0, 0.0]), 0.10)
     task = PushTask([case], Twin(scene), lambda case: HeldOutTwin(scene, draw(EXACT, 0)))
-    policies = (Pusher("good", panda(), 0.35, 0.08), Pusher("aside", panda(), 0.35, 0.08, 0.09))
-    good, aside = run_trials(task, policies).trials
+    policies = (Pusher("good", panda(), 0.35, 0.08), Pusher("offset", panda(), 0.35, 0.08, 0.09))
+    good, offset = run_trials(task, policies).trials
     assert (good.in_map, good.in_held_out) == (True, True), good
-    assert (aside.in_map, aside.in_held_out) == (False, False)
-    assert "short" in aside.why_held_out
+    assert (offset.in_map, offset.in_held_out) == (False, False)
+    assert "short" in offset.why_held_out
 
 
 def test_what_the_map_lacks_is_not_pushed() -> None:
@@ -181,8 +181,8 @@ def test_what_the_map_lacks_is_not_pushed() -> None:
     ],
 )
 def test_extents_of_shapes_are_their_support_functions(shape: dict[str, object], back: float, top: float) -> None:
-    thing = SceneObject.model_validate({"name": "a", "shapes": [shape], "at": [0, 0, 0.5]})
-    assert extents(thing, np.array([1.0, 0.0, 0.0])) == pytest.approx((back, 0.5 + top))
+    item = SceneObject.model_validate({"name": "a", "shapes": [shape], "at": [0, 0, 0.5]})
+    assert extents(item, np.array([1.0, 0.0, 0.0])) == pytest.approx((back, 0.5 + top))
 
 
 def test_work_tables_differ_by_seed_and_their_things_stand_apart() -> None:
@@ -190,16 +190,16 @@ def test_work_tables_differ_by_seed_and_their_things_stand_apart() -> None:
     assert first == again
     assert first != other
     for one in (first, other):
-        things = one.solids[5:]
-        for k, thing in enumerate(things):
-            assert isinstance(thing, Block | Can)
-            rest = Tabletop(tuple(t for i, t in enumerate(things) if i != k))
-            assert rest.distance(middle_of(thing)[None])[0] > 0.08
+        items = one.solids[5:]
+        for k, item in enumerate(items):
+            assert isinstance(item, Block | Can)
+            rest = Tabletop(tuple(t for i, t in enumerate(items) if i != k))
+            assert rest.distance(middle_of(item)[None])[0] > 0.08
 
 
 @dataclass(frozen=True)
 class _Still:
-    """Nothing moves; success is told by a table."""
+    """Nothing moves; a table defines which trials succeed."""
 
     success: tuple[bool, ...]
     name: str = "still"
@@ -215,7 +215,7 @@ class _Still:
         return Twin(make_scene({"name": "bare"})), Twin(make_scene({"name": "bare"}))
 
     def failure(self, case: int, twin: Twin, result: TwinResult) -> str:
-        return "" if self.success[case] else "told so"
+        return "" if self.success[case] else "failed"
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,7 @@ def test_a_stop_while_a_table_is_mapped_keeps_the_tables_before_it(
         mapped.append(seed)
 
     monkeypatch.setattr(sim2sim, "map_table", map_one)
-    monkeypatch.setattr(sim2sim, "_TRY", {"reach": lambda plan, place, tell: whole})
+    monkeypatch.setattr(sim2sim, "_TRY", {"reach": lambda plan, place, on_progress: whole})
     (found,) = sim2sim.run_sim_to_sim(sim2sim.SimToSimPlan(("reach",), tables=5), tmp_path)
     assert found.interrupted
     assert found.cases == (0, 1, 2, 3)

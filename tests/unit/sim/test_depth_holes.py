@@ -1,4 +1,4 @@
-"""Depth holes: the share that was asked for, in blobs, others in every frame."""
+"""Depth holes: the given fraction of pixels, in blobs that differ in every frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.unit.sim.frames import frame_at
 
 
 @pytest.mark.parametrize("share", [0.05, 0.4, 0.9])
-def test_exactly_the_asked_for_share_is_lost(share: float) -> None:
+def test_exactly_the_required_share_is_lost(share: float) -> None:
     after = DepthHoles(share=share).apply(frame_at(), np.random.default_rng(1))
     assert (~after.valid).sum() == round(share * 150 * 200)
     assert (after.depth[after.valid] == 1.0).all()
@@ -28,7 +28,7 @@ def test_the_share_is_of_the_pixels_that_had_depth() -> None:
 
 def test_holes_are_blobs_of_the_size_not_single_pixels() -> None:
     def inner(size: float) -> float:
-        """Share of the missing pixels that are 5 px or more from any pixel with depth."""
+        """Return the fraction of missing pixels that are 5 px or more from any pixel with depth."""
         lost = (~DepthHoles(size=size).apply(frame_at(), np.random.default_rng(1)).valid).astype(np.uint8)
         return float((cv2.distanceTransform(lost, cv2.DIST_L2, 5) > 5).sum() / lost.sum())
 

@@ -1,4 +1,4 @@
-"""Sensor effects: pure, seeded per frame, accounted for; depth noise has the published size."""
+"""Sensor effects: pure, seeded per frame, and reported; depth noise has the published size."""
 
 from __future__ import annotations
 

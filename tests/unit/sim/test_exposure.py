@@ -1,4 +1,4 @@
-"""Exposure: gain and offset from the frame on that was named, or a drift by the clock."""
+"""Exposure: gain and offset from the given frame on, or a drift over time."""
 
 from __future__ import annotations
 

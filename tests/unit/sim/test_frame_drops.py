@@ -1,4 +1,4 @@
-"""Frame drops: the rate that was asked for, decided per frame, alone or in bursts."""
+"""Frame drops: the given rate, decided per frame, alone or in bursts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.unit.sim.frames import frame_at
 
 
 @pytest.mark.parametrize("burst", [1, 5])
-def test_the_asked_for_share_is_lost(burst: int) -> None:
+def test_the_required_share_is_lost(burst: int) -> None:
     kept = Effects([FrameDrops(rate=0.3, burst=burst)], seed=1).kept(10_000)
     sigma = np.sqrt(0.3 * 0.7 * burst / 10_000)
     assert 1 - len(kept) / 10_000 == pytest.approx(0.3, abs=4 * sigma)

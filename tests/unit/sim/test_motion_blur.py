@@ -1,4 +1,4 @@
-"""Motion blur: close to the mean of many renderings while the shutter is open, which is what it stands for."""
+"""Motion blur: close to the mean of many renderings during the exposure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RNG = np.random.default_rng(0)
 
 
 def rendered(log: SyntheticLog, trajectory: str, t: float, exposure: float) -> NDArray[np.float64]:
-    """The mean of 17 renderings while the shutter is open."""
+    """Return the mean of 17 renderings during the exposure."""
     path = make_path(trajectory, log.kind.stage, MotionOptions(2.0))
     times = t + exposure * ((np.arange(17) + 0.5) / 17 - 0.5)
     return np.mean([log.scene.render(log.camera, path(float(s)))[0].astype(float) for s in times], axis=0)

@@ -1,4 +1,4 @@
-"""A run as a page: what it holds is what happened, and a browser plays, steps and scrubs it."""
+"""A run as a page: its data are those of the run, and a browser plays, steps and scrubs it."""
 
 from __future__ import annotations
 
@@ -50,9 +50,7 @@ def unpacked(text: str, kind: type) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", _SHAPES, ids=lambda shape: str(shape["kind"]))
 def test_points_of_a_shape_are_where_a_ray_from_outside_hits_it(shape: dict[str, Any]) -> None:
-    model = Twin(
-        make_scene({"name": "x", "robot": None, "objects": [{"name": "thing", "shapes": [shape]}]})
-    ).world.model
+    model = Twin(make_scene({"name": "x", "robot": None, "objects": [{"name": "body", "shapes": [shape]}]})).world.model
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     points, hit = surface_points(model, 0, 200), np.zeros(1, np.int32)
@@ -63,19 +61,19 @@ def test_points_of_a_shape_are_where_a_ray_from_outside_hits_it(shape: dict[str,
         assert 2.0 - far == pytest.approx(float(np.linalg.norm(point)), abs=1e-6)
 
 
-def test_the_recording_has_the_places_touches_and_room_of_the_run() -> None:
+def test_the_recording_has_the_contacts_and_clearance_of_the_run() -> None:
     recording, result = recorded()
     assert len(recording.times) == pytest.approx(RATE * result.duration, abs=1)
     seen: list[np.ndarray] = []
     twin = Twin(load_scene("mug_hanging"))
     twin.follow(watch=lambda data, time: seen.append(data.xpos.copy()) if time in recording.times else None)
     np.testing.assert_array_equal(recording.poses[..., 3], np.array(seen))
-    assert min(recording.rooms) == pytest.approx(result.near.room, abs=1e-3)
-    touching = [t for t, found in zip(recording.times, recording.touches, strict=True) if found]
-    first, last = min(touch.first for touch in result.touches), max(touch.last for touch in result.touches)
-    assert first <= touching[0] <= first + 2 / RATE + 0.2  # at first fainter than is shown
-    assert touching[-1] <= last
-    assert max(force for found in recording.touches for *_, force in found) <= max(t.force for t in result.touches)
+    assert min(recording.clearances) == pytest.approx(result.clearance.value, abs=1e-3)
+    in_contact = [t for t, found in zip(recording.times, recording.contacts, strict=True) if found]
+    first, last = min(contact.first for contact in result.contacts), max(contact.last for contact in result.contacts)
+    assert first <= in_contact[0] <= first + 2 / RATE + 0.2  # at first fainter than is shown
+    assert in_contact[-1] <= last
+    assert max(force for found in recording.contacts for *_, force in found) <= max(t.force for t in result.contacts)
 
 
 def test_the_pages_bodies_are_where_mujocos_geoms_are() -> None:
@@ -89,7 +87,7 @@ def test_the_pages_bodies_are_where_mujocos_geoms_are() -> None:
     shown = own[body == mug] @ at[:, :3].T + at[:, 3]
     assert len(shown) > 100
     assert np.linalg.norm(shown - recording.poses[-1, mug, :, 3], axis=1).max() < 0.15
-    assert values["touches"][-1]
+    assert values["contacts"][-1]
     assert {number for number in body if recording.world.of_robot[model.body_geomadr[number]]}
 
 
@@ -128,7 +126,7 @@ def browser(tmp_path: Path) -> str:
     ],
     ids=["begins", "address", "beyond the end", "steps", "a step back from the start", "scrubs"],
 )
-def test_a_browser_shows_the_moment_that_it_is_told(
+def test_a_browser_shows_the_moment_of_the_address(
     browser: str, tmp_path: Path, address: str, clicks: str, time: float
 ) -> None:
     text = _label(browser, tmp_path, address, clicks)
@@ -142,7 +140,7 @@ def test_a_browser_plays_until_it_is_stopped(browser: str, tmp_path: Path) -> No
 
 
 def _label(browser: str, folder: Path, address: str, clicks: str) -> str:
-    """What is written beside the slider after some clicks."""
+    """Return the text next to the slider after some clicks."""
     page = twin_html(*recorded())
     press = f"const press = (id) => document.getElementById(id).click(); {clicks}"
     (folder / "run.html").write_text(page.replace("</body>", f"<script>{press}</script></body>"))

@@ -1,4 +1,4 @@
-"""A scene gets the physics it calls for, and no other."""
+"""A scene gets the physics that it requires, and no other."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_shipped_scene_runs_and_its_ledger_lists_only_what_it_calls_for(scene:
 
 
 @pytest.mark.parametrize(("scene", "name"), LISTED)
-def test_without_an_effect_that_a_scene_calls_for_its_observable_changes(scene: str, name: str) -> None:
+def test_without_an_effect_that_a_scene_requires_its_observable_changes(scene: str, name: str) -> None:
     without = run(scene, forbid=(name,))
     (decision,) = (d for d in without.decisions if d.name == name)
     assert not decision.on
@@ -84,7 +84,7 @@ def test_physics_that_cannot_apply_changes_no_bit_when_it_is_forced_on(name: str
 
 
 def test_forced_contact_looks_for_what_might_touch_and_forced_drag_computes_its_forces() -> None:
-    """What costs time is really done: the flags and the medium are in the model."""
+    """Each effect is really computed: the flags and the medium are in the model."""
     scene = load_scene("empty")
     plain = Twin(scene).world.model
     forced = Twin(scene.with_effects(force=("contact", "fluid_drag"))).world.model
@@ -122,7 +122,7 @@ def test_the_latest_word_on_an_effect_counts() -> None:
     assert {d.name: d.on for d in effects_for(again)}["sleep"] is True
 
 
-def test_sensor_effects_that_nobody_asked_for_are_not_even_imported() -> None:
+def test_sensor_effects_that_no_one_required_are_not_even_imported() -> None:
     code = (
         "import sys; from splatbot.sim.scene import load_scene; from splatbot.sim.twin import Twin\n"
         "from splatbot.sim.motion import hold\n"

@@ -1,4 +1,4 @@
-"""A map's folder says where the robot stands; the scene is then in the frame of its base."""
+"""A map's folder defines the robot's base pose; the scene is then in the base frame."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_the_table_and_the_carton_are_where_they_are_from_the_base(run: Path, fi
     scene = make_scene(placed_scene(run / file))
     np.testing.assert_allclose(scene.gravity, [0, 0, -9.81], atol=1e-6)
     world = Twin(scene).world
-    objects = {thing.name: thing for thing in world.scene.objects}
+    objects = {obj.name: obj for obj in world.scene.objects}
     assert _top(objects["map-table"]) == pytest.approx([0.6, 0.0, 0.0], abs=1e-3)
     assert _top(objects["map-table"])[2] == pytest.approx(0.0, abs=1e-5)
     np.testing.assert_allclose(objects["map-box-1"].at[:2], [0.5, 0.15], atol=2e-3)
@@ -64,20 +64,20 @@ def test_a_plane_that_is_given_counts_more_than_one_that_would_be_found(run: Pat
 
 
 def _top(table: SceneObject) -> Array:
-    """The middle of a table's upper face (3,) [m]."""
+    """Return the centre of a table's upper face (3,) [m]."""
     (shape,) = table.shapes
     assert isinstance(shape, BoxGeom)
     return np.asarray(table.at) + rotation_of(table.rpy)[:, 2] * shape.size[2] / 2
 
 
-def test_a_mount_that_leans_feels_gravity_from_aside(run: Path) -> None:
+def test_a_mount_that_leans_feels_gravity_from_the_side(run: Path) -> None:
     down = T_WORLD_BASE[:3, :3] @ np.array([np.sin(0.1), 0.0, -np.cos(0.1)])
     Workspace(T_WORLD_BASE, down).save(run / "scene.yaml")
     np.testing.assert_allclose(placed_scene(run)["gravity"], 9.81 * np.array([np.sin(0.1), 0, -np.cos(0.1)]), atol=1e-6)
 
 
 def test_a_run_that_does_not_say_where_the_robot_stands_is_refused(run: Path) -> None:
-    with pytest.raises(InputError, match="where the robot stands") as caught:
+    with pytest.raises(InputError, match="does not define the base pose") as caught:
         placed_scene(run)
     assert "--fit-plane" in (caught.value.hint or "")
 

@@ -1,4 +1,4 @@
-"""Effects by name: what is not asked for is not even imported; what does not exist is named."""
+"""Effects by name: unused effects are not imported; an unknown name is an error."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_every_setting_can_be_written_in_a_spec(name: str) -> None:
 def test_a_spec_sets_what_it_names_and_leaves_the_rest() -> None:
     effect = make_effect("exposure: step=2, at=40")
     assert settings(effect) == {"step": 2.0, "offset": 0.0, "at": 40, "until": 0, "drift": 0.0}
-    assert effect.why == "asked for as exposure: step=2, at=40"
+    assert effect.why == "requested as exposure: step=2, at=40"
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_an_effect_that_is_on_twice_draws_twice() -> None:
     ("query", "imported"),
     [("", []), ("&effects=exposure", ["exposure"]), ("&effects=blackout;depth_holes", ["blackout", "depth_holes"])],
 )
-def test_only_the_effects_that_are_asked_for_are_imported(query: str, imported: list[str]) -> None:
+def test_only_the_effects_that_are_required_are_imported(query: str, imported: list[str]) -> None:
     program = (
         "import sys\nfrom splatbot.logs import open_log\n"
         f"open_log('synthetic:wall_blank?frames=2&width=16&height=16{query}')[1]\n"
@@ -86,7 +86,7 @@ def test_only_the_effects_that_are_asked_for_are_imported(query: str, imported: 
 
 def test_an_effect_that_is_off_is_never_called(monkeypatch: pytest.MonkeyPatch) -> None:
     def called(*_: object) -> None:
-        raise AssertionError("was not asked for")
+        raise AssertionError("is not used")
 
     for name in set(EFFECTS) - {"exposure"}:
         monkeypatch.setattr(effect_class(name), "apply", called)

@@ -30,7 +30,7 @@ def twin(*sensor: str) -> Twin:
 
 
 def off(points: np.ndarray) -> np.ndarray:
-    """Distance [m] of points from the nearest surface."""
+    """Return the distance [m] of points from the nearest surface."""
     table = points[:, 2]
     return np.abs(np.min([BOX.distance(points), BALL.distance(points), table], axis=0))
 
@@ -39,7 +39,7 @@ def test_discs_are_on_the_surfaces_and_cover_the_objects() -> None:
     model = scan(twin(), views=6, width=160)
     points = model.means.double().numpy()
     assert np.percentile(off(points), 99) < 1.5e-3  # means over 4 mm of a curve lie inside of it
-    for solid, share in ((BOX, 0.9), (BALL, 0.5)):  # nobody sees a ball from below
+    for solid, share in ((BOX, 0.9), (BALL, 0.5)):  # no camera sees the ball from below
         patches = solid.patches()
         surface = np.concatenate([p.at(*np.random.default_rng(0).uniform(0, [[p.width], [p.height]], (2, 200)))[0]
                                   for p in patches])  # fmt: skip
@@ -64,7 +64,7 @@ def test_noise_of_the_sensor_is_in_it_by_seed() -> None:
 
 
 def test_what_makes_no_sense_is_refused() -> None:
-    with pytest.raises(InputError, match="nothing to look at"):
+    with pytest.raises(InputError, match="no object to scan"):
         scan(Twin(make_scene({"name": "bare", "objects": [{"name": "table", "shapes": [{"kind": "plane"}]}]})))
     for wrong in ({"views": 0}, {"width": 8}, {"spacing": 0.0}):
         with pytest.raises(InputError, match="out of range"):

@@ -1,4 +1,4 @@
-"""Scene files: every shipped one loads, and what is wrong in one is named."""
+"""Scene files: every shipped one loads, and errors name the key."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def test_a_mesh_is_looked_for_beside_the_scene_file(tmp_path: Path) -> None:
 
 def test_a_mesh_of_points_has_the_mass_it_is_given() -> None:
     corners = [[x, y, z] for x in (-0.02, 0.02) for y in (-0.03, 0.03) for z in (-0.01, 0.01)]
-    thing = {"name": "brick", "shapes": [{"kind": "mesh", "points": corners}], "movable": True, "mass": 0.7}
-    twin = Twin(make_scene({"name": "x", "robot": None, "objects": [thing]}))
+    brick = {"name": "brick", "shapes": [{"kind": "mesh", "points": corners}], "movable": True, "mass": 0.7}
+    twin = Twin(make_scene({"name": "x", "robot": None, "objects": [brick]}))
     body = twin.world.model.body("object/brick")
     assert body.mass[0] == pytest.approx(0.7)
     expected = sorted(0.7 / 12 * (a * a + b * b) for a, b in ((0.04, 0.06), (0.04, 0.02), (0.06, 0.02)))

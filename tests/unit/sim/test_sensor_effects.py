@@ -1,4 +1,4 @@
-"""What lenses, shutters, pixels and cables do to frames, each against another computation of it."""
+"""Effects of lenses, shutters, pixels and cables on frames, each against an independent computation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LENS = LensDistortion(k1=-0.2, k2=0.05, p1=0.002, p2=-0.001)
 
 
 def seen(effects: str) -> dict[str, list[object]]:
-    """What a stream of six frames is like."""
+    """Describe a stream of six frames."""
     log = open_log(f"synthetic:tabletop?trajectory=handheld&frames=6&width=96&height=72&effects={effects}")
     frames = list(log)
     return {

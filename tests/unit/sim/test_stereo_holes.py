@@ -1,4 +1,4 @@
-"""Holes of stereo cameras: as wide as the datasheet's formula, and where the geometry of two eyes puts them."""
+"""Holes of stereo cameras: as wide as the datasheet's formula, and at the positions of the two-camera geometry."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def test_the_share_of_holes_on_a_wall_is_the_datasheets_band_within_a_tenth(z: f
     assert not lost[:, int(lost[0].sum()) :].any()
 
 
-def test_what_fails_at_random_leaves_the_fill_rate_that_was_asked_for() -> None:
-    """Of the pixels right of the band, as the fill rate is measured in the inner part of the image."""
+def test_what_fails_at_random_leaves_the_fill_rate_that_was_required() -> None:
+    """The fraction refers to the pixels right of the band, as the fill rate refers to the inner part of the image."""
     depth = StereoHoles(scatter=0.03).apply(frame_of(1.0), RNG).depth
     filled = (depth[24:-24, 64:-64] > 0).mean()
     assert 1.0 - filled == pytest.approx(0.03, rel=0.1)
@@ -55,7 +55,7 @@ def test_a_steep_wall_is_not_taken_for_its_own_shadow() -> None:
     assert not lost[band:].any()
 
 
-def test_dark_and_glaring_pixels_fail_only_if_asked_for() -> None:
+def test_dark_and_glaring_pixels_fail_only_if_required() -> None:
     shades = np.repeat(np.linspace(0, 255, 640).astype(np.uint8)[None, :, None], 3, axis=2)
     frame = frame_of(50.0, shades)
     assert StereoHoles(scatter=0.0).apply(frame, RNG).valid.all()

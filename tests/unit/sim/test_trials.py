@@ -1,4 +1,4 @@
-"""Picking trials: scenes, the way of the camera, what shakes, what is written down, and one tiny trial."""
+"""Picking trials: scenes, the camera path, the shaking, storage of results, and one tiny trial."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from splatbot.logs.raycast import RaycastSurface
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.agreement import wilson
 from splatbot.sim.scene import SceneObject
-from splatbot.sim.trials.look import UnseenError, camera_path
 from splatbot.sim.trials.run import FILE, TrialError, TrialsPlan, read_rows, run_trials
+from splatbot.sim.trials.scan import UnseenError, camera_path
 from splatbot.sim.trials.scenes import OBSTACLE, TrialScene, make_trial
 from splatbot.sim.trials.shake import SHARE, Shake
 from splatbot.sim.trials.stacks import GaussianStack
@@ -35,18 +35,18 @@ HELD = TwinPickResult(True, "", "picked", "", 0.18, 0.175)
 SLIPPED = TwinPickResult(False, "slip", "lost", "nothing is between the fingers any more", 0.02, 0.0, ("table",))
 
 
-def row(seed: int, stack: str, ideal: TwinPickResult = HELD, reality: TwinPickResult = HELD) -> TrialRow:
+def row(seed: int, stack: str, ideal: TwinPickResult = HELD, held_out: TwinPickResult = HELD) -> TrialRow:
     return TrialRow(
-        seed, "tabletop", stack, "can", False, ideal, reality, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0, 32, 320
+        seed, "tabletop", stack, "can", False, ideal, held_out, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0, 32, 320
     )
 
 
-def test_a_seed_gives_one_scene_at_rest_whose_things_keep_apart() -> None:
+def test_a_seed_gives_one_scene_at_rest_whose_objects_do_not_overlap() -> None:
     for seed in range(6):
         found, again = make_trial(seed), make_trial(seed)
         assert found.scene == again.scene
-        assert found.target in {thing.name for thing in found.scene.movable}
-        assert found.moving == (seed == 4) == any(thing.name == OBSTACLE for thing in found.scene.objects)
+        assert found.target in {obj.name for obj in found.scene.movable}
+        assert found.moving == (seed == 4) == any(obj.name == OBSTACLE for obj in found.scene.objects)
         for a, b in combinations(found.scene.movable, 2):
             assert np.linalg.norm(np.subtract(a.at, b.at)[:2]) > 0.05
         twin = Twin(found.scene)
@@ -65,8 +65,8 @@ def test_a_seed_gives_one_scene_at_rest_whose_things_keep_apart() -> None:
 def test_what_the_camera_is_shown_is_what_physics_computes_with() -> None:
     size, at, yaw = np.array([0.1, 0.06, 0.04]), np.array([0.5, 0.1, 0.02]), 0.3
     values = {"name": "box", "shapes": [{"kind": "box", "size": size.tolist()}], "at": at, "rpy": [0, 0, yaw]}
-    thing = SceneObject.model_validate(values)
-    (surface,) = surfaces_of(thing)
+    obj = SceneObject.model_validate(values)
+    (surface,) = surfaces_of(obj)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     local = (surface.mesh.vertices - at) @ turn
     np.testing.assert_allclose(np.abs(local), np.broadcast_to(size / 2, local.shape), atol=1e-12)
@@ -135,7 +135,7 @@ def test_the_physics_that_a_table_holds_for_is_that_of_the_twin() -> None:
     trial = make_trial(1)
     found = physics(trial)
     assert found["finger_force_n"] == 70.0
-    assert found["friction"] == sorted({thing.friction for thing in trial.scene.movable})
+    assert found["friction"] == sorted({obj.friction for obj in trial.scene.movable})
     option = Twin(trial.scene).world.model.opt
     assert (found["impratio"], found["timestep_ms"]) == (option.impratio, pytest.approx(1e3 * option.timestep))
     assert 5.0 < found["shake_m_s2"] < 20.0
@@ -155,19 +155,19 @@ def test_what_is_written_is_not_done_again_and_a_line_cut_short_is(tmp_path: Pat
         read_rows(path)
 
 
-def test_a_target_that_no_picture_shows_is_a_failure_of_that_trial_and_not_the_end_of_the_run(
+def test_a_target_that_no_image_shows_is_a_failure_of_that_trial_and_not_the_end_of_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def unseen(*args: object, **options: object) -> None:
         raise UnseenError("is in no picture.", field="can-1")
 
-    monkeypatch.setattr("splatbot.sim.trials.trial.look", unseen)
+    monkeypatch.setattr("splatbot.sim.trials.trial.scan_scene", unseen)
     rows, interrupted = run_trials(TrialsPlan(trials=2, frames=16, width=160), tmp_path)
     assert not interrupted
     assert [row.seed for row in rows] == [0, 1]
     for one in rows:
-        assert (one.ideal.failure, one.reality.failure) == ("perception", "perception")
-        assert "in no picture" in one.reality.reason
+        assert (one.ideal.failure, one.held_out.failure) == ("perception", "perception")
+        assert "in no picture" in one.held_out.reason
         assert (one.frames, one.pixels) == (16, 160)
     assert read_rows(tmp_path / FILE) == rows
     (found,) = summaries([*rows, row(2, "gaussians")])
@@ -204,16 +204,16 @@ def test_one_thing_is_seen_picked_and_shaken_whatever_another_scan_gave_and_ctrl
     plan = TrialsPlan(family="isolated", trials=2, first=1, frames=16, width=240)
     another = replace(row(1, "gaussians", SLIPPED), family="isolated")
     (tmp_path / FILE).write_text(json.dumps(another.to_dict()) + "\n")
-    rows, interrupted = run_trials(plan, tmp_path, tell=stop)
+    rows, interrupted = run_trials(plan, tmp_path, on_progress=stop)
     assert interrupted
     (only,) = rows
     assert (only.seed, only.kind, only.stack) == (1, "can", "gaussians")
     assert only.ideal.success, only.ideal.reason
     assert only.ideal.rose > RISE
     assert only.ideal.kept > KEPT
-    thing = make_trial(1, "isolated").scene.movable[0].shapes[0]
-    assert thing.kind == "cylinder"
-    assert only.width_mm == pytest.approx(2e3 * thing.radius, abs=4.0)  # a scan of 240 pixels
+    obj = make_trial(1, "isolated").scene.movable[0].shapes[0]
+    assert obj.kind == "cylinder"
+    assert only.width_mm == pytest.approx(2e3 * obj.radius, abs=4.0)  # a scan of 240 pixels
     assert only.plan_ms is not None
     assert only.plan_ms < 500.0
     assert (only.frames, only.pixels) == (16, 240)
@@ -247,7 +247,7 @@ def test_workers_end_when_the_process_that_began_them_is_killed(tmp_path: Path) 
 
 
 def _runs(pid: int) -> bool:
-    """Whether a process is there, and no zombie that nobody asks for."""
+    """Return whether a process runs and is no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):

@@ -1,4 +1,4 @@
-"""The stacks that trials compare with: meshes and octrees by python-fcl, and paths from single configurations."""
+"""The comparison stacks of trials: meshes and octrees by python-fcl, and paths from discrete configurations."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_all_stacks_pick_from_the_same_scan(tmp_path: Path) -> None:
     assert not interrupted
     assert [row.stack for row in rows] == ["gaussians", "mesh", "cloud"]
     assert rows[0].ideal.success
-    assert rows[0].reality.success
+    assert rows[0].held_out.success
     for row in rows:
         assert row.ideal.success == (row.ideal.failure == "")
         assert (row.world_bytes or 0) > 1_000_000

@@ -1,4 +1,4 @@
-"""The twin follows motions, sees what they touch, and repeats itself exactly."""
+"""The twin follows motions, reports contacts, and repeats runs exactly."""
 
 from __future__ import annotations
 
@@ -64,45 +64,45 @@ def test_twins_in_four_threads_give_the_bits_of_one() -> None:
     assert found == [alone] * 4
 
 
-def test_a_wall_in_the_way_is_touched_by_the_right_link_with_force() -> None:
+def test_a_wall_in_the_way_is_contacted_by_the_right_link_with_force() -> None:
     tcp = panda().tcp(panda().home)[:3, 3]
     wall = {"name": "wall", "shapes": [{"kind": "box", "size": [0.02, 1.0, 1.5]}], "at": [tcp[0] + 0.08, 0.0, 0.75]}
     moves = [{"t": 1.0, "tcp": [tcp[0] + 0.10, 0.0, tcp[2]]}]
     result = Twin(_scene(objects=[wall], task={"kind": "reach", "moves": moves})).follow()
-    assert {touch.other for touch in result.touches} == {"wall"}
-    assert {touch.part for touch in result.touches} <= {"finger1", "finger2", "link7"}
-    assert max(touch.force for touch in result.touches) > 5.0
-    assert result.near.room < 0
+    assert {contact.other for contact in result.contacts} == {"wall"}
+    assert {contact.part for contact in result.contacts} <= {"finger1", "finger2", "link7"}
+    assert max(contact.force for contact in result.contacts) > 5.0
+    assert result.clearance.value < 0
 
 
 def test_the_room_around_the_arm_is_the_distance_to_the_nearest_thing() -> None:
-    """A ball beside the hand: its centre's distance from the capsule's axis, less both radii."""
+    """A sphere next to the hand: its centre's distance from the capsule's axis, minus both radii."""
     T = panda().fk(panda().home)[7]
     hand = panda().shapes[-1]
     middle = T[:3, :3] @ ((np.array(hand.start) + np.array(hand.end)) / 2) + T[:3, 3]  # type: ignore[attr-defined]
-    aside = T[:3, :3] @ np.cross([0, 0, 1.0], np.array(hand.end) - np.array(hand.start))  # type: ignore[attr-defined]
-    at = middle - 0.15 * aside / np.linalg.norm(aside)
+    side = T[:3, :3] @ np.cross([0, 0, 1.0], np.array(hand.end) - np.array(hand.start))  # type: ignore[attr-defined]
+    at = middle - 0.15 * side / np.linalg.norm(side)
     ball = {"name": "ball", "shapes": [{"kind": "sphere", "radius": 0.03}], "at": at.tolist()}
-    near = Twin(_scene(objects=[ball])).follow(hold(panda().home, 0.1)).near
-    assert near.room == pytest.approx(0.15 - hand.radius - 0.03, abs=2e-3)  # type: ignore[attr-defined]
-    assert (near.part, near.other) == ("link7", "ball")
+    clearance = Twin(_scene(objects=[ball])).follow(hold(panda().home, 0.1)).clearance
+    assert clearance.value == pytest.approx(0.15 - hand.radius - 0.03, abs=2e-3)  # type: ignore[attr-defined]
+    assert (clearance.part, clearance.other) == ("link7", "ball")
 
 
 def test_what_falls_off_an_edge_is_reported_and_what_lies_is_not() -> None:
     table = {"name": "table", "shapes": [{"kind": "box", "size": [0.5, 0.5, 0.4]}], "at": [0.5, 0.0, 0.2]}
-    things = [_box("firm", (0.5, 0.0, 0.43), movable=True), _box("loose", (0.77, 0.1, 0.43), movable=True)]
-    scene = _scene(robot=None, objects=[{"name": "floor", "shapes": [{"kind": "plane"}]}, table, *things])
+    boxes = [_box("firm", (0.5, 0.0, 0.43), movable=True), _box("loose", (0.77, 0.1, 0.43), movable=True)]
+    scene = _scene(robot=None, objects=[{"name": "floor", "shapes": [{"kind": "plane"}]}, table, *boxes])
     result = Twin(scene).follow()
     assert result.dropped == ("loose",)
     assert result.moved["firm"] < 1e-3
 
 
-def test_it_stops_within_a_period_when_told_to_and_at_the_first_touch() -> None:
+def test_it_stops_within_a_period_on_request_and_at_the_first_contact() -> None:
     twin = Twin(load_scene("empty"))
     stopped = twin.follow(progress=lambda share: twin.stop() if share >= 0.5 else None)
     assert stopped.stopped == pytest.approx(1.3, abs=0.05)
-    touched = Twin(load_scene("tabletop_clutter")).follow(until_touch=True)
-    assert touched.stopped == touched.touches[0].first
+    stopped = Twin(load_scene("tabletop_clutter")).follow(until_contact=True)
+    assert stopped.stopped == stopped.contacts[0].first
 
 
 def test_a_motion_of_another_robot_is_refused() -> None:

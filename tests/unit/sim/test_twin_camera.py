@@ -1,4 +1,4 @@
-"""The twin's camera: where MuJoCo puts it, and what its sensor does."""
+"""The twin's camera: its pose in MuJoCo, and its sensor effects."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ side = rng.uniform(-0.05, 0.05, (3000, 3))
 side[np.arange(3000), rng.integers(0, 3, 3000)] = 0.05 * rng.choice([-1, 1], 3000)
 box = side + [0.2, 0.0, 0.05]
 means = np.concatenate([floor, box])
-colors = np.where(means[:, 2:] > 0.02, [0.9, 0.1, 0.1], 0.2)  # lower, it is hardly told from the table
+colors = np.where(means[:, 2:] > 0.02, [0.9, 0.1, 0.1], 0.2)  # lower, it is hardly distinguishable from the table
 quats, scales = np.tile([1.0, 0, 0, 0], (15000, 1)), np.full((15000, 3), 0.005)
 opacities = np.full(15000, 0.9)
 model = GaussianModel.from_activated(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
@@ -86,8 +86,8 @@ gaussians = {"file": sys.argv[1], "movable": True}
 twin = Twin(make_scene({"name": "x", "robot": None, "map": gaussians, "camera": camera}))
 eye = TwinCamera(twin.world)
 T = look_at(np.array([0.2, -0.8, 0.9]), np.array([0.2, 0.0, 0.05]))
-thing = next(o.name for o in twin.world.scene.objects if o.movable)
-start = twin.data.body("object/" + thing).xpos.copy()
+movable = next(o.name for o in twin.world.scene.objects if o.movable)
+start = twin.data.body("object/" + movable).xpos.copy()
 for shift in (0.0, 0.15):
     twin.data.qpos[:3] = start + [shift, 0, 0]
     import mujoco
@@ -163,7 +163,7 @@ def test_the_sensors_effects_are_on_the_account_and_change_the_depth() -> None:
     assert noisy != ideal
 
 
-def test_what_nobody_asked_the_sensor_for_is_never_called() -> None:
+def test_what_no_one_asked_the_sensor_for_is_never_called() -> None:
     ideal, chosen = run_drawing(_IDEAL)
     assert ideal == "[] [] []"
     assert chosen == "['exposure', 'exposure', 'exposure'] [('exposure', 3)] ['exposure']"
@@ -208,7 +208,7 @@ def test_the_gaussians_of_a_movable_object_move_with_it(tmp_path: Path) -> None:
         assert at == pytest.approx(true, abs=4.0)
 
 
-def test_the_camera_looks_where_it_is_told_with_y_down() -> None:
+def test_the_camera_looks_at_its_target_with_y_down() -> None:
     T = pose_of(CameraSection(at=(1.0, 2.0, 3.0), look_at=(1.0, 5.0, 3.0)))
     np.testing.assert_allclose(T[:3, :3], [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
     with pytest.raises(InputError, match="straight up or down"):

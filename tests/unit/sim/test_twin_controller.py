@@ -1,4 +1,4 @@
-"""The twin drives like any controller: it follows, stops, faults, and holds."""
+"""The twin as a controller: it follows, stops, faults, and holds."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_it_is_a_controller_that_follows_within_two_milliradians_and_arrives() -
     assert max(errors) < 2e-3
 
 
-def test_told_to_stop_it_comes_to_rest_where_it_was() -> None:
+def test_on_a_stop_request_it_comes_to_rest_where_it_was() -> None:
     controller = TwinController(Twin(load_scene("empty")))
     controller.send(_swing())
     for _ in range(500):

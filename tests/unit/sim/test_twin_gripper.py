@@ -1,4 +1,4 @@
-"""The twin's fingers: they go where they are sent, press with the force that is asked for, and tell what they hold."""
+"""The twin's fingers: they reach their goal, press with the commanded force, and report a held object."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatbot.sim.twin import Twin
 
 
 def between(width: float) -> TwinController:
-    """An arm at home, with a block of a width between its fingers that nothing moves."""
+    """Return an arm at home with a fixed block of a given width between its fingers."""
     robot = Twin(make_scene({"name": "bare", "objects": []})).world.robot
     assert robot is not None
     T = robot.tcp(robot.home)
@@ -38,7 +38,7 @@ def settle(controller: TwinController, seconds: float = 2.0) -> TwinGripper:
 
 
 def pressed(controller: TwinController) -> float:
-    """Normal force between the block and one finger [N], by MuJoCo's contacts."""
+    """Return the normal force [N] between the block and one finger from MuJoCo's contacts."""
     twin, total = controller.twin, 0.0
     force = np.zeros(6)
     for i in range(twin.data.ncon):
@@ -63,7 +63,7 @@ def test_fingers_go_where_they_are_sent_and_hold_nothing() -> None:
 
 @pytest.mark.parametrize("force", [20.0, 70.0])
 @pytest.mark.parametrize("width", [0.01, 0.05])
-def test_what_is_held_is_pressed_with_the_force_that_was_asked_for(width: float, force: float) -> None:
+def test_what_is_held_is_pressed_with_the_force_that_was_required(width: float, force: float) -> None:
     controller = between(width)
     assert controller.gripper is not None
     controller.gripper.move(0.0, force=force)
@@ -72,10 +72,10 @@ def test_what_is_held_is_pressed_with_the_force_that_was_asked_for(width: float,
         controller.step()
     assert gripper.holds()
     assert pressed(controller) == pytest.approx(force, rel=0.05)
-    assert width - 2e-3 < gripper.opening() < width + 1e-3  # contacts give way
+    assert width - 2e-3 < gripper.opening() < width + 1e-3  # contacts are soft
 
 
-def test_it_never_presses_harder_than_the_gripper_can_and_not_faster_than_told() -> None:
+def test_it_never_presses_harder_than_the_gripper_can_and_not_faster_than_commanded() -> None:
     controller = between(0.05)
     gripper = controller.gripper
     assert gripper is not None

@@ -1,4 +1,4 @@
-"""One picture in front of the other: by depth, in each pixel, with soft edges."""
+"""Composition of two images by the depth of each pixel, with soft edges."""
 
 from __future__ import annotations
 

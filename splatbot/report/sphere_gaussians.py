@@ -1,4 +1,4 @@
-"""Balls as Gaussians, to draw robots and contacts into a map."""
+"""Spheres drawn as Gaussians, to show robots and contacts in a map."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from splatbot.gaussians import GaussianModel
 from splatbot.protocols import Array
 
 
-def balls(centers: Array, radii: Array, color: Array, opacity: float) -> GaussianModel:
-    """Round Gaussians at ``centers`` (N, 3) that look as large as ``radii`` (N,) [m], of one colour (3,) in 0..1."""
+def sphere_gaussians(centers: Array, radii: Array, color: Array, opacity: float) -> GaussianModel:
+    """Create Gaussians that look like spheres: ``centers`` (N, 3), ``radii`` (N,) [m], ``color`` (3,) in 0..1."""
     n = len(centers)
     return GaussianModel.from_activated(
         means=centers,

@@ -1,11 +1,11 @@
-"""A scene is looked at by the camera on the arm's wrist, with all its noise, and mapped: what every stack knows."""
+"""Simulated scan of a scene by the wrist camera with sensor noise, and the map from it that every stack uses."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,10 @@ from splatbot.mapping.selfmask import SelfMask
 from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
-from splatbot.sim.effects.moving_obstacles import place_on
+from splatbot.sim.effects.moving_obstacles import position_on_path
 from splatbot.sim.effects.registry import make_effects
 from splatbot.sim.rays import cast, pixel_rays
+from splatbot.sim.scene import SceneObject
 from splatbot.sim.solids import pose_at
 from splatbot.sim.trials.scenes import TrialScene
 from splatbot.sim.trials.surfaces import surfaces_of
@@ -34,13 +35,13 @@ from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA, WristLog
 from splatbot.slam import Slam
 
-_MIDDLE, _AWAY = np.array([0.5, 0.0, 0.05]), 0.6  # [m] what the camera looks at, and from how far
-_RINGS = ((45.0, (-130, -80, -40, 0, 40, 80)), (65.0, (80, 40, 0, -40, -80)))  # [deg] over the table: turns around it
-FARTHEST = 0.95  # [m] of depth that is used
+_TARGET, _DISTANCE = np.array([0.5, 0.0, 0.05]), 0.6  # [m] point that the camera is aimed at, and the distance to it
+_RINGS = ((45.0, (-130, -80, -40, 0, 40, 80)), (65.0, (80, 40, 0, -40, -80)))  # [deg] elevation, azimuths
+FARTHEST = 0.95  # [m] depth that is used
 _RATE = 4.0  # [Hz]
-_LOOKED = 4  # of the frames, one is looked at for a click
-_KNOWN = (5e-4, 5e-4)  # [m], [rad] standard deviation of the camera's pose by the arm's joints
-# Fine Gaussians, left where depth put them: refinement for pictures moves means by millimetres, too much for grasps.
+_CLICK_STRIDE = 4  # every n-th frame is a candidate for the click
+_POSE_SIGMA = (5e-4, 5e-4)  # [m], [rad] standard deviation of the camera pose by the arm's joints
+# Fine Gaussians that stay where depth put them: refinement on images moves means by millimetres, too much for grasps.
 MAPPING = {"stride": 1, "surface_depth_tolerance": 0.01, "means_lr": 0.0, "refine_iterations": 0, "final_iterations": 0}
 _TABLE = RaycastSurface(
     box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05)
@@ -48,20 +49,20 @@ _TABLE = RaycastSurface(
 
 
 class UnseenError(InputError):
-    """No picture that was tracked shows the target: there is nothing to click at."""
+    """No tracked image shows the target, so there is no pixel to click on."""
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What was seen of a scene.
+class TrialScan:
+    """Result of scanning and mapping a scene.
 
     Args:
         frames: without the arm, with the sensor's noise; world = first camera.
-        T_world_camera: (F, 4, 4) as they were tracked, NaN where lost.
-        T_world_base: (4, 4), as the joints had it at the first frame.
+        T_world_camera: (F, 4, 4) as tracked, NaN for lost frames.
+        T_world_base: (4, 4) by the joints at the first frame.
         snapshot: of the map.
-        observers: (N, 3) where each Gaussian was first seen from [m, world], NaN where that is not known.
-        hint: the target, clicked at in one of the frames: what its depth has there.
+        observers: (N, 3) camera position that first observed each Gaussian [m, world]; NaN if unknown.
+        hint: point of the target under a click in one of the frames, from its depth.
         seconds: of mapping.
     """
 
@@ -80,34 +81,34 @@ class Look:
 
     @property
     def views(self) -> list[DepthView]:
-        """The depth of these, as far as it was used."""
+        """Depth images of these frames, limited to the used range."""
         return [(usable_depth(frame), frame.camera, T) for frame, T in self.tracked]
 
 
 def usable_depth(frame: Frame) -> NDArray[np.float32]:
-    """Depth (H, W) [m] where it is not the arm's and not too far; 0 elsewhere."""
+    """Return depth (H, W) [m] without the arm and beyond-range pixels, which become 0."""
     return np.where(frame.valid & (frame.depth < FARTHEST), frame.depth, 0.0).astype(np.float32)
 
 
-def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Config | None = None) -> Look:
-    """Move the camera over the scene and map what it sees.
+def scan_scene(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Config | None = None) -> TrialScan:
+    """Move the camera over the scene and map its frames.
 
-    The arm's joints tell each camera's pose to half a millimetre and half a milliradian; tracking refines that.
+    The arm's joints give each camera pose with an error of 0.5 mm and 0.5 mrad, which tracking refines.
 
     Args:
         trial: the scene.
-        frames: on the way.
-        width: of a picture [px]; 3/4 as high.
-        config: of mapping; None: finer than by default, and without moving means (:data:`MAPPING`).
+        frames: number of frames.
+        width: of an image [px]; the height is 3/4 of it.
+        config: of mapping. If None, it is finer than the default and keeps the means fixed (:data:`MAPPING`).
 
     Raises:
-        UnseenError: the target is in no picture.
+        UnseenError: no image shows the target.
     """
     log = _log(trial, frames, width)
     true = log.ground_truth.T_world_camera
     rng = np.random.default_rng(trial.seed)
-    sigma = np.repeat(_KNOWN, 3)
-    told = np.stack([T @ se3_exp(sigma * rng.standard_normal(6)) for T in true])
+    sigma = np.repeat(_POSE_SIGMA, 3)
+    prior_poses = np.stack([T @ se3_exp(sigma * rng.standard_normal(6)) for T in true])
     mask = SelfMask(log.robot, T_PANDA_CAMERA)
     assert trial.scene.camera is not None
     effects = make_effects(trial.scene.camera.sensor, seed=trial.seed, why="sensor of the wrist").along(
@@ -116,8 +117,8 @@ def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Confi
     shot = tuple(effects(mask(log[k])) for k in range(frames))
     begin = time.perf_counter()
     slam = Slam(config or Config.model_validate({"mapping": MAPPING, "sensor": {"max_depth": FARTHEST}}))
-    for frame, T in zip(shot, told, strict=True):
-        prior = PosePrior(np.diag(2 * sigma**2), T_world_camera=inverse(told[0]) @ T)
+    for frame, T in zip(shot, prior_poses, strict=True):
+        prior = PosePrior(np.diag(2 * sigma**2), T_world_camera=inverse(prior_poses[0]) @ T)
         slam.process(replace(frame, prior=prior))
     slam.finish()
     lost = np.full((4, 4), np.nan)
@@ -125,10 +126,10 @@ def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Confi
     snapshot = slam.snapshot()
     seconds = time.perf_counter() - begin
     keyframes = poses[[k for k, result in enumerate(slam.results) if result.keyframe]]
-    return Look(
+    return TrialScan(
         shot,
         poses,
-        inverse(told[0]),
+        inverse(prior_poses[0]),
         snapshot,
         _observers(snapshot, keyframes),
         _click(trial, log, shot, poses),
@@ -138,22 +139,22 @@ def look(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Confi
 
 @cache
 def camera_path(frames: int) -> Array:
-    """Joints (F, J) on a way around the table's middle, higher on the way back.
+    """Return the joints (F, J) of a path around the table's centre, with a higher ring on the way back.
 
     Raises:
-        InputError: a place cannot be reached.
+        InputError: a pose cannot be reached.
     """
     robot = panda()
     near, knots = robot.home, []
     for steep, turns in _RINGS:
         for turn in turns:
             t, s = np.radians([turn, steep])
-            eye = _MIDDLE + _AWAY * np.array([np.cos(t) * np.cos(s), np.sin(t) * np.cos(s), np.sin(s)])
-            T = look_at(eye, _MIDDLE)
-            T[:3, :2] *= -1.0  # the hand points away from the base, as at home
+            eye = _TARGET + _DISTANCE * np.array([np.cos(t) * np.cos(s), np.sin(t) * np.cos(s), np.sin(s)])
+            T = look_at(eye, _TARGET)
+            T[:3, :2] *= -1.0  # the hand's x axis is directed away from the base, as at home
             found = solve_ik(robot, T @ inverse(T_PANDA_CAMERA) @ robot.T_link_tcp, near=near)
             if not len(found.q):
-                raise InputError(f"from {turn} degrees is out of reach.", field="camera path")
+                raise InputError(f"azimuth {turn} degrees is out of reach.", field="camera path")
             near = found.q[0]
             knots.append(near)
     at = np.linspace(0.0, len(knots) - 1.0, frames)
@@ -161,14 +162,18 @@ def camera_path(frames: int) -> Array:
 
 
 def _log(trial: TrialScene, frames: int, width: int) -> WristLog:
-    things = [thing for thing in trial.scene.objects if thing.movable]
-    still = [surface for k, thing in enumerate(things) for surface in surfaces_of(thing, seed=k)]
+    objects = [obj for obj in trial.scene.objects if obj.movable]
+    still = [surface for k, obj in enumerate(objects) for surface in surfaces_of(obj, seed=k)]
     moving = {}
-    for thing in trial.scene.carried:
-        shown = surfaces_of(thing, placed=False)
-        moving[thing.name] = Moving(shown, lambda t, thing=thing: pose_at(tuple(place_on(thing, t)), (0.0, 0.0, 0.0)))  # type: ignore[misc]
+    for obj in trial.scene.carried:
+        shown = surfaces_of(obj, placed=False)
+        moving[obj.name] = Moving(shown, partial(_pose_on_path, obj))
     joints = camera_path(frames)
     return WristLog(panda(), joints, [_TABLE, *still], T_scene_base=np.eye(4), width=width, rate=_RATE, moving=moving)
+
+
+def _pose_on_path(obj: SceneObject, t: float) -> Array:
+    return pose_at(tuple(position_on_path(obj, t)), (0.0, 0.0, 0.0))
 
 
 def _observers(snapshot: Snapshot, T_world_keyframe: Array) -> Array:
@@ -179,10 +184,10 @@ def _observers(snapshot: Snapshot, T_world_keyframe: Array) -> Array:
 
 
 def _click(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Array) -> PointHint:
-    """The middle of the target's pixels with depth, in the tracked frame that has most of them, as one would click."""
+    """Return the central target pixel with depth in the tracked frame with most of them, as a user would click."""
     twin = Twin(trial.scene)
     best: tuple[int, NDArray[np.bool_]] | None = None
-    for k in range(0, len(frames), _LOOKED):
+    for k in range(0, len(frames), _CLICK_STRIDE):
         if not np.isfinite(poses[k]).all():
             continue
         twin.reset(log.joints[k])
