@@ -11,14 +11,35 @@ from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array
 
 PAD = 0.006  # [m] standard deviation of the kernel that fits a tangent plane at a contact
-_ON_SURFACE_M = 0.004  # maximum distance of a closing line from a surface point that it meets
-_COMPLETED_WEIGHT = 0.1  # weight of completed points relative to observed points in the plane fit
-_MIN_WIDTH_M = 3e-4  # minimum distance between the two contacts
-_DIRECTION_STD_RAD = 0.25  # standard deviation of the random change of closing directions
-_LEVEL_RAD = 0.05  # inclination below which a closing direction is horizontal
-_STEP_SIZES = (1.0, 0.5, 0.25)  # of the rounds of refinement
-_MIDPOINT_WEIGHT = 0.1  # weight of the contacts' midpoint relative to the lines along their normals
-_LINES_PER_CHUNK = 64  # lines that are tested at once
+
+
+@dataclass(frozen=True)
+class AntipodalConstants:
+    """Constants of contact pair sampling.
+
+    Args:
+        on_surface: [m] a closing line meets a surface point within this distance.
+        completed_weight: weight of completed points relative to observed points in the plane fit.
+        min_width: [m] minimum distance between the two contacts.
+        direction_std: [rad] standard deviation of the random change of closing directions.
+        level: [rad] a closing direction with less inclination counts as horizontal.
+        step_sizes: step sizes of the rounds of refinement.
+        midpoint_weight: weight of the contacts' midpoint relative to the lines along their normals.
+        lines_per_chunk: number of lines that are tested at once; it bounds memory.
+    """
+
+    on_surface: float = 0.004
+    completed_weight: float = 0.1
+    min_width: float = 3e-4
+    direction_std: float = 0.25
+    level: float = 0.05
+    step_sizes: tuple[float, ...] = (1.0, 0.5, 0.25)
+    midpoint_weight: float = 0.1
+    lines_per_chunk: int = 64
+
+
+CONSTANTS = AntipodalConstants()
+
 
 Array32 = NDArray[np.float32]
 
@@ -127,17 +148,17 @@ def antipodal_pairs(
     narrowest = float(away[wide].min()) if wide.any() else np.inf
     use = met & ~wide
     pairs = _refined(surface, origin[use], end[use], cone)
-    good = (pairs.closure > 0.0) & (pairs.width <= stroke) & (pairs.width > _MIN_WIDTH_M)
+    good = (pairs.closure > 0.0) & (pairs.width <= stroke) & (pairs.width > CONSTANTS.min_width)
     pairs = replace(pairs, contacts=pairs.contacts + center)
     return PairSearch(pairs.select(good), int((~met).sum()), int(wide.sum()), int((~good).sum()), narrowest)
 
 
 def _closings(normals: Array, cone: float, up: Array, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
     """Return unit closing directions (C, 3) for seeds with normals (S, 3), and the index of the seed of each (C,)."""
-    noise = rng.normal(0.0, _DIRECTION_STD_RAD, normals.shape)
+    noise = rng.normal(0.0, CONSTANTS.direction_std, normals.shape)
     level = -normals + np.outer(normals @ up, up)
     steep = np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0))
-    slanted = np.flatnonzero((steep > _LEVEL_RAD) & (steep < cone))
+    slanted = np.flatnonzero((steep > CONSTANTS.level) & (steep < cone))
     closing = np.concatenate([-normals, -normals + noise, level[slanted]])
     every = np.arange(len(normals))
     return _unit(closing), np.concatenate([every, every, slanted])
@@ -151,15 +172,18 @@ def _exits(surface: GraspSurface, origin: Array, closing: Array, cosine: float) 
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
     tube = _tube(surface)
     end, away = np.zeros_like(origin), np.full(len(origin), np.inf)
-    for k in range(0, len(origin), _LINES_PER_CHUNK):
-        o, c = origin[k : k + _LINES_PER_CHUNK].astype(np.float32), closing[k : k + _LINES_PER_CHUNK].astype(np.float32)
+    for k in range(0, len(origin), CONSTANTS.lines_per_chunk):
+        o, c = (
+            origin[k : k + CONSTANTS.lines_per_chunk].astype(np.float32),
+            closing[k : k + CONSTANTS.lines_per_chunk].astype(np.float32),
+        )
         along = c @ p.T - np.einsum("ij,ij->i", c, o)[:, None]
         square = ((o**2).sum(axis=1)[:, None] - 2 * (o @ p.T)) + (p**2).sum(axis=1)[None]
-        hit = (square - along**2 < tube) & (along > _MIN_WIDTH_M) & (c @ n.T > cosine)
+        hit = (square - along**2 < tube) & (along > CONSTANTS.min_width) & (c @ n.T > cosine)
         along[~hit] = np.inf
         nearest = along.argmin(axis=1)
-        away[k : k + _LINES_PER_CHUNK] = along[np.arange(len(nearest)), nearest]
-        end[k : k + _LINES_PER_CHUNK] = surface.points[nearest]
+        away[k : k + CONSTANTS.lines_per_chunk] = along[np.arange(len(nearest)), nearest]
+        end[k : k + CONSTANTS.lines_per_chunk] = surface.points[nearest]
     return end, away
 
 
@@ -171,7 +195,7 @@ def _tube(surface: GraspSurface) -> Array32:
 def _refined(surface: GraspSurface, first: Array, second: Array, cone: float) -> Pairs:
     """Refine pairs in rounds of decreasing step size; keep a step only if closure plus observed fraction increases."""
     found = _fitted(surface, first, second, cone)
-    for step in _STEP_SIZES:
+    for step in CONSTANTS.step_sizes:
         middle = found.contacts.mean(axis=1)
         through = (middle + step * (_between(found) - middle))[:, None]
         line = (1.0 - step) * _unit(found.contacts[:, 1] - found.contacts[:, 0])
@@ -209,7 +233,7 @@ def _between(pairs: Pairs) -> Array:
     across = np.eye(3) - pairs.normals[..., :, None] * pairs.normals[..., None, :]
     aside = np.einsum("ckij,ckj->ci", across, pairs.contacts - middle[:, None])
     return np.asarray(
-        middle + np.linalg.solve(across.sum(axis=1) + _MIDPOINT_WEIGHT * np.eye(3), aside[..., None])[..., 0]
+        middle + np.linalg.solve(across.sum(axis=1) + CONSTANTS.midpoint_weight * np.eye(3), aside[..., None])[..., 0]
     )
 
 
@@ -233,19 +257,22 @@ def _plane(surface: GraspSurface, at: Array, out: Array) -> tuple[Array, Array, 
         its point. Its normal is ``-out``, so that its closure is negative.
     """
     p, n = surface.points.astype(np.float32), surface.normals.astype(np.float32)
-    tube = np.maximum(_tube(surface), _ON_SURFACE_M**2)
-    trust = np.where(surface.observed, 1.0, _COMPLETED_WEIGHT).astype(np.float32)
+    tube = np.maximum(_tube(surface), CONSTANTS.on_surface**2)
+    trust = np.where(surface.observed, 1.0, CONSTANTS.completed_weight).astype(np.float32)
     values = np.c_[surface.points, surface.normals, surface.observed, surface.normal_std]
     total, meets = np.zeros((len(at), values.shape[1] + 1)), np.zeros(len(at), np.bool_)
-    for k in range(0, len(at), _LINES_PER_CHUNK):
-        a, o = at[k : k + _LINES_PER_CHUNK].astype(np.float32), out[k : k + _LINES_PER_CHUNK].astype(np.float32)
+    for k in range(0, len(at), CONSTANTS.lines_per_chunk):
+        a, o = (
+            at[k : k + CONSTANTS.lines_per_chunk].astype(np.float32),
+            out[k : k + CONSTANTS.lines_per_chunk].astype(np.float32),
+        )
         square = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + (p**2).sum(axis=1)[None]
         facing = o @ n.T > 0.3
         offset = square - (o @ p.T - np.einsum("ij,ij->i", o, a)[:, None]) ** 2
-        meets[k : k + _LINES_PER_CHUNK] = (facing & (offset < tube) & (square < (2 * PAD) ** 2)).any(axis=1)
+        meets[k : k + CONSTANTS.lines_per_chunk] = (facing & (offset < tube) & (square < (2 * PAD) ** 2)).any(axis=1)
         weight = trust * np.exp(np.minimum(-0.5 / PAD**2 * square, 0.0)) * facing
         weight[square > (2.5 * PAD) ** 2] = 0.0
-        total[k : k + _LINES_PER_CHUNK] = np.c_[weight @ values.astype(np.float32), weight.sum(axis=1)]
+        total[k : k + CONSTANTS.lines_per_chunk] = np.c_[weight @ values.astype(np.float32), weight.sum(axis=1)]
     count = np.maximum(total[:, -1:], 1e-9)
     mean = total[:, :-1] / count
     normal = _unit(mean[:, 3:6])

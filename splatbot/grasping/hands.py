@@ -14,13 +14,31 @@ from splatbot.protocols import Array, HandShape
 MAX_PROTRUSION_M = 0.006  # of the target under a pad beyond the planned contact
 PAD_GAP_M = 0.003  # between each pad and the target during the approach
 OPENING_STEP_M = 0.002  # finger openings are rounded up to multiples of it
-_HANDS_PER_CHUNK = 32  # hands that are evaluated at once
-_QUICK_POINTS = 250  # surface points of the quick palm test
-_COMPLETION_TOLERANCE_M = 0.003  # error of completed points, by which they are shrunk
-_CONTACT_TOLERANCE_M = 0.003  # distance between a pad and a surface point in contact
-_PAD_COMPLIANCE_M = 0.001  # depth over which the soft pad distributes its contact
-_TIP_MARGIN_M = 0.002  # minimum distance of a contact from the finger tips
 MAX_CLEARANCE_M = 0.03  # larger clearances are clipped
+
+
+@dataclass(frozen=True)
+class HandPoseConstants:
+    """Constants of hand placement and of the collision tests against the target.
+
+    Args:
+        hands_per_chunk: number of hands that are evaluated at once; it bounds memory.
+        quick_points: number of surface points of the quick palm test.
+        completion_tolerance: [m] error of completed points, by which they are shrunk.
+        contact_tolerance: [m] maximum distance between a pad and a surface point in contact.
+        pad_compliance: [m] depth over which the soft pad distributes its contact.
+        tip_margin: [m] minimum distance of a contact from the finger tips.
+    """
+
+    hands_per_chunk: int = 32
+    quick_points: int = 250
+    completion_tolerance: float = 0.003
+    contact_tolerance: float = 0.003
+    pad_compliance: float = 0.001
+    tip_margin: float = 0.002
+
+
+CONSTANTS = HandPoseConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +93,7 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     across = np.cross(y, down)
     turns = np.linspace(0.0, 2 * np.pi, rolls, endpoint=False)
     z = np.cos(turns)[None, :, None] * down[:, None] + np.sin(turns)[None, :, None] * across[:, None]
-    front, back = min((hand.tip + hand.pad) / 2, hand.tip - _TIP_MARGIN_M), -0.6 * hand.palm
+    front, back = min((hand.tip + hand.pad) / 2, hand.tip - CONSTANTS.tip_margin), -0.6 * hand.palm
     places = np.linspace(front, back, depths)
     shape = (len(pairs), rolls, depths)
     T = np.zeros((*shape, 4, 4))
@@ -97,15 +115,17 @@ def palm_free(hands: Hands, surface: GraspSurface, hand: HandShape, *, retreat: 
 
     This quick test rejects most hands before :func:`measure_hands`.
     """
-    step = max(1, len(surface) // _QUICK_POINTS)
+    step = max(1, len(surface) // CONSTANTS.quick_points)
     p = (surface.points[::step] - surface.center).astype(np.float32)
     free = np.ones(len(hands), np.bool_)
-    for k in range(0, len(hands), 32 * _HANDS_PER_CHUNK):
-        T = hands.T[k : k + 32 * _HANDS_PER_CHUNK]
+    for k in range(0, len(hands), 32 * CONSTANTS.hands_per_chunk):
+        T = hands.T[k : k + 32 * CONSTANTS.hands_per_chunk]
         axes, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - surface.center).astype(np.float32)
         x, y, z = (axes[:, :, i] @ p.T - np.einsum("ij,ij->i", axes[:, :, i], at)[:, None] for i in range(3))
         across = (np.abs(x) < hand.palm_size[0] / 2) & (np.abs(y) < hand.palm_size[1] / 2)
-        free[k : k + 32 * _HANDS_PER_CHUNK] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(axis=1)
+        free[k : k + 32 * CONSTANTS.hands_per_chunk] = ~(across & (z < -hand.palm) & (z > -hand.palm - retreat)).any(
+            axis=1
+        )
     return free
 
 
@@ -136,20 +156,20 @@ def measure_hands(
     center = surface.center
     p = (surface.points - center).astype(np.float32)
     axes = [np.ascontiguousarray((n_sigma * surface.axes[:, :, i]).astype(np.float32).T) for i in range(3)]
-    tolerance = np.where(surface.observed, 0.0, _COMPLETION_TOLERANCE_M).astype(np.float32)
+    tolerance = np.where(surface.observed, 0.0, CONSTANTS.completion_tolerance).astype(np.float32)
     out = [np.empty(len(hands)) for _ in range(5)]
     half = (pairs.width[hands.pair] / 2).astype(np.float32)
-    for k in range(0, len(hands), _HANDS_PER_CHUNK):
-        T = hands.T[k : k + _HANDS_PER_CHUNK]
+    for k in range(0, len(hands), CONSTANTS.hands_per_chunk):
+        T = hands.T[k : k + CONSTANTS.hands_per_chunk]
         R, at = T[:, :3, :3].astype(np.float32), (T[:, :3, 3] - center).astype(np.float32)
         local, reach = [], []
         for i in range(3):
             u = np.ascontiguousarray(R[:, :, i])
             local.append(u @ p.T - np.einsum("ij,ij->i", u, at)[:, None])
             reach.append(np.sqrt(sum((u @ axis) ** 2 for axis in axes)) - tolerance)
-        found = _measured(local, reach, half[k : k + _HANDS_PER_CHUNK, None], hand, retreat)
+        found = _measured(local, reach, half[k : k + CONSTANTS.hands_per_chunk, None], hand, retreat)
         for into, values in zip(out, (*found, _closure(local, tolerance, hand, np.arctan(friction))), strict=True):
-            into[k : k + _HANDS_PER_CHUNK] = values
+            into[k : k + CONSTANTS.hands_per_chunk] = values
     opening, clearance, protrusion, coverage, closure = out
     return replace(
         hands, opening=opening, clearance=clearance, protrusion=protrusion, pad_coverage=coverage, closure=closure
@@ -196,7 +216,7 @@ def _pad_coverage(
     part = np.left_shift(1, np.where(on, 4 * column + line, 0).astype(np.int32))
     found = []
     for sign in (-1.0, 1.0):
-        contact = on & (np.abs(sign * y - half) < _CONTACT_TOLERANCE_M)
+        contact = on & (np.abs(sign * y - half) < CONSTANTS.contact_tolerance)
         bits = np.bitwise_or.reduce(np.where(contact, part, 0), axis=1)
         found.append(np.unpackbits(bits.astype(np.uint16)[:, None].view(np.uint8), axis=1).sum(axis=1) / 16)
     return np.minimum(*found)
@@ -218,7 +238,7 @@ def _closure(local: list[NDArray[np.float32]], tolerance: NDArray[np.float32], h
     for sign in (-1.0, 1.0):
         height = np.where(under & (sign * y > 0.0), sign * y - side_back - end_back - tolerance, -np.inf)
         top = height.max(axis=1, keepdims=True)
-        weight = np.exp((height - np.where(np.isfinite(top), top, 0.0)) / _PAD_COMPLIANCE_M)
+        weight = np.exp((height - np.where(np.isfinite(top), top, 0.0)) / CONSTANTS.pad_compliance)
         weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
         contacts.append(np.stack([np.einsum("km,km->k", weight, values) for values in local], axis=1))
         inclined.append(np.stack([np.einsum("km,km->k", weight, values) for values in (side, end)], axis=1))

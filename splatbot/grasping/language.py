@@ -56,10 +56,26 @@ _STOP_WORDS = (
     "coloured",
 )
 _SYNONYMS = {"gray": "grey", "violet": "purple", "magenta": "pink", "turquoise": "cyan", "teal": "cyan", "big": "large"}
-_COLOR_SCALE = 28.0  # CIELAB distance at which the colour score falls to exp(-1/2)
-_SHAPE_SCALE_M = 2.5e-3  # excess fit error at which the shape score falls to exp(-1)
-_MIN_SCORE = 0.3  # of a match
-_TIE_RATIO = 0.75  # of the second score over the best, above which the query is ambiguous
+
+
+@dataclass(frozen=True)
+class QueryConstants:
+    """Constants of scores of language queries.
+
+    Args:
+        color_scale: [CIELAB] distance at which the colour score falls to exp(-1/2).
+        shape_scale: [m] excess fit error at which the shape score falls to exp(-1).
+        min_score: minimum score of a match.
+        tie_ratio: ratio of the second score to the best above which the query is ambiguous.
+    """
+
+    color_scale: float = 28.0
+    shape_scale: float = 2.5e-3
+    min_score: float = 0.3
+    tie_ratio: float = 0.75
+
+
+CONSTANTS = QueryConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +135,14 @@ def _decided(scene: SegmentedMap, text: str, scores: Array, notes: tuple[str, ..
     order = np.argsort(-scores, kind="stable")
     best = int(order[0])
     described = [f"{_described(scene.objects[k])}: {scores[k]:.2f}" for k in order[:4]]
-    if scores[best] < _MIN_SCORE:
+    if scores[best] < CONSTANTS.min_score:
         raise AffordanceError(
             f"fits none of {len(scores)} objects; the nearest are {'; '.join(described)}.",
             field=text,
             hint="use other words, or point at it",
             candidates=tuple(described),
         )
-    like = [k for k in order if scores[k] > _TIE_RATIO * scores[best]]
+    like = [k for k in order if scores[k] > CONSTANTS.tie_ratio * scores[best]]
     if len(like) > 1:
         raise AffordanceError(
             f"fits {len(like)} objects about equally: {'; '.join(described[: len(like)])}.",
@@ -175,7 +191,9 @@ def _scores(attributes: _ObjectAttributes, text: str) -> tuple[Array, tuple[str,
         notes.append(word)
     for word in best_of:  # "largest red" selects the largest of the red objects, not the reddest of the large ones
         scores = np.where(
-            scores >= _MIN_SCORE, scores * _superlative_scores(attributes, word, scores >= _MIN_SCORE), 0.0
+            scores >= CONSTANTS.min_score,
+            scores * _superlative_scores(attributes, word, scores >= CONSTANTS.min_score),
+            0.0,
         )
         notes.append(word)
     return scores, (f"rules: {', '.join(notes) or 'any'}",)
@@ -198,7 +216,7 @@ def _color_scores(attributes: _ObjectAttributes, word: str) -> Array:
     away = np.linalg.norm(
         _lab(np.array([o.color for o in attributes.scene.objects])) - _lab(np.array([COLORS[word]])), axis=1
     )
-    return np.asarray(np.exp(-0.5 * (away / _COLOR_SCALE) ** 2))
+    return np.asarray(np.exp(-0.5 * (away / CONSTANTS.color_scale) ** 2))
 
 
 def _lab(rgb: Array) -> Array:
@@ -213,7 +231,7 @@ def _shape_score(scene: SegmentedMap, item: MapObject, kind: str) -> float:
     fits = {
         f.shape["kind"]: f.error for f in primitive_fits(points, support.offset if support is not None else -np.inf)
     }
-    return float(np.exp(-(fits[kind] - min(fits.values())) / _SHAPE_SCALE_M))
+    return float(np.exp(-(fits[kind] - min(fits.values())) / CONSTANTS.shape_scale))
 
 
 def _size_scores(attributes: _ObjectAttributes, word: str) -> Array:

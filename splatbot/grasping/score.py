@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +34,32 @@ WEIGHTS: Mapping[str, float] = {
 """Weight of each score term; the names are fields of results over HTTP."""
 
 ZERO_SCORE_DISTANCE_M = 0.05  # from the centre of mass, or from the indicated point, at which a term is 0
-_FULL_SCORE_STROKE_M = 0.02  # remaining stroke with the score 1
-_HAND_FULL_SCORE_CLEARANCE_M = 0.02  # clearance of the hand with the score 1
-_ZERO_SCORE_STD_M = 0.004  # standard deviation of the surface with the score 0
-_DENSITY = 1000.0  # [kg/m³] assumed density, that of water
-_LOAD_ACCELERATION = 2 * 9.81  # [m/s²] gravity plus an equal acceleration of the arm
-_SIMILAR_DISTANCE_M = 0.008  # between the tools of similar grasps
-_SIMILAR_ANGLE_RAD = 0.26  # between the axes of similar grasps
+
+
+@dataclass(frozen=True)
+class ScoreConstants:
+    """Constants of the score terms.
+
+    Args:
+        full_score_stroke: [m] remaining stroke with the score 1.
+        hand_full_score_clearance: [m] clearance of the hand with the score 1.
+        zero_score_std: [m] standard deviation of the surface with the score 0.
+        density: [kg/m³] assumed density of the target, that of water.
+        load_acceleration: [m/s²] gravity plus an equal acceleration of the arm.
+        similar_distance: [m] maximum distance between the tools of similar grasps.
+        similar_angle: [rad] maximum angle between the axes of similar grasps.
+    """
+
+    full_score_stroke: float = 0.02
+    hand_full_score_clearance: float = 0.02
+    zero_score_std: float = 0.004
+    density: float = 1000.0
+    load_acceleration: float = 2 * 9.81
+    similar_distance: float = 0.008
+    similar_angle: float = 0.26
+
+
+CONSTANTS = ScoreConstants()
 
 
 def hand_terms(
@@ -81,11 +101,12 @@ def hand_terms(
         "closure": hands.closure,
         "held": hands.pad_coverage,
         "centre": 1.0 - aside / ZERO_SCORE_DISTANCE_M,
-        "torque": 1.0 - friction_load(body.size * _DENSITY * _LOAD_ACCELERATION, aside, hand, friction),
-        "width": (hand.stroke - pairs.width[p]) / _FULL_SCORE_STROKE_M,
-        "room": clearance / _HAND_FULL_SCORE_CLEARANCE_M,
+        "torque": 1.0
+        - friction_load(body.size * CONSTANTS.density * CONSTANTS.load_acceleration, aside, hand, friction),
+        "width": (hand.stroke - pairs.width[p]) / CONSTANTS.full_score_stroke,
+        "room": clearance / CONSTANTS.hand_full_score_clearance,
         "seen": pairs.observed[p],
-        "certain": 1.0 - pairs.normal_std[p] / _ZERO_SCORE_STD_M,
+        "certain": 1.0 - pairs.normal_std[p] / CONSTANTS.zero_score_std,
         "upright": -(hands.T[:, :3, 2] @ up),
     }
     if near is not None:
@@ -137,9 +158,9 @@ def suppress_similar(hands: Hands, total: Array, *, most: int) -> NDArray[np.int
         if len(kept) == most:
             break
         if kept:
-            near = np.linalg.norm(at[kept] - at[row], axis=1) < _SIMILAR_DISTANCE_M
-            same = (z[kept] @ z[row] > np.cos(_SIMILAR_ANGLE_RAD)) & (
-                np.abs(hands.T[kept, :3, 1] @ hands.T[row, :3, 1]) > np.cos(_SIMILAR_ANGLE_RAD)
+            near = np.linalg.norm(at[kept] - at[row], axis=1) < CONSTANTS.similar_distance
+            same = (z[kept] @ z[row] > np.cos(CONSTANTS.similar_angle)) & (
+                np.abs(hands.T[kept, :3, 1] @ hands.T[row, :3, 1]) > np.cos(CONSTANTS.similar_angle)
             )
             if (near & same).any():
                 continue

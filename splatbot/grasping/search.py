@@ -29,14 +29,34 @@ from splatbot.protocols import Array
 if TYPE_CHECKING:
     from splatbot.grasping.sampler import GraspSampler
 
-_RETRY_FACTOR = 4  # on the number of samples of the second search
-_MAX_HANDS_TARGET = 2000  # hands that are checked against the target
-_MAX_HANDS_MAP = 200  # hands that are checked against the map
-_MAX_HANDS_ARM = 60  # hands whose reachability is checked
-_EARLY_PENETRATION_M = 0.003  # of fingers in the map before their final opening is known
-_MIN_TOP_COSINE = np.cos(np.radians(40.0))  # between the approach direction and down, of a top approach
-_MIN_DOWN_COSINE = -0.26  # the same of any approach
-_MAX_SIDE_COSINE = 0.5  # between the approach direction and the vertical, of a side approach
+
+@dataclass(frozen=True)
+class GraspSearchConstants:
+    """Constants of the search for grasps.
+
+    Args:
+        retry_factor: factor on the number of samples of the second search.
+        max_hands_target: maximum number of hands that are checked against the target.
+        max_hands_map: maximum number of hands that are checked against the map.
+        max_hands_arm: maximum number of hands whose reachability is checked.
+        early_penetration: [m] accepted penetration of fingers into the map before their final opening is known.
+        min_top_cosine: minimum cosine between approach direction and down for a top approach.
+        min_down_cosine: minimum cosine between approach direction and down for any approach.
+        max_side_cosine: maximum cosine between approach direction and vertical for a side approach.
+    """
+
+    retry_factor: int = 4
+    max_hands_target: int = 2000
+    max_hands_map: int = 200
+    max_hands_arm: int = 60
+    early_penetration: float = 0.003
+    min_top_cosine: float = float(np.cos(np.radians(40.0)))
+    min_down_cosine: float = -0.26
+    max_side_cosine: float = 0.5
+
+
+CONSTANTS = GraspSearchConstants()
+
 
 _IN_TARGET = "hands are in the target on their way"
 _IN_MAP = "hands touch the surroundings of the target"
@@ -91,8 +111,8 @@ class Search:
         too_large = not len(self.pairs.width) and self.found.too_wide > 0
         if not grasps and not too_large:
             few = min(self.o.samples, len(self.surface))
-            grasps = self._search(_RETRY_FACTOR * self.o.samples, sharp=True)
-            more = min(_RETRY_FACTOR * self.o.samples, len(self.surface))
+            grasps = self._search(CONSTANTS.retry_factor * self.o.samples, sharp=True)
+            more = min(CONSTANTS.retry_factor * self.o.samples, len(self.surface))
             notes.append(f"No grasp was found with {few} samples; {more} samples with sharper edges were searched.")
         return GraspResult(
             self.target,
@@ -142,9 +162,11 @@ class Search:
 
     def _placed(self) -> Hands:
         up, o = self.s.scene.up, self.o
-        lowest = _MIN_TOP_COSINE if o.approach == "top" else _MIN_DOWN_COSINE
+        lowest = CONSTANTS.min_top_cosine if o.approach == "top" else CONSTANTS.min_down_cosine
         hands = place_hands(self.pairs, self.s.hand, rolls=o.rolls, depths=o.depths, up=up, lowest=lowest)
-        return hands.select(np.abs(hands.T[:, :3, 2] @ up) < _MAX_SIDE_COSINE) if o.approach == "side" else hands
+        return (
+            hands.select(np.abs(hands.T[:, :3, 2] @ up) < CONSTANTS.max_side_cosine) if o.approach == "side" else hands
+        )
 
     def _promising(self, hands: Hands) -> Hands:
         """Return at most 2000 hands with a free palm, those of the best contact pairs."""
@@ -153,7 +175,7 @@ class Search:
         hands = self._fingers_outside_map(hands.select(free))
         aside = np.linalg.norm(self.pairs.contacts.mean(axis=1) - self.body.center, axis=1)
         good = (self.pairs.closure + self.pairs.observed - aside / 0.1)[hands.pair]
-        best = np.sort(np.argsort(-good, kind="stable")[:_MAX_HANDS_TARGET])
+        best = np.sort(np.argsort(-good, kind="stable")[: CONSTANTS.max_hands_target])
         self.log.drop("hands are of worse contacts than others", len(hands) - len(best))
         return hands.select(best)
 
@@ -164,7 +186,7 @@ class Search:
         opening moves the fingers.
         """
         clearance = finger_clearance(self.s.robot, hands, self.around, self.s.hand)
-        free = clearance > -_EARLY_PENETRATION_M
+        free = clearance > -CONSTANTS.early_penetration
         self.log.drop(_IN_MAP, (~free).sum())
         if len(free) and not free.any() and self.log.best is None:  # the first search may have a better rejected grasp
             k = int(np.argmax(clearance))
@@ -203,7 +225,7 @@ class Search:
 
     def _in_map(self, scored: _Scored, around: GaussianCollisionField) -> _Scored:
         """Return the best dissimilar hands that are free of the rest of the map along their approach."""
-        best = suppress_similar(scored.hands, scored.totals, most=_MAX_HANDS_MAP)
+        best = suppress_similar(scored.hands, scored.totals, most=CONSTANTS.max_hands_map)
         self.log.drop("hands are like a better one", len(scored.hands) - len(best))
         tried = scored.select(best)
         clearance = swept_clearance(self.s.robot, tried.hands, around, retreat=self.o.pregrasp) - self.s.margin
@@ -224,7 +246,9 @@ class Search:
     def _outside_ellipsoids(self, scored: _Scored, own: GaussianCollisionField) -> _Scored:
         """Return the best hands, best first, whose boxes do not intersect the target's ellipsoids."""
         order = (
-            np.argsort(-scored.totals, kind="stable")[:_MAX_HANDS_ARM] if len(scored.hands) else np.zeros(0, np.int64)
+            np.argsort(-scored.totals, kind="stable")[: CONSTANTS.max_hands_arm]
+            if len(scored.hands)
+            else np.zeros(0, np.int64)
         )
         scored = scored.select(order)
         inside = touches(own, scored.hands, self.s.hand, retreat=self.o.pregrasp)
@@ -310,13 +334,13 @@ class Search:
 
     def _approach(self, T: Array) -> str:
         z = T[:3, 2]
-        if -(z @ self.s.scene.up) >= _MIN_TOP_COSINE:
+        if -(z @ self.s.scene.up) >= CONSTANTS.min_top_cosine:
             return "top"
-        if abs(z @ self.s.scene.up) >= _MAX_SIDE_COSINE:
+        if abs(z @ self.s.scene.up) >= CONSTANTS.max_side_cosine:
             return "free"
         ahead = T[:3, 3] - self.s.scene.T_world_base[:3, 3]
         ahead = ahead - (ahead @ self.s.scene.up) * self.s.scene.up
-        return "front" if z @ ahead >= _MIN_TOP_COSINE * np.linalg.norm(ahead) else "side"
+        return "front" if z @ ahead >= CONSTANTS.min_top_cosine * np.linalg.norm(ahead) else "side"
 
     def _split(self) -> tuple[GaussianModel, GaussianCollisionField, GaussianCollisionField]:
         """Return the map without the target, its collision field, and the collision field of the target alone."""

@@ -7,6 +7,7 @@ Measured depth that passes behind a face limits the inferred depth.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,27 +21,60 @@ from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 from splatbot.segmentation.faces import nearest_of
 
-_COMPLETION_WINDING = 0.45  # winding number above which a point is inside of the observed surface
-_FACING_COSINE = 0.7  # minimum cosine between a direction and the normals of a face that points in it
-_VISIBLE_COSINE = 0.1  # minimum cosine between a direction and the normals that are visible from it
-_SAME_FACE_COSINE = 0.7  # between normals of one face
-_MIN_FACE_POINTS = 20
-_FLAT_COSINE = 0.97  # between normals of a flat face
-_DOMINANT_FRACTION = 0.4  # of the target that a dominant flat face covers
-_WIDTH_PRIOR_M = 0.005  # width of a face below which its normals determine its orientation better than its points
-_MAX_ROTATION_TANGENT = 0.47  # of the correction of a face's orientation, 25 degrees
-_SIDE_COSINE = 0.7  # maximum cosine between up and the normals of a side
-_MIN_LEAN_RAD = 0.17  # angle from the vertical above which a flat face leans
-_DEFAULT_DEPTH_M = 0.04  # half of the maximum depth that is inferred without an observation of the depth
-_MIN_OBSERVED_DEPTH_M = 0.008  # observed depth above which it is the depth of the object
-_NOISE_QUANTILE = 1.65  # standard deviations that 5 % of a normal distribution exceed
-_TUBE_M = 0.003  # distance of a ray from a point that it meets, for the full point density
-_OBSERVED_RADIUS_M = 0.006  # around observed points of a side in which no points are added
-_SPACING_M = 0.003  # between added points
-_MIN_THROUGH_VIEWS = 2  # views with depth behind an unobserved point that prove it free
-_MAX_FREE_FRACTION = 0.03  # of a face, without its boundary, with free space behind it at the depth of the object
-_BOUNDARY_M = 0.014  # at the edges of a face, where depth images smear and free space is uncertain
-_MAX_COLUMNS = 300  # points of a face behind which free space is queried
+
+@dataclass(frozen=True)
+class CompletionConstants:
+    """Constants of shape completion.
+
+    Args:
+        completion_winding: winding number above which a point is inside of the observed surface.
+        facing_cosine: minimum cosine between a direction and the normals of a face that points in it.
+        visible_cosine: minimum cosine between a direction and the normals that are visible from it.
+        same_face_cosine: minimum cosine between normals of one face.
+        min_face_points: minimum number of points of a face.
+        flat_cosine: minimum cosine between normals of a flat face.
+        dominant_fraction: fraction of the target that a dominant flat face covers.
+        width_prior: [m] normals determine the orientation of a narrower face better than its points.
+        max_rotation_tangent: maximum tangent of the correction of a face's orientation, 25 degrees.
+        side_cosine: maximum cosine between up and the normals of a side.
+        min_lean: [rad] a flat face with a larger angle from the vertical leans.
+        default_depth: [m] half of the maximum depth that is inferred without an observation of the depth.
+        min_observed_depth: [m] a larger observed depth is the depth of the object.
+        noise_quantile: standard deviations that 5 % of a normal distribution exceed.
+        tube: [m] distance of a ray from a point that it meets, at the full point density.
+        observed_radius: [m] no points are added within this distance of observed points of a side.
+        spacing: [m] distance between added points.
+        min_through_views: number of views with depth behind an unobserved point that prove it free.
+        max_free_fraction: a face ends where more than this fraction of it has free space behind it.
+        boundary: [m] width of the edges of a face at which depth images smear and free space is uncertain.
+        max_columns: maximum number of points of a face behind which free space is queried.
+    """
+
+    completion_winding: float = 0.45
+    facing_cosine: float = 0.7
+    visible_cosine: float = 0.1
+    same_face_cosine: float = 0.7
+    min_face_points: int = 20
+    flat_cosine: float = 0.97
+    dominant_fraction: float = 0.4
+    width_prior: float = 0.005
+    max_rotation_tangent: float = 0.47
+    side_cosine: float = 0.7
+    min_lean: float = 0.17
+    default_depth: float = 0.04
+    min_observed_depth: float = 0.008
+    noise_quantile: float = 1.65
+    tube: float = 0.003
+    observed_radius: float = 0.006
+    spacing: float = 0.003
+    min_through_views: int = 2
+    max_free_fraction: float = 0.03
+    boundary: float = 0.014
+    max_columns: int = 300
+
+
+CONSTANTS = CompletionConstants()
+
 
 _Points = tuple[Array, Array, Array]
 
@@ -68,10 +102,10 @@ def target_surface(
     """
     measured, areas = measured_surface(scene, rows, observers=observers, seed=seed, sharp=sharp)
     up = _along(measured, scene.up)
-    leans = bool(up @ scene.up < np.cos(_MIN_LEAN_RAD / 2))
+    leans = bool(up @ scene.up < np.cos(CONSTANTS.min_lean / 2))
     floor = float(np.percentile(measured.points @ up, 1)) if leans else _floor(scene, measured, up)
     down = _extruded_sides(measured, up, floor)
-    parts = [(*down, np.full(len(down[0]), _SPACING_M / 2))]
+    parts = [(*down, np.full(len(down[0]), CONSTANTS.spacing / 2))]
     faces = [_CompletedFace(direction, measured) for direction in _directions(measured, up)]
     backs = []
     for face in faces:
@@ -80,21 +114,24 @@ def target_surface(
         backs.append(back)
     points, normals, normal_std = (np.concatenate([part[k] for part in parts]) for k in range(3))
     # Sides reach down to the floor, so downward points of a front face's sides above it are no bottom.
-    standing = np.flatnonzero((normals @ up > -_SAME_FACE_COSINE) | (points @ up < floor + STEP))
-    thin = np.unique(np.floor(points[standing] / _SPACING_M).astype(np.int64), axis=0, return_index=True)[1]
+    standing = np.flatnonzero((normals @ up > -CONSTANTS.same_face_cosine) | (points @ up < floor + STEP))
+    thin = np.unique(np.floor(points[standing] / CONSTANTS.spacing).astype(np.int64), axis=0, return_index=True)[1]
     every = 1 + len(thin) // MAX_POINTS
     kept = standing[thin[::every]]
     for face, back in zip(faces, backs, strict=True):
         kept = kept[~face.hides(points[kept], back)]
-    winding = winding_numbers(points[kept], measured.points, measured.normals, areas, softened=_SPACING_M)
+    winding = winding_numbers(points[kept], measured.points, measured.normals, areas, softened=CONSTANTS.spacing)
     evidence = evidence_at(points[kept], views)
-    kept = kept[(winding < _COMPLETION_WINDING) & ~(evidence.seen_through & (evidence.passes >= _MIN_THROUGH_VIEWS))]
-    kept = kept[~_inside(points[kept], normals[kept], tube=_TUBE_M * np.sqrt(every))]
+    kept = kept[
+        (winding < CONSTANTS.completion_winding)
+        & ~(evidence.seen_through & (evidence.passes >= CONSTANTS.min_through_views))
+    ]
+    kept = kept[~_inside(points[kept], normals[kept], tube=CONSTANTS.tube * np.sqrt(every))]
     return GraspSurface(
         np.concatenate([measured.points, points[kept]]),
         np.concatenate([measured.normals, normals[kept]]),
         np.concatenate([measured.axes, np.zeros((len(kept), 3, 3))]),
-        np.concatenate([measured.spread, np.full(len(kept), _SPACING_M / 2)]),
+        np.concatenate([measured.spread, np.full(len(kept), CONSTANTS.spacing / 2)]),
         np.concatenate([measured.observed, np.zeros(len(kept), np.bool_)]),
         np.concatenate([measured.normal_std, normal_std[kept]]),
         measured.center,
@@ -106,19 +143,19 @@ class _CompletedFace:
 
     def __init__(self, direction: Array, measured: GraspSurface) -> None:
         self.direction = direction
-        self.points = measured.points[measured.normals @ direction > _FACING_COSINE]
+        self.points = measured.points[measured.normals @ direction > CONSTANTS.facing_cosine]
         self.across = frame_along(direction)
         self.flat = self.points @ self.across.T
-        self.relief = Relief.of(self.flat) if len(self.points) >= _MIN_FACE_POINTS else None
+        self.relief = Relief.of(self.flat) if len(self.points) >= CONSTANTS.min_face_points else None
 
     def hides(self, points: Array, back: float) -> NDArray[np.bool_]:
         """Return which points (P, 3) are between the face and its back, away from the boundary: no side is there."""
         if self.relief is None:
             return np.zeros(len(points), np.bool_)
         flat = points @ self.across.T
-        behind = self.relief.inwards(flat) > _OBSERVED_RADIUS_M + DISC
+        behind = self.relief.inwards(flat) > CONSTANTS.observed_radius + DISC
         top = np.percentile(self.flat[:, 2], 95)
-        return np.asarray(behind & (flat[:, 2] > back + _OBSERVED_RADIUS_M) & (flat[:, 2] < top))
+        return np.asarray(behind & (flat[:, 2] > back + CONSTANTS.observed_radius) & (flat[:, 2] < top))
 
     def seen_through(self, views: Sequence[DepthView]) -> float:
         """Return the coordinate along the direction [m, world] at which measured depth proves free space behind it.
@@ -128,14 +165,16 @@ class _CompletedFace:
         """
         if self.relief is None or not views:
             return -np.inf
-        front = self.points[self.relief.inwards(self.flat) > _BOUNDARY_M]
-        front = front[:: 1 + len(front) // _MAX_COLUMNS]
-        if len(front) < _MIN_FACE_POINTS:
+        front = self.points[self.relief.inwards(self.flat) > CONSTANTS.boundary]
+        front = front[:: 1 + len(front) // CONSTANTS.max_columns]
+        if len(front) < CONSTANTS.min_face_points:
             return -np.inf
-        depths = np.arange(_SPACING_M, 2 * _DEFAULT_DEPTH_M, _SPACING_M)
+        depths = np.arange(CONSTANTS.spacing, 2 * CONSTANTS.default_depth, CONSTANTS.spacing)
         evidence = evidence_at((front[None] - depths[:, None, None] * self.direction).reshape(-1, 3), views)
-        through = (evidence.seen_through & (evidence.passes >= _MIN_THROUGH_VIEWS)).reshape(len(depths), len(front))
-        free = np.logical_or.accumulate(through, axis=0).mean(axis=1) >= _MAX_FREE_FRACTION
+        through = (evidence.seen_through & (evidence.passes >= CONSTANTS.min_through_views)).reshape(
+            len(depths), len(front)
+        )
+        free = np.logical_or.accumulate(through, axis=0).mean(axis=1) >= CONSTANTS.max_free_fraction
         return float(np.median(front @ self.direction) - depths[free.argmax()]) if free.any() else -np.inf
 
 
@@ -149,13 +188,13 @@ def _behind(
         coordinate of the back along the face's direction [m, world], infinity for a curved back.
     """
     back, mirrored = _back(measured, face.direction, up)
-    back_std = _SPACING_M / 2
+    back_std = CONSTANTS.spacing / 2
     along = measured.points @ face.direction
     if not mirrored and back < np.percentile(along, 5):  # no observation of the depth
         back = max(back, face.seen_through(views))
         back_std = max(back_std, float(np.median(along) - back) / np.sqrt(12))  # uniform distribution of the depth
     points, normals = _extruded_sides(measured, face.direction, back, closed=True, mirrored=mirrored)
-    normal_std = np.where(normals @ face.direction < -_SAME_FACE_COSINE, back_std, _SPACING_M / 2)
+    normal_std = np.where(normals @ face.direction < -CONSTANTS.same_face_cosine, back_std, CONSTANTS.spacing / 2)
     return (points, normals, normal_std), np.inf if mirrored else back
 
 
@@ -165,17 +204,17 @@ def _along(measured: GraspSurface, up: Array) -> Array:
     The back of a leaning object, such as a book against a wall, is parallel to its face. Its sides end in its own
     frame rather than at the support. Round objects and objects with several visible sides have no dominant face.
     """
-    side = measured.normals[np.abs(measured.normals @ up) < _SIDE_COSINE]
-    if len(side) < max(_MIN_FACE_POINTS, _DOMINANT_FRACTION * len(measured)):
+    side = measured.normals[np.abs(measured.normals @ up) < CONSTANTS.side_cosine]
+    if len(side) < max(CONSTANTS.min_face_points, CONSTANTS.dominant_fraction * len(measured)):
         return up
-    close = side @ side[:: max(1, len(side) // 100)].T > _FLAT_COSINE
+    close = side @ side[:: max(1, len(side) // 100)].T > CONSTANTS.flat_cosine
     best = int(close.sum(axis=0).argmax())
-    if close[:, best].sum() < _DOMINANT_FRACTION * len(measured):
+    if close[:, best].sum() < CONSTANTS.dominant_fraction * len(measured):
         return up
     face = side[close[:, best]].mean(axis=0)
     face /= np.linalg.norm(face)
     lean = float(face @ up)
-    if abs(lean) < np.sin(_MIN_LEAN_RAD):
+    if abs(lean) < np.sin(CONSTANTS.min_lean):
         return up
     along = up - lean * face
     return np.asarray(along / np.linalg.norm(along))
@@ -187,7 +226,7 @@ def _directions(measured: GraspSurface, up: Array) -> list[Array]:
     left, points = measured.normals[level], measured.points[level]
     left = left - np.outer(left @ up, up)
     left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
-    min_points = max(_MIN_FACE_POINTS, 0.05 * len(measured))
+    min_points = max(CONSTANTS.min_face_points, 0.05 * len(measured))
     found: list[Array] = []
     while len(left) >= min_points and len(found) < 8:
         close = left @ left[:: max(1, len(left) // 100)].T > 0.9
@@ -197,9 +236,9 @@ def _directions(measured: GraspSurface, up: Array) -> list[Array]:
         face = left[own].mean(axis=0)
         face /= np.linalg.norm(face)
         found.append(_across(points[own], face, up))
-        other = left @ face < _SAME_FACE_COSINE
+        other = left @ face < CONSTANTS.same_face_cosine
         left, points = left[other], points[other]
-    return [face for face in found if not any(face @ other < -_FACING_COSINE for other in found)]
+    return [face for face in found if not any(face @ other < -CONSTANTS.facing_cosine for other in found)]
 
 
 def _across(points: Array, face: Array, up: Array) -> Array:
@@ -213,7 +252,7 @@ def _across(points: Array, face: Array, up: Array) -> Array:
     local = points @ np.stack([aside, up, face], axis=1)
     left = local[:, 0] < np.median(local[:, 0])
     whole, *halves = (_slope(part) for part in (local, local[left], local[~left]))
-    if abs(whole) > _MAX_ROTATION_TANGENT or min(np.sign(whole) * half for half in halves) < 0.5 * abs(whole):
+    if abs(whole) > CONSTANTS.max_rotation_tangent or min(np.sign(whole) * half for half in halves) < 0.5 * abs(whole):
         return face
     turned = face - whole * aside
     return np.asarray(turned / np.linalg.norm(turned))
@@ -231,10 +270,10 @@ def _slope(local: Array) -> float:
     for _ in range(3):
         middle = local[kept] - local[kept].mean(axis=0)
         A, depth = middle[:, :2], middle[:, 2]
-        slopes = np.linalg.solve(A.T @ A + len(A) * _WIDTH_PRIOR_M**2 * np.eye(2), A.T @ depth)
+        slopes = np.linalg.solve(A.T @ A + len(A) * CONSTANTS.width_prior**2 * np.eye(2), A.T @ depth)
         residual = local[:, 2] - local[:, :2] @ slopes
         residual = np.abs(residual - np.median(residual))
-        kept = residual <= max(3 * float(np.median(residual)), _SPACING_M)
+        kept = residual <= max(3 * float(np.median(residual)), CONSTANTS.spacing)
     return float(slopes[0])
 
 
@@ -244,7 +283,7 @@ def _floor(scene: SegmentedMap, measured: GraspSurface, up: Array) -> float:
     local = transform_points(inverse(scene.T_world_base), measured.points)
     support = scene.under(local)
     if support is None:
-        return low - _DEFAULT_DEPTH_M
+        return low - CONSTANTS.default_depth
     under = float(np.percentile(support.height(local), 1))
     return low - under if 0.0 <= under < 0.03 else low - 0.01
 
@@ -258,14 +297,14 @@ def _back(measured: GraspSurface, face: Array, up: Array) -> tuple[float, bool]:
     """
     across = measured.points @ np.stack([up, np.cross(up, face)], axis=1)
     along = measured.points @ face
-    facing = measured.normals @ face > _FACING_COSINE
+    facing = measured.normals @ face > CONSTANTS.facing_cosine
     bent, noise = _paraboloid(across[facing], along[facing])
     near, far = float(np.percentile(bent, 95)), float(np.percentile(along, 5))
-    if near - far > _MIN_OBSERVED_DEPTH_M + _NOISE_QUANTILE * noise:
-        flat = float((near - bent < _MIN_OBSERVED_DEPTH_M).mean()) > 0.7
-        return (far, False) if flat else (max(2 * far - near, near - 2 * _DEFAULT_DEPTH_M), True)
+    if near - far > CONSTANTS.min_observed_depth + CONSTANTS.noise_quantile * noise:
+        flat = float((near - bent < CONSTANTS.min_observed_depth).mean()) > 0.7
+        return (far, False) if flat else (max(2 * far - near, near - 2 * CONSTANTS.default_depth), True)
     narrow = float(np.ptp(np.percentile(across, [2, 98], axis=0), axis=0).min())
-    return near - min(narrow, 2 * _DEFAULT_DEPTH_M), False
+    return near - min(narrow, 2 * CONSTANTS.default_depth), False
 
 
 def _paraboloid(at: Array, heights: Array) -> tuple[Array, float]:
@@ -295,17 +334,17 @@ def _extruded_sides(
         Points (K, 3) and normals (K, 3) [world].
     """
     none = np.zeros((0, 3)), np.zeros((0, 3))
-    facing = measured.normals @ direction > _VISIBLE_COSINE
-    if facing.sum() < _MIN_FACE_POINTS:
+    facing = measured.normals @ direction > CONSTANTS.visible_cosine
+    if facing.sum() < CONSTANTS.min_face_points:
         return none
     across = frame_along(direction)
     flat = measured.points @ across.T  # the last coordinate is the height
     # A disc covers only its projection onto the plane of the map.
     relief = Relief.of(flat[facing], (measured.spread * (measured.normals @ direction))[facing])
-    below = Relief.of(flat[measured.normals @ direction < -_VISIBLE_COSINE], like=relief).heights
+    below = Relief.of(flat[measured.normals @ direction < -CONSTANTS.visible_cosine], like=relief).heights
     at, out, top, beyond = relief.edges()
     foot = np.maximum(floor, np.maximum(beyond, below[at[:, 0], at[:, 1]]))
-    rows = [np.arange(h - _SPACING_M / 2, f, -_SPACING_M) for h, f in zip(top, foot, strict=True)]
+    rows = [np.arange(h - CONSTANTS.spacing / 2, f, -CONSTANTS.spacing) for h, f in zip(top, foot, strict=True)]
     count = np.array([len(row) for row in rows])
     if not count.sum():
         return none
@@ -340,7 +379,7 @@ def _inside(points: Array, normals: Array, *, tube: float) -> NDArray[np.bool_]:
         a, d = p[k : k + 256], n[k : k + 256]
         ahead = d @ p.T - np.einsum("ij,ij->i", a, d)[:, None]
         aside = (a**2).sum(axis=1)[:, None] - 2 * (a @ p.T) + square - ahead**2
-        ahead[(ahead < _OBSERVED_RADIUS_M) | (aside > tube**2)] = np.inf
+        ahead[(ahead < CONSTANTS.observed_radius) | (aside > tube**2)] = np.inf
         first = ahead.argmin(axis=1)
         hit = np.isfinite(ahead[np.arange(len(a)), first])
         found[k : k + 256] = hit & (np.einsum("ij,ij->i", n[first], d) > 0.3)
@@ -350,7 +389,7 @@ def _inside(points: Array, normals: Array, *, tube: float) -> NDArray[np.bool_]:
 def _unseen(points: Array, normals: Array, measured: GraspSurface) -> NDArray[np.bool_]:
     """Return which points (P, 3) have no observed neighbour with a similar normal within 6 mm (P,)."""
     new = np.ones(len(points), np.bool_)
-    reach = max(_OBSERVED_RADIUS_M, 2.0 * float(np.median(measured.spread)))
+    reach = max(CONSTANTS.observed_radius, 2.0 * float(np.median(measured.spread)))
     for axis in (*np.eye(3), *-np.eye(3)):
         queried, known = normals @ axis > 0.5, measured.normals @ axis > 0.3
         if queried.any() and known.any():

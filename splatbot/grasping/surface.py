@@ -15,11 +15,27 @@ from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
 MAX_POINTS = 1800  # on a surface; more are subsampled
-_MIN_SUPPORT = 0.2  # observations of a Gaussian, as a fraction of the 90th percentile
 SMOOTHING_M = 0.006  # standard deviation [m] of the kernel that averages normals
-_SMOOTHING_COSINE = 0.3  # minimum cosine between normals that are averaged
-_SHARP_COSINE = 0.8  # the same where edges stay sharp
-_MAX_AREA_RATIO = 4.0  # area of a point over the median; points above it are strays
+
+
+@dataclass(frozen=True)
+class SurfaceConstants:
+    """Constants of the observed surface.
+
+    Args:
+        min_support: minimum observations of a Gaussian as a fraction of the 90th percentile.
+        smoothing_cosine: minimum cosine between normals that are averaged.
+        sharp_cosine: minimum cosine between normals that are averaged where edges stay sharp.
+        max_area_ratio: points with a larger area, relative to the median, are strays.
+    """
+
+    min_support: float = 0.2
+    smoothing_cosine: float = 0.3
+    sharp_cosine: float = 0.8
+    max_area_ratio: float = 4.0
+
+
+CONSTANTS = SurfaceConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +95,7 @@ def measured_surface(
     rng = np.random.default_rng(seed)
     # Gaussians with few observations are often flying pixels next to a depth edge.
     support = scene.model.observations.numpy()[rows]
-    rows = rows[support >= _MIN_SUPPORT * np.percentile(support, 90)] if len(rows) else rows
+    rows = rows[support >= CONSTANTS.min_support * np.percentile(support, 90)] if len(rows) else rows
     chosen = rows if len(rows) <= MAX_POINTS else np.sort(rng.choice(rows, MAX_POINTS, replace=False))
     model = scene.model.select(torch.from_numpy(chosen))
     points = model.means.detach().double().numpy()
@@ -91,10 +107,12 @@ def measured_surface(
     normals = shortest_axes(model).detach().double().numpy()
     normals = normals * np.where(np.einsum("ij,ij->i", normals, outward) < 0, -1.0, 1.0)[:, None]
     flatness = 1.0 - scales[:, 0] / np.maximum(scales[:, 1], 1e-12)
-    normals, areas = _smoothed(points, normals, flatness, cosine=_SHARP_COSINE if sharp else _SMOOTHING_COSINE)
+    normals, areas = _smoothed(
+        points, normals, flatness, cosine=CONSTANTS.sharp_cosine if sharp else CONSTANTS.smoothing_cosine
+    )
     normal_std = _normal_stds(model, scales)
     axes = (rotations(model) * model.scales[:, None, :]).detach().double().numpy()
-    kept = np.flatnonzero(areas < _MAX_AREA_RATIO * np.median(areas))
+    kept = np.flatnonzero(areas < CONSTANTS.max_area_ratio * np.median(areas))
     spacing = np.sqrt(areas)
     spread = np.where(spacing > 2 * scales[:, 2], 1.2 * spacing, scales[:, 2])  # cover the gaps of a subsample
     surface = GraspSurface(points, normals, axes, spread, np.ones(len(points), np.bool_), normal_std, center)

@@ -9,11 +9,27 @@ import numpy as np
 from splatbot.grasping.surface import SMOOTHING_M
 from splatbot.protocols import Array
 
-_MAX_VOLUME_POINTS = 800  # on the surface; more are subsampled
-_MAX_CELLS = 3000  # of the grid over the bounding box
-_INSIDE_WINDING = 0.5  # winding number above which a point is inside
-_MIN_CELLS = 30  # inside cells below which the surface encloses no volume
-_SAME_SIDE_COSINE = 0.3  # between normals of points on the same side of a thin object
+
+@dataclass(frozen=True)
+class VolumeConstants:
+    """Constants of the enclosed volume.
+
+    Args:
+        max_volume_points: maximum number of surface points; more are subsampled.
+        max_cells: maximum number of grid cells over the bounding box.
+        inside_winding: winding number above which a point is inside.
+        min_cells: number of inside cells below which the surface encloses no volume.
+        same_side_cosine: minimum cosine between normals on the same side of a thin object.
+    """
+
+    max_volume_points: int = 800
+    max_cells: int = 3000
+    inside_winding: float = 0.5
+    min_cells: int = 30
+    same_side_cosine: float = 0.3
+
+
+CONSTANTS = VolumeConstants()
 
 
 def winding_numbers(places: Array, points: Array, normals: Array, areas: Array, *, softened: float) -> Array:
@@ -69,17 +85,17 @@ def enclosed_volume(points: Array, normals: Array, *, seed: int = 0) -> Volume:
     """
     low, high = points.min(axis=0), points.max(axis=0)
     none = Volume((low + high) / 2, 0.0)
-    if len(points) > _MAX_VOLUME_POINTS:
-        chosen = np.sort(np.random.default_rng(seed).choice(len(points), _MAX_VOLUME_POINTS, replace=False))
+    if len(points) > CONSTANTS.max_volume_points:
+        chosen = np.sort(np.random.default_rng(seed).choice(len(points), CONSTANTS.max_volume_points, replace=False))
         points, normals = points[chosen], normals[chosen]
-    size = float((np.prod(high - low) / _MAX_CELLS) ** (1 / 3))
+    size = float((np.prod(high - low) / CONSTANTS.max_cells) ** (1 / 3))
     if not size > 0.0:
         return none
     axes = (np.arange(a + size / 2, b, size) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     around = winding_numbers(grid, points, normals, _areas(points, normals), softened=size)
-    inside = grid[around > _INSIDE_WINDING]
-    return Volume(inside.mean(axis=0), len(inside) * size**3) if len(inside) >= _MIN_CELLS else none
+    inside = grid[around > CONSTANTS.inside_winding]
+    return Volume(inside.mean(axis=0), len(inside) * size**3) if len(inside) >= CONSTANTS.min_cells else none
 
 
 def _areas(points: Array, normals: Array) -> Array:
@@ -87,5 +103,5 @@ def _areas(points: Array, normals: Array) -> Array:
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
     weight = np.exp(np.maximum(square[:, None] + square - 2 * (p @ p.T), 0.0) * (-0.5 / SMOOTHING_M**2))
-    weight *= n @ n.T > _SAME_SIDE_COSINE
+    weight *= n @ n.T > CONSTANTS.same_side_cosine
     return np.asarray(2 * np.pi * SMOOTHING_M**2 / weight.sum(axis=1), dtype=np.float64)

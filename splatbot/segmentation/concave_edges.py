@@ -11,14 +11,33 @@ from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.faces import local_normals, nearest_of
 
-_PLANE_CANDIDATES = 150  # points whose tangent planes are scored
-_MAX_INLIER_SAMPLE = 4000  # points on which inliers are counted
-_MAX_PLANES = 16
-_MIN_PLANE_FRACTION = 0.01  # of the points that are inliers of a plane
-_INLIER_DISTANCE_M = 0.008
-_INLIER_COSINE = 0.8  # between the normal at a point and that of its plane
-_MAX_CONCAVE_OFFSET_M = 0.006  # of a face in front of another face of the same object
-_MIN_CONTACT_POINTS = 5  # of a face near another face
+
+@dataclass(frozen=True)
+class ConcaveEdgeConstants:
+    """Constants of the segmentation at concave edges.
+
+    Args:
+        plane_candidates: number of points whose tangent planes are scored.
+        max_inlier_sample: maximum number of points on which inliers are counted.
+        max_planes: maximum number of planes.
+        min_plane_fraction: minimum fraction of the points that are inliers of a plane.
+        inlier_distance: [m] maximum distance of an inlier from its plane.
+        inlier_cosine: minimum cosine between the normal at a point and that of its plane.
+        max_concave_offset: [m] faces of one object lie at most this far in front of each other.
+        min_contact_points: minimum number of points of a face near another face that it meets.
+    """
+
+    plane_candidates: int = 150
+    max_inlier_sample: int = 4000
+    max_planes: int = 16
+    min_plane_fraction: float = 0.01
+    inlier_distance: float = 0.008
+    inlier_cosine: float = 0.8
+    max_concave_offset: float = 0.006
+    min_contact_points: int = 5
+
+
+CONSTANTS = ConcaveEdgeConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +93,8 @@ def _faces(points: Array, observers: Array, *, apart: float, fewest: int) -> lis
     rng = np.random.default_rng(0)
     left = np.arange(len(points))
     planes: list[tuple[Array, float]] = []
-    least = max(fewest, int(_MIN_PLANE_FRACTION * len(points)))
-    while len(left) >= least and len(planes) < _MAX_PLANES:
+    least = max(fewest, int(CONSTANTS.min_plane_fraction * len(points)))
+    while len(left) >= least and len(planes) < CONSTANTS.max_planes:
         plane = _largest_plane(points[left], normals[left], rng)
         on = _inliers(plane, points[left], normals[left])
         if on.sum() < least:
@@ -106,9 +125,9 @@ def _oriented(points: Array, observers: Array, rows: NDArray[np.int64], normal: 
 
 def _largest_plane(points: Array, normals: Array, rng: np.random.Generator) -> tuple[Array, float]:
     """Return the tangent plane with the most inliers among random points, refitted to its inliers."""
-    sample = rng.choice(len(points), min(len(points), _MAX_INLIER_SAMPLE), replace=False)
+    sample = rng.choice(len(points), min(len(points), CONSTANTS.max_inlier_sample), replace=False)
     p, n = points[sample], normals[sample]
-    candidates = [(n[k], float(p[k] @ n[k])) for k in range(min(_PLANE_CANDIDATES, len(p)))]
+    candidates = [(n[k], float(p[k] @ n[k])) for k in range(min(CONSTANTS.plane_candidates, len(p)))]
     plane = candidates[int(np.argmax([_inliers(some, p, n).sum() for some in candidates]))]
     for _ in range(3):
         near = points[_inliers(plane, points, normals)]
@@ -123,13 +142,16 @@ def _largest_plane(points: Array, normals: Array, rng: np.random.Generator) -> t
 def _inliers(plane: tuple[Array, float], points: Array, normals: Array) -> NDArray[np.bool_]:
     normal, offset = plane
     return np.asarray(
-        (np.abs(points @ normal - offset) < _INLIER_DISTANCE_M) & (np.abs(normals @ normal) > _INLIER_COSINE)
+        (np.abs(points @ normal - offset) < CONSTANTS.inlier_distance)
+        & (np.abs(normals @ normal) > CONSTANTS.inlier_cosine)
     )
 
 
 def _same_object(points: Array, a: _PlanarFace, b: _PlanarFace, apart: float) -> bool:
     """Return whether two faces meet at a convex edge: neither lies in front of the other."""
     p, q = points[a.rows], points[b.rows]
-    if not (a.offset_of(q) < _MAX_CONCAVE_OFFSET_M and b.offset_of(p) < _MAX_CONCAVE_OFFSET_M):  # NaN if unknown
+    if not (
+        a.offset_of(q) < CONSTANTS.max_concave_offset and b.offset_of(p) < CONSTANTS.max_concave_offset
+    ):  # NaN if unknown
         return False
-    return bool((nearest_of(p, q)[1] < apart**2).sum() >= _MIN_CONTACT_POINTS)
+    return bool((nearest_of(p, q)[1] < apart**2).sum() >= CONSTANTS.min_contact_points)

@@ -10,16 +10,37 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-_NEIGHBOUR_RADIUS_M = 0.012
-_MAX_NEIGHBOURS = 24
-_MIN_NEIGHBOURS = 6  # median number of neighbours, with the point itself, from which normals are reliable
-_MIN_COHERENCE = 0.9  # length of the mean normal around a point of a face
-_PARALLEL_COSINE = 0.8  # between normals of one face
-_LEVEL_COSINE = 0.8  # between the normal of a horizontal face and z
-_MAX_STEP_M = 0.006  # between neighbours of one face along their normal
-_MIN_CONTACT_PAIRS = 5  # pairs of neighbours between two faces that meet
-_MIN_SEED_FRACTION = 0.5  # of a face's points that are seeds
-_MIN_PART_FRACTION = 0.02  # of all points that a separate part has
+
+@dataclass(frozen=True)
+class FaceConstants:
+    """Constants of smooth faces.
+
+    Args:
+        neighbour_radius: [m] maximum distance of a neighbour.
+        max_neighbours: maximum number of neighbours of a point.
+        min_neighbours: median number of neighbours, with the point itself, from which normals are reliable.
+        min_coherence: minimum length of the mean normal around a point of a face.
+        parallel_cosine: minimum cosine between normals of one face.
+        level_cosine: minimum cosine between the normal of a horizontal face and z.
+        max_step: [m] maximum distance between neighbours of one face along their normal.
+        min_contact_pairs: minimum number of pairs of neighbours between two faces that meet.
+        min_seed_fraction: a face is selected if more than this fraction of its points are seeds.
+        min_part_fraction: minimum fraction of all points that a separate part has.
+    """
+
+    neighbour_radius: float = 0.012
+    max_neighbours: int = 24
+    min_neighbours: int = 6
+    min_coherence: float = 0.9
+    parallel_cosine: float = 0.8
+    level_cosine: float = 0.8
+    max_step: float = 0.006
+    min_contact_pairs: int = 5
+    min_seed_fraction: float = 0.5
+    min_part_fraction: float = 0.02
+
+
+CONSTANTS = FaceConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +64,7 @@ class Faces:
     def adjacent(self, a: int, b: int) -> bool:
         """Return whether two faces meet."""
         rows = np.flatnonzero(self.owner == a)
-        return bool((self.near[rows] & (self.owner[self.index[rows]] == b)).sum() >= _MIN_CONTACT_PAIRS)
+        return bool((self.near[rows] & (self.owner[self.index[rows]] == b)).sum() >= CONSTANTS.min_contact_pairs)
 
     def axis(self, number: int) -> Array:
         """Return the dominant normal (3,) of a face, of arbitrary sign: first principal axis of its normals."""
@@ -61,11 +82,11 @@ def find_faces(points: Array, *, fewest: int) -> Faces:
     normals = _normals(points, index, near)
     aligned = normals[index] * np.sign(np.einsum("pki,pi->pk", normals[index], normals))[:, :, None]
     mean = np.where(near[:, :, None], aligned, 0.0).sum(axis=1) / np.maximum(near.sum(axis=1), 1)[:, None]
-    flat = np.linalg.norm(mean, axis=1) > _MIN_COHERENCE
+    flat = np.linalg.norm(mean, axis=1) > CONSTANTS.min_coherence
     between = points[index] - points[:, None]
     step = np.abs(np.einsum("pki,pki->pk", between, aligned + normals[:, None])) / 2
-    parallel = np.einsum("pki,pi->pk", aligned, normals) > _PARALLEL_COSINE
-    linked = near & flat[:, None] & flat[index] & parallel & (step < _MAX_STEP_M)
+    parallel = np.einsum("pki,pi->pk", aligned, normals) > CONSTANTS.parallel_cosine
+    linked = near & flat[:, None] & flat[index] & parallel & (step < CONSTANTS.max_step)
     label = np.where(flat, _components(len(points), index, linked), -1)
     numbers, counts = np.unique(label[flat], return_counts=True)
     big = [int(k) for k in numbers[counts >= fewest]]
@@ -82,14 +103,14 @@ def split_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
     """
     if len(points) < 2 * fewest:
         return [np.arange(len(points))]
-    faces = find_faces(points, fewest=max(fewest, int(_MIN_PART_FRACTION * len(points))))
-    if len(faces.numbers) < 2 or np.median(faces.near.sum(axis=1)) < _MIN_NEIGHBOURS:
+    faces = find_faces(points, fewest=max(fewest, int(CONSTANTS.min_part_fraction * len(points))))
+    if len(faces.numbers) < 2 or np.median(faces.near.sum(axis=1)) < CONSTANTS.min_neighbours:
         return [np.arange(len(points))]
     group = {face: face for face in faces.numbers}
     for i, a in enumerate(faces.numbers):
         for b in faces.numbers[i + 1 :]:
             if (
-                abs(faces.axis(a) @ faces.axis(b)) < _PARALLEL_COSINE
+                abs(faces.axis(a) @ faces.axis(b)) < CONSTANTS.parallel_cosine
                 and faces.adjacent(a, b)
                 and _under(points, faces, a, b)
             ):
@@ -103,18 +124,18 @@ def split_at_steps(points: Array, *, fewest: int) -> list[NDArray[np.int64]]:
 def _under(points: Array, faces: Faces, a: int, b: int) -> bool:
     """Return whether the side of two faces is below the horizontal one; a side above a top is another object."""
     up = [abs(float(faces.axis(k)[2])) for k in (a, b)]
-    if max(up) < _LEVEL_COSINE:
+    if max(up) < CONSTANTS.level_cosine:
         return True
     top, side = (a, b) if up[0] >= up[1] else (b, a)
     n = faces.axis(top)
     own, other = points[faces.owner == top], points[faces.owner == side]
-    return float(np.median((other - own.mean(axis=0)) @ (n * np.sign(n[2])))) < _MAX_STEP_M
+    return float(np.median((other - own.mean(axis=0)) @ (n * np.sign(n[2])))) < CONSTANTS.max_step
 
 
 def region(points: Array, seeds: NDArray[np.bool_], *, fewest: int) -> NDArray[np.int64]:
     """Return the rows of the faces of points (P, 3) [m] with more than half of their points in ``seeds`` (P,)."""
     faces = find_faces(points, fewest=fewest)
-    chosen = [k for k in faces.numbers if seeds[faces.owner == k].mean() > _MIN_SEED_FRACTION]
+    chosen = [k for k in faces.numbers if seeds[faces.owner == k].mean() > CONSTANTS.min_seed_fraction]
     return np.flatnonzero(np.isin(faces.owner, chosen))
 
 
@@ -130,8 +151,10 @@ def local_normals(points: Array, rows: NDArray[np.int64] | None = None) -> Array
 
 def _neighbours(points: Array, rows: NDArray[np.int64] | None = None) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the nearest neighbours (M, K) of all points or of ``rows``, and a mask of those within 12 mm."""
-    index, square = _search(points, points if rows is None else points[rows], min(_MAX_NEIGHBOURS, len(points)))
-    return index, square < _NEIGHBOUR_RADIUS_M**2
+    index, square = _search(
+        points, points if rows is None else points[rows], min(CONSTANTS.max_neighbours, len(points))
+    )
+    return index, square < CONSTANTS.neighbour_radius**2
 
 
 def _normals(points: Array, index: NDArray[np.int64], near: NDArray[np.bool_]) -> Array:

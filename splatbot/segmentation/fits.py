@@ -10,13 +10,29 @@ import numpy as np
 
 from splatbot.protocols import Array
 
-# A convex hull follows the noise of its points and lacks unobserved sides. It is used only if the error of every
-# primitive exceeds _HULL_ERROR_RATIO times that of the hull plus _HULL_NOISE_M.
-_HULL_ERROR_RATIO, _HULL_NOISE_M = 1.3, 3e-3
-_FOOT_FRACTION = 0.3  # lower part of a hull's height whose points are projected to the floor
-_MAX_UNOBSERVED_CAP = 0.25  # height of a ball above its points, as a fraction of the radius
-_TRIM = 1.0  # [%] of the points outside of a box or cylinder on each side
-_MAX_FLOOR_GAP_M = 0.03  # between a cluster and the floor that it stands on
+
+@dataclass(frozen=True)
+class FitConstants:
+    """Constants of primitive fits.
+
+    Args:
+        hull_error_ratio: a hull is used only if every primitive's error exceeds this multiple of the hull's error.
+        hull_noise: [m] noise that is added to that multiple, since a hull follows the noise and lacks unobserved sides.
+        foot_fraction: lower part of a hull's height whose points are projected to the floor.
+        max_unobserved_cap: maximum height of a ball above its points as a fraction of the radius.
+        trim: [%] points outside of a box or cylinder on each side.
+        max_floor_gap: [m] maximum distance between a cluster and the floor that it stands on.
+    """
+
+    hull_error_ratio: float = 1.3
+    hull_noise: float = 3e-3
+    foot_fraction: float = 0.3
+    max_unobserved_cap: float = 0.25
+    trim: float = 1.0
+    max_floor_gap: float = 0.03
+
+
+CONSTANTS = FitConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +59,7 @@ def fit(points: Array, floor: float) -> Fit:
     """
     best = min(primitive_fits(points, floor), key=lambda f: f.error)
     hull = _hull(points, *_heights(points, floor))
-    return hull if best.error > _HULL_ERROR_RATIO * hull.error + _HULL_NOISE_M else best
+    return hull if best.error > CONSTANTS.hull_error_ratio * hull.error + CONSTANTS.hull_noise else best
 
 
 def primitive_fits(points: Array, floor: float) -> list[Fit]:
@@ -55,8 +71,8 @@ def primitive_fits(points: Array, floor: float) -> list[Fit]:
 def _heights(points: Array, floor: float) -> tuple[float, float]:
     """Return bottom and top [m]; a cluster that begins less than 3 cm above the floor stands on it."""
     lowest = float(points[:, 2].min())
-    return min(floor, lowest) if floor > lowest - _MAX_FLOOR_GAP_M else lowest, float(
-        np.percentile(points[:, 2], 100 - _TRIM)
+    return min(floor, lowest) if floor > lowest - CONSTANTS.max_floor_gap else lowest, float(
+        np.percentile(points[:, 2], 100 - CONSTANTS.trim)
     )
 
 
@@ -66,7 +82,7 @@ def _box(points: Array, low: float, high: float) -> Fit:
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     q = points @ R
-    ends = np.percentile(q, [_TRIM, 100 - _TRIM], axis=0)
+    ends = np.percentile(q, [CONSTANTS.trim, 100 - CONSTANTS.trim], axis=0)
     ends[:, 2] = low, high
     middle, half = ends.mean(axis=0), np.maximum(np.diff(ends, axis=0)[0] / 2, 1e-3)
     away = np.abs(q - middle) - half
@@ -91,7 +107,7 @@ def _circle(points: Array) -> tuple[Array, float]:
     """
     (x, y), _ = cv2.minEnclosingCircle(points.astype(np.float32))
     center = np.array([x, y])
-    return center, max(float(np.percentile(np.linalg.norm(points - center, axis=1), 100 - _TRIM)), 1e-3)
+    return center, max(float(np.percentile(np.linalg.norm(points - center, axis=1), 100 - CONSTANTS.trim)), 1e-3)
 
 
 def _ball(points: Array) -> Fit:
@@ -103,7 +119,7 @@ def _ball(points: Array) -> Fit:
     x = np.linalg.lstsq(A, (points**2).sum(axis=1), rcond=None)[0]
     radius = float(np.sqrt(max(x[3] + x[:3] @ x[:3], 1e-6)))
     shape = {"kind": "sphere", "radius": radius}
-    if x[2] + radius > points[:, 2].max() + _MAX_UNOBSERVED_CAP * radius:
+    if x[2] + radius > points[:, 2].max() + CONSTANTS.max_unobserved_cap * radius:
         return Fit(shape, x[:3], np.inf, np.inf)
     return _fit(shape, x[:3], np.linalg.norm(points - x[:3], axis=1) - radius)
 
@@ -115,7 +131,7 @@ def _hull(points: Array, low: float, high: float) -> Fit:
     """
     import open3d as o3d
 
-    foot = points[points[:, 2] < low + _FOOT_FRACTION * (high - low)] * [1.0, 1.0, 0.0] + [0.0, 0.0, low]
+    foot = points[points[:, 2] < low + CONSTANTS.foot_fraction * (high - low)] * [1.0, 1.0, 0.0] + [0.0, 0.0, low]
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.concatenate([points, foot])))
     mesh, _ = cloud.compute_convex_hull()
     middle = points.mean(axis=0)

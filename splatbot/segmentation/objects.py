@@ -24,17 +24,42 @@ from splatbot.workspace import NamedPlace
 MIN_OPACITY = 0.3  # of a Gaussian that represents a surface
 MIN_HEIGHT, MAX_HEIGHT = 0.002, 0.008  # [m] limits of the height above a support below which points are its noise
 FEWEST, LARGEST = 40, 0.35  # minimum number of Gaussians of an object; maximum extent [m]
-_OBJECT_DISTANCE_M = 0.012  # minimum distance between objects
-_MIN_SUPPORT_EXTENT_M = 0.15  # of a cluster that may contain a support
-_MIN_SUPPORT_FRACTION = 0.1  # of a cluster's points that are on its support
-_MAX_SUPPORT_PLANES = 3  # planes of a cluster that are tried as supports
-_MAX_NESTED_SUPPORTS = 1  # supports on supports
-_SPACING_FACTOR = 2.2  # minimum object distance over the median size of the Gaussians, for coarse maps
-_SEED_MARGIN_M = 0.05  # around seeds, in which faces are searched
-_STRAY_DISTANCE_M = 0.006  # around an object, within which faint Gaussians belong to it
-_MIN_OVER_FRACTION = 0.7  # of the points above a support that are over its area
-_MIN_SUPPORT_COSINE, _MIN_LEVEL_FRACTION = 0.8, 0.5  # between point normals and that of a support; of its points
-_MAX_NAME_DISTANCE_M = 0.05  # between a named place and its object
+
+
+@dataclass(frozen=True)
+class SegmentationConstants:
+    """Constants of the segmentation into objects.
+
+    Args:
+        object_distance: [m] minimum distance between objects.
+        min_support_extent: [m] minimum extent of a cluster that may contain a support.
+        min_support_fraction: minimum fraction of a cluster's points that are on its support.
+        max_support_planes: maximum number of planes of a cluster that are tried as supports.
+        max_nested_supports: maximum depth of supports on supports.
+        spacing_factor: minimum object distance relative to the median size of the Gaussians, for coarse maps.
+        seed_margin: [m] margin around seeds in which faces are searched.
+        stray_distance: [m] faint Gaussians within this distance of an object belong to it.
+        min_over_fraction: minimum fraction of the points above a support that are over its area.
+        min_support_cosine: minimum cosine between the normals of points on a support and its own.
+        min_level_fraction: minimum fraction of a support's points with such normals.
+        max_name_distance: [m] maximum distance between a named place and its object.
+    """
+
+    object_distance: float = 0.012
+    min_support_extent: float = 0.15
+    min_support_fraction: float = 0.1
+    max_support_planes: int = 3
+    max_nested_supports: int = 1
+    spacing_factor: float = 2.2
+    seed_margin: float = 0.05
+    stray_distance: float = 0.006
+    min_over_fraction: float = 0.7
+    min_support_cosine: float = 0.8
+    min_level_fraction: float = 0.5
+    max_name_distance: float = 0.05
+
+
+CONSTANTS = SegmentationConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +130,7 @@ class SegmentedMap:
         if not len(seeds):
             return seeds
         near = self.points[seeds]
-        low, high = np.percentile(near, [2, 98], axis=0) + np.array([[-_SEED_MARGIN_M], [_SEED_MARGIN_M]])
+        low, high = np.percentile(near, [2, 98], axis=0) + np.array([[-CONSTANTS.seed_margin], [CONSTANTS.seed_margin]])
         rows = np.flatnonzero(self.solid & ((self.points > low) & (self.points < high)).all(axis=1))
         rows = rows[self.labels[rows] >= -1]
         if len(rows) < FEWEST:
@@ -132,7 +157,7 @@ def segment(
     box: ArrayLike | None = None,
     plane: ArrayLike | None = None,
     names: Sequence[NamedPlace] = (),
-    apart: float = _OBJECT_DISTANCE_M,
+    apart: float = CONSTANTS.object_distance,
     cut: bool = True,
     observers: Array | None = None,
 ) -> SegmentedMap:
@@ -165,7 +190,7 @@ def segment(
     used = np.flatnonzero(solid_rows(model) & ((points >= low - MAX_HEIGHT) & (points <= high)).all(axis=1))
     if not len(used):
         raise InputError(f"has nothing between {low.tolist()} and {high.tolist()}.", field="map", hint="see scene.yaml")
-    apart = max(apart, _SPACING_FACTOR * float(model.scales[torch.from_numpy(used)].amax(dim=1).median()))
+    apart = max(apart, CONSTANTS.spacing_factor * float(model.scales[torch.from_numpy(used)].amax(dim=1).median()))
     support = find_support(points[used]) if plane is None else _known(plane, T, points[used])
     above = used if support is None else used[above_support(support, points[used])]
     labels = np.full(len(model), -1, np.int32)
@@ -175,7 +200,7 @@ def segment(
     objects: list[MapObject] = []
     colors = model.colors.detach().double().numpy()
     for rows in sorted(
-        _object_rows(points, eyes, above, apart, _MAX_NESTED_SUPPORTS, labels, supports, cut),
+        _object_rows(points, eyes, above, apart, CONSTANTS.max_nested_supports, labels, supports, cut),
         key=lambda rows: (-len(rows), int(rows[0])),
     ):
         labels[rows] = len(objects)
@@ -209,7 +234,7 @@ def _object_rows(
     for part in clusters(points[used], apart=apart):
         rows = used[part]
         wide = float(np.ptp(points[rows], axis=0).max())
-        ledge = _nested_support(points[rows]) if cut and deeper and wide > _MIN_SUPPORT_EXTENT_M else None
+        ledge = _nested_support(points[rows]) if cut and deeper and wide > CONSTANTS.min_support_extent else None
         if ledge is not None:
             on = rows[above_support(ledge, points[rows])]
             supports.append(replace(ledge, inside=np.zeros(0, np.bool_)))
@@ -226,9 +251,9 @@ def _object_rows(
 def _nested_support(points: Array) -> Support | None:
     """Return the lowest of the three largest horizontal planes of a cluster (P, 3) with objects on it, or None."""
     left, best = np.ones(len(points), np.bool_), None
-    for _ in range(_MAX_SUPPORT_PLANES):
+    for _ in range(CONSTANTS.max_support_planes):
         plane = find_support(points[left])
-        if plane is None or plane.inside.sum() < _MIN_SUPPORT_FRACTION * len(points):
+        if plane is None or plane.inside.sum() < CONSTANTS.min_support_fraction * len(points):
             break
         if (best is None or plane.offset < best.offset) and _holds(plane, points) and _level(plane, points, left):
             best = plane
@@ -243,7 +268,7 @@ def _level(plane: Support, points: Array, left: NDArray[np.bool_]) -> bool:
     """Return whether the inliers form a face along the plane, rather than an intersection of the plane with walls."""
     rows = np.flatnonzero(left)[plane.inside]
     normals = local_normals(points, rows[:: max(1, len(rows) // 300)])
-    return float((np.abs(normals @ plane.normal) > _MIN_SUPPORT_COSINE).mean()) > _MIN_LEVEL_FRACTION
+    return float((np.abs(normals @ plane.normal) > CONSTANTS.min_support_cosine).mean()) > CONSTANTS.min_level_fraction
 
 
 def _holds(plane: Support, points: Array) -> bool:
@@ -255,7 +280,7 @@ def _holds(plane: Support, points: Array) -> bool:
     hull = cv2.convexHull(points[np.abs(away) < NEAR][:, :2].astype(np.float32))
     some = on[:: max(1, len(on) // 200)]
     over = [cv2.pointPolygonTest(hull, (float(x), float(y)), False) >= 0 for x, y in some]
-    return float(np.mean(over)) > _MIN_OVER_FRACTION
+    return float(np.mean(over)) > CONSTANTS.min_over_fraction
 
 
 def above_support(support: Support, points: Array) -> NDArray[np.bool_]:
@@ -276,13 +301,13 @@ def _with_faint(
     if not objects:
         return objects
     own = np.flatnonzero(labels >= 0)
-    low, high = points[own].min(axis=0) - _STRAY_DISTANCE_M, points[own].max(axis=0) + _STRAY_DISTANCE_M
+    low, high = points[own].min(axis=0) - CONSTANTS.stray_distance, points[own].max(axis=0) + CONSTANTS.stray_distance
     solid = np.zeros(len(points), np.bool_)
     solid[used] = True
     faint = np.flatnonzero(~solid & ((points > low) & (points < high)).all(axis=1))
     if len(faint):
         nearest, square = nearest_of(points[own], points[faint])
-        near = square < _STRAY_DISTANCE_M**2
+        near = square < CONSTANTS.stray_distance**2
         labels[faint[near]] = labels[own[nearest[near]]]
     return [replace(o, rows=np.flatnonzero(labels == o.number)) for o in objects]
 
@@ -303,7 +328,7 @@ def _with_names(
     for place in names:
         at = transform_points(inverse(T), place.at)
         away = [float(np.linalg.norm(points[o.rows] - at, axis=1).min()) for o in objects]
-        if away and min(away) < _MAX_NAME_DISTANCE_M:
+        if away and min(away) < CONSTANTS.max_name_distance:
             k = int(np.argmin(away))
             found[k] = replace(objects[k], name=place.name, aliases=place.aliases)
     return tuple(found)

@@ -10,10 +10,26 @@ from numpy.typing import NDArray
 from splatbot.protocols import Array
 
 NEAR = 0.01  # [m] maximum distance of an inlier from the plane
-_ITERATIONS = 300  # of RANSAC
-_MAX_RANSAC_SAMPLE = 5000  # points on which RANSAC counts inliers
-_MIN_UP_COSINE = np.cos(np.radians(15.0))  # between the normal of a support and up
-_MIN_INLIER_FRACTION = 0.05
+
+
+@dataclass(frozen=True)
+class SupportConstants:
+    """Constants of support detection.
+
+    Args:
+        iterations: number of iterations of RANSAC.
+        max_ransac_sample: maximum number of points on which RANSAC counts inliers.
+        min_up_cosine: minimum cosine between the normal of a support and up.
+        min_inlier_fraction: minimum fraction of the points that are inliers.
+    """
+
+    iterations: int = 300
+    max_ransac_sample: int = 5000
+    min_up_cosine: float = float(np.cos(np.radians(15.0)))
+    min_inlier_fraction: float = 0.05
+
+
+CONSTANTS = SupportConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +74,19 @@ def find_support(points: Array, *, seed: int = 0) -> Support | None:
     if len(points) < 20:
         return None
     rng = np.random.default_rng(seed)
-    sample = points[rng.choice(len(points), min(len(points), _MAX_RANSAC_SAMPLE), replace=False)]
+    sample = points[rng.choice(len(points), min(len(points), CONSTANTS.max_ransac_sample), replace=False)]
     best, most = None, 0
-    for _ in range(_ITERATIONS):
+    for _ in range(CONSTANTS.iterations):
         a, b, c = sample[rng.choice(len(sample), 3, replace=False)]
         normal = np.cross(b - a, c - a)
         length = float(np.linalg.norm(normal))
-        if length < 1e-9 or abs(normal[2]) < _MIN_UP_COSINE * length:
+        if length < 1e-9 or abs(normal[2]) < CONSTANTS.min_up_cosine * length:
             continue
         normal = normal / length * np.sign(normal[2])
         count = int((np.abs(sample @ normal - a @ normal) < NEAR).sum())
         if count > most:
             best, most = (normal, float(a @ normal)), count
-    if best is None or most < _MIN_INLIER_FRACTION * len(sample):
+    if best is None or most < CONSTANTS.min_inlier_fraction * len(sample):
         return None
     return _refined(points, *best)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,10 +17,25 @@ from splatbot.grasping.vision.models import Picture
 from splatbot.rasterize.views import colorize, render_view
 from splatbot.segmentation import SegmentedMap
 
-_ELEVATION = np.radians(50.0)  # of the cameras over the support
-_FIELD_OF_VIEW = np.radians(50.0)  # horizontal
-_AZIMUTH_STEP = np.radians(35.0)  # between neighbouring cameras
-_EXTENT_FACTOR = 1.35  # visible extent over that of the objects
+
+@dataclass(frozen=True)
+class ViewConstants:
+    """Constants of the cameras around a scene.
+
+    Args:
+        elevation: [rad] elevation of the cameras over the support.
+        field_of_view: [rad] horizontal field of view.
+        azimuth_step: [rad] angle between neighbouring cameras.
+        extent_factor: visible extent relative to that of the objects.
+    """
+
+    elevation: float = float(np.radians(50.0))
+    field_of_view: float = float(np.radians(50.0))
+    azimuth_step: float = float(np.radians(35.0))
+    extent_factor: float = 1.35
+
+
+CONSTANTS = ViewConstants()
 
 
 def scene_views(
@@ -31,18 +48,24 @@ def scene_views(
     """
     if not scene.objects or count < 1:
         raise InputError("has no objects, or no views are wanted.", field="scene", hint="map a scene with objects")
-    focal = 0.5 * width / np.tan(_FIELD_OF_VIEW / 2)
+    focal = 0.5 * width / np.tan(CONSTANTS.field_of_view / 2)
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     rows = np.concatenate([o.rows for o in scene.objects])
     points = transform_points(inverse(scene.T_world_base), scene.model.means.detach().double().numpy()[rows])
     center = (points.min(axis=0) + points.max(axis=0)) / 2
-    reach = _EXTENT_FACTOR * float(np.linalg.norm(points - center, axis=1).max())
-    away = reach / np.sin(min(_FIELD_OF_VIEW, 2 * np.arctan(0.5 * height / focal)) / 2)
+    reach = CONSTANTS.extent_factor * float(np.linalg.norm(points - center, axis=1).max())
+    away = reach / np.sin(min(CONSTANTS.field_of_view, 2 * np.arctan(0.5 * height / focal)) / 2)
     behind = np.arctan2(-center[1], -center[0])  # from the objects to the base
     views = []
     for k in range(count):
-        turn = behind + (k - (count - 1) / 2) * _AZIMUTH_STEP
-        side = np.array([np.cos(turn) * np.cos(_ELEVATION), np.sin(turn) * np.cos(_ELEVATION), np.sin(_ELEVATION)])
+        turn = behind + (k - (count - 1) / 2) * CONSTANTS.azimuth_step
+        side = np.array(
+            [
+                np.cos(turn) * np.cos(CONSTANTS.elevation),
+                np.sin(turn) * np.cos(CONSTANTS.elevation),
+                np.sin(CONSTANTS.elevation),
+            ]
+        )
         views.append(ObservedView(camera, scene.T_world_base @ look_at(center + away * side, center)))
     return tuple(views)
 
