@@ -19,7 +19,7 @@ PYTEST_ARGS ?=
 TORCH_STAMP := $(VENV)/.torch
 INSTALL_STAMP := $(VENV)/.installed
 MODULES := $(VENV)/.modules
-BUILD_TOOLS := 'scikit-build-core>=0.11' 'nanobind>=2.4' 'cmake>=3.26' 'ninja>=1.11'
+BUILD_TOOLS := 'scikit-build-core>=0.11' 'nanobind>=2.4' 'cmeel-eigen>=3.4' 'cmake>=3.26' 'ninja>=1.11'
 NEW_DEPENDENCIES = $(filter pyproject.toml $(TORCH_STAMP),$?)
 NATIVE_SOURCES := $(shell find splatbot/native -name '*.cpp' -o -name '*.hpp' -o -name '*.h' -o -name CMakeLists.txt)
 

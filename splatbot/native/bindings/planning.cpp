@@ -104,29 +104,29 @@ class ArmPlanner {
 void define_planning(nb::module_& m) {
   m.def(
       "inverse_kinematics",
-      [](const Arm& arm, Targets targets, Target tool, Numbers lower, Numbers upper, Configurations starts, int most) {
+      [](const Arm& arm, Targets targets, Target tool, Numbers lower, Numbers upper, Configurations starts, int max_iterations) {
         const auto joints = static_cast<std::size_t>(arm.joints());
         const std::size_t n = targets.shape(0);
         if (starts.shape(0) != n || starts.shape(1) != joints || lower.shape(0) != joints || upper.shape(0) != joints) {
           throw nb::value_error("targets, starts and limits do not fit");
         }
-        std::vector<double> q(starts.data(), starts.data() + starts.size()), miss(2 * n);
+        std::vector<double> q(starts.data(), starts.data() + starts.size()), residuals(2 * n);
         {
           const nb::gil_scoped_release release;
           for (std::size_t i = 0; i < n; ++i) {
             splatbot::planning::IkGoal goal;
             std::copy_n(targets.data() + 12 * i, 12, goal.target);
             std::copy_n(tool.data(), 12, goal.tool);
-            const auto left = splatbot::planning::solve_ik(arm, goal, span_of(lower), span_of(upper), most,
-                                                           std::span(q).subspan(joints * i, joints));
-            miss[2 * i] = left.position;
-            miss[2 * i + 1] = left.angle;
+            const auto residual = splatbot::planning::solve_ik(arm, goal, span_of(lower), span_of(upper), max_iterations,
+                                                               std::span(q).subspan(joints * i, joints));
+            residuals[2 * i] = residual.position;
+            residuals[2 * i + 1] = residual.angle;
           }
         }
-        return nb::make_tuple(owned(std::move(q), {n, joints}), owned(std::move(miss), {n, 2}));
+        return nb::make_tuple(owned(std::move(q), {n, joints}), owned(std::move(residuals), {n, 2}));
       },
       "arm"_a, "targets"_a.noconvert(), "tool"_a.noconvert(), "lower"_a.noconvert(), "upper"_a.noconvert(),
-      "starts"_a.noconvert(), "most"_a, "Joint values (N, J) and what they miss the targets (N, 3, 4) by (N, 2) [m, rad]");
+      "starts"_a.noconvert(), "max_iterations"_a, "Joint values (N, J) and their errors (N, 2) [m, rad] to the targets (N, 3, 4)");
   m.def(
       "path_clearance",
       [](const Arm& arm, const CollisionField& field, Configurations path, double cut, int rounds,

@@ -1,77 +1,23 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "splatbot/align.hpp"
 
+#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+
+#include "splatbot/se3.hpp"
 
 namespace splatbot {
 namespace {
 
-using Mat4 = std::array<double, 16>;
-using Vec6 = std::array<double, 6>;
-using Mat6 = std::array<double, 36>;
+constexpr double kConvergedStep = 1e-5;  // [m] and [rad]: a smaller step ends a level
+constexpr double kDamping = 1e-5;        // share of the mean diagonal of H
 
-constexpr double kStepDone = 1e-5;  // [m] and [rad]
-constexpr double kDamping = 1e-5;   // share of the mean diagonal
+constexpr double kMinDepth = 1e-3;  // [m] of points in front of the camera
 
-Mat4 multiply(std::span<const double, 16> A, std::span<const double, 16> B) {
-  Mat4 C{};
-  for (int i = 0; i < 4; ++i)
-    for (int j = 0; j < 4; ++j)
-      for (int k = 0; k < 4; ++k) C[4 * i + j] += A[4 * i + k] * B[4 * k + j];
-  return C;
-}
-
-// Exponential of a twist (t, ω); the series stand in where θ is small.
-Mat4 se3_exp(const Vec6& xi) {
-  const double wx = xi[3], wy = xi[4], wz = xi[5];
-  const double theta2 = wx * wx + wy * wy + wz * wz, theta = std::sqrt(theta2);
-  const bool small = theta < 1e-4;
-  const double half = 0.5 * theta;
-  const double a = small ? 1.0 - theta2 / 6.0 : std::sin(theta) / theta;
-  const double b = small ? 0.5 - theta2 / 24.0 : 0.5 * std::pow(std::sin(half) / half, 2);
-  const double c = small ? 1.0 / 6.0 - theta2 / 120.0 : (1.0 - a) / theta2;
-  const double K[9] = {0, -wz, wy, wz, 0, -wx, -wy, wx, 0};
-  double K2[9] = {};
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j)
-      for (int k = 0; k < 3; ++k) K2[3 * i + j] += K[3 * i + k] * K[3 * k + j];
-  Mat4 T{};
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) {
-      const double unit = i == j ? 1.0 : 0.0;
-      T[4 * i + j] = unit + a * K[3 * i + j] + b * K2[3 * i + j];
-      T[4 * i + 3] += (unit + b * K[3 * i + j] + c * K2[3 * i + j]) * xi[j];
-    }
-  }
-  T[15] = 1.0;
-  return T;
-}
-
-Mat4 inverse(std::span<const double, 16> T) {
-  Mat4 R{};
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) {
-      R[4 * i + j] = T[4 * j + i];
-      R[4 * i + 3] -= T[4 * j + i] * T[4 * j + 3];
-    }
-  }
-  R[15] = 1.0;
-  return R;
-}
-
-// Twist (t, ω) of a pose that turns by less than π; the translation to first order in ω.
-Vec6 se3_log_near(std::span<const double, 16> T) {
-  const double v[3] = {0.5 * (T[9] - T[6]), 0.5 * (T[2] - T[8]), 0.5 * (T[4] - T[1])};  // sin θ times the axis
-  const double sine = std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), cosine = 0.5 * (T[0] + T[5] + T[10] - 1.0);
-  const double scale = sine < 1e-6 ? 1.0 : std::atan2(sine, cosine) / sine;
-  const double w[3] = {scale * v[0], scale * v[1], scale * v[2]}, t[3] = {T[3], T[7], T[11]};
-  return {t[0] - 0.5 * (w[1] * t[2] - w[2] * t[1]), t[1] - 0.5 * (w[2] * t[0] - w[0] * t[2]),
-          t[2] - 0.5 * (w[0] * t[1] - w[1] * t[0]), w[0], w[1], w[2]};
-}
-
-// Σ ψ' / Σ ψ(r)/r over Student-t residuals r/σ: how much of their weights is curvature (Huber 1967).
-struct Curving {
+// Share of the Gauss-Newton information that remains in the Hessian of the robust cost: Σ ψ'(r) / Σ ψ(r)/r over Student-t
+// residuals r/σ, where ψ is the derivative of the cost (Huber 1967).
+struct RobustCurvature {
   double curvature = 0.0, weight = 0.0;
 
   void add(double r, double nu) {
@@ -85,140 +31,128 @@ struct Curving {
       if (!std::isnan(r)) add(r, nu);
   }
 
-  // Half of all residuals beyond σ √ν would leave no minimum; a tenth keeps the covariance finite.
+  // If half of all residuals exceed σ √ν, the cost has no minimum; the floor of 0.1 keeps the covariance finite.
   double share() const { return weight > 0.0 ? std::max(curvature / weight, 0.1) : 1.0; }
 };
 
-// Gradients by cell of the current image.
-class Cells {
+// Normal equations of Gauss-Newton, H δ = -g with H = Σ w JᵀJ and g = Σ w Jᵀr.
+struct NormalEquations {
+  Matrix6 H = Matrix6::Zero();
+  Vector6 g = Vector6::Zero();
+
+  // The damped step δ = -(H + λI)⁻¹ g by LDLᵀ, with λ = kDamping tr(H)/6. Zero if H carries no information.
+  Vector6 solve() const {
+    const double trace = H.trace();
+    if (!(trace > 0.0)) return Vector6::Zero();
+    const Matrix6 damped = H + kDamping * trace / 6.0 * Matrix6::Identity();
+    return damped.ldlt().solve(-g);
+  }
+};
+
+// Normal equations of the residuals of each cell of the current image.
+class CellSums {
  public:
   static constexpr int kCount = kAlignCellColumns * kAlignCellRows;
 
-  // Cell of a place in an image of that size, -1 outside.
-  static int of(double u, double v, double width, double height) {
+  // Index of the cell that contains pixel (u, v) of an image of that size. Returns -1 outside the image.
+  static int index_of(double u, double v, double width, double height) {
     if (!(u >= 0 && v >= 0 && u < width && v < height)) return -1;
     return static_cast<int>(v * kAlignCellRows / height) * kAlignCellColumns +
            static_cast<int>(u * kAlignCellColumns / width);
   }
 
-  void add(int cell, const Vec6& g, const Mat6& H) {
-    for (int i = 0; i < 6; ++i) sums_[cell][i] += g[i];
-    for (int i = 0; i < 36; ++i) H_[cell][i] += H[i];
+  void add(int cell, const NormalEquations& sums) {
+    g_[cell] += sums.g;
+    H_[cell] += sums.H;
     used_[cell] = true;
   }
 
-  // How much larger the spread of the gradients is than the noise model says, which is 1 for independent residuals of
-  // the noise that it states. About the minimum of these residuals, wherever the pose is; 0 where there are too few.
-  double excess() const;
+  // Ratio of the spread of the cells' gradients to the spread that the noise model predicts. It is 1 for independent
+  // residuals with the modelled noise. The gradients are evaluated at the minimum of these residuals. Returns 0 if fewer
+  // than twelve cells have residuals.
+  double variance_ratio() const {
+    NormalEquations total;
+    int n = 0;
+    for (int c = 0; c < kCount; ++c) {
+      n += used_[c] ? 1 : 0;
+      total.g += g_[c];
+      total.H += H_[c];
+    }
+    if (n < 2 * 6) return 0.0;
+    const Vector6 step = total.solve();
+    Vector6 squares = Vector6::Zero();
+    for (int c = 0; c < kCount; ++c) squares += (g_[c] + H_[c] * step).cwiseAbs2();
+    double ratio = 0.0;
+    for (int i = 0; i < 6; ++i)
+      if (total.H(i, i) > 0.0) ratio += squares[i] / total.H(i, i) / 6.0;
+    return ratio * n / (n - 6);
+  }
 
+  // The number of cells that have residuals, and Σ g gᵀ over them.
   void report(AlignResult& result) const {
+    Matrix6 spread = Matrix6::Zero();
     for (int c = 0; c < kCount; ++c) {
       if (!used_[c]) continue;
       ++result.cells;
-      for (int i = 0; i < 6; ++i)
-        for (int j = 0; j < 6; ++j) result.spread[6 * i + j] += sums_[c][i] * sums_[c][j];
+      spread += g_[c] * g_[c].transpose();
     }
+    result.spread = array_from<6>(spread);
   }
 
  private:
-  std::array<Vec6, kCount> sums_{};
-  std::array<Mat6, kCount> H_{};
+  std::array<Vector6, kCount> g_ = filled<Vector6>();
+  std::array<Matrix6, kCount> H_ = filled<Matrix6>();
   std::array<bool, kCount> used_{};
-};
 
-struct Normal {
-  Mat6 H{};
-  Vec6 g{};
-
-  // Damped Gauss-Newton step by LDLᵀ; zero where there is no information.
-  Vec6 solve() const {
-    double trace = 0.0;
-    for (int i = 0; i < 6; ++i) trace += H[7 * i];
-    Vec6 x{};
-    if (!(trace > 0.0)) return x;
-    Mat6 L = H;
-    for (int i = 0; i < 6; ++i) L[7 * i] += kDamping * trace / 6.0;
-    for (int j = 0; j < 6; ++j) {
-      for (int k = 0; k < j; ++k) L[7 * j] -= L[6 * j + k] * L[6 * j + k] * L[7 * k];
-      for (int i = j + 1; i < 6; ++i) {
-        for (int k = 0; k < j; ++k) L[6 * i + j] -= L[6 * i + k] * L[6 * j + k] * L[7 * k];
-        L[6 * i + j] /= L[7 * j];
-      }
-    }
-    for (int i = 0; i < 6; ++i) {
-      x[i] = -g[i];
-      for (int k = 0; k < i; ++k) x[i] -= L[6 * i + k] * x[k];
-    }
-    for (int i = 0; i < 6; ++i) x[i] /= L[7 * i];
-    for (int i = 5; i >= 0; --i)
-      for (int k = i + 1; k < 6; ++k) x[i] -= L[6 * k + i] * x[k];
-    return x;
+  template <class M>
+  static std::array<M, kCount> filled() {
+    std::array<M, kCount> all;
+    all.fill(M::Zero());
+    return all;
   }
 };
 
-double Cells::excess() const {
-  Normal total;
-  int n = 0;
-  for (int c = 0; c < kCount; ++c) {
-    n += used_[c] ? 1 : 0;
-    for (int i = 0; i < 6; ++i) total.g[i] += sums_[c][i];
-    for (int i = 0; i < 36; ++i) total.H[i] += H_[c][i];
-  }
-  if (n < 2 * 6) return 0.0;
-  const Vec6 x = total.solve();
-  double excess = 0.0;
-  for (int i = 0; i < 6; ++i) {
-    double squares = 0.0;
-    for (int c = 0; c < kCount; ++c) {
-      double g = sums_[c][i];
-      for (int j = 0; j < 6; ++j) g += H_[c][6 * i + j] * x[j];
-      squares += g * g;
-    }
-    if (total.H[7 * i] > 0.0) excess += squares / total.H[7 * i] / 6.0;
-  }
-  return excess * n / (n - 6);
-}
-
-// What one residual of each kind weighs.
+// Weight of one residual of each kind.
 struct Weights {
   double dense, matches;
 };
 
-// One reference on one level, with that pair's own exposure (a, b).
+// The dense residuals of one reference on one level. Each reference has an exposure of its own: current = a · reference + b.
+//
+// The linearisation has eight unknowns, the twist and the exposure,
+//   [H_xx H_xe] [δ]      [g_x]
+//   [H_ex H_ee] [ε]  = - [g_e].
+// The Schur complement marginalises the exposure: (H_xx - H_xe H_ee⁻¹ H_ex) δ = -(g_x - H_xe H_ee⁻¹ g_e), and
+// back-substitution gives ε = -H_ee⁻¹ (g_e + H_ex δ).
 class DenseTerm {
  public:
   DenseTerm(const AlignImage& image, const AlignPoints& points, std::span<const double, 16> T_world_reference)
-      : image_(image), points_(points), T_world_reference_(T_world_reference) {}
+      : image_(image), points_(points), T_world_reference_(pose_from(T_world_reference)) {}
 
-  // Add this term, exposure marginalised (Schur complement); remember how exposure would follow a step.
-  void add(std::span<const double, 16> T_camera_world, const AlignPlan& plan, double weight, Normal& total) {
-    const Mat4 T = multiply(T_camera_world, T_world_reference_);
-    const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, plan.settings, {}, {});
-    inverse_ = exposure_inverse(s);
-    residual_ = {s.g[6] + kExposurePrior * (a_ - 1.0), s.g[7] + kExposurePrior * b_};
-    for (int i = 0; i < 6; ++i) {
-      coupling_[2 * i] = s.H[8 * i + 6];
-      coupling_[2 * i + 1] = s.H[8 * i + 7];
-    }
-    for (int i = 0; i < 6; ++i) {
-      const double c0 = coupling_[2 * i], c1 = coupling_[2 * i + 1];
-      const double k0 = c0 * inverse_[0] + c1 * inverse_[1], k1 = c0 * inverse_[1] + c1 * inverse_[2];
-      for (int j = 0; j < 6; ++j)
-        H_[6 * i + j] = weight * (s.H[8 * i + j] - k0 * coupling_[2 * j] - k1 * coupling_[2 * j + 1]);
-      total.g[i] += weight * (s.g[i] - k0 * residual_[0] - k1 * residual_[1]);
-    }
-    for (int i = 0; i < 36; ++i) total.H[i] += H_[i];
+  // Add the marginalised normal equations to `total` and keep what `update_exposure` and `add_cells` need.
+  void add(const Pose& T_camera_world, const AlignPlan& plan, double weight, NormalEquations& total) {
+    const AlignSums s = linearize(points_, T_camera_world * T_world_reference_, plan.settings, {}, {});
+    const std::array<double, 3> inverse = exposure_inverse(s);
+    H_ee_inverse_ << inverse[0], inverse[1], inverse[1], inverse[2];
+    g_e_ << s.g[6] + kExposurePrior * (a_ - 1.0), s.g[7] + kExposurePrior * b_;
+    const Map8 H(s.H.data());
+    H_xe_ = H.topRightCorner<6, 2>();
+    const Eigen::Matrix<double, 6, 2> gain = H_xe_ * H_ee_inverse_;
+    H_ = weight * (H.topLeftCorner<6, 6>() - gain * H_xe_.transpose());
+    total.H += H_;
+    total.g += weight * (Eigen::Map<const Vector6>(s.g.data()) - gain * g_e_);
   }
 
-  // Gradients of this term by cell, and its curvature, exposure marginalised as in `add`, which came before.
-  void scatter(std::span<const double, 16> T_camera_world, const AlignPlan& plan, double weight, Cells& cells,
-               Mat6& curvature) const {
-    Mat6 H_geometric{};
-    Curving of_photometric, of_geometric;
-    const Mat4 T = multiply(T_camera_world, T_world_reference_);
+  // Add the normal equations of each cell to `cells` and the robust curvature to `curvature`. The exposure is
+  // marginalised as in the last call of `add`.
+  void add_cells(const Pose& T_camera_world, const AlignPlan& plan, double weight, CellSums& cells,
+                 Matrix6& curvature) const {
+    RobustCurvature of_photometric, of_geometric;
+    const Pose T = T_camera_world * T_world_reference_;
+    const Eigen::Matrix<double, 6, 2> gain = H_xe_ * H_ee_inverse_;
     const std::vector<std::vector<std::size_t>> members = by_cell(T);
     std::vector<float> points, normals, gray, r_photometric, r_geometric;
-    for (int c = 0; c < Cells::kCount; ++c) {
+    for (int c = 0; c < CellSums::kCount; ++c) {
       points.clear();
       normals.clear();
       gray.clear();
@@ -230,53 +164,50 @@ class DenseTerm {
       if (gray.empty()) continue;
       r_photometric.resize(gray.size());
       r_geometric.resize(gray.size());
-      const AlignSums s = linearize_alignment(image_, {points, normals, gray}, T, a_, b_, plan.settings, r_photometric,
-                                              r_geometric);
+      const AlignSums s = linearize({points, normals, gray}, T, plan.settings, r_photometric, r_geometric);
       if (s.photometric + s.geometric == 0) continue;
       of_photometric.add(r_photometric, plan.settings.nu);
       of_geometric.add(r_geometric, plan.settings.nu);
-      Vec6 g{};
-      Mat6 H{};
-      for (int i = 0; i < 6; ++i) {
-        const double k0 = coupling_[2 * i] * inverse_[0] + coupling_[2 * i + 1] * inverse_[1];
-        const double k1 = coupling_[2 * i] * inverse_[1] + coupling_[2 * i + 1] * inverse_[2];
-        g[i] = weight * (s.g[i] - k0 * s.g[6] - k1 * s.g[7]);
-        for (int j = 0; j < 6; ++j)
-          H[6 * i + j] = weight * (s.H[8 * i + j] - k0 * s.H[8 * j + 6] - k1 * s.H[8 * j + 7]);
-      }
-      cells.add(c, g, H);
+      const Map8 H(s.H.data());
+      const Eigen::Map<const Eigen::Matrix<double, 8, 1>> g(s.g.data());
+      NormalEquations cell;
+      cell.g = weight * (g.head<6>() - gain * g.tail<2>());
+      cell.H = weight * (H.topLeftCorner<6, 6>() - gain * H.bottomLeftCorner<2, 6>());
+      cells.add(c, cell);
     }
     AlignSettings geometric = plan.settings;
     geometric.use_photometric = false;
-    const AlignSums s = linearize_alignment(image_, points_, T, a_, b_, geometric, {}, {});
-    for (int i = 0; i < 6; ++i)
-      for (int j = 0; j < 6; ++j) H_geometric[6 * i + j] = weight * s.H[8 * i + j];
-    for (int i = 0; i < 36; ++i)
-      curvature[i] += of_photometric.share() * (H_[i] - H_geometric[i]) + of_geometric.share() * H_geometric[i];
+    const AlignSums s = linearize(points_, T, geometric, {}, {});
+    const Matrix6 H_geometric = weight * Map8(s.H.data()).topLeftCorner<6, 6>();
+    curvature += of_photometric.share() * (H_ - H_geometric) + of_geometric.share() * H_geometric;
   }
 
-  // Back-substitute the exposure that belongs to a twist step.
-  void follow(const Vec6& step) {
-    double r0 = residual_[0], r1 = residual_[1];
-    for (int i = 0; i < 6; ++i) {
-      r0 += coupling_[2 * i] * step[i];
-      r1 += coupling_[2 * i + 1] * step[i];
-    }
-    a_ -= inverse_[0] * r0 + inverse_[1] * r1;
-    b_ -= inverse_[1] * r0 + inverse_[2] * r1;
+  // Back-substitute the exposure of a twist step.
+  void update_exposure(const Vector6& step) {
+    const Eigen::Vector2d change = H_ee_inverse_ * (g_e_ + H_xe_.transpose() * step);
+    a_ -= change[0];
+    b_ -= change[1];
   }
 
  private:
-  // Indices of the points that land in each cell.
-  std::vector<std::vector<std::size_t>> by_cell(const Mat4& T) const {
-    std::vector<std::vector<std::size_t>> members(Cells::kCount);
+  using Map8 = Eigen::Map<const Eigen::Matrix<double, 8, 8, Eigen::RowMajor>>;
+
+  AlignSums linearize(const AlignPoints& points, const Pose& T, const AlignSettings& settings,
+                      std::span<float> r_photometric, std::span<float> r_geometric) const {
+    return linearize_alignment(image_, points, array_from(T), a_, b_, settings, r_photometric, r_geometric);
+  }
+
+  // Indices of the points that project into each cell.
+  std::vector<std::vector<std::size_t>> by_cell(const Pose& T) const {
+    std::vector<std::vector<std::size_t>> members(CellSums::kCount);
+    const Eigen::Matrix<double, 3, 4> M = T.matrix().topRows<3>();
     for (std::size_t i = 0; i < points_.gray.size(); ++i) {
       const float* p = &points_.points[3 * i];
-      const double z = T[8] * p[0] + T[9] * p[1] + T[10] * p[2] + T[11];
-      if (!(z > 1e-3)) continue;
-      const double u = image_.fx * (T[0] * p[0] + T[1] * p[1] + T[2] * p[2] + T[3]) / z + image_.cx;
-      const double v = image_.fy * (T[4] * p[0] + T[5] * p[1] + T[6] * p[2] + T[7]) / z + image_.cy;
-      const int cell = Cells::of(u, v, image_.width, image_.height);
+      const double z = M(2, 0) * p[0] + M(2, 1) * p[1] + M(2, 2) * p[2] + M(2, 3);
+      if (!(z > kMinDepth)) continue;
+      const double u = image_.fx * (M(0, 0) * p[0] + M(0, 1) * p[1] + M(0, 2) * p[2] + M(0, 3)) / z + image_.cx;
+      const double v = image_.fy * (M(1, 0) * p[0] + M(1, 1) * p[1] + M(1, 2) * p[2] + M(1, 3)) / z + image_.cy;
+      const int cell = CellSums::index_of(u, v, image_.width, image_.height);
       if (cell >= 0) members[cell].push_back(i);
     }
     return members;
@@ -284,117 +215,127 @@ class DenseTerm {
 
   const AlignImage& image_;
   const AlignPoints& points_;
-  std::span<const double, 16> T_world_reference_;
+  Pose T_world_reference_;
   double a_ = 1.0, b_ = 0.0;
-  std::array<double, 3> inverse_{};
-  std::array<double, 2> residual_{};
-  std::array<double, 12> coupling_{};
-  Mat6 H_{};
+  Eigen::Matrix2d H_ee_inverse_ = Eigen::Matrix2d::Zero();
+  Eigen::Vector2d g_e_ = Eigen::Vector2d::Zero();
+  Eigen::Matrix<double, 6, 2> H_xe_ = Eigen::Matrix<double, 6, 2>::Zero();
+  Matrix6 H_ = Matrix6::Zero();
 };
 
-// Reprojection residuals over their σ, Student-t weights: calls take(index, w, Ju, Jv, ru, rv) for each match in view.
-template <typename Take>
-void for_matches(const AlignMatches& m, std::span<const double, 16> T, Take take) {
+using Jacobian = Eigen::Matrix<double, 2, 6, Eigen::RowMajor>;
+
+constexpr double kMatchNu = 4.0;  // degrees of freedom of the Student-t noise of matches
+
+// Call visit(index, w, J, r) for each match in front of the camera. The residual is r = (π(T p) - pixel)/σ with the pinhole
+// projection π, and w = (ν + 1)/(ν + |r|²) its Student-t weight. With q = T p, the left perturbation exp(δ) T gives
+// dq = [I, -[q]x] δ, hence J = dπ/dq [I, -[q]x] / σ.
+template <typename Visit>
+void for_each_match(const AlignMatches& m, const Pose& T, Visit visit) {
   for (std::size_t i = 0; i < m.points.size() / 3; ++i) {
-    const double *p = &m.points[3 * i], *pixel = &m.pixels[2 * i];
-    const double x = T[0] * p[0] + T[1] * p[1] + T[2] * p[2] + T[3];
-    const double y = T[4] * p[0] + T[5] * p[1] + T[6] * p[2] + T[7];
-    const double z = T[8] * p[0] + T[9] * p[1] + T[10] * p[2] + T[11];
-    if (!(z > 1e-3)) continue;
+    const Eigen::Vector3d q = T * Eigen::Vector3d::Map(&m.points[3 * i]);
+    const double x = q.x(), y = q.y(), z = q.z();
+    if (!(z > kMinDepth)) continue;
+    const double* pixel = &m.pixels[2 * i];
     const double iz = 1.0 / z;
     const double fx = m.fx / m.sigmas[i], fy = m.fy / m.sigmas[i];
-    const double ru = fx * x * iz + (m.cx - pixel[0]) / m.sigmas[i], rv = fy * y * iz + (m.cy - pixel[1]) / m.sigmas[i];
-    const double w = 5.0 / (4.0 + ru * ru + rv * rv);
+    const Eigen::Vector2d r(fx * x * iz + (m.cx - pixel[0]) / m.sigmas[i], fy * y * iz + (m.cy - pixel[1]) / m.sigmas[i]);
     const double ux = fx * iz, uz = -fx * x * iz * iz, vy = fy * iz, vz = -fy * y * iz * iz;
-    const Vec6 Ju = {ux, 0.0, uz, uz * y, ux * z - uz * x, -ux * y};
-    const Vec6 Jv = {0.0, vy, vz, vz * y - vy * z, -vz * x, vy * x};
-    take(i, w, Ju, Jv, ru, rv);
+    Jacobian J;
+    J << ux, 0.0, uz, uz * y, ux * z - uz * x, -ux * y,  //
+        0.0, vy, vz, vz * y - vy * z, -vz * x, vy * x;
+    visit(i, (kMatchNu + 1.0) / (kMatchNu + r.squaredNorm()), J, r);
   }
 }
 
-void add_matches(const AlignMatches& m, std::span<const double, 16> T, double weight, Normal& total) {
-  for_matches(m, T, [&](std::size_t, double robust, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
-    const double w = weight * robust;
-    for (int a = 0; a < 6; ++a) {
-      for (int b = 0; b < 6; ++b) total.H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
-      total.g[a] += w * (Ju[a] * ru + Jv[a] * rv);
-    }
+// H += w JᵀJ and g += w Jᵀr. Plain loops: the compiler unrolls them better than the product of such narrow matrices.
+void accumulate(double w, const Jacobian& J, const Eigen::Vector2d& r, NormalEquations& sums) {
+  const double *Ju = J.data(), *Jv = J.data() + 6;
+  double *H = sums.H.data(), *g = sums.g.data();
+  for (int a = 0; a < 6; ++a) {
+    for (int b = 0; b < 6; ++b) H[6 * a + b] += w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
+    g[a] += w * (Ju[a] * r[0] + Jv[a] * r[1]);
+  }
+}
+
+void add_matches(const AlignMatches& m, const Pose& T, double weight, NormalEquations& total) {
+  for_each_match(m, T, [&](std::size_t, double robust, const Jacobian& J, const Eigen::Vector2d& r) {
+    accumulate(weight * robust, J, r, total);
   });
 }
 
-// The matches' pixels are of the full image, which is as wide as the finest level's, or a multiple of it.
-void scatter_matches(const AlignMatches& m, std::span<const double, 16> T, const AlignImage& finest, double weight,
-                     Cells& cells, Mat6& curvature) {
+// The pixels of matches belong to the full image. Its width is that of the finest level, or a multiple of it.
+void add_cells_of_matches(const AlignMatches& m, const Pose& T, const AlignImage& finest, double weight, CellSums& cells,
+                          Matrix6& curvature) {
   const double scale = m.fx / finest.fx;
-  Mat6 H{};
-  Curving curving;
-  for_matches(m, T, [&](std::size_t i, double robust, const Vec6& Ju, const Vec6& Jv, double ru, double rv) {
-    const double w = weight * robust;
-    const int cell = Cells::of(m.pixels[2 * i], m.pixels[2 * i + 1], scale * finest.width, scale * finest.height);
-    Vec6 g{};
-    Mat6 own{};
-    for (int a = 0; a < 6; ++a) {
-      g[a] = w * (Ju[a] * ru + Jv[a] * rv);
-      for (int b = 0; b < 6; ++b) own[6 * a + b] = w * (Ju[a] * Ju[b] + Jv[a] * Jv[b]);
-    }
-    if (cell >= 0) cells.add(cell, g, own);
-    for (int a = 0; a < 36; ++a) H[a] += own[a];
-    curving.add(std::hypot(ru, rv), 4.0);
+  Matrix6 H = Matrix6::Zero();
+  RobustCurvature robust_curvature;
+  for_each_match(m, T, [&](std::size_t i, double robust, const Jacobian& J, const Eigen::Vector2d& r) {
+    const int cell = CellSums::index_of(m.pixels[2 * i], m.pixels[2 * i + 1], scale * finest.width, scale * finest.height);
+    NormalEquations match;
+    accumulate(weight * robust, J, r, match);
+    if (cell >= 0) cells.add(cell, match);
+    H += match.H;
+    robust_curvature.add(r.norm(), kMatchNu);
   });
-  for (int i = 0; i < 36; ++i) curvature[i] += curving.share() * H[i];
+  curvature += robust_curvature.share() * H;
 }
 
-// To first order: the twist from the prior to the pose is small where the prior is kept.
-void add_prior(const AlignPrior& prior, std::span<const double, 16> T_camera_world, Normal& total) {
-  const Vec6 off = se3_log_near(multiply(T_camera_world, inverse(prior.T_camera_world)));
-  for (int i = 0; i < 6; ++i) {
-    for (int j = 0; j < 6; ++j) {
-      total.H[6 * i + j] += prior.information[6 * i + j];
-      total.g[i] += prior.information[6 * i + j] * off[j];
-    }
-  }
+// The residual of the prior is log(T T_prior⁻¹). Its Jacobian is the identity to first order, as the twist is small.
+void add_prior(const AlignPrior& prior, const Pose& T_camera_world, NormalEquations& total) {
+  const Vector6 r = se3_log_near(T_camera_world * pose_from(prior.T_camera_world).inverse());
+  const Matrix6 information = Eigen::Map<const Eigen::Matrix<double, 6, 6, Eigen::RowMajor>>(prior.information.data());
+  total.H += information;
+  total.g += information * r;
 }
 
-// Gauss-Newton on one level.
-void descend(std::vector<DenseTerm>& terms, const AlignMatches& matches, const AlignPrior* prior, const AlignPlan& plan,
-             const Weights& weights, AlignResult& result) {
+// State of the optimisation: the pose and the information of its last linearisation, without the prior's.
+struct Estimate {
+  Pose T_camera_world;
+  Matrix6 H = Matrix6::Zero();
+  Matrix6 curvature = Matrix6::Zero();
+};
+
+// Gauss-Newton on one level with left updates T <- exp(δ) T.
+void minimize(std::vector<DenseTerm>& terms, const AlignMatches& matches, const AlignPrior* prior,
+              const AlignPlan& plan, const Weights& weights, Estimate& estimate) {
   for (int iteration = 0; iteration < plan.iterations; ++iteration) {
-    Normal total;
-    for (DenseTerm& term : terms) term.add(result.T_camera_world, plan, weights.dense, total);
-    add_matches(matches, result.T_camera_world, weights.matches, total);
-    result.H = total.H;
-    if (prior != nullptr) add_prior(*prior, result.T_camera_world, total);
-    const Vec6 step = total.solve();
-    result.T_camera_world = multiply(se3_exp(step), result.T_camera_world);
-    for (DenseTerm& term : terms) term.follow(step);
-    if (std::all_of(step.begin(), step.end(), [](double s) { return std::abs(s) < kStepDone; })) break;
+    NormalEquations total;
+    for (DenseTerm& term : terms) term.add(estimate.T_camera_world, plan, weights.dense, total);
+    add_matches(matches, estimate.T_camera_world, weights.matches, total);
+    estimate.H = total.H;
+    if (prior != nullptr) add_prior(*prior, estimate.T_camera_world, total);
+    const Vector6 step = total.solve();
+    estimate.T_camera_world = se3_exp(step) * estimate.T_camera_world;
+    for (DenseTerm& term : terms) term.update_exposure(step);
+    if (step.cwiseAbs().maxCoeff() < kConvergedStep) break;
   }
 }
 
-// However well residuals agree (a camera at rest before a still scene): the noise is no less than this share.
-constexpr double kLeastExcess = 0.05;
+// Lower bound of the variance ratio. A camera at rest in a static scene has residuals that agree better than its noise.
+constexpr double kMinVarianceRatio = 0.05;
 
-// Weights by what the residuals of this frame show: the inverse of each kind's excess over its noise model.
-Weights adapted(const std::vector<DenseTerm>& terms, const AlignMatches& matches, const AlignImage& finest,
-                const AlignPlan& plan, const Weights& before, const AlignResult& result) {
-  Cells dense, sparse;
-  Mat6 unused{};
-  for (const DenseTerm& term : terms) term.scatter(result.T_camera_world, plan, 1.0, dense, unused);
-  scatter_matches(matches, result.T_camera_world, finest, 1.0, sparse, unused);
-  const double of_dense = dense.excess(), of_sparse = sparse.excess();
-  return {.dense = of_dense > 0.0 ? plan.dense_share / std::max(of_dense, kLeastExcess) : before.dense,
-          .matches = of_sparse > 0.0 ? 1.0 / std::max(of_sparse, kLeastExcess) : before.matches};
+// Weights from the residuals of this frame: the inverse of the variance ratio of each kind.
+Weights adapted_weights(const std::vector<DenseTerm>& terms, const AlignMatches& matches, const AlignImage& finest,
+                        const AlignPlan& plan, const Weights& current, const Pose& T_camera_world) {
+  CellSums dense, sparse;
+  Matrix6 unused = Matrix6::Zero();
+  for (const DenseTerm& term : terms) term.add_cells(T_camera_world, plan, 1.0, dense, unused);
+  add_cells_of_matches(matches, T_camera_world, finest, 1.0, sparse, unused);
+  const double of_dense = dense.variance_ratio(), of_sparse = sparse.variance_ratio();
+  return {.dense = of_dense > 0.0 ? plan.dense_share / std::max(of_dense, kMinVarianceRatio) : current.dense,
+          .matches = of_sparse > 0.0 ? 1.0 / std::max(of_sparse, kMinVarianceRatio) : current.matches};
 }
 
-// Ten to a freedom; fewer fit noise, and a step from them may lead anywhere.
-constexpr std::size_t kLeastPoints = 60;
+// Ten points for each degree of freedom. Fewer points fit noise, and their step can diverge.
+constexpr std::size_t kMinPoints = 60;
 
-// Whether a level says enough of the pose: small levels of distant or patchy surfaces have next to no points.
-bool is_worth_a_step(std::size_t level, std::span<const AlignReference> references, const AlignMatches& matches,
+// Whether a level constrains the pose. Coarse levels of distant or patchy surfaces have few points.
+bool constrains_pose(std::size_t level, std::span<const AlignReference> references, const AlignMatches& matches,
                      const AlignPrior* prior) {
   std::size_t n = matches.points.size() / 3;
   for (const AlignReference& reference : references) n += reference.levels[level].gray.size();
-  return n >= kLeastPoints || prior != nullptr;
+  return n >= kMinPoints || prior != nullptr;
 }
 
 }  // namespace
@@ -403,25 +344,29 @@ AlignResult align(std::span<const AlignImage> levels, std::span<const AlignRefer
                   const AlignMatches& matches, const AlignPrior* prior, std::span<const double, 16> T_start,
                   const AlignPlan& plan) {
   AlignResult result;
-  std::copy(T_start.begin(), T_start.end(), result.T_camera_world.begin());
+  Estimate estimate{.T_camera_world = pose_from(T_start)};
   Weights weights{.dense = plan.dense_weight, .matches = 1.0};
   for (std::size_t level = levels.size(); level-- > plan.finest;) {
-    if (level > plan.finest && !is_worth_a_step(level, references, matches, prior)) continue;
+    if (level > plan.finest && !constrains_pose(level, references, matches, prior)) continue;
     std::vector<DenseTerm> terms;
     for (const AlignReference& reference : references) {
       terms.emplace_back(levels[level], reference.levels[level], reference.T_world_reference);
     }
-    descend(terms, matches, prior, plan, weights, result);
+    minimize(terms, matches, prior, plan, weights, estimate);
     if (level > plan.finest) continue;
     if (plan.dense_share > 0.0) {
-      weights = adapted(terms, matches, levels[level], plan, weights, result);
-      descend(terms, matches, prior, plan, weights, result);
+      weights = adapted_weights(terms, matches, levels[level], plan, weights, estimate.T_camera_world);
+      minimize(terms, matches, prior, plan, weights, estimate);
     }
-    Cells cells;
-    for (const DenseTerm& term : terms) term.scatter(result.T_camera_world, plan, weights.dense, cells, result.curvature);
-    scatter_matches(matches, result.T_camera_world, levels[level], weights.matches, cells, result.curvature);
+    CellSums cells;
+    const Pose& T = estimate.T_camera_world;
+    for (const DenseTerm& term : terms) term.add_cells(T, plan, weights.dense, cells, estimate.curvature);
+    add_cells_of_matches(matches, T, levels[level], weights.matches, cells, estimate.curvature);
     cells.report(result);
   }
+  result.T_camera_world = array_from(estimate.T_camera_world);
+  result.H = array_from<6>(estimate.H);
+  result.curvature = array_from<6>(estimate.curvature);
   result.dense_weight = weights.dense;
   result.match_weight = weights.matches;
   return result;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Joint values that put a tool at a pose.
+// Inverse kinematics: joint values that put a tool at a pose.
 #pragma once
 
 #include <span>
@@ -13,14 +13,15 @@ struct IkGoal {
   double tool[12];    // T_link_tcp of the last link
 };
 
-// What is missing at the end [m] and [rad].
-struct IkMiss {
+// Norms of the final error: position [m], angle [rad].
+struct IkResidual {
   double position, angle;
 };
 
-// Walks q (joints,) towards the goal within the limits by damped least squares with the squared error as damping
-// (Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", T-RO 2011).
-IkMiss solve_ik(const Arm& arm, const IkGoal& goal, std::span<const double> lower, std::span<const double> upper,
-                int most, std::span<double> q);
+// Moves the joint values q (joints,) to the goal within the limits, by damped least squares (Levenberg-Marquardt). The
+// damping is proportional to the squared error: Sugihara, "Solvability-unconcerned inverse kinematics by the
+// Levenberg-Marquardt method", T-RO 2011.
+IkResidual solve_ik(const Arm& arm, const IkGoal& goal, std::span<const double> lower, std::span<const double> upper,
+                    int max_iterations, std::span<double> q);
 
 }  // namespace splatbot::planning
