@@ -1,4 +1,4 @@
-"""Hard cases of cameras other than the plain pinhole, each held to a bound (see docs/stability.md)."""
+"""Hard cases of cameras other than the plain pinhole, each with an error bound (see docs/stability.md)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NEAR = 0.01
 
 
 def before(points: Tensor) -> Tensor:
-    """In front of the near plane."""
+    """Return True for points in front of the near plane."""
     return points[..., 2] >= NEAR
 
 

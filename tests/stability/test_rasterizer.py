@@ -1,4 +1,4 @@
-"""Hard cases of the rasterizer, each held to a bound against the float64 reference (see docs/stability.md)."""
+"""Hard cases of the rasterizer, each with an error bound against the float64 reference (see docs/stability.md)."""
 
 from __future__ import annotations
 

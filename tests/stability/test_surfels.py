@@ -1,4 +1,4 @@
-"""Hard cases of the surfel rasterizer, each held to a bound (see docs/stability.md)."""
+"""Hard cases of the surfel rasterizer, each with an error bound (see docs/stability.md)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def assert_within_bounds(
 
 
 def images_and_gradients(scene: Scene) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """All finite."""
+    """Return images and gradients, and check that all are finite."""
     leaves = scene.to(torch.float32, requires_grad=True)
     images, _ = render(leaves, "RGB+ED", distloss=True)
     loss(images, torch.ones(()), RENDERED).backward()
