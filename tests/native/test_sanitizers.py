@@ -33,6 +33,7 @@ def test_the_core_runs_clean_under_sanitizers(sanitizers: str, portable: bool, t
     ninja = tool("ninja")
     generator = ["-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={ninja}"] if ninja else []
     options = [f"-DSPLATBOT_SANITIZE={sanitizers}", f"-DSPLATBOT_PORTABLE={'ON' if portable else 'OFF'}"]
+    options.append(f"-DPython_EXECUTABLE={sys.executable}")  # its packages hold Eigen's headers
     subprocess.run([cmake, "-S", str(NATIVE), "-B", str(tmp_path), *generator, *options], check=True)
     subprocess.run([cmake, "--build", str(tmp_path), "--parallel", "2"], check=True)
     environment = {k: v for k, v in os.environ.items() if k not in ("SPLATBOT_ISA", "SPLATBOT_NUM_THREADS")}
