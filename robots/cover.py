@@ -12,7 +12,7 @@ from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
 
 
 def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
-    """Spheres around every shape, which reach at most ``slack`` [m] beyond it.
+    """Cover every shape by spheres that reach at most ``slack`` [m] beyond it.
 
     Capsules: spheres of radius R + slack along the segment, half of each other's chord apart, so that their union
     holds the capsule exactly. Boxes and meshes: see :func:`cover_solid`.
@@ -26,7 +26,7 @@ def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
 
 
 def cover_shape(shape: Shape, slack: float) -> tuple[Array, Array]:
-    """Centres (S, 3) [m, link frame] and radii (S,) [m]."""
+    """Cover a shape; return centres (S, 3) [m, link frame] and radii (S,) [m]."""
     if not slack > 0:
         raise InputError(f"is {slack}.", field="slack", hint="give metres above 0, as 0.01")
     if isinstance(shape, Capsule):
@@ -39,7 +39,7 @@ def cover_shape(shape: Shape, slack: float) -> tuple[Array, Array]:
 
 
 def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
-    """The ends inset by the slack (a cap's tip is then just inside), and between them at most a chord apart."""
+    """Cover a capsule: ends inset by the slack (the cap's tip is just inside), spheres a chord apart between."""
     radius = shape.radius + slack
     half_chord = np.sqrt(radius**2 - shape.radius**2)
     middle = (np.asarray(shape.start) + np.asarray(shape.end)) / 2
@@ -52,11 +52,13 @@ def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
 
 
 def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
-    """Greedy: of the candidates on a grid inside, each as large as fits plus the slack, that which covers most is next.
+    """Cover a solid greedily by balls.
 
-    What no candidate covers is covered by balls of radius ``slack`` on the surface itself. Points of the surface stand
-    for a neighbourhood of a quarter of the slack (their spacing and that of the cells they are thinned by), by which
-    every ball is taken to be smaller.
+    Candidates lie on an inner grid, each as large as fits plus the slack; the one that covers most is next.
+
+    Points without a candidate are covered by balls of radius ``slack`` on the surface itself. Each surface point
+    represents a neighbourhood of a quarter of the slack: its spacing, and that of the thinning cells. Every ball counts
+    as that much smaller.
     """
     spacing = slack / 8
     left = _thinned(shape.surface(spacing), spacing / 2)
@@ -82,7 +84,7 @@ def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
 
 
 def _thinned(points: Array, cell: float) -> Array:
-    """One point (the first) of each cell [m] of a grid."""
+    """Keep the first point in each cell [m] of a grid."""
     at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     size = at.max(axis=0) + 1
     _, first = np.unique((at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2], return_index=True)
@@ -90,14 +92,14 @@ def _thinned(points: Array, cell: float) -> Array:
 
 
 def _grid(low: Array, high: Array, slack: float) -> Array:
-    """Points (P, 3) at most the slack apart, or a sixteenth of the longest side."""
+    """Return grid points (P, 3) at most the slack apart, or a sixteenth of the longest side."""
     step = max(slack, float((high - low).max()) / 16)
     lines = [np.linspace(low[k], high[k], int((high[k] - low[k]) / step) + 3)[1:-1] for k in range(3)]
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def uncovered(shapes: Sequence[Shape], spheres: LinkSpheres, spacing: float) -> float:
-    """How far the worst point of the shapes' surfaces lies outside of the spheres [m], at most ``spacing`` too little.
+    """Return the largest distance [m] of the shapes' surfaces outside the spheres, at most ``spacing`` too little.
 
     Negative: every point is that deep inside.
     """

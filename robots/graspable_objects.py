@@ -1,4 +1,4 @@
-"""What a robot can grasp in a map: the things in it, where they were seen from, and what depth saw through."""
+"""Graspable objects in a map: their segmentation, observer positions, and free-space evidence from depth."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from splatbot.workspace import Workspace
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMap:
-    """A map and what the recording that it was made of says of it.
+    """A map and the evidence of its recording.
 
     Args:
-        state: without what more frames saw through than saw.
-        observers: (N, 3) where each Gaussian was seen from [m, world], NaN where that is not known; None: nowhere is.
+        state: without Gaussians that more frames saw through than supported.
+        observers: (N, 3) observer position of each Gaussian [m, world], NaN if unknown. If None, no position is known.
         views: the recording's depth, subsampled.
-        notes: what was not asked, and why.
+        notes: the checks that were skipped, and why.
     """
 
     state: Snapshot
@@ -42,46 +42,46 @@ class MeasuredMap:
 
 @dataclass(frozen=True, eq=False)
 class GraspableObjects:
-    """The things in a map, as commands and service alike ask for grasps of them."""
+    """The objects in a map, as commands and the service grasp them."""
 
     measured: MeasuredMap
     scene: SegmentedMap
 
     def sampler(self, robot: RobotKinematics, **options: Any) -> GraspSampler:
-        """Of grasps of them; ``options`` as of :class:`splatbot.grasping.sampler.GraspSampler`."""
+        """Return the sampler of their grasps; ``options`` as in :class:`splatbot.grasping.sampler.GraspSampler`."""
         return GraspSampler(self.scene, robot, observers=self.measured.observers, views=self.measured.views, **options)
 
     def told(self, result: GraspResult) -> GraspResult:
-        """With what was not asked."""
+        """Return the result with notes on the skipped checks."""
         return replace(result, notes=(*self.measured.notes, *result.notes))
 
 
 def run_of(path: Path) -> RunFolder | None:
-    """The run that a folder is of; None: it is of none, or a file."""
+    """Return the run that a folder belongs to, or None for a file or another folder."""
     run = RunFolder(path)
     return run if run.frames.is_file() else None
 
 
 def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
-    """A map but for flying pixels at edges, as far as its recording can be asked.
+    """Load a map and remove flying pixels at edges, as far as its recording is available.
 
     Args:
         state: of the map.
-        run: that made it; None: none is known, which is noted.
+        run: run that made it. If None, the checks that need it are skipped and noted.
 
     Raises:
         FormatError: the run's folder is damaged.
     """
     if run is None:
-        return MeasuredMap(state, notes=("What depth saw through was not asked, for the map is of no run's folder.",))
+        return MeasuredMap(state, notes=("free-space evidence was not checked: the map belongs to no run folder.",))
     notes: tuple[str, ...] = ()
     views: tuple[DepthView, ...] = ()
     try:
         views = subsampled_views(run, reopen_log(run))
     except SplatbotError as error:
-        name = f"{Path(error.file).name}: " if error.file else ""  # the folder is nobody's business
+        name = f"{Path(error.file).name}: " if error.file else ""  # clients must not learn the folder
         why = f"the run's log cannot be read: {name}{error.message}"
-        notes = (f"What depth saw through was not asked, for {why}",)
+        notes = (f"free-space evidence was not checked: {why}",)
     model = _solid(state.model, views)
     return MeasuredMap(replace(state, model=model), observers(run, model), views, notes)
 
@@ -89,12 +89,12 @@ def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
 def things_of(
     measured: MeasuredMap, T_world_base: ArrayLike, workspace: Workspace | None, *, as_known: bool
 ) -> GraspableObjects:
-    """The things in a map.
+    """Segment the objects in a map.
 
     Args:
         measured: the map.
         T_world_base: (4, 4), a frame whose z is up.
-        workspace: what is known beside the map.
+        workspace: workspace of the map, if known.
         as_known: the base is the workspace's, and so are its box and plane.
 
     Raises:
@@ -113,7 +113,7 @@ def things_of(
 
 
 def _solid(model: GaussianModel, views: tuple[DepthView, ...]) -> GaussianModel:
-    """Without what more views saw through than saw; all of it where there is no view."""
+    """Return the map without Gaussians that more views saw through than supported; the whole map without views."""
     if not views:
         return model
     return model.select(torch.from_numpy(~gather_evidence(model, views).seen_through).nonzero()[:, 0])

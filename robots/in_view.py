@@ -12,11 +12,11 @@ from splatbot.workspace import NAME, find_workspace
 
 
 def without_robot(log: Log, robot: str | None) -> Log:
-    """The log with the robot left out of its frames; the log itself without one.
+    """Return the log with the robot masked in its frames, or the log itself without a robot.
 
     Args:
         log: its folder holds ``joints.txt`` and ``scene.yaml``, which says where the camera is mounted.
-        robot: a name, as ``splatbot robot list`` tells them, or None.
+        robot: a name as ``splatbot robot list`` prints it, or None.
 
     Raises:
         InputError: the robot is unknown, or its camera's mount is.
@@ -35,7 +35,7 @@ def without_robot(log: Log, robot: str | None) -> Log:
 
 
 def reopen_log(run: RunFolder, *, uri: str | None = None, camera: str | None = None) -> Log:
-    """The log of a run as the run read it: with its camera, and without the robot that it was told of.
+    """Open the log of a run as the run read it: with its camera, and with the same robot masked.
 
     Args:
         run: the folder.

@@ -22,7 +22,7 @@ FINGER_GAIN = 2000.0  # [N/m] of the fingers' position servo, capped by the grip
 
 
 def to_mjcf(robot: RobotModel) -> str:
-    """MJCF text: a body for each link, position servos, the home posture as keyframe "home".
+    """Convert a robot to MJCF text: a body for each link, position servos, the home posture as keyframe "home".
 
     Joints, limits of position and torque, inertias and collision capsules and boxes are the robot's own; meshes are
     replaced by its spheres. Neighbouring links, and those whose spheres meet at home, do not collide.
@@ -73,7 +73,7 @@ def to_mjcf(robot: RobotModel) -> str:
 
 
 def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> None:
-    """Capsules and boxes; spheres for links that have meshes or no shapes."""
+    """Add capsules and boxes as geoms; spheres for links that have meshes or no shapes."""
     plain = {shape.link for shape in robot.shapes} - {
         shape.link for shape in robot.shapes if not isinstance(shape, (Capsule, Box))
     }
@@ -99,7 +99,7 @@ def _geom(shape: Shape) -> dict[str, str]:
 def _add_gripper(
     root: ElementTree.Element, actuators: ElementTree.Element, hand: ElementTree.Element, gripper: GripperGeometry
 ) -> None:
-    """Two sliding fingers on one servo; an equality keeps them symmetric. The force is the gripper's own."""
+    """Add two sliding fingers on one servo; an equality keeps them symmetric. The force is the gripper's own."""
     names = [f"finger{i + 1}" for i in range(2)]
     for name, T in zip(names, gripper.T_link_finger, strict=True):
         body = ElementTree.SubElement(hand, "body", {"name": name, **_pose(T)})

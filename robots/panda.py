@@ -1,8 +1,8 @@
 """Franka Emika Panda with its hand: published kinematics and limits, estimated inertias, coarse collision shapes.
 
-Sources: DH parameters and limits from Franka's documentation (robot and interface specifications); inertias as
-identified by Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019); capsules as in Franka's
-own coarse self-collision model.
+DH parameters and limits are from Franka's documentation (robot and interface specifications). Inertias are those
+identified by Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019). Capsules are as in
+Franka's own coarse self-collision model.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _INERTIALS = (
 
 @cache
 def panda() -> RobotModel:
-    """The arm with its hand; the tool's frame lies between the finger tips."""
+    """Build the arm with its hand; the tool's frame lies between the finger tips."""
     joints = tuple(
         Joint(
             f"panda_joint{k + 1}",
@@ -96,13 +96,13 @@ def _arm_shapes() -> list[Capsule]:
 
 
 def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
-    """Around the hand's body of 63 x 204 x 66 mm, round at its ends."""
+    """Return shapes around the hand's body of 63 x 204 x 66 mm, round at its ends."""
     start, end = (T_link_hand @ np.array([0.0, y, 0.0345, 1.0]) for y in (-0.0705, 0.0705))
     return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.0315)]
 
 
 def _dh(a: float, d: float, alpha: float) -> Array:
-    """Rot_x(alpha) Trans_x(a) Trans_z(d) (Craig 1986)."""
+    """Return the transform Rot_x(alpha) Trans_x(a) Trans_z(d) (Craig 1986)."""
     c, s = np.cos(alpha), np.sin(alpha)
     return np.array([[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1.0]])
 

@@ -1,4 +1,4 @@
-"""A robot arm: kinematics, limits, collision geometry and the spheres that stand for it."""
+"""A robot arm: kinematics, limits, collision geometry and its collision spheres."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ class RobotModel:
         inertials: of the links 0..J, for the twin; empty where they are not known.
         gripper: fingers, or None.
         slack: how far the spheres may reach beyond the shapes [m].
-        allowed: pairs of links that may touch, beside neighbours and those whose spheres meet at home.
-        covering: spheres of the links; None: generated from the shapes.
-        pairs: (M, 2) links that may not touch; None: found from the spheres.
+        allowed: pairs of links that may touch, in addition to neighbours and those whose spheres overlap at home.
+        covering: spheres of the links. If None, they are generated from the shapes.
+        pairs: (M, 2) links that may not touch. If None, they are derived from the spheres.
 
     Raises:
         InputError: joints, home or shapes do not fit together.
@@ -89,7 +89,7 @@ class RobotModel:
             raise InputError("names a link that is not there.", field="shapes", hint=f"links are 0..{len(self.joints)}")
 
     def __len__(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
         return len(self.joints)
 
     @cached_property
@@ -107,7 +107,7 @@ class RobotModel:
         )
 
     def fk(self, q: ArrayLike) -> Array:
-        """Poses T_base_link (..., J + 1, 4, 4) of all links at configurations (..., J) [rad or m]."""
+        """Compute the poses T_base_link (..., J + 1, 4, 4) of all links at configurations (..., J) [rad or m]."""
         values = self.configurations(q)
         T = np.empty((*values.shape[:-1], len(self) + 1, 4, 4))
         T[..., 0, :, :] = np.eye(4)
@@ -116,11 +116,11 @@ class RobotModel:
         return T
 
     def tcp(self, q: ArrayLike) -> Array:
-        """Poses T_base_tcp (..., 4, 4) of the tool."""
+        """Compute the poses T_base_tcp (..., 4, 4) of the tool."""
         return np.asarray(self.fk(q)[..., -1, :, :] @ self.T_link_tcp)
 
     def jacobian(self, q: ArrayLike, link: int | None = None, point: ArrayLike | None = None) -> Array:
-        """Geometric Jacobian (..., 6, J): velocity [m] and angular velocity [rad] of a point per unit of each joint.
+        """Compute the geometric Jacobian (..., 6, J): linear [m] and angular [rad] velocity of a point per joint unit.
 
         Args:
             q: configurations (..., J).
@@ -141,7 +141,7 @@ class RobotModel:
         return J
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
-        """Spheres that cover the shapes, the gripper opened by ``opening`` [m] between its fingers (None: all the way).
+        """Return the collision spheres with the gripper opened by ``opening`` [m]. If None, it is fully open.
 
         Raises:
             InputError: the opening is out of range.
@@ -174,7 +174,7 @@ class RobotModel:
         pad = finger[finger[:, 1] < finger[:, 1].min() + _FLAT]
         own = [shape.surface(_SPACING) for shape in self.shapes if shape.link == len(self)]
         body = transform_points(T_tcp_link, np.concatenate(own)) if own else np.zeros((0, 3))
-        palm = body[body[:, 2] > finger[:, 2].min()]  # what stands beside the fingers or between them
+        palm = body[body[:, 2] > finger[:, 2].min()]  # objects next to the fingers or between them
         front = palm if len(palm) else finger[finger[:, 2] == finger[:, 2].min()]
         return HandShape(
             stroke=2 * self.gripper.stroke,
@@ -207,17 +207,17 @@ class RobotModel:
         return np.array(pairs, dtype=np.int32).reshape(-1, 2)
 
     def random(self, count: int, rng: np.random.Generator) -> Array:
-        """Configurations (count, J), uniform within the limits."""
+        """Sample configurations (count, J), uniform within the limits."""
         return rng.uniform(self.chain.lower, self.chain.upper, (count, len(self)))
 
     def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> NDArray[np.bool_]:
-        """Whether configurations (..., J) respect the limits of position."""
+        """Return True for configurations (..., J) within the position limits."""
         values = self.configurations(q)
         low, high = self.chain.lower - tolerance, self.chain.upper + tolerance
         return np.asarray(((values >= low) & (values <= high)).all(axis=-1))
 
     def configurations(self, q: ArrayLike) -> Array:
-        """``q`` as float64 (..., J).
+        """Return ``q`` as float64 (..., J).
 
         Raises:
             InputError: another number of joints, or a value that is not finite.
@@ -245,7 +245,7 @@ def _covered(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
 
 
 def _moved(q: Array, prismatic: bool) -> Array:
-    """What a joint about or along z does (..., 4, 4)."""
+    """Return the transform (..., 4, 4) of a joint about or along z."""
     T = np.zeros((*q.shape, 4, 4))
     T[..., range(4), range(4)] = 1.0
     if prismatic:

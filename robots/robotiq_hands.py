@@ -1,8 +1,8 @@
-"""The Panda with a Robotiq 2F-85 or 2F-140 in place of its hand: slim fingers for what is low or stands close, and a
-hand for things that are wider than 80 mm.
+"""The Panda with a Robotiq 2F-85 or 2F-140 in place of its hand. They are slim fingers for low or close
+objects, and a hand for objects wider than 80 mm.
 
-Strokes, and the length of the 2F-85, from Robotiq's data sheets (85 mm, 20 to 235 N, 163 mm; 140 mm, 10 to 125 N); the
-2F-85 presses as the Panda's hand does. The shapes are coarse ones around body, open linkage and fingers.
+Strokes, forces and the length of the 2F-85 are from Robotiq's data sheets (85 mm, 20 to 235 N, 163 mm; 140 mm, 10 to
+125 N). The 2F-85 presses as the Panda's hand does. The shapes are coarse ones around body, open linkage and fingers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _Along = tuple[tuple[float, float, float], tuple[float, float, float], float]  #
 
 @cache
 def panda_2f85() -> RobotModel:
-    """The arm with the slim fingers, 22 mm wide and, for 38 mm from their tips, 10 mm thick with round edges.
+    """Return the arm with the slim fingers, 22 mm wide and, for 38 mm from their tips, 10 mm thick with round edges.
 
     Against the target itself its fingers count as boxes as thick as they are at their roots, 20 mm.
     """
@@ -45,7 +45,7 @@ def panda_2f85() -> RobotModel:
 
 @cache
 def panda_2f140() -> RobotModel:
-    """The arm with the wide hand."""
+    """Return the arm with the wide hand."""
     return _with_hand(
         "panda-2f140",
         tcp=0.205,
@@ -60,8 +60,10 @@ def panda_2f140() -> RobotModel:
 def _with_hand(
     name: str, *, tcp: float, body: Sequence[_Along], root: float, finger: Sequence[_Along], stroke: float, force: float
 ) -> RobotModel:
-    """The Panda with a hand whose fingers begin ``root`` [m] from the flange; the tool's frame lies between its pads,
-    ``tcp`` [m] from the flange, and they open along its y, ``stroke`` [m] each."""
+    """Build the Panda with a hand whose fingers begin ``root`` [m] from the flange.
+
+    The tool's frame lies between its pads, ``tcp`` [m] from the flange; they open along its y, ``stroke`` [m] each.
+    """
     arm = panda()
     T_link_flange = _along_z(_FLANGE)
     own = tuple(shape for shape in arm.shapes if shape.link < 7)
@@ -89,5 +91,5 @@ def _along_z(z: float) -> Array:
 
 
 def _at(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A point of the flange on the last link."""
+    """Return a point of the flange on the last link."""
     return x, y, z + _FLANGE

@@ -22,7 +22,7 @@ class Shape(Protocol):
         ...
 
     def surface(self, spacing: float) -> Array:
-        """Points (P, 3) of its surface in the link's frame, at most about ``spacing`` [m] apart."""
+        """Sample points (P, 3) of the surface in the link's frame, at most about ``spacing`` [m] apart."""
         ...
 
 
@@ -37,16 +37,16 @@ class Capsule:
 
     @property
     def length(self) -> float:
-        """Of the segment [m]."""
+        """Length of the segment [m]."""
         return float(np.linalg.norm(np.subtract(self.end, self.start)))
 
     def along(self) -> Array:
-        """Unit vector (3,) of the segment; x for a ball."""
+        """Return the unit vector (3,) of the segment; x for a ball."""
         d = np.subtract(self.end, self.start)
         return np.asarray(d / self.length) if self.length > 0 else np.array([1.0, 0.0, 0.0])
 
     def surface(self, spacing: float) -> Array:
-        """Rings along the segment, and rings of latitude on both caps."""
+        """Sample rings along the segment, and rings of latitude on both caps."""
         axis = self.along()
         side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         side /= np.linalg.norm(side)
@@ -73,7 +73,7 @@ class Box:
     size: tuple[float, float, float]
 
     def surface(self, spacing: float) -> Array:
-        """A grid on each face."""
+        """Sample a grid on each face."""
         half = np.asarray(self.size) / 2
         faces = []
         for k in range(3):
@@ -87,7 +87,7 @@ class Box:
         return transform_points(self.T_link_box, np.concatenate(faces))
 
     def depth(self, points: Array) -> Array:
-        """How deep points (P, 3) [m, link frame] lie inside (P,) [m]; below 0 outside."""
+        """Return the penetration depth (P,) [m] of points (P, 3) [m, link frame]; below 0 outside."""
         local = transform_points(inverse(self.T_link_box), points)
         return np.asarray((np.asarray(self.size) / 2 - np.abs(local)).min(axis=1))
 
@@ -101,7 +101,7 @@ class Mesh:
     triangles: NDArray[np.int64] = field(repr=False)
 
     def depth(self, points: Array) -> Array:
-        """How deep points (P, 3) [m, link frame] lie inside (P,) [m]; below 0 outside."""
+        """Return the penetration depth (P,) [m] of points (P, 3) [m, link frame]; below 0 outside."""
         scene = o3d.t.geometry.RaycastingScene()
         vertices, triangles = self.vertices.astype(np.float32), self.triangles.astype(np.uint32)
         scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
@@ -109,7 +109,7 @@ class Mesh:
         return np.asarray(-scene.compute_signed_distance(queries, nsamples=5).numpy(), dtype=np.float64)
 
     def surface(self, spacing: float) -> Array:
-        """Barycentric grids on the triangles."""
+        """Sample barycentric grids on the triangles."""
         a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
         edge = np.max(
             [np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)], axis=0

@@ -24,17 +24,17 @@ VELOCITY, ACCELERATION_PER_VELOCITY, JERK_PER_VELOCITY = 1.0, 5.0, 50.0  # [rad/
 
 @dataclass(frozen=True)
 class Reading:
-    """What came of a file: the robot, and what was assumed for want of it."""
+    """Result of reading a file: the robot, and the assumptions for missing data."""
 
     robot: RobotModel
     notes: tuple[str, ...]
 
 
 def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = SLACK) -> Reading:
-    """The serial arm from the root to ``tip`` (by default the link with most moving joints before it).
+    """Read the serial arm from the root to ``tip`` (by default the link with most moving joints before it).
 
-    Fixed links belong to the arm's link that carries them; moving joints off the arm (fingers) are held at 0, or at the
-    limit nearest to it. Collision geometry is taken where a link has any, else what is visible.
+    Fixed links belong to the arm's link that carries them. Moving joints off the arm (fingers) are held at 0, or at the
+    limit nearest to it. Collision geometry is taken if a link has any, else the visual geometry.
 
     Raises:
         FormatError: the file is no URDF, has no moving joint, or an element cannot be used (it is named).
@@ -138,7 +138,7 @@ class _UrdfReader:
             raise FormatError(error.message, file=self.file, field=name, hint=error.hint) from error
 
     def _held(self, e: ElementTree.Element) -> Array:
-        """Where a joint off the arm is held."""
+        """Return the position at which a joint off the arm is held."""
         T = np.eye(4)
         if e.get("type") not in _MOVING:
             return T
@@ -194,7 +194,7 @@ class _UrdfReader:
         return Mesh(k, transform_points(T, np.asarray(mesh.vertices) * scale), np.asarray(mesh.triangles, np.int64))
 
     def _resolve(self, name: str, link: str) -> Path:
-        """A mesh beside the URDF, or of a package:// whose folder is above it."""
+        """Resolve a mesh next to the URDF, or of a package:// whose folder is above it."""
         if not name.startswith("package://"):
             found = (self.file.parent / name.removeprefix("file://")).resolve()
         else:
@@ -205,12 +205,12 @@ class _UrdfReader:
             found = next((f / rest for f in folders if (f / rest).exists()), Path(name))
         if not found.exists():
             raise FormatError(
-                f"{name} is not there.", file=self.file, field=link, hint="keep the meshes beside the file"
+                f"{name} is not there.", file=self.file, field=link, hint="keep the meshes next to the file"
             )
         return found
 
     def _inertials(self, joints: int, placed: dict[str, tuple[int, Array]]) -> tuple[Inertial, ...]:
-        """Of the arm's links, each with what is fixed to it; empty if a moving one has none."""
+        """Return the inertials of the arm's links with all parts fixed to them; empty if a moving link has none."""
         mass, first, second = np.zeros(joints + 1), np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3, 3))
         for link, (k, T_link) in placed.items():
             e = self.links[link].find("inertial")
@@ -260,7 +260,7 @@ class _UrdfReader:
 
 
 def _cylinder(k: int, T: Array, radius: float, length: float) -> Shape:
-    """A box where it is flatter than a capsule could be; else the capsule around it would be too long by its caps."""
+    """Return a box if it is flatter than a capsule: the capsule around it would be too long by its caps."""
     ends = transform_points(T, np.array([[0, 0, -length / 2], [0, 0, length / 2]]))
     start, end = ends
     if length <= 2 * radius:
@@ -269,7 +269,7 @@ def _cylinder(k: int, T: Array, radius: float, length: float) -> Shape:
 
 
 def _origin(e: ElementTree.Element) -> Array:
-    """The pose (4, 4) of an element: fixed-axis roll, pitch, yaw."""
+    """Return the pose (4, 4) of an element: fixed-axis roll, pitch, yaw."""
     found = e.find("origin")
     T = np.eye(4)
     if found is not None:
@@ -280,7 +280,7 @@ def _origin(e: ElementTree.Element) -> Array:
 
 
 def _z_to(axis: Array) -> Array:
-    """A rotation (3, 3) that takes z to a unit vector, the shortest way."""
+    """Return the shortest rotation (3, 3) that takes z to a unit vector."""
     c = float(axis[2])
     if c < -1 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])

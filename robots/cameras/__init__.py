@@ -10,12 +10,12 @@ __all__ = ["ReplayCamera", "is_camera", "open_camera"]
 
 
 def is_camera(uri: str) -> bool:
-    """Whether a name is that of a camera, not of a preset or a file."""
+    """Return True if a name is that of a camera, not of a preset or a file."""
     return uri.startswith(PREFIX)
 
 
 def open_camera(uri: str) -> FrameSource:
-    """The camera that ``uri`` names; it runs from the first frame that is asked for.
+    """Open the camera that ``uri`` names; it starts with the first requested frame.
 
     Raises:
         InputError: there is no such kind of camera, or an option makes no sense.

@@ -1,4 +1,4 @@
-"""A recording that behaves as a camera: frames at their times, lost when nobody takes them, and a device's faults."""
+"""A recording that behaves as a camera: frames at their times, dropped without a reader, and a device's faults."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ReplayOptions:
 
     Args:
         speed: 2 plays twice as fast; stamps stay the recording's.
-        loop: begin anew at the end; stamps go on increasing.
+        loop: restart at the end; stamps continue to increase.
         stall: the frame before which nothing comes for ``stall_s``; -1: never.
         stall_s: how long [s].
         drop: the share of frames that the device loses, 0 to 1.
@@ -52,7 +52,7 @@ class ReplayOptions:
 
 
 class ReplayCamera:
-    """A log as a live camera. Who reads too slowly loses the oldest frames, which ``dropped`` counts.
+    """A log as a live camera. A slow reader loses the oldest frames, which ``dropped`` counts.
 
     Iterating starts a thread that reads the log and delivers each frame at its time; a log that itself is too slow
     delivers late. The frames end with the log, or by :meth:`close`.
@@ -80,7 +80,7 @@ class ReplayCamera:
 
     @classmethod
     def from_uri(cls, uri: str) -> ReplayCamera:
-        """The camera of `replay:LOG?speed=2&loop=1&...`; options that are not of replay are the log's own.
+        """Open the camera of `replay:LOG?speed=2&loop=1&...`; other options belong to the log.
 
         Raises:
             InputError: an option is no number or out of range.
@@ -99,7 +99,7 @@ class ReplayCamera:
         return cls(open_log(log + (f"?{own}" if own else "")), ReplayOptions(**values))
 
     def close(self) -> None:
-        """End the stream; who waits for a frame gets none."""
+        """End the stream; a waiting reader receives no frame."""
         self._closed.set()
         with self._changed:
             self._changed.notify_all()
@@ -134,7 +134,7 @@ class ReplayCamera:
             self._deliver(error)
 
     def _frames(self) -> Iterator[tuple[int, Frame]]:
-        """Frames at their times, numbered over all rounds, until the camera is closed."""
+        """Yield frames at their times, numbered over all rounds, until the camera is closed."""
         number, offset, late = 0, 0.0, 0.0
         begun: tuple[float, float] | None = None
         while True:
@@ -162,7 +162,7 @@ class ReplayCamera:
             self._changed.notify_all()
 
     def _damaged(self, frame: Frame) -> Frame:
-        """The frame as a transfer that broke off leaves it."""
+        """Return the frame as an interrupted transfer leaves it."""
         rgb, depth, half = frame.rgb.copy(), frame.depth.copy(), frame.rgb.shape[0] // 2
         rgb[half:] = self._rng.integers(0, 256, rgb[half:].shape, dtype=np.uint8)
         depth[half:] = self._rng.uniform(0, 10, depth[half:].shape)

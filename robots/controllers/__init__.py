@@ -1,4 +1,4 @@
-"""Controllers without hardware: one that moves as told, one that moves as was recorded."""
+"""Controllers without hardware: one follows its commands, the other a recorded motion."""
 
 from splatbot.robots.controllers.fake import FakeController
 from splatbot.robots.controllers.recorded import JointRecording, RecordedController

@@ -1,4 +1,4 @@
-"""What controllers without hardware share: the clock, what may be sent, stops and faults."""
+"""Base of controllers without hardware: the clock, checks of trajectories, stops and faults."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class SteppedController:
     Args:
         position: (J,) where the arm is.
         period: [s]
-        following: largest difference between where it is and should be, beyond which it faults and stands still.
+        following: largest tracking error; beyond it the controller faults and stops.
 
     Raises:
         InputError: the period or ``following`` is not above 0.
@@ -47,7 +47,7 @@ class SteppedController:
 
     @property
     def state(self) -> MotionState:
-        """What it is doing."""
+        """State of the controller."""
         return self._state
 
     def send(self, trajectory: TimedPath) -> None:
@@ -82,11 +82,11 @@ class SteppedController:
         )
 
     def stop(self) -> None:
-        """At rest from the next step on."""
+        """Stop at the next step."""
         self._stopping = True
 
     def fault(self, why: str) -> None:
-        """Stand still until :meth:`reset`, as after an emergency stop."""
+        """Fault until :meth:`reset`, as after an emergency stop."""
         self._rest(MotionState.FAULT)
         self._fault = why
 
@@ -112,5 +112,5 @@ class SteppedController:
         self._state, self._stopping = state, False
 
     def _moved(self, t: float, desired: Array, velocity: Array) -> Array:
-        """Where the arm is (J,) at time ``t`` [s]."""
+        """Return the positions (J,) of the arm at time ``t`` [s]."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""A controller that moves as told, late by a lag and off by noise."""
+"""A controller that follows its trajectory with a lag and noise."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from splatbot.robots.controllers.base import FOLLOWING, SteppedController
 
 
 class FakeController(SteppedController):
-    """A first-order lag behind the trajectory, with noise in what it measures.
+    """A first-order lag behind the trajectory, with noise in its measurements.
 
     Args:
         position: (J,) where the arm is.

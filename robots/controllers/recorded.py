@@ -1,4 +1,4 @@
-"""A controller whose arm moves as a recording of joints says, whatever it is told."""
+"""A controller whose arm follows a recording of joints and ignores its commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class JointRecording:
     Args:
         stamps: (N,) [s], increasing.
         positions: (N, J) [rad or m].
-        source: what they came from, for messages.
+        source: their source, for messages.
 
     Raises:
         LogError: fewer than two samples, stamps that do not increase, or a value that is not finite.
@@ -56,21 +56,21 @@ class JointRecording:
         try:
             table = np.array([[float(row[i]) for i in (header.index("time"), *columns)] for row in rows[1:]])
         except (ValueError, IndexError) as error:
-            raise LogError(f"holds what is no number ({error}).", file=path, field="rows") from error
+            raise LogError(f"holds a value that is not a number ({error}).", file=path, field="rows") from error
         if table.ndim != 2:
             raise LogError("is empty.", file=path, field="rows")
         return cls(table[:, 0] - table[0, 0], table[:, 1:], str(path))
 
     def at(self, t: float) -> Array:
-        """Positions (J,) at a time [s] since its start, interpolated; the last one after its end."""
+        """Return the positions (J,) at a time [s] since its start, interpolated; the last one after its end."""
         return np.array([np.interp(t, self.stamps, column) for column in self.positions.T])
 
 
 class RecordedController(SteppedController):
-    """Replays how an arm really moved: what follows a trajectory sees its errors, delays and stops again.
+    """Replays the recorded motion of an arm with its errors, delays and stops.
 
     Args:
-        recording: what it does once a trajectory is sent.
+        recording: motion that it performs once a trajectory is sent.
         period: [s]
         following: see :class:`SteppedController`.
     """

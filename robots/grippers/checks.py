@@ -1,4 +1,4 @@
-"""What every gripper asks of a move."""
+"""Checks of a gripper move."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from splatbot.errors import InputError
 
 
 def check_move(stroke: float, opening: float, force: float | None, speed: float | None) -> None:
-    """A move's values make sense.
+    """Check the values of a move.
 
     Raises:
         InputError: the opening is out of 0..stroke [m], or force [N] or speed [m/s] are not above 0.

@@ -11,7 +11,7 @@ class FakeGripper:
 
     Args:
         stroke: widest opening [m].
-        width: of what is between the fingers [m]; 0: nothing.
+        width: of the object between the fingers [m]; 0 without an object.
 
     Raises:
         InputError: the width does not fit between the fingers.
@@ -29,7 +29,7 @@ class FakeGripper:
         return self._stroke
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Go to an opening [m], or as near as what is between the fingers lets them.
+        """Move to an opening [m], or until the fingers meet an object.
 
         Raises:
             InputError: a value is out of range.
@@ -39,15 +39,15 @@ class FakeGripper:
         self._opening = max(opening, self.width)
 
     def moving(self) -> bool:
-        """Never: they are there at once."""
+        """Return False: the fingers arrive at once."""
         return False
 
     def opening(self) -> float:
-        """Between the fingers now [m]."""
+        """Return the distance between the fingers [m]."""
         return self._opening
 
     def holds(self) -> bool:
-        """Whether what is between the fingers keeps them apart."""
+        """Return True if an object between the fingers keeps them apart."""
         return self._opening > self._wanted
 
     def stop(self) -> None:

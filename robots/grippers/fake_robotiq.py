@@ -25,7 +25,7 @@ _HOLDING_CURRENT = 100  # [mA]
 
 @dataclass
 class LineFaults:
-    """What the line does to bytes; may be changed at any time.
+    """Faults of the line; they may change at any time.
 
     Args:
         drop: share of bytes that are lost, either way.
@@ -43,11 +43,11 @@ class LineFaults:
 
 
 class FakeRobotiq:
-    """Fingers that move at their speed, stop at what is between them, and answer on the serial port ``port``.
+    """A gripper whose fingers move at their speed, stop at an object, and answer on the serial port ``port``.
 
     Args:
         model: "2f-85" or "2f-140".
-        width: of what is between the fingers [m]; 0: nothing. May be changed at any time.
+        width: of the object between the fingers [m]; 0 without an object. May be changed at any time.
         faults: of the line.
         hurry: how many times faster it moves than a real one; may be changed at any time.
         device: its Modbus number.
@@ -76,7 +76,7 @@ class FakeRobotiq:
         self._rng = np.random.default_rng(seed)
         self._command = Command(activate=False, go=False)
         self._position = float(self.model.open_at)
-        self._ready_at: float | None = None  # None: not activated
+        self._ready_at: float | None = None  # None before activation
         self._stopped = Fingers.THERE
         self._last = time.monotonic()
         self._master, self._slave = pty.openpty()
@@ -94,11 +94,11 @@ class FakeRobotiq:
 
     @property
     def commanded(self) -> Command:
-        """What it was told last."""
+        """The last command."""
         return self._command
 
     def unplug(self) -> None:
-        """The port is gone, for good."""
+        """Remove the port permanently."""
         if self._plugged:
             self._plugged = False
             self._thread.join()
@@ -199,7 +199,7 @@ class FakeRobotiq:
         )
 
     def _through(self, data: bytes) -> bytes:
-        """What is left of bytes after the line."""
+        """Return the bytes that the line delivers."""
         if not (self.faults.drop or self.faults.flip):
             return data
         kept = [byte for byte in data if self._rng.random() >= self.faults.drop]
@@ -207,7 +207,7 @@ class FakeRobotiq:
 
 
 def _request_length(data: bytes) -> int:
-    """How long a request that begins so is."""
+    """Return the length of a request with this beginning."""
     if len(data) < 7:
         return 8
     return 9 + data[6] if data[1] == WRITE else 8

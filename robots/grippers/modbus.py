@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class NoAnswerError(GripperError):
-    """The device gave no good answer, asked as often as was allowed (TIMED_OUT)."""
+    """The device gave no valid answer within the allowed number of requests (TIMED_OUT)."""
 
     code = -6
 
@@ -42,7 +42,7 @@ class FramingError(Exception):
 
 
 def crc16(data: bytes) -> int:
-    """The checksum of Modbus: polynomial 0xA001 reflected, from 0xFFFF (Modbus over Serial Line V1.02, 6.2.2)."""
+    """Return the Modbus checksum: reflected polynomial 0xA001 from 0xFFFF (Modbus over Serial Line V1.02, 6.2.2)."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
@@ -52,15 +52,15 @@ def crc16(data: bytes) -> int:
 
 
 def framed(body: bytes) -> bytes:
-    """Device, function and data with their checksum, low byte first."""
+    """Frame device, function and data with their checksum, low byte first."""
     return body + struct.pack("<H", crc16(body))
 
 
 def unframed(frame: bytes) -> bytes:
-    """What :func:`framed` was given.
+    """Return the arguments of :func:`framed` for a frame.
 
     Raises:
-        FrameError: the checksum is wrong, or there is none.
+        FrameError: the checksum is wrong or missing.
     """
     if len(frame) < 4 or framed(frame[:-2]) != frame:
         raise FramingError(f"a wrong checksum in {frame.hex(' ')}")
@@ -68,7 +68,7 @@ def unframed(frame: bytes) -> bytes:
 
 
 def open_line(port: str, *, timeout: float) -> Any:
-    """A serial port at 115200 8N1, for this process alone.
+    """Open a serial port at 115200 8N1, for this process alone.
 
     Raises:
         LineError: it cannot be opened.
@@ -81,7 +81,7 @@ def open_line(port: str, *, timeout: float) -> Any:
 
 
 class ModbusClient:
-    """Asks one device on a line. Every exchange ends within (retries + 1) · 4 time-outs.
+    """Queries one device on a line. Every exchange ends within (retries + 1) · 4 time-outs.
 
     Args:
         line: an open ``serial.Serial`` with a time-out [s].
@@ -95,7 +95,7 @@ class ModbusClient:
         self.repeated = 0  # exchanges that were tried again
 
     def read(self, address: int, count: int) -> bytes:
-        """``count`` registers from an address on, two bytes each.
+        """Read ``count`` registers from an address on, two bytes each.
 
         Raises:
             NoAnswerError, LineError, RefusedError: as they say.
@@ -105,7 +105,7 @@ class ModbusClient:
         return answer[3:]
 
     def write(self, address: int, data: bytes, *, retries: int | None = None) -> None:
-        """Registers from an address on; repeated if unanswered, so that writing them twice must do no harm.
+        """Write registers from an address on. Unanswered requests are repeated, so writing twice must be harmless.
 
         Raises:
             NoAnswerError, LineError, RefusedError: as they say.
@@ -159,7 +159,7 @@ class ModbusClient:
         return good
 
     def _drain(self) -> None:
-        """Wait until the line is silent, at most a time-out: what comes late is not the next answer."""
+        """Wait until the line is silent, at most a time-out: late bytes must not count as the next answer."""
         try:
             until = time.monotonic() + float(self._line.timeout)
             while time.monotonic() < until:

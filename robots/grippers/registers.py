@@ -21,7 +21,7 @@ class Activation(IntEnum):
 
 
 class Fingers(IntEnum):
-    """gOBJ: what the fingers do or have met."""
+    """gOBJ: motion of the fingers, or contact."""
 
     MOVING = 0
     STOPPED_OPENING = 1
@@ -34,7 +34,7 @@ FAULTS = {
     0x05: "the action waits for the activation to end",
     0x07: "it is not activated",
     0x08: "it is too hot",
-    NO_COMMUNICATION: "nothing was said to it for a second",
+    NO_COMMUNICATION: "no communication for a second",
     0x0A: "its voltage is too low",
     0x0B: "the automatic release is under way",
     0x0C: "an internal fault",
@@ -46,14 +46,14 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class Command:
-    """What it is told.
+    """Command registers.
 
     Args:
         activate: rACT; False resets it and clears faults.
-        go: rGTO; False stands still.
+        go: rGTO; False stops the fingers.
         position: rPR, 0 open .. 255 closed.
         speed, force: rSP and rFR, 0 least .. 255 most.
-        release: rATR, let go slowly, after which it must be activated anew.
+        release: rATR, slow automatic release; the gripper must be activated again afterwards.
         release_opens: rARD, the direction of that.
     """
 
@@ -66,20 +66,20 @@ class Command:
     release_opens: bool = False
 
     def to_bytes(self) -> bytes:
-        """Six bytes, for the registers from ``COMMAND`` on."""
+        """Encode six bytes, for the registers from ``COMMAND`` on."""
         action = _ACT * self.activate | _GTO * self.go | _ATR * self.release | _ARD * self.release_opens
         return bytes([action, 0, 0, self.position, self.speed, self.force])
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Command:
-        """Of six bytes."""
+        """Decode six bytes."""
         a, (position, speed, force) = data[0], data[3:6]
         return cls(bool(a & _ACT), bool(a & _GTO), position, speed, force, bool(a & _ATR), bool(a & _ARD))
 
 
 @dataclass(frozen=True)
 class Status:
-    """What it tells.
+    """Status registers.
 
     Args:
         activated: gACT.
@@ -87,7 +87,7 @@ class Status:
         activation: gSTA.
         fingers: gOBJ.
         fault: gFLT, 0 for none.
-        requested: gPR, the position it was last told.
+        requested: gPR, echo of the last requested position.
         position: gPO, 0 open .. 255 closed.
         current: gCU [mA].
     """
@@ -102,13 +102,13 @@ class Status:
     current: int
 
     def to_bytes(self) -> bytes:
-        """Six bytes, of the registers from ``STATUS`` on."""
+        """Encode six bytes, of the registers from ``STATUS`` on."""
         first = _ACT * self.activated | _GTO * self.going | self.activation << 4 | self.fingers << 6
         return bytes([first, 0, self.fault, self.requested, self.position, self.current // 10])
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Status:
-        """Of six bytes.
+        """Decode six bytes.
 
         Raises:
             GripperError: gSTA has a value that means nothing.

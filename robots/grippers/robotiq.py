@@ -1,4 +1,4 @@
-"""Robotiq's 2F-85 and 2F-140 over Modbus RTU: activated, moved, asked, and at rest where anything goes wrong."""
+"""Driver of Robotiq's 2F-85 and 2F-140 over Modbus RTU; it stops the gripper after every error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from splatbot.robots.grippers.registers import (
 )
 
 _POLL = 0.01  # [s] between questions
-_ECHO = 0.5  # [s] in which the gripper must tell the position that it was told
+_ECHO = 0.5  # [s] within which the gripper must echo the requested position
 _log = logging.getLogger(__name__)
 
 
@@ -38,7 +38,7 @@ class FaultError(GripperError):
 
 @dataclass(frozen=True)
 class Model:
-    """What a gripper can do (data sheets); values between the ends are taken as linear in the registers.
+    """Limits of a gripper (data sheets); values between the ends are linear in the registers.
 
     Args:
         stroke: widest opening [m].
@@ -54,12 +54,12 @@ class Model:
     closed_at: int = 230
 
     def opening(self, position: int) -> float:
-        """[m] at gPO."""
+        """Return the opening [m] at gPO."""
         share = (self.closed_at - position) / (self.closed_at - self.open_at)
         return self.stroke * min(max(share, 0.0), 1.0)
 
     def position(self, opening: float) -> int:
-        """rPR of an opening [m]; the ends are asked for in full."""
+        """Return rPR of an opening [m]; the ends map to 0 and 255."""
         if opening <= 0.0:
             return 255
         if opening >= self.stroke:
@@ -76,9 +76,9 @@ MODELS = {
 class RobotiqGripper:
     """A :class:`splatbot.protocols.Gripper` on a serial port.
 
-    Whatever goes wrong (no answer, a wrong checksum again and again, a port that is gone, a fault) is a
-    :class:`splatbot.errors.GripperError`; the gripper is then told once to stand still, and takes no move until it is
-    activated again. No call lasts longer than its time-outs.
+    Every failure is a :class:`splatbot.errors.GripperError`: no answer, repeated wrong checksums, a missing port, a
+    fault. The gripper is then stopped once, and accepts no move until it is activated again. No call lasts longer than
+    its time-outs.
 
     Args:
         port: as "/dev/ttyUSB0".
@@ -129,7 +129,7 @@ class RobotiqGripper:
     def activate(self, *, again: bool = False, patience: float = 10.0) -> None:
         """Clear faults and activate: the fingers close and open once. Opens the port again if it was lost.
 
-        A gripper that is active and at no fault is left as it is, with what it holds, unless ``again``.
+        An active gripper without a fault is left unchanged, with the object that it holds, unless ``again``.
 
         Raises:
             GripperError: it does not become ready within ``patience`` [s].
@@ -155,7 +155,7 @@ class RobotiqGripper:
 
         Raises:
             InputError: a value is out of range.
-            GripperError: it must be activated first, or cannot be told.
+            GripperError: it is not activated, or does not answer.
         """
         check_move(self.stroke, opening, force, speed)
         if self._unsafe:
@@ -169,7 +169,7 @@ class RobotiqGripper:
             self._write(self._told)
 
     def status(self) -> Status:
-        """All that it tells, once it tells of what it was told last.
+        """Return the status once it refers to the last command.
 
         Raises:
             FaultError: it reports a fault.
@@ -179,46 +179,46 @@ class RobotiqGripper:
             return self._status()
 
     def moving(self) -> bool:
-        """Whether the fingers are still on their way."""
+        """Return True while the fingers move."""
         status = self.status()
         return status.going and status.fingers is Fingers.MOVING
 
     def opening(self) -> float:
-        """Between the fingers now [m]."""
+        """Return the distance between the fingers [m]."""
         return self.model.opening(self.status().position)
 
     def holds(self) -> bool:
-        """Whether something stopped the fingers, and still does; not known, so False, after :meth:`stop`."""
+        """Return True while an object blocks the fingers. The state is unknown, so False, after :meth:`stop`."""
         status = self.status()
         return status.going and status.fingers in (Fingers.STOPPED_CLOSING, Fingers.STOPPED_OPENING)
 
     def wait(self, seconds: float = 5.0) -> None:
-        """Until the fingers rest.
+        """Wait until the fingers rest.
 
         Raises:
-            GripperError: they do not within that time [s]; they are then told to.
+            GripperError: the fingers still move after that time [s]; they are stopped then.
         """
         with self._secured():
             self._until(lambda s: not (s.going and s.fingers is Fingers.MOVING), seconds, "still moves")
 
     def stop(self) -> None:
-        """Stay where they are; what is held stays held.
+        """Stop the fingers; a held object stays held.
 
         Raises:
-            GripperError: it cannot be told.
+            GripperError: it does not answer.
         """
         with self._secured():
             self._told = replace(self._told or Command(), go=False)
             self._write(self._told)
 
     def release(self, *, opens: bool = True) -> None:
-        """Let go slowly, whatever else it was told (automatic release); it must be activated afterwards.
+        """Release slowly in any state (automatic release); the gripper must be activated afterwards.
 
         Raises:
-            GripperError: it cannot be told.
+            GripperError: it does not answer.
         """
         with self._secured():
-            self._unsafe = "it was told to release"
+            self._unsafe = "it was released"
             self._write(Command(release=True, release_opens=opens))
 
     def calibrate(self, *, patience: float = 10.0) -> Model:
@@ -234,13 +234,13 @@ class RobotiqGripper:
             ends.append(self.status().position)
         closed, opened = ends
         if not opened + 128 <= closed:
-            hint = "take away what is between the fingers"
+            hint = "remove the object between the fingers"
             raise GripperError(f"closes at {closed} and opens at {opened}.", field=self._port, hint=hint)
         self.model = replace(self.model, open_at=opened, closed_at=closed)
         return self.model
 
     def close(self) -> None:
-        """Give the port back. The fingers keep what they hold."""
+        """Give the port back. The fingers keep a held object."""
         if self._client is not None:
             self._client.close()
         self._client, self._unsafe = None, "its port is closed"
@@ -258,19 +258,19 @@ class RobotiqGripper:
         self._asked.write(COMMAND, command.to_bytes())
 
     def _status(self) -> Status:
-        """As :meth:`status`. A status from before the last command would tell of other fingers: its echo says so."""
+        """Read the status until its echo matches the last command; earlier ones describe another motion."""
         until = time.monotonic() + _ECHO
         while True:
             status = self._read()
             if status.fault == NO_COMMUNICATION:
-                _log.info("nothing was said to %s for a second", self._port)
+                _log.info("no communication with %s for a second", self._port)
             elif status.fault:
                 raise FaultError(status, field=self._port)
             if self._told is None or (status.requested, status.going) == (self._told.position, self._told.go):
                 return status
             if time.monotonic() > until:
                 hint = "check that nothing else commands it; activate it"
-                raise GripperError("does not tell what it was told.", field=self._port, hint=hint)
+                raise GripperError("does not echo the last command.", field=self._port, hint=hint)
             time.sleep(_POLL)
 
     def _read(self) -> Status:
@@ -293,7 +293,7 @@ class RobotiqGripper:
 
     @contextmanager
     def _secured(self) -> Iterator[None]:
-        """After an error nothing moves: it is told once to stand still, and moves are refused."""
+        """Stop once after an error, and refuse further moves."""
         try:
             yield
         except GripperError as error:
@@ -318,5 +318,5 @@ class RobotiqGripper:
 
 
 def _register(value: float | None, least: float, most: float, *, default: int) -> int:
-    """0..255 between the least and the most."""
+    """Scale a value to 0..255 between its limits."""
     return default if value is None else round(255 * min(max((value - least) / (most - least), 0.0), 1.0))
