@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UncertaintyParameters:
-    """Empirical constants of the covariance. Larger values increase it; docs/tracking.md has the NEES."""
+    """Empirical constants of the covariance. Larger values increase it; docs/experiments/tracking.md has the NEES."""
 
     min_information: float = 1e-3
     """Information [1/m²] and [1/rad²] of any pose: alignment finds it within about 30 m of its start."""
