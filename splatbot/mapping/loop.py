@@ -156,7 +156,7 @@ class LoopCloser:
 
     def state(self) -> dict[str, Any]:
         """Return the state for :meth:`restore`, by reference; containers are copied."""
-        state = {name: copy_of(value) for name, value in vars(self).items() if name not in ("config", "graph")}
+        state = {name: _shallow_copy(value) for name, value in vars(self).items() if name not in ("config", "graph")}
         return state | {"graph": PoseGraph(dict(self.graph.poses), list(self.graph.edges))}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -328,7 +328,7 @@ class LoopCloser:
         return found.overlap >= self.config.loops.min_overlap and found.inliers >= self.config.loops.min_inliers
 
 
-def copy_of(value: Any) -> Any:
+def _shallow_copy(value: Any) -> Any:
     """Return a shallow copy of a list or dict, other values as they are."""
     return value.copy() if isinstance(value, list | dict) else value
 
