@@ -51,7 +51,7 @@ splatbot::AlignPoints points_of(const Rows3& points, const Rows3& normals, const
   return {span_of(points), span_of(normals), span_of(gray)};
 }
 
-// What Python holds: the arrays stay alive through the call because the caller's tuples do.
+// Arguments from Python. The caller's tuples keep the arrays alive during the call.
 using LevelArrays = std::tuple<Image, Image, Intrinsics>;
 using PointArrays = std::tuple<Rows3, Rows3, Vector>;
 using ReferenceArrays = std::pair<Pose, std::vector<PointArrays>>;

@@ -15,8 +15,8 @@ constexpr double kDamping = 1e-5;        // share of the mean diagonal of H
 
 constexpr double kMinDepth = 1e-3;  // [m] of points in front of the camera
 
-// Share of the Gauss-Newton information that remains in the Hessian of the robust cost: Σ ψ'(r) / Σ ψ(r)/r over Student-t
-// residuals r/σ, where ψ is the derivative of the cost (Huber 1967).
+// Ratio of the Hessian of the robust cost to the Gauss-Newton information, Σ ψ'(r) / Σ ψ(r)/r over Student-t residuals r/σ.
+// ψ is the derivative of the cost (Huber 1967).
 struct RobustCurvature {
   double curvature = 0.0, weight = 0.0;
 
@@ -129,7 +129,7 @@ class DenseTerm {
   DenseTerm(const AlignImage& image, const AlignPoints& points, std::span<const double, 16> T_world_reference)
       : image_(image), points_(points), T_world_reference_(pose_from(T_world_reference)) {}
 
-  // Add the marginalised normal equations to `total` and keep what `update_exposure` and `add_cells` need.
+  // Add the marginalised normal equations to `total`. Keeps the blocks that `update_exposure` and `add_cells` use.
   void add(const Pose& T_camera_world, const AlignPlan& plan, double weight, NormalEquations& total) {
     const AlignSums s = linearize(points_, T_camera_world * T_world_reference_, plan.settings, {}, {});
     const std::array<double, 3> inverse = exposure_inverse(s);
@@ -330,7 +330,7 @@ Weights adapted_weights(const std::vector<DenseTerm>& terms, const AlignMatches&
 // Ten points for each degree of freedom. Fewer points fit noise, and their step can diverge.
 constexpr std::size_t kMinPoints = 60;
 
-// Whether a level constrains the pose. Coarse levels of distant or patchy surfaces have few points.
+// Returns whether a level constrains the pose. Coarse levels of distant or patchy surfaces have few points.
 bool constrains_pose(std::size_t level, std::span<const AlignReference> references, const AlignMatches& matches,
                      const AlignPrior* prior) {
   std::size_t n = matches.points.size() / 3;

@@ -25,7 +25,7 @@ struct AlignMatches {
   std::span<const double> sigmas;  // (M,) [px]
 };
 
-// What is known of the pose besides: where it should be, and the information of the twist (t, ω) that left-multiplies it.
+// Prior of the pose: its mean, and the information of the twist (t, ω) that left-multiplies it.
 struct AlignPrior {
   std::array<double, 16> T_camera_world;
   std::array<double, 36> information{};  // (6, 6)
@@ -36,26 +36,26 @@ struct AlignPlan {
   double dense_weight = 1.0;  // of a dense residual against a match's: neighbours are correlated
   int iterations = 5;         // per level, at most
   std::size_t finest = 0;     // level to end on
-  // On the last level both kinds are weighed by the spread that they show; the dense ones with this share of it, since
-  // they err together across cells too (a rolling shutter, depth registered late). 0: keep the weights.
+  // If positive, the last level weights both kinds of residuals by the spread that they show. Dense residuals get this share
+  // of their weight, as their errors correlate across cells as well (rolling shutter, late depth).
   double dense_share = 0.0;
 };
 
 struct AlignResult {
   std::array<double, 16> T_camera_world;
-  std::array<double, 36> H{};       // (6, 6) information of the last linearisation, the prior's left out
-  std::array<double, 36> curvature{};  // (6, 6) of the robust cost: less than H by what outlying residuals do not curve
+  std::array<double, 36> H{};       // (6, 6) information of the last linearisation, without the prior's
+  std::array<double, 36> curvature{};  // (6, 6) Hessian of the robust cost; outliers make it smaller than H
   std::array<double, 36> spread{};  // (6, 6) Σ g gᵀ over the cells of the image, g the gradient of a cell's residuals
   double dense_weight = 0, match_weight = 0;  // of one residual, at the end
   std::size_t cells = 0;            // cells that have residuals
 };
 
-// Gauss-Newton over the levels, coarse to fine. Each reference has its own exposure, which is marginalised (Schur
-// complement) and follows the step; it starts neutral on every level. `prior` may be null; without one, a level above the
-// finest with fewer than 60 points and matches is passed over.
+// Gauss-Newton over the levels, coarse to fine: H δ = -g with H = Σ w JᵀJ and g = Σ w Jᵀr, then T <- exp(δ) T. Each reference
+// has its own exposure, which the Schur complement marginalises. It starts neutral on every level. `prior` may be null.
+// Without a prior, levels above the finest with fewer than 60 points and matches are skipped.
 //
-// The spread is taken at the result, over kAlignCells cells: what residuals of one cell have in common (blur, a depth
-// that is wrong all over a surface) counts as often as it occurs, whatever the noise model says. With C the curvature,
+// The spread is evaluated at the result over kAlignCellColumns x kAlignCellRows cells. It includes errors common to the
+// residuals of a cell (blur, a wrong depth of a surface). The noise model does not cover them. With the curvature C,
 // C⁻¹ spread C⁻¹ is the cluster-robust covariance (Huber 1967; Liang and Zeger 1986).
 constexpr int kAlignCellColumns = 8, kAlignCellRows = 6;
 AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,

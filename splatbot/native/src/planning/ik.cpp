@@ -32,8 +32,8 @@ Vector6 pose_error(const Pose& current, const Pose& goal) {
   return e;
 }
 
-// Column of the geometric Jacobian: (z x (p - o), z) of a revolute joint, (z, 0) of a prismatic one, with the joint's axis
-// z and origin o.
+// Column of the geometric Jacobian of a joint with axis z and origin o. It is (z x (p - o), z) for a revolute joint and
+// (z, 0) for a prismatic joint.
 Vector6 jacobian_column(const double* T_world_joint, bool prismatic, const Eigen::Vector3d& p) {
   const Pose34 T(T_world_joint);
   const Eigen::Vector3d z = T.col(2), o = T.col(3);

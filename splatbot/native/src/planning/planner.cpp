@@ -12,7 +12,7 @@ namespace splatbot::planning {
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-constexpr double kConnectRange = 1.5, kStarRange = 2.0;  // [rad] longest new edges
+constexpr double kConnectRange = 1.5, kRrtStarRange = 2.0;  // [rad] longest new edges
 constexpr double kLocalShare = 0.5;                      // of RRT*'s samples that are near the best path
 constexpr int kRound = 60;                               // samples between two rounds of shortcuts or restarts
 constexpr int kAttempts = 30, kFirstAttempts = 100;      // shortcuts tried in a row
@@ -35,7 +35,7 @@ void Planner::forget_best() {
   best_ = {{}, kInfinity, {}};
 }
 
-void Planner::publish(double seconds) { publish(star_->path(), star_->best(), seconds); }
+void Planner::publish(double seconds) { publish(rrt_star_->path(), rrt_star_->best(), seconds); }
 
 void Planner::publish(Configuration waypoints, double cost, double seconds) {
   const std::lock_guard lock(mutex_);
@@ -59,7 +59,7 @@ PlanEnd Planner::run(std::span<const double> start, std::span<const double> goal
 void Planner::begin(std::span<const double> start) {
   start_.assign(start.begin(), start.end());
   sampler_ = std::make_unique<Sampler>(*space_, start_, goals_);
-  star_ = std::make_unique<Star>(*space_, *sampler_, start_, kStarRange);
+  rrt_star_ = std::make_unique<RrtStar>(*space_, *sampler_, start_, kRrtStarRange);
   connect_ = std::make_unique<Connect>(*space_, *sampler_, kConnectRange);
   edges_before_ = space_->edges();
   iterations_ = 0;
@@ -80,14 +80,14 @@ PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLi
     publish(connect_->path(), connect_->cost(), stop.elapsed());
   }
   Configuration orphans;
-  star_->cut(added, stop, orphans);
-  if (!star_->start_from(start.data())) {
-    star_ = std::make_unique<Star>(*space_, *sampler_, start_, kStarRange);
+  rrt_star_->cut(added, stop, orphans);
+  if (!rrt_star_->start_from(start.data())) {
+    rrt_star_ = std::make_unique<RrtStar>(*space_, *sampler_, start_, kRrtStarRange);
   }
   if (met) {
-    star_->adopt(*connect_);
+    rrt_star_->adopt(*connect_);
   }
-  if (std::isfinite(star_->best())) {
+  if (std::isfinite(rrt_star_->best())) {
     publish(stop.elapsed());
   }
   join(orphans, stop);
@@ -97,7 +97,7 @@ PlanEnd Planner::rerun(std::span<const double> start, Space& added, const PlanLi
 // Configurations of the old tree: reconnects those that are still reachable.
 void Planner::join(const Configuration& orphans, const Stop& stop) {
   for (std::size_t i = 0; i < orphans.size() && !stop.now(); i += space_->size()) {
-    if (star_->grow(orphans.data() + i, stop)) {
+    if (rrt_star_->grow(orphans.data() + i, stop)) {
       publish(stop.elapsed());
     }
   }
@@ -105,17 +105,17 @@ void Planner::join(const Configuration& orphans, const Stop& stop) {
 
 // Until there is a path, and then until time is up.
 PlanEnd Planner::search(const PlanLimits& limits, const Stop& stop) {
-  if (!std::isfinite(star_->best()) && iterations_ < limits.iterations) {
+  if (!std::isfinite(rrt_star_->best()) && iterations_ < limits.iterations) {
     std::uint64_t left = limits.iterations - iterations_;
     const bool met = connect_->run(start_, random_, stop, kInfinity, left);
     iterations_ = limits.iterations - left;
     if (met) {
-      star_->adopt(*connect_);
+      rrt_star_->adopt(*connect_);
       publish(stop.elapsed());
     }
   }
   const bool found = std::isfinite(best_.cost);
-  if (std::isfinite(star_->best())) {
+  if (std::isfinite(rrt_star_->best())) {
     improve(limits, stop);
   }
   const bool cancelled = cancelled_.exchange(false);
@@ -135,7 +135,7 @@ void Planner::shorten(const Configuration& path, int attempts, const Stop& stop)
   for (int i = 0; i < attempts && vain < kIdle && !stop.now(); ++i) {
     vain = shortcut.improve(random_) ? 0 : vain + 1;
   }
-  if (star_->insert(shortcut.waypoints())) {
+  if (rrt_star_->insert(shortcut.waypoints())) {
     publish(stop.elapsed());
   }
 }
@@ -144,28 +144,28 @@ void Planner::improve(const PlanLimits& limits, const Stop& stop) {
   const double straight = sampler_->to_goal(start_.data()) * (1.0 + 1e-9);  // nothing is shorter
   const double enough = std::max(limits.good_enough, straight);
   Configuration q(space_->size());
-  shorten(star_->path(), kFirstAttempts, stop);
+  shorten(rrt_star_->path(), kFirstAttempts, stop);
   std::size_t settled = kFewNodes;
-  for (int round = 1; iterations_ < limits.iterations && star_->best() > enough && !stop.now(); ++round, ++iterations_) {
+  for (int round = 1; iterations_ < limits.iterations && rrt_star_->best() > enough && !stop.now(); ++round, ++iterations_) {
     if (round % kRound == 0) {
       std::uint64_t left = kRestartSamples;
-      if (connect_->run(start_, random_, stop, star_->best() * kRestartBound, left)) {
+      if (connect_->run(start_, random_, stop, rrt_star_->best() * kRestartBound, left)) {
         shorten(connect_->path(), kAttempts, stop);
       }
       continue;
     }
     if (round % kRound == kRound / 2) {
-      shorten(star_->path(), kAttempts, stop);
+      shorten(rrt_star_->path(), kAttempts, stop);
       continue;
     }
     const bool sampled = random_.uniform() < kLocalShare ? near_best(q.data())
-                                                         : sampler_->informed(random_, star_->best(), q.data());
-    if (sampled && star_->grow(q.data(), stop)) {
+                                                         : sampler_->informed(random_, rrt_star_->best(), q.data());
+    if (sampled && rrt_star_->grow(q.data(), stop)) {
       publish(stop.elapsed());
     }
-    if (star_->tree().size() > 2 * settled) {
-      star_->prune();
-      settled = std::max(kFewNodes, star_->tree().size());
+    if (rrt_star_->tree().size() > 2 * settled) {
+      rrt_star_->prune();
+      settled = std::max(kFewNodes, rrt_star_->tree().size());
     }
   }
 }

@@ -9,7 +9,7 @@
 #include <span>
 #include <vector>
 
-#include "splatbot/planning/star.hpp"
+#include "splatbot/planning/rrt_star.hpp"
 
 namespace splatbot::planning {
 
@@ -49,7 +49,7 @@ class Planner {
   void cancel() noexcept { cancelled_.store(true, std::memory_order_relaxed); }
 
   // Statistics of the last run.
-  const Tree* tree() const noexcept { return star_ ? &star_->tree() : nullptr; }
+  const Tree* tree() const noexcept { return rrt_star_ ? &rrt_star_->tree() : nullptr; }
   std::uint64_t iterations() const noexcept { return iterations_; }
   std::uint64_t edges() const noexcept { return space_->edges() - edges_before_; }
 
@@ -67,7 +67,7 @@ class Planner {
   std::shared_ptr<Space> space_;
   Configuration start_, goals_;
   std::unique_ptr<Sampler> sampler_;
-  std::unique_ptr<Star> star_;
+  std::unique_ptr<RrtStar> rrt_star_;
   std::unique_ptr<Connect> connect_;
   Random random_{0};
   std::atomic<bool> cancelled_{false};

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "splatbot/planning/star.hpp"
+#include "splatbot/planning/rrt_star.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -9,15 +9,15 @@ namespace splatbot::planning {
 
 namespace {
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-constexpr double kGain = 1e-9;  // relative: what a cheaper way must save
+constexpr double kMinSaving = 1e-9;  // relative saving of a cheaper path
 }  // namespace
 
-Star::Star(Space& space, Sampler& sampler, std::span<const double> start, double range)
+RrtStar::RrtStar(Space& space, Sampler& sampler, std::span<const double> start, double range)
     : space_(&space), sampler_(&sampler), range_(range), tree_(space), goal_nodes_(sampler.goals(), -1), best_(kInfinity), step_(space.size()) {
   root_ = enter(start.data(), -1);
 }
 
-std::int32_t Star::enter(const double* q, std::int32_t parent) {
+std::int32_t RrtStar::enter(const double* q, std::int32_t parent) {
   const std::int32_t node = tree_.add(q, parent);
   for (std::size_t g = 0; g < goal_nodes_.size(); ++g) {
     if (goal_nodes_[g] < 0 && std::equal(q, q + space_->size(), sampler_->goal(g))) {
@@ -27,8 +27,8 @@ std::int32_t Star::enter(const double* q, std::int32_t parent) {
   return node;
 }
 
-// The node that is exactly there, or -1.
-std::int32_t Star::find(const double* q) {
+// Returns the node at exactly q, or -1.
+std::int32_t RrtStar::find(const double* q) {
   for (std::size_t g = 0; g < goal_nodes_.size(); ++g) {
     if (goal_nodes_[g] >= 0 && std::equal(q, q + space_->size(), sampler_->goal(g))) {
       return goal_nodes_[g];
@@ -38,7 +38,7 @@ std::int32_t Star::find(const double* q) {
   return near >= 0 && std::equal(q, q + space_->size(), tree_.at(near)) ? near : -1;
 }
 
-bool Star::update() {
+bool RrtStar::update() {
   double least = kInfinity;
   for (const std::int32_t node : goal_nodes_) {
     if (node >= 0 && tree_.cost(node) < least) {
@@ -51,7 +51,7 @@ bool Star::update() {
   return better;
 }
 
-Configuration Star::path() const {
+Configuration RrtStar::path() const {
   Configuration q;
   for (const std::int32_t node : tree_.branch(best_node_)) {
     q.insert(q.end(), tree_.at(node), tree_.at(node) + space_->size());
@@ -59,16 +59,16 @@ Configuration Star::path() const {
   return q;
 }
 
-void Star::adopt(const Connect& connect) {
+void RrtStar::adopt(const Connect& connect) {
   const Tree& a = connect.from_start();
   const Tree& b = connect.from_goals();
   std::vector<std::int32_t> renamed(a.size(), root_);  // the root is already there
   for (std::int32_t i = 1; i < static_cast<std::int32_t>(a.size()); ++i) {
     renamed[static_cast<std::size_t>(i)] = enter(a.at(i), renamed[static_cast<std::size_t>(a.parent(i))]);
   }
-  // What the meeting's goal tree holds, walked from the meeting outwards.
+  // A node of the goals' tree in a depth-first traversal from the meeting node.
   struct Visit {
-    std::int32_t node, from, parent;  // in b, whence in b, in this tree
+    std::int32_t node, from, parent;  // in b; the predecessor in b; the parent in this tree
   };
   std::vector<Visit> waiting{{connect.meeting(1), -1, renamed[static_cast<std::size_t>(connect.meeting(0))]}};
   while (!waiting.empty()) {
@@ -88,8 +88,8 @@ void Star::adopt(const Connect& connect) {
   update();
 }
 
-// The neighbours of q, those that promise the cheapest way first.
-void Star::gather(const double* q) {
+// Collects the neighbours of q, sorted by the cost of the path over them.
+void RrtStar::gather(const double* q) {
   const double dims = static_cast<double>(space_->size());
   const double n = static_cast<double>(tree_.size() + 1);
   const auto k = static_cast<std::size_t>(std::ceil(2.718281828459045 * (1.0 + 1.0 / dims) * std::log(n)));
@@ -103,7 +103,7 @@ void Star::gather(const double* q) {
   });
 }
 
-bool Star::grow(const double* q, const Stop& stop) {
+bool RrtStar::grow(const double* q, const Stop& stop) {
   const std::size_t dims = space_->size();
   const std::int32_t near = tree_.index().nearest(q);
   const double apart = space_->distance(tree_.at(near), q);
@@ -133,7 +133,7 @@ bool Star::grow(const double* q, const Stop& stop) {
   const std::int32_t node = enter(step_.data(), parent);
   for (const Candidate& c : candidates_) {
     const double total = tree_.cost(node) + c.length;
-    if (c.blocked || c.node == parent || !(total < tree_.cost(c.node) * (1.0 - kGain)) ||
+    if (c.blocked || c.node == parent || !(total < tree_.cost(c.node) * (1.0 - kMinSaving)) ||
         total + sampler_->to_goal(tree_.at(c.node)) >= best_) {
       continue;
     }
@@ -147,7 +147,7 @@ bool Star::grow(const double* q, const Stop& stop) {
   return update();
 }
 
-bool Star::insert(const Configuration& path) {
+bool RrtStar::insert(const Configuration& path) {
   const std::size_t dims = space_->size();
   std::int32_t above = root_;
   for (std::size_t i = dims; i < path.size(); i += dims) {
@@ -155,7 +155,7 @@ bool Star::insert(const Configuration& path) {
     std::int32_t node = find(q);
     if (node < 0) {
       node = enter(q, above);
-    } else if (tree_.cost(above) + space_->distance(tree_.at(above), q) < tree_.cost(node) * (1.0 - kGain)) {
+    } else if (tree_.cost(above) + space_->distance(tree_.at(above), q) < tree_.cost(node) * (1.0 - kMinSaving)) {
       tree_.hang(node, above);
     }
     above = node;
@@ -163,7 +163,7 @@ bool Star::insert(const Configuration& path) {
   return update();
 }
 
-void Star::prune() {
+void RrtStar::prune() {
   if (!std::isfinite(best_)) {
     return;
   }
@@ -171,7 +171,7 @@ void Star::prune() {
   std::vector<std::uint8_t> kept(n, 0);
   for (std::size_t i = 0; i < n; ++i) {
     const auto node = static_cast<std::int32_t>(i);
-    if (kept[i] != 0 || sampler_->through(tree_.at(node)) > best_ * (1.0 + kGain)) {
+    if (kept[i] != 0 || sampler_->through(tree_.at(node)) > best_ * (1.0 + kMinSaving)) {
       continue;
     }
     for (std::int32_t up = node; up >= 0 && kept[static_cast<std::size_t>(up)] == 0; up = tree_.parent(up)) {
@@ -182,7 +182,7 @@ void Star::prune() {
   drop(kept);
 }
 
-void Star::drop(const std::vector<std::uint8_t>& kept) {
+void RrtStar::drop(const std::vector<std::uint8_t>& kept) {
   const std::vector<std::int32_t> renamed = tree_.keep(kept);
   root_ = renamed[static_cast<std::size_t>(root_)];
   for (std::int32_t& node : goal_nodes_) {
@@ -191,7 +191,7 @@ void Star::drop(const std::vector<std::uint8_t>& kept) {
   update();
 }
 
-bool Star::cut(Space& added, const Stop& stop, Configuration& orphans) {
+bool RrtStar::cut(Space& added, const Stop& stop, Configuration& orphans) {
   const std::size_t n = tree_.size();
   orphans.clear();
   std::vector<std::uint8_t> free(n, 0), kept(n, 0);
@@ -226,7 +226,7 @@ bool Star::cut(Space& added, const Stop& stop, Configuration& orphans) {
   return in_time;
 }
 
-bool Star::start_from(const double* q) {
+bool RrtStar::start_from(const double* q) {
   std::int32_t node = find(q);
   if (node == root_) {
     return true;
