@@ -48,16 +48,15 @@ class StageScheduler:
         hypotheses = self._refine([start, *proposals.values()])
         best = self._score(hypotheses)
         again = [stage for stage in stages if stage.is_needed_again(problem, best)]
-        n_runs, n_scored = 0, len(hypotheses)
-        for stage, effort in self._affordable(again, best.hypothesis):
-            n_runs += 1
-            hypothesis = stage.run(problem, best.hypothesis, effort)
-            if hypothesis is not None:
-                chosen = self._choose_effort(self._stages.refinement, hypothesis, len(hypotheses) + 1)
-                hypotheses.append(self._refine_one(hypothesis, *chosen))
-        if len(hypotheses) > n_scored:
+        found = [
+            stage.run(problem, best.hypothesis, effort) for stage, effort in self._affordable(again, best.hypothesis)
+        ]
+        for hypothesis in filter(None, found):
+            chosen = self._choose_effort(self._stages.refinement, hypothesis, len(hypotheses) + 1)
+            hypotheses.append(self._refine_one(hypothesis, *chosen))
+        if any(found):
             best = self._score(hypotheses)
-        if n_runs < len(again):
+        if len(found) < len(again):
             best = best.degraded("another pose may explain the frame better: no time was left for it")
         if not best.hypothesis.is_refined:
             best = best.degraded("not aligned on fine levels: no time was left for them")
@@ -75,9 +74,9 @@ class StageScheduler:
     def _affordable(
         self, stages: Iterable[TrackingStage], hypothesis: Hypothesis
     ) -> Iterator[tuple[TrackingStage, int]]:
-        """Yield the stages that fit the remaining time, with their effort; the caller runs each before the next.
+        """Yield the stages that fit the remaining time, with their effort; stages that do not fit are skipped.
 
-        The time of the caller is charged to the stage. Stages that do not fit are recorded as skipped.
+        The caller runs a stage, and nothing else, before it takes the next one: its time is charged to the stage.
         """
         for stage in stages:
             for _ in range(stage.repetitions(self._problem)):

@@ -6,6 +6,7 @@ import ast
 import inspect
 import textwrap
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,24 @@ def test_a_wrong_pose_of_local_matching_is_replaced_by_that_of_all_features(wron
     assert result.T_world_camera is not None
     assert result.verdict == "ok"
     assert pose_distance(TRUE, result.T_world_camera)[0] < 2e-3
+
+
+def test_the_time_of_a_stage_is_charged_to_no_other_stage(
+    wrong_start: WrongStart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, open_runs, kinds = Budget.run, list[str](), list[str]()
+
+    @contextmanager
+    def charge(budget: Budget, kind: str, units: float, under: str | None = None) -> Iterator[None]:
+        assert open_runs == []
+        open_runs.append(kind)
+        with run(budget, kind, units, under):
+            yield
+        kinds.append(open_runs.pop())
+
+    monkeypatch.setattr(Budget, "run", charge)
+    wrong_start.result()
+    assert kinds[-4:] == ["health", "match all", "direct", "health"]
 
 
 def test_without_time_for_all_keyframes_features_are_matched_with_the_nearest(
