@@ -1,1 +1,1 @@
-"""Measurements of speed, and of what accuracy costs in time (`splatbot bench`)."""
+"""Benchmarks (`splatbot bench`): speed, and accuracy over time."""

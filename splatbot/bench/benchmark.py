@@ -88,7 +88,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What `splatbot bench NAME` runs and shows.
+    """The measurement and the tables of `splatbot bench NAME`.
 
     Args:
         settings: The class of the settings; its docstring is the help of the command.

@@ -1,4 +1,4 @@
-"""The planner's table top, filmed in an arc with a noisy depth camera, and the map that is made of it."""
+"""A film of the table top by a noisy depth camera on an arc, and its map."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
 
 NOISY = ("depth_noise", "depth_holes")
-TARGET, RADIUS = np.array([0.5, 0.1, 0.1]), 1.15  # [m]; of the camera's way around
+TARGET, RADIUS = np.array([0.5, 0.1, 0.1]), 1.15  # [m] centre and radius of the camera's arc
 MIDDLE, SWING = 0.70, 0.15  # [m] height over the table top
-ARC = np.radians(75.0)  # to both sides of where the robot stands
-WHOLE = 120  # frames; fewer end on the way
+ARC = np.radians(75.0)  # to both sides of the robot
+FULL_ARC = 120  # frames; fewer cover a part of it
 RATE = 30.0  # [Hz]
 _FLOOR = RaycastSurface(
     box([8.0, 8.0, 0.02]).placed([0.5, 0.0, -0.8]), Texture((0.60, 0.58, 0.55), (0.30, 0.30, 0.33), 0.30)
@@ -37,18 +37,18 @@ _COLORS = ((0.80, 0.62, 0.42), (0.85, 0.85, 0.80), (0.20, 0.70, 0.35), (0.95, 0.
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Frames of the shapes, and from where they were taken.
+    """Frames of the shapes with their exact poses.
 
     Args:
-        frames: with noise and holes in their depth.
-        T_scene_camera: (F, 4, 4), exact.
+        frames: Frames whose depth has noise and holes.
+        T_scene_camera: (F, 4, 4), exact poses.
     """
 
     frames: list[Frame]
     T_scene_camera: Array
 
-    def seen(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point of the true surface (P, 3) is what some frame's depth shows, from its true pose."""
+    def observed(self, points: Array) -> NDArray[np.bool_]:
+        """Return whether the depth image of any frame, at its true pose, observes each surface point (P, 3)."""
         seen = np.zeros(len(points), np.bool_)
         for frame, T in zip(self.frames, self.T_scene_camera, strict=True):
             rows, measured, z = measured_depths(points, frame.depth, frame.camera, T)
@@ -58,12 +58,12 @@ class Film:
 
 @dataclass(frozen=True, eq=False)
 class FilmedMap:
-    """What `Slam` made of a film.
+    """The map of a film by `Slam`.
 
     Args:
-        film: of the shapes.
-        snapshot: of the map, whose world is its first camera.
-        T_world_camera: (F, 4, 4) as tracked, NaN where lost.
+        film: The mapped film.
+        snapshot: Snapshot of the map; its world frame is the first camera.
+        T_world_camera: (F, 4, 4), estimated poses, NaN where lost.
     """
 
     film: Film
@@ -72,25 +72,25 @@ class FilmedMap:
 
     @property
     def T_map_scene(self) -> Array:
-        """(4, 4); exact, as the first camera is where the map's world is."""
+        """Exact pose (4, 4) of the scene; the first camera is the world frame of the map."""
         return np.asarray(np.linalg.inv(self.film.T_scene_camera[0]))
 
     def views(self) -> Iterator[tuple[NDArray[np.float32], Camera, Array]]:
-        """What the map knows of itself: its frames' depth, from where it believes that they were taken."""
+        """Yield depth, camera and estimated pose of each tracked frame, the information available to the map."""
         for frame, T in zip(self.film.frames, self.T_world_camera, strict=True):
             if np.isfinite(T).all():
                 yield frame.depth, frame.camera, T
 
     def drift(self) -> Array:
-        """How far (F,) [m] each tracked camera is from where it was; NaN where lost."""
+        """Return the position error (F,) [m] of each tracked camera, NaN where lost."""
         true = transform_points(self.T_map_scene, self.film.T_scene_camera[:, :3, 3])
         return np.asarray(np.linalg.norm(self.T_world_camera[:, :3, 3] - true, axis=1))
 
 
 def shoot(scene: Tabletop, frames: int, width: int, seed: int = 0) -> Film:
-    """From behind the robot 75 degrees to one side, to the other and back, 55 to 85 cm over the table, the floor below.
+    """Render a film of the scene from behind the robot, 75 degrees to both sides, 55 to 85 cm above the table.
 
-    The robot is not there. What faces down or away from it stays unseen.
+    The robot is not in the scene. Surfaces that face down or away from it stay unobserved.
     """
     solids = [
         RaycastSurface(solid_mesh(solid), Texture(_COLORS[i % 5], _COLORS[(i + 2) % 5], 0.04, seed=i))
@@ -99,7 +99,7 @@ def shoot(scene: Tabletop, frames: int, width: int, seed: int = 0) -> Film:
     stage = RaycastScene([_FLOOR, *solids])
     f, height = 525.0 * width / 640.0, width * 3 // 4
     camera = Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
-    poses = np.array([_pose(i / WHOLE) for i in range(frames)])
+    poses = np.array([_pose(i / FULL_ARC) for i in range(frames)])
     stamps = np.arange(frames) / RATE
     effects = make_effects(NOISY, seed=seed).along(Trajectory(stamps, poses))
     shot = []
@@ -110,7 +110,7 @@ def shoot(scene: Tabletop, frames: int, width: int, seed: int = 0) -> Film:
 
 
 def map_film(film: Film) -> FilmedMap:
-    """Run SLAM over it, poses unknown to it."""
+    """Map a film by SLAM, without its poses."""
     slam = Slam()
     for frame in film.frames:
         slam.process(frame)
@@ -121,7 +121,7 @@ def map_film(film: Film) -> FilmedMap:
 
 
 def _pose(share: float) -> Array:
-    """T_scene_camera (4, 4) after a share of the way."""
+    """Return T_scene_camera (4, 4) after a share of the arc."""
     turn = np.pi + ARC * np.sin(2 * np.pi * share)
     height = MIDDLE + SWING * np.cos(4 * np.pi * share)
     eye = [TARGET[0] + RADIUS * np.cos(turn), TARGET[1] + RADIUS * np.sin(turn), height]

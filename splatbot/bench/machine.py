@@ -17,7 +17,7 @@ from splatbot.rasterize.native import native
 
 
 def describe_machine(thread_counts: Sequence[int], *, peak_ms: float) -> dict[str, Any]:
-    """CPU, versions, load and the measured peak of multiply-adds [GFLOP/s] by instruction set and threads.
+    """Return CPU, versions, load and the measured peak of multiply-adds [GFLOP/s] by instruction set and threads.
 
     Args:
         thread_counts: to measure the peak for.
@@ -45,7 +45,7 @@ def raise_peaks(machine: dict[str, Any], count: int, *, peak_ms: float) -> None:
 
 
 def measured_peak(name: str, count: int, milliseconds: float) -> float:
-    """GFLOP/s of independent multiply-adds (two operations each; without FMA a product and a sum)."""
+    """Measure GFLOP/s of independent multiply-adds (two operations each; without FMA a product and a sum)."""
     with threads(count), isa(name):
         return float(native().multiply_add_peak(milliseconds))
 

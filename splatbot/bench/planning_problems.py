@@ -1,4 +1,4 @@
-"""Seeded planning problems on the table top: from anywhere to close above the table, with something in between."""
+"""Seeded planning problems on the table top: goals are just above the table, and the straight line collides."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 
-HAND = 0.22  # [m] that the tool is at most above the table at the goal
-ROOM = 5e-3  # [m] of true room at both ends, so that a problem is one on every kind of map
-_BATCHES = 20  # of 20,000 configurations that are looked at on a map
+MAX_GOAL_HEIGHT = 0.22  # [m] of the tool above the table
+MIN_CLEARANCE = 5e-3  # [m] true clearance at both ends, so that both are free on every kind of map
+_BATCHES = 20  # of 20,000 configurations that are sampled on a map
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """From one configuration (J,) to another."""
+    """Start and goal configurations, each (J,)."""
 
     start: Array
     goal: Array
@@ -31,18 +31,24 @@ def problems(
     truth: Truth,
     count: int,
     seed: int = 0,
-    room: float = ROOM,
+    clearance: float = MIN_CLEARANCE,
 ) -> list[Problem]:
-    """``count`` pairs of configurations with ``room`` [m] between which the straight line in joint space collides."""
+    """Sample ``count`` pairs of configurations with at least ``clearance`` [m] whose straight joint path collides."""
     rng = np.random.default_rng(seed)
     found: list[Problem] = []
     while len(found) < count:
         q = robot.random(20_000, rng)
         q = q[~arm.check(field, q).in_collision]
-        q = q[truth.rooms(arm, q) > room]
+        q = q[truth.clearances(arm, q) > clearance]
         tool = robot.tcp(q)[:, :3, 3]
         above = tool[:, 2] > 0.0
-        low = above & (tool[:, 2] < HAND) & (tool[:, 0] > 0.2) & (tool[:, 0] < 0.9) & (np.abs(tool[:, 1]) < 0.8)
+        low = (
+            above
+            & (tool[:, 2] < MAX_GOAL_HEIGHT)
+            & (tool[:, 0] > 0.2)
+            & (tool[:, 0] < 0.9)
+            & (np.abs(tool[:, 1]) < 0.8)
+        )
         starts, goals = q[above & ~low], q[low]
         n = min(len(starts), len(goals))
         blocked = arm.certify(field, starts[:n], goals[:n]).in_collision
@@ -53,15 +59,15 @@ def problems(
 def map_problems(
     robot: RobotModel, arm: RobotSpheres, field: GaussianCollisionField, box: Array, count: int, seed: int = 0
 ) -> list[Problem]:
-    """As :func:`problems` on any map, free with the arm's margin; fewer where there are no more of them.
+    """Sample problems as :func:`problems` on any map, free with the margin of the arm; fewer if there are not enough.
 
     Args:
-        robot: of whom the goals are.
-        arm: its spheres, whose base stands on the surface that is worked on, z up.
-        field: the map.
-        box: (2, 3) corners of the space to work in [m], in the base's frame: where the goals are.
-        count: how many.
-        seed: of the configurations.
+        robot: The robot.
+        arm: Its spheres; its base is on the work surface, z up.
+        field: The map.
+        box: (2, 3) corners [m] of the workspace in the frame of the base, which contains the goals.
+        count: Largest number of problems.
+        seed: Seed of the configurations.
     """
     rng = np.random.default_rng(seed)
     found: list[Problem] = []
@@ -70,7 +76,7 @@ def map_problems(
         q = q[~arm.check(field, q).in_collision]
         tool = robot.tcp(q)[:, :3, 3]
         above = tool[:, 2] > box[0, 2]
-        low = above & (tool[:, 2] < box[0, 2] + HAND) & ((tool > box[0]) & (tool < box[1])).all(axis=1)
+        low = above & (tool[:, 2] < box[0, 2] + MAX_GOAL_HEIGHT) & ((tool > box[0]) & (tool < box[1])).all(axis=1)
         starts, goals = q[above & ~low], q[low]
         n = min(len(starts), len(goals))
         blocked = arm.certify(field, starts[:n], goals[:n]).in_collision

@@ -1,4 +1,4 @@
-"""Rows of figures, and the files they are kept in."""
+"""Rows of measured values, and their files."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Row:
-    """One figure.
+    """One measured value.
 
     Args:
-        case: what was run, as in "surface 320x240, 2 threads".
-        metric: what was measured, as in "forward".
-        value: the figure; None where there is none, with ``note`` saying why.
-        unit: of the figure; "x" for a ratio.
+        case: the measured case, as in "surface 320x240, 2 threads".
+        metric: name of the value, as in "forward".
+        value: the value. If None, ``note`` gives the reason.
+        unit: unit of the value; "x" for a ratio.
         spread: median minus least of the repeated runs, in the same unit.
-        peer: whose figure it is, or whom the ratio is against; None: splatbot's own.
+        peer: the measured peer, or the reference of the ratio. If None, the value is splatbot's.
     """
 
     case: str
@@ -55,7 +55,7 @@ class Results:
         peer: str | None = None,
         note: str | None = None,
     ) -> None:
-        """Append one figure."""
+        """Append one value."""
         self.rows.append(Row(case, metric, value, unit, peer=peer, note=note))
 
     def add_time(self, case: str, metric: str, timing: Timing, *, peer: str | None = None) -> None:
@@ -63,24 +63,24 @@ class Results:
         self.rows.append(Row(case, metric, timing.least_ms, "ms", spread=timing.median_ms - timing.least_ms, peer=peer))
 
     def find(self, case: str, metric: str, peer: str | None = None) -> float | None:
-        """The figure of that name, None if there is none."""
+        """Return the value of that case, metric and peer. If None, no such row exists."""
         for row in self.rows:
             if (row.case, row.metric, row.peer) == (case, metric, peer):
                 return row.value
         return None
 
     def select(self, prefix: str) -> list[Row]:
-        """Rows whose case begins so."""
+        """Return the rows whose case begins with ``prefix``."""
         return [row for row in self.rows if row.case.startswith(prefix)]
 
     def write_json(self, path: Path) -> None:
-        """``{"machine": {...}, "rows": [{...}]}``."""
+        """Write ``{"machine": {...}, "rows": [{...}]}``."""
         text = json.dumps({"machine": self.machine, "rows": [asdict(row) for row in self.rows]}, indent=1)
         with atomic_write(path) as file:
             file.write(text.encode())
 
     def write_csv(self, path: Path) -> None:
-        """The rows alone."""
+        """Write the rows alone."""
         with path.open("w", newline="") as file:
             writer = csv.writer(file)
             names = list(Row.__dataclass_fields__)

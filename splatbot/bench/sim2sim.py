@@ -1,4 +1,4 @@
-"""Policies on maps of noisy films of tables, tried in the map's twin and in a held-out one: sim-to-sim."""
+"""Sim-to-sim: policies on maps of noisy films of tables, evaluated in the twin of the map and in a held-out twin."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ from splatbot.sim.solids import rpy_of
 from splatbot.sim.twin import Twin
 
 TASKS = ("reach", "push")
-DISTANCE = 0.10  # [m] that things are pushed
+DISTANCE = 0.10  # [m] of a push
 _FIXED = 5  # solids of a table that do not move: its top and the shelf
-_PLACES = ((0.42, -0.42), (0.66, -0.42), (0.42, -0.14), (0.68, -0.14), (0.45, 0.14))  # [m] where things stand
+_PLACES = ((0.42, -0.42), (0.66, -0.42), (0.42, -0.14), (0.68, -0.14), (0.45, 0.14))  # [m] positions of the objects
 _JITTER = 0.03  # [m]
-_ROOM = 0.01  # [m] of true room at both ends of a reach
-_MATCH = 0.05  # [m] between the middles of a thing and of what the map has of it
-_SWEPT = 0.09  # [m] around a push that shall be free
-_TABLES = 7919  # between seeds
+_CLEARANCE = 0.01  # [m] true clearance at both ends of a reach
+_MATCH = 0.05  # [m] between the centres of an object and of its mapped counterpart
+_SWEPT = 0.09  # [m] clearance that a push needs
+_SEED_STRIDE = 7919  # between the seeds of tables
 
 Tell = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class SimToSimPlan:
-    """What to run.
+    """Workload of the comparison.
 
     Args:
-        tasks: names of :data:`TASKS`.
-        tables: different ones, each filmed and mapped.
-        trials: of each task on each table; a table has five things to push, again and again.
-        film: frames, and their width [px].
-        gaussians: of the ideal map that reaches are chosen by.
-        seed: of everything.
+        tasks: Names of :data:`TASKS`.
+        tables: Number of different tables, each filmed and mapped.
+        trials: Trials of each task on each table. Pushes take the five objects of a table in turns.
+        film: Number of frames, and their width [px].
+        gaussians: Gaussians of the ideal map that selects the reaches.
+        seed: Seed of tables, problems and physics.
     """
 
     tasks: tuple[str, ...] = TASKS
@@ -64,13 +64,13 @@ class SimToSimPlan:
 
 @dataclass(frozen=True, eq=False)
 class MappedTable:
-    """A table, what was mapped of it, and where the map is.
+    """A table and its map.
 
     Args:
-        table: the true shapes, around the arm's base.
-        mapped: from its film.
-        file: that the map is in.
-        seed: of this table.
+        table: The true shapes, in the frame of the arm's base.
+        mapped: The map of its film.
+        file: File of the map.
+        seed: Seed of this table.
     """
 
     table: Tabletop
@@ -79,19 +79,19 @@ class MappedTable:
     seed: int
 
     def map_scene(self, *, movable: bool) -> Scene:
-        """The twin's scene of the map, around the arm's base."""
+        """Return the twin's scene of the map, in the frame of the arm's base."""
         T = inverse(self.mapped.T_map_scene)
         place = {"at": T[:3, 3].tolist(), "rpy": rpy_of(T[:3, :3])}
         return make_scene({"name": "map", "map": {"file": str(self.file.resolve()), "movable": movable, **place}})
 
     def own_margin(self, field: GaussianCollisionField) -> float:
-        """The error [m] of the map's surfaces near the arm, as its own depth tells."""
+        """Return the error [m] of the map's surfaces near the arm, measured against its own depth images."""
         around = [*self.mapped.T_map_scene[:3, 3], RADIUS]
         return surface_error(field, self.mapped.views(), around=around).share(SHARE)
 
 
 def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, share: None) -> tuple[TrialResults, ...]:
-    """All tasks on all tables; one result for each task. Ctrl-C ends it with what was done.
+    """Run all tasks on all tables, and return one result for each task. Ctrl-C returns the finished trials.
 
     Maps are written into ``folder``.
     """
@@ -101,7 +101,7 @@ def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, s
         try:
             for number in range(plan.tables):
                 tell(f"filming and mapping table {number + 1} of {plan.tables}", 0.0)
-                place = map_table(plan, folder / f"map-{number}.ply", plan.seed + _TABLES * number)
+                place = map_table(plan, folder / f"map-{number}.ply", plan.seed + _SEED_STRIDE * number)
                 for task in plan.tasks:
                     more = _TRY[task](plan, place, tell)
                     found[task] = join(found[task], more) if task in found else more
@@ -113,33 +113,35 @@ def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, s
 
 
 def map_table(plan: SimToSimPlan, file: Path, seed: int) -> MappedTable:
-    """A table of that seed, filmed with noise and mapped without its poses."""
+    """Render a noisy film of the table of that seed, and map it without its poses."""
     table = work_table(seed)
     mapped = map_film(shoot(table, *plan.film, seed=seed))
     file.parent.mkdir(parents=True, exist_ok=True)
-    save_ply(mapped.snapshot.model, file, bookkeeping=True)  # what no depth supports is air to physics, too
+    save_ply(
+        mapped.snapshot.model, file, bookkeeping=True
+    )  # bookkeeping removes unsupported Gaussians from physics as well
     return MappedTable(table, mapped, file, seed)
 
 
 def work_table(seed: int = 0) -> Tabletop:
-    """The planner's table with its shelf, and five things with room to push them; sizes and places differ by seed."""
+    """Return the planner's table with its shelf and five objects to push; the seed varies sizes and positions."""
     rng = np.random.default_rng(seed)
-    things: list[Solid] = []
+    objects: list[Solid] = []
     for k, place in enumerate(_PLACES):
         x, y = (np.asarray(place) + rng.uniform(-_JITTER, _JITTER, 2)).tolist()
         if k % 2:
-            things.append(Can((x, y, 0.0), float(rng.uniform(0.035, 0.05)), float(rng.uniform(0.08, 0.15))))
+            objects.append(Can((x, y, 0.0), float(rng.uniform(0.035, 0.05)), float(rng.uniform(0.08, 0.15))))
         else:
             width, depth, height = rng.uniform([0.06, 0.06, 0.08], [0.10, 0.10, 0.15]).tolist()
-            things.append(Block((x, y, height / 2), (width, depth, height), float(rng.uniform(-1.5, 1.5))))
-    return Tabletop((*tabletop().solids[:_FIXED], *things))
+            objects.append(Block((x, y, height / 2), (width, depth, height), float(rng.uniform(-1.5, 1.5))))
+    return Tabletop((*tabletop().solids[:_FIXED], *objects))
 
 
 def _reach(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
     robot, field = panda(), GaussianCollisionField(place.mapped.snapshot)
     ideal = GaussianCollisionField(place.table.gaussians(plan.gaussians))
     truth = Truth(place.table, 0.05)
-    wanted = problems(robot, RobotSpheres(robot), ideal, truth, plan.trials, place.seed, _ROOM)
+    wanted = problems(robot, RobotSpheres(robot), ideal, truth, plan.trials, place.seed, _CLEARANCE)
     cases = [ReachCase(problem.start, problem.goal, place.seed + k) for k, problem in enumerate(wanted)]
     true = truth_scene(place.table)
     task = ReachTask(
@@ -151,14 +153,14 @@ def _reach(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
 
 def _push(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
     map_twin = Twin(place.map_scene(movable=True))
-    believed = [thing for thing in map_twin.world.scene.objects if thing.movable]
+    mapped = [found for found in map_twin.world.scene.objects if found.movable]
     true = movable_truth(place.table)
     rng = np.random.default_rng(place.seed)
     cases = []
     for k in range(plan.trials):
         index = _FIXED + k % len(_PLACES)
         direction = _free_direction(place.table, index, rng)
-        match = _believed(believed, middle_of(place.table.solids[index]))
+        match = _mapped_object(mapped, middle_of(place.table.solids[index]))
         cases.append(PushCase(match, f"thing{index}", direction, DISTANCE, place.seed + k))
     task = PushTask(cases, map_twin, lambda case: HeldOutTwin(true, draw(Spread(), case.seed)))
     return run_trials(task, push_policies(panda()), seed=plan.seed, on_progress=tell)
@@ -168,14 +170,14 @@ _TRY = {"reach": _reach, "push": _push}
 
 
 def movable_truth(table: Tabletop) -> Scene:
-    """The true shapes, things that stand on the table movable."""
+    """Return the scene of the true shapes, in which the objects on the table are movable."""
     scene = truth_scene(table)
-    things = [thing.model_copy(update={"movable": k >= _FIXED}) for k, thing in enumerate(scene.objects)]
-    return make_scene({**scene.model_dump(), "objects": things})
+    objects = [shape.model_copy(update={"movable": k >= _FIXED}) for k, shape in enumerate(scene.objects)]
+    return make_scene({**scene.model_dump(), "objects": objects})
 
 
 def middle_of(solid: Solid) -> Array:
-    """Of a solid (3,) [m]."""
+    """Return the centre of a solid (3,) [m]."""
     if isinstance(solid, Can):
         x, y, z = solid.foot
         return np.array([x, y, z + solid.height / 2])
@@ -183,25 +185,25 @@ def middle_of(solid: Solid) -> Array:
     return np.asarray(solid.center, dtype=np.float64)
 
 
-def _believed(things: Sequence[SceneObject], middle: Array) -> SceneObject | None:
-    """What the map has at a thing's place; the table's maker knows of both, no policy does."""
-    gaps = [float(np.linalg.norm(np.asarray(thing.at)[:2] - middle[:2])) for thing in things]
-    return things[int(np.argmin(gaps))] if gaps and min(gaps) <= _MATCH else None
+def _mapped_object(candidates: Sequence[SceneObject], center: Array) -> SceneObject | None:
+    """Return the mapped object at the position of a true one; policies do not know this association."""
+    gaps = [float(np.linalg.norm(np.asarray(found.at)[:2] - center[:2])) for found in candidates]
+    return candidates[int(np.argmin(gaps))] if gaps and min(gaps) <= _MATCH else None
 
 
 def _free_direction(table: Tabletop, index: int, rng: np.random.Generator) -> Array:
-    """One of those directions (2,) in which a thing and the hand behind it have room, or the one with most."""
+    """Choose a direction (2,) with enough clearance for the object and the hand behind it, or the one with the most."""
     rest = Tabletop(tuple(solid for k, solid in enumerate(table.solids) if k not in (0, index)))
     middle = middle_of(table.solids[index])
     angles = np.linspace(-np.pi / 2, np.pi / 2, 8) + rng.uniform(0.0, np.pi / 8)  # away from the arm
-    ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     along = np.linspace(-0.12, DISTANCE + 0.05, 12)[:, None]
-    rooms = []
-    for way in ways:
-        points = np.c_[middle[:2] + along * way, np.full(len(along), 0.1)]
+    clearances = []
+    for direction in directions:
+        points = np.c_[middle[:2] + along * direction, np.full(len(along), 0.1)]
         on_table = bool(
             (np.abs(points[:, 1]) < 0.7).all() and (points[:, 0] > 0.28).all() and (points[:, 0] < 0.85).all()
         )
-        rooms.append(float(rest.distance(points).min()) if on_table else -1.0)
-    good = np.flatnonzero(np.array(rooms) > _SWEPT)
-    return np.asarray(ways[rng.choice(good) if len(good) else int(np.argmax(rooms))])
+        clearances.append(float(rest.distance(points).min()) if on_table else -1.0)
+    good = np.flatnonzero(np.array(clearances) > _SWEPT)
+    return np.asarray(directions[rng.choice(good) if len(good) else int(np.argmax(clearances))])

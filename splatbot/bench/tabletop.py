@@ -13,7 +13,7 @@ from splatbot.geometry import rotation_to_quat
 
 Array = NDArray[np.float64]
 
-NORMAL_SIGMA = 1.5e-3  # [m] that a Gaussian is thick
+NORMAL_SIGMA = 1.5e-3  # [m] standard deviation of a Gaussian along its normal
 OVERLAP = 0.55  # a Gaussian's tangential sigma, in spacings of the samples
 
 
@@ -21,11 +21,11 @@ class Solid(Protocol):
     """A closed body with an exact signed distance."""
 
     def distance(self, points: Array) -> Array:
-        """Signed distance (P,) [m] of points (P, 3)."""
+        """Return the signed distance (P,) [m] of points (P, 3)."""
         ...
 
     def patches(self) -> list[Patch]:
-        """Its surface."""
+        """Return the patches of its surface."""
         ...
 
 
@@ -58,12 +58,12 @@ class Block:
         return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
     def distance(self, points: Array) -> Array:
-        """Exact."""
+        """Return the exact signed distance (P,) [m] of points (P, 3)."""
         q = np.abs((points - np.asarray(self.center)) @ self._rotation()) - np.asarray(self.size) / 2
         return np.asarray(np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0))
 
     def patches(self) -> list[Patch]:
-        """Six faces."""
+        """Return the six faces."""
         R, half = self._rotation(), np.asarray(self.size) / 2
         found = []
         for k in range(3):
@@ -84,7 +84,7 @@ class Can:
     height: float
 
     def distance(self, points: Array) -> Array:
-        """Exact."""
+        """Return the exact signed distance (P,) [m] of points (P, 3)."""
         p = points - np.asarray(self.foot)
         q = np.stack(
             [np.hypot(p[:, 0], p[:, 1]) - self.radius, np.abs(p[:, 2] - self.height / 2) - self.height / 2], axis=1
@@ -92,7 +92,7 @@ class Can:
         return np.asarray(np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0))
 
     def patches(self) -> list[Patch]:
-        """Side and both lids."""
+        """Return the side and both lids."""
         foot, r = np.asarray(self.foot), self.radius
 
         def side(u: Array, v: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
@@ -117,11 +117,11 @@ class Ball:
     radius: float
 
     def distance(self, points: Array) -> Array:
-        """Exact."""
+        """Return the exact signed distance (P,) [m] of points (P, 3)."""
         return np.asarray(np.linalg.norm(points - np.asarray(self.center), axis=1) - self.radius)
 
     def patches(self) -> list[Patch]:
-        """By the equal-area map of Lambert: z is uniform."""
+        """Return the surface by Lambert's equal-area map, in which z is uniform."""
         r = self.radius
 
         def globe(u: Array, v: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
@@ -153,16 +153,16 @@ def _within(plane: _Map, center: Array, radius: float) -> _Map:
 
 @dataclass(frozen=True)
 class Tabletop:
-    """What stands around the robot, whose base is the origin."""
+    """The solids around the robot, whose base is the origin."""
 
     solids: tuple[Solid, ...]
 
     def distance(self, points: Array) -> Array:
-        """Exact signed distance (P,) [m] to the union, inside at least as deep as in the deepest solid."""
+        """Return the signed distance (P,) [m] to the union; exact outside, inside that to the deepest solid."""
         return np.asarray(np.min([solid.distance(points) for solid in self.solids], axis=0))
 
     def gaussians(self, count: int, seed: int = 0) -> GaussianModel:
-        """About ``count`` discs on the surfaces, on jittered grids, each 1.5 mm thick."""
+        """Sample about ``count`` discs on the surfaces, on jittered grids, each 1.5 mm thick."""
         rng = np.random.default_rng(seed)
         patches = [patch for solid in self.solids for patch in solid.patches()]
         area = sum(p.width * p.height for p in patches)
@@ -190,7 +190,7 @@ def _sample(patch: Patch, spacing: float, rng: np.random.Generator) -> tuple[Arr
 
 
 def tabletop() -> Tabletop:
-    """A table top with a shelf and ten objects before a robot that stands on it."""
+    """Build a table top with a shelf and ten objects in front of a robot."""
     table = Block((0.625, 0.0, -0.02), (0.95, 1.8, 0.04))
     shelf = [
         Block((0.60, 0.45, 0.20), (0.30, 0.02, 0.40)),
@@ -198,7 +198,7 @@ def tabletop() -> Tabletop:
         Block((0.60, 0.60, 0.21), (0.30, 0.28, 0.02)),
         Block((0.60, 0.60, 0.41), (0.30, 0.32, 0.02)),
     ]
-    things: list[Solid] = [
+    objects: list[Solid] = [
         Block((0.45, 0.10, 0.06), (0.10, 0.07, 0.12), 0.4),
         Block((0.60, -0.25, 0.09), (0.08, 0.12, 0.18), -0.3),
         Block((0.35, -0.30, 0.03), (0.14, 0.09, 0.06), 0.9),
@@ -210,4 +210,4 @@ def tabletop() -> Tabletop:
         Ball((0.55, 0.22, 0.05), 0.05),
         Ball((0.70, -0.10, 0.04), 0.04),
     ]
-    return Tabletop((table, *shelf, *things))
+    return Tabletop((table, *shelf, *objects))

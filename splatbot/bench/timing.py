@@ -16,7 +16,7 @@ from splatbot.rasterize.native import native
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall milliseconds of several runs. The least is the machine's, the median what a busy machine gives."""
+    """Wall times of several runs [ms]. Other programs raise the median more than the least."""
 
     least_ms: float
     median_ms: float
@@ -66,7 +66,7 @@ def isa(name: str) -> Iterator[None]:
 
 
 def peak_memory(function: Callable[[], object]) -> int | None:
-    """The most bytes that the process holds in memory during one run; None if that is not known here."""
+    """Return the peak memory [bytes] of the process during one run. If None, the system does not report it."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # forget the earlier peak
     except OSError:
@@ -77,7 +77,7 @@ def peak_memory(function: Callable[[], object]) -> int | None:
 
 @contextmanager
 def memory_peak() -> Iterator[Callable[[], int | None]]:
-    """Gives a function that tells, during the block and after it, the most bytes held since it began; None: unknown."""
+    """Yield a function that returns the peak memory [bytes] since the block began. If None, it is unknown."""
     known = True
     try:
         Path("/proc/self/clear_refs").write_text("5")  # forget the earlier peak

@@ -1,4 +1,4 @@
-"""Exact truth for an arm among analytic shapes, and how wrong a map's answers are against it."""
+"""Exact clearances of an arm among analytic shapes, and errors of a collision field against them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from splatbot.bench.tabletop import Tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.protocols import Array
 
-_LOW, _HIGH = np.array([-1.3, -1.3, -0.6]), np.array([1.3, 1.3, 1.6])  # [m] all that the arm reaches
+_LOW, _HIGH = np.array([-1.3, -1.3, -0.6]), np.array([1.3, 1.3, 1.6])  # [m] bounds of the arm's reach
 _CHUNK = 200_000
 
 
 class Truth:
-    """Exact distances to the shapes; a grid of them, ``step`` [m] fine, tells which need no computing."""
+    """Exact distances to the shapes; a grid with cells of ``step`` [m] bounds them, to skip distant configurations."""
 
     def __init__(self, scene: Tabletop, step: float = 0.02) -> None:
         self._step = step
@@ -27,8 +27,8 @@ class Truth:
         nodes = np.concatenate([scene.distance(part) for part in np.array_split(grid, max(1, len(grid) // _CHUNK))])
         self._bound = (nodes - step * np.sqrt(3) / 2).astype(np.float32)
 
-    def rooms(self, arm: RobotSpheres, q: Array) -> Array:
-        """Least gap (C,) [m] between the arm's moving spheres and the shapes; beyond 1 cm, a lower bound above that."""
+    def clearances(self, arm: RobotSpheres, q: Array) -> Array:
+        """Return the clearance (C,) [m] of the arm's moving spheres; above 1 cm, a lower bound."""
         moving = arm.spheres.link > 0
         found = []
         for part in np.array_split(q, max(1, len(q) * int(moving.sum()) // (10 * _CHUNK))):
@@ -46,13 +46,15 @@ class Truth:
 
 @dataclass(frozen=True)
 class Audit:
-    """How a map's verdicts on configurations differ from the truth; self-collision is left out.
+    """Errors of a collision field on configurations; self-collision is not checked.
 
     Args:
-        configurations: looked at.
-        free_percent: of them called free.
-        false_free: called free, yet touching the true shapes; ``deepest_m`` how deep [m].
-        false_hit_percent: called a collision, yet free; ``largest_m`` with how much room [m].
+        configurations: Number of checked configurations.
+        free_percent: Share of configurations that the field reports as free [%].
+        false_free: Number of configurations that the field reports as free although they collide.
+        deepest_m: Largest penetration of these [m].
+        false_hit_percent: Share of configurations that the field reports as a collision although they are free [%].
+        largest_m: Largest clearance of these [m].
     """
 
     configurations: int
@@ -63,25 +65,25 @@ class Audit:
     largest_m: float
 
 
-def audit(field: GaussianCollisionField, arm: RobotSpheres, q: Array, rooms: Array) -> Audit:
-    """The verdicts on configurations (C, J) that do not touch themselves, whose true room is known."""
-    return score(arm.check(field, q).in_collision, rooms)
+def audit(field: GaussianCollisionField, arm: RobotSpheres, q: Array, clearances: Array) -> Audit:
+    """Compare the field with the true clearances (C,) [m] of configurations (C, J) without self-collision."""
+    return score(arm.check(field, q).in_collision, clearances)
 
 
-def score(hit: NDArray[np.bool_], rooms: Array) -> Audit:
-    """Verdicts (C,) against true room (C,) [m]."""
-    touching = rooms <= 0
+def score(hit: NDArray[np.bool_], clearances: Array) -> Audit:
+    """Compare verdicts (C,) with true clearances (C,) [m]."""
+    touching = clearances <= 0
     false_free, false_hit = ~hit & touching, hit & ~touching
     return Audit(
         configurations=len(hit),
         free_percent=100.0 * float((~hit).mean()),
         false_free=int(false_free.sum()),
-        deepest_m=float(-rooms[false_free].min()) if false_free.any() else 0.0,
+        deepest_m=float(-clearances[false_free].min()) if false_free.any() else 0.0,
         false_hit_percent=100.0 * float(false_hit.mean()),
-        largest_m=float(rooms[false_hit].max()) if false_hit.any() else 0.0,
+        largest_m=float(clearances[false_hit].max()) if false_hit.any() else 0.0,
     )
 
 
-def apart_from_itself(arm: RobotSpheres, q: Array) -> Array:
-    """Those of the configurations (C, J) in which the arm does not touch itself."""
+def without_self_collision(arm: RobotSpheres, q: Array) -> Array:
+    """Return the configurations (C, J) without self-collision."""
     return q[~arm.check(None, q).in_collision]

@@ -1,4 +1,4 @@
-"""The `splatbot` command. Each subcommand is one module here, imported only when it is asked for."""
+"""The `splatbot` command. Each subcommand is one module here, imported only to run it."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ class _Command(NamedTuple):
     summary: str
 
 
-# The summaries stand here, not in the modules: `splatbot --help` must not wait for torch or open3d.
+# The summaries are here, not in the modules, because `splatbot --help` must not wait for torch or open3d.
 COMMANDS = {
     "map": _Command("splatbot.cli.map", "map_log_command", "Turn an RGB-D log into a Gaussian map and a run folder."),
     "eval": _Command("splatbot.cli.eval", "eval_run", "Score a run again: trajectory error and held-out views."),
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
-    "info": _Command("splatbot.cli.info", "info", "Say what is in a map, a log or a run."),
+    "info": _Command("splatbot.cli.info", "info", "Describe a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
-    "serve": _Command("splatbot.cli.serve", "serve", "Answer questions about a map over HTTP."),
+    "serve": _Command("splatbot.cli.serve", "serve", "Serve a map over HTTP."),
     "view": _Command("splatbot.cli.view", "view", "Show a map in a web browser, or write it as one HTML page."),
     "plan": _Command(
-        "splatbot.cli.plan", "plan", "Plan an arm's way among the Gaussians of a map, with pictures of it."
+        "splatbot.cli.plan", "plan", "Plan a path of an arm among the Gaussians of a map, with pictures of it."
     ),
-    "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked thing in a map."),
+    "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked object in a map."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
-    "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or say what is known of one."),
-    "pick": _Command("splatbot.cli.pick", "pick", "Pick a named thing in the twin: look, grasp, plan, lift, check."),
-    "trials": _Command("splatbot.cli.trials", "trials", "Pick from many seeded scenes, and say how often and why not."),
-    "gripper": _Command("splatbot.cli.gripper", "gripper", "Ask or move a gripper on a serial port, or a fake one."),
-    "twin": _Command("splatbot.cli.twin", "twin", "Try a motion in a scene's physics before the robot moves."),
+    "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),
+    "pick": _Command("splatbot.cli.pick", "pick", "Pick a named object in the twin: scan, grasp, plan, lift, check."),
+    "trials": _Command("splatbot.cli.trials", "trials", "Pick in many seeded scenes; report success and failures."),
+    "gripper": _Command("splatbot.cli.gripper", "gripper", "Query or move a gripper, or a simulated one."),
+    "twin": _Command("splatbot.cli.twin", "twin", "Simulate a motion in a scene before the robot moves."),
     "sim2real": _Command(
-        "splatbot.cli.sim2real", "sim2real", "Say how far the twin is from a recorded log, and from a held-out twin."
+        "splatbot.cli.sim2real", "sim2real", "Measure the difference of the twin from a log, and from a held-out twin."
     ),
-    "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and say how to mend it."),
+    "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and print how to fix it."),
 }
 
-_GROUPS = {"bench": "Measure speed, and what accuracy costs in time; `splatbot bench --help` lists the benchmarks."}
+_GROUPS = {"bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks."}
 
-_DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers a robot's questions.
+_DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers queries of a robot.
 
 `splatbot COMMAND --help` explains a command with examples. Every command takes --debug (or SPLATBOT_DEBUG=1),
 which adds the traceback to an error. Exit codes: 0 done, 1 failed, 2 wrong input, 130 interrupted."""
@@ -103,7 +103,7 @@ def _dispatch(words: list[str]) -> Any:
         from splatbot.cli.bench import run_benchmark
 
         return run_benchmark(words[1], words[2:])
-    # Without a known command, tyro prints the help or names the nearest command, and exits.
+    # Without a known command, tyro prints the help or names the closest command, and exits.
     return tyro.extras.subcommand_cli_from_dict(
         {name: _outline(summary) for name, summary in _summaries(group).items()},
         prog=f"splatbot {group}".strip(),

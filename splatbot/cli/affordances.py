@@ -1,4 +1,4 @@
-"""Who says what a name means, for commands that take one."""
+"""Affordance backends that resolve the name of a target."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ if TYPE_CHECKING:
 
 
 def name_backends(*, vlm: bool) -> list[Affordance]:
-    """The rules; before them, if asked for, the model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL, which they check.
+    """Return the rules; with ``vlm``, first the model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL, which they check.
 
     Raises:
-        InputError: the model is asked for and not named in the environment.
+        InputError: ``vlm`` is set and the environment names no model.
     """
     from splatbot.grasping.language import LanguageAffordance
 

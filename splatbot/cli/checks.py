@@ -1,4 +1,4 @@
-"""What `splatbot doctor` looks at. Each check gives lines of (state, what, detail, how to mend it)."""
+"""Checks of `splatbot doctor`. Each check returns findings: state, subject, detail and fix."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EGL_TIMEOUT_S = 60.0
 SELF_CHECK_BOUND = 1e-4
 _APT = "apt-get install libegl1 libgl1 libegl-mesa0 libgl1-mesa-dri"
 
-# Distributions, any of which will do, and what is lost without them ("": nothing works).
+# Alternative distributions, and the feature that needs one of them ("": every feature).
 _PACKAGES: tuple[tuple[tuple[str, ...], str], ...] = (
     (("torch",), ""),
     (("numpy",), ""),
@@ -28,7 +28,7 @@ _PACKAGES: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fastapi",), "the service"),
 )
 
-# Runs apart: a broken graphics driver may crash or hang the process that asks for it.
+# Runs in a separate process, because a broken graphics driver may crash or hang it.
 _EGL_PROGRAM = """
 import mujoco
 model = mujoco.MjModel.from_xml_string(
@@ -44,7 +44,7 @@ print("rendered" if image.any() else "black")
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor's answer."""
+    """One line of the doctor's output."""
 
     state: Literal["ok", "warn", "fail"]
     what: str
@@ -53,12 +53,12 @@ class Finding:
 
 
 def all_checks() -> list[Callable[[], list[Finding]]]:
-    """The checks in the order in which they are shown."""
+    """Return the checks in the order of the output."""
     return [check_python, check_packages, check_native, check_rasterizer, check_egl, check_serial]
 
 
 def check_python() -> list[Finding]:
-    """The interpreter and the machine."""
+    """Report the interpreter and the machine."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return [
         Finding("ok", "python", platform.python_version()),
@@ -67,7 +67,7 @@ def check_python() -> list[Finding]:
 
 
 def check_packages() -> list[Finding]:
-    """Versions of the libraries, read without importing them."""
+    """Report the versions of the libraries, without importing them."""
     return [_check_package(names, loss) for names, loss in _PACKAGES]
 
 
@@ -86,7 +86,7 @@ def _check_package(names: tuple[str, ...], loss: str) -> Finding:
 
 
 def check_native() -> list[Finding]:
-    """The compiled kernels: present, and which of them this processor gets."""
+    """Check that the compiled kernels exist, and report those that this processor uses."""
     try:
         from splatbot import _native
     except ImportError as error:
@@ -95,10 +95,10 @@ def check_native() -> list[Finding]:
 
 
 def check_rasterizer() -> list[Finding]:
-    """A few Gaussians rendered by the native kernels and by the float64 reference."""
+    """Compare a render of the native kernels with the float64 reference."""
     try:
         error = rasterizer_error()
-    except Exception as problem:  # whatever it is, the doctor names it and looks on
+    except Exception as problem:  # the doctor reports any error and continues
         return [Finding("fail", "rasterizer", f"{type(problem).__name__}: {problem}", "rebuild: pip install -e .")]
     detail = f"differs from the float64 reference by {error:.1e}"
     if error > SELF_CHECK_BOUND:
@@ -107,7 +107,7 @@ def check_rasterizer() -> list[Finding]:
 
 
 def rasterizer_error() -> float:
-    """Largest difference of colour between kernels and reference for eight smooth Gaussians, 0..1."""
+    """Return the largest colour difference between kernels and reference for eight smooth Gaussians, 0..1."""
     import torch
 
     from splatbot.rasterize import rasterization
@@ -131,7 +131,7 @@ def rasterizer_error() -> float:
 
 
 def check_egl() -> list[Finding]:
-    """Rendering without a display, as the simulated camera needs it."""
+    """Check rendering without a display, which the simulated camera needs."""
     try:
         answer = subprocess.run(
             [sys.executable, "-c", _EGL_PROGRAM],
@@ -150,7 +150,7 @@ def check_egl() -> list[Finding]:
 
 
 def check_serial() -> list[Finding]:
-    """Ports at which a gripper could be."""
+    """Check the serial ports that a gripper may use."""
     try:
         from serial.tools import list_ports
     except ImportError:

@@ -1,4 +1,4 @@
-"""`splatbot demo`: a synthetic table top from camera to answer, checked against the scene's truth."""
+"""`splatbot demo`: a synthetic table top from the camera to a query, checked against the ground truth."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from splatbot.serving import serving
 from splatbot.sim.effects.base import Effects
 from splatbot.sim.effects.depth_noise import DepthNoise
 
-_TABLE_M = 1e-3  # a ray-cast point this near to z = 0 is on the table
-_TIP_M = 0.005  # radius of the fingertip that is asked about: a camera with 2 mm of noise cannot place a bare point
+_TABLE_M = 1e-3  # [m] largest height of a ray-cast point on the table
+_TIP_M = 0.005  # [m] radius of the queried fingertip; a camera with 2 mm of noise cannot locate a single point
 
 
 def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
-    """Record a synthetic table top, map it, serve the map and ask it what is free.
+    """Record a synthetic table top, map it, serve the map, and query free space.
 
-    May a fingertip of 1 cm touch here? Where the table is and where there is air is known exactly, so the answers are
-    checked: exit code 1 if the map calls a place on the table free, or one in the air occupied.
+    The queries ask whether a fingertip of 1 cm is free at a position on the table and at one in the air. Both are known
+    exactly. The exit code is 1 if the map reports the table as free, or the air as occupied.
 
     Examples:
         splatbot demo
@@ -57,7 +57,7 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
     question = _question(scene)
     with serving("--map", str(out / "map.ply"), log=out / "service.log") as service, Client(service.url) as client:
         _say(f"3/4 serving the map on {service.url}")
-        _say("4/4 asking it over HTTP: POST /v1/maps/default/distance")
+        _say("4/4 querying it over HTTP: POST /v1/maps/default/distance")
         answer = client.distance("default", _tips(question.places))
     wrong = _judge(question, answer)
     _say(f"report: {out / 'report.html'}      serve it again: splatbot serve --map {out / 'map.ply'}")
@@ -66,7 +66,7 @@ def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
 
 @dataclass(frozen=True)
 class _Question:
-    """Places (P, 3) [m, the map's world: the first camera], what they are, and whether something is there."""
+    """Positions (P, 3) [m, world frame of the map: the first camera], their names, and whether they are occupied."""
 
     places: NDArray[np.float64]
     names: tuple[str, ...]
@@ -74,7 +74,7 @@ class _Question:
 
 
 def _question(scene: Log) -> _Question:
-    """A place on the table top and one half-way to it from the camera, which sees the table through it: free air."""
+    """Choose a position on the table top, and one half-way from the camera to it, which is free space."""
     first = scene.read(0)
     truth = scene.ground_truth
     if truth is None:
@@ -93,7 +93,7 @@ def _question(scene: Log) -> _Question:
 
 
 def _tips(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (P·T, 3) that fill a fingertip at each of the places (P, 3), place by place."""
+    """Sample points (P·T, 3) in a fingertip at each of the positions (P, 3)."""
     steps = np.linspace(-_TIP_M, _TIP_M, 5)
     cube = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
     ball = cube[np.linalg.norm(cube, axis=1) <= _TIP_M * (1 + 1e-9)]
@@ -101,16 +101,16 @@ def _tips(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _judge(question: _Question, answer: Distances) -> int:
-    """Print each answer beside the truth; how many contradict it."""
+    """Print each answer next to the truth; return the number of contradictions."""
     wrong = 0
     touched = answer.inside.reshape(len(question.places), -1)
     nearest = answer.distance.reshape(touched.shape).min(axis=1)
     rows = zip(question.names, question.places, question.occupied, touched.sum(axis=1), nearest, strict=True)
     for name, place, occupied, inside, distance in rows:
         at = ", ".join(f"{x:+.3f}" for x in place)
-        said = "occupied" if inside else "free"
+        reported = "occupied" if inside else "free"
         verdict = "right" if bool(inside) == occupied else f"WRONG: it is {'occupied' if occupied else 'free'}"
-        _say(f"    a fingertip {name} ({at}) m: {said}  [{verdict}]")
+        _say(f"    a fingertip {name} ({at}) m: {reported}  [{verdict}]")
         _say(f"        {inside} of its {touched.shape[1]} points are inside, the nearest at {distance:.1f} sigma")
         wrong += bool(inside) != occupied
     _say(f"    answered on map_version {answer.map_version}")

@@ -6,10 +6,10 @@ import sys
 
 
 def doctor() -> int:
-    """Check this installation and say how to mend it.
+    """Check this installation and print how to fix it.
 
-    Looks at Python, the libraries, the compiled kernels (against a float64 reference), rendering without a display
-    and serial ports. Exits with 1 when something that everything needs is broken.
+    The checks cover Python, the libraries, the compiled kernels (against a float64 reference), rendering without a
+    display and serial ports. The exit code is 1 if a required part is broken.
 
     Examples:
         splatbot doctor

@@ -1,4 +1,4 @@
-"""Drawing without a screen."""
+"""Rendering without a display."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ import sys
 
 
 def draw_offscreen() -> None:
-    """Have MuJoCo draw through EGL where there is no screen; to be called before anything imports mujoco."""
+    """Select EGL for MuJoCo without a display; call it before any import of mujoco."""
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")

@@ -44,11 +44,10 @@ def grasp(
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
-    """Find grasps of one thing in a map, best first, with each term of their scores.
+    """Find grasps of an object in a map, best first, with each term of their scores.
 
-    The thing is named, or pointed at in one of the run's pictures, or in the world. Words are rules on names of the
-    scene.yaml, colours, shapes, sizes and places; what fits two things is refused. Writes grasp.json and a picture
-    grasp.png.
+    A name, a mark in an image of the run, or a point in the world selects the object. Names are rules on the names of
+    the scene.yaml, colours, shapes, sizes and positions; ambiguous names are refused. Writes grasp.json and grasp.png.
 
     Examples:
         splatbot grasp --map runs/latest --target "largest box"
@@ -59,29 +58,28 @@ def grasp(
 
     Args:
         map: a run folder, or a map file.
-        target: words.
-        pixel: of a picture of the run.
-        point: on or in the thing, in the map's frame [m].
-        box: corners of a rectangle in a picture of the run [px].
-        mask: a picture of the same size, not black where the thing is.
-        tag: number of an AprilTag 36h11 on the thing.
-        vlm: ask the vision-language model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL for the target too; it and the
-            rules must not contradict each other.
-        index: which picture of the run, from 0.
+        target: name or description of the object.
+        pixel: pixel in an image of the run.
+        point: position on or in the object, in the frame of the map [m].
+        box: corners of a rectangle in an image of the run [px].
+        mask: image of the same size that is not black at the object.
+        tag: number of an AprilTag 36h11 on the object.
+        vlm: also query the vision-language model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL; it and the rules must not
+            contradict each other.
+        index: index of the image in the run, from 0.
         robot: its name, as of `splatbot robot list`.
-        base: pose of the robot's base in the map; by default that of the scene.yaml beside the map (see
+        base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
             `splatbot info --fit-plane`).
-        hand_only: leave the arm out: where the hand could be, not whether the arm gets there.
-        approach: where the hand may come from.
-        friction: coefficient between pads and thing.
-        samples: places on the surface that are tried, four times as many with sharper rims where that finds nothing:
-            the knob of time.
-        wanted: how many grasps.
+        hand_only: ignore the arm and its reachability.
+        approach: direction of the approach.
+        friction: friction coefficient between finger pads and object.
+        samples: sampled surface points, which determine the time. Without a result, four times as many are tried.
+        wanted: largest number of grasps.
         pregrasp: length of the straight approach [m].
-        margin: room [m] that hand and arm keep from the rest of the map; "auto" as in `splatbot plan`.
-        n_sigma: where the surface of a Gaussian is; less than for planning, as the hand has to come near.
-        min_observations: Gaussians that fewer keyframes support are air.
-        seed: of the search.
+        margin: clearance [m] of hand and arm to the rest of the map; "auto" as in `splatbot plan`.
+        n_sigma: surface of a Gaussian, in standard deviations; smaller than for planning, because the hand comes close.
+        min_observations: least number of keyframes that support a Gaussian; others are ignored.
+        seed: seed of the search.
         out: folder to write to; by default runs/grasp.
     """
     from splatbot.errors import InputError
@@ -91,7 +89,7 @@ def grasp(
     if len(given) != 1:
         raise InputError(f"are {len(given)}.", field=", ".join(places), hint="give one of them")
     if vlm and target is None:
-        raise InputError("is about names.", field="--vlm", hint="give --target too")
+        raise InputError("needs a name.", field="--vlm", hint="give --target too")
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
@@ -176,7 +174,7 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
 
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if picture is None:
-        raise InputError("cannot be read.", file=path, field="--mask", hint="give a PNG as large as the picture")
+        raise InputError("cannot be read.", file=path, field="--mask", hint="give a PNG of the size of the image")
     return np.asarray(picture.reshape(*picture.shape[:2], -1).any(axis=2))
 
 
@@ -189,7 +187,7 @@ def _view(map_: Path, index: int) -> ObservedView:
     from splatbot.robots.in_view import reopen_log
 
     if not map_.is_dir():
-        raise InputError("has no pictures.", file=map_, hint="give the folder of a run, or --target or --point")
+        raise InputError("has no images.", file=map_, hint="give the folder of a run, or --target or --point")
     run = RunFolder(map_)
     poses = run.load_poses()
     log = reopen_log(run)
@@ -216,10 +214,10 @@ def _print(result: GraspResult, folder: Path) -> None:
     print_table(rows, title="grasps")
     terms = list(result.grasps[0].terms)
     table = Table()
-    for name in ("", "total", "approach", "width", "opens", "room", *terms):
+    for name in ("", "total", "approach", "width", "opens", "clearance", *terms):
         table.add_column(name, justify="left" if name == "approach" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *(f"{g.terms[name]:.2f}" for name in terms))
     wide_console().print(table)
-    print("width, opens and room in mm; the terms are 1 at best")
+    print("width, opens and clearance in mm; the best value of a term is 1")

@@ -26,10 +26,11 @@ def gripper(
     fake: bool = False,
     fake_width: Annotated[float, tyro.conf.arg(metavar="METRES")] = 0.0,
 ) -> int:
-    """Ask or move a Robotiq 2F gripper on a serial port, or one that is not there.
+    """Query or move a Robotiq 2F gripper on a serial port, or a simulated one.
 
-    status: what it tells.  open, close, move: go there, wait, and tell.  activate: reset it and activate it anew; its
-    fingers close and open.  release: let go slowly, whatever it does. Before a move it is activated if it is not.
+    The action `status` prints its state. The actions `open`, `close` and `move` move the fingers, wait, and print the
+    state. The action `activate` resets it and activates it again; its fingers close and open. The action `release`
+    opens it slowly at any time. A move activates the gripper first if necessary.
 
     Examples:
         splatbot gripper status --port /dev/ttyUSB0
@@ -37,14 +38,14 @@ def gripper(
         splatbot gripper close --fake --fake-width 0.03
 
     Args:
-        action: what to do.
+        action: the action.
         port: the serial device.
-        model: of the gripper.
-        opening: move: between the fingers [m].
-        force: at most [N].
-        speed: at most [m/s].
-        fake: in place of --port, a gripper that is not there, on a pseudo-terminal.
-        fake_width: of what is between its fingers [m].
+        model: model of the gripper.
+        opening: distance between the fingers for move [m].
+        force: largest force [N].
+        speed: largest speed [m/s].
+        fake: simulate a gripper on a pseudo-terminal instead of --port.
+        fake_width: width of a simulated object between its fingers [m].
     """
     from splatbot.errors import InputError
     from splatbot.robots.grippers import FakeRobotiq, RobotiqGripper
@@ -59,7 +60,7 @@ def gripper(
         hand = stack.enter_context(RobotiqGripper(port, model))
         if action == "release":
             hand.release()
-            print("it lets go; activate it before it moves again")
+            print("the gripper opens; activate it before it moves again")
             return 0
         if action == "activate":
             hand.activate(again=True)
@@ -88,7 +89,7 @@ def _print(hand: RobotiqGripper, port: str) -> None:
     rows = [
         ("activation", status.activation.name.lower()),
         ("opening", f"{1e3 * hand.model.opening(status.position):.1f} of {1e3 * hand.stroke:g} mm"),
-        ("fingers", _FINGERS[status.fingers.name] if status.going else "stand still"),
+        ("fingers", _FINGERS[status.fingers.name] if status.going else "do not move"),
         ("current", f"{status.current} mA"),
         ("exchanges repeated", str(hand.repeated)),
     ]
@@ -99,5 +100,5 @@ _FINGERS = {
     "MOVING": "move",
     "STOPPED_OPENING": "hold something, from within",
     "STOPPED_CLOSING": "hold something",
-    "THERE": "are where they were sent, and hold nothing",
+    "THERE": "reached the commanded opening, and hold nothing",
 }

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from splatbot.logs import Log
 
 _N_SAMPLES = 10  # frames that are decoded to describe a log
-_MUCH = 0.004  # of the width: sensors widen near things by less
+_MAX_SHIFT = 0.004  # share of the width; sensors widen close objects by less
 
 
 def info(
@@ -21,10 +21,10 @@ def info(
     fit_plane: bool = False,
     up: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y Z")] = (0.0, -1.0, 0.0),
 ) -> int:
-    """Say what is in a map, a log or a run.
+    """Describe a map, a log or a run.
 
-    A log's depth is described from ten frames spread over it. Its shift tells whether it is registered: by how many
-    pixels right and down its edges would have to move to lie on those of colour.
+    Ten frames of a log describe its depth. The shift shows whether depth is registered to colour: it is the distance in
+    pixels, right and down, between the edges of both.
 
     Examples:
         splatbot info recordings/desk
@@ -35,8 +35,8 @@ def info(
     Args:
         path: a map file, a folder in TUM or Replica layout, synthetic:SCENE, or a run folder (its map).
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
-        fit_plane: estimate where the map's table or floor is, and propose where a robot may stand, in a scene.yaml
-            beside the map, if there is none yet.
+        fit_plane: estimate the plane of the table or floor and propose a base of a robot. They are written to a new
+            scene.yaml next to the map.
         up: with --fit-plane, roughly upwards in the first camera: 0 -1 0 if it looked ahead, 0 0 -1 straight down.
     """
     from splatbot.cli.tables import print_table
@@ -60,7 +60,7 @@ def info(
 
 
 def fit_scene(path: Path, up: tuple[float, float, float]) -> list[tuple[str, str]]:
-    """The workspace beside a map file, as names and values; estimated and written if there is none.
+    """Describe the workspace next to a map file; estimate and write it if the file does not exist.
 
     Raises:
         InputError: the map has no upward surface.
@@ -91,7 +91,7 @@ def fit_scene(path: Path, up: tuple[float, float, float]) -> list[tuple[str, str
 
 
 def describe_map(path: Path) -> list[tuple[str, str]]:
-    """What a map file holds, as names and values.
+    """Describe a map file as names and values.
 
     Raises:
         FormatError: the file is damaged or of an unknown format.
@@ -120,10 +120,10 @@ def describe_map(path: Path) -> list[tuple[str, str]]:
 
 
 def describe_log(log: Log) -> list[tuple[str, str]]:
-    """What a log holds, as names and values.
+    """Describe a log as names and values.
 
     Raises:
-        LogError: a frame that was looked at is damaged.
+        LogError: a decoded frame is damaged.
     """
     import numpy as np
 
@@ -153,8 +153,8 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
 
 
 def shift_text(shift: tuple[int, int] | None, width: int) -> str:
-    """How well depth is registered to colour ``width`` [px] wide, in words; None: not known."""
+    """Describe the registration of depth to colour of ``width`` [px]. If the shift is None, it is unknown."""
     if shift is None:
         return "not known: few frames or edges, or none that depth and colour share clearly"
     text = f"{shift[0]}, {shift[1]} px"
-    return f"{text}: not well registered" if max(map(abs, shift)) > _MUCH * width else text
+    return f"{text}: not well registered" if max(map(abs, shift)) > _MAX_SHIFT * width else text

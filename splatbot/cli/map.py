@@ -39,8 +39,8 @@ def map_log_command(
     """Turn an RGB-D log into a map of Gaussians.
 
     Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml, report.html and map.html.
-    Ctrl-C saves what has been mapped so far; so does a frame that cannot be read. Every 30 s, and when the frames are
-    through, the whole state is saved too (RUN/state), for --resume and --localise.
+    Ctrl-C saves the current map; so does a frame that cannot be read. Every 30 s, and after the last frame, the whole
+    state is saved too (RUN/state), for --resume and --localise.
 
     Examples:
         splatbot map recordings/desk
@@ -62,17 +62,16 @@ def map_log_command(
         budget_ms: time for tracking one frame, 100 by default; 30, 300 and 1000 have other settings. As --set
             tracking.budget_ms=MS; counted in work, so that runs repeat, unless --realtime.
         camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
-        on_bad_frame: what to do about a frame that cannot be read: save and stop, or leave it out.
+        on_bad_frame: reaction to a frame that cannot be read: save and stop, or skip it.
         max_frames: read only the first N frames.
-        realtime: give frames at the times of their stamps, map beside tracking, drop frames there is no time for.
-        rate: the same at so many frames per second.
-        save_every: seconds between two saves of the state; 0: never, not even at the end.
-        resume: go on with a run that was killed, interrupted or cut short, into its own folder unless --out is given;
-            LOG only if the log has moved.
-        localise: place the frames in the map of this run instead of building one; the first may be anywhere in it, and
-            is not believed before the second agrees.
-        robot: leave this robot out of the frames: the log's joints.txt and the T_link_camera of its scene.yaml say
-            where it is in view.
+        realtime: feed frames at the times of their stamps, map in parallel with tracking, and drop late frames.
+        rate: as realtime, at this rate [Hz].
+        save_every: time between two saves of the state [s]; 0 never saves it.
+        resume: continue a run that was killed or interrupted, in its own folder unless --out is given. Give LOG only
+            if the log has moved.
+        localise: localise the frames in the map of this run instead of building one. The first pose is
+            arbitrary, and is accepted when the second agrees.
+        robot: mask this robot in the frames, by the log's joints.txt and the T_link_camera of its scene.yaml.
         dump_config: print the configuration in force and leave.
         quiet: no progress and no summary, only errors.
     """
@@ -87,7 +86,7 @@ def map_log_command(
     if resume is not None and localise is not None:
         raise InputError("excludes --resume.", field="--localise", hint="give the one or the other")
     if (resume or localise) and (config or given):
-        hint = "leave --config, --set and --budget-ms out, or map the log anew"
+        hint = "leave --config, --set and --budget-ms out, or map the log again"
         raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
     if not log and resume is None:
         raise InputError("is missing.", field="LOG", hint="name a recording: splatbot map LOG")
@@ -156,7 +155,7 @@ def _parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _lasting(camera: str) -> str:
-    """A file's path that still holds when the run is scored from another folder; the name of a preset as it is."""
+    """Return an absolute path of a file, so that the run can be scored from any folder; keep names of presets."""
     return str(Path(camera).resolve()) if Path(camera).exists() else camera
 
 
@@ -167,7 +166,7 @@ def _slug(name: str) -> str:
 def _link_latest(folder: Path) -> None:
     link = folder.parent / "latest"
     if link.exists() and not link.is_symlink():
-        return  # somebody's own folder
+        return  # a folder of the user
     fresh = folder.parent / f".latest-{os.getpid()}"
     fresh.symlink_to(folder.name)
     fresh.replace(link)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def page_of_map(model: GaussianModel, trajectory: Trajectory) -> str:
-    """One page that needs nothing else, with the map and the camera's way, both to be turned."""
+    """Return a self-contained page with the map and the camera's trajectory in an interactive view."""
     from splatbot.services.viewer.page import map_page
 
     return map_page(model, trajectory=trajectory)

@@ -27,11 +27,11 @@ def pick(
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
-    """Pick a thing in the twin: look around, find grasps, plan, approach, close, lift, check.
+    """Pick an object in the twin: scan, find grasps, plan, approach, close, lift, check.
 
-    The scene is scanned by a depth camera through the scene's sensor effects; all that follows knows only that map. The
-    whole way is certified before the arm moves. Writes pick.json: outcome, stage, times, grasp, and how far the thing
-    really rose. Exit code 1 if it is not held.
+    The scene is scanned by a depth camera through the scene's sensor effects; all later steps use only that map. The
+    whole path is certified before the arm moves. Writes pick.json: outcome, stage, times, grasp, and the height
+    to which the object rose. The exit code is 1 if the hand does not hold it.
 
     Examples:
         splatbot pick tabletop_clutter --target can
@@ -41,15 +41,15 @@ def pick(
     Args:
         scene: a scene's name, as of `splatbot twin --list`, or its YAML file.
         target: a name of the scene, or words as of `splatbot grasp`.
-        vlm: ask the vision-language model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL too; it and the rules must not
+        vlm: also query the vision-language model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL; it and the rules must not
             contradict each other.
-        views: of the scan.
-        force: of the fingers; by default the gripper's own.
-        lift: how far up [m].
-        tries: grasps whose way is looked for.
-        margin: room [m] that hand and arm keep from the map.
-        home: carry it home.
-        seed: of sensor noise and search.
+        views: number of views of the scan.
+        force: force of the fingers; by default the gripper's own.
+        lift: height of the lift [m].
+        tries: largest number of grasps to plan for.
+        margin: clearance [m] of hand and arm to the map.
+        home: carry the object to the home configuration.
+        seed: seed of sensor noise and search.
         out: folder to write to; by default runs/pick.
     """
     from splatbot.atomic import atomic_write

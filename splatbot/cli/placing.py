@@ -1,4 +1,4 @@
-"""What commands that place a robot in a map have in common: poses, its base, its margin."""
+"""Options of commands that place a robot in a map: poses, base and margin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Pose = tuple[float, float, float, float, float, float, float]
 
 
 def checked_pose(pose: Pose, flag: str) -> NDArray[np.float64]:
-    """A pose (4, 4) of position and quaternion wxyz.
+    """Return the pose (4, 4) of a position and a quaternion wxyz.
 
     Raises:
         InputError: the quaternion is no rotation.
@@ -32,7 +32,7 @@ def checked_pose(pose: Pose, flag: str) -> NDArray[np.float64]:
 
 
 def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
-    """T_world_base (4, 4): as given, or that of the scene.yaml beside the map.
+    """Return T_world_base (4, 4): the given one, or that of the scene.yaml next to the map.
 
     Raises:
         InputError: it is not known.
@@ -50,7 +50,7 @@ def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
 
 
 def margin_of(text: str, map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
-    """Metres, or "auto": those that the run itself calls for.
+    """Parse a margin [m]; "auto" is the surface error of the run.
 
     Raises:
         InputError: it is neither, or the map is no run folder.

@@ -32,10 +32,10 @@ def plan(
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
-    """Plan an arm's way among the Gaussians of a map.
+    """Plan a path of an arm among the Gaussians of a map.
 
-    Writes the certified trajectory (trajectory.json as ROS JointTrajectory, trajectory.csv at 1 kHz), plan.json, a
-    picture plan.png and plan.html, in which arm and map can be turned and played.
+    Writes the certified trajectory (trajectory.json as ROS JointTrajectory, trajectory.csv at 1 kHz), plan.json and
+    plan.png. The page plan.html animates arm and map.
 
     Examples:
         splatbot plan --map runs/latest --start home --goal 0.5 -0.3 0 -2.0 0 1.9 0.8
@@ -46,16 +46,15 @@ def plan(
         map: a map file, or a run folder.
         start: joint values [rad or m], or "home".
         goal: joint values, or "home".
-        goal_pose: in place of --goal, where the tool shall be, in the frame of the robot's base: position [m] and
-            quaternion.
+        goal_pose: pose of the tool instead of --goal, in the frame of the robot's base: position [m] and quaternion.
         robot: its name, as of `splatbot robot list`.
-        base: pose of the robot's base in the map; by default that of the scene.yaml beside the map (see
+        base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
             `splatbot info --fit-plane`).
-        margin: room [m] to keep from the map; "auto", for a run folder: the error of its surfaces within a metre of
-            the base, as its own depth images tell.
-        n_sigma: where the surface of a Gaussian is.
-        budget_ms: time to plan.
-        seed: of the search.
+        margin: clearance [m] to the map. With "auto" and a run folder, it is the error of the map's surfaces near the
+            base, measured against the depth images of the run.
+        n_sigma: surface of a Gaussian, in standard deviations.
+        budget_ms: time budget of the planner [ms].
+        seed: seed of the search.
         out: folder to write to; by default runs/plan.
     """
     from splatbot.errors import InputError
@@ -146,7 +145,7 @@ def _print(result: PlanResult, trajectory: JointTrajectory, folder: Path) -> Non
         ("length", f"{result.path.cost:.3f} rad, {len(result.path)} waypoints"),
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
-        ("room all along", f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm"),
+        ("clearance along the path", f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm"),
         ("written to", str(folder)),
     ]
     print_table(rows, title="planned")

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from splatbot.run import Progress
 
 PLAIN_EVERY_S = 2.0
-_RATE_FRAMES = 10  # frames that the shown rate looks back on
+_RATE_FRAMES = 10  # number of frames that the shown rate averages
 _COLOURS = {"ok": "green", "degraded": "yellow", "lost": "red"}
 
 
 @contextmanager
 def progress_display(*, quiet: bool = False) -> Iterator[Callable[[Progress], None]]:
-    """A callback for :func:`splatbot.run.map_log` that shows progress while the block lasts."""
+    """Yield a callback for :func:`splatbot.run.map_log` that shows progress during the block."""
     if quiet:
         yield lambda progress: None
     elif sys.stderr.isatty():
@@ -31,7 +31,7 @@ def progress_display(*, quiet: bool = False) -> Iterator[Callable[[Progress], No
 
 @contextmanager
 def shares(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """A callback for what is done now and the share (0..1) that is done, shown on a terminal alone."""
+    """Yield a callback that shows the current step and the finished share (0..1) on a terminal."""
     if quiet or not sys.stderr.isatty():
         yield lambda what, share: None
         return
@@ -53,7 +53,7 @@ class PlainLines:
         self._verdict = "ok"
 
     def __call__(self, progress: Progress) -> None:
-        """Show where the run stands, if it is time."""
+        """Show the progress of the run, if it is due."""
         rate = self._rate.add(progress)
         if progress.skipped:
             print(f"skipped: {progress.skipped}", file=sys.stderr, flush=True)
@@ -72,7 +72,7 @@ class FrameRate:
         self._times: deque[tuple[int, float]] = deque(maxlen=_RATE_FRAMES + 1)
 
     def add(self, progress: Progress) -> float:
-        """The rate [1/s] with this frame counted; 0 before the second."""
+        """Return the rate [1/s] including this frame; 0 before the second."""
         self._times.append((progress.done, progress.elapsed_s))
         frames = self._times[-1][0] - self._times[0][0]
         seconds = self._times[-1][1] - self._times[0][1]
@@ -80,7 +80,7 @@ class FrameRate:
 
 
 def describe(progress: Progress, rate: float) -> str:
-    """One line on where the run stands."""
+    """Return one line on the progress of the run."""
     if progress.phase != "mapping":
         return f"{progress.phase} ..."
     verdict = progress.result.verdict if progress.result else "skipped"
@@ -92,7 +92,7 @@ def describe(progress: Progress, rate: float) -> str:
 
 
 def mishaps(progress: Progress) -> str:
-    """How many frames were lost, late and dropped, where any were."""
+    """Return the counts of lost, late and dropped frames that are not zero."""
     counts = {"lost": progress.lost, "late": progress.late, "dropped": progress.dropped}
     return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
 

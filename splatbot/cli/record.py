@@ -24,7 +24,7 @@ def record(
         splatbot map desk.mcap
 
     Args:
-        log: whatever `splatbot map` takes.
+        log: a log, as for `splatbot map`.
         out: the file to write; must not exist.
         camera: intrinsics instead of the log's own, as for `splatbot map`.
     """

@@ -16,10 +16,11 @@ def robot(
     tip: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None,
     slack: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None,
 ) -> int:
-    """Add a robot arm, or say what is known of one.
+    """Add a robot arm, or describe a stored one.
 
-    add: read a URDF, cover its collision geometry with spheres, check that they do, and keep it under its name.
-    list: the robots there are.  info: joints, limits and spheres of one.  mjcf: write it as a MuJoCo model.
+    The action `add` reads a URDF, covers its collision geometry with spheres, checks the cover, and stores it under its
+    name. The action `list` prints the names of the robots. The action `info` prints joints, limits and spheres. The
+    action `mjcf` writes a MuJoCo model.
 
     Examples:
         splatbot robot add ur5.urdf --tip tool0
@@ -27,11 +28,11 @@ def robot(
         splatbot robot mjcf panda --out panda.xml
 
     Args:
-        action: what to do.
+        action: the action.
         name: a robot's name; for add, the URDF file.
         out: add: a file to keep the robot in; mjcf: the file to write (else it is printed).
         tip: add: the link at the arm's end; by default that with most moving joints before it.
-        slack: add: how far the spheres may reach beyond the geometry [m]; 0.02 by default.
+        slack: add: largest distance of the spheres beyond the geometry [m]; 0.02 by default.
     """
     if action == "add":
         return _add(Path(name), out, tip, 0.02 if slack is None else slack)

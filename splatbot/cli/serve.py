@@ -28,7 +28,7 @@ def serve(
     service_config: Path | None = None,
     new_key: bool = False,
 ) -> int:
-    """Answer questions about maps over HTTP until Ctrl-C or SIGTERM.
+    """Serve maps over HTTP until Ctrl-C or SIGTERM.
 
     Examples:
         splatbot serve --map runs/demo/map.ply
@@ -38,7 +38,7 @@ def serve(
         splatbot serve --new-key
         curl localhost:8000/v1/maps/default/distance -H 'content-type: application/json' -d '{"points": [[0, 0, 1]]}'
 
-    Then http://localhost:8000/docs lists every question with examples, and
+    http://localhost:8000/docs lists every route with examples, and
     http://localhost:8000/v1/maps/default/render shows the map. Every setting is a variable SPLATBOT_NAME, too.
 
     Args:
@@ -49,10 +49,10 @@ def serve(
             --log, intrinsics instead of the log's own.
         host: address to listen on (default 127.0.0.1; 0.0.0.0 for every interface, which needs keys), or SPLATBOT_HOST.
         port: port to listen on (default 8000; 0 takes a free one), or SPLATBOT_PORT.
-        ros_port: one more port, for roslib clients that want a port of their own (usually 9090); rosbridge is at
-            /rosbridge of --port in any case, Foxglove at /foxglove.
+        ros_port: additional port for roslib clients that need a separate one (usually 9090). rosbridge is always at
+            /rosbridge of --port, Foxglove at /foxglove.
         viewer_port: show the map in the browser at this port, on this machine alone.
-        record: record every topic into this MCAP file; what was mapped can be mapped again from it.
+        record: record every topic into this MCAP file, from which the frames can be mapped again.
         config: YAML file with the configuration of mapping.
         service_config: YAML file with the service's address, keys and limits.
         new_key: print a new API key and its hash for SPLATBOT_API_KEYS, and leave.
@@ -129,4 +129,4 @@ def _print_new_key() -> int:
 
 
 def _announce(url: str) -> None:
-    print(f"serving on {url}  (questions: {url}/docs, a picture: {url}/v1/maps/{MAP_ID}/render)", flush=True)
+    print(f"serving on {url}  (routes: {url}/docs, an image: {url}/v1/maps/{MAP_ID}/render)", flush=True)

@@ -29,16 +29,16 @@ def sim2real(
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     quiet: bool = False,
 ) -> int:
-    """Say how far the twin is from a recorded log, and from a held-out twin.
+    """Measure the difference of the twin from a recorded log, and from a held-out twin.
 
-    Sim-to-real, of a log: colour, depth and silhouettes of the twin at the log's recorded camera poses, and the arm's
-    motion done again by the twin's arm. The arm's poses are those of the log's ee_poses.txt and ee_T_camera, or of its
+    Sim-to-real compares colour, depth and silhouettes of the twin at the recorded camera poses of a log. The twin's arm
+    repeats the motion of the arm. The arm's poses are those of the log's ee_poses.txt and ee_T_camera, or of its
     joints.txt and the mount in scene.yaml. Writes sim2real.json and sim2real.html.
 
-    Sim-to-sim, with --held-out: policies that see nothing but the map of a noisy film, in the twin of that map and in a
-    held-out twin of the true shapes with other friction, masses, gains and delays, all effects on. Success in both,
-    the drop, Pearson's r and the mean maximum rank violation, promised against measured clearance. Writes sim2sim.json
-    and sim2sim.html.
+    Sim-to-sim, with --held-out, runs policies that use only the map of a noisy film. They run in the twin of that map
+    and in a held-out twin of the true shapes. The held-out twin has other friction, masses, gains and delays and all
+    effects. The report gives success in both, the drop, Pearson's r and the mean maximum rank violation. It compares
+    certified and measured clearance. Writes sim2sim.json and sim2sim.html.
 
     Examples:
         splatbot sim2real /data/arm --map runs/arm
@@ -49,16 +49,16 @@ def sim2real(
     Args:
         log: a recording that was mapped.
         map: the folder of the run that mapped it.
-        robot: the twin's arm; one with other joints than the log's stands in by its tool's poses.
-        frames: how many to compare, evenly spaced; 0: all.
+        robot: the twin's arm. If its joints differ from those of the log, it follows the poses of the tool.
+        frames: number of evenly spaced frames to compare; 0 compares all.
         held_out: compare the map's twin with a held-out one, on synthetic tables.
-        task: reach or push; once for each, both by default.
-        tables: different ones, each filmed and mapped.
-        trials: of each task on each table.
-        seed: of tables, problems and physics.
+        task: reach or push; repeat it for both. By default both.
+        tables: number of different tables, each filmed and mapped.
+        trials: number of trials of each task on each table.
+        seed: seed of tables, problems and physics.
         quick: two trials of each task on a table filmed briefly, to see whether it runs.
         out: folder to write to; by default runs/sim2real.
-        json: another place for the JSON file of the log, or else of the held-out twin.
+        json: path of the JSON file of the log, or without a log of the held-out twin.
         quiet: print only errors.
     """
     from splatbot.cli.progress import shares
@@ -83,7 +83,7 @@ def sim2real(
 def _compare_log(
     log: str, map: Path, robot: str, frames: int, folder: Path, json: Path | None, tell: Tell, quiet: bool
 ) -> bool:
-    """Whether it was interrupted."""
+    """Compare, and return whether it was interrupted."""
     from splatbot.cli.tables import print_table
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
@@ -114,7 +114,7 @@ def _plan(task: tuple[str, ...], tables: int, trials: int, seed: int, quick: boo
 
 
 def _compare_twins(plan: SimToSimPlan, folder: Path, json: Path | None, tell: Tell, quiet: bool) -> bool:
-    """Whether it was interrupted."""
+    """Compare, and return whether it was interrupted."""
     from rich.table import Table
 
     from splatbot.bench.sim2sim import run_sim_to_sim
@@ -139,7 +139,7 @@ def _compare_twins(plan: SimToSimPlan, folder: Path, json: Path | None, tell: Te
     for found in results:
         for title, head, rows in (
             (trials_title(found), POLICY_HEAD, policy_rows(found)),
-            (f"{KIND}: promised clearance, {found.task}", PROMISE_HEAD, promise_rows(found)),
+            (f"{KIND}: certified clearance, {found.task}", PROMISE_HEAD, promise_rows(found)),
         ):
             if rows:
                 table = Table(*head, title=title)

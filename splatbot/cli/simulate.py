@@ -37,9 +37,9 @@ def simulate(
 ) -> int:
     """Record a synthetic log whose depth and poses are known exactly.
 
-    Writes a TUM-layout folder: rgb/, depth/, rgb.txt, depth.txt, groundtruth.txt, intrinsics.json, effects.json (what
-    the frames went through and why) and objects/NAME.tum (paths of what moves). `splatbot map` takes the folder, or,
-    without any file, the address that is printed at the end.
+    Writes a TUM-layout folder: rgb/, depth/, rgb.txt, depth.txt, groundtruth.txt, intrinsics.json, effects.json (the
+    effects on the frames, with reasons) and objects/NAME.tum (trajectories of objects). `splatbot map` takes the
+    folder, or, without any file, the URI that is printed at the end.
 
     Examples:
         splatbot simulate --list
@@ -49,16 +49,16 @@ def simulate(
         splatbot simulate tabletop_crossing --event 1.5 --frames 150 --size 320x240 --out crossing
 
     Args:
-        scene: what is filmed; --list names the scenes.
+        scene: the scene; --list names all scenes.
         out: folder to write; must hold no recording.
-        trajectory: how the camera moves; by default the scene's own.
-        frames: how many the sensor takes (frame_drops loses some of them).
-        size: of the images [px].
+        trajectory: trajectory of the camera; by default that of the scene.
+        frames: number of frames of the sensor (frame_drops removes some of them).
+        size: size of the images [px].
         fps: frames per second.
         arc: angle over which the trajectory `orbit` swings [degrees].
-        event: when something moves or goes, in the scenes in which something does [s].
-        effects: what the frames go through, in this order; once for each effect. None unless asked for.
-        seed: of everything random; the same seed gives the same bits.
+        event: time at which an object moves or is removed, in scenes with such an event [s].
+        effects: effect on the frames; repeat it for several, in this order. By default no effects.
+        seed: seed of all random numbers; the same seed gives the same bits.
         list_: print the scenes, trajectories and effects and leave.
         quiet: no progress, no summary, only errors.
     """
@@ -98,14 +98,14 @@ def _record(log: SyntheticLog, out: Path, *, quiet: bool) -> None:
     from splatbot.logs.record import record
 
     def frames() -> Iterator[Frame]:
-        def tell() -> None:
+        def account() -> None:
             write_account(out, uri=log.uri, effects=log.effects, blanks_depth=log.blanks_depth)
 
-        tell()  # before the first frame: a recording that is interrupted must not pass for a real sensor's
+        account()  # before the first frame, so that an interrupted recording is also marked as synthetic
         try:
             yield from log
         finally:
-            tell()
+            account()
 
     with _progress(len(log), quiet=quiet) as show:
         record(frames(), out, ground_truth=log.ground_truth, progress=show)
@@ -115,7 +115,7 @@ def _record(log: SyntheticLog, out: Path, *, quiet: bool) -> None:
 
 @contextmanager
 def _progress(total: int, *, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """A callback with the number of frames done: a bar on a terminal, a line every two seconds elsewhere."""
+    """Yield a callback for the number of finished frames: a bar on a terminal, else a line every two seconds."""
     if quiet:
         yield lambda done: None
     elif sys.stderr.isatty():
@@ -179,5 +179,5 @@ def _print_lists() -> None:
     )
 
 
-def _first_line(thing: object) -> str:
-    return (thing.__doc__ or "").strip().splitlines()[0]
+def _first_line(documented: object) -> str:
+    return (documented.__doc__ or "").strip().splitlines()[0]

@@ -23,17 +23,17 @@ def trials(
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     quiet: bool = False,
 ) -> int:
-    """Pick from seeded scenes in the twin, end to end, and say how often it goes well and why not.
+    """Pick in seeded scenes in the twin, end to end, and report the success rate and the failures.
 
-    Each scene is looked at by the arm's wrist camera with noise and holes in its depth, mapped, and something in it is
-    clicked at. A stack finds grasps and a way with nothing but that map. The pick is then made in the twin of the scene
-    and in one of other friction, masses, gains and delays, every effect on ("reality"). It goes well if the thing is
-    lifted by 15 cm and still held after it was shaken. All stacks see the same frames from the same poses.
+    The arm's wrist camera scans each scene with noise and holes in its depth. The frames are mapped, and a click
+    selects an object. A stack plans grasp and path with only that map. The pick runs in the twin of the scene, and in a
+    twin with other friction, masses, gains and delays and every effect ("reality"). It succeeds if the hand lifts the
+    object by 15 cm and still holds it after shaking. All stacks get the same frames at the same poses.
 
     Stacks: gaussians (the map), mesh (fused depth, marching cubes, python-fcl), cloud (points, an octree, python-fcl).
 
-    Writes trials.jsonl, a line for each stack in each scene, as they are done: run again, it goes on where it was
-    stopped. Writes trials.json with the table and the physics that it holds for.
+    Writes a line of trials.jsonl for each stack in each scene. A second run continues an interrupted one. Writes
+    trials.json with the table and the physics that it holds for.
 
     Examples:
         splatbot trials --jobs 2
@@ -41,15 +41,16 @@ def trials(
         splatbot trials --full --stacks gaussians mesh cloud --jobs 2 --out runs/trials
 
     Args:
-        scenes: tabletop: cups, tools and clutter, in every fifth something that moves; isolated: one convex thing.
-        trials: scenes; 50, of isolated things 24.
-        full: 250 scenes: of 50, one is 2 %.
-        stacks: who picks: gaussians, mesh, cloud.
+        scenes: tabletop has cups, tools and clutter, and a moving object in every fifth scene. isolated has one convex
+            object.
+        trials: number of scenes; by default 50, or 24 with isolated objects.
+        full: run 250 scenes.
+        stacks: stacks to compare: gaussians, mesh, cloud.
         first: seed of the first scene.
-        jobs: processes.
-        frames: of each scan.
-        width: of its pictures [px].
-        videos: film what failed in reality.
+        jobs: number of processes.
+        frames: frames of each scan.
+        width: width of its images [px].
+        videos: write a video of each pick that failed in reality.
         out: folder to write to; by default runs/trials.
         quiet: print only errors.
     """

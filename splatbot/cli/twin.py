@@ -34,10 +34,10 @@ def twin(
     list_: Annotated[bool, tyro.conf.arg(name="list")] = False,
     quiet: bool = False,
 ) -> int:
-    """Try a motion in a scene's physics before the robot moves.
+    """Simulate a motion in the physics of a scene before the robot moves.
 
-    Says how well the arm followed, what it touched, how near it came to the rest and what fell; which physics was on,
-    why, and what each effect cost. Only what the scene calls for is simulated. Exit code 1: something was touched.
+    The output reports tracking error, contacts, clearance and dropped objects. It lists the active physics effects with
+    reason and cost; only effects that the scene needs are active. The exit code is 1 after an unintended contact.
 
     Examples:
         splatbot twin --list
@@ -48,17 +48,17 @@ def twin(
 
     Args:
         scene: a shipped scene (--list) or a YAML file.
-        map: a run's folder or a Gaussian map: table, objects, clutter are fitted. The scene.yaml beside it says where
-            the robot stands; a file without one is in the robot's frame (z up, base at the origin).
+        map: a run's folder or a Gaussian map: table, objects, clutter are fitted. The scene.yaml next to it defines
+            the base of the robot. Without one, the map is in the robot's frame (z up, base at the origin).
         trajectory: ROS JointTrajectory as JSON, or CSV; by default the moves of the scene's task.
         json: file for the whole result.
-        video: MP4 of what the scene's camera sees.
-        html: page on which the run is turned, played, stepped and scrubbed.
-        force: physics, or an effect of the camera's sensor, that is on whatever the scene calls for; once for each.
-        forbid: what is off.
-        timestep: longest step of physics [s]: accuracy for time.
-        seed: of where movable objects stand, within millimetres, and of the camera's noise; 0: where the scene says.
-        no_costs: do not measure what each effect cost (a run for each).
+        video: MP4 of the scene's camera.
+        html: interactive page of the run.
+        force: effect of physics or of the sensor to activate in any case; repeat it for several.
+        forbid: effect to deactivate; repeat it for several.
+        timestep: longest step of physics [s].
+        seed: seed of the camera's noise and of millimetre offsets of movable objects; 0 uses no offsets.
+        no_costs: do not measure the cost of each effect (one run for each).
         list_: print the scenes and the physics and leave.
         quiet: print only errors.
     """
@@ -115,7 +115,7 @@ def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
 
 
 def _harm(scene: Scene, result: TwinResult) -> bool:
-    """Whether the arm touched what its task does not speak of touching, or something fell or went wrong."""
+    """Return whether the arm had an unintended contact, or the simulation was unstable."""
     may_touch = scene.task.kind in ("push", "grasp", "hang", "wipe", "squeeze")
     return bool((result.contacts and not may_touch) or any("unstable" in text for text in result.warnings))
 
@@ -212,7 +212,7 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
     table = Table("effect", "on", "why", "ms", "us a step")
     for entry in entries:
         cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
-        if entry.on or entry.observable or entry.by != "scene":  # not each of the many that no sensor names
+        if entry.on or entry.observable or entry.by != "scene":  # leaves out effects that no sensor names
             table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
     console.print(table)
     for path in written:
@@ -226,5 +226,5 @@ def _print_lists() -> None:
     from splatbot.sim.scene import load_scene, scene_names
 
     print_table([(name, load_scene(name).about) for name in scene_names()], title="scenes")
-    print_table([(name, physics_effect(name).cost) for name in PHYSICS], title="physics, and what it costs")
-    print_table([(name, effect_class(name).cost) for name in EFFECTS], title="the camera's sensor, and what it costs")
+    print_table([(name, physics_effect(name).cost) for name in PHYSICS], title="physics, and its cost")
+    print_table([(name, effect_class(name).cost) for name in EFFECTS], title="the camera's sensor, and its cost")

@@ -18,7 +18,7 @@ def view(
     robot: str = "panda",
     html: Path | None = None,
 ) -> None:
-    """Show a map's Gaussians in a web browser, with the camera's way and the robot where they are known.
+    """Show a map's Gaussians in a web browser, with the camera's trajectory and the robot if they are known.
 
     Examples:
         splatbot view runs/demo
@@ -29,8 +29,8 @@ def view(
         map: a map file, or a run folder that holds map.ply.
         host: address to listen on.
         port: port to listen on; 0 takes a free one.
-        robot: the arm to show where a scene.yaml beside the map tells its base.
-        html: write one page that needs nothing else, and leave.
+        robot: the arm to show, if a scene.yaml next to the map defines its base.
+        html: write one self-contained page, and exit.
     """
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel, Snapshot

@@ -35,7 +35,7 @@ def splatbot(*words: object, timeout: float = 300.0) -> Answer:
 
 
 def metrics_of(folder: Path) -> dict[str, Any]:
-    """``metrics.json`` of a run."""
+    """Load ``metrics.json`` of a run."""
     values: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
     return values
 

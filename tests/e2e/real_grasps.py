@@ -1,4 +1,4 @@
-"""Grasps on the maps of recordings, held to what does not come from the map: raw pictures and depth."""
+"""Grasps on the maps of recordings, compared with raw images and depth, which do not come from the map."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from splatbot.results.folder import RunFolder
 WIDTH = 0.008  # [m] that a width may be off
 SHELF_BOX = (228, 333)  # [px] the edges of its front in frame 12
 FRICTION = 0.5
-SHOWN = 23  # frame of arm_wrist_48 in which its things are marked by hand
+SHOWN = 23  # frame of arm_wrist_48 in which its objects are marked by hand
 TAPE_ROLL = ((648, 105), (88, 87), 57)  # [px] middle, half axes and half of its hole
 # [px] corners of its top, whose left and right edges are the short ones; and of the wall behind it, as far as it shows
 BOX_TOP = ((568, 207), (972, 300), (870, 578), (514, 487))
 BOX_WALL = ((597, 180), (690, 185), (705, 178), (755, 190), (775, 220), (840, 255), (905, 240), (945, 260))
-NEAR = 0.003  # [m] that contacts may be off what depth saw
+NEAR = 0.003  # [m] largest distance of contacts to the measured depth
 
 
 def check_shelf_box(log: Path, run: Path) -> None:
-    """The tissue box in the shelf, apart from the walls that it touches: as wide as in the picture."""
+    """Check the width of the tissue box in the shelf, next to walls in contact, against the image."""
     grasps = _grasped(run, "--box", "350", "262", "445", "385", "--robot", "panda-2f140")
     frame = open_log(log)[12]  # which looks straight at it
     depth = frame.depth[190:265, 240:320]
@@ -40,7 +40,7 @@ def check_shelf_box(log: Path, run: Path) -> None:
 
 
 def check_tape_roll(log: Path, run: Path) -> None:
-    """A roll, 16 mm high between two other things, by slim fingers: at its wall, where depth saw it."""
+    """Check that slim fingers grasp the wall of a roll, 16 mm high between two objects, at the measured depth."""
     middle, half, hole = TAPE_ROLL
     mask = cv2.ellipse(np.zeros((720, 1280), np.uint8), middle, half, 0, 0, 360, 255, -1)
     grasps = _marked(run, mask, "--robot", "panda-2f85", "--friction", "0.8")
@@ -55,7 +55,7 @@ def check_tape_roll(log: Path, run: Path) -> None:
 
 
 def check_lying_box(log: Path, run: Path) -> None:
-    """A box that roll and ring touch, by the wide hand: as wide as the picture and the plane of its top."""
+    """Check that the wide hand grasps a box next to roll and ring; its width is that in the image."""
     corners = np.array(BOX_TOP)
     outline = np.array((BOX_TOP[0], *BOX_WALL, *BOX_TOP[1:]))
     mask = cv2.fillPoly(np.zeros((720, 1280), np.uint8), [outline], 255)
@@ -80,7 +80,7 @@ def _marked(run: Path, mask: NDArray[Any], *words: str) -> list[dict[str, Any]]:
 
 
 def _seen(log: Path, run: Path, index: int) -> tuple[Camera, Array, Array]:
-    """Camera, depth and T_world_camera of a frame, as the run found it."""
+    """Return camera, depth and estimated T_world_camera of a frame."""
     frame = open_log(log)[index]
     return frame.camera, np.where(frame.depth < 0.5, frame.depth, 0.0), RunFolder(run).load_poses()[index]
 
@@ -93,7 +93,7 @@ def _cloud(camera: Camera, depth: Array, T_world_camera: Array) -> Array:
 
 
 def _grasped(run: Path, *words: str, up: tuple[str, ...] = ()) -> list[dict[str, Any]]:
-    """The ranked grasps, as a user asks for them; the best is drawn."""
+    """Run `splatbot grasp` and return the ranked grasps; the best is drawn."""
     assert (run / "scene.yaml").is_file() or main(["info", str(run), "--fit-plane", *up]) == 0
     out = run / "grasp"
     assert main(["grasp", "--map", str(run), "--min-observations", "3", "--out", str(out), *words]) == 0
@@ -104,7 +104,7 @@ def _grasped(run: Path, *words: str, up: tuple[str, ...] = ()) -> list[dict[str,
 
 
 def _held_and_free(grasp: dict[str, Any], friction: float = FRICTION) -> None:
-    """Both normals are within the friction cone about the line between the contacts, and there is room on the way."""
+    """Check that both normals are within the friction cone of the contact line, and that the approach is free."""
     contacts, normals = np.array(grasp["contacts"]), np.array(grasp["normals"])
     line = (contacts[1] - contacts[0]) / np.linalg.norm(contacts[1] - contacts[0])
     cosines = np.array([-normals[0] @ line, normals[1] @ line])

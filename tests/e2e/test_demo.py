@@ -1,4 +1,4 @@
-"""The demo tells right from wrong; mapping is stood in for by the reference, so that both can be arranged."""
+"""The demo distinguishes right from wrong maps; reference poses replace mapping, to arrange both."""
 
 from __future__ import annotations
 

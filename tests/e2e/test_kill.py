@@ -1,4 +1,4 @@
-"""A run that is killed while it maps leaves what it saved last."""
+"""A run that is killed while it maps leaves its last saved state."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def command(*words: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Trajectory:
-    """The trajectory of the run when nobody kills it."""
+    """Return the trajectory of an undisturbed run."""
     out = tmp_path_factory.mktemp("whole")
     subprocess.run(command(LOG, "--out", str(out), *SMALL), check=True, timeout=200)
     return Trajectory.load(out / "trajectory.tum")
 
 
 def kill_while_mapping(words: list[str], state: Path, seconds: float) -> None:
-    """Start a run and kill it so many seconds after its first save."""
+    """Start a run and kill it after a delay [s] from its first save."""
     run = subprocess.Popen(words, start_new_session=True)
     end = time.monotonic() + 100
     while not state.exists() and run.poll() is None and time.monotonic() < end:

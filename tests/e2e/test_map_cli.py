@@ -48,7 +48,7 @@ def other_depth_size(log: Path) -> None:
 
 
 def image(log: Path, kind: str) -> Path:
-    """The file of the frame to damage."""
+    """Return the file of the frame to damage."""
     lines = [line for line in (log / f"{kind}.txt").read_text().splitlines() if not line.startswith("#")]
     return log / lines[BAD].split()[1]
 
@@ -190,7 +190,7 @@ def test_impatient_interrupts_lose_no_more_than_scores_and_report(sound_log: Pat
 
 
 def start(log: Path, out: Path) -> subprocess.Popen[str]:
-    """A run that is slow enough to be interrupted: much refinement for every keyframe."""
+    """Start a run that is slow enough to interrupt, with many refinement steps per keyframe."""
     slow = ("--set", "mapping.refine_iterations=60", "--set", "mapping.keyframe_translation=0.0001")
     return subprocess.Popen(
         [*COMMAND, "map", str(log), "--out", str(out), *slow],
@@ -201,7 +201,7 @@ def start(log: Path, out: Path) -> subprocess.Popen[str]:
 
 
 def wait_for_frame(process: subprocess.Popen[str]) -> None:
-    """Until the first frame is through."""
+    """Wait until the first frame is mapped."""
     assert process.stderr is not None
     for line in process.stderr:
         if line.startswith("frame 1/"):

@@ -1,4 +1,4 @@
-"""The real recordings with the default configuration: every frame tracked, within what their references support."""
+"""Real recordings with the default configuration: every frame is tracked, within the accuracy of the references."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from splatbot.logs import open_log
 from splatbot.run import map_log
 from tests.e2e.real_grasps import check_lying_box, check_shelf_box, check_tape_roll
 
-# name, frames, ATE RMSE [m]; the references are good to a few mm, 5 to 29 mm, 2 cm and about 3 cm. What the third does
-# not tell (docs/experiments/tracking.md, "Keypoints from the whole image"), photogrammetry and held-out views do.
+# name, frames, ATE RMSE [m]; the references are accurate to a few mm, 5 to 29 mm, 2 cm and about 3 cm. Bundle adjustment
+# and held-out views check the third (docs/experiments/tracking.md, "Keypoints from the whole image").
 LOGS = [
     pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48"),
     pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot"),
@@ -27,7 +27,7 @@ LOGS = [
 
 
 def check_twin(log: Path, run: Path) -> None:
-    """The recording whose arm told its tool's poses, against the twin of its map."""
+    """Compare the recording with poses of the arm's tool with the twin of its map."""
     words = ["sim2real", str(log), "--map", str(run), "--frames", "6", "--out", str(run / "twin")]
     assert main([*words, "--quiet"]) == 0
     found = json.loads((run / "twin" / "sim2real.json").read_text())
@@ -46,17 +46,17 @@ def check_twin(log: Path, run: Path) -> None:
 
 
 def check_images(log: Path, run: Path) -> None:
-    """The recording whose reference errs by 2 cm: against photogrammetry of its images, as a user asks for it."""
+    """Compare the recording whose reference errs by 2 cm with bundle adjustment of its images."""
     words = [sys.executable, "-m", "experiments.bundle", str(log), str(run)]
-    told = subprocess.run(words, capture_output=True, text=True, timeout=900, check=True).stdout
-    lines = [line.split(": ") for line in told.splitlines() if "ATE" in line]
+    output = subprocess.run(words, capture_output=True, text=True, timeout=900, check=True).stdout
+    lines = [line.split(": ") for line in output.splitlines() if "ATE" in line]
     ate = {name: float(text.split("ATE ")[1].split(" mm")[0]) for name, text in lines}
     assert ate["the run to bundle adjustment"] <= 3.0
     assert ate["groundtruth.txt to bundle adjustment"] > 15.0  # so ATE to it says nothing below that
 
 
 def check_views(name: str, metrics: dict[str, Any]) -> None:
-    """Held-out views of recordings that see their scenes from all around; the others see parts of theirs only once."""
+    """Check held-out views of recordings from all sides; the others observe parts of their scenes only once."""
     assert metrics["held_out"] == metrics["frames"] // 8
     if name == "visp_tabletop":  # 23.3 dB and 6.9 mm while keypoints were in the middle of the image alone
         assert metrics["psnr_holdout_db"] >= 23.6
@@ -66,7 +66,7 @@ def check_views(name: str, metrics: dict[str, Any]) -> None:
         assert metrics["depth_median_m"] <= 0.02
 
 
-# What one recording alone can tell, of the folders of its log and its run.
+# Checks that only one recording allows, with the folders of its log and its run.
 CHECKS: dict[str, tuple[Callable[[Path, Path], None], ...]] = {
     "arm_wrist_48": (check_twin, check_tape_roll, check_lying_box),
     "apc_shelf_robot": (check_shelf_box,),

@@ -1,4 +1,4 @@
-"""`splatbot serve` as a process: starts, answers, ends; and says what is wrong with its arguments."""
+"""`splatbot serve` as a process: it starts, answers and ends, and reports errors of its arguments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMMAND = (sys.executable, "-m", "splatbot", "serve")
 
 @contextmanager
 def serving(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Client]]:
-    """A running service and a client of it."""
+    """Run a service, and yield a client of it."""
     process = subprocess.Popen([*COMMAND, *arguments, "--port", "0"], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

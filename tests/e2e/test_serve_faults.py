@@ -1,4 +1,4 @@
-"""The service is ended, killed and started again while it maps and is asked."""
+"""The service is ended, killed and started again while it maps and answers queries."""
 
 from __future__ import annotations
 

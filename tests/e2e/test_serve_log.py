@@ -14,7 +14,7 @@ from tests.e2e.test_serve_cli import serving
 
 
 def _until_not_mapping(client: httpx.Client) -> tuple[list[int], dict[str, Any]]:
-    """Versions seen while the log was being mapped, and the map's description afterwards."""
+    """Return the map versions during mapping, and the description of the map afterwards."""
     versions: list[int] = []
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
@@ -41,7 +41,7 @@ def test_versions_grow_while_a_log_is_mapped_and_the_map_is_served_after_its_end
         assert client.get("/v1/maps/default/render").headers["content-type"] == "image/png"
 
 
-def test_a_log_that_breaks_is_told_and_what_was_mapped_is_served(tmp_path: Path) -> None:
+def test_a_damaged_log_is_reported_and_the_map_is_served(tmp_path: Path) -> None:
     log = record(open_log("synthetic:tabletop?frames=6&width=320&height=240"), tmp_path / "log")
     broken = sorted((log / "rgb").iterdir())[4]
     broken.write_bytes(broken.read_bytes()[:200])

@@ -1,4 +1,4 @@
-"""`splatbot serve --camera replay:...`: a camera with faults is mapped, told to ROS clients and recorded."""
+"""`splatbot serve --camera replay:...`: a camera with faults is mapped, published to ROS clients and recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`splatbot bench collision`: the collision field's speed and memory, and how wrong it is, against exact truth."""
+"""Measurements of `splatbot bench collision`: speed, memory and errors of the collision field."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import Tabletop, tabletop
 from splatbot.bench.timing import Timing, measure, threads
-from splatbot.bench.truth import Audit, Truth, apart_from_itself, audit, score
+from splatbot.bench.truth import Audit, Truth, audit, score, without_self_collision
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres, gather_evidence
 from splatbot.collision.robot import EPS
@@ -119,7 +119,7 @@ def run_speed(
 
 
 def _keyframe(model: GaussianModel, rng: np.random.Generator) -> tuple[GaussianModel, NDArray[np.bool_]]:
-    """The map with what one keyframe adds: 2,000 Gaussians in 0.3 m of space."""
+    """Add the Gaussians of one keyframe to a map: 2,000 within 0.3 m."""
     count = 2000
     part = model.select(torch.from_numpy(rng.integers(0, len(model), count)))
     part.means[:] = torch.from_numpy(rng.uniform([0.4, -0.2, 0.2], [0.7, 0.1, 0.3], (count, 3))).float()
@@ -130,7 +130,7 @@ def _keyframe(model: GaussianModel, rng: np.random.Generator) -> tuple[GaussianM
 def free_edges(
     arm: RobotSpheres, field: GaussianCollisionField, q: Array, rng: np.random.Generator, count: int
 ) -> tuple[Array, Array]:
-    """Up to ``count`` edges of 1 rad whose ends are free."""
+    """Sample up to ``count`` edges of 1 rad whose ends are free."""
     start = q[~arm.check(field, q).in_collision]
     step = rng.normal(size=start.shape)
     end = start + step / np.linalg.norm(step, axis=1, keepdims=True)
@@ -140,11 +140,11 @@ def free_edges(
 
 
 def run_errors(settings: CollisionSettings, results: Results, scene: Tabletop, arm: RobotSpheres) -> None:
-    """The two errors: of configurations over n_sigma and the number of Gaussians, and of edges over samples."""
+    """Measure errors of configurations over n_sigma and the number of Gaussians, and of edges over samples."""
     rng = np.random.default_rng(2)
     truth = Truth(scene, settings.truth_step)
-    q = apart_from_itself(arm, panda().random(int(1.6 * settings.audited), rng))[: settings.audited]
-    rooms = truth.rooms(arm, q)
+    q = without_self_collision(arm, panda().random(int(1.6 * settings.audited), rng))[: settings.audited]
+    clearances = truth.clearances(arm, q)
     few = slice(None, max(1, len(q) // 5))
     for count in settings.counts:
         model = scene.gaussians(count)
@@ -154,14 +154,14 @@ def run_errors(settings: CollisionSettings, results: Results, scene: Tabletop, a
             part = slice(None) if whole else few
             case = f"{SWEEP} n_sigma on {count} Gaussians: {n_sigma:g}{' (default)' if n_sigma == 2.0 else ''}"
             spent = _seconds(arm.check, field, q[part])
-            add_audit(results, case, audit(field, arm, q[part], rooms[part]))
+            add_audit(results, case, audit(field, arm, q[part], clearances[part]))
             results.add(case, "a configuration", 1e6 * spent / len(q[part]), "us")
     model = scene.gaussians(settings.reference)
     for packed in (False, True):
         field = GaussianCollisionField(model, packed=packed)
         case = f"{SWEEP} storage of {settings.reference} Gaussians: {'packed' if packed else 'float32 (default)'}"
         spent = _seconds(arm.check, field, q[few])
-        add_audit(results, case, audit(field, arm, q[few], rooms[few]))
+        add_audit(results, case, audit(field, arm, q[few], clearances[few]))
         results.add(case, "a configuration", 1e6 * spent / len(q[few]), "us")
         results.add(case, "memory", field.nbytes / 1e6, "MB")
     field = GaussianCollisionField(model)
@@ -176,7 +176,7 @@ def run_edges(
     field: GaussianCollisionField,
     q: Array,
 ) -> None:
-    """What certified and sampled edges miss, looked at every 1/128 rad."""
+    """Measure the collisions that certified and sampled edges miss, with the truth every 1/128 rad."""
     rng = np.random.default_rng(3)
     wanted = int(1.1 * settings.audited_edges)
     start, end = free_edges(arm, field, q[: 6 * wanted], rng, wanted)
@@ -184,7 +184,7 @@ def run_edges(
     self_hit = np.zeros(len(start), bool)
     for t in np.linspace(0, 1, 9 if settings.quick else 129):
         at = start + t * (end - start)
-        least = np.minimum(least, truth.rooms(arm, at))
+        least = np.minimum(least, truth.clearances(arm, at))
         self_hit |= arm.check(None, at).in_collision
     methods: list[tuple[str, Any]] = [("certified, 1 mm", 1e-3), ("certified, 3 mm", 3e-3)]
     methods += [(f"{n} samples", n) for n in (4, 8, 16, 32, 64)]
@@ -196,11 +196,11 @@ def run_edges(
         add_audit(results, case, score(answer.in_collision, least))
         missed = int((~answer.in_collision & self_hit).sum())
         results.add(case, "self-collisions missed", float(missed), "edges")
-        results.add(case, "edges called free", float((~answer.in_collision).sum()), "edges")
+        results.add(case, "edges reported free", float((~answer.in_collision).sum()), "edges")
 
 
 def run_floaters(settings: CollisionSettings, results: Results, scene: Tabletop, arm: RobotSpheres) -> None:
-    """1 % of floaters in the air: what they block, and what the gates give back.
+    """Measure the configurations that 1 % of floaters block, with and without the gates.
 
     Evidence is gathered from depth images of the true shapes. Floaters have random opacities and 0 to 2 observations.
     """
@@ -219,8 +219,8 @@ def run_floaters(settings: CollisionSettings, results: Results, scene: Tabletop,
     floaters.observations[:] = torch.from_numpy(rng.integers(0, 3, count)).to(torch.int32)
     dirty = GaussianModel.concatenate([model, floaters])
     evidence = gather_evidence(dirty, depth_views(scene, 4 if settings.quick else 24))
-    q = apart_from_itself(arm, panda().random(2000 if settings.quick else 100_000, rng))
-    rooms = Truth(scene, settings.truth_step).rooms(arm, q)
+    q = without_self_collision(arm, panda().random(2000 if settings.quick else 100_000, rng))
+    clearances = Truth(scene, settings.truth_step).clearances(arm, q)
     for label, found in (
         ("clean map", GaussianCollisionField(model)),
         ("1 % floaters, none", GaussianCollisionField(dirty, min_opacity=0.0, min_observations=0)),
@@ -229,11 +229,11 @@ def run_floaters(settings: CollisionSettings, results: Results, scene: Tabletop,
         ("1 % floaters, seen through", GaussianCollisionField(dirty, min_observations=0, evidence=evidence)),
         ("1 % floaters, all three", GaussianCollisionField(dirty, min_opacity=0.3, evidence=evidence)),
     ):
-        add_audit(results, f"gate: {label}", audit(found, arm, q, rooms))
+        add_audit(results, f"gate: {label}", audit(found, arm, q, clearances))
 
 
 def depth_views(scene: Tabletop, count: int) -> Iterator[tuple[NDArray[np.float32], Camera, Array]]:
-    """Depth images of the true shapes from a ring around them."""
+    """Render depth images of the true shapes from a ring around them."""
     vertices, triangles = mesh_of(scene)
     ray = o3d.t.geometry.RaycastingScene()
     corners = o3d.core.Tensor.from_numpy(vertices.astype(np.float32))
@@ -256,23 +256,23 @@ def run_peers(
     arm: RobotSpheres,
     report_progress: ReportProgress,
 ) -> None:
-    """Brute force on the same points; meshes of the same shapes on the same configurations."""
+    """Measure brute force on the same points, and meshes of the same shapes on the same configurations."""
     rng = np.random.default_rng(5)
     model = scene.gaussians(settings.counts[0] if settings.quick else 100_000)
     points = rng.uniform([0.0, -0.8, -0.05], [1.0, 0.9, 0.7], (200 if settings.quick else 10_000, 3))
     run_brute_force(results, model, points, report_progress)
-    q = apart_from_itself(arm, panda().random(40 if settings.quick else 2000, rng))
+    q = without_self_collision(arm, panda().random(40 if settings.quick else 2000, rng))
     run_mesh_peers(results, scene, arm, q, report_progress)
 
 
 def add_audit(results: Results, case: str, found: Audit) -> None:
-    """Its figures as rows."""
+    """Add the errors as rows."""
     results.add(case, "false free", 100.0 * found.false_free / max(1, found.configurations), "%")
     results.add(case, "false free, count", float(found.false_free), f"of {found.configurations}")
     results.add(case, "deepest false free", 1e3 * found.deepest_m, "mm")
     results.add(case, "false hit", found.false_hit_percent, "%")
     results.add(case, "largest false hit", 1e3 * found.largest_m, "mm")
-    results.add(case, "called free", found.free_percent, "%")
+    results.add(case, "reported free", found.free_percent, "%")
 
 
 def _add_rate(results: Results, case: str, runs: int, metric: str, count: int, query: Callable[[], object]) -> None:

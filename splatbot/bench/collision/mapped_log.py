@@ -1,4 +1,4 @@
-"""The collision field of a map that was made of a noisy log, against the true shapes: spheres, and an arm."""
+"""Errors of the collision field of a map of a noisy log, against the true shapes, for spheres and for an arm."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from splatbot.robots.panda import panda
 from splatbot.slam import Slam
 
 NOISY = "effects=depth_noise;depth_holes"
-SHARE = 0.999  # of the measured points whose error the margin shall hold
-# In front of the table, at its height, turned to it.
+SHARE = 0.999  # share of the measured points whose error is within the margin
+# The base is in front of the table, at its height, and faces it.
 T_SCENE_BASE = np.array([[0.0, -1, 0, 0.0], [1, 0, 0, -0.55], [0, 0, 1, 0.0], [0, 0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
 class Mapped:
-    """A map of a noisy log, and the truth.
+    """A map of a noisy log, and the ground truth.
 
     Args:
-        log: what was mapped.
-        snapshot: of its map.
-        T_map_scene: (4, 4); a map's world is its first camera.
-        tracked: (F, 4, 4) T_world_camera as the map has it, NaN where lost.
-        shapes: true, in the scene's frame.
+        log: The mapped log.
+        snapshot: The snapshot of its map.
+        T_map_scene: (4, 4); the world frame of the map is its first camera.
+        tracked: (F, 4, 4), estimated T_world_camera, NaN where lost.
+        shapes: The true shapes in the frame of the scene.
     """
 
     log: SyntheticLog
@@ -47,13 +47,13 @@ class Mapped:
     shapes: o3d.t.geometry.RaycastingScene
 
     def views(self) -> Iterator[tuple[NDArray[np.float32], Camera, Array]]:
-        """What the map knows of itself: its frames' depth, from where it believes that they were taken."""
+        """Yield depth, camera and estimated pose of each tracked frame, the information available to the map."""
         for frame, T in zip(self.log, self.tracked, strict=False):
             if np.isfinite(T).all():
                 yield frame.depth, frame.camera, T
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point of the true surface (P, 3) is what some frame's depth shows, from its true pose."""
+        """Return whether the depth image of any frame, at its true pose, observes each surface point (P, 3)."""
         seen = np.zeros(len(points), np.bool_)
         for frame, T in zip(self.log, self.log.ground_truth.T_world_camera, strict=False):
             rows, measured, z = measured_depths(points, frame.depth, frame.camera, T)
@@ -61,7 +61,7 @@ class Mapped:
         return seen
 
     def closest(self, points: Array) -> tuple[Array, Array]:
-        """Signed distances (P,) of points of the scene, and the nearest points (P, 3) of the true surface."""
+        """Return signed distances (P,) of points in the scene, and the closest points (P, 3) of the true surface."""
         at = self.shapes.compute_closest_points(_tensor(points))["points"].numpy().astype(np.float64)
         inside = self.shapes.compute_occupancy(_tensor(points), nsamples=3).numpy() > 0
         distance = np.linalg.norm(at - points, axis=1)
@@ -83,9 +83,10 @@ def map_noisy_log(frames: int, width: int) -> Mapped:
 def audit_mapped_log(
     results: Results, *, frames: int, width: int, spheres: int, configurations: int, n_sigmas: tuple[float, ...]
 ) -> None:
-    """Ask random spheres in free space and random configurations of an arm, over n_sigma and with the map's own margin.
+    """Check random spheres in free space and random configurations of an arm, over n_sigma and margins.
 
-    What was seen is told apart from what was not: by the true surface nearest to a sphere, or touched by the arm.
+    The margins are 0 and the surface error of the map. Results are separate for observed and unobserved surface: the
+    true surface closest to a sphere, or in contact with the arm.
     """
     mapped = map_noisy_log(frames, width)
     for n_sigma in n_sigmas:
@@ -96,7 +97,9 @@ def audit_mapped_log(
             case = f"mapped noisy log, n_sigma {n_sigma:g}" + (f", margin {1e3 * margin:.1f} mm" if margin else "")
             results.add(case, "Gaussians", float(len(field)), "")
             for share in (0.5, 0.99, SHARE, 1.0):
-                results.add(case, f"surface error, as the map's depth tells, {share:.1%}", 1e3 * own.share(share), "mm")
+                results.add(
+                    case, f"surface error against the map's own depth, {share:.1%}", 1e3 * own.share(share), "mm"
+                )
             audit_spheres(results, case, mapped, field, spheres, margin)
             audit_arm(results, case, mapped, field, configurations, margin)
 
@@ -104,7 +107,7 @@ def audit_mapped_log(
 def audit_spheres(
     results: Results, case: str, mapped: Mapped, field: GaussianCollisionField, count: int, margin: float
 ) -> None:
-    """Spheres of 2 to 8 cm whose centres are in free space over the table."""
+    """Check spheres of 2 to 8 cm whose centres are in the free space above the table."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.55, -0.40, 0.0], [0.55, 0.35, 0.35], (3 * count, 3))
     distance, nearest = mapped.closest(points)
@@ -115,8 +118,8 @@ def audit_spheres(
     error = np.maximum(field.clearance(transform_points(mapped.T_map_scene, nearest[seen])).distance, 0)
     for share in (0.5, 0.99, SHARE, 1.0):
         value = 1e3 * float(np.quantile(error, share))
-        results.add(case, f"surface error against the truth, seen, {share:.1%}", value, "mm")
-    for name, part in (("seen", seen), ("unseen", ~seen)):
+        results.add(case, f"surface error against the truth, observed, {share:.1%}", value, "mm")
+    for name, part in (("observed", seen), ("unobserved", ~seen)):
         room, struck = (distance - radii)[part], hit[part]
         free, false = ~struck & (room <= 0), struck & (room > 0)
         results.add(case, f"spheres, {name}: false free", float(free.sum()), f"of {len(room)}")
@@ -129,7 +132,7 @@ def audit_spheres(
 def audit_arm(
     results: Results, case: str, mapped: Mapped, field: GaussianCollisionField, count: int, margin: float
 ) -> None:
-    """Configurations that do not touch themselves, of an arm that stands before the table."""
+    """Check configurations without self-collision of an arm in front of the table."""
     bare = RobotSpheres(panda(), T_world_base=mapped.T_map_scene @ T_SCENE_BASE)
     wide = RobotSpheres(panda(), T_world_base=mapped.T_map_scene @ T_SCENE_BASE, margin=margin)
     q = panda().random(2 * count, np.random.default_rng(1))
@@ -144,15 +147,15 @@ def audit_arm(
     flat = np.zeros(room.size, np.bool_)
     flat[touching.ravel()] = mapped.seen(nearest[touching.ravel()])
     seen = flat.reshape(room.shape)
-    for name, part in (("seen", seen), ("unseen", touching & ~seen)):
-        touches = (touching & part).any(axis=1) if name == "seen" else part.any(axis=1) & ~seen.any(axis=1)
+    for name, part in (("observed", seen), ("unobserved", touching & ~seen)):
+        touches = (touching & part).any(axis=1) if name == "observed" else part.any(axis=1) & ~seen.any(axis=1)
         free = touches & ~struck
         depth = np.where(part, -room, 0.0).max(axis=1)
-        results.add(case, f"arm, {name}: false free", float(free.sum()), f"of {int(touches.sum())} that touch")
+        results.add(case, f"arm, {name}: false free", float(free.sum()), f"of {int(touches.sum())} in contact")
         results.add(case, f"arm, {name}: deepest", 1e3 * float(depth[free].max()) if free.any() else 0.0, "mm")
     clear = ~touching.any(axis=1)
     results.add(case, "arm: false hit", 100.0 * float(struck[clear].mean()), f"% of {int(clear.sum())} that are free")
-    results.add(case, "arm: called free", 100.0 * float((~struck).mean()), f"% of {len(q)}")
+    results.add(case, "arm: reported free", 100.0 * float((~struck).mean()), f"% of {len(q)}")
 
 
 def _true_shapes() -> o3d.t.geometry.RaycastingScene:

@@ -1,4 +1,4 @@
-"""What the collision field is measured beside: brute force in torch, coal, python-fcl, Open3D, VAMP where installed."""
+"""Peers of the collision field: brute force in torch, coal, python-fcl, Open3D, and VAMP if it is installed."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from splatbot.logs.shapes import TriangleMesh, box, cylinder, sphere
 from splatbot.protocols import Array
 
 OCTREE_VOXEL = 0.01  # [m]
-_CHUNK = 50  # points at once against all Gaussians: 100,000 of them make 60 MB
+_CHUNK = 50  # points per batch against all Gaussians: 60 MB with 100,000 Gaussians
 
 
 def run_brute_force(results: Results, model: GaussianModel, points: Array, report_progress: ReportProgress) -> None:
-    """The textbook's way: x = p - mu, then x' inv(Sigma) x by einsum in float32, chunk by chunk."""
+    """Evaluate d² = (p - μ)ᵀ Σ⁻¹ (p - μ) for all pairs by einsum in float32, batch by batch."""
     case = f"points against {len(model)} Gaussians"
     field = GaussianCollisionField(model)
-    ours_hit = _least(lambda: field.in_collision(points))
-    ours_distance = _least(lambda: field.mahalanobis(points))
+    ours_hit = _least_seconds(lambda: field.in_collision(points))
+    ours_distance = _least_seconds(lambda: field.mahalanobis(points))
     results.add(case, "boolean", 1e3 * ours_hit, "ms")
     results.add(case, "smallest Mahalanobis distance", 1e3 * ours_distance, "ms")
     report_progress(f"{case}: torch")
@@ -43,7 +43,7 @@ def run_brute_force(results: Results, model: GaussianModel, points: Array, repor
     theirs = time.perf_counter() - start
     for metric, ours in (("boolean", ours_hit), ("smallest Mahalanobis distance", ours_distance)):
         results.add(case, metric, 1e3 * theirs, "ms", peer="torch")
-        results.add(case, f"{metric}, times ours", theirs / ours, "x", peer="torch")
+        results.add(case, f"{metric}, ratio to splatbot", theirs / ours, "x", peer="torch")
     some = points[:: max(1, len(points) // 1000)]
     exact = _torch_squared(model.means.double(), inverse, torch.from_numpy(some)).clamp_min(0).sqrt().numpy()
     found = field.mahalanobis(some).distance
@@ -66,7 +66,7 @@ def _torch_squared(means: torch.Tensor, inverse: torch.Tensor, points: torch.Ten
 def run_mesh_peers(
     results: Results, scene: Tabletop, arm: RobotSpheres, q: Array, report_progress: ReportProgress
 ) -> None:
-    """The same spheres against the true shapes' mesh and an octree of their points, through Python."""
+    """Check the same spheres against a mesh of the true shapes and an octree of their points, through Python."""
     vertices, triangles = mesh_of(scene)
     case = f"configurations, {len(arm.spheres)} spheres, against {len(triangles)} triangles"
     moving = arm.spheres.link > 0
@@ -81,13 +81,13 @@ def run_mesh_peers(
         report_progress(f"{case}: {name}")
         try:
             start = time.perf_counter()
-            ask = make(vertices, triangles, scene)
+            check = make(vertices, triangles, scene)
             built = time.perf_counter() - start
         except (ImportError, AttributeError) as error:
             results.add(case, "configurations a second", None, "1/s", peer=name, note=f"absent: {error}")
             continue
         start = time.perf_counter()
-        hits = ask(centers, radii)
+        hits = check(centers, radii)
         spent = time.perf_counter() - start
         results.add(case, "build", 1e3 * built, "ms", peer=name)
         results.add(case, "configurations a second", len(q) / spent, "1/s", peer=name)
@@ -96,10 +96,10 @@ def run_mesh_peers(
     _run_vamp(results, case, scene, q)
 
 
-Ask = Callable[[Array, Array], list[bool]]
+SphereCheck = Callable[[Array, Array], list[bool]]
 
 
-def _coal_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
+def _coal_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck:
     coal = importlib.import_module("coal")
     model = coal.BVHModelOBBRSS()
     model.beginModel(len(triangles), len(vertices))
@@ -109,25 +109,25 @@ def _coal_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
     return _coal_spheres(coal, model)
 
 
-def _coal_octree(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
+def _coal_octree(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck:
     coal = importlib.import_module("coal")
     return _coal_spheres(coal, coal.makeOctree(_points_of(scene), OCTREE_VOXEL))
 
 
-def mesh_checker(scene: Tabletop) -> Ask:
-    """Coal's, of spheres (C, S, 3) and their radii (S,) [m] against the shapes' mesh."""
+def mesh_checker(scene: Tabletop) -> SphereCheck:
+    """Return coal's check of spheres (C, S, 3) with radii (S,) [m] against the mesh of the shapes."""
     return _coal_mesh(*mesh_of(scene), scene)
 
 
-def octree_checker(scene: Tabletop) -> Ask:
-    """The same against an octree of points on the shapes."""
+def octree_checker(scene: Tabletop) -> SphereCheck:
+    """Return coal's check of spheres (C, S, 3) with radii (S,) [m] against an octree of points on the shapes."""
     return _coal_octree(*mesh_of(scene), scene)
 
 
-def _coal_spheres(coal: Any, world: Any) -> Ask:
+def _coal_spheres(coal: Any, world: Any) -> SphereCheck:
     request, fixed = coal.CollisionRequest(), coal.Transform3s()
 
-    def ask(centers: Array, radii: Array) -> list[bool]:
+    def check(centers: Array, radii: Array) -> list[bool]:
         balls = [coal.Sphere(float(r)) for r in radii]
         poses = [coal.Transform3s() for _ in radii]
         hits = []
@@ -142,21 +142,21 @@ def _coal_spheres(coal: Any, world: Any) -> Ask:
             hits.append(hit)
         return hits
 
-    return ask
+    return check
 
 
-def _fcl_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
+def _fcl_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck:
     return _fcl_spheres(importlib.import_module("fcl"), fcl_mesh(vertices, triangles))
 
 
-def _fcl_octree(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
+def _fcl_octree(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck:
     return _fcl_spheres(importlib.import_module("fcl"), fcl_octree(_points_of(scene), OCTREE_VOXEL))
 
 
-def _fcl_spheres(fcl: Any, model: Any) -> Ask:
+def _fcl_spheres(fcl: Any, model: Any) -> SphereCheck:
     world = fcl.CollisionObject(model, fcl.Transform())
 
-    def ask(centers: Array, radii: Array) -> list[bool]:
+    def check(centers: Array, radii: Array) -> list[bool]:
         balls = [fcl.CollisionObject(fcl.Sphere(float(r)), fcl.Transform()) for r in radii]
         hits = []
         for row in centers:
@@ -169,31 +169,31 @@ def _fcl_spheres(fcl: Any, model: Any) -> Ask:
             hits.append(hit)
         return hits
 
-    return ask
+    return check
 
 
-def _open3d(vertices: Array, triangles: Array, scene: Tabletop) -> Ask:
+def _open3d(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck:
     ray = o3d.t.geometry.RaycastingScene(nthreads=1)
     ray.add_triangles(
         o3d.core.Tensor.from_numpy(vertices.astype(np.float32)), o3d.core.Tensor.from_numpy(triangles.astype(np.uint32))
     )
 
-    def ask(centers: Array, radii: Array) -> list[bool]:
+    def check(centers: Array, radii: Array) -> list[bool]:
         queries = o3d.core.Tensor.from_numpy(np.ascontiguousarray(centers.reshape(-1, 3), dtype=np.float32))
         distance = ray.compute_distance(queries, nthreads=1).numpy().reshape(len(centers), -1)
         return [bool(hit) for hit in (distance <= radii).any(axis=1)]
 
-    return ask
+    return check
 
 
 def _points_of(scene: Tabletop) -> Array:
-    """A cloud (about 100,000, 3) [m] of the shapes' surfaces."""
+    """Sample about 100,000 points (P, 3) [m] on the surfaces of the shapes."""
     points: Array = scene.gaussians(100_000).means.numpy().astype(np.float64)
     return points
 
 
 def _run_vamp(results: Results, case: str, scene: Tabletop, q: Array) -> None:
-    """VAMP's own Panda against a CAPT of the cloud, thinned to 2 cm, points of 2.5 mm: its defaults."""
+    """Check VAMP's own Panda against a CAPT of the cloud with its defaults: 2 cm spacing, point radius 2.5 mm."""
     try:
         vamp = importlib.import_module("vamp")
         robot = vamp.panda
@@ -210,7 +210,7 @@ def _run_vamp(results: Results, case: str, scene: Tabletop, q: Array) -> None:
         spent = time.perf_counter() - start
     except (ImportError, AttributeError, TypeError) as error:
         missing = importlib.util.find_spec("vamp") is None
-        note = "absent: vamp is not installed (it has no wheel)" if missing else f"of another interface: {error}"
+        note = "absent: vamp is not installed (it has no wheel)" if missing else f"incompatible interface: {error}"
         results.add(case, "configurations a second", None, "1/s", peer="VAMP CAPT 2 cm", note=note)
         return
     results.add(case, "build", 1e3 * built, "ms", peer="VAMP CAPT 2 cm")
@@ -219,7 +219,7 @@ def _run_vamp(results: Results, case: str, scene: Tabletop, q: Array) -> None:
 
 
 def mesh_of(scene: Tabletop) -> tuple[Array, Array]:
-    """Vertices (V, 3) [m] and triangles (T, 3) of the shapes."""
+    """Return vertices (V, 3) [m] and triangles (T, 3) of the shapes."""
     vertices, triangles, count = [], [], 0
     for solid in scene.solids:
         mesh = solid_mesh(solid)
@@ -230,7 +230,7 @@ def mesh_of(scene: Tabletop) -> tuple[Array, Array]:
 
 
 def solid_mesh(solid: object) -> TriangleMesh:
-    """The triangles of a block, can or ball."""
+    """Return the triangle mesh of a block, can or ball."""
     if isinstance(solid, Block):
         x, y, z = solid.center
         return box(solid.size).placed([x, y, z - solid.size[2] / 2], solid.yaw)
@@ -241,10 +241,10 @@ def solid_mesh(solid: object) -> TriangleMesh:
     return sphere(solid.radius).placed([x, y, z - solid.radius])
 
 
-def _least(ask: Callable[[], object], runs: int = 5) -> float:
+def _least_seconds(query: Callable[[], object], runs: int = 5) -> float:
     best = np.inf
     for _ in range(runs):
         start = time.perf_counter()
-        ask()
+        query()
         best = min(best, time.perf_counter() - start)
     return float(best)

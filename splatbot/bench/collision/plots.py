@@ -13,7 +13,7 @@ from splatbot.bench.results import Results
 
 
 def plot_accuracy(results: Results, out: Path) -> None:
-    """``collision-accuracy.png`` and ``.svg``: false hits and false frees over n_sigma, and of edges over time."""
+    """Write ``collision-accuracy.png`` and ``.svg``: errors of configurations over n_sigma, of edges over time."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.9))
     rows = [row.case for row in results.rows if row.case.startswith("sweep n_sigma") and row.metric == "false hit"]
     most = max(
@@ -50,5 +50,5 @@ def plot_accuracy(results: Results, out: Path) -> None:
 
 
 def rows_of(cases: list[str], count: str) -> int:
-    """How many cases a number of Gaussians has."""
+    """Count the cases of a number of Gaussians."""
     return sum(f" on {count} Gaussians" in case for case in cases)

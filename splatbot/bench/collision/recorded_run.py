@@ -1,4 +1,4 @@
-"""The collision field of a mapped recording against its raw depth."""
+"""Errors of the collision field of a mapped recording against its raw depth images."""
 
 from __future__ import annotations
 
@@ -30,18 +30,19 @@ from splatbot.robots.in_view import reopen_log
 
 _VOXEL = 0.01  # [m]
 _FARTHEST = 10.0  # [m]
-_GREY = (0.5, 0.5, 0.5)  # of the fused surface, whose colour nobody asks for
+_GREY = (0.5, 0.5, 0.5)  # colour of the fused surface, which no result depends on
 
 
 def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observations: int = 1) -> None:
-    """A mapped recording: clearance at random points in free space against its raw depth.
+    """Compare the clearance of a mapped recording with its raw depth, at random points in free space.
 
-    That is once the nearest of all raw points, strays and noise towards the camera included, and once the surface that
-    Open3D fuses from the frames that were not held out (truncated signed distances, in voxels of 1 cm; three
-    measurements or more). How far the two are apart is told beside: no map can be nearer to both. So is how well that
-    surface foretells the depth of held-out frames, beside the map.
-    Points are drawn along the rays of random pixels, before the measured depth. Writes ``NAME-field.jpg``: a slice
-    of the field beside the picture that it cuts.
+    The first reference is the closest of all raw points, including outliers and noise towards the camera. The second
+    is the surface that Open3D fuses from the frames that were not held out. Its TSDF has voxels of 1 cm and needs three
+    measurements. The difference of both references is reported too, because no map can be closer to both.
+    The fused surface and the map are also compared with the depth of held-out frames.
+
+    Points are sampled along the rays of random pixels, in front of the measured depth. ``NAME-field.jpg`` shows a slice
+    of the field next to the image that it intersects.
     """
     folder = RunFolder(run)
     name = str(folder.load_metrics()["log"]["name"])
@@ -93,13 +94,13 @@ def _add_mean(results: Results, case: str, metric: str, errors: list[float | Non
 
 
 def lifted(depth: NDArray[np.float32], u: NDArray[np.int64], v: NDArray[np.int64], camera: Camera, T: Array) -> Array:
-    """Points (P, 3) [m, world] that pixels (u, v) show from ``T`` (4, 4)."""
+    """Backproject pixels (u, v) with ``T`` = T_world_camera (4, 4) to points (P, 3) [m, world]."""
     z = depth[v, u].astype(np.float64)
     return transform_points(T, np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1))
 
 
 def _nearest(cloud: Array, queries: Array) -> Array:
-    """Distance (P,) to the nearest of a cloud (N, 3)."""
+    """Return the distance (P,) [m] to the closest point of a cloud (N, 3)."""
     search = o3d.core.nns.NearestNeighborSearch(_tensor(cloud))
     search.knn_index()
     _, squared = search.knn_search(_tensor(queries), 1)
@@ -107,7 +108,7 @@ def _nearest(cloud: Array, queries: Array) -> Array:
 
 
 def _picture(field: GaussianCollisionField, frame: Frame, T: Array, cloud: Array, path: Path) -> None:
-    """The vertical plane through the middle of the first view: clearance, what was measured near it, and the view."""
+    """Plot the vertical plane through the centre of the first view: clearance, measured points, and the view."""
     valid = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
     far = 1.5 * float(np.median(valid))
     half = far * frame.camera.height / frame.camera.fy / 2

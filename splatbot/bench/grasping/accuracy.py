@@ -27,7 +27,7 @@ _STEP = 1e-5  # [m] of differences for the true normals
 
 @dataclass(frozen=True, eq=False)
 class _BenchObject:
-    """A thing of the table top that the map shows, and its exact shape."""
+    """A segmented object of the table top, and its exact shape."""
 
     target: Target
     solid: Solid
@@ -55,15 +55,15 @@ def _run_map(results: Results, top: Tabletop, count: int, samples: int, case: st
     start = time.perf_counter()
     scene = segment(model, np.eye(4))
     segmented = time.perf_counter() - start
-    things = _things(scene, top)
+    objects = _bench_objects(scene, top)
     sampler = GraspSampler(scene, panda())
     options = GraspOptions(samples=samples)
-    sampler.sample(things[0].target, options)  # warms up
+    sampler.sample(objects[0].target, options)  # warms up
     found: list[tuple[_BenchObject, GraspResult, float]] = []
-    for thing in things:
+    for one in objects:
         start = time.perf_counter()
-        result = sampler.sample(thing.target, options)
-        found.append((thing, result, time.perf_counter() - start))
+        result = sampler.sample(one.target, options)
+        found.append((one, result, time.perf_counter() - start))
     seconds = np.array([spent for _, _, spent in found])
     hands = sum(result.candidates for _, result, _ in found)
     results.add(case, "segmentation", 1e3 * segmented, "ms")
@@ -71,47 +71,49 @@ def _run_map(results: Results, top: Tabletop, count: int, samples: int, case: st
     results.add(case, "to a ranked list, most", 1e3 * float(seconds.max()), "ms")
     results.add(case, "candidates", hands / float(seconds.sum()), "1/s")
     narrow = [f for f in found if _narrow(f[0].solid)]
-    results.add(case, "graspable things with a grasp", sum(bool(r) for _, r, _ in narrow), f"of {len(narrow)}")
+    results.add(case, "graspable objects with a grasp", sum(bool(r) for _, r, _ in narrow), f"of {len(narrow)}")
     best = [result.grasps[0].total for _, result, _ in found if result]
     results.add(case, "score of the best, mean", float(np.mean(best)) if best else None, "")
     _audit(results, case, found)
 
 
-def _things(scene: SegmentedMap, top: Tabletop) -> list[_BenchObject]:
-    """The segmented objects whose shape is known, without the shelf."""
+def _bench_objects(scene: SegmentedMap, top: Tabletop) -> list[_BenchObject]:
+    """Return the segmented objects whose shape is known, without the shelf."""
     points = scene.model.means.double().numpy()
-    things = []
-    for thing in scene.objects:
-        away = [float(np.median(np.abs(solid.distance(points[thing.rows])))) for solid in top.solids[5:]]
+    found = []
+    for cluster in scene.objects:
+        away = [float(np.median(np.abs(solid.distance(points[cluster.rows])))) for solid in top.solids[5:]]
         k = int(np.argmin(away))
         if away[k] < 2e-3:
-            things.append(
-                _BenchObject(Target(thing.rows, None, f"thing {k}", "bench", 1.0, (), thing.number), top.solids[5 + k])
+            found.append(
+                _BenchObject(
+                    Target(cluster.rows, None, f"object {k}", "bench", 1.0, (), cluster.number), top.solids[5 + k]
+                )
             )
-    return things
+    return found
 
 
 def _narrow(solid: Solid) -> bool:
-    """Whether a hand of 8 cm, less its slack, goes around it."""
+    """Return whether a hand of 8 cm, less its tolerance, encloses the solid."""
     size = getattr(solid, "size", None)
     return (min(size[:2]) if size is not None else 2 * solid.radius) < 0.074  # type: ignore[attr-defined]
 
 
 def _audit(results: Results, case: str, found: list[tuple[_BenchObject, GraspResult, float]]) -> None:
-    """Contacts off the true surface, and the true normals off the line between them."""
+    """Add the distances of contacts to the true surface, and the angles of true normals to their line."""
     off: list[float] = []
     angle: list[float] = []
-    for thing, result, _ in found:
+    for one, result, _ in found:
         for grasp in result.grasps:
-            off += np.abs(thing.solid.distance(grasp.contacts)).tolist()
+            off += np.abs(one.solid.distance(grasp.contacts)).tolist()
             line = grasp.contacts[1] - grasp.contacts[0]
             line = line / np.linalg.norm(line)
-            normals = _normals(thing.solid, grasp.contacts)
+            normals = _normals(one.solid, grasp.contacts)
             angle += np.degrees(np.arccos(np.clip(normals @ line * [-1.0, 1.0], -1.0, 1.0))).tolist()
-    results.add(case, "grasps looked at", len(off) // 2, "")
+    results.add(case, "checked grasps", len(off) // 2, "")
     for name, values, unit, scale in (
-        ("contacts off the true surface", off, "mm", 1e3),
-        ("true normals off", angle, "deg", 1.0),
+        ("distance of contacts to the true surface", off, "mm", 1e3),
+        ("angle of true normals to the contact line", angle, "deg", 1.0),
     ):
         for part, share in (("95 %", 95.0), ("most", 100.0)):
             value = scale * float(np.percentile(values, share)) if values else None

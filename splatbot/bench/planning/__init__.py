@@ -15,7 +15,7 @@ from splatbot.bench.tables import Table, cases, per_metric
 from splatbot.errors import InputError
 
 BUDGET, AGAINST = "budget", "against"
-FAR_CHANGE, NEAR_CHANGE, MEMORY = "a far change", "a change in the way", "memory"
+FAR_CHANGE, NEAR_CHANGE, MEMORY = "a far change", "a change on the path", "memory"
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class PlanningSettings(Settings):
 
     @property
     def on_maps(self) -> bool:
-        """Whether to plan on maps made from images."""
+        """True if the maps are made from images."""
         return self.mapped or bool(self.run)
 
     @property

@@ -1,4 +1,4 @@
-"""Exact truth along paths."""
+"""Exact clearances along paths."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from splatbot.bench.truth import Truth
 from splatbot.collision import RobotSpheres
 from splatbot.protocols import Array
 
-STEP = 1 / 256  # [rad] between the configurations of a path that the truth is asked for
+STEP = 1 / 256  # [rad] between the checked configurations of a path
 
 
 def configurations(path: Array) -> Array:
-    """Configurations (C, J) along a path (N, J), at most 1/256 rad apart."""
+    """Interpolate configurations (C, J) along a path (N, J), at most 1/256 rad apart."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     parts = [
         a + np.linspace(0, 1, int(np.ceil(step / STEP)) + 1)[:, None] * (b - a)
@@ -24,10 +24,10 @@ def configurations(path: Array) -> Array:
 
 
 def audit(paths: Sequence[Array], arm: RobotSpheres, truth: Truth) -> tuple[Array, int]:
-    """Least true room (P,) [m] of each path's configurations every 1/256 rad, and how many paths touch themselves."""
-    rooms, own = [], 0
+    """Return the least true clearance (P,) [m] of each path, and the number of paths in self-collision."""
+    clearances, own = [], 0
     for path in paths:
         q = configurations(path)
-        rooms.append(float(truth.rooms(arm, q).min()))
+        clearances.append(float(truth.clearances(arm, q).min()))
         own += bool(arm.check(None, q).in_collision.any())
-    return np.array(rooms), own
+    return np.array(clearances), own

@@ -1,4 +1,4 @@
-"""The planner's problems on a map of a noisy film of their table top, over margins, against exact truth."""
+"""Planning problems on a map of a noisy film of the table top, over margins, against exact ground truth."""
 
 from __future__ import annotations
 
@@ -22,35 +22,35 @@ from splatbot.protocols import Array
 from splatbot.results.margin import RADIUS, SHARE
 from splatbot.robots.panda import panda
 
-MARGINS = (0.0, 0.005, 0.02)  # [m] beside the map's own
-_SOUGHT = (PlanStatus.SUCCESS, PlanStatus.TIMED_OUT, PlanStatus.PLANNING_FAILED)
+MARGINS = (0.0, 0.005, 0.02)  # [m] in addition to the surface error of the map
+_SEARCHED = (PlanStatus.SUCCESS, PlanStatus.TIMED_OUT, PlanStatus.PLANNING_FAILED)
 
 
 @dataclass(frozen=True, eq=False)
 class TrueClearances:
-    """What exact distances say of paths.
+    """Exact clearances of paths.
 
     Args:
-        rooms: least true room (P,) [m] of each path, negative inside a shape.
-        seen: whether each path (P,) touches a place of the true surface that some frame shows.
+        clearances: Least true clearance (P,) [m] of each path, negative inside a shape.
+        observed: True for each path (P,) in contact with surface that some frame observes.
     """
 
-    rooms: Array
-    seen: NDArray[np.bool_]
+    clearances: Array
+    observed: NDArray[np.bool_]
 
 
 def add_map(results: Results, mapped: FilmedMap) -> float:
-    """What the map is like; returns the margin [m] that it asks for itself."""
+    """Add size and errors of the map, and return its surface error [m], which serves as a margin."""
     case = "mapped noisy log"
     field = GaussianCollisionField(mapped.snapshot)
     own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], RADIUS]).share(SHARE)
     drift = mapped.drift()
     results.add(case, "frames", float(len(drift)), "")
     results.add(case, "lost", float(np.isnan(drift).sum()), f"of {len(drift)}")
-    results.add(case, "camera off, median", 1e3 * float(np.nanmedian(drift)), "mm")
-    results.add(case, "camera off, most", 1e3 * float(np.nanmax(drift)), "mm")
+    results.add(case, "camera position error, median", 1e3 * float(np.nanmedian(drift)), "mm")
+    results.add(case, "camera position error, most", 1e3 * float(np.nanmax(drift)), "mm")
     results.add(case, "Gaussians", float(len(field)), "")
-    results.add(case, f"surface error within {RADIUS:g} m, as its depth tells, {SHARE:.1%}", 1e3 * own, "mm")
+    results.add(case, f"surface error within {RADIUS:g} m against its own depth, {SHARE:.1%}", 1e3 * own, "mm")
     return own
 
 
@@ -65,9 +65,9 @@ def audit_mapped(
     seeds: int,
     budget_ms: float,
 ) -> None:
-    """All problems with all seeds on the map, over margins from 0 to 2 cm and with the map's ``own`` [m].
+    """Plan all problems with all seeds on the map, over margins from 0 to 2 cm and with the surface error ``own`` [m].
 
-    Costs are told beside those of margin 0, over the problems that both solved.
+    Costs are compared with those of margin 0, over the problems that both solved.
     """
     field = GaussianCollisionField(mapped.snapshot)
     base = mapped.T_map_scene
@@ -89,40 +89,40 @@ def audit_mapped(
         _add_cost(results, case, costs, reference)
         paths = [run.path.waypoints for run in runs if run.path is not None]
         if paths:
-            _add_touches(results, case, touches(paths, bare, truth, mapped.film))
+            _add_contacts(results, case, true_clearances(paths, bare, truth, mapped.film))
 
 
-def touches(paths: Sequence[Array], arm: RobotSpheres, truth: Truth, film: Film) -> TrueClearances:
-    """How the configurations of paths, every 1/256 rad, lie to the true shapes in whose frame the arm stands."""
+def true_clearances(paths: Sequence[Array], arm: RobotSpheres, truth: Truth, film: Film) -> TrueClearances:
+    """Compute true clearances of paths every 1/256 rad; the frame of the shapes is that of the arm's base."""
     shapes = _shapes(truth)
     moving = arm.spheres.link > 0
-    rooms, seen = [], []
+    clearances, observed = [], []
     for path in paths:
         q = configurations(path)
-        room = truth.rooms(arm, q)
-        rooms.append(float(room.min()))
+        clearance = truth.clearances(arm, q)
+        clearances.append(float(clearance.min()))
         inside = np.zeros((0, 3))
-        if rooms[-1] <= 0:
-            centers = arm.centers(q[room <= 0])[:, moving].reshape(-1, 3)
-            radii = np.tile(arm.spheres.radii[moving], int((room <= 0).sum()))
+        if clearances[-1] <= 0:
+            centers = arm.centers(q[clearance <= 0])[:, moving].reshape(-1, 3)
+            radii = np.tile(arm.spheres.radii[moving], int((clearance <= 0).sum()))
             inside = centers[truth.scene.distance(centers) <= radii]
-        seen.append(bool(film.seen(_closest(shapes, inside)).any()) if len(inside) else False)
-    return TrueClearances(np.array(rooms), np.array(seen, np.bool_))
+        observed.append(bool(film.observed(_closest(shapes, inside)).any()) if len(inside) else False)
+    return TrueClearances(np.array(clearances), np.array(observed, np.bool_))
 
 
 def _add_success(results: Results, case: str, runs: Sequence[PlanResult], mean_ms: float) -> None:
-    blocked = sum(run.status not in _SOUGHT for run in runs)
+    blocked = sum(run.status not in _SEARCHED for run in runs)
     results.add(case, "start or goal not free on the map", float(blocked), f"of {len(runs)}")
     solved = [run.path for run in runs if run.path is not None]
     results.add(case, "solved", float(len(solved)), f"of {len(runs)}")
     results.add(case, "solved of those free at both ends", float(len(solved)), f"of {len(runs) - blocked}")
-    results.add(case, "the whole call, mean", mean_ms, "ms")
+    results.add(case, "planning time, mean", mean_ms, "ms")
     if solved:
         first = [1e3 * run.first_seconds for run in runs if run]
         results.add(case, "first path, median", float(np.median(first)), "ms")
         results.add(case, "first path, 95 %", float(np.percentile(first, 95)), "ms")
         clearance = 1e3 * float(np.median([path.certificate.clearance for path in solved]))
-        results.add(case, "clearance promised beyond the margin, median", clearance, "mm")
+        results.add(case, "certified clearance beyond the margin, median", clearance, "mm")
 
 
 def _add_cost(results: Results, case: str, costs: Array, reference: Array) -> None:
@@ -133,13 +133,13 @@ def _add_cost(results: Results, case: str, costs: Array, reference: Array) -> No
         results.add(case, "cost against margin 0 where both solved, mean", ratio, "x")
 
 
-def _add_touches(results: Results, case: str, found: TrueClearances) -> None:
-    touch = found.rooms <= 0
-    count = f"of {len(touch)}"
-    results.add(case, "touch the truth", float(touch.sum()), count)
-    results.add(case, "touch what a frame showed", float((touch & found.seen).sum()), count)
-    results.add(case, "deepest", 1e3 * max(0.0, -float(found.rooms.min())), "mm")
-    deepest = -float(found.rooms[found.seen].min()) if found.seen.any() else 0.0
+def _add_contacts(results: Results, case: str, found: TrueClearances) -> None:
+    contact = found.clearances <= 0
+    count = f"of {len(contact)}"
+    results.add(case, "in contact with the true shapes", float(contact.sum()), count)
+    results.add(case, "in contact with observed surface", float((contact & found.observed).sum()), count)
+    results.add(case, "deepest", 1e3 * max(0.0, -float(found.clearances.min())), "mm")
+    deepest = -float(found.clearances[found.observed].min()) if found.observed.any() else 0.0
     results.add(case, "deepest of those", 1e3 * deepest, "mm")
 
 

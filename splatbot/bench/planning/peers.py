@@ -37,7 +37,7 @@ def run_peers(
     truth: Truth,
     report_progress: ReportProgress,
 ) -> dict[str, dict[float, Array]]:
-    """Costs (P,) of the peers that improve until time is up, by name and budget [ms]."""
+    """Measure the peers; return the costs (P,) of those that improve a path, by name and budget [ms]."""
     missing = importlib.util.find_spec("vamp") is None
     note = "absent: vamp is not installed (it has no wheel)" if missing else "not driven by this benchmark"
     results.add("first path", "time, median", None, "ms", peer="VAMP", note=note)
@@ -77,7 +77,7 @@ def run_peers(
 
 
 def add_ratio(results: Results, case: str, ours: Array, theirs: Array, peer: str) -> None:
-    """The mean of the paired ratios ours / theirs over problems that both solved, with its 95 % interval."""
+    """Add the mean of the paired ratios ours / theirs over problems that both solved, with its 95 % interval."""
     both = np.isfinite(ours) & np.isfinite(theirs)
     if both.sum() < 2:
         return
@@ -100,10 +100,12 @@ def _first_paths(
     if not paths:
         return
     results.add("first path", "cost, mean", float(np.mean([_length(path) for path in paths])), "rad", peer=name)
-    rooms, own = audit(paths, problem.arm, truth)
-    results.add("first path", "touch the truth", float((rooms <= 0).sum()), f"of {len(paths)}", peer=name)
-    results.add("first path", "deepest", 1e3 * max(0.0, -float(rooms.min())), "mm", peer=name)
-    results.add("first path", "touch themselves", float(own), f"of {len(paths)}", peer=name)
+    clearances, own = audit(paths, problem.arm, truth)
+    results.add(
+        "first path", "in contact with the true shapes", float((clearances <= 0).sum()), f"of {len(paths)}", peer=name
+    )
+    results.add("first path", "deepest", 1e3 * max(0.0, -float(clearances.min())), "mm", peer=name)
+    results.add("first path", "in self-collision", float(own), f"of {len(paths)}", peer=name)
 
 
 def _length(path: Array) -> float:
@@ -111,22 +113,22 @@ def _length(path: Array) -> float:
 
 
 def _field_states(planner: GaussianRRTStar) -> Callable[[Array], bool]:
-    ask, field = planner.arm.native.configurations, planner.field.native
-    return lambda q: bool(ask(field, q)[0] < 0)
+    check, field = planner.arm.native.configurations, planner.field.native
+    return lambda q: bool(check(field, q)[0] < 0)
 
 
 def _certified_edges(planner: GaussianRRTStar) -> Callable[[Array, Array], bool]:
-    ask, field, eps = planner.arm.native.certify, planner.field.native, planner.eps
-    return lambda a, b: bool(ask(field, a, b, eps)[0][0] < 0)
+    certify, field, eps = planner.arm.native.certify, planner.field.native, planner.eps
+    return lambda a, b: bool(certify(field, a, b, eps)[0][0] < 0)
 
 
-def _solid_states(arm: RobotSpheres, ask: Callable[[Array, Array], list[bool]]) -> Callable[[Array], bool]:
+def _solid_states(arm: RobotSpheres, check: Callable[[Array, Array], list[bool]]) -> Callable[[Array], bool]:
     moving = arm.spheres.link > 0
     radii = arm.spheres.radii[moving]
     own = arm.native.configurations
 
     def free(q: Array) -> bool:
-        return bool(own(None, q)[0] < 0) and not ask(arm.centers(q)[:, moving], radii)[0]
+        return bool(own(None, q)[0] < 0) and not check(arm.centers(q)[:, moving], radii)[0]
 
     return free
 
@@ -151,7 +153,7 @@ class _Ompl:
         self._space.setBounds(bounds)
 
     def solve(self, planner: str, problem: Problem, seconds: float) -> tuple[Array | None, float]:
-        """The waypoints (N, J), None if there are none in time, and the seconds spent."""
+        """Return the waypoints (N, J) and the time [s]. If the waypoints are None, the time was not enough."""
         setup = self._geometric.SimpleSetup(self._space)
         setup.setStateValidityChecker(lambda state: self._states(self._read(state)))
         information = setup.getSpaceInformation()

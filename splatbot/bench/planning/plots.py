@@ -17,7 +17,7 @@ DEFAULT_MS = 28.0
 
 
 def plot_cost(histories: Sequence[Array], peers: Mapping[str, Mapping[float, Array]], out: Path) -> None:
-    """``planning-cost.png`` and ``.svg``: the mean cost of all problems over time, with peers' at their budgets.
+    """Write ``planning-cost.png`` and ``.svg``: the mean cost of all problems over time, with peers' at their budgets.
 
     Args:
         histories: (H, 2) of (seconds, cost [rad]) of each problem.

@@ -1,4 +1,4 @@
-"""The planner on maps of recordings: an arm beside what was mapped, to within what the depth images showed."""
+"""Planning on maps of recordings; paths are compared with the measured depth images."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from splatbot.robots.panda import panda
 from splatbot.tracking.prepare import usable_depth
 from splatbot.workspace import AHEAD, Workspace, find_workspace, fit_workspace
 
-_FRAMES = 40  # whose depth the paths are compared with, at least
-_EVERY = 5  # pixel of them
+_FRAMES = 40  # least number of frames whose depth is compared with the paths
+_PIXEL_STRIDE = 5  # between the compared pixels
 _TURNS = (0, *(sign * angle for angle in range(30, 181, 30) for sign in (1, -1)))  # [deg]
-_TRIED, _FREE = 1000, 0.1  # configurations, and the share of them that must be free
+_TRIED, _MIN_FREE = 1000, 0.1  # configurations, and the least share of free ones
 _BOX = ((0.2, -0.5, 0.0), (0.9, 0.5, 0.8))  # [m]
-_SPARSE = 8  # configurations of a path per one that is compared with depth: 1/32 rad
+_PATH_STRIDE = 8  # between the compared configurations of a path: 1/32 rad
 
 
 def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float, seed: int = 0) -> None:
-    """Seeded problems in a run's map, with margin 0 and with the map's own.
+    """Plan seeded problems in the map of a run, with margin 0 and with the surface error of the map.
 
-    The base stands where the run's scene.yaml says; without one, where :func:`splatbot.workspace.fit_workspace`
-    proposes, or as near to it around the same middle as leaves the arm free to move.
+    The scene.yaml of the run defines the pose of the base. Without a scene.yaml,
+    :func:`splatbot.workspace.fit_workspace` proposes it, and :func:`free_place` turns it until the arm can move.
 
     Raises:
-        InputError: there is no plane in the map, or its scene.yaml lacks the base or the workspace.
+        InputError: The map has no plane, or its scene.yaml lacks the base or the workspace.
     """
     model = GaussianModel.load(run / "map.ply")
     field = GaussianCollisionField(model)
@@ -69,9 +69,9 @@ def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float,
 
 
 def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
-    """A proposed place (base known), turned about the middle of its surface until the arm can be in many postures.
+    """Turn a proposed workspace about the centre of its surface until enough configurations are free.
 
-    A turned one has a box of its own: what lies in reach before the arm. None is: the place as it was.
+    A turned workspace gets the box in reach in front of the arm. If no turn is free enough, the workspace is unchanged.
     """
     T = place.T_world_base
     assert T is not None
@@ -81,7 +81,7 @@ def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
         turn[:3, :3] = so3_exp([0.0, 0.0, np.radians(degrees)])
         turn[:3, 3] = [AHEAD, 0.0, 0.0] - turn[:3, :3] @ [AHEAD, 0.0, 0.0]
         arm = RobotSpheres(panda(), T_world_base=T @ turn)
-        if (~arm.check(field, some).in_collision).mean() > _FREE:
+        if (~arm.check(field, some).in_collision).mean() > _MIN_FREE:
             return place if degrees == 0 else replace(place, T_world_base=T @ turn, box=np.array(_BOX))
     return place
 
@@ -89,7 +89,7 @@ def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
 def _add(results: Results, case: str, runs: list[PlanResult], planner: GaussianRRTStar, measured: cKDTree) -> None:
     paths = [run.path for run in runs if run.path is not None]
     results.add(case, "solved", float(len(paths)), f"of {len(runs)}")
-    results.add(case, "the whole call, median", 1e3 * float(np.median([run.seconds for run in runs])), "ms")
+    results.add(case, "planning time, median", 1e3 * float(np.median([run.seconds for run in runs])), "ms")
     if not paths:
         return
     first = [1e3 * run.first_seconds for run in runs if run]
@@ -98,15 +98,15 @@ def _add(results: Results, case: str, runs: list[PlanResult], planner: GaussianR
     results.add(case, "first path, most", max(first), "ms")
     results.add(case, "cost, mean", float(np.mean([path.cost for path in paths])), "rad")
     promised = [1e3 * path.certificate.clearance for path in paths]
-    results.add(case, "clearance promised beyond the margin, least", min(promised), "mm")
-    results.add(case, "clearance promised beyond the margin, median", float(np.median(promised)), "mm")
-    rooms = np.array([_room(planner.arm, path.waypoints, measured) for path in paths])
-    results.add(case, "touch a measured point", float((rooms <= 0).sum()), f"of {len(paths)}")
-    results.add(case, "deepest", 1e3 * max(0.0, -float(rooms.min())), "mm")
+    results.add(case, "certified clearance beyond the margin, least", min(promised), "mm")
+    results.add(case, "certified clearance beyond the margin, median", float(np.median(promised)), "mm")
+    clearances = np.array([_clearance(planner.arm, path.waypoints, measured) for path in paths])
+    results.add(case, "in contact with a measured point", float((clearances <= 0).sum()), f"of {len(paths)}")
+    results.add(case, "deepest", 1e3 * max(0.0, -float(clearances.min())), "mm")
 
 
 def _measured(folder: RunFolder, log: Log) -> Array:
-    """Points (P, 3) [m, world] of the log's depth, without what mapping leaves out."""
+    """Return the points (P, 3) [m, world] of the log's depth that mapping uses."""
     config = folder.load_config().tracking
     poses = sorted(folder.load_poses().items())
     parts = []
@@ -114,14 +114,14 @@ def _measured(folder: RunFolder, log: Log) -> Array:
         frame = log[index]
         depth = usable_depth(frame, config)
         v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
-        parts.append(lifted(depth, u[::_EVERY], v[::_EVERY], frame.camera, T))
+        parts.append(lifted(depth, u[::_PIXEL_STRIDE], v[::_PIXEL_STRIDE], frame.camera, T))
     return np.concatenate(parts)
 
 
-def _room(arm: RobotSpheres, path: Array, measured: cKDTree) -> float:
-    """Least gap [m] between the arm's moving spheres along a path and measured points; up to 10 cm."""
+def _clearance(arm: RobotSpheres, path: Array, measured: cKDTree) -> float:
+    """Compute the least clearance [m] between the arm along a path and measured points, at most 10 cm."""
     moving = arm.spheres.link > 0
-    centers = arm.centers(configurations(path)[::_SPARSE])[:, moving]
+    centers = arm.centers(configurations(path)[::_PATH_STRIDE])[:, moving]
     distance, _ = measured.query(centers.reshape(-1, 3), distance_upper_bound=0.1 + float(arm.spheres.radii.max()))
     gap = np.minimum(distance.reshape(len(centers), -1) - arm.spheres.radii[moving], 0.1)
     return float(gap.min())

@@ -22,8 +22,9 @@ class RasterSettings(Settings):
     """Measure the speed of the rasterizer, and how its error depends on the time.
 
     Built-in scenes are rendered from 320x240 to 1280x720, forward and backward, through Python and autograd. The
-    benchmark also measures the share of this machine's peak of multiply-adds, the fused loss, the cost of each option,
-    the error over the time, and the growth with the scene. Times are the least of several runs [ms], with the median.
+    benchmark also measures the share of this machine's peak of multiply-adds, the fused loss and the cost of each
+    option. It varies settings for the error over the time, and sizes for the growth. Times are the least of several
+    runs [ms], with the median.
 
     Examples:
         splatbot bench raster
@@ -101,11 +102,11 @@ BENCHMARK = Benchmark(
             lambda row: row.peer is not None,
             (
                 *_TIMES[:2],
-                *("forward, times ours", "forward+backward, times ours"),
+                *("forward, ratio to splatbot", "forward+backward, ratio to splatbot"),
                 *("image, error of 99.9 % of the pixels", "gradients, largest relative difference"),
             ),
         ),
-        Table("", lambda row: row.metric == "what it is", layout=notes_of_peers),
+        Table("", lambda row: row.metric == "implementation", layout=notes_of_peers),
     ),
     plot=_plot,
 )

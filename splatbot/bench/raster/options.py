@@ -1,4 +1,4 @@
-"""What each option of a render costs: milliseconds with it minus milliseconds without."""
+"""Cost of each option of a render: time with it minus time without it [ms]."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RasterOption:
 
 
 def all_effects() -> list[RasterOption]:
-    """In the order they are reported."""
+    """Return all options in the order of the report."""
     return [
         RasterOption("depth (RGB+ED)", lambda a: a | {"render_mode": "RGB+ED"}),
         RasterOption("plane depth", lambda a: a | {"render_mode": "RGB+ED", "depth_mode": "plane"}),
@@ -53,7 +53,7 @@ def all_effects() -> list[RasterOption]:
 
 
 def run_effects(results: Results, scene: SplatScene, size: tuple[int, int], *, runs: int, budget_s: float) -> None:
-    """One row per effect and pass; an effect that this build refuses is reported with its refusal."""
+    """Add a row per option and pass; an option that this build refuses gets the reason as its note."""
     plain = plain_arguments(scene, size)
     case = f"effect on {scene.name} {size[0]}x{size[1]}"
     for effect in all_effects():
@@ -76,13 +76,13 @@ def run_effects(results: Results, scene: SplatScene, size: tuple[int, int], *, r
 
 
 def plain_arguments(scene: SplatScene, size: tuple[int, int]) -> Arguments:
-    """A call of ``rasterization`` with nothing switched on; gradients to all five tensors."""
+    """Return arguments of ``rasterization`` without options, with gradients of all five tensors."""
     leaves = {name: t.detach().clone().requires_grad_() for name, t in scene.named().items()}
     return leaves | scene.view(*size)
 
 
 def with_harmonics(arguments: Mapping[str, Any], degree: int) -> Arguments:
-    """The call with coefficients (N, K, 3) in place of colours: the same mean colours, and lobes."""
+    """Replace colours by coefficients (N, K, 3) of spherical harmonics with the same mean colours."""
     colors = arguments["colors"].detach()
     generator = torch.Generator().manual_seed(2)
     coefficients = 0.1 * torch.randn(len(colors), (degree + 1) ** 2, 3, generator=generator)

@@ -1,4 +1,4 @@
-"""Other implementations of the same model, to measure beside splatbot's in the same process."""
+"""Other implementations of the same model, measured in the same process as splatbot."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Peer:
 
 
 def all_peers() -> list[Peer]:
-    """The peers there are, those that cannot run here included."""
+    """Return all peers, including those that cannot run here."""
     return [
         Peer(
             "torch",
@@ -61,7 +61,7 @@ def _gsplat() -> Peer:
 
 
 def scalar_render(scene: SplatScene, width: int, height: int, grad: Tensor | None) -> PeerRender:
-    """Through the scalar C++ code; gradients to colours, opacities, and the projected means and conics."""
+    """Render by the scalar C++ code; gradients are those of colours, opacities, projected means and conics."""
     n = len(scene)
     image, alpha = torch.empty(height, width, 3), torch.empty(height, width)
     gradients = {
@@ -93,7 +93,7 @@ def torch_render(
     grad: Tensor | None,
     project: Callable[..., Projection] | None = None,
 ) -> PeerRender:
-    """Through torch's float32 operations. A tile is differentiated as soon as it is rendered, which bounds memory."""
+    """Render by float32 operations of torch, and differentiate each tile at once, which bounds the memory."""
     leaves = [t.detach().clone().requires_grad_(grad is not None) for t in scene.tensors()]
     means, quats, scales, opacities, colors = leaves
     with torch.set_grad_enabled(grad is not None):
@@ -119,7 +119,7 @@ def torch_render(
 
 
 def gsplat_render(scene: SplatScene, width: int, height: int, grad: Tensor | None) -> PeerRender:
-    """Projected by gsplat's torch reference and differentiated through it, blended as in :func:`torch_render`."""
+    """Render with the projection of gsplat's torch reference, and blend as in :func:`torch_render`."""
     return torch_render(scene, width, height, grad, _gsplat_project)
 
 
@@ -142,7 +142,7 @@ def _grad(tensor: Tensor) -> Tensor:
 
 
 def _project(scene: SplatScene, means: Tensor, quats: Tensor, scales: Tensor, width: int, height: int) -> Projection:
-    """EWA projection (Zwicker et al. 2001)."""
+    """Project by EWA splatting (Zwicker et al. 2001)."""
     K = scene.intrinsics(width, height)[0]
     fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     R, t = scene.viewmat[:3, :3], scene.viewmat[:3, 3]

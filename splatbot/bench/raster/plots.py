@@ -17,7 +17,7 @@ _KNOBS = ("radius_clip", "percent_of_gaussians", "sh_degree", "unscented_transfo
 
 
 def plot_sweeps(results: Results, out: Path) -> None:
-    """``raster-sweeps.png``, ``.svg``: largest error against milliseconds, a panel per knob, the default marked."""
+    """Write ``raster-sweeps.png``, ``.svg``: largest error over time, a panel per knob, the default marked."""
     panels = [(knob, points) for knob in _KNOBS if (points := _points(results, knob))]
     figure, axes = plt.subplots(1, max(1, len(panels)), figsize=(4.2 * max(1, len(panels)), 3.6), squeeze=False)
     for axis, (knob, points) in zip(axes[0], panels, strict=False):
@@ -33,7 +33,7 @@ def plot_sweeps(results: Results, out: Path) -> None:
 
 
 def plot_growth(results: Results, out: Path) -> None:
-    """``raster-growth.png`` and ``.svg``: time against Gaussians and against pixels, with a line of slope one."""
+    """Write ``raster-growth.png`` and ``.svg``: time against Gaussians and against pixels, with a line of slope one."""
     figure, axes = plt.subplots(1, 2, figsize=(9.5, 3.8))
     for axis, kind in zip(axes, ("gaussians", "pixels"), strict=True):
         rows = results.select(f"{GROWTH} {kind}: ")
@@ -54,7 +54,7 @@ def plot_growth(results: Results, out: Path) -> None:
 
 
 def _points(results: Results, knob: str) -> list[tuple[float, float, str, bool]]:
-    """(milliseconds, error, setting, is the default) of the settings that ran."""
+    """Return (time [ms], error, setting, whether it is the default) of the settings that ran."""
     rows = results.select(f"{SWEEP} {knob} on ")
     points = []
     for case in dict.fromkeys(row.case for row in rows):

@@ -43,30 +43,30 @@ class SplatScene:
         return len(self.means)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """Means, quats, scales, opacities, colours."""
+        """Return means, quats, scales, opacities, colours."""
         return self.means, self.quats, self.scales, self.opacities, self.colors
 
     def named(self) -> dict[str, Tensor]:
-        """The same, by the names of ``rasterization``'s arguments."""
+        """Return the tensors by the argument names of ``rasterization``."""
         return dict(zip(NAMES, self.tensors(), strict=True))
 
     def intrinsics(self, width: int, height: int) -> Tensor:
-        """(1, 3, 3) [px], principal point at the centre."""
+        """Return intrinsics (1, 3, 3) [px] with the principal point at the centre."""
         focal = 0.5 * width / math.tan(0.5 * self.fov)
         return torch.tensor([[[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]])
 
     def view(self, width: int, height: int) -> dict[str, Any]:
-        """What ``rasterization`` is told of the camera."""
+        """Return the camera arguments of ``rasterization``."""
         return {"viewmats": self.viewmat[None], "Ks": self.intrinsics(width, height), "width": width, "height": height}
 
     def select(self, index: Tensor, name: str) -> SplatScene:
-        """Some of the Gaussians."""
+        """Select some of the Gaussians."""
         means, quats, scales, opacities, colors = (t[index] for t in self.tensors())
         return replace(self, name=name, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
 
 
 def surface_map(width: int = MAP_WIDTH, height: int = MAP_HEIGHT, *, sigma_px: float = 1.0) -> SplatScene:
-    """A table with two boxes, one round Gaussian of opacity 0.7 back-projected from each pixel (76,800 by default).
+    """Build a table with two boxes, one round Gaussian of opacity 0.7 per pixel (76,800 by default).
 
     Args:
         width, height: of the grid of pixels.
@@ -94,10 +94,10 @@ def surface_map(width: int = MAP_WIDTH, height: int = MAP_HEIGHT, *, sigma_px: f
 
 
 def random_box(n: int, *, shrink: float = 1.0) -> SplatScene:
-    """Uniform in [-1, 1]³, scales 1e-4..0.02, opacity 0..1; camera at z = -2.5, 60° field of view.
+    """Sample Gaussians uniformly in [-1, 1]³, scales 1e-4..0.02, opacity 0..1; camera at z = -2.5, 60° field of view.
 
     Args:
-        n: how many.
+        n: number of Gaussians.
         shrink: factor of the scales; sqrt(1e5 / n) keeps the blends per pixel those of 1e5.
     """
     g = torch.Generator().manual_seed(n)
@@ -116,7 +116,7 @@ def random_box(n: int, *, shrink: float = 1.0) -> SplatScene:
 
 
 def from_file(path: Path) -> SplatScene:
-    """A map or splat file as its default view shows it.
+    """Load a map or splat file with its default view.
 
     Raises:
         InputError: the file cannot be read.

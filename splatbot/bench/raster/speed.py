@@ -1,4 +1,4 @@
-"""`splatbot bench raster`: the rasterizer's speed, beside its peers and beside what the machine could do."""
+"""Measurements of `splatbot bench raster`: speed of the rasterizer, compared with peers and with the machine's peak."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def run_raster(settings: RasterSettings, report_progress: ReportProgress = ignor
 
 
 def case_name(scene: SplatScene, size: tuple[int, int], count: int) -> str:
-    """As in "surface 320x240, 2 threads"."""
+    """Return the name of a case, as in "surface 320x240, 2 threads"."""
     return f"{scene.name} {size[0]}x{size[1]}, {count} thread{'s' if count > 1 else ''}"
 
 
@@ -99,7 +99,7 @@ def run_case(settings: RasterSettings, results: Results, scene: SplatScene, size
 
 
 def add_shares(results: Results, count: int) -> None:
-    """The blend stages' shares of the peak, of the cases on ``count`` threads, once their peak is known."""
+    """Add the shares of the peak that the blend stages reach, for the cases with ``count`` threads."""
     peak = results.machine["fma_peak_gflops"][results.machine["isa"]][str(count)]
     ending = f", {count} thread{'s' if count > 1 else ''}"
     pairs = {r.case: r.value for r in results.rows if r.metric == "evaluated pairs" and r.case.endswith(ending)}
@@ -127,33 +127,33 @@ class Passes:
         self.upstream = torch.randn(1, size[1], size[0], channels, generator=generator)
 
     def forward(self) -> Tensor:
-        """The image; no gradients."""
+        """Render the image without gradients."""
         with torch.no_grad():
             return rasterization(**self._plain)[0]
 
     def forward_backward(self) -> RenderMeta:
-        """Gradients to all five tensors."""
+        """Compute gradients with respect to all five tensors."""
         image, _, meta = rasterization(**(self._plain | self._leaves))
         torch.autograd.grad(image, tuple(self._leaves.values()), self.upstream)
         return meta
 
     def pose_backward(self) -> Tensor:
-        """The gradient to the view matrix alone."""
+        """Compute the gradient with respect to the view matrix alone."""
         image, _, _ = rasterization(**(self._plain | {"viewmats": self._pose}))
         return torch.autograd.grad(image, self._pose, self.upstream)[0]
 
     def gradients(self) -> dict[str, Tensor]:
-        """By name."""
+        """Return the gradients by name."""
         image, _, _ = rasterization(**(self._plain | self._leaves))
         found = torch.autograd.grad(image, tuple(self._leaves.values()), self.upstream)
         return dict(zip(self._leaves, found, strict=True))
 
     def state_bytes(self) -> int:
-        """Memory that a render holds until its backward pass."""
+        """Return the memory that a render keeps until its backward pass."""
         return int(sum(rasterization(**self._plain)[2]["state_bytes"]))
 
     def best_work(self, runs: int) -> RasterWork:
-        """Each stage's least time over a few runs."""
+        """Measure the least time of each stage over a few runs."""
         works = [raster_work(self.forward_backward())[0] for _ in range(runs)]
         stages = [name for name in RasterWork.__dataclass_fields__ if name.endswith("_ms")]
         return RasterWork(
@@ -163,7 +163,7 @@ class Passes:
 
 
 def run_loss(settings: RasterSettings, results: Results) -> None:
-    """The fused L1 + D-SSIM, with its gradient."""
+    """Measure the fused L1 + D-SSIM with its gradient."""
     width, height = (48, 32) if settings.quick else (640, 480)
     rendered = torch.rand(height, width, 3).requires_grad_()
     target = torch.rand(height, width, 3)
@@ -177,7 +177,7 @@ def run_loss(settings: RasterSettings, results: Results) -> None:
 
 
 def run_peers(settings: RasterSettings, results: Results, report_progress: ReportProgress) -> None:
-    """Every peer on the first two scenes: its times, how many times splatbot's, and whether they agree."""
+    """Measure every peer on the first two scenes: its times, ratios to splatbot's, and differences."""
     size = settings.sizes[0]
     for scene in scenes_of(settings)[:2]:
         case = case_name(scene, size, 1)
@@ -188,7 +188,7 @@ def run_peers(settings: RasterSettings, results: Results, report_progress: Repor
         results.add_time(case + ", RGB", "forward+backward", own_both)
         grad = passes.upstream[0]
         for peer in all_peers():
-            results.add(case + ", RGB", "what it is", None, "", peer=peer.name, note=peer.note)
+            results.add(case + ", RGB", "implementation", None, "", peer=peer.name, note=peer.note)
             if peer.render is None:
                 results.add(case + ", RGB", "forward", None, "ms", peer=peer.name, note="absent")
                 continue
@@ -205,18 +205,18 @@ def _add_peer(
 ) -> None:
     for metric, their, our in zip(("forward", "forward+backward"), theirs, ours, strict=True):
         results.add_time(case, metric, their, peer=peer)
-        results.add(case, f"{metric}, times ours", their.least_ms / our.least_ms, "x", peer=peer)
+        results.add(case, f"{metric}, ratio to splatbot", their.least_ms / our.least_ms, "x", peer=peer)
 
 
 def _compare(
     results: Results, case: str, peer: str, passes: Passes, image: Tensor, gradients: dict[str, Tensor]
 ) -> None:
-    """Whether the peer shows the same image (but for pixels at a jump of the model) and the same gradients."""
+    """Compare image and gradients with those of a peer; images may differ at discontinuities of the model."""
     error = (passes.forward()[0] - image).abs().amax(-1)
     results.add(case, "image, error of 99.9 % of the pixels", float(error.flatten().quantile(0.999)), "", peer=peer)
-    results.add(case, "image, pixels off by over 1e-4", float((error > 1e-4).sum()), "px", peer=peer)
+    results.add(case, "image, pixels that differ by over 1e-4", float((error > 1e-4).sum()), "px", peer=peer)
     own = passes.gradients()
-    # A round Gaussian looks the same from all sides: what is there of its quaternion's gradient is rounding.
+    # The image of a round Gaussian does not depend on its quaternion, so that gradient is rounding error.
     names = (own.keys() & gradients.keys()) - ({"quats"} if passes.round else set())
     differences = {k: float((gradients[k] - own[k]).norm() / own[k].norm().clamp_min(1e-30)) for k in sorted(names)}
     for name, relative in differences.items():

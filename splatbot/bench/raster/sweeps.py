@@ -1,4 +1,4 @@
-"""What accuracy costs in time, one knob after the other, and how time grows with Gaussians and pixels."""
+"""Error over time for each setting of the rasterizer, and growth of the time with Gaussians and pixels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GROWTH = "growth"
 
 @dataclass(frozen=True)
 class Setting:
-    """One value of a knob and the call of ``rasterization`` with it; ``exact`` is what others are compared with."""
+    """A value of a knob with the arguments of ``rasterization``; the ``exact`` one is the reference of the others."""
 
     knob: str
     value: float
@@ -38,7 +38,7 @@ class Setting:
 def run_sweeps(
     results: Results, scene: SplatScene, size: tuple[int, int], *, runs: int, budget_s: float, quick: bool
 ) -> None:
-    """Milliseconds and error of each setting of each knob; then each instruction set against float64."""
+    """Measure time [ms] and error of each setting of each knob, then of each instruction set against float64."""
     exact: dict[str, Tensor] = {}
     for setting in _settings(scene, size):
         case = f"{SWEEP} {setting.knob} on {scene.name}: {setting.value:g}{' (default)' if setting.default else ''}"
@@ -56,7 +56,7 @@ def run_sweeps(
 
 
 def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
-    """The most exact setting of each knob first."""
+    """Yield the settings of each knob, the most exact one first."""
     plain = _detached(scene, size)
     for clip in (0.0, 0.5, 1.0, 2.0, 4.0):
         yield Setting("radius_clip", clip, plain | {"radius_clip": clip}, exact=clip == 0.0, default=clip == 0.0)
@@ -81,7 +81,10 @@ def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
 
 
 def _sweep_instruction_sets(results: Results, *, runs: int, budget_s: float, quick: bool) -> None:
-    """Each has its own exponential (a table and degree 2 in AVX-512, degree 5 elsewhere) and its own rounding."""
+    """Measure the instruction sets; they differ in rounding and in the exponential.
+
+    AVX-512 uses a table and degree 2, the others degree 5.
+    """
     arguments, exact, safe = _reference_case(quick=quick)
     large = _detached(*_speed_case(quick))
     for name in native().available_isas():
@@ -93,13 +96,13 @@ def _sweep_instruction_sets(results: Results, *, runs: int, budget_s: float, qui
 
 
 def error_against_reference() -> float:
-    """The largest error of a small image against float64, of the kernels in use."""
+    """Return the largest error of a small image against float64, with the kernels in use."""
     arguments, exact, safe = _reference_case(quick=False)
     return float(torch.where(safe, (_render(arguments).double() - exact).abs(), 0.0).max())
 
 
 def _reference_case(*, quick: bool) -> tuple[dict[str, Any], Tensor, Tensor]:
-    """Arguments, their image in float64, and its pixels that no rounding can flip."""
+    """Return arguments, their image in float64, and a mask of the pixels that rounding cannot flip."""
     scene = random_box(200 if quick else 2000, shrink=3.0)
     arguments = _detached(scene, (24, 16) if quick else (96, 64))
     doubled: dict[str, Any] = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
@@ -125,7 +128,7 @@ def _add_errors(results: Results, case: str, image: Tensor, exact: Tensor) -> No
 
 
 def run_growth(results: Results, *, runs: int, budget_s: float, quick: bool) -> None:
-    """Time against the number of Gaussians at the same blends per pixel, and against pixels."""
+    """Measure the time over the number of Gaussians, at equal blends per pixel, and over the number of pixels."""
     counts = (200, 600, 2000) if quick else (10_000, 30_000, 100_000, 300_000, 1_000_000)
     size = (64, 48) if quick else (640, 480)
     for n in counts:
@@ -169,7 +172,7 @@ def _grow(
     pairs = works[0].evaluated_pairs
     results.add(case, _PER_PIXEL, per_pixel, "ms")
     results.add(case, "pairs per pixel", pairs / (size[0] * size[1]), "")
-    # Blends per pixel cannot be held exactly: no footprint is smaller than the blur of eps2d.
+    # Blends per pixel are not exactly constant, because no footprint is smaller than the blur of eps2d.
     results.add(case, _ONE_GAUSSIAN, 1e6 * per_gaussian / len(scene), "ns")
     results.add(case, _ONE_PAIR, 1e6 * per_pixel / pairs if pairs else None, "ns")
 

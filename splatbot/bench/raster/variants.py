@@ -1,4 +1,4 @@
-"""Sweeps of what is fixed when the C++ core is compiled: degree of the exponential, shape of the tiles.
+"""Sweeps of compile-time constants of the C++ core: degree of the exponential, shape of the tiles.
 
 Run as a module, it measures one such build and prints JSON.
 """
@@ -44,7 +44,7 @@ VARIANTS = (
 
 @dataclass(frozen=True)
 class MeasuredVariant:
-    """Of one build: milliseconds of the surface map at 320x240, RGB and expected depth.
+    """Times of one build [ms] on the surface map at 320x240, RGB and expected depth.
 
     Args:
         largest_error: of a small image's colours and depths against the float64 reference, where no rounding can flip.

@@ -71,9 +71,9 @@ def _measure(settings: ServiceSettings, report_progress: ReportProgress) -> Resu
 
 
 _FRAMES = ("frames", "frame p50", "frame p95", "frame p95 grows by", "dropped")
-_PUSHED = ("pushed and answered p50", "pushed and answered p95")
-_QUERIES = ("questions", "errors", *(f"answer p{share}" for share in (50, 95, 99, 100)))
-_CPU = ("service's processors", "clients' processors", "service's processors for an answer")
+_PUSHED = ("push to answer p50", "push to answer p95")
+_QUERIES = ("queries", "errors", *(f"latency p{share}" for share in (50, 95, 99, 100)))
+_CPU = ("CPU of the service", "CPU of the clients", "CPU of the service per answer")
 
 BENCHMARK = Benchmark(
     ServiceSettings,

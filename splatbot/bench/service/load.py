@@ -1,4 +1,4 @@
-"""What the service costs: questions of many clients while frames are mapped, and HTTP over a call in the process."""
+"""Load of the service: queries of many clients while frames are mapped, and HTTP against a call in the process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.service import ServiceSettings
-from splatbot.bench.service.clients import Asked, Questions, asking
+from splatbot.bench.service.clients import QueryLoad, QueryOutcome, running_clients
 from splatbot.bench.timing import measure
 from splatbot.client import Client
 from splatbot.collision import GaussianCollisionField
@@ -30,11 +30,11 @@ _TURNS = 2
 
 
 def run_service_bench(settings: ServiceSettings, report_progress: ReportProgress = ignore_progress) -> Results:
-    """Measure, and write service.json and service.csv into ``folder``.
+    """Measure the service of the settings, and write its log into their folder.
 
-    Questions are asked at fixed times whatever the answers take (open loop), so that a slow answer delays no other
-    question and its delay is counted. The frames come from a client, as a robot's would; those who ask are a process of
-    their own, of the lowest priority: on a robot they are other machines.
+    Queries are sent at fixed times (open loop), so that a slow answer delays no other query and its delay counts. A
+    client pushes the frames, as on a robot. The clients that send queries are a separate process of the lowest
+    priority, because on a robot they are other machines.
     """
     results = Results(describe_machine((1,), peak_ms=20.0))
     report_progress("rendering the frames")
@@ -46,7 +46,7 @@ def run_service_bench(settings: ServiceSettings, report_progress: ReportProgress
     ):
         client.create_map(_MAP)
         stamps = _Stamps(frames, settings.rate)
-        report_progress("mapping all that is to be seen")
+        report_progress("mapping the whole scene")
         _push(service, client, stamps, min(2 * (len(frames) - 1) / settings.rate, settings.seconds))
         before = _resident(service.process)
         _measure_mapping(results, service, client, stamps, settings, report_progress)
@@ -58,7 +58,7 @@ def run_service_bench(settings: ServiceSettings, report_progress: ReportProgress
 
 
 class _Stamps:
-    """Frames without end, to and fro, at growing stamps."""
+    """An endless sequence of frames, forwards and backwards in turns, with increasing stamps."""
 
     def __init__(self, frames: Sequence[Frame], rate: float) -> None:
         self._frames = frames
@@ -75,8 +75,13 @@ class _Stamps:
 
 @dataclass
 class _Pushed:
-    """What frames took [ms]: the mapper for each, and from pushing it to the answer; how many were dropped; and the
-    service's processor time meanwhile [s], None where the system does not tell.
+    """Times of pushed frames.
+
+    Args:
+        mapper: Time of the mapper for each frame [ms].
+        answered: Time from the push to the answer for each frame [ms].
+        dropped: Number of dropped frames.
+        cpu_s: Processor time of the service [s]. If None, the system does not report it.
     """
 
     mapper: list[float] = field(default_factory=list)
@@ -92,7 +97,7 @@ class _Pushed:
 
 
 def _push(service: Serving, client: Client, frames: _Stamps, seconds: float) -> _Pushed:
-    """A frame each period; those are dropped that are due while the one before is not done."""
+    """Push a frame in each period; frames that are due while the previous one is in progress are dropped."""
     found, before = _Pushed(), _cpu_seconds(service.process)
     due = begin = time.perf_counter()
     while due < begin + seconds:
@@ -118,26 +123,28 @@ def _measure_mapping(
     settings: ServiceSettings,
     report_progress: ReportProgress,
 ) -> None:
-    """Without questions and with them by turns: a map grows, and a machine is not as quick at all times."""
-    alone, asked_at = _Pushed(), _Pushed()
-    asked = Asked([], [], 0.0)
+    """Measure with and without queries in turns, because the map grows and the speed of the machine varies."""
+    alone, loaded = _Pushed(), _Pushed()
+    outcome = QueryOutcome([], [], 0.0)
     part = settings.seconds / _TURNS
     for turn in range(_TURNS):
-        report_progress(f"no questions, then questions, {part:g} s each ({turn + 1} of {_TURNS})")
+        report_progress(f"without and with queries, {part:g} s each ({turn + 1} of {_TURNS})")
         alone.add(_push(service, client, frames, part))
-        with asking(Questions(service.url, _MAP, settings.clients, settings.per_s, settings.points, part)) as clients:
-            asked_at.add(_push(service, client, frames, part))
-            asked = asked.and_then(clients.result())
+        with running_clients(
+            QueryLoad(service.url, _MAP, settings.clients, settings.per_s, settings.points, part)
+        ) as clients:
+            loaded.add(_push(service, client, frames, part))
+            outcome = outcome.and_then(clients.result())
     case = f"{settings.clients} clients x {settings.per_s:g}/s"
-    for name, pushed in (("no questions", alone), (case, asked_at)):
+    for name, pushed in (("no queries", alone), (case, loaded)):
         _add_frames(results, name, pushed, settings.seconds)
-    growth = float(np.percentile(asked_at.mapper, 95) / np.percentile(alone.mapper, 95)) - 1
+    growth = float(np.percentile(loaded.mapper, 95) / np.percentile(alone.mapper, 95)) - 1
     results.add(case, "frame p95 grows by", 100 * growth, "%")
-    _add_answers(results, case, asked)
-    results.add(case, "clients' processors", asked.cpu_s / settings.seconds, "cores")
-    if asked_at.cpu_s is not None and alone.cpu_s is not None:
-        each = 1e3 * (asked_at.cpu_s - alone.cpu_s) / max(1, len(asked.seconds))
-        results.add(case, "service's processors for an answer", each, "ms")
+    _add_answers(results, case, outcome)
+    results.add(case, "CPU of the clients", outcome.cpu_s / settings.seconds, "cores")
+    if loaded.cpu_s is not None and alone.cpu_s is not None:
+        each = 1e3 * (loaded.cpu_s - alone.cpu_s) / max(1, len(outcome.seconds))
+        results.add(case, "CPU of the service per answer", each, "ms")
 
 
 def _add_frames(results: Results, case: str, pushed: _Pushed, seconds: float) -> None:
@@ -145,20 +152,20 @@ def _add_frames(results: Results, case: str, pushed: _Pushed, seconds: float) ->
     results.add(case, "dropped", pushed.dropped, "")
     for share in (50, 95):
         results.add(case, f"frame p{share}", float(np.percentile(pushed.mapper, share)), "ms")
-        results.add(case, f"pushed and answered p{share}", float(np.percentile(pushed.answered, share)), "ms")
-    results.add(case, "service's processors", None if pushed.cpu_s is None else pushed.cpu_s / seconds, "cores")
+        results.add(case, f"push to answer p{share}", float(np.percentile(pushed.answered, share)), "ms")
+    results.add(case, "CPU of the service", None if pushed.cpu_s is None else pushed.cpu_s / seconds, "cores")
 
 
-def _add_answers(results: Results, case: str, asked: Asked) -> None:
-    waits = 1e3 * np.array(asked.seconds or [np.nan])
-    results.add(case, "questions", len(asked.seconds), "")
-    results.add(case, "errors", len(asked.errors), "", note=asked.errors[0] if asked.errors else None)
+def _add_answers(results: Results, case: str, outcome: QueryOutcome) -> None:
+    waits = 1e3 * np.array(outcome.seconds or [np.nan])
+    results.add(case, "queries", len(outcome.seconds), "")
+    results.add(case, "errors", len(outcome.errors), "", note=outcome.errors[0] if outcome.errors else None)
     for share in (50, 95, 99, 100):
-        results.add(case, f"answer p{share}", float(np.percentile(waits, share)), "ms")
+        results.add(case, f"latency p{share}", float(np.percentile(waits, share)), "ms")
 
 
 def _measure_one(results: Results, client: Client, settings: ServiceSettings, report_progress: ReportProgress) -> None:
-    """One large question over HTTP and in this process, on the same map."""
+    """Measure one large query over HTTP and in this process, on the same map."""
     report_progress(f"{settings.many} points at once")
     while client.map(_MAP)["state"] == "mapping":
         time.sleep(0.1)
@@ -170,7 +177,7 @@ def _measure_one(results: Results, client: Client, settings: ServiceSettings, re
     found = GaussianCollisionField(model)
     case = f"{settings.many} points"
     inside = measure(lambda: found.mahalanobis(points), runs=9)
-    client.distance_npy(_MAP, points)  # the first question builds the field
+    client.distance_npy(_MAP, points)  # the first query builds the field
     outside = measure(lambda: client.distance_npy(_MAP, points), runs=9)
     results.add_time(case, "in process", inside)
     results.add_time(case, "npy over HTTP", outside)
@@ -178,7 +185,7 @@ def _measure_one(results: Results, client: Client, settings: ServiceSettings, re
 
 
 def _resident(process: subprocess.Popen[str]) -> float | None:
-    """Memory of a process [MiB]; None where the system does not tell."""
+    """Return the resident memory of a process [MiB]. If None, the system does not report it."""
     try:
         lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
     except OSError:
@@ -187,10 +194,10 @@ def _resident(process: subprocess.Popen[str]) -> float | None:
 
 
 def _cpu_seconds(process: subprocess.Popen[str]) -> float | None:
-    """Processor time of a process so far [s]; None where the system does not tell."""
+    """Return the processor time of a process [s]. If None, the system does not report it."""
     try:
-        told = Path(f"/proc/{process.pid}/stat").read_text()
+        stat = Path(f"/proc/{process.pid}/stat").read_text()
     except OSError:
         return None
-    user, system = told.rpartition(")")[2].split()[11:13]
+    user, system = stat.rpartition(")")[2].split()[11:13]
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")

@@ -19,8 +19,8 @@ PERCENTILES, RESIDENT = (50, 95, 99), "peak resident memory"
 FRAME_MS = "tracking and mapping p50"
 
 STRESS = "stress"
-SILENT, WORST, DEGRADED = "frames wrong without a word", "worst believed frame", "degraded"
-RECOVERY, AFTER, VIEWS = "until tracked again", "worst frame after", "views got worse by"
+SILENT, WORST, DEGRADED = "wrong frames reported as ok", "largest error of an ok frame", "degraded"
+RECOVERY, AFTER, VIEWS = "time to recovery", "largest error after recovery", "PSNR loss of views"
 
 _QUICK_LOG = "synthetic:tabletop?width=160&height=120&frames=6"
 
@@ -29,9 +29,9 @@ _QUICK_LOG = "synthetic:tabletop?width=160&height=120&frames=6"
 class TrackingSettings(Settings):
     """Measure the error of tracking over its time, and compare it with other trackers.
 
-    Each log is tracked with each time budget, and by other trackers in the same process: RGB-D odometry of OpenCV and
-    of Open3D, small_gicp, and ORB with PnP against keyframes. Errors are the ATE (RMSE over all tracked frames after
-    rigid alignment) and the RPE. Times end when the pose is known; decoding and mapping do not count.
+    Each log is tracked with each time budget, and by other trackers in the same process. These are RGB-D odometry of
+    OpenCV and of Open3D, small_gicp, and ORB with PnP against keyframes. Errors are the ATE (RMSE over all tracked
+    frames after rigid alignment) and the RPE. Times end when the pose is known; decoding and mapping do not count.
     NEES / 6 is 1 for consistent covariances; it includes the error of the reference.
 
     --stress runs hard synthetic logs with exact ground truth: flat walls, a corridor, pure rotation, jumps, depth

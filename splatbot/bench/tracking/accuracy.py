@@ -1,4 +1,4 @@
-"""Tracking on recorded logs: error against milliseconds, for each time budget and beside other trackers."""
+"""Error over time of tracking on logs, for each time budget and for other trackers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Contender:
-    """One row of the comparison: a tracker, its name among peers (None: splatbot), a setting and a note."""
+    """One row of the comparison: a tracker, its name, a setting and a note. If the name is None, it is splatbot."""
 
     peer: str | None
     setting: str
@@ -49,7 +49,7 @@ class Contender:
 
 @dataclass
 class TrackingOutcome:
-    """What a tracker made of a log: milliseconds by frame, the poses it gave, how sure it was, and memory.
+    """Result of a tracker on a log: times by frame [ms], estimated poses, covariances, and memory.
 
     Covariances (N, 6, 6) of the trajectory's poses as of :func:`splatbot.evaluation.nees`; None of a tracker without.
     """
@@ -63,13 +63,13 @@ class TrackingOutcome:
 
 
 class SlamOdometry:
-    """splatbot as a tracker; its milliseconds are told apart from those of mapping."""
+    """splatbot as a tracker, with separate times of tracking and mapping."""
 
     def __init__(self, config: Config) -> None:
         self.slam = Slam(config)
 
     def track(self, frame: Frame) -> Array | None:
-        """See :class:`Odometry`."""
+        """Track a frame; see :class:`Odometry`."""
         return self.slam.process(frame).T_world_camera
 
     @property
@@ -78,12 +78,12 @@ class SlamOdometry:
         return sum(ms for stage, ms in self.slam.results[-1].stage_ms.items() if stage != "mapping")
 
     def refined(self) -> Trajectory:
-        """The trajectory as it is once the log has ended."""
+        """Return the trajectory after the end of the log."""
         found = [(r.stamp, r.T_world_camera) for r in self.slam.results if r.T_world_camera is not None]
         return _trajectory([stamp for stamp, _ in found], [T for _, T in found])
 
     def covariances(self) -> Array | None:
-        """Of these poses (N, 6, 6); None where one is not known."""
+        """Return the covariances (N, 6, 6) of these poses. If None, at least one is unknown."""
         found = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
         known = [covariance for covariance in found if covariance is not None]
         return np.array(known) if len(known) == len(found) > 0 else None
@@ -105,12 +105,12 @@ def run_tracking(settings: TrackingSettings, report_progress: ReportProgress = i
 
 
 def distinct(names: Sequence[str]) -> list[str]:
-    """The names, those that occur again numbered: room, room #2."""
+    """Append a number to repeated names: room, room #2."""
     return [name if (n := names[: k + 1].count(name)) == 1 else f"{name} #{n}" for k, name in enumerate(names)]
 
 
 def contenders(settings: TrackingSettings, config: Config) -> Iterator[Contender]:
-    """splatbot with each budget, then its peers."""
+    """Yield splatbot with each budget, then its peers."""
     for budget in settings.budgets:
         limited = _with_budget(config, budget)
         yield Contender(None, f"{budget:g} ms", "", lambda limited=limited: SlamOdometry(limited))  # type: ignore[misc]
@@ -138,7 +138,7 @@ def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> Trac
 
 
 def add_rows(results: Results, log: Log, contender: Contender, outcome: TrackingOutcome, name: str) -> None:
-    """The figures of one run. ATE is RMSE over all tracked frames, SE(3)-aligned; RPE from frame to frame."""
+    """Add the rows of one run. ATE is RMSE over all tracked frames, SE(3)-aligned; RPE from frame to frame."""
     case = f"{name}, {contender.setting}" if contender.setting else name
 
     def add(metric: str, value: float | None, unit: str, note: str | None = None) -> None:
@@ -166,7 +166,7 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Tracking
 
 
 def _with_budget(config: Config, budget_ms: float) -> Config:
-    values = config.model_dump(mode="json")  # where null stands for what a budget decides
+    values = config.model_dump(mode="json")  # null marks a value that depends on the budget
     values["tracking"]["budget_ms"] = budget_ms
     return Config.model_validate(values)
 

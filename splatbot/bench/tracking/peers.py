@@ -1,4 +1,4 @@
-"""Other RGB-D trackers, to measure beside splatbot's in the same process."""
+"""Other RGB-D trackers, measured in the same process as splatbot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Odometry(Protocol):
     """A tracker of frames."""
 
     def track(self, frame: Frame) -> Array | None:
-        """T_world_camera (4, 4), world = first camera; None when the tracker itself says that it failed."""
+        """Estimate T_world_camera (4, 4), world = first camera. If None, the tracker reports a failure."""
         ...
 
 
@@ -38,7 +38,7 @@ class TrackingPeer:
 
 
 def tracking_peers() -> list[TrackingPeer]:
-    """The peers, with the settings that their figures belong to."""
+    """Return the peers with their settings."""
     return [
         TrackingPeer("OpenCV RGB_DEPTH", "cv2.Odometry, RGB_DEPTH, COMMON, frame to frame", OpenCvOdometry),
         TrackingPeer("Open3D hybrid", "open3d.t rgbd_odometry_multi_scale, Hybrid, frame to frame", Open3dOdometry),
@@ -59,7 +59,7 @@ class _FrameToFrame:
         self.T_world_camera: Array = np.eye(4)
 
     def track(self, frame: Frame) -> Array | None:
-        """See :class:`Odometry`."""
+        """Track a frame; see :class:`Odometry`."""
         current = self._prepare(frame)
         if self._last is not None:
             T_last_current = self._motion(self._last, current, frame)
@@ -73,7 +73,7 @@ class _FrameToFrame:
         raise NotImplementedError
 
     def _motion(self, last: Any, current: Any, frame: Frame) -> Array | None:
-        """T_last_current (4, 4)."""
+        """Estimate T_last_current (4, 4)."""
         raise NotImplementedError
 
 
@@ -174,7 +174,7 @@ class OrbPnpOdometry:
         self._count = 0
 
     def track(self, frame: Frame) -> Array | None:
-        """See :class:`Odometry`."""
+        """Track a frame; see :class:`Odometry`."""
         keypoints, descriptors = self._orb.detectAndCompute(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), None)
         pixels = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
         T = np.eye(4) if not self._keyframes else self._pose(pixels, descriptors, frame)

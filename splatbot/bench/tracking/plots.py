@@ -17,7 +17,7 @@ DEFAULT_SETTINGS = ("default", "100 ms")
 
 
 def plot_tracking(results: Results, out: Path) -> None:
-    """``tracking.png``, ``.svg``: ATE against the median of milliseconds; ours joined, the default marked."""
+    """Write ``tracking.png``, ``.svg``: ATE against the median of milliseconds; ours joined, the default marked."""
     logs = list(dict.fromkeys(row.case.partition(",")[0] for row in results.rows))
     figure, axes = plt.subplots(1, max(1, len(logs)), figsize=(4.6 * max(1, len(logs)), 3.8), squeeze=False)
     for axis, log in zip(axes[0], logs, strict=False):
@@ -47,13 +47,13 @@ def _plain(value: float, _: int) -> str:
 
 
 def _spaced(value: float, _: int) -> str:
-    """A number of a logarithmic axis; only some of each decade, or side by side they would overlap."""
+    """Format a number of a logarithmic axis; some of each decade stay empty, because labels would overlap."""
     digit = round(value / 10 ** math.floor(math.log10(value)))
     return f"{value:g}" if digit in (1, 2, 3, 5, 7) else ""
 
 
 def _points(results: Results, log: str) -> list[tuple[str | None, str, float, float]]:
-    """(peer, setting, milliseconds, error [mm]) of the runs on a log that have both."""
+    """Return (peer, setting, time [ms], error [mm]) of the runs on a log that have both."""
     points = []
     for row in results.rows:
         name, _, setting = row.case.partition(", ")

@@ -28,11 +28,11 @@ class StressCase:
     """One hard log.
 
     Args:
-        name: what is hard about it.
-        log: scene, trajectory and effects of the synthetic log, without size and length; ``{at}`` and ``{end}`` stand
-            for the bad stretch's first frame and the first good one.
+        name: the difficulty.
+        log: scene, trajectory and effects of the synthetic log, without size and length. ``{at}`` and ``{end}`` are
+            replaced by the first frame of the bad stretch and the first good frame after it.
         bound_m: error [m] within which a frame counts as tracked.
-        stretch: shares of the log between which it is bad; None: all of it.
+        stretch: shares of the log between which it is bad. If None, all of it is.
         rate: of the log [Hz].
         blind: whether nothing can be seen in the bad stretch: each of its frames has to be lost.
     """
@@ -45,7 +45,7 @@ class StressCase:
     blind: bool = False
 
     def uri(self, frames: int, width: int) -> str:
-        """What opens the log."""
+        """Return the URI of the log."""
         at, end = self.bad(frames)
         size = f"frames={frames}&width={width}&height={width * 3 // 4}&rate={self.rate:g}"
         joined = "&" if "?" in self.log else "?"
@@ -55,7 +55,7 @@ class StressCase:
         return f"synthetic:{text}"
 
     def bad(self, frames: int) -> tuple[int, int]:
-        """The first bad frame, and the first good one after it."""
+        """Return the first bad frame, and the first good one after it."""
         if self.stretch is None:
             return 0, frames
         return round(self.stretch[0] * frames), round(self.stretch[1] * frames)
@@ -77,16 +77,17 @@ CASES = (
 
 @dataclass(frozen=True)
 class StressFigures:
-    """What became of a hard log.
+    """Result on a hard log.
 
     Args:
         results: by frame; ``errors`` [m] of those with a pose, NaN of the others.
         silent: frames called "ok" whose error is above the bound.
         worst_m: largest error of a frame called "ok"; NaN without any.
-        recovery: frames from the first good one until one is within the bound and none is lost any more; None: never.
+        recovery: frames from the first good one until a frame is within the bound and none is lost after it. If None,
+            tracking does not recover.
         after_m: largest error [m] from then on; NaN where none.
-        worse_db: how much PSNR of the map's views, at up to five frames from before the bad stretch, is less after it;
-            NaN where nothing is good before it.
+        worse_db: loss of PSNR [dB] over the bad stretch, in views of the map at up to five frames before it. NaN
+            without such frames.
         same_map: whether no bit of the map changed in the bad stretch.
     """
 
@@ -100,7 +101,7 @@ class StressFigures:
     same_map: bool
 
     def count(self, verdict: str) -> int:
-        """Frames of that verdict."""
+        """Count the frames of that verdict."""
         return sum(result.verdict == verdict for result in self.results)
 
 
@@ -167,7 +168,7 @@ def run_stress(
 
 
 def _recovery(errors: Array, bound: float) -> int | None:
-    """Frames until one is within the bound with no lost frame after it."""
+    """Count the frames until one is within the bound with no lost frame after it."""
     lost = np.flatnonzero(~np.isfinite(errors))
     start = int(lost[-1]) + 1 if len(lost) else 0
     within = np.flatnonzero(errors[start:] <= bound)
@@ -175,7 +176,7 @@ def _recovery(errors: Array, bound: float) -> int | None:
 
 
 def _quality(model: GaussianModel | None, log: Log, results: Sequence[FrameResult], chosen: Sequence[int]) -> float:
-    """Mean PSNR [dB] of the map's views against the frames they were made of; NaN of none."""
+    """Compute the mean PSNR [dB] of views of the map against their frames; NaN without frames."""
     if model is None or not chosen:
         return np.nan
     values = []

@@ -1,4 +1,4 @@
-"""What the figures of `splatbot bench twin` must keep to."""
+"""Bounds of the values of `splatbot bench twin`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FILMED = "composite picture, map of a noisy film"
 _BOUNDS: tuple[tuple[str, str, float, float], ...] = (
     ("empty scene", "over the robot alone", 0.0, 1.3),
     (FORCED, "over none forced", 1.2, float("inf")),  # physics that cannot apply is not free
-    ("planned paths among the true shapes", "touched", 0.0, 0.0),
+    ("planned paths among the true shapes", "in contact", 0.0, 0.0),
     (EXACT, "median overlap", 0.98, 1.0),
     (EXACT, "farthest wrong pixel", 0.0, 4.0),  # outlines are soft
     (FILMED, "least overlap", 0.98, 1.0),
@@ -21,7 +21,7 @@ _BOUNDS: tuple[tuple[str, str, float, float], ...] = (
 
 
 def broken_bounds(results: Results) -> list[str]:
-    """A sentence on each figure that is out of its bounds; figures that were not measured are let."""
+    """Return a sentence for each value out of its bounds; values that were not measured are skipped."""
     found = []
     for case, metric, least, largest in _BOUNDS:
         value = results.find(case, metric)

@@ -27,7 +27,7 @@ from splatbot.sim.solids import rpy_of
 from splatbot.sim.twin import Twin
 from splatbot.sim.view import TwinView
 
-HELD_OUT = 5  # every so many frames of the film are not mapped
+HELD_OUT = 5  # period [frames] of the frames that are not mapped
 _REACH = 0.35  # of each joint's range, to both sides of home
 _PAPER = 1e-4  # [m]
 _AWAY = 1.5  # [m] of the cameras from the middle of the table
@@ -36,7 +36,7 @@ _CAMERA = {"at": [1.5, -0.9, 0.9], "look_at": [0.35, 0.0, 0.25]}  # the poses ar
 
 @dataclass(frozen=True)
 class Composites:
-    """What came of it.
+    """Agreement of the composite pictures.
 
     Args:
         overlap: (P,) of each pose, intersection over union of the robot's pixels with those in MuJoCo's picture.
@@ -52,9 +52,9 @@ class Composites:
 
 
 def exact_map(poses: int, gaussians: int, *, width: int = 320, seed: int = 0) -> Composites:
-    """Gaussians on the true shapes, as thin as paper, so that the shapes of physics are theirs; seen from all around.
+    """Compare pictures of paper-thin Gaussians on the true shapes, from all sides.
 
-    At the usual 1.5 mm a map has a skin, which hides a strip of what stands behind an edge.
+    With the usual thickness of 1.5 mm, the surface of the map would occlude a strip behind each edge.
     """
     table, rng = tabletop(), np.random.default_rng(seed)
     turns, heights = rng.uniform(-2.6, 2.6, poses), rng.uniform(0.15, 1.0, poses)
@@ -66,7 +66,7 @@ def exact_map(poses: int, gaussians: int, *, width: int = 320, seed: int = 0) ->
 
 
 def filmed_map(poses: int, frames: int, *, width: int = 320, seed: int = 0) -> Composites:
-    """A map that SLAM made of a noisy film, seen from where frames were taken that it was not given."""
+    """Compare pictures of a SLAM map of a noisy film, at the poses of held-out frames."""
     table, rng = tabletop(), np.random.default_rng(seed)
     film = shoot(table, frames, width, seed)
     held = np.arange(HELD_OUT // 2, frames, HELD_OUT)
@@ -110,7 +110,7 @@ def _compare(
 
 
 def _agreement(shown: NDArray[np.bool_], truth: NDArray[np.bool_]) -> tuple[float, float]:
-    """Intersection over union, and how far wrong pixels are from the truth's outline [px]."""
+    """Return the IoU, and the largest distance of a wrong pixel from the true outline [px]."""
     union = np.count_nonzero(shown | truth)
     overlap = np.count_nonzero(shown & truth) / union if union else 1.0
     inside, outside = (cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for m in (truth, ~truth))
@@ -120,7 +120,7 @@ def _agreement(shown: NDArray[np.bool_], truth: NDArray[np.bool_]) -> tuple[floa
 def _likeness(
     model: GaussianModel, camera: Camera, T_map_camera: Array, seen: TwinView, image: NDArray[np.uint8] | None
 ) -> tuple[float, float]:
-    """PSNR [dB] of the plain and of the composite picture where no body is; NaN without a frame."""
+    """Return the PSNR [dB] of the plain and of the composite picture outside the bodies; NaN without a frame."""
     if image is None:
         return np.nan, np.nan
     free = seen.bodies == 0.0

@@ -1,4 +1,4 @@
-"""`splatbot bench twin`: what a step costs, what each effect costs, and what the time step costs in accuracy."""
+"""Measurements of `splatbot bench twin`: cost of a step and of each effect, time steps, paths, pictures."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _cluttered_steps(results: Results, settings: TwinSettings, name: str, scene:
 
 
 def cluttered(ellipsoids: int, gaussians: int, folder: Path) -> Scene:
-    """The table top's map as at most so many ellipsoids and a plane, with a robot and four free boxes."""
+    """Build the table top's map as a plane and at most ``ellipsoids``, with a robot and four free boxes."""
     file = folder / "map.ply"
     tabletop().gaussians(gaussians).save(file)
     boxes = [
@@ -89,7 +89,7 @@ def cluttered(ellipsoids: int, gaussians: int, folder: Path) -> Scene:
 
 
 def step_us(model: Any, data: Any, steps: int) -> float:
-    """Least time of a step over nine shares of ``steps`` [us]."""
+    """Measure the least time of a step over nine parts of ``steps`` [us]."""
     share, best = max(1, steps // 9), float("inf")
     for _ in range(9):
         start = time.perf_counter()
@@ -114,7 +114,7 @@ def _effects(results: Results, settings: TwinSettings, report_progress: ReportPr
 
 
 def _time_steps(results: Results, settings: TwinSettings, report_progress: ReportProgress) -> None:
-    """Against a step ten times finer than the finest; the controller's rate is the same, 100 Hz, for all."""
+    """Compare time steps with one ten times finer than the finest, at the same rate of the controller."""
     for name in ("empty", "tabletop_clutter"):
         report_progress(f"time steps in {name}")
         values = load_scene(name).model_dump()
@@ -130,7 +130,7 @@ def _time_steps(results: Results, settings: TwinSettings, report_progress: Repor
 
 
 def _track(scene: Scene, step: float) -> tuple[Array, float]:
-    """Places (K, 3) of all bodies at 12.5 Hz, and milliseconds of physics for a second."""
+    """Return positions (K, 3) of all bodies at 12.5 Hz, and the time of physics per simulated second [ms/s]."""
     twin = Twin(scene, timestep=step)
     found: list[Array] = []
     every = max(1, round(twin.rate * 0.08))
@@ -148,12 +148,12 @@ def _paths(results: Results, settings: TwinSettings, report_progress: ReportProg
         settings.paths, gaussians=settings.gaussians, budget_ms=settings.budget_ms, report_progress=report_progress
     )
     case = "planned paths among the true shapes"
-    results.add(case, "planned", trials.planned, "", note=f"of {trials.asked}")
+    results.add(case, "planned", trials.planned, "", note=f"of {trials.problems}")
     results.add(case, "certified", trials.certified, "")
-    results.add(case, "touched", trials.touched, "", note="of those planned")
-    results.add(case, "least room", 1e3 * trials.least_room, "mm")
+    results.add(case, "in contact", trials.in_contact, "", note="of those planned")
+    results.add(case, "least clearance", 1e3 * trials.least_clearance, "mm")
     results.add(case, f"pushed {1e3 * DEPTH:g} mm in", trials.pushed, "")
-    results.add(case, "seen as contact", trials.seen, "", note="of those pushed")
+    results.add(case, "detected as contact", trials.detected, "", note="of those pushed")
     results.add(case, "faster than real time", trials.real_time, "x")
 
 

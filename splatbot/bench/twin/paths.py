@@ -1,4 +1,4 @@
-"""Planned paths tried in a twin of the true shapes: certified ones must touch nothing, pushed ones must be seen."""
+"""Planned paths in a twin of the true shapes: certified ones must not collide, pushed ones must cause contacts."""
 
 from __future__ import annotations
 
@@ -20,44 +20,46 @@ from splatbot.sim.motion import JointMotion, minimum_jerk
 from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.twin import Twin
 
-MARGIN = 0.005  # [m] that plans keep: the arm follows to a millimetre
+MARGIN = 0.005  # [m] of the plans; the arm follows them within a millimetre
 DEPTH = 0.01  # [m] that pushed paths go into an obstacle
 _ALONG = 13  # points on a capsule's axis
-_SPARE = 20  # problems more than paths are wanted: for some no path is found in time
-_LEAVES = 12  # places at which a path may be left
-_MOBILE = 3  # links before it turn in their place, as near to the table as ever
-_SHARE = 0.6  # of the joints' limits of velocity and acceleration
+_SPARE = 20  # additional problems, because some have no path within the budget
+_DEPARTURES = 12  # configurations at which a pushed path may leave the path
+_FIRST_LINK = 3  # of the checked ones: the clearance of earlier links hardly changes
+_LIMIT_SHARE = 0.6  # of the joints' limits of velocity and acceleration
 
 
 @dataclass(frozen=True)
 class PathTrials:
-    """What came of them.
+    """Results of planned and pushed paths.
 
     Args:
-        planned: paths that were found, of ``asked``.
-        asked: problems.
-        certified: of those planned.
-        touched: certified paths on which the arm touched anything.
-        least_room: over all certified paths [m].
-        pushed: paths that could be pushed into an obstacle.
-        seen: of them, those on which the twin saw contact.
-        real_time: simulated over real time.
+        planned: Number of paths that were found.
+        problems: Number of problems.
+        certified: Number of certified paths.
+        in_contact: Number of planned paths on which the arm had a contact.
+        least_clearance: Least clearance over all paths [m].
+        pushed: Number of paths that could be pushed into an obstacle.
+        detected: Number of pushed paths on which the twin detected a contact.
+        real_time: Ratio of simulated to real time.
     """
 
     planned: int
-    asked: int
+    problems: int
     certified: int
-    touched: int
-    least_room: float
+    in_contact: int
+    least_clearance: float
     pushed: int
-    seen: int
+    detected: int
     real_time: float
 
 
 def truth_scene(table: Tabletop) -> Scene:
-    """The shapes themselves as a scene: nothing of it comes from a map."""
-    things = [{"name": f"thing{i}", "shapes": [_shape(solid)], **_place(solid)} for i, solid in enumerate(table.solids)]
-    return make_scene({"name": "truth", "objects": things})
+    """Build the scene of the true shapes, without a map."""
+    objects = [
+        {"name": f"thing{i}", "shapes": [_shape(solid)], **_place(solid)} for i, solid in enumerate(table.solids)
+    ]
+    return make_scene({"name": "truth", "objects": objects})
 
 
 def try_paths(
@@ -69,47 +71,49 @@ def try_paths(
     planner = GaussianRRTStar(field, robot, margin=MARGIN)
     truth = Truth(table)
     twin = Twin(truth_scene(table))
-    planned = certified = touched = pushed = seen = 0
+    planned = certified = in_contact = pushed = detected = 0
     least, simulated, spent = np.inf, 0.0, 0.0
-    asked = 0
+    tried = 0
     for i, problem in enumerate(problems(robot, planner.arm, field, truth, count + _SPARE, seed)):
         if planned == count:
             break
         if planned % 20 == 0:
             report_progress(f"path {planned} of {count}")
-        asked += 1
+        tried += 1
         path = planner.plan(problem.start, problem.goal, budget_ms=budget_ms, seed=seed + i).path
         if path is None:
             continue
         planned += 1
         certified += path.certificate.certified
         result = twin.follow(timed(path.waypoints, robot.chain))
-        touched += bool(result.contacts)
+        in_contact += bool(result.contacts)
         least = min(least, result.clearance.value)
         simulated, spent = simulated + result.duration, spent + result.seconds
         into = push(path.waypoints, robot, table, DEPTH)
         if into is not None:
             pushed += 1
-            seen += bool(twin.follow(timed(into, robot.chain), until_contact=True).contacts)
-    return PathTrials(planned, asked, certified, touched, float(least), pushed, seen, simulated / max(spent, 1e-9))
+            detected += bool(twin.follow(timed(into, robot.chain), until_contact=True).contacts)
+    return PathTrials(
+        planned, tried, certified, in_contact, float(least), pushed, detected, simulated / max(spent, 1e-9)
+    )
 
 
 def timed(waypoints: Array, chain: KinematicChain) -> JointMotion:
-    """A motion exactly along the edges, at rest at each waypoint, within the limits of velocity and acceleration."""
+    """Time a motion along the edges, at rest at each waypoint, within the limits of velocity and acceleration."""
     steps = np.abs(np.diff(waypoints, axis=0))
     # Minimum jerk peaks at 1.875 of the mean velocity and at 5.774 of distance over time squared.
-    slow = (1.875 * steps / (_SHARE * chain.velocity)).max(axis=1)
-    soft = np.sqrt((5.774 * steps / (_SHARE * chain.acceleration)).max(axis=1))
+    slow = (1.875 * steps / (_LIMIT_SHARE * chain.velocity)).max(axis=1)
+    soft = np.sqrt((5.774 * steps / (_LIMIT_SHARE * chain.acceleration)).max(axis=1))
     times = np.concatenate([[0.0], np.cumsum(np.maximum(np.maximum(slow, soft), 0.02))])
     t = np.unique(np.concatenate([np.arange(0.0, times[-1], 4e-3), times]))
     q, v, a = (minimum_jerk(t, times, waypoints, order) for order in range(3))
     return JointMotion(t, q, v, a)
 
 
-def arm_room(robot: RobotModel, table: Tabletop, q: Array, first: int = 1) -> Array:
-    """Distance (C,) [m] between the capsules of links from ``first`` on, gripper open, and the shapes; signed.
+def arm_clearance(robot: RobotModel, table: Tabletop, q: Array, first: int = 1) -> Array:
+    """Compute the signed distance (C,) [m] between the shapes and the capsules of links from ``first``, gripper open.
 
-    In closed form, at 13 points of each axis: at most a few millimetres above the exact one.
+    The closed form samples 13 points of each axis and is at most a few millimetres too large.
     """
     T = robot.fk(q)
     found = []
@@ -123,16 +127,16 @@ def arm_room(robot: RobotModel, table: Tabletop, q: Array, first: int = 1) -> Ar
 
 
 def push(waypoints: Array, robot: RobotModel, table: Tabletop, depth: float) -> Array | None:
-    """The path up to where it has least room, and from there down the room's gradient until ``depth`` [m] deep.
+    """Follow the path to its least clearance, then descend the clearance to a penetration of ``depth`` [m].
 
-    Where a limit of the joints, or a place from which no joint leads deeper, is met before, it leaves the path
-    elsewhere, or in a random direction; None if that helps nowhere.
+    If joint limits or a local minimum stop the descent, it starts from other configurations of the path, then along
+    random directions. If None, no start leads to the penetration.
     """
     share = np.linspace(0.0, len(waypoints) - 1, 20 * len(waypoints))
     edge = np.minimum(share.astype(int), len(waypoints) - 2)
     q = waypoints[edge] + (share - edge)[:, None] * (waypoints[edge + 1] - waypoints[edge])
-    nearest = np.argsort(arm_room(robot, table, q, _MOBILE), kind="stable")
-    for k in nearest[:: max(1, len(nearest) // _LEAVES)]:
+    nearest = np.argsort(arm_clearance(robot, table, q, _FIRST_LINK), kind="stable")
+    for k in nearest[:: max(1, len(nearest) // _DEPARTURES)]:
         out = _deeper(q[k], robot, table, depth)
         if out is not None:
             return np.concatenate([waypoints[: edge[k] + 1], out])
@@ -142,14 +146,14 @@ def push(waypoints: Array, robot: RobotModel, table: Tabletop, depth: float) -> 
 
 
 def _straight_in(start: Array, robot: RobotModel, table: Tabletop, depth: float) -> Array | None:
-    """Along the first of a hundred random directions of the joints that leads ``depth`` [m] into something."""
+    """Follow the first of a hundred random joint directions with a penetration of ``depth`` [m]."""
     rng = np.random.default_rng(0)
     far = np.linspace(0.0, 1.0, 251)[:, None]
     for _ in range(100):
         direction = rng.standard_normal(len(start))
         q = start + far * direction / np.linalg.norm(direction)
         q = q[((q >= robot.chain.lower) & (q <= robot.chain.upper)).all(axis=1)]
-        deep = np.flatnonzero(arm_room(robot, table, q, _MOBILE) <= -depth)
+        deep = np.flatnonzero(arm_clearance(robot, table, q, _FIRST_LINK) <= -depth)
         if len(deep):
             return np.stack([q[0], q[deep[0]]])
     return None
@@ -159,22 +163,22 @@ def _deeper(start: Array, robot: RobotModel, table: Tabletop, depth: float) -> A
     at = start.copy()
     out = [at.copy()]
     for _ in range(400):
-        room = float(arm_room(robot, table, at[None], _MOBILE)[0])
-        if room <= -depth:
+        clearance = float(arm_clearance(robot, table, at[None], _FIRST_LINK)[0])
+        if clearance <= -depth:
             return np.array(out)
         probes = at + 1e-5 * np.eye(len(at))
-        slope = (arm_room(robot, table, probes, _MOBILE) - room) / 1e-5
+        slope = (arm_clearance(robot, table, probes, _FIRST_LINK) - clearance) / 1e-5
         length = float(np.linalg.norm(slope))
         if length < 1e-3:
             return None
-        step = at - min(0.02, max(room + 1.2 * depth, 1e-3) / length) * slope / length
+        step = at - min(0.02, max(clearance + 1.2 * depth, 1e-3) / length) * slope / length
         at = np.clip(step, robot.chain.lower + 0.01, robot.chain.upper - 0.01)
         out.append(at.copy())
     return None
 
 
 def _capsules(robot: RobotModel) -> list[tuple[int, Capsule]]:
-    """Of the moving links, and of the fingers on the last one, in its frame."""
+    """Return the capsules of the moving links, and of the fingers in the frame of the last link."""
     found = [(s.link, s) for s in robot.shapes if isinstance(s, Capsule) and s.link > 0]
     if robot.gripper is not None:
         opened = np.array([0.0, robot.gripper.stroke, 0.0])

@@ -12,7 +12,7 @@ import pytest
 from splatbot.bench.collision import BENCHMARK, CollisionSettings
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import Ball, Block, Can, Tabletop, tabletop
-from splatbot.bench.truth import Truth, apart_from_itself, score
+from splatbot.bench.truth import Truth, score, without_self_collision
 from splatbot.cli import main
 from splatbot.collision import RobotSpheres
 from splatbot.robots.panda import panda
@@ -48,7 +48,7 @@ def test_no_configuration_or_certified_edge_is_called_free_wrongly(run: tuple[Re
 def test_gates_give_back_what_floaters_block(run: tuple[Results, Path]) -> None:
     results, _ = run
     clean, none, all_three = (
-        results.find(f"gate: {label}", "called free")
+        results.find(f"gate: {label}", "reported free")
         for label in ("clean map", "1 % floaters, none", "1 % floaters, all three")
     )
     assert clean is not None
@@ -99,16 +99,16 @@ def test_gaussians_lie_on_the_shapes_surface_facing_outwards(solid: Block | Can 
 
 def test_rooms_equal_the_exact_distances_where_they_are_small() -> None:
     scene, arm = tabletop(), RobotSpheres(panda())
-    q = apart_from_itself(arm, panda().random(300, np.random.default_rng(0)))
+    q = without_self_collision(arm, panda().random(300, np.random.default_rng(0)))
     moving = arm.spheres.link > 0
     exact = scene.distance(arm.centers(q)[:, moving].reshape(-1, 3)).reshape(len(q), -1) - arm.spheres.radii[moving]
-    rooms, least = Truth(scene, 0.1).rooms(arm, q), exact.min(axis=1)
+    rooms, least = Truth(scene, 0.1).clearances(arm, q), exact.min(axis=1)
     np.testing.assert_allclose(rooms[least < 0.01], least[least < 0.01], atol=1e-12)
     assert (rooms[least >= 0.01] >= 0.01 - 1e-9).all()
     assert (rooms <= least + 1e-6).all()
 
 
-def test_both_errors_are_told_apart() -> None:
+def test_both_errors_are_separate() -> None:
     found = score(np.array([True, False, True, False]), np.array([0.02, -0.005, -0.1, 0.3]))
     assert (found.false_free, found.deepest_m) == (1, 0.005)
     assert (found.false_hit_percent, found.largest_m) == (25.0, 0.02)

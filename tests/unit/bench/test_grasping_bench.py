@@ -19,13 +19,13 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Results:
 
 def test_every_case_has_its_figures(ran: Results) -> None:
     for case in ("10000 Gaussians", "50 samples", "100 samples"):
-        for metric in ("to a ranked list, median", "candidates", "graspable things with a grasp", "grasps looked at"):
+        for metric in ("to a ranked list, median", "candidates", "graspable objects with a grasp", "checked grasps"):
             assert (ran.find(case, metric) or 0) > 0, (case, metric)
 
 
 def test_contacts_are_within_three_millimetres_of_the_exact_shapes(ran: Results) -> None:
     for case in ("10000 Gaussians", "50 samples", "100 samples"):
-        off = ran.find(case, "contacts off the true surface, 95 %")
+        off = ran.find(case, "distance of contacts to the true surface, 95 %")
         assert off is not None
         assert off < 3.0
 

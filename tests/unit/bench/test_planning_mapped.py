@@ -1,4 +1,4 @@
-"""`splatbot bench planning --mapped` and `--run`: films of exact shapes, and what exact distances say of paths."""
+"""`splatbot bench planning --mapped` and `--run`: films of exact shapes, and exact clearances of paths."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 
 from splatbot.bench.film import Film, FilmedMap, map_film, shoot
 from splatbot.bench.planning.audit import STEP, audit, configurations
-from splatbot.bench.planning.mapped_log import touches
-from splatbot.bench.planning_problems import HAND, map_problems
+from splatbot.bench.planning.mapped_log import true_clearances
+from splatbot.bench.planning_problems import MAX_GOAL_HEIGHT, map_problems
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.truth import Truth
 from splatbot.cli import main
@@ -29,7 +29,7 @@ def film() -> Film:
 
 @pytest.fixture(scope="module")
 def truth() -> Truth:
-    """Of the shapes."""
+    """Depth image of the shapes."""
     return Truth(tabletop(), 0.1)
 
 
@@ -58,7 +58,7 @@ def test_the_map_of_a_film_lies_on_the_shapes(film: Film) -> None:
 
 
 def test_what_no_frame_shows_is_unseen(film: Film) -> None:
-    np.testing.assert_array_equal(film.seen(np.array([[0.9, -0.6, 0.0], [0.6, 0.0, -0.04]])), [True, False])
+    np.testing.assert_array_equal(film.observed(np.array([[0.9, -0.6, 0.0], [0.6, 0.0, -0.04]])), [True, False])
 
 
 def test_a_lost_frame_is_no_view(film: Film) -> None:
@@ -70,11 +70,11 @@ def test_a_lost_frame_is_no_view(film: Film) -> None:
 
 def test_a_path_through_the_table_touches_what_was_seen(film: Film, truth: Truth) -> None:
     arm, path = RobotSpheres(panda()), np.stack([panda().home, DOWN])
-    found = touches([path, np.stack([panda().home, panda().home])], arm, truth, film)
+    found = true_clearances([path, np.stack([panda().home, panda().home])], arm, truth, film)
     rooms, _ = audit([path], arm, truth)
-    assert found.rooms[0] == rooms[0] < -0.01
-    assert found.rooms[1] > 0
-    np.testing.assert_array_equal(found.seen, [True, False])
+    assert found.clearances[0] == rooms[0] < -0.01
+    assert found.clearances[1] > 0
+    np.testing.assert_array_equal(found.observed, [True, False])
 
 
 def test_configurations_of_a_path_are_close_and_hold_its_waypoints(rng: np.random.Generator) -> None:
@@ -95,12 +95,12 @@ def test_problems_in_a_map_end_within_the_box_and_keep_the_margin() -> None:
     assert not arm.check(field, ends).in_collision.any()
     tool = panda().tcp(np.array([problem.goal for problem in found]))[:, :3, 3]
     assert ((tool > box[0]) & (tool < box[1])).all()
-    assert (tool[:, 2] < HAND).all()
+    assert (tool[:, 2] < MAX_GOAL_HEIGHT).all()
     nothing = np.array([[5.0, 5.0, 0.0], [6.0, 6.0, 1.0]])
     assert map_problems(panda(), arm, field, nothing, 1) == []
 
 
-def test_peers_and_maps_are_not_asked_for_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_peers_and_maps_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "planning", "--mapped", "--peers"]) == 2
     assert "--peers" in capsys.readouterr().err
 
@@ -113,5 +113,5 @@ def test_a_run_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
 def test_the_command_plans_on_the_map_of_a_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "planning", "--quick", "--mapped", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert "touch the truth" in out
+    assert "in contact with the true shapes" in out
     assert {path.name for path in tmp_path.iterdir()} == {"planning-mapped.json", "planning-mapped.csv"}

@@ -34,8 +34,8 @@ def test_problems_in_a_run_are_solved_certified_and_off_what_was_measured(record
     for case in cases:
         found = {row["metric"]: row["value"] for row in rows if row["case"] == case}
         assert found["solved"] == found["certified"] == found["problems found"] == 2
-        assert found["clearance promised beyond the margin, least"] >= 0
-        assert found["touch a measured point"] == 0 or "margin 0.0" in case
+        assert found["certified clearance beyond the margin, least"] >= 0
+        assert found["in contact with a measured point"] == 0 or "margin 0.0" in case
 
 
 def test_a_scene_without_a_place_to_work_at_is_named(recorded: Path) -> None:
@@ -48,7 +48,7 @@ def test_a_scene_without_a_place_to_work_at_is_named(recorded: Path) -> None:
         file.unlink()
 
 
-def test_a_base_that_stands_in_something_is_turned_about_the_middle_until_it_is_free() -> None:
+def test_a_base_inside_an_obstacle_is_turned_about_the_centre_until_it_is_free() -> None:
     place = Workspace(T_world_base=np.eye(4), box=np.array([[0.0, -1, 0], [1, 1, 1]]))
     pile = _pile([0.0, 0.0, 0.3])
     found = free_place(pile, place)
@@ -62,7 +62,7 @@ def test_a_base_that_stands_in_something_is_turned_about_the_middle_until_it_is_
 
 
 def _pile(at: list[float]) -> GaussianCollisionField:
-    """Something of 20 cm where an arm's shoulder would be."""
+    """Build an obstacle of 20 cm at the shoulder of an arm."""
     points = np.asarray(at) + np.random.default_rng(0).uniform(-0.1, 0.1, (200, 3))
     return GaussianCollisionField(
         GaussianModel.from_activated(

@@ -24,7 +24,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
 
 
 def figures(results: Results, case: str, peer: str | None = None) -> dict[str, Any]:
-    """Values by metric."""
+    """Return the values by metric."""
     return {row.metric: row.value for row in results.rows if row.case == case and row.peer == peer}
 
 
@@ -55,8 +55,8 @@ def test_ratios_are_those_of_the_measured_times(run: tuple[Results, Path]) -> No
     results, _ = run
     compared = 0
     for row in results.rows:
-        if row.metric.endswith(", times ours") and row.value is not None:
-            metric = row.metric.removesuffix(", times ours")
+        if row.metric.endswith(", ratio to splatbot") and row.value is not None:
+            metric = row.metric.removesuffix(", ratio to splatbot")
             ours, theirs = results.find(row.case, metric), results.find(row.case, metric, row.peer)
             assert ours is not None
             assert theirs is not None
@@ -87,7 +87,7 @@ def test_peers_show_the_same_image_and_gradients(run: tuple[Results, Path]) -> N
 
 def test_an_absent_peer_is_said_to_be_absent(run: tuple[Results, Path]) -> None:
     results, _ = run
-    notes = {row.peer: row.note for row in results.rows if row.metric == "what it is"}
+    notes = {row.peer: row.note for row in results.rows if row.metric == "implementation"}
     assert set(notes) == {"torch", "scalar C++", "gsplat torch reference"}
     assert all(notes.values())
 
@@ -106,7 +106,7 @@ def test_an_instruction_set_is_compared_with_float64(run: tuple[Results, Path]) 
         assert figures(results, f"sweep instruction set: {name}")["largest error"] < 1e-5
 
 
-def test_the_command_prints_its_tables_and_writes_where_told(
+def test_the_command_prints_its_tables_and_writes_to_the_given_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"

@@ -1,4 +1,4 @@
-"""The benchmark of the service asks a real one and counts what comes back."""
+"""The benchmark of the service queries a running service and counts the answers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from splatbot.bench.service import BENCHMARK, ServiceSettings
 
 
 @pytest.mark.long
-def test_questions_are_asked_at_their_times_and_all_answered(tmp_path: Path) -> None:
+def test_queries_are_sent_at_fixed_times_and_all_are_answered(tmp_path: Path) -> None:
     values = {**ServiceSettings.quick_values, "per_s": 4.0}
     results = BENCHMARK.run(ServiceSettings(out=tmp_path, **values))
     case = "3 clients x 4/s"
-    asked = results.find(case, "questions")
+    asked = results.find(case, "queries")
     assert asked is not None
     assert 18 <= asked <= 27
     assert results.find(case, "errors") == 0
-    assert (results.find("no questions", "frames") or 0) > 5
+    assert (results.find("no queries", "frames") or 0) > 5
     assert (results.find("1000 points", "npy over HTTP") or 0) > 0
     assert (tmp_path / "service.json").is_file()

@@ -40,7 +40,7 @@ def test_a_peer_follows_a_clean_log_to_centimetres(peer: TrackingPeer) -> None:
 
 
 @pytest.mark.parametrize("peer", tracking_peers(), ids=lambda peer: peer.name)
-def test_a_peer_that_sees_nothing_reports_no_pose_or_does_not_move(peer: TrackingPeer) -> None:
+def test_a_peer_without_texture_reports_no_pose_or_does_not_move(peer: TrackingPeer) -> None:
     log = open_log(LOG)
     odometry = peer.make()
     first = log[0]
@@ -90,7 +90,9 @@ def test_files_hold_the_rows_the_machine_and_the_plot(run: tuple[Results, Path])
     assert (folder / "tracking.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_prints_the_table_and_writes_where_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_the_table_and_writes_to_the_given_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     where = tmp_path / "figures.json"
     words = [
         "--out",
@@ -109,6 +111,6 @@ def test_the_command_prints_the_table_and_writes_where_told(tmp_path: Path, caps
 
 
 @pytest.mark.parametrize("words", [[], [LOG, "--max-frames", "1"], [LOG, "--budgets", "0"]])
-def test_wrong_input_is_told_before_anything_runs(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_input_is_reported_before_anything_runs(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "tracking", *words]) == 2
     assert "Fix:" in capsys.readouterr().err

@@ -10,7 +10,7 @@ import numpy as np
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.twin.bounds import FORCED, broken_bounds
-from splatbot.bench.twin.paths import DEPTH, arm_room, push, timed, truth_scene, try_paths
+from splatbot.bench.twin.paths import DEPTH, arm_clearance, push, timed, truth_scene, try_paths
 from splatbot.robots.panda import panda
 from splatbot.sim.twin import Twin
 
@@ -25,7 +25,7 @@ def test_the_closed_form_room_is_that_between_mujocos_geoms(rng: np.random.Gener
     for q in panda().random(40, rng):
         twin.reset(q)
         theirs = min(mujoco.mj_geomDistance(world.model, data, a, b, 1.0, None) for a in arm for b in rest)
-        ours = float(arm_room(panda(), table, q[None])[0])
+        ours = float(arm_clearance(panda(), table, q[None])[0])
         if 0.0 < theirs < 0.9:
             compared += 1
             assert -1e-6 < ours - theirs < 5e-3
@@ -50,16 +50,16 @@ def test_a_pushed_path_ends_a_centimetre_deep() -> None:
     home = panda().home
     into = push(np.stack([home, home + 0.2]), panda(), tabletop(), DEPTH)
     assert into is not None
-    assert float(arm_room(panda(), tabletop(), into[-1:])[0]) <= -DEPTH
-    assert float(arm_room(panda(), tabletop(), into[:1])[0]) > 0
+    assert float(arm_clearance(panda(), tabletop(), into[-1:])[0]) <= -DEPTH
+    assert float(arm_clearance(panda(), tabletop(), into[:1])[0]) > 0
 
 
-def test_planned_paths_touch_nothing_and_pushed_ones_are_seen() -> None:
+def test_planned_paths_are_free_and_pushed_ones_cause_contacts() -> None:
     trials = try_paths(2, gaussians=6000, budget_ms=60.0)
     assert trials.planned == trials.certified == 2
-    assert trials.touched == 0
-    assert trials.least_room > 0
-    assert trials.seen == trials.pushed == 2
+    assert trials.in_contact == 0
+    assert trials.least_clearance > 0
+    assert trials.detected == trials.pushed == 2
 
 
 def test_a_figure_out_of_its_bounds_is_named_and_one_that_is_missing_is_not() -> None:

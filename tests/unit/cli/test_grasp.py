@@ -43,7 +43,7 @@ def test_ranked_grasps_are_printed_written_and_drawn(run: RunCommand, map_file: 
     assert picture.std() > 5
 
 
-def test_a_run_whose_log_is_gone_still_answers_and_says_what_was_not_asked(
+def test_a_run_whose_log_is_gone_still_answers_and_notes_the_skipped_checks(
     run: RunCommand, map_file: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "frames.jsonl").write_text("")
@@ -56,7 +56,7 @@ def test_a_run_whose_log_is_gone_still_answers_and_says_what_was_not_asked(
     assert "moved" in note
 
 
-def test_names_and_base_come_from_the_scene_beside_the_map(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+def test_names_and_base_come_from_the_scene_file_of_the_map(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
     names = (NamedPlace("soup", np.array([0.50, -0.15, 0.12])),)
     Workspace(T_world_base=np.eye(4), objects=names).save(tmp_path / "scene.yaml")
     answer = run("grasp", "--map", map_file, "--target", "soup", "--out", tmp_path / "out")
@@ -108,7 +108,7 @@ def test_wrong_questions_are_answered_in_one_line(
     assert "Traceback" not in answer.err
 
 
-def test_a_model_is_asked_for_names_alone_and_must_be_named(
+def test_a_model_needs_a_target_name_and_a_model_name(
     run: RunCommand, map_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("SPLATBOT_VLM_URL", raising=False)

@@ -1,4 +1,4 @@
-"""`splatbot map`: what it prints, writes and refuses."""
+"""`splatbot map`: output, files and refused input."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_phases_after_the_frames_are_named() -> None:
         (["LOG", "--localise", "nowhere"], "run.state"),
     ],
 )
-def test_a_saved_run_that_cannot_be_used_is_told_before_anything_is_written(
+def test_a_saved_run_that_cannot_be_used_is_reported_before_anything_is_written(
     run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], what: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""`splatbot pick`: from a scan of the twin to a thing in the hand."""
+"""`splatbot pick`: from a scan of the twin to an object in the hand."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ def test_a_can_is_taken_and_the_twin_says_how_far_it_rose(run: RunCommand, scene
     assert abs(written["rose_m"]["slab"]) < 0.002
 
 
-def test_what_is_too_wide_is_no_grasp_and_nothing_moves(run: RunCommand, scene: Path, tmp_path: Path) -> None:
+def test_an_object_that_is_too_wide_has_no_grasp_and_nothing_moves(
+    run: RunCommand, scene: Path, tmp_path: Path
+) -> None:
     answer = run("pick", scene, "--target", "slab", "--out", tmp_path / "out")
     assert answer.code == 1
     assert "no grasp" in answer.err

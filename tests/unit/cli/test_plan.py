@@ -52,7 +52,7 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     assert page.count("<script") == 3
 
 
-def test_the_base_is_taken_from_the_scene_beside_the_map_and_a_pose_is_reached(
+def test_the_base_is_taken_from_the_scene_file_of_the_map_and_a_pose_is_reached(
     run: RunCommand, map_file: Path, tmp_path: Path
 ) -> None:
     assert run("plan", "--map", map_file, "--start", "home", "--goal", *GOAL).code == 2

@@ -70,9 +70,7 @@ def test_eval_of_something_else_is_refused(run: RunCommand, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("mode", ["rgb", "depth", "normal", "alpha"])
-def test_render_writes_a_picture_of_the_asked_size(
-    run: RunCommand, run_folder: Path, tmp_path: Path, mode: str
-) -> None:
+def test_render_writes_an_image_of_the_given_size(run: RunCommand, run_folder: Path, tmp_path: Path, mode: str) -> None:
     answer = run("render", run_folder, "--mode", mode, "--out", tmp_path / "view.png", "--size", "80x60")
     assert answer.code == 0
     image = cv2.imread(str(tmp_path / "view.png"), cv2.IMREAD_UNCHANGED)

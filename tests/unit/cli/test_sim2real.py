@@ -1,4 +1,4 @@
-"""`splatbot sim2real`: what it is asked, what it calls what, and what it writes."""
+"""`splatbot sim2real`: options, names in the output, and files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_wrong_words_are_named(run: RunCommand, words: list[str], message: str) 
 def test_a_log_without_an_arm_is_compared_at_tracked_poses(
     run: RunCommand, log_folder: Path, run_folder: Path, tmp_path: Path
 ) -> None:
-    """Of a scene in which nothing stands on anything, and whose log tells neither tool nor joints."""
+    """Build a run of a scene without objects on a surface; its log has neither tool poses nor joints."""
     Workspace(np.eye(4)).save(log_folder / "scene.yaml")
     answer = run("sim2real", log_folder, "--map", run_folder, "--frames", "3", "--out", tmp_path / "out")
     assert answer.code == 0, answer.err

@@ -1,4 +1,4 @@
-"""`splatbot simulate`: what it writes is the log that its address opens; its effects reach the run's metrics."""
+"""`splatbot simulate`: its files equal the log that its URI opens; its effects are in the metrics of the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands at a terminal: a pseudo-terminal is what users have, a pipe is what tests usually have."""
+"""Commands at a terminal: users have a terminal, while most tests use a pipe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`splatbot twin`: what it says, what it writes, and how it ends."""
+"""`splatbot twin`: output, files, and exit codes."""
 
 from __future__ import annotations
 
