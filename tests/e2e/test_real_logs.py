@@ -16,8 +16,8 @@ from splatbot.logs import open_log
 from splatbot.run import map_log
 from tests.e2e.real_grasps import check_lying_box, check_shelf_box, check_tape_roll
 
-# name, frames, ATE RMSE [m]; the references are accurate to a few mm, 5 to 29 mm, 2 cm and about 3 cm. Bundle adjustment
-# and held-out views check the third (docs/experiments/tracking.md, "Keypoints from the whole image").
+# name, frames, ATE RMSE [m]; the references are accurate to a few mm, 5 to 29 mm, 2 cm and about 3 cm. Bundle
+# adjustment and held-out views check the third (docs/experiments/tracking.md, "Keypoints from the whole image").
 LOGS = [
     pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48"),
     pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot"),
