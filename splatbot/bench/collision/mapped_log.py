@@ -120,12 +120,12 @@ def audit_spheres(
         value = 1e3 * float(np.quantile(error, share))
         results.add(case, f"surface error against the truth, observed, {share:.1%}", value, "mm")
     for name, part in (("observed", seen), ("unobserved", ~seen)):
-        room, struck = (distance - radii)[part], hit[part]
-        free, false = ~struck & (room <= 0), struck & (room > 0)
-        results.add(case, f"spheres, {name}: false free", float(free.sum()), f"of {len(room)}")
-        results.add(case, f"spheres, {name}: deepest", 1e3 * float(-room[free].min()) if free.any() else 0.0, "mm")
+        clearance, struck = (distance - radii)[part], hit[part]
+        free, false = ~struck & (clearance <= 0), struck & (clearance > 0)
+        results.add(case, f"spheres, {name}: false free", float(free.sum()), f"of {len(clearance)}")
+        results.add(case, f"spheres, {name}: deepest", 1e3 * float(-clearance[free].min()) if free.any() else 0.0, "mm")
         results.add(case, f"spheres, {name}: false hit", 100.0 * float(false.mean()), "%")
-        largest = 1e3 * float(room[false].max()) if false.any() else 0.0
+        largest = 1e3 * float(clearance[false].max()) if false.any() else 0.0
         results.add(case, f"spheres, {name}: largest false hit", largest, "mm")
 
 
@@ -141,16 +141,16 @@ def audit_arm(
     radii = bare.spheres.radii[moving]
     centers = transform_points(np.linalg.inv(mapped.T_map_scene), bare.centers(q)[:, moving].reshape(-1, 3))
     distance, nearest = mapped.closest(centers)
-    room = distance.reshape(len(q), -1) - radii
+    clearance = distance.reshape(len(q), -1) - radii
     struck = wide.check(field, q).in_collision
-    touching = room <= 0
-    flat = np.zeros(room.size, np.bool_)
+    touching = clearance <= 0
+    flat = np.zeros(clearance.size, np.bool_)
     flat[touching.ravel()] = mapped.seen(nearest[touching.ravel()])
-    seen = flat.reshape(room.shape)
+    seen = flat.reshape(clearance.shape)
     for name, part in (("observed", seen), ("unobserved", touching & ~seen)):
         touches = (touching & part).any(axis=1) if name == "observed" else part.any(axis=1) & ~seen.any(axis=1)
         free = touches & ~struck
-        depth = np.where(part, -room, 0.0).max(axis=1)
+        depth = np.where(part, -clearance, 0.0).max(axis=1)
         results.add(case, f"arm, {name}: false free", float(free.sum()), f"of {int(touches.sum())} in contact")
         results.add(case, f"arm, {name}: deepest", 1e3 * float(depth[free].max()) if free.any() else 0.0, "mm")
     clear = ~touching.any(axis=1)

@@ -165,26 +165,26 @@ def run_changes(settings: PlanningSettings, results: Results, model: GaussianMod
     before = GaussianCollisionField(model)
     far = changed(before, model, np.array([-0.6, 0.0, 0.05]))
     kept, repaired = [], []
-    stood = asked = 0
+    valid = solvable = 0
     for seed, problem in enumerate(wanted):
         replanner = Replanner(GaussianRRTStar(before, panda()))
         path = replanner.plan(problem.start, problem.goal, budget_ms=FAST_MS, seed=seed).path
         if path is None:
             continue
         update = replanner.update(far)
-        stood += update.kept
+        valid += update.kept
         kept.append(1e3 * update.seconds)
         arm = replanner.planner.arm
         near = changed(far, model, arm.centers(path.at([0.5]))[0, arm.spheres.link >= 6][-1])
         if not GaussianRRTStar(near, panda()).plan(problem.start, problem.goal, budget_ms=SOLVABLE_MS).path:
             continue
-        asked += 1
+        solvable += 1
         update = replanner.update(near, budget_ms=REPAIR_MS)
         if update.result:
             repaired.append(1e3 * (update.seconds - update.result.seconds + update.result.first_seconds))
-    results.add(FAR_CHANGE, "paths that stay valid", float(stood), f"of {len(kept)}")
+    results.add(FAR_CHANGE, "paths that stay valid", float(valid), f"of {len(kept)}")
     spread(results, FAR_CHANGE, "certified again", kept, "ms")
-    results.add(NEAR_CHANGE, f"repaired in {REPAIR_MS:g} ms", float(len(repaired)), f"of {asked}")
+    results.add(NEAR_CHANGE, f"repaired in {REPAIR_MS:g} ms", float(len(repaired)), f"of {solvable}")
     if repaired:
         spread(results, NEAR_CHANGE, "time to a new path", repaired, "ms")
 
