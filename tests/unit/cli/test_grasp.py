@@ -92,7 +92,7 @@ def test_what_cannot_be_grasped_is_said_counted_and_drawn(run: RunCommand, map_f
         (("--target", "box", "--point", 0, 0, 0), "are 2"),
         (("--target", "box"), "about equally"),
         (("--target", "screwdriver"), "nor in the vocabulary"),
-        (("--pixel", 10, 10), "has no pictures"),
+        (("--pixel", 10, 10), "has no images"),
         (("--point", 0.3, -0.05, 0.0), "there is no object"),
         (("--target", "red box", "--friction", 9), "friction"),
         (("--target", "red box", "--robot", "nobody"), "robot"),
