@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from splatbot.bench.benchmark import BENCHMARKS
+from splatbot.cli import COMMANDS
+
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "experiments/README.md"]
 DOCUMENTS += [str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))]
@@ -70,6 +73,18 @@ def test_every_file_of_the_repository_that_a_document_names_exists() -> None:
         for path in named.findall((ROOT / name).read_text(encoding="utf-8"))
         if "my_" not in path and not (ROOT / path).exists()
     }
+    assert missing == set()
+
+
+def test_every_command_that_a_document_shows_exists() -> None:
+    commands = set(COMMANDS) | {f"bench {name}" for name in BENCHMARKS} | {"bench"}
+    shown = re.compile(r"^(?:\w+=\S+ )*splatbot ((?:bench )?[a-z]\w*)", flags=re.M)
+    missing = set()
+    for name in DOCUMENTS:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        spans = [*re.findall(r"`([^`\n]+)`", text), *re.findall(r"^```\w*\n(.*?)^```", text, flags=re.S | re.M)]
+        found = {command for span in spans for command in shown.findall(span)}
+        missing |= {f"{name}: splatbot {command}" for command in found - commands if command != "bench my"}
     assert missing == set()
 
 
