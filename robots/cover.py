@@ -1,4 +1,4 @@
-"""Spheres that cover a link's collision geometry, and the check that they do."""
+"""Spheres that cover the collision geometry of links, and a check of the cover."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
 
 
 def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
-    """Cover every shape by spheres that reach at most ``slack`` [m] beyond it.
+    """Cover every shape with spheres that extend at most ``slack`` [m] beyond it.
 
-    Capsules: spheres of radius R + slack along the segment, half of each other's chord apart, so that their union
-    holds the capsule exactly. Boxes and meshes: see :func:`cover_solid`.
+    The spheres of a capsule of radius R have the radius r = R + slack. Their distance along the segment is at most
+    2 sqrt(r² - R²), so that their union contains the capsule. For boxes and meshes see :func:`cover_solid`.
     """
     found = [(shape.link, *cover_shape(shape, slack)) for shape in shapes]
     link = np.concatenate([np.full(len(radii), link, np.int32) for link, _, radii in found])
@@ -26,7 +26,7 @@ def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
 
 
 def cover_shape(shape: Shape, slack: float) -> tuple[Array, Array]:
-    """Cover a shape; return centres (S, 3) [m, link frame] and radii (S,) [m]."""
+    """Return the centres (S, 3) [m, link frame] and radii (S,) [m] of the spheres of one shape."""
     if not slack > 0:
         raise InputError(f"is {slack}.", field="slack", hint="give metres above 0, as 0.01")
     if isinstance(shape, Capsule):
@@ -39,7 +39,7 @@ def cover_shape(shape: Shape, slack: float) -> tuple[Array, Array]:
 
 
 def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
-    """Cover a capsule: ends inset by the slack (the cap's tip is just inside), spheres a chord apart between."""
+    """Place spheres a chord apart; the outer ones lie a slack inside the ends and contain the tips of the caps."""
     radius = shape.radius + slack
     half_chord = np.sqrt(radius**2 - shape.radius**2)
     middle = (np.asarray(shape.start) + np.asarray(shape.end)) / 2
@@ -52,13 +52,11 @@ def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
 
 
 def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
-    """Cover a solid greedily by balls.
+    """Cover a solid greedily: the candidate that covers most uncovered surface points is next.
 
-    Candidates lie on an inner grid, each as large as fits plus the slack; the one that covers most is next.
-
-    Points without a candidate are covered by balls of radius ``slack`` on the surface itself. Each surface point
-    represents a neighbourhood of a quarter of the slack: its spacing, and that of the thinning cells. Every ball counts
-    as that much smaller.
+    Candidates are the inscribed spheres at the points of a grid, enlarged by the slack. Spheres of radius ``slack`` on
+    the surface cover the remaining points. A surface point represents a neighbourhood of a quarter of the slack, which
+    follows from the sampling. Every radius is reduced by this amount in the test.
     """
     spacing = slack / 8
     left = _thinned(shape.surface(spacing), spacing / 2)
@@ -84,7 +82,7 @@ def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
 
 
 def _thinned(points: Array, cell: float) -> Array:
-    """Keep the first point in each cell [m] of a grid."""
+    """Keep the first point of each cell [m] of a grid."""
     at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     size = at.max(axis=0) + 1
     _, first = np.unique((at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2], return_index=True)
@@ -92,23 +90,24 @@ def _thinned(points: Array, cell: float) -> Array:
 
 
 def _grid(low: Array, high: Array, slack: float) -> Array:
-    """Return grid points (P, 3) at most the slack apart, or a sixteenth of the longest side."""
+    """Return grid points (P, 3) with a step of the slack, or a sixteenth of the longest side if that is larger."""
     step = max(slack, float((high - low).max()) / 16)
     lines = [np.linspace(low[k], high[k], int((high[k] - low[k]) / step) + 3)[1:-1] for k in range(3)]
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def uncovered(shapes: Sequence[Shape], spheres: LinkSpheres, spacing: float) -> float:
-    """Return the largest distance [m] of the shapes' surfaces outside the spheres, at most ``spacing`` too little.
+    """Return the largest distance [m] of a surface point of the shapes from the spheres.
 
-    Negative: every point is that deep inside.
+    The sampling makes it too small by at most ``spacing`` [m]. A negative value is the smallest depth of any point in
+    the spheres.
     """
     worst = -np.inf
     for shape in shapes:
         own = spheres.link == shape.link
         points = shape.surface(spacing)
-        beyond = np.full(len(points), np.inf)
+        distance = np.full(len(points), np.inf)
         for center, radius in zip(spheres.centers[own], spheres.radii[own], strict=True):
-            beyond = np.minimum(beyond, np.linalg.norm(points - center, axis=1) - radius)
-        worst = max(worst, float(beyond.max()))
+            distance = np.minimum(distance, np.linalg.norm(points - center, axis=1) - radius)
+        worst = max(worst, float(distance.max()))
     return worst

@@ -1,4 +1,4 @@
-"""Graspable objects in a map: their segmentation, observer positions, and free-space evidence from depth."""
+"""Graspable objects of a map, with the viewpoints of its Gaussians and their visibility in depth images."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from splatbot.workspace import Workspace
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMap:
-    """A map and the evidence of its recording.
+    """A map with the measurements of its recording.
 
     Args:
-        state: without Gaussians that more frames saw through than supported.
-        observers: (N, 3) observer position of each Gaussian [m, world], NaN if unknown. If None, no position is known.
-        views: the recording's depth, subsampled.
-        notes: the checks that were skipped, and why.
+        state: the map without Gaussians that more frames see through than see.
+        observers: (N, 3) viewpoint of each Gaussian [m, world], NaN if unknown. If None, all are unknown.
+        views: thinned depth images of the recording.
+        notes: omitted checks with reasons.
     """
 
     state: Snapshot
@@ -42,63 +42,63 @@ class MeasuredMap:
 
 @dataclass(frozen=True, eq=False)
 class GraspableObjects:
-    """The objects in a map, as commands and the service grasp them."""
+    """Segmented objects of a map, from which commands and service sample grasps."""
 
     measured: MeasuredMap
     scene: SegmentedMap
 
     def sampler(self, robot: RobotKinematics, **options: Any) -> GraspSampler:
-        """Return the sampler of their grasps; ``options`` as in :class:`splatbot.grasping.sampler.GraspSampler`."""
+        """Create a grasp sampler; for ``options`` see :class:`splatbot.grasping.sampler.GraspSampler`."""
         return GraspSampler(self.scene, robot, observers=self.measured.observers, views=self.measured.views, **options)
 
-    def told(self, result: GraspResult) -> GraspResult:
-        """Return the result with notes on the skipped checks."""
+    def with_notes(self, result: GraspResult) -> GraspResult:
+        """Add the notes of the map to a result."""
         return replace(result, notes=(*self.measured.notes, *result.notes))
 
 
 def run_of(path: Path) -> RunFolder | None:
-    """Return the run that a folder belongs to, or None for a file or another folder."""
+    """Return the run of a folder, or None for a file or a folder of another kind."""
     run = RunFolder(path)
     return run if run.frames.is_file() else None
 
 
 def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
-    """Load a map and remove flying pixels at edges, as far as its recording is available.
+    """Remove flying pixels from a map by the visibility in its recording, if that is available.
 
     Args:
-        state: of the map.
-        run: run that made it. If None, the checks that need it are skipped and noted.
+        state: the map.
+        run: run that made the map. If None, visibility is not checked, which a note states.
 
     Raises:
         FormatError: the run's folder is damaged.
     """
     if run is None:
-        return MeasuredMap(state, notes=("free-space evidence was not checked: the map belongs to no run folder.",))
+        return MeasuredMap(state, notes=("Visibility was not checked, because the map is in no run's folder.",))
     notes: tuple[str, ...] = ()
     views: tuple[DepthView, ...] = ()
     try:
         views = subsampled_views(run, reopen_log(run))
     except SplatbotError as error:
-        name = f"{Path(error.file).name}: " if error.file else ""  # clients must not learn the folder
-        why = f"the run's log cannot be read: {name}{error.message}"
-        notes = (f"free-space evidence was not checked: {why}",)
+        name = f"{Path(error.file).name}: " if error.file else ""  # without the private path of the folder
+        reason = f"the run's log cannot be read: {name}{error.message}"
+        notes = (f"Visibility was not checked, because {reason}",)
     model = _solid(state.model, views)
     return MeasuredMap(replace(state, model=model), observers(run, model), views, notes)
 
 
-def things_of(
+def segment_objects(
     measured: MeasuredMap, T_world_base: ArrayLike, workspace: Workspace | None, *, as_known: bool
 ) -> GraspableObjects:
-    """Segment the objects in a map.
+    """Segment the objects of a map.
 
     Args:
         measured: the map.
-        T_world_base: (4, 4), a frame whose z is up.
-        workspace: workspace of the map, if known.
-        as_known: the base is the workspace's, and so are its box and plane.
+        T_world_base: (4, 4) pose of the base, with z up [m].
+        workspace: description of the scene in addition to the map.
+        as_known: True if the base is that of the workspace, so that its box and plane apply.
 
     Raises:
-        InputError: nothing of the map is in the box.
+        InputError: the box contains no Gaussians.
     """
     own = workspace if as_known else None
     scene = segment(
@@ -113,7 +113,7 @@ def things_of(
 
 
 def _solid(model: GaussianModel, views: tuple[DepthView, ...]) -> GaussianModel:
-    """Return the map without Gaussians that more views saw through than supported; the whole map without views."""
+    """Remove Gaussians with more passes than hits; without views the model is unchanged."""
     if not views:
         return model
     return model.select(torch.from_numpy(~gather_evidence(model, views).seen_through).nonzero()[:, 0])

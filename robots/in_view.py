@@ -1,4 +1,4 @@
-"""Logs in which a robot sees itself, without its body."""
+"""Logs of a wrist or static camera with the robot's own body masked out."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from splatbot.workspace import NAME, find_workspace
 
 
 def without_robot(log: Log, robot: str | None) -> Log:
-    """Return the log with the robot masked in its frames, or the log itself without a robot.
+    """Mask the robot in the frames of a log; without a robot the log is returned unchanged.
 
     Args:
-        log: its folder holds ``joints.txt`` and ``scene.yaml``, which says where the camera is mounted.
-        robot: a name as ``splatbot robot list`` prints it, or None.
+        log: log whose folder contains ``joints.txt`` and ``scene.yaml`` with the camera's pose on its link.
+        robot: name as listed by ``splatbot robot list``, or None.
 
     Raises:
-        InputError: the robot is unknown, or its camera's mount is.
+        InputError: the robot or the pose of its camera is unknown.
     """
     if robot is None:
         return log
@@ -35,19 +35,19 @@ def without_robot(log: Log, robot: str | None) -> Log:
 
 
 def reopen_log(run: RunFolder, *, uri: str | None = None, camera: str | None = None) -> Log:
-    """Open the log of a run as the run read it: with its camera, and with the same robot masked.
+    """Open the log of a run as the run read it, with the same camera and the same masked robot.
 
     Args:
-        run: the folder.
-        uri: where the log is now, if it was moved.
-        camera: intrinsics instead of those that the run used.
+        run: folder of the run.
+        uri: present location of the log, if it was moved.
+        camera: intrinsics that replace those of the run.
 
     Raises:
-        FormatError: the folder is damaged, or does not say where the log is.
-        LogError: the log is gone or damaged.
+        FormatError: the folder is damaged or does not name the log.
+        LogError: the log is missing or damaged.
     """
     source = run.load_metrics().get("log", {})
     found = uri or source.get("uri")
     if found is None:
-        raise FormatError("does not say where the log is.", file=run.metrics, field="log.uri", hint="give --log LOG")
+        raise FormatError("does not name the log.", file=run.metrics, field="log.uri", hint="give --log LOG")
     return without_robot(open_log(str(found), camera=camera or source.get("camera")), source.get("robot"))

@@ -12,15 +12,15 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint that turns about, or moves along, the z axis of its own frame.
+    """A joint that rotates about, or translates along, the z axis of its own frame.
 
     Args:
-        name: as the robot's maker calls it.
-        T_before_joint: (4, 4), its frame at 0 in the frame of the link before [m].
+        name: name by the manufacturer.
+        T_before_joint: (4, 4) pose of its frame at 0 in the frame of the previous link [m].
         lower, upper: limits [rad or m].
         velocity, acceleration, jerk: largest magnitudes [1/s, 1/s², 1/s³ of those units].
         effort: largest torque [Nm] or force [N].
-        prismatic: moves along z instead of turning.
+        prismatic: True for translation along z.
 
     Raises:
         InputError: a limit is not finite or upper is below lower.

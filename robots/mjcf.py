@@ -15,14 +15,12 @@ from splatbot.robots.shapes import Box, Capsule, Shape
 
 DAMPING = 1.0  # [Nm s/rad] of arm joints; an estimate
 FINGER_MASS = 0.015  # [kg]
-FINGER_DRIVE = (
-    0.5  # [kg] of the drive as a finger feels it, an estimate; contacts of a bare finger's 15 g would be jelly
-)
+FINGER_DRIVE = 0.5  # [kg] reflected mass of the drive, an estimate; with the 15 g of a finger alone, contacts are soft
 FINGER_GAIN = 2000.0  # [N/m] of the fingers' position servo, capped by the gripper's force
 
 
 def to_mjcf(robot: RobotModel) -> str:
-    """Convert a robot to MJCF text: a body for each link, position servos, the home posture as keyframe "home".
+    """Write MJCF text: a body for each link, position servos, the home posture as keyframe "home".
 
     Joints, limits of position and torque, inertias and collision capsules and boxes are the robot's own; meshes are
     replaced by its spheres. Neighbouring links, and those whose spheres meet at home, do not collide.
@@ -73,7 +71,7 @@ def to_mjcf(robot: RobotModel) -> str:
 
 
 def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> None:
-    """Add capsules and boxes as geoms; spheres for links that have meshes or no shapes."""
+    """Add capsules and boxes, or spheres for links with meshes or without shapes."""
     plain = {shape.link for shape in robot.shapes} - {
         shape.link for shape in robot.shapes if not isinstance(shape, (Capsule, Box))
     }
@@ -99,7 +97,7 @@ def _geom(shape: Shape) -> dict[str, str]:
 def _add_gripper(
     root: ElementTree.Element, actuators: ElementTree.Element, hand: ElementTree.Element, gripper: GripperGeometry
 ) -> None:
-    """Add two sliding fingers on one servo; an equality keeps them symmetric. The force is the gripper's own."""
+    """Add two sliding fingers on one servo with the gripper's force; an equality constraint keeps them symmetric."""
     names = [f"finger{i + 1}" for i in range(2)]
     for name, T in zip(names, gripper.T_link_finger, strict=True):
         body = ElementTree.SubElement(hand, "body", {"name": name, **_pose(T)})

@@ -1,8 +1,8 @@
 """Franka Emika Panda with its hand: published kinematics and limits, estimated inertias, coarse collision shapes.
 
-DH parameters and limits are from Franka's documentation (robot and interface specifications). Inertias are those
-identified by Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019). Capsules are as in
-Franka's own coarse self-collision model.
+DH parameters and limits come from Franka's documentation (robot and interface specifications). Inertias are those of
+Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019). Capsules follow Franka's coarse
+self-collision model.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from splatbot.robots.joints import Joint
 from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
 from splatbot.robots.shapes import Capsule
 
-# Modified DH (Craig): a [m], d [m], alpha [rad] of the frame of each joint in that before it.
+# Modified DH (Craig): a [m], d [m], alpha [rad] of the frame of each joint in the previous frame.
 _DH = (
     (0.0, 0.333, 0.0),
     (0.0, 0.0, -np.pi / 2),
@@ -50,7 +50,7 @@ _INERTIALS = (
 
 @cache
 def panda() -> RobotModel:
-    """Build the arm with its hand; the tool's frame lies between the finger tips."""
+    """Return the arm with its hand; the tool frame lies between the finger tips."""
     joints = tuple(
         Joint(
             f"panda_joint{k + 1}",
@@ -96,13 +96,13 @@ def _arm_shapes() -> list[Capsule]:
 
 
 def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
-    """Return shapes around the hand's body of 63 x 204 x 66 mm, round at its ends."""
+    """Return a capsule around the body of the hand, 63 x 204 x 66 mm, round at its ends."""
     start, end = (T_link_hand @ np.array([0.0, y, 0.0345, 1.0]) for y in (-0.0705, 0.0705))
     return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.0315)]
 
 
 def _dh(a: float, d: float, alpha: float) -> Array:
-    """Return the transform Rot_x(alpha) Trans_x(a) Trans_z(d) (Craig 1986)."""
+    """Return Rot_x(alpha) Trans_x(a) Trans_z(d) (Craig 1986)."""
     c, s = np.cos(alpha), np.sin(alpha)
     return np.array([[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1.0]])
 

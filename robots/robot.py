@@ -1,4 +1,4 @@
-"""A robot arm: kinematics, limits, collision geometry and its collision spheres."""
+"""Model of a robot arm: kinematics, limits, collision geometry and its cover of spheres."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from splatbot.robots.cover import cover
 from splatbot.robots.joints import Joint
 from splatbot.robots.shapes import Shape
 
-SLACK = 0.008  # [m] that generated spheres may reach beyond the collision geometry
-_FLAT = 1e-4  # [m] behind the foremost of a finger that is its pad's face
-_SPACING = 2e-3  # [m] between points of the shapes that the hand is measured by
+SLACK = 0.008  # [m] by which generated spheres may extend beyond the collision geometry
+_PAD_DEPTH = 1e-4  # [m] depth of the layer of a finger that counts as the face of its pad
+_SPACING = 2e-3  # [m] between the surface points from which the dimensions of the hand are measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,11 @@ class GripperGeometry:
     """Two fingers on the last link that open symmetrically.
 
     Args:
-        T_link_finger: (2, 4, 4), each finger's frame when closed; its y axis points the way it opens.
-        stroke: how far each finger moves [m].
-        shapes: of one finger, in its own frame; their ``link`` is ignored.
-        speed: of each finger [m/s].
-        force: between the fingers [N].
+        T_link_finger: (2, 4, 4) pose of each finger when closed [m]; its y axis points in the direction of opening.
+        stroke: travel of each finger [m].
+        shapes: shapes of one finger in its own frame; their ``link`` is ignored.
+        speed: speed of each finger [m/s].
+        force: force between the fingers [N].
     """
 
     T_link_finger: Array
@@ -51,23 +51,23 @@ class GripperGeometry:
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """A serial arm.
+    """Model of a serial arm.
 
     Args:
-        name: as the user calls it.
-        joints: from the base outwards.
+        name: name of the robot.
+        joints: joints from the base outwards.
         shapes: collision geometry of the links; 0 is the base, link k moves with joint k - 1.
-        T_link_tcp: (4, 4), the tool's frame on the last link.
-        home: (J,) a posture to rest in.
-        inertials: of the links 0..J, for the twin; empty where they are not known.
+        T_link_tcp: (4, 4) pose of the tool on the last link [m].
+        home: (J,) home posture [rad or m].
+        inertials: inertias of the links 0..J for the twin; empty if unknown.
         gripper: fingers, or None.
-        slack: how far the spheres may reach beyond the shapes [m].
-        allowed: pairs of links that may touch, in addition to neighbours and those whose spheres overlap at home.
+        slack: distance by which the spheres may extend beyond the shapes [m].
+        allowed: pairs of links that may touch, in addition to neighbours and links whose spheres overlap at home.
         covering: spheres of the links. If None, they are generated from the shapes.
         pairs: (M, 2) links that may not touch. If None, they are derived from the spheres.
 
     Raises:
-        InputError: joints, home or shapes do not fit together.
+        InputError: joints, home and shapes are inconsistent.
     """
 
     name: str
@@ -112,20 +112,24 @@ class RobotModel:
         T = np.empty((*values.shape[:-1], len(self) + 1, 4, 4))
         T[..., 0, :, :] = np.eye(4)
         for k, joint in enumerate(self.joints):
-            T[..., k + 1, :, :] = T[..., k, :, :] @ joint.T_before_joint @ _moved(values[..., k], joint.prismatic)
+            T[..., k + 1, :, :] = (
+                T[..., k, :, :] @ joint.T_before_joint @ _joint_transform(values[..., k], joint.prismatic)
+            )
         return T
 
     def tcp(self, q: ArrayLike) -> Array:
-        """Compute the poses T_base_tcp (..., 4, 4) of the tool."""
+        """Compute the poses T_base_tcp (..., 4, 4) of the tool at configurations (..., J) [rad or m]."""
         return np.asarray(self.fk(q)[..., -1, :, :] @ self.T_link_tcp)
 
     def jacobian(self, q: ArrayLike, link: int | None = None, point: ArrayLike | None = None) -> Array:
-        """Compute the geometric Jacobian (..., 6, J): linear [m] and angular [rad] velocity of a point per joint unit.
+        """Compute the geometric Jacobian (..., 6, J): velocity and angular velocity of a point per joint velocity.
+
+        Column j of a revolute joint with axis z and origin o is (z × (p - o), z), that of a prismatic joint (z, 0).
 
         Args:
-            q: configurations (..., J).
-            link: on which the point is; the last by default.
-            point: (3,) or (..., 3) in the base's frame [m]; the tool's origin by default.
+            q: configurations (..., J) [rad or m].
+            link: link of the point; the last by default.
+            point: point p, (3,) or (..., 3), in the frame of the base [m]; the origin of the tool by default.
         """
         T = self.fk(q)
         last = len(self) if link is None else link
@@ -141,17 +145,19 @@ class RobotModel:
         return J
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
-        """Return the collision spheres with the gripper opened by ``opening`` [m]. If None, it is fully open.
+        """Return spheres that cover the shapes, with ``opening`` [m] between the fingers.
+
+        If None, the gripper is fully open.
 
         Raises:
             InputError: the opening is out of range.
         """
         if self.gripper is None:
             return self._link_spheres
-        most = 2 * self.gripper.stroke
-        width = most if opening is None else opening
-        if not 0 <= width <= most:
-            raise InputError(f"is {width}.", field="opening", hint=f"give 0..{most:g} m")
+        widest = 2 * self.gripper.stroke
+        width = widest if opening is None else opening
+        if not 0 <= width <= widest:
+            raise InputError(f"is {width}.", field="opening", hint=f"give 0..{widest:g} m")
         centers, radii = [self._link_spheres.centers], [self._link_spheres.radii]
         for T in self.gripper.T_link_finger:
             moved = self._finger_spheres.centers + np.array([0.0, width / 2, 0.0])
@@ -164,17 +170,17 @@ class RobotModel:
 
     @cached_property
     def hand(self) -> HandShape | None:
-        """The gripper as boxes around its shapes; None without one. Its fingers must open along the tool's y."""
+        """Boxes around the shapes of the gripper, whose fingers open along the tool's y axis; None without one."""
         if self.gripper is None or not self.gripper.shapes:
             return None
         T_tcp_link = inverse(self.T_link_tcp)
         T_tcp_finger = T_tcp_link @ self.gripper.T_link_finger[0]
         finger = np.concatenate([shape.surface(_SPACING) for shape in self.gripper.shapes])
         finger = transform_points(T_tcp_finger, finger) * [1.0, np.sign(T_tcp_finger[1, 1]), 1.0]
-        pad = finger[finger[:, 1] < finger[:, 1].min() + _FLAT]
+        pad = finger[finger[:, 1] < finger[:, 1].min() + _PAD_DEPTH]
         own = [shape.surface(_SPACING) for shape in self.shapes if shape.link == len(self)]
         body = transform_points(T_tcp_link, np.concatenate(own)) if own else np.zeros((0, 3))
-        palm = body[body[:, 2] > finger[:, 2].min()]  # objects next to the fingers or between them
+        palm = body[body[:, 2] > finger[:, 2].min()]  # parts next to the fingers or between them
         front = palm if len(palm) else finger[finger[:, 2] == finger[:, 2].min()]
         return HandShape(
             stroke=2 * self.gripper.stroke,
@@ -190,7 +196,10 @@ class RobotModel:
 
     @cached_property
     def self_collision_pairs(self) -> NDArray[np.int32]:
-        """(M, 2) links that may not touch: all but neighbours, those allowed, and those whose spheres meet at home."""
+        """Pairs (M, 2) of links that may not touch.
+
+        These are all pairs except neighbours, allowed pairs, and links whose spheres overlap at home.
+        """
         if self.pairs is not None:
             return self.pairs
         s = self.spheres()
@@ -207,20 +216,20 @@ class RobotModel:
         return np.array(pairs, dtype=np.int32).reshape(-1, 2)
 
     def random(self, count: int, rng: np.random.Generator) -> Array:
-        """Sample configurations (count, J), uniform within the limits."""
+        """Draw configurations (count, J) [rad or m], uniform within the limits."""
         return rng.uniform(self.chain.lower, self.chain.upper, (count, len(self)))
 
     def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> NDArray[np.bool_]:
-        """Return True for configurations (..., J) within the position limits."""
+        """Return whether configurations (..., J) respect the position limits within a tolerance [rad or m]."""
         values = self.configurations(q)
         low, high = self.chain.lower - tolerance, self.chain.upper + tolerance
         return np.asarray(((values >= low) & (values <= high)).all(axis=-1))
 
     def configurations(self, q: ArrayLike) -> Array:
-        """Return ``q`` as float64 (..., J).
+        """Return ``q`` as finite float64 (..., J).
 
         Raises:
-            InputError: another number of joints, or a value that is not finite.
+            InputError: ``q`` has another number of joints, or a value is not finite.
         """
         values = np.asarray(q, dtype=np.float64)
         if values.ndim < 1 or values.shape[-1] != len(self):
@@ -244,8 +253,8 @@ def _covered(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
     return cover(shapes, slack)
 
 
-def _moved(q: Array, prismatic: bool) -> Array:
-    """Return the transform (..., 4, 4) of a joint about or along z."""
+def _joint_transform(q: Array, prismatic: bool) -> Array:
+    """Return the transforms (..., 4, 4) of a joint about or along z."""
     T = np.zeros((*q.shape, 4, 4))
     T[..., range(4), range(4)] = 1.0
     if prismatic:

@@ -1,8 +1,9 @@
-"""The Panda with a Robotiq 2F-85 or 2F-140 in place of its hand. They are slim fingers for low or close
-objects, and a hand for objects wider than 80 mm.
+"""The Panda with a Robotiq 2F-85 or 2F-140 instead of its hand.
 
-Strokes, forces and the length of the 2F-85 are from Robotiq's data sheets (85 mm, 20 to 235 N, 163 mm; 140 mm, 10 to
-125 N). The 2F-85 presses as the Panda's hand does. The shapes are coarse ones around body, open linkage and fingers.
+The 2F-85 has slim fingers for low or closely spaced objects. The 2F-140 grasps objects wider than 80 mm.
+
+Strokes, forces and the length of the 2F-85 come from Robotiq's data sheets (85 mm, 20 to 235 N, 163 mm; 140 mm, 10 to
+125 N). The 2F-85 uses the force of the Panda's hand. Coarse shapes enclose the body, the open linkage and the fingers.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ _Along = tuple[tuple[float, float, float], tuple[float, float, float], float]  #
 
 @cache
 def panda_2f85() -> RobotModel:
-    """Return the arm with the slim fingers, 22 mm wide and, for 38 mm from their tips, 10 mm thick with round edges.
+    """Return the arm with the 2F-85.
 
-    Against the target itself its fingers count as boxes as thick as they are at their roots, 20 mm.
+    The fingers are 22 mm wide and, up to 38 mm from their tips, 10 mm thick with round edges. Collision checks with the
+    target use boxes of the thickness at the roots of the fingers, 20 mm.
     """
     return _with_hand(
         "panda-2f85",
@@ -45,7 +47,7 @@ def panda_2f85() -> RobotModel:
 
 @cache
 def panda_2f140() -> RobotModel:
-    """Return the arm with the wide hand."""
+    """Return the arm with the 2F-140."""
     return _with_hand(
         "panda-2f140",
         tcp=0.205,
@@ -60,9 +62,16 @@ def panda_2f140() -> RobotModel:
 def _with_hand(
     name: str, *, tcp: float, body: Sequence[_Along], root: float, finger: Sequence[_Along], stroke: float, force: float
 ) -> RobotModel:
-    """Build the Panda with a hand whose fingers begin ``root`` [m] from the flange.
+    """Build the Panda with another hand.
 
-    The tool's frame lies between its pads, ``tcp`` [m] from the flange; they open along its y, ``stroke`` [m] each.
+    Args:
+        name: name of the robot.
+        tcp: distance of the tool frame, which lies between the pads, from the flange [m].
+        body: capsules of the hand.
+        root: distance of the roots of the fingers from the flange [m].
+        finger: capsules of one finger in its own frame.
+        stroke: travel of each finger along the y axis of the tool [m].
+        force: force between the fingers [N].
     """
     arm = panda()
     T_link_flange = _along_z(_FLANGE)
@@ -91,5 +100,5 @@ def _along_z(z: float) -> Array:
 
 
 def _at(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return a point of the flange on the last link."""
+    """Transform a point from the flange to the last link."""
     return x, y, z + _FLANGE

@@ -18,11 +18,11 @@ class Shape(Protocol):
 
     @property
     def link(self) -> int:
-        """Which; 0 is the base."""
+        """Index of the link; 0 is the base."""
         ...
 
     def surface(self, spacing: float) -> Array:
-        """Sample points (P, 3) of the surface in the link's frame, at most about ``spacing`` [m] apart."""
+        """Sample points (P, 3) of the surface in the link frame, at a distance of about ``spacing`` [m] or less."""
         ...
 
 
@@ -41,7 +41,7 @@ class Capsule:
         return float(np.linalg.norm(np.subtract(self.end, self.start)))
 
     def along(self) -> Array:
-        """Return the unit vector (3,) of the segment; x for a ball."""
+        """Return the unit vector (3,) of the segment; it is x for a sphere."""
         d = np.subtract(self.end, self.start)
         return np.asarray(d / self.length) if self.length > 0 else np.array([1.0, 0.0, 0.0])
 
@@ -87,7 +87,7 @@ class Box:
         return transform_points(self.T_link_box, np.concatenate(faces))
 
     def depth(self, points: Array) -> Array:
-        """Return the penetration depth (P,) [m] of points (P, 3) [m, link frame]; below 0 outside."""
+        """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface; negative outside."""
         local = transform_points(inverse(self.T_link_box), points)
         return np.asarray((np.asarray(self.size) / 2 - np.abs(local)).min(axis=1))
 
@@ -101,7 +101,7 @@ class Mesh:
     triangles: NDArray[np.int64] = field(repr=False)
 
     def depth(self, points: Array) -> Array:
-        """Return the penetration depth (P,) [m] of points (P, 3) [m, link frame]; below 0 outside."""
+        """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface; negative outside."""
         scene = o3d.t.geometry.RaycastingScene()
         vertices, triangles = self.vertices.astype(np.float32), self.triangles.astype(np.uint32)
         scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))

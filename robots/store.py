@@ -1,4 +1,4 @@
-"""Robots by name: the Panda, and those that were added from URDF files."""
+"""Robots by name: built-in ones, and those added from URDF files."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ _BUILT_IN = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f14
 
 
 def robots_folder() -> Path:
-    """Return the folder of added robots: SPLATBOT_ROBOTS, else splatbot/robots in the user's data folder."""
+    """Return the folder of added robots: SPLATBOT_ROBOTS, or splatbot/robots in the user's data folder."""
     chosen = os.environ.get("SPLATBOT_ROBOTS")
     data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
     return Path(chosen) if chosen else data / "splatbot" / "robots"
 
 
 def robot_names() -> list[str]:
-    """List all robots."""
+    """Return the names of all robots."""
     folder = robots_folder()
     added = sorted(path.stem for path in folder.glob("*.json")) if folder.is_dir() else []
     return [*_BUILT_IN, *(name for name in added if name not in _BUILT_IN)]
 
 
 def load_robot(name: str | Path) -> RobotModel:
-    """Load a robot by name, or from a file that :func:`save_robot` wrote.
+    """Load a robot by name, or from a file of :func:`save_robot`.
 
     Raises:
-        InputError: the name is unknown.
-        FormatError: its file is damaged.
+        InputError: no robot has that name.
+        FormatError: the file is damaged.
     """
     if str(name) in _BUILT_IN:
         return _BUILT_IN[str(name)]()
@@ -55,7 +55,7 @@ def load_robot(name: str | Path) -> RobotModel:
 
 
 def save_robot(robot: RobotModel, path: Path) -> None:
-    """Write joints, spheres and the other data of collision checks and planning; not the shapes."""
+    """Write joints, spheres and other inputs of collision checks and planning; the shapes are not saved."""
     spheres = robot.spheres()
     document = {
         "format": _FORMAT,
@@ -82,7 +82,7 @@ def save_robot(robot: RobotModel, path: Path) -> None:
 
 
 def read_robot(path: Path) -> RobotModel:
-    """Read a robot that :func:`save_robot` wrote.
+    """Read a robot from a file of :func:`save_robot`.
 
     Raises:
         FormatError: the file is missing or damaged.

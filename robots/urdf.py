@@ -1,4 +1,4 @@
-"""An arm from a URDF file."""
+"""Reader of an arm from a URDF file."""
 
 from __future__ import annotations
 
@@ -24,20 +24,25 @@ VELOCITY, ACCELERATION_PER_VELOCITY, JERK_PER_VELOCITY = 1.0, 5.0, 50.0  # [rad/
 
 @dataclass(frozen=True)
 class Reading:
-    """Result of reading a file: the robot, and the assumptions for missing data."""
+    """Robot of a URDF file, and the assumptions that replace missing values."""
 
     robot: RobotModel
     notes: tuple[str, ...]
 
 
 def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = SLACK) -> Reading:
-    """Read the serial arm from the root to ``tip`` (by default the link with most moving joints before it).
+    """Read the serial arm from the root to ``tip``.
 
-    Fixed links belong to the arm's link that carries them. Moving joints off the arm (fingers) are held at 0, or at the
-    limit nearest to it. Collision geometry is taken if a link has any, else the visual geometry.
+    Fixed links belong to the link of the arm that carries them. Moving joints outside the arm (fingers) are fixed at
+    the value in their limits that is nearest to 0. Links without collision geometry use their visual geometry.
+
+    Args:
+        path: URDF file.
+        tip: last link of the arm. If None, the link with most moving joints between the root and it.
+        slack: see :class:`splatbot.robots.robot.RobotModel` [m].
 
     Raises:
-        FormatError: the file is no URDF, has no moving joint, or an element cannot be used (it is named).
+        FormatError: the file is no URDF, has no moving joint, or contains an invalid element, which the error names.
     """
     file = Path(path)
     try:
@@ -78,7 +83,7 @@ class _UrdfReader:
                 k, T = placed[self._link(joint, "parent")]
                 T = T @ _origin(joint)
                 if joint not in arm:
-                    placed[child] = (k, T @ self._held(joint))
+                    placed[child] = (k, T @ self._fixed(joint))
                     continue
                 turn = np.eye(4)
                 turn[:3, :3] = _z_to(self._axis(joint))
@@ -137,8 +142,8 @@ class _UrdfReader:
         except InputError as error:
             raise FormatError(error.message, file=self.file, field=name, hint=error.hint) from error
 
-    def _held(self, e: ElementTree.Element) -> Array:
-        """Return the position at which a joint off the arm is held."""
+    def _fixed(self, e: ElementTree.Element) -> Array:
+        """Return the transform (4, 4) of a joint outside the arm."""
         T = np.eye(4)
         if e.get("type") not in _MOVING:
             return T
@@ -194,14 +199,14 @@ class _UrdfReader:
         return Mesh(k, transform_points(T, np.asarray(mesh.vertices) * scale), np.asarray(mesh.triangles, np.int64))
 
     def _resolve(self, name: str, link: str) -> Path:
-        """Resolve a mesh next to the URDF, or of a package:// whose folder is above it."""
+        """Find a mesh relative to the URDF, or in the folder of its package:// above the URDF."""
         if not name.startswith("package://"):
             found = (self.file.parent / name.removeprefix("file://")).resolve()
         else:
             package, _, rest = name.removeprefix("package://").partition("/")
             above = [folder for folder in self.file.resolve().parents if folder.name == package]
-            beside = [folder / package for folder in self.file.resolve().parents if (folder / package).is_dir()]
-            folders = (*above, *beside, *self.file.resolve().parents)  # some packages were renamed since
+            siblings = [folder / package for folder in self.file.resolve().parents if (folder / package).is_dir()]
+            folders = (*above, *siblings, *self.file.resolve().parents)  # for packages in renamed folders
             found = next((f / rest for f in folders if (f / rest).exists()), Path(name))
         if not found.exists():
             raise FormatError(
@@ -210,7 +215,7 @@ class _UrdfReader:
         return found
 
     def _inertials(self, joints: int, placed: dict[str, tuple[int, Array]]) -> tuple[Inertial, ...]:
-        """Return the inertials of the arm's links with all parts fixed to them; empty if a moving link has none."""
+        """Sum the inertias of each link of the arm and its fixed links; empty if a moving link has no mass."""
         mass, first, second = np.zeros(joints + 1), np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3, 3))
         for link, (k, T_link) in placed.items():
             e = self.links[link].find("inertial")
@@ -260,7 +265,7 @@ class _UrdfReader:
 
 
 def _cylinder(k: int, T: Array, radius: float, length: float) -> Shape:
-    """Return a box if it is flatter than a capsule: the capsule around it would be too long by its caps."""
+    """Return a capsule with the cylinder's axis, or the enclosing box if the cylinder is not longer than wide."""
     ends = transform_points(T, np.array([[0, 0, -length / 2], [0, 0, length / 2]]))
     start, end = ends
     if length <= 2 * radius:
@@ -280,7 +285,7 @@ def _origin(e: ElementTree.Element) -> Array:
 
 
 def _z_to(axis: Array) -> Array:
-    """Return the shortest rotation (3, 3) that takes z to a unit vector."""
+    """Return the rotation (3, 3) of smallest angle that maps z to a unit vector."""
     c = float(axis[2])
     if c < -1 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
-from splatbot.robots.graspable_objects import GraspableObjects, measured_map, things_of
+from splatbot.robots.graspable_objects import GraspableObjects, measured_map, segment_objects
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
 from splatbot.services.schemas import Pose
@@ -48,7 +48,7 @@ def objects_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) 
     measured = served.derived.get("measured", lambda: measured_map(served.ready, served.run))
     return served.derived.get(
         ("things", base.tobytes(), as_known),
-        lambda: things_of(measured, base, served.workspace, as_known=as_known),
+        lambda: segment_objects(measured, base, served.workspace, as_known=as_known),
     )
 
 

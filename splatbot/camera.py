@@ -14,8 +14,8 @@ from splatbot.errors import CameraError
 class Camera:
     """Pinhole camera; axes as OpenCV (x right, y down, z forward).
 
-    A point (x, y, z) [m] of the camera frame lands at u = fx·x/z + cx, v = fy·y/z + cy, where integer (u, v) is
-    the centre of a pixel. ``distortion`` are OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty when undistorted.
+    A point (x, y, z) [m] of the camera frame projects to u = fx·x/z + cx, v = fy·y/z + cy. Integer (u, v) is the
+    centre of a pixel. ``distortion`` are OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty when undistorted.
 
     Raises:
         CameraError: an intrinsic is not finite or not positive, or the number of coefficients is unknown.
@@ -54,7 +54,7 @@ class Camera:
         return K
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera delivering images of another size [px]; pixel areas, not centres, scale."""
+        """Return the same camera with images of another size [px]; the scaling maps pixel areas, not pixel centres."""
         sx, sy = width / self.width, height / self.height
         return Camera(
             fx=self.fx * sx,
@@ -67,12 +67,12 @@ class Camera:
         )
 
     def project(self, points_camera: ArrayLike) -> NDArray[np.float64]:
-        """Pixels (..., 2) of points (..., 3) [m] of the camera frame with z > 0; distortion is not applied."""
+        """Project points (..., 3) [m] of the camera frame with z > 0 to pixels (..., 2); distortion is not applied."""
         p = np.asarray(points_camera, dtype=np.float64)
         return np.stack([self.fx * p[..., 0] / p[..., 2] + self.cx, self.fy * p[..., 1] / p[..., 2] + self.cy], -1)
 
     def backproject(self, depth: ArrayLike) -> NDArray[np.float32]:
-        """Points (H, W, 3) [m] of the camera frame of a depth image (H, W) [m]; depth 0 gives the origin.
+        """Backproject to points (H, W, 3) [m] of the camera frame a depth image (H, W) [m]; depth 0 gives the origin.
 
         Raises:
             CameraError: the image is not of this camera's size.

@@ -1,4 +1,4 @@
-"""One tree of errors. Each says what is wrong, where (file, field) and how to mend it."""
+"""Hierarchy of errors. Each error states the problem, its place (file, field) and a fix."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ class SplatbotError(Exception):
     """Base of every error that splatbot raises on purpose.
 
     Args:
-        message: what is wrong, in one sentence.
+        message: the problem, in one sentence.
         file: the file at fault, if there is one.
         field: the field, property, column or argument at fault.
-        hint: what the user can do about it.
+        hint: a fix that the user can apply.
 
-    ``http_status`` is what the service answers, ``exit_code`` what the command line returns and ``code`` the
-    nearest ``moveit_msgs/MoveItErrorCodes`` value (99999 is FAILURE).
+    ``http_status`` is the status code of the service, ``exit_code`` the exit code of the command line. ``code`` is the
+    nearest value of ``moveit_msgs/MoveItErrorCodes``; 99999 is FAILURE.
     """
 
     http_status = 500
@@ -38,7 +38,7 @@ class SplatbotError(Exception):
 
 
 class InputError(SplatbotError):
-    """What the user gave (an argument, a file, a request) cannot be used."""
+    """An input of the user (an argument, a file, a request) cannot be used."""
 
     http_status = 422
     exit_code = 2
@@ -49,7 +49,7 @@ class LogError(InputError):
 
 
 class CameraError(InputError):
-    """Camera intrinsics are missing or make no sense."""
+    """Camera intrinsics are missing or invalid."""
 
 
 class FormatError(InputError):
@@ -61,14 +61,14 @@ class ConfigError(InputError):
 
 
 class ControllerError(SplatbotError):
-    """A controller cannot do what it is asked (CONTROL_FAILED)."""
+    """A controller cannot execute a command (CONTROL_FAILED)."""
 
     http_status = 409
     code = -4
 
 
 class GripperError(ControllerError):
-    """A gripper does not do what it is asked; it was told to stand still as far as it could be told anything."""
+    """A gripper does not execute a command; a stop command was sent to it if it still received commands."""
 
 
 class DeviceError(SplatbotError):
@@ -91,4 +91,4 @@ class NativeError(SplatbotError):
 
 
 class DeprecatedNameWarning(FutureWarning):
-    """A name of an earlier version is in use; it still holds, and the message gives the present name."""
+    """A deprecated name is in use; it still works, and the message contains the current name."""

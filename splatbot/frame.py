@@ -13,7 +13,7 @@ from splatbot.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """What a robot knows of the camera's pose before its image is looked at: joints, wheels, an inertial sensor.
+    """Camera pose or motion that a robot reports for a frame, from joints, wheels or an inertial sensor.
 
     Exactly one of the two poses is given.
 
@@ -59,11 +59,11 @@ class Frame:
             32FC1 convention).
         camera: intrinsics of both images; undistorted.
         index: position in the log.
-        joints: joint positions (n,) [rad] at ``stamp``, where a robot told them.
-        mask: (H, W) bool, True where the pixel may be used; None uses all. What it leaves out (a gripper, the robot's
-            own arm) is neither tracked nor mapped.
-        prior: what is known of the pose already.
-        source: what the frame came from (for messages).
+        joints: joint positions (n,) [rad] at ``stamp``, where a robot reports them.
+        mask: (H, W) bool, True where the pixel may be used; None uses all. Masked pixels (a gripper, the robot's own
+            arm) are neither tracked nor mapped.
+        prior: robot prior of the pose.
+        source: origin of the frame, for messages.
 
     Raises:
         InputError: sizes differ, a type is wrong or depth is negative.

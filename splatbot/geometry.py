@@ -14,13 +14,13 @@ _SMALL_ANGLE = 1e-4
 
 
 def skew(v: ArrayLike) -> Array:
-    """Cross-product matrix (3, 3) of a vector (3,): ``skew(v) @ w == cross(v, w)``."""
+    """Return the cross-product matrix (3, 3) of a vector (3,): ``skew(v) @ w == cross(v, w)``."""
     x, y, z = np.asarray(v, dtype=np.float64)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def so3_exp(omega: ArrayLike) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) [rad] by Rodrigues' formula."""
     w = np.asarray(omega, dtype=np.float64)
     theta = float(np.linalg.norm(w))
     W = skew(w)
@@ -30,9 +30,10 @@ def so3_exp(omega: ArrayLike) -> Array:
 
 
 def so3_log(R: ArrayLike) -> Array:
-    """Rotation vector (3,) [rad] of a rotation matrix (3, 3), norm in [0, π].
+    """Return the rotation vector (3,) [rad] of a rotation matrix (3, 3), with a norm in [0, π].
 
-    Up to a right angle by the skew part, whose length is sin θ; beyond through the quaternion, which is exact near π.
+    Up to a right angle the skew part, of length sin θ, gives the vector. Beyond, the quaternion gives it, which is
+    accurate near π.
     """
     M = np.asarray(R, dtype=np.float64)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = M.tolist()
@@ -45,7 +46,7 @@ def so3_log(R: ArrayLike) -> Array:
 
 
 def se3_exp(xi: ArrayLike) -> Array:
-    """Pose (4, 4) of a twist (6,) = (translation [m], rotation [rad]) (Barfoot 2017, eq. 7.85)."""
+    """Return the pose (4, 4) of a twist (6,) = (translation [m], rotation [rad]) (Barfoot 2017, eq. 7.85)."""
     x = np.asarray(xi, dtype=np.float64)
     T = np.eye(4)
     T[:3, :3] = so3_exp(x[3:])
@@ -54,7 +55,7 @@ def se3_exp(xi: ArrayLike) -> Array:
 
 
 def se3_log(T: ArrayLike) -> Array:
-    """Twist (6,) = (translation [m], rotation [rad]) of a pose (4, 4); inverse of :func:`se3_exp`."""
+    """Return the twist (6,) = (translation [m], rotation [rad]) of a pose (4, 4); inverse of :func:`se3_exp`."""
     M = np.asarray(T, dtype=np.float64)
     omega = so3_log(M[:3, :3])
     return np.concatenate([np.linalg.solve(_left_jacobian(omega), M[:3, 3]), omega])
@@ -71,7 +72,7 @@ def _left_jacobian(omega: Array) -> Array:
 
 
 def inverse(T: ArrayLike) -> Array:
-    """Inverse (4, 4) of a rigid transform (4, 4)."""
+    """Return the inverse (4, 4) of a rigid transform (4, 4)."""
     M = np.asarray(T, dtype=np.float64)
     out = np.eye(4)
     out[:3, :3] = M[:3, :3].T
@@ -80,7 +81,7 @@ def inverse(T: ArrayLike) -> Array:
 
 
 def adjoint(T_a_b: ArrayLike) -> Array:
-    """Matrix (6, 6) that takes a twist (translation, rotation) of frame b to frame a: T exp(ξ) T⁻¹ = exp(Ad ξ)."""
+    """Return the matrix Ad (6, 6) that maps a twist of frame b to frame a: T exp(ξ) T⁻¹ = exp(Ad ξ)."""
     M = np.asarray(T_a_b, dtype=np.float64)
     A = np.zeros((6, 6))
     A[:3, :3] = A[3:, 3:] = M[:3, :3]
@@ -89,13 +90,13 @@ def adjoint(T_a_b: ArrayLike) -> Array:
 
 
 def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
-    """Points (..., 3) [m] of frame b in frame a."""
+    """Transform points (..., 3) [m] of frame b to frame a."""
     M = np.asarray(T_a_b, dtype=np.float64)
     return np.asarray(points_b, dtype=np.float64) @ M[:3, :3].T + M[:3, 3]
 
 
 def look_at(eye: Array, target: Array) -> Array:
-    """T_world_camera (4, 4) at ``eye`` (3,), facing ``target`` (3,) [m], upright: z is up in the world."""
+    """Return T_world_camera (4, 4) of an upright camera (world z is up) at ``eye`` (3,), facing ``target`` (3,) [m]."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -106,7 +107,7 @@ def look_at(eye: Array, target: Array) -> Array:
 
 
 def quat_to_rotation(quat: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz of any positive norm.
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz of any positive norm.
 
     Raises:
         ValueError: a quaternion is zero or not finite.
@@ -129,7 +130,7 @@ def quat_to_rotation(quat: ArrayLike) -> Array:
 
 
 def rotation_to_quat(R: ArrayLike) -> Array:
-    """Quaternions (..., 4) wxyz, w >= 0, of rotation matrices (..., 3, 3) (Shepperd 1978, largest pivot)."""
+    """Return the quaternions (..., 4) wxyz, w >= 0, of rotation matrices (..., 3, 3) (Shepperd 1978, largest pivot)."""
     M = np.asarray(R, dtype=np.float64)
     xx, yy, zz = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
     sums = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], -1)  # 4 q_i²
@@ -151,7 +152,7 @@ def rotation_to_quat(R: ArrayLike) -> Array:
 
 
 def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
-    """Hamilton products (..., 4) wxyz: the rotation ``b``, then ``a``."""
+    """Return the Hamilton products (..., 4) wxyz: the rotation ``b``, then ``a``."""
     p, q = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
     w = pw * qw - np.sum(pv * qv, axis=-1, keepdims=True)
@@ -159,7 +160,7 @@ def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def pose_from_quat(translation: ArrayLike, quat: ArrayLike) -> Array:
-    """Poses (..., 4, 4) of translations (..., 3) [m] and quaternions (..., 4) wxyz."""
+    """Return the poses (..., 4, 4) of translations (..., 3) [m] and quaternions (..., 4) wxyz."""
     t = np.asarray(translation, dtype=np.float64)
     T = np.zeros((*t.shape[:-1], 4, 4))
     T[..., :3, :3] = quat_to_rotation(quat)

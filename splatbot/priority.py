@@ -1,4 +1,4 @@
-"""Who goes first where cores are short: threads of other priorities, and the interpreter that they share."""
+"""Thread priorities on a machine with few cores, and the switch interval of the shared interpreter."""
 
 from __future__ import annotations
 

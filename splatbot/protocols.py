@@ -1,4 +1,4 @@
-"""What the core asks of a robot: kinematics, spheres for its links, a controller, a gripper, a camera."""
+"""Interfaces of a robot to the core: kinematics, spheres of its links, controller, gripper, camera."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class KinematicChain:
-    """A serial arm of J joints. Link 0 is the base; link k moves with joint k - 1. Joints turn about, or move along, z.
+    """Serial arm of J joints. Link 0 is the base; link k moves with joint k - 1. Each joint axis is z of its frame.
 
     Args:
-        names: of the joints.
-        T_before_joint: (J, 4, 4), pose of each joint's frame at 0 in the frame of the link before [m].
-        prismatic: (J,), the others are revolute.
+        names: names of the joints.
+        T_before_joint: (J, 4, 4) pose of each joint's frame at 0 in the frame of the previous link [m].
+        prismatic: (J,), True for a prismatic joint, False for a revolute one.
         lower, upper: (J,) limits [rad or m].
         velocity, acceleration, jerk: (J,) largest magnitudes, in units of lower per s, s² and s³.
         effort: (J,) largest torque [Nm] or force [N].
@@ -45,7 +45,7 @@ class KinematicChain:
 
 @dataclass(frozen=True, eq=False)
 class LinkSpheres:
-    """S spheres that cover an arm, sorted by link.
+    """Cover of an arm by S spheres, sorted by link.
 
     Args:
         link: (S,) int32.
@@ -63,11 +63,11 @@ class LinkSpheres:
 
 @runtime_checkable
 class RobotKinematics(Protocol):
-    """An arm as collision checking and planning see it."""
+    """Kinematics of an arm for collision checks and planning."""
 
     @property
     def name(self) -> str:
-        """As the user calls it."""
+        """Name of the robot."""
         ...
 
     @property
@@ -81,26 +81,26 @@ class RobotKinematics(Protocol):
         ...
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
-        """The spheres with the gripper opened by ``opening`` [m]; None: as wide as it goes."""
+        """Return the spheres with the gripper at ``opening`` [m]. If None, the gripper is fully open."""
         ...
 
 
 @dataclass(frozen=True)
 class HandShape:
-    """Two fingers with flat pads that close on each other, as boxes in the tool's frame whose pads may end round.
+    """Two-finger hand as boxes in the tool frame, with flat pads that face each other and may have rounded ends.
 
-    The hand comes along the tool's z and closes along its y; the tool's origin is between the pads.
+    The hand approaches along z of the tool and closes along y; the origin of the tool is between the pads.
 
     Args:
         stroke: widest opening between the pads [m].
-        width: of a finger along x [m].
-        thickness: of a finger along y, outwards from its pad [m].
-        tip: how far the fingers reach beyond the origin along z [m].
-        pad: how far their pads are flat beyond it, below ``tip`` where the rest is rounded off [m]; may be negative.
-        pad_width: how wide they are flat along x [m]; 0 of round fingers.
-        palm: how far behind the origin the palm is [m].
-        palm_size: of the palm along x and y [m].
-        force: between the fingers [N].
+        width: width of a finger along x [m].
+        thickness: thickness of a finger along y, outwards from its pad [m].
+        tip: z of the finger tips [m].
+        pad: z of the end of the flat part of the pads [m], below ``tip`` if the tips are rounded; may be negative.
+        pad_width: width of the flat part along x [m]; 0 for round fingers.
+        palm: distance of the palm behind the origin [m].
+        palm_size: size of the palm along x and y [m].
+        force: force between the fingers [N].
     """
 
     stroke: float
@@ -116,21 +116,21 @@ class HandShape:
 
 @runtime_checkable
 class HasHand(Protocol):
-    """A robot that can take hold of things."""
+    """A robot that can grasp objects."""
 
     @property
     def hand(self) -> HandShape | None:
-        """Its fingers; None: it has none."""
+        """Fingers of the robot, or None."""
         ...
 
     @property
     def T_link_tcp(self) -> Array:
-        """(4, 4), the tool's frame on the last link."""
+        """Pose (4, 4) of the tool on the last link [m]."""
         ...
 
 
 class MotionState(StrEnum):
-    """What a controller is doing."""
+    """State of a controller."""
 
     IDLE = "idle"
     MOVING = "moving"
@@ -141,14 +141,14 @@ class MotionState(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """What a controller tells of itself at one period.
+    """Feedback of a controller at one period.
 
     Args:
-        time: since the trajectory began [s].
-        position, velocity: (J,) measured [rad or m, and per s].
-        desired: (J,) where the trajectory has it.
-        state: what it is doing.
-        fault: why it stands still, if it is at fault.
+        time: time since the start of the trajectory [s].
+        position, velocity: (J,) measured values [rad or m, and per s].
+        desired: (J,) position of the trajectory [rad or m].
+        state: state of the controller.
+        fault: cause of a fault; empty without a fault.
     """
 
     time: float
@@ -160,20 +160,20 @@ class Feedback:
 
     @property
     def error(self) -> float:
-        """The largest difference between measured and desired [rad or m]."""
+        """Largest absolute difference between measured and desired position [rad or m]."""
         return float(np.abs(self.position - self.desired).max())
 
 
 class TimedPath(Protocol):
-    """What a controller follows: a curve in joint space with its time."""
+    """A curve in joint space over time, which a controller follows."""
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         ...
 
     def reference(self, t: float) -> tuple[Array, Array]:
-        """Position and velocity (J,) at a time [s] since the start; at rest at the ends before and after."""
+        """Return position and velocity (J,) at a time [s] since the start; outside, the arm rests at an end."""
         ...
 
 
@@ -181,12 +181,12 @@ class TimedPath(Protocol):
 class Controller(Protocol):
     """An arm that follows trajectories: a driver, a twin, a recording, or a fake.
 
-    Time passes by :meth:`step`, one period at a time; a driver's waits for its robot's.
+    Each :meth:`step` advances the time by one period; a driver waits for the period of its robot.
     """
 
     @property
     def period(self) -> float:
-        """Between two steps [s]."""
+        """Control period [s]."""
         ...
 
     def send(self, trajectory: TimedPath) -> None:
@@ -202,7 +202,7 @@ class Controller(Protocol):
         ...
 
     def stop(self) -> None:
-        """Come to rest; told at the latest by the next step."""
+        """Stop the arm; the command takes effect at the next step at the latest."""
         ...
 
     def reset(self) -> None:
@@ -220,42 +220,42 @@ class Gripper(Protocol):
         ...
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Go towards an opening [m], with at most a force [N] and a speed [m/s] of the opening."""
+        """Move towards an opening [m], with at most a force [N] and a speed [m/s] of the opening."""
         ...
 
     def moving(self) -> bool:
-        """Whether the fingers are still on their way."""
+        """Return whether the fingers move."""
         ...
 
     def opening(self) -> float:
-        """Between the fingers now [m]."""
+        """Return the distance between the fingers [m]."""
         ...
 
     def holds(self) -> bool:
-        """Whether something keeps the fingers from the opening that they were sent to."""
+        """Return whether an object keeps the fingers from the commanded opening."""
         ...
 
     def stop(self) -> None:
-        """Stay where they are."""
+        """Stop the fingers."""
         ...
 
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """A camera that runs by itself: frames come at their times and are lost when nobody takes them."""
+    """A free-running camera: frames arrive at their times and are dropped if no client reads them."""
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Display name."""
         ...
 
     @property
     def uri(self) -> str:
-        """What it is opened by."""
+        """URI that opens the camera."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames from now on.
+        """Yield frames from now on.
 
         Raises:
             DeviceError: the device is gone.

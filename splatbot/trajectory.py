@@ -74,6 +74,6 @@ class Trajectory:
         return self.T_world_camera[:, :3, 3]
 
     def select(self, index: ArrayLike) -> Trajectory:
-        """The poses that ``index`` (a mask (N,) or increasing indices) names."""
+        """Return the poses at ``index``, a mask (N,) or increasing indices."""
         rows = np.asarray(index)
         return Trajectory(self.stamps[rows], self.T_world_camera[rows])

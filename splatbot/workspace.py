@@ -1,4 +1,4 @@
-"""Where a robot works in a map: `scene.yaml` beside a map or in a log's folder, read, written and estimated."""
+"""Workspace of a robot in a map: `scene.yaml` next to a map or in a log's folder, read, written and estimated."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
 _KEYS = ("T_world_base", "gravity", "support_plane", "workspace", "T_link_camera", "camera_link", "objects")
-_TRIALS = 4000  # planes tried; one triple in a thousand is of a plane that holds a tenth of the points
-_THICK = 0.01  # [m] that a plane's points may be off it
-_UPRIGHT = 6  # power of the cosine of a plane's lean that its points are weighed by
-AHEAD = 0.55  # [m] from a robot's base to what it works on
-_HEIGHT = 0.8  # [m] of the workspace over the plane
+_RANSAC_TRIALS = 4000  # a plane with a tenth of the points is hit by one triple in a thousand
+_INLIER_DISTANCE = 0.01  # [m] largest distance of an inlier from its plane
+_TILT_EXPONENT = 6  # exponent of the cosine of a plane's tilt, which weights its inliers
+AHEAD = 0.55  # [m] from the base of a robot to the middle of its workspace
+_HEIGHT = 0.8  # [m] height of the workspace above the plane
 
 
 @dataclass(frozen=True, eq=False)
 class NamedPlace:
-    """What things at a place are called.
+    """Name of an object in the map.
 
     Args:
-        name: of the thing.
-        at: (3,) a point in or on it [m, world].
+        name: name of the object.
+        at: (3,) point in or on the object [m, world].
         aliases: other names.
     """
 
@@ -43,19 +43,21 @@ class NamedPlace:
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """What a map alone does not say. World is the map's: its first camera, unless the map came from elsewhere.
+    """Description of the scene in addition to the map. The world frame is the map's, usually its first camera.
+
+    Unknown fields have the value None.
 
     Args:
-        T_world_base: (4, 4) pose of the robot's base, z up; None: not known.
-        gravity: (3,) unit vector downwards; None: not known.
-        support_plane: (4,) = (n, d): the surface that things stand on is n · p + d = 0, n a unit vector upwards; None.
-        box: (2, 3) corners of the space to work in [m], in the base's frame; None.
-        T_link_camera: (4, 4) where the camera is on the link that carries it; None: not known.
-        camera_link: that link; -1: the last one, 0: the base, for a camera that stands beside the robot.
-        objects: names of things, for whoever asks for them by name.
+        T_world_base: (4, 4) pose of the robot's base, with z up [m].
+        gravity: (3,) unit vector downwards in the world.
+        support_plane: (4,) = (n, d), the support surface n · p + d = 0 with the upward unit normal n [m].
+        box: (2, 3) low and high corners of the workspace in the frame of the base [m].
+        T_link_camera: (4, 4) pose of the camera on its link [m].
+        camera_link: index of the link that carries the camera; -1 is the last one, 0 the base.
+        objects: named objects.
 
     Raises:
-        InputError: a value is of another shape, not finite, no rigid pose, no direction, or an empty box.
+        InputError: a value has a wrong shape, is not finite, or is no rigid pose, no unit vector or an empty box.
     """
 
     T_world_base: Array | None = None
@@ -87,10 +89,10 @@ class Workspace:
 
     @classmethod
     def load(cls, path: str | Path) -> Workspace:
-        """From a YAML file.
+        """Load a YAML file.
 
         Raises:
-            FormatError: it cannot be read, or a field is unknown or makes no sense.
+            FormatError: the file cannot be read, or a field is unknown or invalid.
         """
         try:
             found = yaml.safe_load(Path(path).read_text())
@@ -113,7 +115,7 @@ class Workspace:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
 
     def save(self, path: str | Path) -> None:
-        """As YAML; what is not known is left out."""
+        """Write a YAML file; unknown fields are omitted."""
         document: dict[str, Any] = {}
         for key, T in (("T_world_base", self.T_world_base), ("T_link_camera", self.T_link_camera)):
             if T is not None:
@@ -134,10 +136,10 @@ class Workspace:
 
 
 def find_workspace(*places: str | Path | None) -> Workspace | None:
-    """The first ``scene.yaml`` in a folder, or beside a file, of those named; None if there is none.
+    """Return the first ``scene.yaml`` in the given folders or next to the given files, or None.
 
     Raises:
-        FormatError: it is damaged.
+        FormatError: the file is damaged.
     """
     for place in places:
         if place is None:
@@ -150,18 +152,19 @@ def find_workspace(*places: str | Path | None) -> Workspace | None:
 
 
 def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), seed: int = 0) -> Workspace:
-    """The widest upward surface below the first camera by RANSAC (Fischler and Bolles 1981), a base and a box on it.
+    """Estimate the support plane below the first camera, and propose a base and a workspace on it.
 
-    Of two planes the one that leans less from ``up`` counts for more. The base is proposed 55 cm from the middle of the
-    surface on the camera's side, x towards the middle. Both are estimates to be corrected by hand.
+    RANSAC (Fischler and Bolles 1981) maximizes ``inliers · (n · up)⁶`` over planes of normal n; least squares refine
+    the plane. The base is 55 cm from the middle of the plane's inliers on the camera's side, with x towards the middle.
+    These are estimates for correction by hand.
 
     Args:
-        model: a map whose world is its first camera.
-        up: (3,) roughly upwards in it; -y is right for a camera that looks ahead, -z for one that looks straight down.
-        seed: of what is tried.
+        model: a map whose world frame is its first camera.
+        up: (3,) approximate upward direction: -y for a camera that looks ahead, -z for one that looks straight down.
+        seed: seed of the RANSAC samples.
 
     Raises:
-        InputError: fewer than 100 Gaussians, no direction, or no plane holds a twentieth of them.
+        InputError: the map has fewer than 100 Gaussians, ``up`` is no direction, or no plane has 5 % of the Gaussians.
     """
     points = model.means.double().numpy()
     upward = np.asarray(up, dtype=np.float64)
@@ -172,28 +175,28 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
         raise InputError(f"has {len(points)} Gaussians.", field="map", hint="map a log with a table or a floor in view")
     rng = np.random.default_rng(seed)
     some = points[rng.choice(len(points), min(len(points), 4000), replace=False)]
-    best, most, count = np.zeros(4), 0.0, 0
-    for trio in rng.integers(0, len(some), (_TRIALS, 3)):
+    best, best_score, count = np.zeros(4), 0.0, 0
+    for trio in rng.integers(0, len(some), (_RANSAC_TRIALS, 3)):
         a, b, c = some[trio]
         plane = _through(np.cross(b - a, c - a), a, upward)
         if plane is None or plane[3] <= 0.0:
             continue
-        held = int((np.abs(some @ plane[:3] + plane[3]) < _THICK).sum())
-        weight = held * float(plane[:3] @ upward) ** _UPRIGHT
-        if weight > most:
-            best, most, count = plane, weight, held
+        inliers = int((np.abs(some @ plane[:3] + plane[3]) < _INLIER_DISTANCE).sum())
+        score = inliers * float(plane[:3] @ upward) ** _TILT_EXPONENT
+        if score > best_score:
+            best, best_score, count = plane, score, inliers
     if count < len(some) / 20:
         raise InputError("has no upward surface.", field="map", hint="write scene.yaml by hand")
-    for _ in range(5):  # least squares on what it holds
-        on = points[np.abs(points @ best[:3] + best[3]) < _THICK]
+    for _ in range(5):  # least squares on the inliers
+        on = points[np.abs(points @ best[:3] + best[3]) < _INLIER_DISTANCE]
         middle = on.mean(axis=0)
         refined = _through(np.linalg.svd(on - middle, full_matrices=False)[2][2], middle, upward)
         best = best if refined is None else refined
-    return _around(best, points[np.abs(points @ best[:3] + best[3]) < _THICK])
+    return _around(best, points[np.abs(points @ best[:3] + best[3]) < _INLIER_DISTANCE])
 
 
 def _through(normal: Array, point: Array, up: Array) -> Array | None:
-    """The plane (4,) through a point, its normal turned upwards; None of three in a row."""
+    """Return the plane (4,) through a point with its normal upwards, or None for collinear points."""
     length = float(np.linalg.norm(normal))
     if length < 1e-9:
         return None
@@ -218,9 +221,9 @@ def _around(plane: Array, on: Array) -> Workspace:
     return Workspace(T, -up, plane, box)
 
 
-def _check(name: str, value: Array | None, shape: tuple[int, ...], what: str) -> None:
+def _check(name: str, value: Array | None, shape: tuple[int, ...], meaning: str) -> None:
     if value is not None and (value.shape != shape or not np.isfinite(value).all()):
-        raise InputError(f"is {value.shape}, or not finite.", field=name, hint=f"give {what}, {shape}")
+        raise InputError(f"is {value.shape}, or not finite.", field=name, hint=f"give {meaning}, {shape}")
 
 
 def _pose(found: dict[str, Any], key: str) -> Array | None:
@@ -231,7 +234,7 @@ def _pose(found: dict[str, Any], key: str) -> Array | None:
         raise InputError("is no pose.", field=key, hint="give translation and quaternion_wxyz")
     translation, quat = _array(value["translation"], "translation"), _array(value["quaternion_wxyz"], "quaternion")
     if translation is None or quat is None or translation.shape != (3,) or quat.shape != (4,):
-        raise InputError("makes no sense.", field=key, hint="give 3 and 4 numbers")
+        raise InputError("has a wrong shape.", field=key, hint="give 3 and 4 numbers")
     try:
         return pose_from_quat(translation, quat)
     except ValueError as error:
@@ -241,18 +244,18 @@ def _pose(found: dict[str, Any], key: str) -> Array | None:
 def _places(value: Any) -> tuple[NamedPlace, ...]:
     if value is None:
         return ()
-    hint = "list things as - {name: cup, at: [x, y, z], aliases: [mug]}"
-    if not isinstance(value, list) or not all(isinstance(thing, dict) for thing in value):
-        raise InputError("is no list of things.", field="objects", hint=hint)
+    hint = "list objects as - {name: cup, at: [x, y, z], aliases: [mug]}"
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise InputError("is no list of objects.", field="objects", hint=hint)
     found = []
-    for thing in value:
-        at, aliases = _array(thing.get("at"), "objects: at"), thing.get("aliases", [])
-        words = [thing.get("name"), *(aliases if isinstance(aliases, list) else [None])]
-        if set(thing) - {"name", "at", "aliases"} or not all(isinstance(word, str) and word for word in words):
-            raise InputError(f"has {thing}.", field="objects", hint=hint)
+    for entry in value:
+        at, aliases = _array(entry.get("at"), "objects: at"), entry.get("aliases", [])
+        words = [entry.get("name"), *(aliases if isinstance(aliases, list) else [None])]
+        if set(entry) - {"name", "at", "aliases"} or not all(isinstance(word, str) and word for word in words):
+            raise InputError(f"has {entry}.", field="objects", hint=hint)
         if at is None or at.shape != (3,) or not np.isfinite(at).all():
-            raise InputError(f"{thing['name']} is nowhere.", field="objects", hint=hint)
-        found.append(NamedPlace(thing["name"], at, tuple(words[1:])))
+            raise InputError(f"{entry['name']} has no valid position.", field="objects", hint=hint)
+        found.append(NamedPlace(entry["name"], at, tuple(words[1:])))
     return tuple(found)
 
 
@@ -262,7 +265,7 @@ def _array(value: Any, name: str) -> Array | None:
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"holds what is no number ({error}).", field=name, hint="give numbers") from error
+        raise InputError(f"holds a value that is no number ({error}).", field=name, hint="give numbers") from error
 
 
 def _plain(values: Array, digits: int = 6) -> Any:

@@ -1,4 +1,4 @@
-"""Cameras that deliver frames as they are taken."""
+"""Cameras that deliver frames in real time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ __all__ = ["ReplayCamera", "is_camera", "open_camera"]
 
 
 def is_camera(uri: str) -> bool:
-    """Return True if a name is that of a camera, not of a preset or a file."""
+    """Return whether a URI names a camera, not a preset or a file."""
     return uri.startswith(PREFIX)
 
 
 def open_camera(uri: str) -> FrameSource:
-    """Open the camera that ``uri`` names; it starts with the first requested frame.
+    """Open the camera at ``uri``; it starts when its frames are iterated.
 
     Raises:
-        InputError: there is no such kind of camera, or an option makes no sense.
+        InputError: the kind of camera is unknown, or an option is invalid.
     """
     if not is_camera(uri):
         raise InputError(f"{uri!r} is unknown.", field="camera", hint=f"name one as in {PREFIX}recordings/desk")

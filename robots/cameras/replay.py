@@ -1,4 +1,4 @@
-"""A recording that behaves as a camera: frames at their times, dropped without a reader, and a device's faults."""
+"""A recording that behaves as a camera: frames at their times, dropped if the reader is slow, with device faults."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
 
 PREFIX = "replay:"
-_QUEUE = 4  # frames that a driver holds for a slow reader, as depthai's queues do
+_QUEUE = 4  # frames that a driver buffers for a slow reader, the default of depthai's queues
 _END = object()
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How a recording is played; the faults count frames from 0 at the first.
+    """Options of a replay; frames are counted from 0.
 
     Args:
-        speed: 2 plays twice as fast; stamps stay the recording's.
-        loop: restart at the end; stamps continue to increase.
-        stall: the frame before which nothing comes for ``stall_s``; -1: never.
-        stall_s: how long [s].
-        drop: the share of frames that the device loses, 0 to 1.
-        corrupt: the share of frames whose transfer breaks off: the lower half is noise.
-        unplug: the frame instead of which the device is gone; -1: never.
-        fault_seed: of which frames are lost and broken.
+        speed: playback speed; 2 plays twice as fast. The stamps do not change.
+        loop: start again at the end; stamps continue to increase.
+        stall: index of the frame that is delayed by ``stall_s``, -1 for never.
+        stall_s: delay [s].
+        drop: fraction of frames that the device loses, 0..1.
+        corrupt: fraction of frames whose transfer is interrupted, so that the lower half is noise.
+        unplug: index of the frame at which the device disconnects, -1 for never.
+        fault_seed: seed of the dropped and corrupted frames.
     """
 
     speed: float = 1.0
@@ -80,7 +80,7 @@ class ReplayCamera:
 
     @classmethod
     def from_uri(cls, uri: str) -> ReplayCamera:
-        """Open the camera of `replay:LOG?speed=2&loop=1&...`; other options belong to the log.
+        """Open the camera of `replay:LOG?speed=2&loop=1&...`; other options are passed to the log.
 
         Raises:
             InputError: an option is no number or out of range.
@@ -99,7 +99,7 @@ class ReplayCamera:
         return cls(open_log(log + (f"?{own}" if own else "")), ReplayOptions(**values))
 
     def close(self) -> None:
-        """End the stream; a waiting reader receives no frame."""
+        """End the stream; a waiting reader receives no further frame."""
         self._closed.set()
         with self._changed:
             self._changed.notify_all()
@@ -134,7 +134,7 @@ class ReplayCamera:
             self._deliver(error)
 
     def _frames(self) -> Iterator[tuple[int, Frame]]:
-        """Yield frames at their times, numbered over all rounds, until the camera is closed."""
+        """Yield frames at their times, numbered over all loops, until the camera is closed."""
         number, offset, late = 0, 0.0, 0.0
         begun: tuple[float, float] | None = None
         while True:
@@ -162,7 +162,7 @@ class ReplayCamera:
             self._changed.notify_all()
 
     def _damaged(self, frame: Frame) -> Frame:
-        """Return the frame as an interrupted transfer leaves it."""
+        """Replace the lower half of a frame by noise, as an interrupted transfer does."""
         rgb, depth, half = frame.rgb.copy(), frame.depth.copy(), frame.rgb.shape[0] // 2
         rgb[half:] = self._rng.integers(0, 256, rgb[half:].shape, dtype=np.uint8)
         depth[half:] = self._rng.uniform(0, 10, depth[half:].shape)

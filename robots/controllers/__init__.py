@@ -1,4 +1,4 @@
-"""Controllers without hardware: one follows its commands, the other a recorded motion."""
+"""Controllers without hardware: one follows its trajectory, one replays a recording."""
 
 from splatbot.robots.controllers.fake import FakeController
 from splatbot.robots.controllers.recorded import JointRecording, RecordedController

@@ -7,17 +7,17 @@ import numpy as np
 from splatbot.errors import ControllerError, InputError
 from splatbot.protocols import Array, Feedback, MotionState, TimedPath
 
-AT_START = 0.01  # [rad or m]; an arm farther than this from where a trajectory begins does not follow it
-FOLLOWING = 0.05  # [rad or m]; an arm farther than this from where it should be is at fault
+AT_START = 0.01  # [rad or m] largest distance of the arm from the start of a trajectory that it accepts
+FOLLOWING = 0.05  # [rad or m] largest tracking error before a fault
 
 
 class SteppedController:
-    """A :class:`splatbot.protocols.Controller` whose motion a subclass makes.
+    """A :class:`splatbot.protocols.Controller` whose motion a subclass defines.
 
     Args:
-        position: (J,) where the arm is.
-        period: [s]
-        following: largest tracking error; beyond it the controller faults and stops.
+        position: (J,) position of the arm [rad or m].
+        period: control period [s].
+        following: largest tracking error before a fault [rad or m].
 
     Raises:
         InputError: the period or ``following`` is not above 0.
@@ -37,17 +37,17 @@ class SteppedController:
 
     @property
     def period(self) -> float:
-        """Between two steps [s]."""
+        """Control period [s]."""
         return self._period
 
     @property
     def position(self) -> Array:
-        """Where the arm is (J,)."""
+        """Position (J,) of the arm [rad or m]."""
         return self._position.copy()
 
     @property
     def state(self) -> MotionState:
-        """State of the controller."""
+        """State of the motion."""
         return self._state
 
     def send(self, trajectory: TimedPath) -> None:
@@ -63,10 +63,10 @@ class SteppedController:
         start = trajectory.reference(0.0)[0]
         if start.shape != self._position.shape:
             raise ControllerError(f"has {start.size} joints, not {self._position.size}.", field="trajectory")
-        off = float(np.abs(start - self._position).max())
-        if not off <= AT_START:
+        distance = float(np.abs(start - self._position).max())
+        if not distance <= AT_START:
             hint = "plan from where the arm is"
-            raise ControllerError(f"begins {off:.4f} from where the arm is.", field="trajectory", hint=hint)
+            raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="trajectory", hint=hint)
         self._trajectory, self._time, self._stopping = trajectory, 0.0, False
         self._state = MotionState.MOVING
 
@@ -85,10 +85,10 @@ class SteppedController:
         """Stop at the next step."""
         self._stopping = True
 
-    def fault(self, why: str) -> None:
-        """Fault until :meth:`reset`, as after an emergency stop."""
+    def fault(self, reason: str) -> None:
+        """Stop until :meth:`reset`, as after an emergency stop."""
         self._rest(MotionState.FAULT)
-        self._fault = why
+        self._fault = reason
 
     def reset(self) -> None:
         """Clear a fault; the arm stays where it is."""
@@ -112,5 +112,5 @@ class SteppedController:
         self._state, self._stopping = state, False
 
     def _moved(self, t: float, desired: Array, velocity: Array) -> Array:
-        """Return the positions (J,) of the arm at time ``t`` [s]."""
+        """Return the position (J,) of the arm at time ``t`` [s]."""
         raise NotImplementedError

@@ -11,15 +11,15 @@ from splatbot.robots.controllers.base import FOLLOWING, SteppedController
 
 
 class FakeController(SteppedController):
-    """A first-order lag behind the trajectory, with noise in its measurements.
+    """A first-order lag behind the trajectory, with noise in the measured positions.
 
     Args:
-        position: (J,) where the arm is.
-        period: [s]
-        lag: time constant [s]; 0: exactly on the trajectory.
-        noise: standard deviation [rad or m].
+        position: (J,) position of the arm [rad or m].
+        period: control period [s].
+        lag: time constant [s]; 0 follows the trajectory exactly.
+        noise: standard deviation of a measured position [rad or m].
         following: see :class:`SteppedController`.
-        seed: of the noise.
+        seed: seed of the noise.
 
     Raises:
         InputError: a value is out of range.

@@ -1,4 +1,4 @@
-"""A controller whose arm follows a recording of joints and ignores its commands."""
+"""A controller whose arm replays recorded joint positions, independent of the trajectory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class JointRecording:
     Args:
         stamps: (N,) [s], increasing.
         positions: (N, J) [rad or m].
-        source: their source, for messages.
+        source: origin of the recording, for messages.
 
     Raises:
         LogError: fewer than two samples, stamps that do not increase, or a value that is not finite.
@@ -41,7 +41,7 @@ class JointRecording:
 
     @classmethod
     def load(cls, path: str | Path) -> JointRecording:
-        """From CSV: a column ``time`` [s] and one ``position.NAME`` for each joint, as ``Trajectory.to_csv`` has it.
+        """Load CSV in the format of ``Trajectory.to_csv``: columns ``time`` [s] and ``position.NAME`` of each joint.
 
         Raises:
             LogError: a column is missing, or a value is no number.
@@ -52,17 +52,17 @@ class JointRecording:
         columns = [i for i, name in enumerate(header) if name.startswith("position.")]
         if "time" not in header or not columns:
             hint = "give a column time and one position.NAME for each joint"
-            raise LogError("has not the columns.", file=path, field="header", hint=hint)
+            raise LogError("lacks columns.", file=path, field="header", hint=hint)
         try:
             table = np.array([[float(row[i]) for i in (header.index("time"), *columns)] for row in rows[1:]])
         except (ValueError, IndexError) as error:
-            raise LogError(f"holds a value that is not a number ({error}).", file=path, field="rows") from error
+            raise LogError(f"holds a value that is no number ({error}).", file=path, field="rows") from error
         if table.ndim != 2:
             raise LogError("is empty.", file=path, field="rows")
         return cls(table[:, 0] - table[0, 0], table[:, 1:], str(path))
 
     def at(self, t: float) -> Array:
-        """Return the positions (J,) at a time [s] since its start, interpolated; the last one after its end."""
+        """Interpolate the positions (J,) at a time [s] since the start; after the end the last one holds."""
         return np.array([np.interp(t, self.stamps, column) for column in self.positions.T])
 
 
@@ -70,8 +70,8 @@ class RecordedController(SteppedController):
     """Replays the recorded motion of an arm with its errors, delays and stops.
 
     Args:
-        recording: motion that it performs once a trajectory is sent.
-        period: [s]
+        recording: motion that begins when a trajectory is sent.
+        period: control period [s].
         following: see :class:`SteppedController`.
     """
 

@@ -1,4 +1,4 @@
-"""Checks of a gripper move."""
+"""Checks of gripper commands."""
 
 from __future__ import annotations
 

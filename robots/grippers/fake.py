@@ -1,4 +1,4 @@
-"""A gripper that opens and closes at once, around an object of a given width if there is one."""
+"""A gripper that opens and closes instantly, optionally around an object of a given width."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class FakeGripper:
 
     Args:
         stroke: widest opening [m].
-        width: of the object between the fingers [m]; 0 without an object.
+        width: width of the object between the fingers [m]; 0 for no object.
 
     Raises:
         InputError: the width does not fit between the fingers.
@@ -21,7 +21,7 @@ class FakeGripper:
         if not 0.0 <= width <= stroke:
             raise InputError(f"is {width}.", field="width", hint=f"give 0..{stroke:g} m")
         self._stroke, self.width = stroke, width
-        self._opening = self._wanted = stroke
+        self._opening = self._target = stroke
 
     @property
     def stroke(self) -> float:
@@ -29,17 +29,17 @@ class FakeGripper:
         return self._stroke
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Move to an opening [m], or until the fingers meet an object.
+        """Move to an opening [m], or to contact with the object.
 
         Raises:
             InputError: a value is out of range.
         """
         check_move(self._stroke, opening, force, speed)
-        self._wanted = opening
+        self._target = opening
         self._opening = max(opening, self.width)
 
     def moving(self) -> bool:
-        """Return False: the fingers arrive at once."""
+        """Return False, because motions are instantaneous."""
         return False
 
     def opening(self) -> float:
@@ -47,9 +47,9 @@ class FakeGripper:
         return self._opening
 
     def holds(self) -> bool:
-        """Return True if an object between the fingers keeps them apart."""
-        return self._opening > self._wanted
+        """Return whether the object stops the fingers."""
+        return self._opening > self._target
 
     def stop(self) -> None:
-        """Stay."""
-        self._wanted = self._opening
+        """Keep the present opening."""
+        self._target = self._opening

@@ -1,4 +1,4 @@
-"""A gripper that is not there: a Robotiq 2F on a pseudo-terminal, byte for byte, with the faults of real lines."""
+"""Emulator of a Robotiq 2F gripper on a pseudo-terminal, byte for byte, with the faults of serial lines."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _HOLDING_CURRENT = 100  # [mA]
 
 @dataclass
 class LineFaults:
-    """Faults of the line; they may change at any time.
+    """Faults of the serial line; they may be changed at any time.
 
     Args:
-        drop: share of bytes that are lost, either way.
-        flip: share of bytes with one wrong bit.
-        half: share of answers that break off in the middle.
-        delay: before each answer [s].
-        silent: nothing is answered.
+        drop: fraction of lost bytes in both directions.
+        flip: fraction of bytes with one wrong bit.
+        half: fraction of responses that end in the middle.
+        delay: delay before each response [s].
+        silent: True suppresses all responses.
     """
 
     drop: float = 0.0
@@ -43,15 +43,15 @@ class LineFaults:
 
 
 class FakeRobotiq:
-    """A gripper whose fingers move at their speed, stop at an object, and answer on the serial port ``port``.
+    """Gripper whose fingers move at their speed, stop at an object, and respond on the serial port ``port``.
 
     Args:
         model: "2f-85" or "2f-140".
-        width: of the object between the fingers [m]; 0 without an object. May be changed at any time.
-        faults: of the line.
-        hurry: how many times faster it moves than a real one; may be changed at any time.
-        device: its Modbus number.
-        seed: of the faults.
+        width: width of the object between the fingers [m], 0 for no object. May be changed at any time.
+        faults: faults of the line.
+        hurry: speed relative to a real gripper; may be changed at any time.
+        device: Modbus address.
+        seed: seed of the faults.
 
     Raises:
         InputError: the model is unknown.
@@ -72,11 +72,11 @@ class FakeRobotiq:
         self.model, self.hurry, self._device = MODELS[model], hurry, device
         self.width, self.faults = width, faults if faults is not None else LineFaults()
         self.fault = 0  # gFLT that it reports until it is reset
-        self.requests: list[bytes] = []  # that arrived whole
+        self.requests: list[bytes] = []  # complete requests
         self._rng = np.random.default_rng(seed)
         self._command = Command(activate=False, go=False)
         self._position = float(self.model.open_at)
-        self._ready_at: float | None = None  # None before activation
+        self._ready_at: float | None = None  # None without activation
         self._stopped = Fingers.THERE
         self._last = time.monotonic()
         self._master, self._slave = pty.openpty()
@@ -94,11 +94,11 @@ class FakeRobotiq:
 
     @property
     def commanded(self) -> Command:
-        """The last command."""
+        """Last command."""
         return self._command
 
     def unplug(self) -> None:
-        """Remove the port permanently."""
+        """Close the port permanently."""
         if self._plugged:
             self._plugged = False
             self._thread.join()
@@ -167,7 +167,7 @@ class FakeRobotiq:
         return self._ready_at is not None and time.monotonic() >= self._ready_at
 
     def _advance(self) -> None:
-        """Move the fingers to where they are by now."""
+        """Advance the fingers to the present time."""
         now = time.monotonic()
         passed, self._last = now - self._last, now
         if not (self._command.go and self._ready) or self.fault:
@@ -199,7 +199,7 @@ class FakeRobotiq:
         )
 
     def _through(self, data: bytes) -> bytes:
-        """Return the bytes that the line delivers."""
+        """Apply the faults of the line to bytes."""
         if not (self.faults.drop or self.faults.flip):
             return data
         kept = [byte for byte in data if self._rng.random() >= self.faults.drop]
@@ -207,7 +207,7 @@ class FakeRobotiq:
 
 
 def _request_length(data: bytes) -> int:
-    """Return the length of a request with this beginning."""
+    """Return the length of a request from its first bytes."""
     if len(data) < 7:
         return 8
     return 9 + data[6] if data[1] == WRITE else 8

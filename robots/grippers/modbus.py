@@ -1,4 +1,4 @@
-"""Modbus RTU over a serial line: frames, their checksum, and exchanges that end, one way or another."""
+"""Modbus RTU over a serial line: frames, checksums, and exchanges with time-outs and retries."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class NoAnswerError(GripperError):
-    """The device gave no valid answer within the allowed number of requests (TIMED_OUT)."""
+    """The device sends no valid response within all retries (TIMED_OUT)."""
 
     code = -6
 
@@ -34,7 +34,7 @@ class LineError(GripperError):
 
 
 class RefusedError(GripperError):
-    """The device understood, and refused."""
+    """The device refuses a request with a Modbus exception."""
 
 
 class FramingError(Exception):
@@ -42,7 +42,7 @@ class FramingError(Exception):
 
 
 def crc16(data: bytes) -> int:
-    """Return the Modbus checksum: reflected polynomial 0xA001 from 0xFFFF (Modbus over Serial Line V1.02, 6.2.2)."""
+    """Compute the Modbus checksum: polynomial 0xA001 reflected, from 0xFFFF (Modbus over Serial Line V1.02, 6.2.2)."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
@@ -52,15 +52,15 @@ def crc16(data: bytes) -> int:
 
 
 def framed(body: bytes) -> bytes:
-    """Frame device, function and data with their checksum, low byte first."""
+    """Append the checksum, low byte first, to device, function and data."""
     return body + struct.pack("<H", crc16(body))
 
 
 def unframed(frame: bytes) -> bytes:
-    """Return the arguments of :func:`framed` for a frame.
+    """Remove the checksum that :func:`framed` appends.
 
     Raises:
-        FrameError: the checksum is wrong or missing.
+        FramingError: the checksum is wrong or missing.
     """
     if len(frame) < 4 or framed(frame[:-2]) != frame:
         raise FramingError(f"a wrong checksum in {frame.hex(' ')}")
@@ -68,7 +68,7 @@ def unframed(frame: bytes) -> bytes:
 
 
 def open_line(port: str, *, timeout: float) -> Any:
-    """Open a serial port at 115200 8N1, for this process alone.
+    """Open a serial port at 115200 8N1 exclusively.
 
     Raises:
         LineError: it cannot be opened.
@@ -81,12 +81,12 @@ def open_line(port: str, *, timeout: float) -> Any:
 
 
 class ModbusClient:
-    """Queries one device on a line. Every exchange ends within (retries + 1) · 4 time-outs.
+    """Client of one device on a line. Every exchange ends within (retries + 1) · 4 time-outs.
 
     Args:
         line: an open ``serial.Serial`` with a time-out [s].
-        device: its number on the line.
-        retries: after the first try.
+        device: Modbus address.
+        retries: number of tries after the first.
     """
 
     def __init__(self, line: Any, device: int, *, retries: int = 4) -> None:
@@ -95,26 +95,26 @@ class ModbusClient:
         self.repeated = 0  # exchanges that were tried again
 
     def read(self, address: int, count: int) -> bytes:
-        """Read ``count`` registers from an address on, two bytes each.
+        """Read ``count`` registers of two bytes from an address on.
 
         Raises:
-            NoAnswerError, LineError, RefusedError: as they say.
+            NoAnswerError, LineError, RefusedError: the exchange fails.
         """
         body = struct.pack(">BBHH", self._device, READ, address, count)
         answer = self._exchange(body, 3 + 2 * count, lambda a: a[2] == 2 * count)
         return answer[3:]
 
     def write(self, address: int, data: bytes, *, retries: int | None = None) -> None:
-        """Write registers from an address on. Unanswered requests are repeated, so writing twice must be harmless.
+        """Write registers from an address on; a write without a response is repeated and must be idempotent.
 
         Raises:
-            NoAnswerError, LineError, RefusedError: as they say.
+            NoAnswerError, LineError, RefusedError: the exchange fails.
         """
         head = struct.pack(">BBHH", self._device, WRITE, address, len(data) // 2)
         self._exchange(head + bytes([len(data)]) + data, 6, lambda a: a == head, retries)
 
     def close(self) -> None:
-        """Give the port back; without an error if it is gone."""
+        """Close the port, without an error if it is gone."""
         with self._lock:
             try:
                 self._line.close()
@@ -123,7 +123,7 @@ class ModbusClient:
 
     def _exchange(self, body: bytes, length: int, fits: Callable[[bytes], bool], retries: int | None = None) -> bytes:
         tries = 1 + (self._retries if retries is None else retries)
-        why = ""
+        reason = ""
         for k in range(tries):
             try:
                 with self._lock:
@@ -132,12 +132,14 @@ class ModbusClient:
                     raise FramingError(f"an answer to something else, {answer.hex(' ')}")
                 return answer
             except FramingError as error:
-                why = str(error)
+                reason = str(error)
                 self.repeated += k + 1 < tries
-                _log.info("try %d of %d got %s", k + 1, tries, why)
+                _log.info("try %d of %d got %s", k + 1, tries, reason)
                 self._drain()
         hint = "check cable, power and the device's number; try a longer timeout"
-        raise NoAnswerError(f"gave no good answer to {tries} tries; the last was {why}.", field=self._name, hint=hint)
+        raise NoAnswerError(
+            f"gave no good answer to {tries} tries; the last was {reason}.", field=self._name, hint=hint
+        )
 
     def _once(self, frame: bytes, length: int) -> bytes:
         try:
@@ -159,7 +161,7 @@ class ModbusClient:
         return good
 
     def _drain(self) -> None:
-        """Wait until the line is silent, at most a time-out: late bytes must not count as the next answer."""
+        """Wait until the line is silent, at most one time-out, so that a late response is not read as the next one."""
         try:
             until = time.monotonic() + float(self._line.timeout)
             while time.monotonic() < until:

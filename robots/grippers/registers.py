@@ -1,4 +1,4 @@
-"""The registers of Robotiq's 2F grippers, as bits and as meaning (2F-85 & 2F-140 instruction manual, chapter 4)."""
+"""Registers of Robotiq's 2F grippers (2F-85 & 2F-140 instruction manual, chapter 4)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ACT, _GTO, _ATR, _ARD = 0x01, 0x08, 0x10, 0x20
 
 
 class Activation(IntEnum):
-    """gSTA."""
+    """State of the activation, gSTA."""
 
     RESET = 0
     RUNNING = 1
@@ -21,7 +21,7 @@ class Activation(IntEnum):
 
 
 class Fingers(IntEnum):
-    """gOBJ: motion of the fingers, or contact."""
+    """Motion and contact of the fingers, gOBJ."""
 
     MOVING = 0
     STOPPED_OPENING = 1
@@ -34,7 +34,7 @@ FAULTS = {
     0x05: "the action waits for the activation to end",
     0x07: "it is not activated",
     0x08: "it is too hot",
-    NO_COMMUNICATION: "no communication for a second",
+    NO_COMMUNICATION: "it received no message for a second",
     0x0A: "its voltage is too low",
     0x0B: "the automatic release is under way",
     0x0C: "an internal fault",
@@ -49,12 +49,12 @@ class Command:
     """Command registers.
 
     Args:
-        activate: rACT; False resets it and clears faults.
+        activate: rACT; False resets the gripper and clears faults.
         go: rGTO; False stops the fingers.
         position: rPR, 0 open .. 255 closed.
-        speed, force: rSP and rFR, 0 least .. 255 most.
-        release: rATR, slow automatic release; the gripper must be activated again afterwards.
-        release_opens: rARD, the direction of that.
+        speed, force: rSP and rFR, 0 smallest .. 255 largest.
+        release: rATR, automatic release, after which the gripper must be activated again.
+        release_opens: rARD, direction of the automatic release.
     """
 
     activate: bool = True
@@ -66,7 +66,7 @@ class Command:
     release_opens: bool = False
 
     def to_bytes(self) -> bytes:
-        """Encode six bytes, for the registers from ``COMMAND`` on."""
+        """Encode six bytes for the registers from ``COMMAND`` on."""
         action = _ACT * self.activate | _GTO * self.go | _ATR * self.release | _ARD * self.release_opens
         return bytes([action, 0, 0, self.position, self.speed, self.force])
 
@@ -86,8 +86,8 @@ class Status:
         going: gGTO.
         activation: gSTA.
         fingers: gOBJ.
-        fault: gFLT, 0 for none.
-        requested: gPR, echo of the last requested position.
+        fault: gFLT, 0 without a fault.
+        requested: gPR, echo of the last commanded position.
         position: gPO, 0 open .. 255 closed.
         current: gCU [mA].
     """
@@ -102,7 +102,7 @@ class Status:
     current: int
 
     def to_bytes(self) -> bytes:
-        """Encode six bytes, of the registers from ``STATUS`` on."""
+        """Encode six bytes of the registers from ``STATUS`` on."""
         first = _ACT * self.activated | _GTO * self.going | self.activation << 4 | self.fingers << 6
         return bytes([first, 0, self.fault, self.requested, self.position, self.current // 10])
 
@@ -111,18 +111,18 @@ class Status:
         """Decode six bytes.
 
         Raises:
-            GripperError: gSTA has a value that means nothing.
+            GripperError: gSTA has an undefined value.
         """
         first, fault = data[0], data[2] & 0x0F
         try:
             activation = Activation(first >> 4 & 3)
         except ValueError as error:
             hint = "check that the device is a Robotiq 2F"
-            raise GripperError(f"is {first:#04x}, which means nothing.", field="status", hint=hint) from error
+            raise GripperError(f"is {first:#04x}, an undefined value.", field="status", hint=hint) from error
         fingers = Fingers(first >> 6)
         return cls(bool(first & _ACT), bool(first & _GTO), activation, fingers, fault, data[3], data[4], 10 * data[5])
 
     @property
     def fault_text(self) -> str:
-        """In words; empty without a fault."""
+        """Description of the fault; empty without a fault."""
         return FAULTS.get(self.fault, f"fault {self.fault:#04x}") if self.fault else ""

@@ -1,4 +1,4 @@
-"""Driver of Robotiq's 2F-85 and 2F-140 over Modbus RTU; it stops the gripper after every error."""
+"""Driver of Robotiq's 2F-85 and 2F-140 over Modbus RTU; any error stops the fingers."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from splatbot.robots.grippers.registers import (
     Status,
 )
 
-_POLL = 0.01  # [s] between questions
-_ECHO = 0.5  # [s] within which the gripper must echo the requested position
+_POLL = 0.01  # [s] between two status requests
+_ECHO = 0.5  # [s] within which the status must echo the commanded position
 _log = logging.getLogger(__name__)
 
 
 class FaultError(GripperError):
-    """The gripper reports a fault; ``status`` has it."""
+    """The gripper reports a fault, which ``status`` contains."""
 
     def __init__(self, status: Status, *, field: str) -> None:
         self.status = status
@@ -38,13 +38,13 @@ class FaultError(GripperError):
 
 @dataclass(frozen=True)
 class Model:
-    """Limits of a gripper (data sheets); values between the ends are linear in the registers.
+    """Specification of a gripper (data sheets); force, speed and opening are linear in the registers.
 
     Args:
         stroke: widest opening [m].
-        force: least and largest [N].
-        speed: least and largest, of the opening [m/s].
-        open_at, closed_at: gPO at the ends of the stroke; :meth:`RobotiqGripper.calibrate` measures a gripper's own.
+        force: smallest and largest force [N].
+        speed: smallest and largest speed of the opening [m/s].
+        open_at, closed_at: gPO at the ends of the stroke; :meth:`RobotiqGripper.calibrate` measures them.
     """
 
     stroke: float
@@ -54,12 +54,12 @@ class Model:
     closed_at: int = 230
 
     def opening(self, position: int) -> float:
-        """Return the opening [m] at gPO."""
+        """Convert gPO to the opening [m]."""
         share = (self.closed_at - position) / (self.closed_at - self.open_at)
         return self.stroke * min(max(share, 0.0), 1.0)
 
     def position(self, opening: float) -> int:
-        """Return rPR of an opening [m]; the ends map to 0 and 255."""
+        """Convert an opening [m] to rPR; the ends of the stroke map to 255 and 0."""
         if opening <= 0.0:
             return 255
         if opening >= self.stroke:
@@ -76,16 +76,16 @@ MODELS = {
 class RobotiqGripper:
     """A :class:`splatbot.protocols.Gripper` on a serial port.
 
-    Every failure is a :class:`splatbot.errors.GripperError`: no answer, repeated wrong checksums, a missing port, a
-    fault. The gripper is then stopped once, and accepts no move until it is activated again. No call lasts longer than
-    its time-outs.
+    Every failure (no response, repeated wrong checksums, a lost port, a fault) raises
+    :class:`splatbot.errors.GripperError`. The driver then sends one stop command and refuses moves until the gripper is
+    activated again. No call lasts longer than its time-outs.
 
     Args:
-        port: as "/dev/ttyUSB0".
+        port: serial port, as "/dev/ttyUSB0".
         model: "2f-85" or "2f-140".
-        device: its Modbus number.
-        timeout: for the first and for the other bytes of an answer [s].
-        retries: of an exchange.
+        device: Modbus address.
+        timeout: time-out of the first byte, and of the remaining bytes, of a response [s].
+        retries: number of retries of an exchange.
 
     Raises:
         InputError: the model is unknown.
@@ -102,7 +102,7 @@ class RobotiqGripper:
         self.model = MODELS[model]
         self._port, self._device, self._timeout, self._retries = port, device, timeout, retries
         self._unsafe = "it is not activated"
-        self._told: Command | None = None
+        self._sent: Command | None = None
         self._client: ModbusClient | None = self._opened()
 
     def __enter__(self) -> RobotiqGripper:
@@ -118,18 +118,18 @@ class RobotiqGripper:
 
     @property
     def unsafe(self) -> str:
-        """Why it takes no move; empty if it does."""
+        """Reason why moves are refused; empty if they are accepted."""
         return self._unsafe
 
     @property
     def repeated(self) -> int:
-        """How many exchanges were tried again since the port was opened."""
+        """Number of repeated exchanges since the port was opened."""
         return self._client.repeated if self._client is not None else 0
 
     def activate(self, *, again: bool = False, patience: float = 10.0) -> None:
-        """Clear faults and activate: the fingers close and open once. Opens the port again if it was lost.
+        """Clear faults and activate the gripper; the fingers close and open once.
 
-        An active gripper without a fault is left unchanged, with the object that it holds, unless ``again``.
+        A lost port is opened again. An active gripper without a fault does not move, unless ``again`` is True.
 
         Raises:
             GripperError: it does not become ready within ``patience`` [s].
@@ -137,7 +137,7 @@ class RobotiqGripper:
         with self._secured():
             if self._client is None:
                 self._client = self._opened()
-            self._told, self._unsafe = None, "it is not activated"
+            self._sent, self._unsafe = None, "it is not activated"
             status = self._read()
             if again or status.fault not in (0, NO_COMMUNICATION) or status.activation is not Activation.DONE:
                 self._write(Command(activate=False, go=False))
@@ -147,39 +147,38 @@ class RobotiqGripper:
             self._unsafe = ""
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Go towards an opening [m], with at most a force [N] and a speed [m/s].
+        """Move to an opening [m], with at most a force [N] and a speed [m/s].
 
-        By default as fast as it can, with a quarter of its force (the 2F-85: 74 N).
-
-        Values beyond its own least and most are taken as those; fingers that meet something stop and hold it.
+        The default is the largest speed and a quarter of the force range (the 2F-85: 74 N). Values outside the range of
+        the gripper are clamped. Fingers that meet an object stop and hold it.
 
         Raises:
             InputError: a value is out of range.
-            GripperError: it is not activated, or does not answer.
+            GripperError: the gripper is not activated, or the command fails.
         """
         check_move(self.stroke, opening, force, speed)
         if self._unsafe:
             raise GripperError(f"takes no move: {self._unsafe}.", field=self._port, hint="activate it")
         with self._secured():
-            self._told = Command(
+            self._sent = Command(
                 position=self.model.position(opening),
                 speed=_register(speed, *self.model.speed, default=255),
                 force=_register(force, *self.model.force, default=64),
             )
-            self._write(self._told)
+            self._write(self._sent)
 
     def status(self) -> Status:
-        """Return the status once it refers to the last command.
+        """Read the status that refers to the last command.
 
         Raises:
-            FaultError: it reports a fault.
-            GripperError: it does not answer.
+            FaultError: the gripper reports a fault.
+            GripperError: the gripper does not respond.
         """
         with self._secured():
             return self._status()
 
     def moving(self) -> bool:
-        """Return True while the fingers move."""
+        """Return whether the fingers move."""
         status = self.status()
         return status.going and status.fingers is Fingers.MOVING
 
@@ -188,44 +187,44 @@ class RobotiqGripper:
         return self.model.opening(self.status().position)
 
     def holds(self) -> bool:
-        """Return True while an object blocks the fingers. The state is unknown, so False, after :meth:`stop`."""
+        """Return whether an object stops the fingers; after :meth:`stop` this is unknown, and False."""
         status = self.status()
         return status.going and status.fingers in (Fingers.STOPPED_CLOSING, Fingers.STOPPED_OPENING)
 
     def wait(self, seconds: float = 5.0) -> None:
-        """Wait until the fingers rest.
+        """Wait until the fingers stop.
 
         Raises:
-            GripperError: the fingers still move after that time [s]; they are stopped then.
+            GripperError: they still move after ``seconds`` [s]; a stop command is then sent.
         """
         with self._secured():
             self._until(lambda s: not (s.going and s.fingers is Fingers.MOVING), seconds, "still moves")
 
     def stop(self) -> None:
-        """Stop the fingers; a held object stays held.
+        """Stop the fingers; a grasped object stays grasped.
 
         Raises:
-            GripperError: it does not answer.
+            GripperError: the command fails.
         """
         with self._secured():
-            self._told = replace(self._told or Command(), go=False)
-            self._write(self._told)
+            self._sent = replace(self._sent or Command(), go=False)
+            self._write(self._sent)
 
     def release(self, *, opens: bool = True) -> None:
-        """Release slowly in any state (automatic release); the gripper must be activated afterwards.
+        """Open or close slowly, regardless of other commands (automatic release); activation is required afterwards.
 
         Raises:
-            GripperError: it does not answer.
+            GripperError: the command fails.
         """
         with self._secured():
-            self._unsafe = "it was released"
+            self._unsafe = "it is in automatic release"
             self._write(Command(release=True, release_opens=opens))
 
     def calibrate(self, *, patience: float = 10.0) -> Model:
-        """Close and open all the way, with nothing between the fingers, and take where they end as the stroke's ends.
+        """Close and open fully, without an object, and take the end positions as the ends of the stroke.
 
         Raises:
-            GripperError: they end where no gripper of this kind does.
+            GripperError: the end positions are implausible.
         """
         ends = []
         for opening in (0.0, self.stroke):
@@ -240,7 +239,7 @@ class RobotiqGripper:
         return self.model
 
     def close(self) -> None:
-        """Give the port back. The fingers keep a held object."""
+        """Close the port; a grasped object stays grasped."""
         if self._client is not None:
             self._client.close()
         self._client, self._unsafe = None, "its port is closed"
@@ -249,24 +248,24 @@ class RobotiqGripper:
         return ModbusClient(open_line(self._port, timeout=self._timeout), self._device, retries=self._retries)
 
     @property
-    def _asked(self) -> ModbusClient:
+    def _open_client(self) -> ModbusClient:
         if self._client is None:
             raise LineError(f"is not open: {self._unsafe}.", file=self._port, hint="activate the gripper")
         return self._client
 
     def _write(self, command: Command) -> None:
-        self._asked.write(COMMAND, command.to_bytes())
+        self._open_client.write(COMMAND, command.to_bytes())
 
     def _status(self) -> Status:
-        """Read the status until its echo matches the last command; earlier ones describe another motion."""
+        """Read the status until its echo matches the last command; an older status describes an earlier motion."""
         until = time.monotonic() + _ECHO
         while True:
             status = self._read()
             if status.fault == NO_COMMUNICATION:
-                _log.info("no communication with %s for a second", self._port)
+                _log.info("%s received no message for a second", self._port)
             elif status.fault:
                 raise FaultError(status, field=self._port)
-            if self._told is None or (status.requested, status.going) == (self._told.position, self._told.go):
+            if self._sent is None or (status.requested, status.going) == (self._sent.position, self._sent.go):
                 return status
             if time.monotonic() > until:
                 hint = "check that nothing else commands it; activate it"
@@ -274,26 +273,26 @@ class RobotiqGripper:
             time.sleep(_POLL)
 
     def _read(self) -> Status:
-        return Status.from_bytes(self._asked.read(STATUS, REGISTERS))
+        return Status.from_bytes(self._open_client.read(STATUS, REGISTERS))
 
     def _until(
         self,
         holds: Callable[[Status], bool],
         seconds: float,
-        what: str,
+        failure: str,
         read: Callable[[], Status] | None = None,
     ) -> None:
         until = time.monotonic() + seconds
         while not holds((read or self._status)()):
             if time.monotonic() > until:
                 raise GripperError(
-                    f"{what} after {seconds:g} s.", field=self._port, hint="check its power; activate it"
+                    f"{failure} after {seconds:g} s.", field=self._port, hint="check its power; activate it"
                 )
             time.sleep(_POLL)
 
     @contextmanager
     def _secured(self) -> Iterator[None]:
-        """Stop once after an error, and refuse further moves."""
+        """Send one stop command after an error, and refuse later moves."""
         try:
             yield
         except GripperError as error:
@@ -307,7 +306,7 @@ class RobotiqGripper:
             return
         if not lost:
             try:
-                self._client.write(COMMAND, replace(self._told or Command(), go=False).to_bytes(), retries=0)
+                self._client.write(COMMAND, replace(self._sent or Command(), go=False).to_bytes(), retries=0)
             except LineError:
                 lost = True
             except GripperError as error:
@@ -317,6 +316,6 @@ class RobotiqGripper:
             self._client = None
 
 
-def _register(value: float | None, least: float, most: float, *, default: int) -> int:
-    """Scale a value to 0..255 between its limits."""
-    return default if value is None else round(255 * min(max((value - least) / (most - least), 0.0), 1.0))
+def _register(value: float | None, smallest: float, largest: float, *, default: int) -> int:
+    """Map a value between the smallest and the largest to 0..255."""
+    return default if value is None else round(255 * min(max((value - smallest) / (largest - smallest), 0.0), 1.0))

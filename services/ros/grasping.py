@@ -50,7 +50,7 @@ class GraspServices:
             served, robot, base = robot_place(self._store, self._robot)
             objects = objects_in(served, base, as_known=True)
             target = find_target(_hint(args), objects.scene, [LanguageAffordance(), SpatialAffordance()])
-            found = objects.told(objects.sampler(robot).sample(target, GraspOptions()))
+            found = objects.with_notes(objects.sampler(robot).sample(target, GraspOptions()))
             found.unwrap()
             stamp = served.ready.stamp
             self._store.bus.publish(map_topic(served.id, GRASPS), found)

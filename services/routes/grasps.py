@@ -69,7 +69,7 @@ def grasps(
         approach=query.approach,
         seed=query.seed,
     )
-    result = objects.told(sampler.sample(found, options))
+    result = objects.with_notes(sampler.sample(found, options))
     result.unwrap()
     service.bus.publish(map_topic(served.id, GRASPS), result)
     return answer(request, summary(result) | {"map_version": served.map_version})

@@ -111,7 +111,7 @@ def grasp(
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
     sampler = things.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
     sampler.margin = margin_of(margin, map, sampler.field, scene.T_world_base)
-    result = things.told(sampler.sample(found, options))
+    result = things.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
@@ -127,13 +127,13 @@ def grasp(
 
 def _things(map_: Path, base: Pose | None) -> GraspableObjects:
     from splatbot.gaussians import GaussianModel, Snapshot
-    from splatbot.robots.graspable_objects import measured_map, run_of, things_of
+    from splatbot.robots.graspable_objects import measured_map, run_of, segment_objects
     from splatbot.workspace import find_workspace
 
     T = base_pose(base, map_)
     model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
     measured = measured_map(Snapshot(model, map_version=0), run_of(map_))
-    return things_of(measured, T, find_workspace(map_), as_known=base is None)
+    return segment_objects(measured, T, find_workspace(map_), as_known=base is None)
 
 
 def _hint(

@@ -1,4 +1,4 @@
-"""Where the robot may not go, asked of the Gaussians themselves."""
+"""Collision queries of points, bodies and robots against a map of Gaussians."""
 
 from splatbot.collision.answers import ClearanceResult, MahalanobisResult, NeighboursResult
 from splatbot.collision.bodies import boxes_in_collision, capsules_in_collision

@@ -1,4 +1,4 @@
-"""What the collision field answers."""
+"""Results of the queries of a collision field."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class MahalanobisResult:
-    """Answers for P points.
+    """Mahalanobis distances of P points.
 
     Args:
-        distance: (P,) float32, in standard deviations of the nearest Gaussian; infinity where the map is empty.
-        index: (P,) int64, that Gaussian's row in the model (the lowest of equals), -1 where the map is empty.
-        map_version: the state of the map that was asked.
+        distance: (P,) float32, in standard deviations of the nearest Gaussian; infinity if the map is empty.
+        index: (P,) int64, row of that Gaussian in the model, the lowest of equals; -1 if the map is empty.
+        map_version: version of the map.
     """
 
     distance: NDArray[np.float32]
@@ -25,17 +25,23 @@ class MahalanobisResult:
 
 @dataclass(frozen=True, eq=False)
 class ClearanceResult:
-    """Euclidean answers for P points or spheres; an array of ``distance`` to numpy.
+    """Clearance of P points or spheres; numpy converts it to the array ``distance``.
+
+    The distance d bounds the true signed distance D from below, with the error::
+
+        0 <= D - d <= 4e-6 (|v|₁ + a) + 1e-6 A
+
+    Here v [m] leads from the centre of the ellipsoid to the point, in the frame of the ellipsoid. Its shortest and
+    longest semi-axes are a and A [m].
 
     Args:
-        distance: (P,) [m], the signed distance from the sphere's surface to the nearest n-sigma ellipsoid: never more
-            than the true one, and less by at most 4e-6 (|v|₁ + a) + 1e-6 A, with v [m] from the ellipsoid's centre to
-            the point in its frame, a and A its least and longest semi-axes. Negative inside.
-            Infinity: nothing within the cut.
-        gradient: (P, 3), of the distance with respect to the point: the unit normal of that ellipsoid. 0 for no answer.
-        witness: (P, 3) [m, world], the nearest point of that ellipsoid's surface. NaN for no answer.
-        index: (P,) int64, that Gaussian's row in the model, -1 for none.
-        map_version: the state of the map that was asked.
+        distance: (P,) signed distance from the surface of the sphere to the nearest n-sigma ellipsoid [m]; negative
+            inside, infinity if no ellipsoid is within the cut.
+        gradient: (P, 3) derivative of the distance with respect to the point, which is the unit normal of the
+            ellipsoid; 0 if no ellipsoid is within the cut.
+        witness: (P, 3) nearest point of the surface of the ellipsoid [m, world]; NaN if none is within the cut.
+        index: (P,) int64, row of that Gaussian in the model; -1 if none is within the cut.
+        map_version: version of the map.
     """
 
     distance: NDArray[np.float64]
@@ -50,12 +56,12 @@ class ClearanceResult:
 
 @dataclass(frozen=True)
 class NeighboursResult:
-    """The k nearest Gaussians of P points or spheres, nearest first.
+    """The k nearest Gaussians of P points or spheres, sorted by distance.
 
     Args:
-        distance: (P, k) [m], as in :class:`ClearanceResult`; infinity where there are fewer.
-        index: (P, k) int64, rows of the model; -1 where there are fewer.
-        map_version: the state of the map that was asked.
+        distance: (P, k) signed distances as in :class:`ClearanceResult` [m]; infinity beyond the last Gaussian.
+        index: (P, k) int64, rows of the model; -1 beyond the last Gaussian.
+        map_version: version of the map.
     """
 
     distance: NDArray[np.float64]

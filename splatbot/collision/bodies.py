@@ -1,4 +1,4 @@
-"""Capsules, swept spheres and oriented boxes against the field: covered by balls, made smaller where in doubt."""
+"""Collision of capsules, swept spheres and oriented boxes: adaptive covers of spheres against the field."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from splatbot.errors import InputError
 from splatbot.geometry import quat_to_rotation
 from splatbot.protocols import Array
 
-TOLERANCE = 2e-4  # [m]; a body nearer to an ellipsoid than this may be called a hit
-_CHUNK = 200_000  # cells at once
+TOLERANCE = 2e-4  # [m]; a body nearer to an ellipsoid than this may be reported as a collision
+_CHUNK = 200_000  # cells in one query
 
-# Splits cells: their centres (C, 3), how far each reaches beyond the body's own radius (C,), and the cells' sizes.
+# Splits cells, given as centres (C, 3), sizes as fractions of the body (C,), and body indices (C,).
 _Split = Callable[[Array, Array, NDArray[np.int64]], tuple[Array, Array, NDArray[np.int64]]]
 
 
@@ -29,18 +29,17 @@ def capsules_in_collision(
     *,
     tolerance: float = TOLERANCE,
 ) -> NDArray[np.bool_]:
-    """Whether capsules, or spheres swept along segments, may touch a Gaussian (P,).
+    """Check whether capsules, which are spheres swept along segments, may collide with a Gaussian (P,).
 
-    A stretch of a segment is free if a ball around its middle that holds that stretch of the capsule is free; a hit if
-    the ball of the capsule's own radius there is hit; else it is halved. False is certain; true may be wrong for what
-    misses an ellipsoid by less than the tolerance.
+    A part of a capsule is free if the sphere around its middle that encloses it is free. It collides if the sphere of
+    the capsule's radius there collides. Otherwise it is bisected. False is certain; true may be wrong for a capsule
+    whose clearance is below the tolerance.
 
     Args:
-        field: the map.
-        start: (P, 3) [m, world].
-        end: (P, 3) [m, world].
+        field: collision field.
+        start, end: (P, 3) ends of the segments [m, world].
         radius: (P,) or one for all [m].
-        tolerance: [m]
+        tolerance: size of a part that is not bisected further [m].
 
     Raises:
         InputError: shapes do not fit, or a value is not finite or negative.
@@ -67,14 +66,17 @@ def boxes_in_collision(
     *,
     tolerance: float = 1e-3,
 ) -> NDArray[np.bool_]:
-    """Whether oriented boxes may touch a Gaussian (P,); see :func:`capsules_in_collision`. Cells are cut in eight.
+    """Check whether oriented boxes may collide with a Gaussian (P,).
+
+    The search is that of :func:`capsules_in_collision`, with cells that split into eight.
 
     Args:
-        field: the map.
+        field: collision field.
         centers: (P, 3) [m, world].
         quats: (P, 4) wxyz.
         sizes: (P, 3) edge lengths [m].
-        tolerance: [m]; a box along a surface at less than this costs (size / tolerance)² questions.
+        tolerance: size of a cell that is not split further [m]. A box that lies along a surface costs
+            (size / tolerance)² queries.
 
     Raises:
         InputError: shapes do not fit, or a value is not finite or negative, or a quaternion is zero.
@@ -99,7 +101,16 @@ def boxes_in_collision(
 def _search(
     field: GaussianCollisionField, centers: Array, own: Array, reach: Array, split: _Split, tolerance: float
 ) -> NDArray[np.bool_]:
-    """Branch and bound over the cells of all bodies at once; ``reach`` [m] is that of a whole body."""
+    """Run branch and bound over the cells of all bodies at once.
+
+    Args:
+        field: collision field.
+        centers: (P, 3) centres of the bodies [m, world].
+        own: (P,) radii of their spheres [m].
+        reach: (P,) distance from the centre by which the body exceeds that sphere [m].
+        split: splits cells.
+        tolerance: see :func:`capsules_in_collision` [m].
+    """
     hit = np.zeros(len(centers), np.bool_)
     at, part, body = centers, np.ones(len(centers)), np.arange(len(centers))
     while len(at):
@@ -107,10 +118,10 @@ def _search(
         for k in range(0, len(at), _CHUNK):
             c, p, b = at[k : k + _CHUNK], part[k : k + _CHUNK], body[k : k + _CHUNK]
             c, p, b = c[~hit[b]], p[~hit[b]], b[~hit[b]]
-            beyond = reach[b] * p
-            doubtful = field.in_collision(np.c_[c, own[b] + beyond])
-            c, p, b, beyond = c[doubtful], p[doubtful], b[doubtful], beyond[doubtful]
-            sure = (beyond <= tolerance) | field.in_collision(np.c_[c, own[b]]) if len(c) else np.zeros(0, np.bool_)
+            extent = reach[b] * p
+            doubtful = field.in_collision(np.c_[c, own[b] + extent])
+            c, p, b, extent = c[doubtful], p[doubtful], b[doubtful], extent[doubtful]
+            sure = (extent <= tolerance) | field.in_collision(np.c_[c, own[b]]) if len(c) else np.zeros(0, np.bool_)
             hit[b[sure]] = True
             c, p, b = c[~sure], p[~sure], b[~sure]
             left.append(split(c, p, b))

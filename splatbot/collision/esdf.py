@@ -1,4 +1,4 @@
-"""The field on a dense grid, for those who want one."""
+"""Euclidean signed distance field (ESDF) on a dense grid, sampled from a collision field."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatbot.collision.inputs import rows
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 
-MOST_VOXELS = 20_000_000
+MAX_ESDF_VOXELS = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +20,11 @@ class Esdf:
     """Euclidean signed distances at the centres of voxels.
 
     Args:
-        distance: (X, Y, Z) float32 [m], as :meth:`GaussianCollisionField.clearance`; the cut where there is more.
-        gradient: (X, Y, Z, 3) float32; 0 beyond the cut.
-        origin: (3,) [m, world], the first voxel's corner.
-        voxel: edge [m].
-        map_version: the state of the map that was asked.
+        distance: (X, Y, Z) float32, see :meth:`GaussianCollisionField.clearance`, at most the cut [m].
+        gradient: (X, Y, Z, 3) float32 derivative with respect to the point; 0 beyond the cut.
+        origin: (3,) corner of the first voxel [m, world].
+        voxel: edge length [m].
+        map_version: version of the map.
     """
 
     distance: NDArray[np.float32]
@@ -34,18 +34,18 @@ class Esdf:
     map_version: int
 
     def centers(self) -> Array:
-        """The voxels' centres (X, Y, Z, 3) [m, world]."""
+        """Return the centres (X, Y, Z, 3) of the voxels [m, world]."""
         return np.moveaxis(np.indices(self.distance.shape), 0, -1) * self.voxel + self.origin + self.voxel / 2
 
 
 def esdf(field: GaussianCollisionField, aabb: ArrayLike, voxel: float, *, cut: float = 1.0) -> Esdf:
-    """Distance and gradient at the centres of the voxels that fill the box ``aabb`` (2, 3) = (low, high) [m].
+    """Sample distance and gradient at the centres of the voxels of a box.
 
     Args:
-        field: the map.
-        aabb: corners of the box.
-        voxel: edge [m].
-        cut: distances beyond it [m] are not told.
+        field: collision field.
+        aabb: (2, 3) = (low, high), corners of the box [m, world].
+        voxel: edge length [m].
+        cut: largest distance [m].
 
     Raises:
         InputError: the box is empty, the voxel or cut is not above 0, or there are more than 20 million voxels.
@@ -56,13 +56,13 @@ def esdf(field: GaussianCollisionField, aabb: ArrayLike, voxel: float, *, cut: f
             f"is {low.tolist()}..{high.tolist()} in {voxel} m.", field="aabb", hint="give low < high, voxel > 0"
         )
     size = np.ceil((high - low) / voxel - 1e-9).astype(np.int64)
-    if np.prod(size.astype(float)) > MOST_VOXELS:
-        raise InputError(f"needs {size.tolist()} voxels.", field="voxel", hint=f"at most {MOST_VOXELS} in all")
+    if np.prod(size.astype(float)) > MAX_ESDF_VOXELS:
+        raise InputError(f"needs {size.tolist()} voxels.", field="voxel", hint=f"at most {MAX_ESDF_VOXELS} in all")
     centers = np.moveaxis(np.indices(tuple(size.tolist())), 0, -1).reshape(-1, 3) * voxel + low + voxel / 2
-    answer = field.clearance(centers, cut=cut)
+    sampled = field.clearance(centers, cut=cut)
     return Esdf(
-        np.minimum(answer.distance, cut).astype(np.float32).reshape(*size),
-        answer.gradient.astype(np.float32).reshape(*size, 3),
+        np.minimum(sampled.distance, cut).astype(np.float32).reshape(*size),
+        sampled.gradient.astype(np.float32).reshape(*size, 3),
         low,
         float(voxel),
         field.map_version,

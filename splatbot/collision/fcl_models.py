@@ -1,4 +1,4 @@
-"""Meshes and octrees as python-fcl takes them, for what is measured beside the collision field. Needs python-fcl."""
+"""Meshes and octrees for python-fcl, the peer of the collision field in benchmarks. Requires python-fcl."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatbot.protocols import Array
 
 
 def fcl_mesh(vertices: Array, triangles: NDArray[Any]) -> Any:
-    """A bounding volume hierarchy of vertices (V, 3) [m] and triangles (T, 3).
+    """Build a bounding volume hierarchy of vertices (V, 3) [m] and triangles (T, 3).
 
     Raises:
         ImportError: python-fcl is not installed.
@@ -25,19 +25,19 @@ def fcl_mesh(vertices: Array, triangles: NDArray[Any]) -> Any:
 
 
 def fcl_octree(points: Array, voxel: float) -> Any:
-    """An octree with the voxels [m] of points (P, 3) [m] occupied.
+    """Build an octree whose occupied voxels, of edge ``voxel`` [m], contain the points (P, 3) [m].
 
     Raises:
         ImportError: python-fcl is not installed.
     """
-    data = octomap_bytes(points, voxel)  # which it takes as signed numbers
+    data = octomap_bytes(points, voxel)  # python-fcl reads signed bytes
     return importlib.import_module("fcl").OcTree(voxel, np.frombuffer(data, np.int8).tolist())
 
 
 def octomap_bytes(points: Array, voxel: float) -> bytes:
-    """OctoMap's binary tree of 16 levels (Hornung et al. 2013) with the voxels of points (P, 3) [m] occupied.
+    """Serialize the occupied voxels of points (P, 3) [m] as OctoMap's binary tree of 16 levels (Hornung et al. 2013).
 
-    A node is two bytes, two bits a child: (0, 0) unknown, (0, 1) occupied, (1, 1) a node, which follows depth first.
+    A node has two bytes, two bits per child: (0, 0) unknown, (0, 1) occupied, (1, 1) inner node, in depth-first order.
     """
     keys = np.unique(np.floor(points / voxel).astype(np.int64) + (1 << 15), axis=0)
     found = bytearray()

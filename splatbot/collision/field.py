@@ -1,4 +1,4 @@
-"""The map as a collision field: how far a point or a sphere is from the Gaussians, and whether it may touch one."""
+"""The map as a collision field: distance of points and spheres from the Gaussians, and collision checks."""
 
 from __future__ import annotations
 
@@ -26,35 +26,38 @@ except ImportError as error:
 
 __all__ = ["MIN_OPACITY", "SCALE_FLOOR", "GaussianCollisionField"]
 
-VOXEL, PACKED_VOXEL = 0.02, 0.025  # [m] of the grid of lower bounds
-MAX_VOXELS = 2_000_000  # of that grid: 4 MB; beyond, voxels grow
+VOXEL, PACKED_VOXEL = 0.02, 0.025  # [m] edge length in the grid of lower bounds
+MAX_VOXELS = 2_000_000  # largest size of that grid, 4 MB; a larger map has larger voxels
 
 
 class GaussianCollisionField:
     """Collision queries against an immutable copy of a map.
 
-    A Gaussian's solid is its ellipsoid at ``n_sigma`` standard deviations (each at least ``SCALE_FLOOR``): what lies
-    within it. "Free" is certified for these ellipsoids: distances come from below, with float32's rounding taken off.
-    Signed distance to a convex body is the largest n·v - h(n) over unit n, h its support function; the n that attains
-    it is found by Hebden's iteration on the secular equation.
+    The solid of a Gaussian is its ellipsoid at ``n_sigma`` standard deviations, each at least ``SCALE_FLOOR``. "Free"
+    is certified for these ellipsoids: distances are lower bounds that include the rounding of float32.
 
-    A point p is at Mahalanobis distance |S⁻¹ Rᵀ (p - μ)| from a Gaussian of mean μ, rotation R and scales S; the
-    winner is found in float32 and its distance computed in float64 from the model's float32 values.
+    A Gaussian has the mean μ, the rotation R and the scales S. A point p has the local coordinates v = Rᵀ (p - μ)::
+
+        Mahalanobis distance   |S⁻¹ v|
+        signed distance        max over |n| = 1 of  n·v - h(n),   h(n) = n_sigma |S n|
+
+    The maximizing normal n is found by Hebden's iteration on the secular equation. The nearest Gaussian by Mahalanobis
+    distance is found in float32; its distance is computed in float64 from the float32 values of the model.
 
     Args:
         source: a model (``map_version`` 0) or a snapshot.
-        n_sigma: where the surface of a Gaussian is taken to be.
-        min_opacity: Gaussians fainter than this are air.
-        min_observations: so are those that fewer keyframes' depth supports.
-        evidence: so are those that were seen through more often than hit; None: whether is not asked.
-        packed: keep the ellipsoids in 18 bytes each in place of 56. What that may move a surface by is taken off
-            every distance, so that "free" stays certain; distances then come out too small by up to 0.05 mm more,
-            and 2.6 % of the nearest Gaussian's longest semi-axis. Semi-axes above 0.125 m are never packed.
-            Mahalanobis distances are those of the packed Gaussians, and an update costs more.
+        n_sigma: standard deviations at which the surface of a Gaussian lies.
+        min_opacity: Gaussians of lower opacity are ignored.
+        min_observations: Gaussians that the depth of fewer keyframes supports are ignored.
+        evidence: Gaussians with more passes than hits are ignored. If None, visibility is not checked.
+        packed: store each ellipsoid in 18 bytes instead of 56. All distances are reduced by the packing error, so that
+            "free" stays certain. They are then smaller by up to 0.05 mm plus 2.6 % of the nearest Gaussian's longest
+            semi-axis. Gaussians with semi-axes above 0.125 m are not packed. Mahalanobis distances refer to the packed
+            Gaussians, and an update is slower.
 
     Raises:
-        InputError: a mean, scale, opacity or quaternion is not finite, or a quaternion is zero (the message names the
-            row); n_sigma is not in 1e-3..1e3, min_opacity not in 0..1, or a value is above 1e6 m.
+        InputError: a mean, scale, opacity or quaternion is not finite, or a quaternion is zero; the message names the
+            row. Also if n_sigma is not in 1e-3..1e3, min_opacity is not in 0..1, or a value exceeds 1e6 m.
     """
 
     def __init__(
@@ -97,28 +100,28 @@ class GaussianCollisionField:
         previous: ArrayLike | Tensor | None = None,
         evidence: VisibilityEvidence | None = None,
     ) -> GaussianCollisionField:
-        """The field of a later state of the map, which shares what did not change; this one stays as it is.
+        """Return the field of a later map version, which shares unchanged Gaussians with this field.
 
-        The answers are those of a field built anew with the same n_sigma and gates.
+        This field does not change. The results equal those of a new field with the same n_sigma and gates.
 
         Args:
             source: the later map.
-            changed: (N,) bool, Gaussians that moved, changed their shape, opacity or observations, or are new.
-            previous: (N,) the row that each Gaussian had in this field's model, -1 for a new one; None: rows stay
-                what they were, and further ones are new. Rows of this field's model that nobody had are removed.
-            evidence: as at first; None: changed Gaussians are not asked for it.
+            changed: (N,) bool, True for a new Gaussian and for a change of mean, shape, opacity or observations.
+            previous: (N,) row of each Gaussian in the model of this field, -1 for a new one; rows that do not occur are
+                removed. If None, rows keep their places, and further rows are new.
+            evidence: visibility, see the class. If None, the visibility of changed Gaussians is not checked.
 
         Raises:
-            InputError: as the constructor, for what changed; changed or previous do not fit the models.
+            InputError: a changed Gaussian is invalid, see the class, or an array does not fit the models.
         """
         model = source.model if isinstance(source, Snapshot) else source
         dirty = np.asarray(changed)
         if dirty.shape != (len(model),) or dirty.dtype != np.bool_:
             raise InputError(f"is {dirty.dtype} {dirty.shape}.", field="changed", hint=f"give ({len(model)},) booleans")
         names, new, gone = self._names.carried(len(model), previous)
-        asked = dirty.copy()
-        asked[new] = True
-        rows = np.flatnonzero(asked)
+        dirty = dirty.copy()
+        dirty[new] = True
+        rows = np.flatnonzero(dirty)
         part = model.select(torch.from_numpy(rows))
         check_opacities(part)
         here = self.gate.solid(part, None if evidence is None else evidence.select(rows))
@@ -131,39 +134,40 @@ class GaussianCollisionField:
         return field
 
     def added_since(self, earlier: GaussianCollisionField) -> GaussianCollisionField:
-        """A field of what ``earlier`` has not: only that can be in the way of a path that was free of ``earlier``.
+        """Return a field of the Gaussians that ``earlier`` lacks.
 
-        Compared by geometry, block by block; blocks that both share cost nothing.
+        Only these can block a path that was free in ``earlier``. Gaussians are compared by geometry, block by block;
+        shared blocks are skipped.
 
         Raises:
-            InputError: the two differ in n_sigma, or one of them is packed.
+            InputError: the fields differ in n_sigma or in packing.
         """
         if earlier.packed != self.packed:
-            raise InputError(f"is {earlier.packed}, not {self.packed}.", field="packed", hint="ask fields of one kind")
+            raise InputError(f"is {earlier.packed}, not {self.packed}.", field="packed", hint="compare equal kinds")
         if earlier.n_sigma != self.n_sigma:
             raise InputError(
-                f"is {earlier.n_sigma}, not {self.n_sigma}.", field="n_sigma", hint="ask fields of one kind"
+                f"is {earlier.n_sigma}, not {self.n_sigma}.", field="n_sigma", hint="compare fields of one kind"
             )
         field = copy.copy(self)
         field.native = self.native.added_since(earlier.native)
         return field
 
     def __len__(self) -> int:
-        """Number of Gaussians that count, after the gates on opacity and observation."""
+        """Return the number of solid Gaussians, after the gates on opacity and observation."""
         return len(self.native)
 
     @property
     def rows(self) -> int:
-        """Number of Gaussians of the model, air included."""
+        """Number of Gaussians of the model, ignored ones included."""
         return self._names.count
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all that answers need: ellipsoids, trees, grid, and tables of names where there are any."""
+        """Memory of ellipsoids, trees, grid and identifier tables [bytes]."""
         return int(self.native.bytes) + self._names.nbytes
 
     def mahalanobis(self, points: ArrayLike | Tensor) -> MahalanobisResult:
-        """The nearest Gaussian of each of ``points`` (P, 3) [m, world frame], numpy or torch.
+        """Find the nearest Gaussian of each of ``points`` (P, 3) by Mahalanobis distance [m, world frame].
 
         Raises:
             InputError: the shape is not (P, 3) or a value is not finite (the message names the row).
@@ -172,36 +176,36 @@ class GaussianCollisionField:
         return MahalanobisResult(distance.astype(np.float32), self.rows_of(names), self.map_version)
 
     def in_collision(self, points: ArrayLike | Tensor) -> NDArray[np.bool_]:
-        """Whether each of ``points`` (P, 3) or spheres (P, 4) = (x, y, z, radius) [m, world] may touch a Gaussian (P,).
+        """Check whether each of ``points`` (P, 3) or spheres (P, 4) may collide with a Gaussian (P,).
 
-        False is certain; true may be wrong for what misses an ellipsoid by less than the error of
-        :class:`ClearanceResult`.
+        Spheres are (x, y, z, radius) [m, world]. False is certain; true may be wrong if the clearance is below the
+        error of :class:`ClearanceResult`.
 
         Raises:
-            InputError: another shape, a value that is not finite, a radius below 0.
+            InputError: the shape is wrong, a value is not finite, or a radius is below 0.
         """
         hits: NDArray[np.uint8] = self.native.hits(*spheres(points))
         return hits.astype(np.bool_)
 
     def clearance(self, points: ArrayLike | Tensor, *, cut: float = np.inf) -> ClearanceResult:
-        """The signed distance of each of ``points`` (P, 3) or spheres (P, 4) to the nearest ellipsoid [m].
+        """Compute the signed distance of each of ``points`` (P, 3) or spheres (P, 4) to the nearest ellipsoid [m].
 
         Args:
-            points: as in :meth:`in_collision`.
-            cut: how far to look [m]; what is farther has no answer, which is quicker.
+            points: see :meth:`in_collision`.
+            cut: search distance [m]; a smaller one is faster.
 
         Raises:
-            InputError: as :meth:`in_collision`; the cut is negative or NaN.
+            InputError: the points are invalid, or the cut is negative or NaN.
         """
         distance, gradient, witness, names = self.native.nearest(*spheres(points), _checked_cut(cut))
         witness[names < 0] = np.nan
         return ClearanceResult(distance, gradient, witness, self.rows_of(names), self.map_version)
 
     def nearest(self, points: ArrayLike | Tensor, k: int, *, cut: float = np.inf) -> NeighboursResult:
-        """The ``k`` (1..64) nearest Gaussians of each of ``points`` (P, 3) or spheres (P, 4), by signed distance.
+        """Find the ``k`` (1..64) nearest Gaussians of each of ``points`` (P, 3) or spheres (P, 4) by signed distance.
 
         Raises:
-            InputError: as :meth:`clearance`; k is out of range.
+            InputError: the points or the cut are invalid, or k is out of range.
         """
         if not 1 <= k <= 64:
             raise InputError(f"is {k}.", field="k", hint="give 1..64")
@@ -209,7 +213,7 @@ class GaussianCollisionField:
         return NeighboursResult(distance, self.rows_of(names), self.map_version)
 
     def rows_of(self, names: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Rows of the model of the native field's names; -1 stays -1."""
+        """Map identifiers of the native field to rows of the model; -1 stays -1."""
         return self._names.rows(names)
 
 

@@ -1,4 +1,4 @@
-"""Names of a map's Gaussians, which they keep from field to field while their rows in the model may change."""
+"""Persistent identifiers of Gaussians, which stay equal from field to field while their rows in the model change."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from splatbot.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class GaussianIdMap:
-    """Which Gaussian has which name.
+    """Bijection between the rows of a model and the identifiers ("names") of its Gaussians.
 
-    As long as rows keep their places a name is the row, and there are no tables.
+    As long as rows keep their places, the identifier is the row, and no table exists.
 
     Args:
-        count: rows of the model.
-        by_row: (count,) int32, the name of each row; None: the row itself.
-        by_name: int32, the row of each name, -1 for those that nobody has any more; None as ``by_row``.
+        count: number of rows of the model.
+        by_row: (count,) int32, identifier of each row. If None, it equals the row.
+        by_name: int32, row of each identifier, -1 for a removed Gaussian. If None, it equals the identifier.
     """
 
     count: int
@@ -29,15 +29,15 @@ class GaussianIdMap:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the tables."""
+        """Memory of the tables [bytes]."""
         return sum(table.nbytes for table in (self.by_row, self.by_name) if table is not None)
 
     def of(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
-        """The names (R,) of rows (R,)."""
+        """Return the identifiers (R,) of rows (R,)."""
         return rows.astype(np.int32) if self.by_row is None else self.by_row[rows]
 
     def rows(self, names: NDArray[np.int32]) -> NDArray[np.int64]:
-        """The rows of names; -1 stays -1."""
+        """Return the rows of identifiers; -1 stays -1."""
         if self.by_name is None:
             return names.astype(np.int64)
         if not len(self.by_name):
@@ -47,14 +47,18 @@ class GaussianIdMap:
     def carried(
         self, count: int, previous: ArrayLike | Tensor | None
     ) -> tuple[GaussianIdMap, NDArray[np.int64], NDArray[np.int32]]:
-        """Those of a later model of ``count`` rows, its rows that are new, and the names that nobody has any more.
+        """Update the identifiers to a later model.
 
         Args:
-            count: rows of the later model.
-            previous: (count,) the row that each had here, -1 for a new one; None: rows stay, further ones are new.
+            count: number of rows of the later model.
+            previous: (count,) row of each Gaussian in this model, -1 for a new one. If None, rows keep their places,
+                and further rows are new.
+
+        Returns:
+            The identifiers of the later model, its new rows, and the identifiers of removed Gaussians.
 
         Raises:
-            InputError: ``previous`` is of another length, or names a row twice or one that was not there.
+            InputError: ``previous`` has a wrong length, or contains a row twice or a row that does not exist.
         """
         if previous is None and self.by_row is None:
             new = np.arange(min(count, self.count), count)

@@ -1,4 +1,4 @@
-"""Checks of what a collision field is asked, with errors that name the row."""
+"""Checks of the inputs of a collision field, with errors that name the row."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 
-LARGEST_RADIUS = 1e4  # [m]
-FARTHEST = 1e9  # [m or rad]; squares of what lies beyond, in units of a small Gaussian, overflow in float32
+MAX_RADIUS = 1e4  # [m]
+MAX_COORDINATE = 1e9  # [m or rad]; squares of larger values, in units of a small Gaussian, overflow in float32
 
 
 def as_float64(values: ArrayLike | Tensor) -> NDArray[np.float64]:
-    """A numpy copy or view in float64 of what numpy or torch holds."""
+    """Convert a numpy array or a tensor to a float64 array, without a copy if possible."""
     return np.asarray(values.detach() if isinstance(values, Tensor) else values, dtype=np.float64)
 
 
 def rows(values: ArrayLike | Tensor, name: str, width: int, meaning: str) -> NDArray[np.float64]:
-    """``values`` as (P, width) finite float64, C-contiguous.
+    """Return ``values`` as finite C-contiguous float64 (P, width).
 
     Raises:
-        InputError: another shape, or a value that is not finite or beyond 1e9 (the message names the row).
+        InputError: the shape is wrong, or a value is not finite or beyond 1e9; the message names the row.
     """
     array = as_float64(values)
     if array.ndim != 2 or array.shape[1] != width:
@@ -29,19 +29,19 @@ def rows(values: ArrayLike | Tensor, name: str, width: int, meaning: str) -> NDA
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
         raise InputError(f"row {int(np.argmax(bad))} is not finite.", field=name, hint=f"give finite {meaning}")
-    far = (np.abs(array) > FARTHEST).any(axis=1)
+    far = (np.abs(array) > MAX_COORDINATE).any(axis=1)
     if far.any():
-        raise InputError(f"row {int(np.argmax(far))} is beyond {FARTHEST:g}.", field=name, hint=f"give {meaning}")
+        raise InputError(f"row {int(np.argmax(far))} is beyond {MAX_COORDINATE:g}.", field=name, hint=f"give {meaning}")
     return np.ascontiguousarray(array)
 
 
 def spheres(values: ArrayLike | Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
-    """Centres (P, 3) and radii (P,), None for points, of points (P, 3) or spheres (P, 4) = (x, y, z, radius) [m].
+    """Split points (P, 3) or spheres (P, 4) = (x, y, z, radius) [m] into centres (P, 3) and radii (P,).
 
-    Radii are rounded up to float32.
+    Points have no radii (None). Radii are rounded up to float32.
 
     Raises:
-        InputError: another shape, a value that is not finite, a radius below 0 or above 10 km.
+        InputError: the shape is wrong, a value is not finite, or a radius is not in 0..10 km.
     """
     array = as_float64(values)
     if array.ndim != 2 or array.shape[1] not in (3, 4):
@@ -57,14 +57,14 @@ def spheres(values: ArrayLike | Tensor) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def radii(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Radii (P,) [m] rounded up to float32.
+    """Round radii (P,) [m] up to float32.
 
     Raises:
         InputError: a radius is below 0 or above 10 km.
     """
-    bad = ~((values >= 0.0) & (values <= LARGEST_RADIUS))
+    bad = ~((values >= 0.0) & (values <= MAX_RADIUS))
     if bad.any():
         row = int(np.argmax(bad))
-        raise InputError(f"row {row} is {values[row]}.", field="radius", hint=f"give 0..{LARGEST_RADIUS:g} m")
+        raise InputError(f"row {row} is {values[row]}.", field="radius", hint=f"give 0..{MAX_RADIUS:g} m")
     rounded = values.astype(np.float32)
     return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)

@@ -1,4 +1,4 @@
-"""How far a map's surfaces are from what its own depth images measured, and the margin that this calls for."""
+"""Distance between the surfaces of a map and its own depth images, and the margin that follows from it."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from splatbot.errors import InputError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 
-_EACH = 5000  # points of one image
-_CUT = 0.3  # [m]; what was measured farther from the map than this counts as this far
+_POINTS_PER_VIEW = 5000  # largest number of pixels of one view
+_MAX_ERROR = 0.3  # [m]; larger distances between a measured point and the map are clamped
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceError:
-    """How far measured points lie outside of a field's ellipsoids.
+    """Distances of measured surface points from the ellipsoids of a field.
 
-    A ball that reaches d [m] beyond a point of a surface is called a hit if that point is less than d outside of the
-    ellipsoids; so no ball is called free that is deeper in a surface than the error there.
+    A sphere that contains a surface point at depth d collides with the field if the error of that point is below d.
+    Therefore no sphere that the field reports as free penetrates a surface deeper than the error there.
 
     Args:
-        sorted: (P,) [m], ascending; 0 for points inside of an ellipsoid.
+        sorted: (P,) errors in ascending order [m]; 0 for points inside an ellipsoid.
     """
 
     sorted: Array
 
     def share(self, share: float) -> float:
-        """The error [m] that a share (0..1) of the points does not exceed."""
+        """Return the quantile of the error [m]: a fraction ``share`` (0..1) of the points does not exceed it."""
         if not 0.0 <= share <= 1.0:
             raise InputError(f"is {share}.", field="share", hint="give a value in 0..1, as 0.999")
         return float(np.quantile(self.sorted, share))
@@ -45,18 +45,19 @@ def surface_error(
     *,
     around: ArrayLike | None = None,
 ) -> SurfaceError:
-    """Ask the field at what was measured: up to 5,000 pixels of each view, evenly spaced.
+    """Measure the distance of up to 5,000 evenly spaced pixels of each view from the field.
 
-    ``surface_error(field, views).share(0.999)`` is what ``RobotSpheres(margin=)`` may be set to where a touch in seen
-    space must not happen: the depth's own noise is in it, so it is rather too large.
+    ``surface_error(field, views).share(0.999)`` is a suitable ``margin`` of :class:`RobotSpheres` to avoid contact in
+    observed space. It contains the noise of the depth images and is therefore slightly too large.
 
     Args:
-        field: the map.
-        views: depth (H, W) [m, 0 or NaN: none], camera and T_world_camera (4, 4) of each, as tracked.
-        around: (x, y, z, radius) [m, world]: only what lies in this ball counts, as all that an arm reaches; None: all.
+        field: collision field.
+        views: depth (H, W) [m], 0 or NaN where invalid, camera, and tracked T_world_camera (4, 4) of each view.
+        around: (x, y, z, radius) of a sphere that limits the points, as the reach of an arm [m, world]. If None, all
+            points count.
 
     Raises:
-        InputError: a depth image is not of its camera's size, or no view has any depth there.
+        InputError: the size of a depth image differs from its camera's, or no view has depth in the sphere.
     """
     ball = None if around is None else rows(np.atleast_2d(np.asarray(around)), "around", 4, "(x, y, z, radius)")[0]
     found = []
@@ -64,13 +65,13 @@ def surface_error(
         if depth.shape != (camera.height, camera.width):
             raise InputError(f"is {depth.shape}.", field="depth", hint=f"give ({camera.height}, {camera.width})")
         v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
-        some = np.linspace(0, len(v) - 1, min(len(v), _EACH)).astype(np.int64)
+        some = np.linspace(0, len(v) - 1, min(len(v), _POINTS_PER_VIEW)).astype(np.int64)
         z = depth[v[some], u[some]].astype(np.float64)
         ray = np.stack([(u[some] - camera.cx) / camera.fx, (v[some] - camera.cy) / camera.fy, np.ones(len(some))], 1)
         points = transform_points(T_world_camera, ray * z[:, None])
         if ball is not None:
             points = points[np.linalg.norm(points - ball[:3], axis=1) <= ball[3]]
-        found.append(np.clip(field.clearance(points, cut=_CUT).distance, 0.0, _CUT))
+        found.append(np.clip(field.clearance(points, cut=_MAX_ERROR).distance, 0.0, _MAX_ERROR))
     if not sum(map(len, found)):
         raise InputError("have no depth.", field="views", hint="give the depth images that the map was made of")
     return SurfaceError(np.sort(np.concatenate(found)))

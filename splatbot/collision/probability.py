@@ -1,4 +1,4 @@
-"""How likely a sphere touches the map, if each Gaussian's place is known to within a standard deviation."""
+"""Collision probability of a sphere and a map whose Gaussians have uncertain positions."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from splatbot.collision.inputs import as_float64
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 
-_NEIGHBOURS = 64
+_NEIGHBOURS = 64  # Gaussians whose probabilities are summed; the rest is bounded
 
 
 @dataclass(frozen=True)
 class ProbabilityResult:
-    """Bounds for P spheres; they hold whatever the Gaussians' errors have to do with each other.
+    """Bounds of the collision probability of P spheres, valid for any correlation between the Gaussians' errors.
 
     Args:
-        lower: (P,), of the likeliest Gaussian alone.
-        upper: (P,), of the sum over all (Boole's inequality), at most 1.
-        map_version: the state of the map that was asked.
+        lower: (P,) largest probability of any single Gaussian.
+        upper: (P,) sum over all Gaussians (Boole's inequality), at most 1.
+        map_version: version of the map.
     """
 
     lower: Array
@@ -34,15 +34,19 @@ class ProbabilityResult:
 def collision_probability(
     field: GaussianCollisionField, spheres: ArrayLike | Tensor, sigma: ArrayLike | Tensor | float
 ) -> ProbabilityResult:
-    """P(a Gaussian, moved by its error along the line to the sphere, touches it) = Φ(-d / σ), d the clearance.
+    """Bound the probability that a sphere collides with the map.
 
-    Gaussian i's place is taken to be off by N(0, σᵢ²) along any direction. The nearest 64 Gaussians are summed;
-    what may lie beyond is bounded by the map's number of Gaussians at the 64th distance and the largest σ.
+    The position error of Gaussian i is N(0, σᵢ²) along any direction. With the clearance dᵢ::
+
+        P(collision with i) = Φ(-dᵢ / σᵢ)
+        max_i P_i <= P <= Σ_i P_i
+
+    The sum runs over the nearest 64 Gaussians. All others are bounded by Φ at the 64th distance and the largest σ.
 
     Args:
-        field: the map.
+        field: collision field.
         spheres: (P, 4) = (x, y, z, radius) or points (P, 3) [m, world].
-        sigma: standard deviation [m] of each row of the model (N,), or one for all.
+        sigma: standard deviation of each row of the model (N,), or one for all [m].
 
     Raises:
         InputError: sigma is not above 0, or does not fit the model.
@@ -54,14 +58,14 @@ def collision_probability(
         raise InputError(f"has {len(deviations)} values.", field="sigma", hint=f"the model has {field.rows} rows")
     near = field.nearest(spheres, _NEIGHBOURS)
     own = deviations[np.maximum(near.index, 0)] if deviations.ndim else np.full(near.index.shape, float(deviations))
-    each = np.where(near.index >= 0, _below(-near.distance / own), 0.0)
-    beyond = (len(field) - _NEIGHBOURS) * _below(-near.distance[:, -1] / deviations.max())
-    rest = np.where(near.index[:, -1] >= 0, np.maximum(beyond, 0.0), 0.0)
+    each = np.where(near.index >= 0, _normal_cdf(-near.distance / own), 0.0)
+    tail = (len(field) - _NEIGHBOURS) * _normal_cdf(-near.distance[:, -1] / deviations.max())
+    rest = np.where(near.index[:, -1] >= 0, np.maximum(tail, 0.0), 0.0)
     return ProbabilityResult(each.max(axis=1), np.minimum(1.0, each.sum(axis=1) + rest), field.map_version)
 
 
-def _below(x: Array) -> Array:
-    """Φ(x), the standard normal distribution."""
+def _normal_cdf(x: Array) -> Array:
+    """Compute Φ(x), the cumulative standard normal distribution."""
     import torch
 
     return np.asarray(torch.special.ndtr(torch.from_numpy(np.asarray(x, dtype=np.float64))).numpy())

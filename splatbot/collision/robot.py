@@ -1,4 +1,4 @@
-"""A robot of spheres against the map and against itself: configurations and straight edges in joint space."""
+"""Collision checks of a robot's spheres with the map and with each other: configurations and edges in joint space."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from splatbot.collision.inputs import rows
 from splatbot.errors import InputError
 from splatbot.protocols import Array, LinkSpheres, RobotKinematics
 
-EPS = 1e-3  # [m]; an edge with less room than this for a sphere is not certified
+EPS = 1e-3  # [m]; an edge on which a sphere has less clearance is not certified
 
 
 @dataclass(frozen=True)
 class ConfigurationResult:
-    """Verdicts on C configurations.
+    """Collision checks of C configurations.
 
     Args:
-        in_collision: (C,), false is certain for the ellipsoids of the map.
-        link: (C,) the link that may touch something, -1 for none.
-        other: (C,) the link that it may touch; -1 for the map, or for none.
-        map_version: the state of the map that was asked; -1 for self-collision alone.
+        in_collision: (C,); false is certain for the ellipsoids of the map.
+        link: (C,) int32, link that may be in contact, -1 for a free configuration.
+        other: (C,) int32, link that it may touch, -1 for the map or for a free configuration.
+        map_version: version of the map; -1 if only self-collision is checked.
     """
 
     in_collision: NDArray[np.bool_]
@@ -36,11 +36,11 @@ class ConfigurationResult:
 
 @dataclass(frozen=True)
 class EdgeResult(ConfigurationResult):
-    """Verdicts on E edges.
+    """Collision checks of E edges.
 
     Args:
-        at: (E,) where on the edge (0..1) it was rejected; 1 for a free one.
-        checked: (E,) how many configurations were looked at.
+        at: (E,) position on the edge (0..1) at which it was rejected; 1 for a free edge.
+        checked: (E,) int32, number of configurations that were checked.
     """
 
     at: NDArray[np.float32]
@@ -52,11 +52,11 @@ class ArmClearanceResult:
     """Clearance of C configurations from the map.
 
     Args:
-        distance: (C,) [m], of the sphere that has least; never above the true one. Infinity: more than the cut.
-        gradient: (C, J), of the distance with respect to the joints [m per rad or m]; 0 beyond the cut.
-        link: (C,) of that sphere, -1 beyond the cut.
+        distance: (C,) lower bound of the smallest clearance of any sphere [m]; infinity beyond the cut.
+        gradient: (C, J) derivative of the distance with respect to the joints [m per rad or m]; 0 beyond the cut.
+        link: (C,) int32, link of that sphere, -1 beyond the cut.
         index: (C,) int64, row of the Gaussian in the model, -1 beyond the cut.
-        map_version: the state of the map that was asked.
+        map_version: version of the map.
     """
 
     distance: Array
@@ -67,20 +67,20 @@ class ArmClearanceResult:
 
 
 class RobotSpheres:
-    """The spheres of a robot, ready to be asked.
+    """Collision model of a robot: spheres on its links, for queries against a field and against each other.
 
     Args:
-        robot: its chain, spheres and pairs of links that may not touch.
-        T_world_base: (4, 4) pose of its base.
-        opening: of the gripper [m]; None: as wide as it goes.
-        attached: (A, 4) spheres (x, y, z, radius) [m] of a held object, in the frame of the last link.
-        base_in_map: test the base's own spheres against the map too; where it stands, the map usually holds its stand.
-        margin: room [m] that every sphere shall have to the map, as if it were larger by it; the arm may come nearer to
-            itself. See :func:`splatbot.collision.surface_error`.
+        robot: kinematic chain, spheres of the links, and pairs of links that may not touch.
+        T_world_base: (4, 4) pose of the base [m]. If None, the base is at the origin.
+        opening: opening of the gripper [m]. If None, the gripper is fully open.
+        attached: (A, 4) spheres (x, y, z, radius) of a grasped object in the frame of the last link [m].
+        base_in_map: check the spheres of the base against the map, which usually contains the stand of the robot.
+        margin: clearance that every sphere keeps to the map [m]. It does not apply to self-collision. See
+            :func:`splatbot.collision.surface_error`.
 
     Raises:
-        InputError: T_world_base is no rigid pose, attached or margin make no sense, or the arm is too large for the
-            kernels (16 joints, 256 spheres, 256 pairs).
+        InputError: T_world_base is no rigid pose, attached or margin is invalid, or the arm exceeds 16 joints, 256
+            spheres or 256 pairs.
     """
 
     def __init__(
@@ -119,34 +119,38 @@ class RobotSpheres:
             raise InputError(f"{error}.", field=robot.name, hint="give an arm of fewer parts") from error
 
     def centers(self, q: ArrayLike) -> Array:
-        """Centres (C, S, 3) [m, world] of the spheres at configurations (C, J)."""
+        """Compute the centres (C, S, 3) of the spheres [m, world] at configurations (C, J)."""
         centers: Array = self.native.centers(self._joints(q, "q"))
         return centers
 
     def forward(self, q: ArrayLike) -> Array:
-        """Poses T_world_link (C, J + 1, 4, 4) at configurations (C, J)."""
+        """Compute the poses T_world_link (C, J + 1, 4, 4) at configurations (C, J)."""
         poses: Array = self.native.forward(self._joints(q, "q"))
         return poses
 
     def check(self, field: GaussianCollisionField | None, q: ArrayLike) -> ConfigurationResult:
-        """Whether configurations (C, J) may touch the map or themselves; without a field, themselves alone.
+        """Check whether configurations (C, J) may collide with the map or with themselves.
+
+        Args:
+            field: collision field. If None, only self-collision is checked.
+            q: configurations (C, J) [rad or m].
 
         Raises:
-            InputError: ``q`` is of another shape or not finite.
+            InputError: ``q`` has a wrong shape or is not finite.
         """
         verdict = self.native.configurations(_native(field), self._joints(q, "q"))
         return ConfigurationResult(verdict >= 0, *self._links(verdict), _version(field))
 
     def clearance(self, field: GaussianCollisionField, q: ArrayLike, *, cut: float = np.inf) -> ArmClearanceResult:
-        """The room (C,) that configurations (C, J) have to the map, less the margin, with its gradient in joint space.
+        """Compute the clearance of configurations from the map, less the margin, and its gradient in joint space.
 
         Args:
-            field: the map.
-            q: configurations (C, J).
-            cut: how far to look [m].
+            field: collision field.
+            q: configurations (C, J) [rad or m].
+            cut: search distance [m].
 
         Raises:
-            InputError: ``q`` is of another shape or not finite, or the cut is negative.
+            InputError: ``q`` has a wrong shape or is not finite, or the cut is negative.
         """
         if not cut >= 0.0:
             raise InputError(f"is {cut}.", field="cut", hint="give metres, 0 or more")
@@ -159,20 +163,25 @@ class RobotSpheres:
     def certify(
         self, field: GaussianCollisionField | None, start: ArrayLike, end: ArrayLike, *, eps: float = EPS
     ) -> EdgeResult:
-        """Whether every configuration on straight edges in joint space is free of the map and of itself.
+        """Certify that every configuration on straight edges in joint space is free of collisions.
 
-        Conservative: an edge is cut into stretches, on each of which a sphere moves less than the room that it has
-        (speed at the middle, and a bound of the acceleration); stretches with too little room are halved. An edge is
-        rejected where a configuration may collide, or where a sphere has less room than ``eps``.
+        The check is continuous and conservative. An interval of an edge is free if each sphere moves less than its
+        clearance d at the midpoint. With the speed v at the midpoint, a bound a of the acceleration, and the
+        half-width h::
+
+            v h + a h² / 2 < d
+
+        Other intervals are bisected. An edge is rejected if a configuration may collide, or if a sphere has a clearance
+        below ``eps``.
 
         Args:
-            field: the map; None for self-collision alone.
-            start: (E, J) configurations.
-            end: (E, J) configurations.
-            eps: [m]
+            field: collision field. If None, only self-collision is checked.
+            start: (E, J) configurations [rad or m].
+            end: (E, J) configurations [rad or m].
+            eps: resolution [m].
 
         Raises:
-            InputError: the ends do not fit, or eps is not above 1e-5 m.
+            InputError: the ends differ in shape, or eps is below 1e-5 m.
         """
         if not 1e-5 <= eps < np.inf:
             raise InputError(f"is {eps}.", field="eps", hint="give metres, at least 0.00001")
@@ -187,17 +196,19 @@ class RobotSpheres:
         *,
         eps: float = EPS,
     ) -> EdgeResult:
-        """Whether edges that were certified on the map ``before`` are free on ``now``: only what is new is asked.
+        """Certify edges on the field ``now`` that are certified on ``before``; only added Gaussians are checked.
 
         Raises:
-            InputError: as :meth:`certify`, or the fields differ in n_sigma.
+            InputError: an argument is invalid, as in :meth:`certify`, or the fields differ in n_sigma.
         """
         return self.without_pairs.certify(now.added_since(before), start, end, eps=eps)
 
     def grown(self, by: float) -> RobotSpheres:
-        """The same arm with every sphere larger by ``by`` [m], against the map and against itself."""
+        """Return the same arm with every sphere enlarged by ``by`` [m], against the map and against itself."""
         return RobotSpheres(
-            _Respheres(self, LinkSpheres(self.spheres.link, self.spheres.centers, self.spheres.radii + by), self.pairs),
+            _RobotVariant(
+                self, LinkSpheres(self.spheres.link, self.spheres.centers, self.spheres.radii + by), self.pairs
+            ),
             T_world_base=self.T_world_base,
             base_in_map=self.base_in_map,
             margin=self.margin,
@@ -205,14 +216,14 @@ class RobotSpheres:
 
     @cached_property
     def reach(self) -> Array:
-        """How far (S, J) each sphere's centre moves at most as each joint turns by 1 rad or slides by 1 m [m]."""
+        """Largest motion (S, J) of each sphere's centre per unit of each joint [m per rad or m]."""
         return np.asarray(self.native.reach(), dtype=np.float64)
 
     @cached_property
     def without_pairs(self) -> RobotSpheres:
-        """The same arm, which may touch itself."""
+        """The same arm without self-collision checks."""
         return RobotSpheres(
-            _Respheres(self, self.spheres, np.zeros((0, 2), np.int32)),
+            _RobotVariant(self, self.spheres, np.zeros((0, 2), np.int32)),
             T_world_base=self.T_world_base,
             base_in_map=self.base_in_map,
             margin=self.margin,
@@ -221,10 +232,12 @@ class RobotSpheres:
     def sample(
         self, field: GaussianCollisionField | None, start: ArrayLike, end: ArrayLike, *, samples: int = 32
     ) -> EdgeResult:
-        """The fast knob: ``samples`` configurations of each edge, both ends included; what lies between is not seen.
+        """Check ``samples`` configurations of each edge, both ends included; the rest of the edge is not checked.
+
+        This is faster than :meth:`certify` and gives no certificate.
 
         Raises:
-            InputError: the ends do not fit, or samples is out of range.
+            InputError: the ends differ in shape, or samples is out of range.
         """
         if not 1 <= samples <= 1 << 20:
             raise InputError(f"is {samples}.", field="samples", hint="give 1..1048576")
@@ -246,7 +259,7 @@ class RobotSpheres:
         return rows(values[None] if values.ndim == 1 else values, name, len(self.robot.chain), "joint values")
 
     def _links(self, verdict: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """The link and what it may touch, of native verdicts."""
+        """Return the link and the link that it may touch, from native verdicts."""
         link, other = np.full(len(verdict), -1, np.int32), np.full(len(verdict), -1, np.int32)
         pair = verdict - ARM_SELF
         own, touched = pair >= 0, (verdict >= 0) & (pair < 0)
@@ -255,7 +268,7 @@ class RobotSpheres:
         return link, other
 
     def _gradient(self, q: Array, normal: Array, center: Array, link: NDArray[np.int32]) -> Array:
-        """d distance / d q = n · (z × (c - o)), or n · z for a joint that slides."""
+        """Compute d distance / d q = n · (z × (c - o)), or n · z for a prismatic joint."""
         T = self.native.forward(q)[:, 1:]
         z, at = T[..., :3, 2], T[..., :3, 3]
         turning = np.einsum("cji,ci->cj", np.cross(z, center[:, None] - at), normal)
@@ -264,8 +277,8 @@ class RobotSpheres:
         return np.where(np.arange(q.shape[1]) < link[:, None], gradient, 0.0)
 
 
-class _Respheres:
-    """A robot with other spheres, or other pairs of links that may not touch."""
+class _RobotVariant:
+    """A robot with replaced spheres or replaced pairs of links that may not touch."""
 
     def __init__(self, arm: RobotSpheres, spheres: LinkSpheres, pairs: NDArray[np.int32]) -> None:
         self.name, self.chain = arm.robot.name, arm.robot.chain
@@ -277,16 +290,16 @@ class _Respheres:
 
 
 def _with(spheres: LinkSpheres, last: int, attached: ArrayLike | None) -> LinkSpheres:
-    """The spheres with those of a held object."""
-    held = (
+    """Append the spheres of a grasped object to those of the links."""
+    extra = (
         np.zeros((0, 4)) if attached is None else rows(np.asarray(attached), "attached", 4, "metres (x, y, z, radius)")
     )
-    if (held[:, 3] < 0).any():
+    if (extra[:, 3] < 0).any():
         raise InputError("has a radius below 0.", field="attached", hint="give (x, y, z, radius) in metres")
     return LinkSpheres(
-        np.concatenate([spheres.link, np.full(len(held), last, np.int32)]),
-        np.concatenate([spheres.centers, held[:, :3]]),
-        np.concatenate([spheres.radii, held[:, 3]]),
+        np.concatenate([spheres.link, np.full(len(extra), last, np.int32)]),
+        np.concatenate([spheres.centers, extra[:, :3]]),
+        np.concatenate([spheres.radii, extra[:, 3]]),
     )
 
 

@@ -1,4 +1,4 @@
-"""What of a map is solid: the gates on opacity and observation, and the arrays that the native field takes."""
+"""Solid Gaussians of a map: gates on opacity and observation, and the input arrays of the native field."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from splatbot.collision.visibility import VisibilityEvidence
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 
-# A mapped surface is measured to a fraction of a millimetre at best. With this floor the 2σ ellipsoid reaches at least
-# 0.1 mm to either side of a surface, and a scale of 0 is safe: it only ever fattens.
+# A surface is measured to a fraction of a millimetre at best. With this floor the 2σ ellipsoid extends at least 0.1 mm
+# to either side of it. The floor only enlarges ellipsoids, and makes a scale of 0 safe.
 SCALE_FLOOR = 5e-5  # [m]
-# Below this opacity a Gaussian contributes to no pixel (the rasterizer's cut), so nobody could have seen it.
+# The rasterizer ignores Gaussians of lower opacity, so no image can show them.
 MIN_OPACITY = 1.0 / 255.0
-LARGEST = 1e6  # [m] of means and scales: beyond it squares of float32 overflow
+MAX_VALUE = 1e6  # [m] largest mean or scale; squares of larger values overflow in float32
 
 
 @dataclass(frozen=True)
 class SolidGate:
-    """Which Gaussians are solid; the others are air.
+    """Criteria of solid Gaussians; all others are ignored.
 
     Args:
-        min_opacity: fainter ones are air.
-        min_observations: so are those that fewer keyframes' depth supports; a Gaussian without any only carries colour.
+        min_opacity: smallest opacity.
+        min_observations: smallest number of keyframes whose depth supports the Gaussian; without any it only carries
+            colour.
 
     Raises:
         InputError: a bound is out of range.
@@ -44,10 +45,10 @@ class SolidGate:
             raise InputError(f"is {self.min_observations}.", field="min_observations", hint="give 0 or more keyframes")
 
     def solid(self, model: GaussianModel, evidence: VisibilityEvidence | None = None) -> NDArray[np.bool_]:
-        """Whether each Gaussian (N,) is solid; one that was seen through more often than hit is not.
+        """Return whether each Gaussian (N,) is solid; one with more passes than hits is not.
 
         Raises:
-            InputError: the evidence is of another number of Gaussians.
+            InputError: the evidence has another number of Gaussians.
         """
         if evidence is not None and len(evidence.hits) != len(model):
             raise InputError(f"has {len(evidence.hits)} rows.", field="evidence", hint=f"gather it for {len(model)}")
@@ -58,13 +59,13 @@ class SolidGate:
 
 @dataclass(frozen=True)
 class SolidArrays:
-    """Gaussians as the native field takes them: float32, C-contiguous.
+    """Input of the native field: float32, C-contiguous.
 
     Args:
         means: (N, 3) [m, world].
         quats: (N, 4) wxyz, any norm.
         scales: (N, 3) standard deviations [m], at least ``SCALE_FLOOR``.
-        names: (N,) int32.
+        names: (N,) int32, identifiers.
     """
 
     means: NDArray[np.float32]
@@ -74,11 +75,11 @@ class SolidArrays:
 
 
 def solid_arrays(model: GaussianModel, rows: NDArray[np.int64], names: NDArray[np.int32]) -> SolidArrays:
-    """The Gaussians ``rows`` (N,) of a model, each once and in order, under ``names`` (N,).
+    """Extract the Gaussians ``rows`` (N,), sorted and distinct, of a model with the identifiers ``names`` (N,).
 
     Raises:
-        InputError: a mean, scale, opacity or quaternion is not finite, or a quaternion is zero: a damaged Gaussian
-            would never be hit, which reads as free (with the row); or a value is above 1e6 m.
+        InputError: a mean, scale, opacity or quaternion is not finite, a quaternion is zero, or a value exceeds 1e6 m.
+            The message names the row. A damaged Gaussian would otherwise count as free space.
     """
     columns = [model.means, model.quats, model.log_scales]
     if len(rows) != len(model):
@@ -92,13 +93,13 @@ def solid_arrays(model: GaussianModel, rows: NDArray[np.int64], names: NDArray[n
         row = rows[int(zero.nonzero()[0, 0])]
         raise InputError(f"row {row} is zero.", field="quats", hint="use (1, 0, 0, 0) for no rotation")
     scales = log_scales.exp().clamp_min_(SCALE_FLOOR)
-    if len(rows) and max(float(scales.amax()), float(means.amax()), -float(means.amin())) > LARGEST:
-        raise InputError(f"has values above {LARGEST:g} m.", field="means, scales", hint="give metres")
+    if len(rows) and max(float(scales.amax()), float(means.amax()), -float(means.amin())) > MAX_VALUE:
+        raise InputError(f"has values above {MAX_VALUE:g} m.", field="means, scales", hint="give metres")
     return SolidArrays(_array(means), _array(quats), _array(scales), np.ascontiguousarray(names, dtype=np.int32))
 
 
 def check_opacities(model: GaussianModel) -> None:
-    """Refuse opacities that are not finite: they would read as air.
+    """Refuse opacities that are not finite; such Gaussians would count as free space.
 
     Raises:
         InputError: the message names the row.
@@ -107,7 +108,7 @@ def check_opacities(model: GaussianModel) -> None:
 
 
 def _check_finite(name: str, values: Tensor, rows: NDArray[np.int64]) -> None:
-    if math.isfinite(float(values.detach().sum(dtype=torch.float64))):  # no sum of float32 overflows float64
+    if math.isfinite(float(values.detach().sum(dtype=torch.float64))):  # cannot overflow in float64
         return
     bad = ~torch.isfinite(values).reshape(len(values), -1).all(dim=1)
     raise InputError(

@@ -1,4 +1,4 @@
-"""Space that no depth image has seen: free, occupied, or at a cost; the caller says which."""
+"""Unknown space, which no depth image has observed; the caller treats it as free, as occupied or as a cost."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True, eq=False)
 class UnknownSpace:
-    """Which voxels of a box were never seen to be free.
+    """Voxels of a box that no depth ray has passed.
 
-    Unknown as *free*: do not ask. As *occupied*: join :meth:`solids` to the map (``GaussianModel.concatenate``) before
-    making a field. As a *cost*: make a field of :meth:`solids` alone, and ask it beside the map's.
+    A caller ignores this class to treat unknown space as free. To treat it as occupied, append :meth:`solids` to the
+    map (``GaussianModel.concatenate``) before the field is built. To treat it as a cost, query a separate field of
+    :meth:`solids`.
 
     Args:
-        unknown: (X, Y, Z).
-        origin: (3,) [m, world], the first voxel's corner.
-        voxel: edge [m].
+        unknown: (X, Y, Z), True where unknown.
+        origin: (3,) corner of the first voxel [m, world].
+        voxel: edge length [m].
     """
 
     unknown: NDArray[np.bool_]
@@ -34,7 +35,7 @@ class UnknownSpace:
     voxel: float
 
     def at(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Whether points (P, 3) [m, world] lie in unknown space; outside of the box everything is unknown."""
+        """Return whether points (P, 3) [m, world] lie in unknown space; space outside the box is unknown."""
         p = rows(np.asarray(points), "points", 3, "world coordinates in metres")
         cell = np.floor((p - self.origin) / self.voxel).astype(np.int64)
         inside = ((cell >= 0) & (cell < self.unknown.shape)).all(axis=1)
@@ -43,17 +44,18 @@ class UnknownSpace:
         return found
 
     def solids(self, n_sigma: float = 2.0, *, rim: bool = True) -> GaussianModel:
-        """A ball around each unknown voxel, as Gaussians of ``n_sigma``; with ``rim``, of those with a known neighbour.
+        """Return spheres that enclose the unknown voxels, as Gaussians whose surface is at ``n_sigma``.
 
-        Balls hold the whole voxel. What starts in known space cannot reach the inside without passing the rim.
+        With ``rim`` only voxels with a known neighbour are returned. A motion that starts in known space cannot reach
+        the interior without passing the rim.
         """
         known = np.pad(~self.unknown, 1, constant_values=False)
-        beside = np.zeros_like(self.unknown)
+        has_known_neighbour = np.zeros_like(self.unknown)
         for shift in np.ndindex(3, 3, 3):
             i, j, k = shift
             x, y, z = self.unknown.shape
-            beside |= known[i : i + x, j : j + y, k : k + z]
-        cells = np.argwhere(self.unknown & beside if rim else self.unknown)
+            has_known_neighbour |= known[i : i + x, j : j + y, k : k + z]
+        cells = np.argwhere(self.unknown & has_known_neighbour if rim else self.unknown)
         n = len(cells)
         return GaussianModel.from_activated(
             means=self.origin + (cells + 0.5) * self.voxel,
@@ -67,18 +69,18 @@ class UnknownSpace:
 def find_unknown(
     aabb: ArrayLike, voxel: float, views: Iterable[tuple[NDArray[np.float32], Camera, Array]]
 ) -> UnknownSpace:
-    """The voxels of a box (2, 3) = (low, high) [m] through which no measured ray is known to have passed.
+    """Find the voxels of a box that no measured ray is known to have passed.
 
-    A voxel is known to be free where the depth at the pixel of its centre is behind the voxel's far side; those that
-    are crossed only off their centre stay unknown, which is safe.
+    A voxel is free if the depth at the pixel of its centre lies behind the whole voxel. A voxel that rays cross only
+    away from its centre stays unknown, which is conservative.
 
     Args:
-        aabb: corners of the box.
-        voxel: edge [m].
-        views: depth (H, W) [m, 0 or NaN: none], camera and T_world_camera (4, 4) of each.
+        aabb: (2, 3) = (low, high), corners of the box [m, world].
+        voxel: edge length [m].
+        views: depth (H, W) [m], 0 or NaN where invalid, camera, and T_world_camera (4, 4) of each view.
 
     Raises:
-        InputError: the box is empty or the voxel not above 0.
+        InputError: the box is empty, or the voxel is not above 0.
     """
     low, high = rows(np.asarray(aabb, dtype=np.float64), "aabb", 3, "corners in metres")[:2]
     if not (voxel > 0 and (high > low).all()):

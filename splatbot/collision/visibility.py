@@ -1,4 +1,4 @@
-"""What depth images say of each Gaussian: a surface was measured there, or something behind it was."""
+"""Visibility of Gaussians in depth images: the depth at a Gaussian's pixel confirms it or lies behind it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 
-# A depth within this much of a Gaussian's own hits it; one farther behind sees through it. It grows with the square of
-# the depth, as a structured-light camera's noise does (Khoshelham & Elberink 2012: sigma = 1.4e-3 z^2).
+# A depth that differs from the Gaussian's by at most TOLERANCE + TOLERANCE_PER_Z2 z² hits it; a larger one passes it.
+# The noise of structured-light cameras grows with z² (Khoshelham & Elberink 2012: sigma = 1.4e-3 z^2).
 TOLERANCE, TOLERANCE_PER_Z2 = 0.01, 0.006  # [m], [1/m]
 
-DepthView = tuple[NDArray[np.float32], Camera, Array]  # depth (H, W) [m, 0: none], its camera, T_world_camera (4, 4)
+DepthView = tuple[NDArray[np.float32], Camera, Array]  # depth (H, W) [m], 0 if invalid, camera, T_world_camera (4, 4)
 
 
 @dataclass(frozen=True, eq=False)
 class VisibilityEvidence:
-    """Counts (N,) over depth images, by the pixel on which each Gaussian's mean falls.
+    """Counts over depth images, at the pixel to which the mean of each Gaussian projects.
 
     Args:
-        hits: how often the depth there was the Gaussian's own.
-        passes: how often it was behind it, so that the ray went through.
+        hits: (N,) int32, number of images whose depth equals that of the Gaussian.
+        passes: (N,) int32, number of images whose depth lies behind the Gaussian, so that the ray passed it.
     """
 
     hits: NDArray[np.int32]
@@ -35,28 +35,32 @@ class VisibilityEvidence:
 
     @property
     def seen_through(self) -> NDArray[np.bool_]:
-        """More often than hit: no ray would pass through a surface."""
+        """True (N,) where passes outnumber hits; rays do not pass a real surface."""
         return self.passes > self.hits
 
     def select(self, rows: NDArray[np.int64]) -> VisibilityEvidence:
-        """The counts of some rows."""
+        """Return the counts of some rows."""
         return VisibilityEvidence(self.hits[rows], self.passes[rows])
 
 
 def gather_evidence(model: GaussianModel, views: Iterable[DepthView]) -> VisibilityEvidence:
-    """Count over views, each a depth image (H, W) [m, 0 or NaN: none], its camera and T_world_camera (4, 4).
+    """Count hits and passes of a model's Gaussians over views.
+
+    Args:
+        model: the map.
+        views: depth (H, W) [m], 0 or NaN where invalid, camera, and T_world_camera (4, 4) of each view.
 
     Raises:
-        InputError: a depth image is not of its camera's size.
+        InputError: the size of a depth image differs from its camera's.
     """
     return evidence_at(model.means.detach().numpy().astype(np.float64), views)
 
 
 def evidence_at(points: Array, views: Iterable[DepthView]) -> VisibilityEvidence:
-    """The same of points (P, 3) [m, world].
+    """Count hits and passes of points (P, 3) [m, world]; see :func:`gather_evidence`.
 
     Raises:
-        InputError: a depth image is not of its camera's size.
+        InputError: the size of a depth image differs from its camera's.
     """
     hits, passes = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for depth, camera, T_world_camera in views:
@@ -72,7 +76,7 @@ def evidence_at(points: Array, views: Iterable[DepthView]) -> VisibilityEvidence
 def measured_depths(
     points: Array, depth: NDArray[np.float32], camera: Camera, T_world_camera: Array
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """The points that fall on a pixel with depth: their rows (M,), the depth there (M,), and their own (M,) [m]."""
+    """Return the points that project to a pixel with depth: rows (M,), measured depth (M,), own depth (M,) [m]."""
     p = transform_points(inverse(T_world_camera), points)
     rows = np.flatnonzero(p[:, 2] > 0.05)
     u = np.rint(camera.fx * p[rows, 0] / p[rows, 2] + camera.cx)

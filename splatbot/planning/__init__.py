@@ -1,4 +1,4 @@
-"""How the arm gets from one configuration to another among the Gaussians."""
+"""Motion planning of an arm in a map of Gaussians: paths, certificates, trajectories, replanning."""
 
 from splatbot.planning.problem import (
     Cause,

@@ -1,4 +1,4 @@
-"""A path of straight edges with its corners rounded, as a curve with two continuous derivatives."""
+"""Blends: a path of straight edges with rounded corners, as a curve with two continuous derivatives."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-_PER_BLEND = 48  # places of a blend
-_CHORDS = 12  # of a blend, where it is only looked at
-_PER_LINE = 24  # at least, of a line
+_BLEND_SAMPLES = 48  # samples of a blend
+_BLEND_CHORDS = 12  # chords that approximate a blend before its speed is planned
+_MIN_LINE_SAMPLES = 24  # samples of the shortest line
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """q(s) in pieces: quintic Bezier curves (a line is one too), joined with equal first and second derivatives.
+    """Curve q(s) of quintic Bezier pieces that are joined with equal first and second derivatives.
 
-    At a corner, a blend runs from ``reach`` before it to ``reach`` after it. Its control points lie on the two edges,
-    the first three and the last three evenly, so that it begins and ends with unit speed and without curvature; it
-    stays in the triangle of its ends and the corner.
+    A blend runs from ``reach`` before a corner to ``reach`` after it. Its control points lie on the two edges, three on
+    each at equal distances. The blend therefore begins and ends with unit speed and zero curvature. It stays in the
+    triangle of its ends and the corner. A line is a Bezier curve with evenly spaced control points.
 
     Args:
         control: (P, 6, J) control points of the pieces [rad or m].
-        length: (P,) of each in s.
-        corner: (P,) int64, the waypoint that a blend rounds; -1 for lines.
+        length: (P,) length of each piece in s [rad or m].
+        corner: (P,) int64, index of the waypoint that a blend rounds, -1 for lines.
     """
 
     control: Array
@@ -37,15 +37,15 @@ class Curve:
         """Length in s."""
         return float(self.length.sum())
 
-    def places(self) -> Array:
-        """Values of s (N,), not decreasing, dense enough to plan speeds on; both sides of each joint are there."""
+    def samples(self) -> Array:
+        """Return values of s (N,), not decreasing, dense enough to plan speeds; a joint between pieces occurs twice."""
         start = np.concatenate([[0.0], np.cumsum(self.length)])
         even = max(self.total / 256, 1e-9)
-        counts = np.where(self.corner >= 0, _PER_BLEND, _PER_LINE + (self.length / even).astype(np.int64))
+        counts = np.where(self.corner >= 0, _BLEND_SAMPLES, _MIN_LINE_SAMPLES + (self.length / even).astype(np.int64))
         return np.concatenate([np.linspace(start[i], start[i + 1], int(counts[i])) for i in range(len(self.length))])
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """q, dq/ds and d²q/ds², each (N, J), at s (N,)."""
+        """Return q, dq/ds and d²q/ds², each (N, J), at s (N,)."""
         start = np.concatenate([[0.0], np.cumsum(self.length)])
         piece = np.clip(np.searchsorted(start, s, side="right") - 1, 0, len(self.length) - 1)
         u = np.clip((s - start[piece]) / self.length[piece], 0.0, 1.0)
@@ -54,18 +54,18 @@ class Curve:
         return _bezier(b, u), _bezier(velocity, u) / L, _bezier(bend, u) / L**2
 
     def piece_of(self, s: Array) -> NDArray[np.int64]:
-        """The piece (N,) that s lies in."""
+        """Return the index of the piece (N,) that contains s (N,)."""
         start = np.concatenate([[0.0], np.cumsum(self.length)])
         return np.clip(np.searchsorted(start, s, side="right") - 1, 0, len(self.length) - 1)
 
 
 def rounded(waypoints: Array, reach: Array, first: int) -> Curve:
-    """The curve through waypoints (N, J), N >= 2, no two in a row alike, its inner corners rounded.
+    """Round the inner corners of a path.
 
     Args:
-        waypoints: of one run from rest to rest.
-        reach: (N,) how far from each corner its blend begins and ends [rad or m]; those of the ends are ignored.
-        first: number of the first waypoint, for ``Curve.corner``.
+        waypoints: (N, J), N >= 2, from rest to rest [rad or m]; consecutive waypoints differ.
+        reach: (N,) distance from each corner to both ends of its blend [rad or m]; the first and last are ignored.
+        first: index of the first waypoint in the whole path, for ``Curve.corner``.
     """
     step = np.diff(waypoints, axis=0)
     edge = np.linalg.norm(step, axis=1)
@@ -90,7 +90,7 @@ def rounded(waypoints: Array, reach: Array, first: int) -> Curve:
 
 
 def blend_chords(before: Array, at: Array, after: Array, reach: float) -> Array:
-    """Places (K, J) along the blend of a corner between three waypoints (J,)."""
+    """Return points (K, J) along the blend of the corner ``at`` between the waypoints ``before`` and ``after`` (J,)."""
     first, last = at - before, after - at
     curve = np.concatenate(
         [
@@ -98,12 +98,12 @@ def blend_chords(before: Array, at: Array, after: Array, reach: float) -> Array:
             at + reach * np.array([0.2, 0.6, 1.0])[:, None] * last / np.linalg.norm(last),
         ]
     )
-    u = np.linspace(0.0, 1.0, _CHORDS + 1)
+    u = np.linspace(0.0, 1.0, _BLEND_CHORDS + 1)
     return _bezier(np.broadcast_to(curve, (len(u), *curve.shape)), u)
 
 
 def _bezier(control: Array, u: Array) -> Array:
-    """De Casteljau: points (N, J) of curves with control points (N, K, J) at u (N,)."""
+    """Evaluate curves with control points (N, K, J) at u (N,) by De Casteljau's algorithm; return points (N, J)."""
     points, share = control, u[:, None, None]
     while points.shape[1] > 1:
         points = points[:, :-1] * (1.0 - share) + points[:, 1:] * share

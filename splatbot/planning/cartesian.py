@@ -1,4 +1,4 @@
-"""The tool along a straight line, as to approach a grasp and to retreat from it; certified, or the reason why not."""
+"""Cartesian paths: the tool moves along a straight line, as in the approach to a grasp and the retreat."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from splatbot.geometry import so3_exp, so3_log
 from splatbot.planning.causes import collision
 from splatbot.planning.ik import TOLERANCE, HasTool, inverse_kinematics, is_rigid
 from splatbot.planning.problem import Cause, Certificate, GoalError, Path, PlanStatus, StartError
-from splatbot.planning.timing import least_room
+from splatbot.planning.timing import min_clearance
 from splatbot.protocols import Array
 
-STEP = 0.01  # [m] between places on the line
-TURN = 0.05  # [rad] between them, at most
-JUMP = 0.3  # [rad or m] of any joint from one place to the next; more is another branch
-OFF_LINE = 1e-3  # [m] that the tool may be off the line between two places
-_FINER = 4  # times the places are doubled where the tool would leave the line
+STEP = 0.01  # [m] largest distance between two points of the line
+TURN = 0.05  # [rad] largest rotation between two points
+JUMP = 0.3  # [rad or m] largest step of a joint between two points; a larger one is another branch of the IK
+OFF_LINE = 1e-3  # [m] largest deviation of the tool from the line between two points
+_SUBDIVISIONS = 4  # largest number of times that the points are doubled to keep OFF_LINE
 
 
 @dataclass(frozen=True, eq=False)
 class StraightResult:
-    """What came of a straight line. True if all of it can be followed.
+    """Result of :func:`straight_line`. True if the path covers the whole line.
 
     Args:
         status: SUCCESS, NO_IK_SOLUTION, GOAL_IN_COLLISION or START_STATE_IN_COLLISION.
-        path: from the start along as much of the line as is certified; None if there is nothing of it.
-        share: how much of the line that is, 0..1.
-        off_line: the most that the tool is off the line between two places [m].
-        cause: what is in the way, if something is.
-        reason: why it ends early, in one sentence; empty if it does not.
+        path: certified part of the line from its start; None if no part is certified.
+        share: fraction of the line that the path covers, 0..1.
+        off_line: largest deviation of the tool from the line between two points [m].
+        cause: the obstacle, if a collision ends the path.
+        reason: one sentence that explains an early end; empty on success.
     """
 
     status: PlanStatus
@@ -57,18 +57,19 @@ def straight_line(
     eps: float = EPS,
     off_line: float = OFF_LINE,
 ) -> StraightResult:
-    """Move the tool from where it is at ``start`` straight to ``T_world_end``, turning evenly on the way.
+    """Move the tool on a straight line with a constant axis of rotation.
 
-    Joint values follow from place to place by inverse kinematics from the last ones, on one branch; the edges between
-    them are certified, so what holds for the path holds between the places.
+    At a fraction s of the line the tool is at ``p(s) = p0 + s (p1 - p0)``, ``R(s) = R0 exp(s log(R0ᵀ R1))``. Inverse
+    kinematics starts at the joint values of the previous point, so that the path stays on one branch. The edges between
+    the points are certified over their whole length.
 
     Args:
-        arm: the robot; what it holds is among its spheres.
-        field: the map; without what is to be grasped, if that is to be touched. None: free of the arm itself alone.
-        start: (J,)
-        T_world_end: (4, 4) of the tool.
-        eps: see :meth:`splatbot.collision.RobotSpheres.certify`.
-        off_line: [m]
+        arm: the robot; an attached object is part of its spheres.
+        field: the map without the object to grasp. If None, only self-collision is checked.
+        start: (J,) configuration [rad or m].
+        T_world_end: (4, 4) final pose of the tool [m].
+        eps: see :meth:`splatbot.collision.RobotSpheres.certify` [m].
+        off_line: largest deviation of the tool from the line [m].
 
     Raises:
         StartError: the start does not fit the arm.
@@ -83,43 +84,43 @@ def straight_line(
         cause = collision(arm, field, q0) if field is not None else None
         return StraightResult(PlanStatus.START_STATE_IN_COLLISION, None, 0.0, 0.0, cause, f"at the start {cause}.")
     count = max(1, int(np.ceil(max(np.linalg.norm(length) / STEP, np.linalg.norm(turn) / TURN))))
-    for _ in range(_FINER):
+    for _ in range(_SUBDIVISIONS):
         shares = np.linspace(0.0, 1.0, count + 1)
-        q, lost = _followed(arm, tool, q0, T_start, length, turn, shares)
-        worst = _off_line(arm, tool, q, T_start, length)
-        if worst <= off_line:
+        q, lost = _joint_path(arm, tool, q0, T_start, length, turn, shares)
+        deviation = _deviation(arm, tool, q, T_start, length)
+        if deviation <= off_line:
             break
         count *= 2
-    return _certified(arm, field, q, shares, lost or worst > off_line, worst, eps)
+    return _certified(arm, field, q, shares, lost or deviation > off_line, deviation, eps)
 
 
 def along(T_world_tool: ArrayLike, distance: float, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """A tool's pose (4, 4) moved by a distance [m] along an axis (3,) of its own; negative: back."""
+    """Translate a tool pose (4, 4) by a signed distance [m] along an axis (3,) of the tool frame."""
     T = np.array(T_world_tool, dtype=np.float64)
     direction = np.asarray(axis, dtype=np.float64)
     T[:3, 3] += T[:3, :3] @ (direction / np.linalg.norm(direction)) * distance
     return T
 
 
-def _followed(
+def _joint_path(
     arm: RobotSpheres, tool: Array, q0: Array, T_start: Array, length: Array, turn: Array, shares: Array
 ) -> tuple[Array, bool]:
-    """Joint values (K, J) at the places, as far as one branch goes, and whether it ends early."""
+    """Return joint values (K, J) at the points up to the end of the branch, and whether the branch ends early."""
     chain = arm.robot.chain
     q = [q0]
     for share in shares[1:]:
         T = T_start.copy()
         T[:3, 3] += share * length
         T[:3, :3] = T_start[:3, :3] @ so3_exp(share * turn)
-        found, miss = inverse_kinematics(arm.native, chain, tool, T[None], q[-1][None])
-        if (miss[0] > TOLERANCE).any() or np.abs(found[0] - q[-1]).max() > JUMP:
+        found, error = inverse_kinematics(arm.native, chain, tool, T[None], q[-1][None])
+        if (error[0] > TOLERANCE).any() or np.abs(found[0] - q[-1]).max() > JUMP:
             return np.array(q), True
         q.append(found[0])
     return np.array(q), False
 
 
-def _off_line(arm: RobotSpheres, tool: Array, q: Array, T_start: Array, length: Array) -> float:
-    """How far the tool is from the line in the middles of the edges [m]."""
+def _deviation(arm: RobotSpheres, tool: Array, q: Array, T_start: Array, length: Array) -> float:
+    """Return the largest distance [m] of the tool from the line at the midpoints of the edges."""
     if len(q) < 2:
         return 0.0
     at = (arm.forward((q[:-1] + q[1:]) / 2)[:, -1] @ tool)[:, :3, 3] - T_start[:3, 3]
@@ -134,7 +135,7 @@ def _certified(
     q: Array,
     shares: Array,
     lost: bool,
-    worst: float,
+    deviation: float,
     eps: float,
 ) -> StraightResult:
     edges = arm.certify(field, q[:-1], q[1:], eps=eps).in_collision
@@ -143,21 +144,21 @@ def _certified(
     share = float(shares[good])
     if good < len(edges):
         cause = collision(arm, field, q[good + 1]) if field is not None else None
-        why = f"at {share:.0%} of the line {cause}." if cause else f"at {share:.0%} of the line the arm touches itself."
-        return StraightResult(PlanStatus.GOAL_IN_COLLISION, path, share, worst, cause, why)
+        reason = f"at {share:.0%} of the line {cause or 'the arm touches itself'}."
+        return StraightResult(PlanStatus.GOAL_IN_COLLISION, path, share, deviation, cause, reason)
     if lost:
-        why = f"at {share:.0%} of the line the posture cannot go on without a jump, or a limit is reached."
-        return StraightResult(PlanStatus.NO_IK_SOLUTION, path, share, worst, None, why)
-    return StraightResult(PlanStatus.SUCCESS, path, 1.0, worst)
+        reason = f"at {share:.0%} of the line the posture cannot continue without a jump, or a limit is reached."
+        return StraightResult(PlanStatus.NO_IK_SOLUTION, path, share, deviation, None, reason)
+    return StraightResult(PlanStatus.SUCCESS, path, 1.0, deviation)
 
 
 def _path(arm: RobotSpheres, field: GaussianCollisionField | None, q: Array, eps: float) -> Path:
-    room = 0.0
+    clearance = 0.0
     if field is not None:
-        # A spline with each place three times is the polyline itself.
-        room = max(0.0, least_room(arm, field, np.repeat(q, 3, axis=0)))
+        # A cubic B-spline in which each control point occurs three times is the polyline itself.
+        clearance = max(0.0, min_clearance(arm, field, np.repeat(q, 3, axis=0)))
     cost = float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum())
-    return Path(q, cost, Certificate(True, eps, room, arm.margin, -1 if field is None else field.map_version))
+    return Path(q, cost, Certificate(True, eps, clearance, arm.margin, -1 if field is None else field.map_version))
 
 
 def _checked(arm: RobotSpheres, start: ArrayLike, end: ArrayLike, off_line: float) -> tuple[Array, Array]:

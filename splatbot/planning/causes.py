@@ -1,4 +1,4 @@
-"""Why a configuration or an edge will not do: which joint, which link, which Gaussian, how deep."""
+"""Causes of rejection: the joint, link and Gaussian that make a configuration or an edge invalid, and the depth."""
 
 from __future__ import annotations
 
@@ -8,31 +8,34 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.planning.problem import Cause
 from splatbot.protocols import Array, KinematicChain
 
-LOOK = 0.05  # [m] around the arm, for what is in the way
-LIMIT_SLACK = 1e-6  # [rad or m] that a start or goal may be beyond a limit, as encoders at a stop read
+SEARCH_DISTANCE = 0.05  # [m] around the arm in which the obstacle is searched
+LIMIT_SLACK = 1e-6  # [rad or m] that a start or goal may exceed a limit; encoders at a hard stop read such values
 
 
-def beyond_limits(chain: KinematicChain, q: Array) -> Cause | None:
-    """The joint of ``q`` (J,) that is farthest out of its limits; None if all are within."""
-    beyond = np.maximum(chain.lower - q, q - chain.upper)
-    joint = int(np.argmax(beyond))
-    return Cause(joint=joint, depth=float(beyond[joint])) if beyond[joint] > LIMIT_SLACK else None
+def limit_violation(chain: KinematicChain, q: Array) -> Cause | None:
+    """Return the joint of ``q`` (J,) that exceeds its limits most, or None if all joints are within their limits."""
+    excess = np.maximum(chain.lower - q, q - chain.upper)
+    joint = int(np.argmax(excess))
+    return Cause(joint=joint, depth=float(excess[joint])) if excess[joint] > LIMIT_SLACK else None
 
 
 def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cause:
-    """What ``q`` (J,) touches, the deepest of the map and of the arm itself; ``depth`` below 0 is room.
+    """Return the deepest contact of ``q`` (J,) with the map or of the arm with itself; ``depth`` below 0 is clearance.
 
-    Without anything within ``LOOK``, neither is named.
+    The cause names no link and no Gaussian if the map is farther than ``SEARCH_DISTANCE``.
     """
-    answer = arm.clearance(field, q[None], cut=LOOK)
-    room, pair = self_room(arm, q)
-    if room < answer.distance[0]:
-        return Cause(int(pair[0]), int(pair[1]), -1, -room)
-    return Cause(int(answer.link[0]), -1, int(answer.index[0]), -float(answer.distance[0]))
+    nearest = arm.clearance(field, q[None], cut=SEARCH_DISTANCE)
+    clearance, pair = self_clearance(arm, q)
+    if clearance < nearest.distance[0]:
+        return Cause(int(pair[0]), int(pair[1]), -1, -clearance)
+    return Cause(int(nearest.link[0]), -1, int(nearest.index[0]), -float(nearest.distance[0]))
 
 
-def self_room(arm: RobotSpheres, q: Array) -> tuple[float, tuple[int, int]]:
-    """The least gap [m] between spheres of links that may not touch at ``q`` (J,), and those links; infinity: none."""
+def self_clearance(arm: RobotSpheres, q: Array) -> tuple[float, tuple[int, int]]:
+    """Return the smallest gap [m] between spheres of links that may not touch at ``q`` (J,), and the two links.
+
+    The gap is infinite if every pair of links may touch.
+    """
     at, radii, link = arm.centers(q[None])[0], arm.spheres.radii, arm.spheres.link
     apart = np.linalg.norm(at[:, None] - at[None], axis=-1) - radii[:, None] - radii[None]
     forbidden = np.zeros((link.max() + 1,) * 2, bool)
@@ -43,7 +46,7 @@ def self_room(arm: RobotSpheres, q: Array) -> tuple[float, tuple[int, int]]:
 
 
 def blocked_line(arm: RobotSpheres, field: GaussianCollisionField, start: Array, goal: Array, eps: float) -> Cause:
-    """What is first found in the way of the straight edge between two configurations (J,)."""
+    """Return the first collision found on the straight edge between two configurations (J,)."""
     edge = arm.certify(field, start[None], goal[None], eps=eps)
     if not edge.in_collision[0]:
         return Cause()

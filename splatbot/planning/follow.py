@@ -1,4 +1,4 @@
-"""Following a trajectory: what became of it, how far off it was, and a stop within one period when told."""
+"""Following a trajectory with a controller: final state, tracking error, and a stop within one period on request."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 
 from splatbot.protocols import Array, Controller, Feedback, MotionState, TimedPath
 
-_PATIENCE = 1.0  # [s] after the trajectory's end in which the arm may still arrive
+_SETTLING_TIME = 1.0  # [s] after the end of the trajectory in which the arm may still arrive
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """What became of a trajectory.
+    """Record of a followed trajectory. True if the arm arrived.
 
     Args:
-        state: how it ended: done, stopped or fault.
-        fault: why it is at fault, if it is.
-        time: (N,) [s] of each period.
-        position, desired: (N, J) measured, and where the trajectory has it.
+        state: final state: done, stopped or fault.
+        fault: cause of the fault; empty without a fault.
+        time: (N,) time of each period since the start [s].
+        position, desired: (N, J) measured positions and positions of the trajectory [rad or m].
     """
 
     state: MotionState
@@ -31,7 +31,7 @@ class Followed:
 
     @property
     def error(self) -> Array:
-        """The largest difference between the two at each period (N,) [rad or m]."""
+        """Largest absolute tracking error of any joint at each period (N,) [rad or m]."""
         return np.asarray(np.abs(self.position - self.desired).max(axis=1))
 
     def __bool__(self) -> bool:
@@ -41,34 +41,34 @@ class Followed:
 def follow(
     controller: Controller, trajectory: TimedPath, *, stop: Callable[[Feedback], bool] | None = None
 ) -> Followed:
-    """Send a trajectory and step until the arm has arrived, was stopped, or is at fault.
+    """Send a trajectory and step until the arm arrives, is stopped or reports a fault.
 
     Args:
-        controller: of the arm.
-        trajectory: to follow.
-        stop: asked at each period; True stops the arm within the next one.
+        controller: controller of the arm.
+        trajectory: trajectory that begins at the arm's position.
+        stop: predicate that is evaluated at each period; True stops the arm within the next period.
 
     Raises:
         ControllerError: the controller does not take the trajectory.
     """
     controller.send(trajectory)
-    seen: list[Feedback] = []
-    most = int((trajectory.duration + _PATIENCE) / controller.period) + 2
-    while len(seen) < most:
-        seen.append(controller.step())
-        if seen[-1].state is not MotionState.MOVING:
+    feedback: list[Feedback] = []
+    max_periods = int((trajectory.duration + _SETTLING_TIME) / controller.period) + 2
+    while len(feedback) < max_periods:
+        feedback.append(controller.step())
+        if feedback[-1].state is not MotionState.MOVING:
             break
-        if stop is not None and stop(seen[-1]):
+        if stop is not None and stop(feedback[-1]):
             controller.stop()
             stop = None
-    if seen[-1].state is MotionState.MOVING:  # it never arrived
+    if feedback[-1].state is MotionState.MOVING:  # the arm does not arrive in time
         controller.stop()
-        seen.append(controller.step())
-    last = seen[-1]
+        feedback.append(controller.step())
+    last = feedback[-1]
     return Followed(
         last.state,
         last.fault,
-        np.array([f.time for f in seen]),
-        np.stack([f.position for f in seen]),
-        np.stack([f.desired for f in seen]),
+        np.array([f.time for f in feedback]),
+        np.stack([f.position for f in feedback]),
+        np.stack([f.desired for f in feedback]),
     )

@@ -1,4 +1,4 @@
-"""Goals as configurations: those of a set that will do, or postures that reach a pose."""
+"""Goal configurations: the valid ones of a given set, or postures that place the tool at a pose."""
 
 from __future__ import annotations
 
@@ -10,19 +10,28 @@ from numpy.typing import ArrayLike
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.geometry import so3_exp
-from splatbot.planning.causes import beyond_limits, collision
+from splatbot.planning.causes import collision, limit_violation
 from splatbot.planning.ik import MAX_STARTS, TOLERANCE, HasTool, inverse_kinematics, is_rigid
 from splatbot.planning.problem import Cause, Goal, GoalError, JointGoal, PlanStatus, PoseGoal
 from splatbot.protocols import Array
 
-_BATCH = 16  # starts between two looks at the clock
-_FEWEST = 128  # before a pose is given up
-_APART = 0.05  # [rad or m]; postures nearer than this in every joint are one
+_BATCH = 16  # starts between two readings of the clock
+_MIN_STARTS = 128  # smallest number of starts before the search for a first posture may time out
+_MIN_SEPARATION = 0.05  # [rad or m]; postures that differ by less in every joint count as one
+_RANKING_CUT = 0.1  # [m]; postures with more clearance rank equally
+_MAX_CAUSES = 8  # largest number of rejected postures that are examined for the cause
 
 
 @dataclass(frozen=True, eq=False)
 class Goals:
-    """Configurations (K, J) that will do, most room first; without any, why."""
+    """Valid goal configurations, or the reason why none exists.
+
+    Args:
+        q: (K, J) [rad or m], those of a pose sorted by clearance, largest first.
+        status: SUCCESS, or the failure.
+        cause: collision or limit violation, if known.
+        reason: one sentence; empty on success.
+    """
 
     q: Array
     status: PlanStatus = PlanStatus.SUCCESS
@@ -33,24 +42,24 @@ class Goals:
 def goal_configurations(
     arm: RobotSpheres, field: GaussianCollisionField, goal: Goal | ArrayLike, *, near: Array, seed: int, until: float
 ) -> Goals:
-    """The goal's configurations that are within limits and free.
+    """Return the goal configurations that are within limits and free of collisions.
 
     Args:
         arm: the robot.
         field: the map.
         goal: see :mod:`splatbot.planning.problem`.
-        near: (J,) where the search for postures starts first.
-        seed: of the other starts.
-        until: of ``time.perf_counter``, when to stop looking for more postures.
+        near: (J,) first start of the inverse kinematics [rad or m].
+        seed: seed of the random starts.
+        until: time of ``time.perf_counter`` at which the search for further postures ends [s].
 
     Raises:
-        GoalError: the goal is of another shape, not finite, or needs a tool that the robot has not.
+        GoalError: the goal has a wrong shape, is not finite, or needs a tool that the robot lacks.
     """
     if isinstance(goal, PoseGoal):
         return _postures(arm, field, goal, near, seed, until)
     q = _configurations(goal.q if isinstance(goal, JointGoal) else goal, len(arm.robot.chain))
     chain = arm.robot.chain
-    causes = [beyond_limits(chain, one) for one in q]
+    causes = [limit_violation(chain, candidate) for candidate in q]
     inside = np.array([cause is None for cause in causes])
     if not inside.any():
         return Goals(q[:0], PlanStatus.GOAL_STATE_INVALID, causes[0], f"{causes[0]}.")
@@ -71,11 +80,11 @@ def _configurations(values: ArrayLike, joints: int) -> Array:
 
 
 def _free(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Goals:
-    """Those of configurations (K, J) that touch nothing."""
+    """Return the configurations of (K, J) that are free of collisions."""
     free = ~arm.check(field, q).in_collision
     if free.any():
         return Goals(np.ascontiguousarray(q[free]))
-    causes = [collision(arm, field, one) for one in q[:8]]
+    causes = [collision(arm, field, candidate) for candidate in q[:_MAX_CAUSES]]
     least = min(causes, key=lambda cause: cause.depth)
     return Goals(q[:0], PlanStatus.GOAL_IN_COLLISION, least, f"{least}.")
 
@@ -89,39 +98,40 @@ def _postures(
     T, box = _region(goal)
     rng = np.random.default_rng(seed)
     found: list[Array] = []
-    reached, missed = False, np.array([np.inf, np.inf])
-    hit: list[Array] = []
+    reached, least_error = False, np.array([np.inf, np.inf])
+    colliding: list[Array] = []
     for tried in range(0, MAX_STARTS, _BATCH):
         starts = rng.uniform(chain.lower, chain.upper, (_BATCH, len(chain)))
         offsets = rng.uniform(-1.0, 1.0, (_BATCH, 6)) * box
         if tried == 0:
             starts[0], offsets[0] = near, 0.0
-        q, miss = _solve(arm, robot.T_link_tcp, T, offsets, starts)
-        good = (miss <= TOLERANCE).all(axis=1)
-        if good.any():
+        q, error = _solve(arm, robot.T_link_tcp, T, offsets, starts)
+        converged = (error <= TOLERANCE).all(axis=1)
+        if converged.any():
             free = ~arm.check(field, q).in_collision
-            hit += list(q[good & ~free][: 8 - len(hit)])
-            for one in q[good & free]:
-                if all(np.abs(one - other).max() > _APART for other in found):
-                    found.append(one)
+            colliding += list(q[converged & ~free][: _MAX_CAUSES - len(colliding)])
+            for candidate in q[converged & free]:
+                if all(np.abs(candidate - other).max() > _MIN_SEPARATION for other in found):
+                    found.append(candidate)
             reached = True
         elif not reached:
-            nearest = int(np.argmin(miss.sum(axis=1)))
-            missed = miss[nearest] if miss[nearest].sum() < missed.sum() else missed
-        if len(found) >= goal.postures or (time.perf_counter() >= until and (found or tried >= _FEWEST)):
+            nearest = int(np.argmin(error.sum(axis=1)))
+            least_error = error[nearest] if error[nearest].sum() < least_error.sum() else least_error
+        if len(found) >= goal.postures or (time.perf_counter() >= until and (found or tried >= _MIN_STARTS)):
             break
     if found:
         q = np.array(found[: goal.postures])
-        room = arm.clearance(field, q, cut=0.1).distance
-        return Goals(np.ascontiguousarray(q[np.argsort(-np.minimum(room, 0.1), kind="stable")]))
+        clearance = np.minimum(arm.clearance(field, q, cut=_RANKING_CUT).distance, _RANKING_CUT)
+        return Goals(np.ascontiguousarray(q[np.argsort(-clearance, kind="stable")]))
     if reached:
-        return _free(arm, field, np.array(hit))
-    why = f"no posture reaches the pose: the nearest misses it by {1e3 * missed[0]:.1f} mm and {missed[1]:.3f} rad."
-    return Goals(np.zeros((0, len(chain))), PlanStatus.NO_IK_SOLUTION, None, why)
+        return _free(arm, field, np.array(colliding))
+    distance, angle = least_error
+    reason = f"no posture reaches the pose: the nearest misses it by {1e3 * distance:.1f} mm and {angle:.3f} rad."
+    return Goals(np.zeros((0, len(chain))), PlanStatus.NO_IK_SOLUTION, None, reason)
 
 
 def _solve(arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Array) -> tuple[Array, Array]:
-    """Joint values (S, J) for the pose moved by offsets (S, 6) = (translation, rotation vector), and what they miss."""
+    """Return joint values (S, J) and errors (S, 2) for poses with offsets (S, 6) = (translation, rotation vector)."""
     targets = np.tile(T, (len(starts), 1, 1))
     targets[:, :3, 3] += offsets[:, :3] @ T[:3, :3].T
     targets[:, :3, :3] = T[:3, :3] @ np.stack([so3_exp(turn) for turn in offsets[:, 3:]])
@@ -129,14 +139,14 @@ def _solve(arm: RobotSpheres, tool: Array, T: Array, offsets: Array, starts: Arr
 
 
 def _region(goal: PoseGoal) -> tuple[Array, Array]:
-    """The pose (4, 4) and the half-widths (6,) of the region around it."""
+    """Return the pose (4, 4) and the half-widths (6,) of the region around it."""
     T = np.asarray(goal.T_world_tcp, dtype=np.float64)
     if not is_rigid(T):
         raise GoalError("is no rigid pose.", field="T_world_tcp", hint="give (4, 4) with an orthonormal rotation")
     box = np.concatenate([np.broadcast_to(np.asarray(x, dtype=np.float64), (3,)) for x in (goal.position, goal.angle)])
     if not ((box >= 0.0) & (box < np.inf)).all() or goal.postures < 1:
         raise GoalError(
-            "has a negative width, or no posture is wanted.",
+            "has a negative or infinite width, or a number of postures below 1.",
             field="goal",
             hint="give metres, radians and a number of postures above 0",
         )

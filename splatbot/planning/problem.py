@@ -1,4 +1,4 @@
-"""What a planner is asked and what it answers: goals, problems, paths with certificates, and typed failures."""
+"""Inputs and outputs of a planner: goals, problems, paths with certificates, and typed failures."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from splatbot.protocols import Array
 
 
 class PlanStatus(IntEnum):
-    """How planning ended; the values are those of ``moveit_msgs/MoveItErrorCodes``."""
+    """Result of planning; the values are those of ``moveit_msgs/MoveItErrorCodes``."""
 
     SUCCESS = 1
-    PLANNING_FAILED = -1  # the trees cannot grow: iterations are used up, or nothing is left to try
+    PLANNING_FAILED = -1  # the iterations are used up, or the trees cannot grow
     TIMED_OUT = -6
     PREEMPTED = -7  # cancelled
     START_STATE_IN_COLLISION = -10
     GOAL_IN_COLLISION = -12
-    START_STATE_INVALID = -26  # out of the joints' limits
+    START_STATE_INVALID = -26  # outside the joint limits
     GOAL_STATE_INVALID = -27
     NO_IK_SOLUTION = -31
 
 
 class StartError(InputError):
-    """The start is no configuration of this robot (INVALID_ROBOT_STATE)."""
+    """Error: the start is no configuration of this robot (INVALID_ROBOT_STATE)."""
 
     code = -17
 
 
 class GoalError(InputError):
-    """The goal makes no sense for this robot (INVALID_GOAL_CONSTRAINTS)."""
+    """Error: the goal is invalid for this robot (INVALID_GOAL_CONSTRAINTS)."""
 
     code = -16
 
 
 class PlanningError(SplatbotError):
-    """No path was found; ``code`` is the :class:`PlanStatus` and ``result`` what is known."""
+    """Error: no path was found; ``code`` is the :class:`PlanStatus`, ``result`` the :class:`PlanResult`."""
 
     http_status = 422
 
@@ -63,7 +63,7 @@ _HINTS = {
     PlanStatus.TIMED_OUT: "give a larger budget_ms, a smaller margin, or a goal that can be reached",
     PlanStatus.START_STATE_IN_COLLISION: "move the arm away, mask it out of the map, or plan with a smaller margin",
     PlanStatus.START_STATE_INVALID: "give a start within the joints' limits",
-    PlanStatus.GOAL_IN_COLLISION: "give a goal with room around the arm, or plan with a smaller margin",
+    PlanStatus.GOAL_IN_COLLISION: "give a goal with more clearance, or plan with a smaller margin",
     PlanStatus.GOAL_STATE_INVALID: "give a goal within the joints' limits",
     PlanStatus.NO_IK_SOLUTION: "give a pose within reach, or a region around it",
 }
@@ -71,14 +71,14 @@ _HINTS = {
 
 @dataclass(frozen=True)
 class Cause:
-    """What is in the way.
+    """Collision or limit violation that makes a configuration invalid.
 
     Args:
-        link: the link that touches something; -1: none does.
-        other: the link that it touches; -1: it is the map.
-        gaussian: row of the Gaussian in the model; -1: it is the arm itself.
-        depth: how deep the arm is in it [m].
-        joint: the joint that is out of its limits, -1: none; ``depth`` is then how far [rad or m].
+        link: index of the link in contact, -1 if no link is.
+        other: index of the link that it touches, -1 if it touches the map.
+        gaussian: row of the touched Gaussian in the model, -1 if the arm touches itself.
+        depth: penetration depth [m]; below 0 it is clearance.
+        joint: index of the joint outside its limits, -1 if all are within; ``depth`` is then the excess [rad or m].
     """
 
     link: int = -1
@@ -91,7 +91,7 @@ class Cause:
         if self.joint >= 0:
             return f"joint {self.joint} is {self.depth:.4g} beyond its limit"
         if self.link < 0:
-            return "nothing is in the way"
+            return "no obstacle is found"
         if self.other >= 0:
             return f"link {self.link} touches link {self.other}, {1e3 * self.depth:.1f} mm deep"
         return f"link {self.link} is {1e3 * self.depth:.1f} mm deep in Gaussian {self.gaussian}"
@@ -99,22 +99,23 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class JointGoal:
-    """Configurations (K, J) or (J,), any one of which will do."""
+    """Goal set of configurations (K, J) or (J,) [rad or m]; a path to any of them is a solution."""
 
     q: ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
 class PoseGoal:
-    """The tool at a pose, in any posture.
+    """Goal pose of the tool in any posture, or a goal region around it.
+
+    A tool pose ``T_world_tcp · (t, exp(r))`` lies in the region if ``|t| <= position`` and ``|r| <= angle`` in each
+    component.
 
     Args:
-        T_world_tcp: (4, 4) [m].
-        position: (3,) half-widths of a box around it, along the goal's axes [m]; 0: exactly there.
-        angle: (3,) largest rotation vector from it, component by component, about the goal's axes [rad]; pi: any.
-        postures: how many different configurations to look for.
-
-    With ``position`` or ``angle`` above 0 this is a region: configurations anywhere in it will do.
+        T_world_tcp: (4, 4) pose [m].
+        position: (3,) half-widths of the box of translations t along the axes of the goal [m].
+        angle: (3,) largest components of the rotation vector r about the axes of the goal [rad]; pi allows any.
+        postures: largest number of distinct configurations to find.
     """
 
     T_world_tcp: ArrayLike
@@ -128,11 +129,11 @@ Goal = JointGoal | PoseGoal
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
-    """From where to where.
+    """Start and goal of a plan.
 
     Args:
         start: (J,) configuration [rad or m].
-        goal: what will do as an end; an array counts as a :class:`JointGoal`.
+        goal: goal set or region; an array counts as a :class:`JointGoal`.
     """
 
     start: ArrayLike
@@ -141,14 +142,15 @@ class PlanningProblem:
 
 @dataclass(frozen=True)
 class Certificate:
-    """That every configuration on a path, not only the waypoints, is free of the map's ellipsoids and of the arm.
+    """Proof that each configuration on a continuous path is free of the map's ellipsoids and of self-collision.
 
     Args:
-        certified: whether so.
-        eps: [m], see :meth:`splatbot.collision.RobotSpheres.certify`.
-        clearance: [m] that the arm has at least to the map all along, beyond the margin; at most ``CLEARANCE_CUT``.
-        margin: [m] that the spheres were enlarged by.
-        map_version: the state of the map that it holds for.
+        certified: True if the proof exists.
+        eps: resolution of the proof [m], see :meth:`splatbot.collision.RobotSpheres.certify`.
+        clearance: lower bound of the clearance along the path, less the margin [m]; at most 0.1 for a path, and 0.05
+            for a trajectory.
+        margin: enlargement of the spheres against the map [m].
+        map_version: version of the map that the proof refers to.
     """
 
     certified: bool
@@ -160,12 +162,12 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A path of straight edges in joint space.
+    """Path of straight edges in joint space.
 
     Args:
-        waypoints: (N, J), N >= 2 [rad or m]; a path from a place to itself has it twice.
-        cost: its length [rad], the sum of the edges' Euclidean lengths.
-        certificate: what is known of it.
+        waypoints: (N, J), N >= 2 [rad or m]; a path whose start is its goal contains it twice.
+        cost: length of the path, the sum of the Euclidean lengths of its edges [rad].
+        certificate: its proof against the map.
     """
 
     waypoints: Array
@@ -173,32 +175,32 @@ class Path:
     certificate: Certificate
 
     def __len__(self) -> int:
-        """Number of waypoints."""
+        """Return the number of waypoints."""
         return len(self.waypoints)
 
     def at(self, share: ArrayLike) -> Array:
-        """Configurations (..., J) at shares (...) of its length, 0 the start and 1 the goal; beyond, the ends."""
+        """Return configurations (..., J) at fractions (...) of the length, clamped to 0 (start) and 1 (goal)."""
         steps = np.linalg.norm(np.diff(self.waypoints, axis=0), axis=1)
-        along = np.concatenate([[0.0], np.cumsum(steps)])
-        wanted = np.clip(np.asarray(share, dtype=np.float64), 0.0, 1.0) * along[-1]
-        return np.stack([np.interp(wanted, along, column) for column in self.waypoints.T], axis=-1)
+        arc_length = np.concatenate([[0.0], np.cumsum(steps)])
+        s = np.clip(np.asarray(share, dtype=np.float64), 0.0, 1.0) * arc_length[-1]
+        return np.stack([np.interp(s, arc_length, column) for column in self.waypoints.T], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """What planning came to. True if there is a path.
+    """Result of a call of the planner. True if there is a path.
 
     Args:
-        status: how it ended.
-        path: the best one found; None unless ``status`` is SUCCESS.
-        history: (H, 2) of (seconds since the call, cost [rad]) each time a better path was found; costs fall.
-        cause: what is in the way of the start or the goal, where that is why there is no path.
-        reason: why there is no path, in one sentence; empty if there is one.
-        seconds: that the call took.
-        iterations: of the trees' growth.
-        edges: that were checked.
-        nodes: in the tree at the end.
-        map_version: the state of the map that was asked.
+        status: success or kind of failure.
+        path: best path found; None unless ``status`` is SUCCESS.
+        history: (H, 2) rows (time since the call [s], cost [rad]), one for each improvement; the costs decrease.
+        cause: collision or limit violation of the start, the goal or the straight edge, if it explains the failure.
+        reason: one sentence that explains the failure; empty on success.
+        seconds: duration of the call [s].
+        iterations: number of extensions of the trees.
+        edges: number of certified edges.
+        nodes: number of nodes in the final tree.
+        map_version: version of the map.
     """
 
     status: PlanStatus
@@ -217,14 +219,14 @@ class PlanResult:
 
     @property
     def first_seconds(self) -> float:
-        """When the first path was there; infinity if there is none."""
+        """Time from the call to the first path [s]; infinity without a path."""
         return float(self.history[0, 0]) if len(self.history) else np.inf
 
     def unwrap(self) -> Path:
-        """The path.
+        """Return the path.
 
         Raises:
-            PlanningError: there is none; it names the status and the cause.
+            PlanningError: there is no path; the error names the status and the cause.
         """
         if self.path is None:
             raise PlanningError(self)

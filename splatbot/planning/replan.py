@@ -1,4 +1,4 @@
-"""A path that is kept good while the map changes."""
+"""Replanning: a path stays certified while the map changes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from splatbot.planning.rrt_star import GaussianRRTStar
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What a later map means for a path.
+    """Effect of a later map on the current path.
 
     Args:
-        result: with the path, the old one or a repaired one, certified on the later map.
-        kept: whether the path stands as it was.
-        clearance_before: [m] that it had on the map before; compare with the certificate's to slow down.
-        seconds: that it took to find out and, if need be, to repair.
+        result: plan on the later map, with the unchanged path or a repaired one.
+        kept: True if the path is unchanged.
+        clearance_before: clearance of the path on the previous map [m]; a smaller one in the certificate is a reason
+            to slow down.
+        seconds: duration of the check and the repair [s].
     """
 
     result: PlanResult
@@ -31,51 +32,52 @@ class Update:
 
 
 class Replanner:
-    """Plans once and then follows the map: a path is asked of what is new alone, and what breaks is repaired.
+    """Replanner that checks the current path against new Gaussians and repairs it if one blocks it.
 
-    The planner's tree outlives the change: of its edges too, only what is new in the map is asked, and the
-    configurations behind those cut off are joined again where that can be.
+    The planner keeps its search tree. Its edges, too, are checked against the new Gaussians only. Nodes that a blocked
+    edge disconnects are reconnected where possible.
 
     Args:
-        planner: whose ``field`` moves on with :meth:`update`.
+        planner: planner whose ``field`` becomes the field of each :meth:`update`.
     """
 
     def __init__(self, planner: GaussianRRTStar) -> None:
         self.planner = planner
         self._result: PlanResult | None = None
-        self._of_tree = planner.field  # the map that the tree was last compared with
+        self._tree_field = planner.field  # map against which the tree was last checked
 
     @property
     def path(self) -> Path | None:
-        """The path in force."""
+        """Current path, or None."""
         return None if self._result is None else self._result.path
 
     def plan(self, start: ArrayLike, goal: Goal | ArrayLike, *, budget_ms: float = 28.0, seed: int = 0) -> PlanResult:
-        """As :meth:`splatbot.planning.GaussianRRTStar.plan`, whose path is then in force."""
+        """Plan as :meth:`splatbot.planning.GaussianRRTStar.plan` does and make the result the current path."""
         self._result = self.planner.plan(start, goal, budget_ms=budget_ms, seed=seed)
-        self._of_tree = self.planner.field
+        self._tree_field = self.planner.field
         return self._result
 
     def update(
         self, field: GaussianCollisionField, *, start: ArrayLike | None = None, budget_ms: float = 10.0, seed: int = 0
     ) -> Update:
-        """Compares the path in force with a later field, and repairs it if it no longer stands.
+        """Check the current path against a later field and repair it if it collides.
 
         Args:
-            field: of the later map, best made by ``updated`` from the field before: what both share costs nothing.
-            start: (J,) where the arm is now, on the path; only a repair begins there. None: where the path begins.
-            budget_ms: for a repair, certificate included.
-            seed: of its samples.
+            field: field of the later map; ``updated`` of the previous field makes it share unchanged Gaussians.
+            start: (J,) current configuration on the path, where a repair begins [rad or m]. If None, a repair begins
+                at the start of the path.
+            budget_ms: time for a repair, certificate included [ms].
+            seed: seed of the samples.
 
         Raises:
             InputError: there is no path, or the fields differ in n_sigma.
-            StartError: the start is of another shape or not finite.
+            StartError: the start has a wrong shape or is not finite.
         """
         begin = time.perf_counter()
         if self._result is None or self._result.path is None:
             raise InputError("has no path yet.", field="plan", hint="call plan first")
         path = self._result.path
-        certificate = self._standing(field, path)
+        certificate = self._recertified(field, path)
         if certificate is not None:
             self.planner.field = field
             self._result = replace(
@@ -86,19 +88,21 @@ class Replanner:
         seconds = time.perf_counter() - begin
         return Update(self._result, certificate is not None, path.certificate.clearance, seconds)
 
-    def _standing(self, field: GaussianCollisionField, path: Path) -> Certificate | None:
-        """The path's certificate on the later field; None: something new is in its way."""
-        was = path.certificate
+    def _recertified(self, field: GaussianCollisionField, path: Path) -> Certificate | None:
+        """Return the certificate of the path on the later field, or None if a new Gaussian blocks it."""
+        old = path.certificate
         added = field.added_since(self.planner.field)
         if not len(added):
-            return replace(was, map_version=field.map_version)
-        room = self.planner.room_to(added, path.waypoints, was.clearance, was.eps)
-        return None if room is None else replace(was, map_version=field.map_version, clearance=min(room, was.clearance))
+            return replace(old, map_version=field.map_version)
+        clearance = self.planner.clearance_to(added, path.waypoints, old.clearance, old.eps)
+        if clearance is None:
+            return None
+        return replace(old, map_version=field.map_version, clearance=min(clearance, old.clearance))
 
     def _repair(
         self, field: GaussianCollisionField, start: ArrayLike, budget_ms: float, seed: int, begin: float
     ) -> None:
         left = budget_ms - 1e3 * (time.perf_counter() - begin)
-        result = self.planner.plan_again(field, self._of_tree, start, budget_ms=max(0.1, left), seed=seed)
-        self._of_tree = field
+        result = self.planner.plan_again(field, self._tree_field, start, budget_ms=max(0.1, left), seed=seed)
+        self._tree_field = field
         self._result = result

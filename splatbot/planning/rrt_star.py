@@ -1,4 +1,4 @@
-"""The planner: RRT-Connect for a first path, shortcuts, then RRT* until time is up; every edge is certified."""
+"""Planner: RRT-Connect finds a first path, shortcuts and RRT* improve it; all edges are certified."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatbot._native import ArmPlanner, path_clearance
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.collision.robot import EPS
 from splatbot.errors import InputError
-from splatbot.planning.causes import beyond_limits, blocked_line, collision
+from splatbot.planning.causes import blocked_line, collision, limit_violation
 from splatbot.planning.goals import goal_configurations
 from splatbot.planning.problem import (
     Cause,
@@ -26,37 +26,40 @@ from splatbot.planning.problem import (
 )
 from splatbot.protocols import Array, RobotKinematics
 
-CLEARANCE_CUT = 0.1  # [m]; more room than this is not told apart
-POSTURES_SHARE = 0.25  # of the budget for postures that reach a pose, once there is one
-_CLEARANCE_ROUNDS = 6  # of halving: clearance to 2 %
-_RESERVE = 7e-4  # [s] of the budget kept for the certificate, at most a third of it
-_FINEST = 4e-5  # [m] that eps is lowered to where the start or a goal has hardly any room
-_ENDS = (None, PlanStatus.PLANNING_FAILED, PlanStatus.TIMED_OUT, PlanStatus.PREEMPTED)
+PATH_CLEARANCE_CUT = 0.1  # [m] largest clearance of a certificate
+POSTURES_SHARE = 0.25  # fraction of the budget for further postures once one reaches the pose
+_CLEARANCE_ROUNDS = 6  # bisections of the clearance along a path, which resolve it to 2 %
+_RESERVE = 7e-4  # [s] of the budget that the certificate takes, at most a third of it
+_MIN_EPS = 4e-5  # [m] smallest eps, for a start or goal with hardly any clearance
+_STATUS = (None, PlanStatus.PLANNING_FAILED, PlanStatus.TIMED_OUT, PlanStatus.PREEMPTED)  # by native return code
 
 
 class GaussianRRTStar:
-    """Plans an arm's way among the Gaussians of one state of a map.
+    """Sampling-based planner of an arm among the Gaussians of one map version.
 
-    Every edge of its trees is certified all along, against the map and against the arm itself
-    (:meth:`splatbot.collision.RobotSpheres.certify`), so that a path is certified when it is found. The first path is
-    that of RRT-Connect; both of its trees then become one, which RRT* (Karaman and Frazzoli, IJRR 2011) rewires with
-    samples from the ellipsoid of what can be better (Gammell et al., IROS 2014), helped by shortcuts of the best path
-    and by RRT-Connect run anew with the best cost as its bound. Costs are lengths in joint space [rad].
+    Each edge of its trees is certified over its whole length against the map and against self-collision
+    (:meth:`splatbot.collision.RobotSpheres.certify`). The search has three parts:
 
-    One search at a time: calls from several threads wait for one another, outside of their budgets.
+    1. RRT-Connect (Kuffner and LaValle, ICRA 2000) finds a first path; its two trees are then joined.
+    2. RRT* (Karaman and Frazzoli, IJRR 2011) rewires the tree. Its samples come from the informed set
+       ``|q - q_start| + |q - q_goal| <= c_best`` (Gammell et al., IROS 2014).
+    3. Shortcuts of the best path, and further runs of RRT-Connect bounded by the best cost, speed this up.
+
+    The cost is the length in joint space [rad]. Searches of several threads run one after another; the waiting time
+    does not count towards their budgets.
 
     Args:
-        field: the map.
+        field: collision field of the map.
         robot: the arm.
-        T_world_base: (4, 4) pose of its base.
-        opening: of the gripper [m]; None: as wide as it goes.
-        attached: (A, 4) spheres (x, y, z, radius) [m] of a held object in the frame of the last link.
-        margin: room that the arm keeps to the map [m]; it may come nearer to itself.
+        T_world_base: (4, 4) pose of its base [m]. If None, the base is at the origin.
+        opening: opening of the gripper [m]. If None, the gripper is fully open.
+        attached: (A, 4) spheres (x, y, z, radius) [m] of a grasped object in the frame of the last link.
+        margin: clearance that the arm keeps to the map [m]; it does not apply to self-collision.
         base_in_map: see :class:`splatbot.collision.RobotSpheres`.
-        eps: room [m] below which an edge is not certified.
+        eps: clearance below which an edge is not certified [m].
 
     Raises:
-        InputError: as :class:`splatbot.collision.RobotSpheres`; eps is not above 4e-5 m.
+        InputError: an argument is invalid, as for :class:`splatbot.collision.RobotSpheres`, or eps is below 4e-5 m.
     """
 
     def __init__(
@@ -71,8 +74,8 @@ class GaussianRRTStar:
         base_in_map: bool = False,
         eps: float = EPS,
     ) -> None:
-        if not _FINEST <= eps < np.inf:
-            raise InputError(f"is {eps}.", field="eps", hint=f"give metres, at least {_FINEST:g}")
+        if not _MIN_EPS <= eps < np.inf:
+            raise InputError(f"is {eps}.", field="eps", hint=f"give metres, at least {_MIN_EPS:g}")
         self._field, self.robot, self.margin, self.eps = field, robot, margin, eps
         self.arm = RobotSpheres(
             robot,
@@ -82,22 +85,22 @@ class GaussianRRTStar:
             base_in_map=base_in_map,
             margin=margin,
         )
-        self._eps = eps  # of the problem at hand
+        self._eps = eps  # of the current problem
         self._native = self._planner(eps)
         self._goals: Array | None = None  # of the last search
         self._searching = threading.Lock()
 
     @property
     def field(self) -> GaussianCollisionField:
-        """The map. One that is assigned holds for the searches that follow."""
+        """Collision field; an assigned field applies to later searches."""
         return self._field
 
     @field.setter
     def field(self, field: GaussianCollisionField) -> None:
         with self._searching:
-            self._look_at(field)
+            self._set_field(field)
 
-    def _look_at(self, field: GaussianCollisionField) -> None:
+    def _set_field(self, field: GaussianCollisionField) -> None:
         self._field = field
         self._native.look_at(field.native)
 
@@ -110,22 +113,22 @@ class GaussianRRTStar:
         seed: int = 0,
         iterations: int | None = None,
     ) -> PlanResult:
-        """The best path from ``start`` (J,) to ``goal`` that is found in time.
+        """Plan a path and improve it until the budget is used up.
 
         Args:
-            start: (J,) [rad or m].
+            start: (J,) configuration [rad or m].
             goal: see :mod:`splatbot.planning.problem`; an array (J,) or (K, J) is a set of configurations.
-            budget_ms: that the whole call may take, inverse kinematics and certificate included.
-            seed: of the samples.
-            iterations: of the trees' growth; where they, not the time, end the search, equal calls give equal paths.
+            budget_ms: time of the whole call, inverse kinematics and certificate included [ms].
+            seed: seed of the samples.
+            iterations: largest number of extensions of the trees. If they end the search, equal calls give equal paths.
 
         Returns:
-            A path with its certificate, or the reason why there is none. The time being up is no failure once there is
-            a path.
+            The best path with its certificate, or the cause of failure. Reaching the budget after a path is found is
+            no failure.
 
         Raises:
-            StartError: the start is of another shape or not finite.
-            GoalError: the goal is, or makes no sense for this robot.
+            StartError: the start has a wrong shape or is not finite.
+            GoalError: the goal has a wrong shape, is not finite or is invalid for this robot.
             InputError: budget_ms or iterations are not above 0.
         """
         _check_budget(budget_ms, iterations)
@@ -137,7 +140,7 @@ class GaussianRRTStar:
     ) -> PlanResult:
         begin = time.perf_counter()
         q = self._start(start)
-        failed = self._bad_start(q, begin)
+        failed = self._check_start(q, begin)
         if failed is not None:
             return failed
         goals = goal_configurations(
@@ -155,7 +158,7 @@ class GaussianRRTStar:
     def solve(
         self, problem: PlanningProblem, *, budget_ms: float = 28.0, seed: int = 0, iterations: int | None = None
     ) -> PlanResult:
-        """As :meth:`plan`, of a problem."""
+        """Call :meth:`plan` with the start and goal of a problem."""
         return self.plan(problem.start, problem.goal, budget_ms=budget_ms, seed=seed, iterations=iterations)
 
     def plan_again(
@@ -167,18 +170,20 @@ class GaussianRRTStar:
         budget_ms: float = 10.0,
         seed: int = 0,
     ) -> PlanResult:
-        """Plans to the goals of the last :meth:`plan` with its old tree on a later field, which is this planner's then.
+        """Plan again to the goals of the last :meth:`plan`, with its tree on a later field.
+
+        The later field becomes :attr:`field`.
 
         Args:
-            field: of the later map.
-            before: the field that the tree stands on: only what ``field`` has beyond it is asked of the tree's edges.
-            start: (J,) on the last path, or anywhere: then the tree begins anew.
-            budget_ms: that the call may take.
-            seed: of the samples.
+            field: collision field of the later map.
+            before: field that the tree was checked against; the edges are checked against the Gaussians added since.
+            start: (J,) configuration [rad or m]. If it is not on the last path, a new tree is grown.
+            budget_ms: time of the call [ms].
+            seed: seed of the samples.
 
         Raises:
-            StartError: the start is of another shape or not finite.
-            InputError: nothing was planned before, the fields differ in n_sigma, or budget_ms is not above 0.
+            StartError: the start has a wrong shape or is not finite.
+            InputError: :meth:`plan` was not called before, the fields differ in n_sigma, or budget_ms is not above 0.
         """
         _check_budget(budget_ms, None)
         with self._searching:
@@ -195,9 +200,9 @@ class GaussianRRTStar:
         begin = time.perf_counter()
         if self._goals is None:
             raise InputError("was not called before.", field="plan", hint="plan first")
-        self._look_at(field)
+        self._set_field(field)
         q = self._start(start)
-        failed = self._bad_start(q, begin)
+        failed = self._check_start(q, begin)
         if failed is not None:
             return failed
         goals = goal_configurations(self.arm, field, self._goals, near=q, seed=seed, until=begin)
@@ -209,47 +214,56 @@ class GaussianRRTStar:
         end = self._native.rerun(q, field.native, added.native, self.arm.without_pairs.native, left, 2**62, seed)
         return self._result(end, q, goals.q, spent, begin, begin + 1e-3 * budget_ms)
 
-    def room_to(self, field: GaussianCollisionField, waypoints: Array, cut: float, eps: float) -> float | None:
-        """Room [m] along a path (N, J) to a field alone, the arm itself left out, up to ``cut``; None: not free."""
+    def clearance_to(self, field: GaussianCollisionField, waypoints: Array, cut: float, eps: float) -> float | None:
+        """Return the clearance [m] of a path (N, J) from a field, at most ``cut``, or None if the path collides.
+
+        Self-collision is not checked.
+        """
         arm = self.arm.without_pairs
         if arm.certify(field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
             return None
         return float(path_clearance(arm.native, field.native, waypoints, max(cut, eps), _CLEARANCE_ROUNDS, np.inf))
 
     def cancel(self) -> None:
-        """Ends the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""
+        """End the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""
         self._native.cancel()
 
     def best(self) -> tuple[Array, float, NDArray[np.float64]]:
-        """Waypoints (N, J), cost and history (H, 2) of the search that another thread runs; N is 0 before the first."""
+        """Return waypoints (N, J), cost [rad] and history (H, 2) of a running search; N is 0 before the first path.
+
+        Any thread may call this.
+        """
         waypoints, cost, history = self._native.best()
         return waypoints, float(cost), history
 
     def tree(self) -> tuple[Array, NDArray[np.int32], Array]:
-        """Nodes (N, J), their parents (N,), -1 for the root, and costs from it (N,), of the last search."""
+        """Return nodes (N, J), parents (N,), -1 for the root, and costs from the root (N,) [rad] of the last search."""
         with self._searching:
             q, parent, cost = self._native.tree()
         return q, parent, cost
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the tree of the last search."""
+        """Memory of the tree of the last search [bytes]."""
         with self._searching:
             return int(self._native.bytes)
 
     def certificate(self, waypoints: Array, until: float = np.inf) -> Certificate:
-        """What can be promised of a path (N, J): whether all its edges are free, and the room along it.
+        """Certify a path (N, J) and bound its clearance from below.
 
-        The room is a lower bound, within a few percent unless ``until`` (of ``time.perf_counter``) comes before.
+        Args:
+            waypoints: (N, J) [rad or m].
+            until: time of ``time.perf_counter`` at which the bound is no longer improved [s]. Without this limit the
+                bound is tight to a few percent.
         """
-        # The trees' edges were checked in the direction they grew; rounding may make a difference to the other one.
+        # The trees' edges were checked in their direction of growth; the reverse direction may round differently.
         for eps in (self._eps, self._eps / 4):
             if not self.arm.certify(self.field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
                 left = until - time.perf_counter()
-                room = path_clearance(
-                    self.arm.native, self.field.native, waypoints, CLEARANCE_CUT, _CLEARANCE_ROUNDS, left
+                clearance = path_clearance(
+                    self.arm.native, self.field.native, waypoints, PATH_CLEARANCE_CUT, _CLEARANCE_ROUNDS, left
                 )
-                return Certificate(True, eps, room, self.margin, self.field.map_version)
+                return Certificate(True, eps, clearance, self.margin, self.field.map_version)
         return Certificate(False, self._eps, 0.0, self.margin, self.field.map_version)
 
     def _planner(self, eps: float) -> ArmPlanner:
@@ -268,8 +282,8 @@ class GaussianRRTStar:
             raise StartError("has values that are not finite.", field="start", hint="give radians and metres")
         return q
 
-    def _bad_start(self, q: Array, begin: float) -> PlanResult | None:
-        cause = beyond_limits(self.robot.chain, q)
+    def _check_start(self, q: Array, begin: float) -> PlanResult | None:
+        cause = limit_violation(self.robot.chain, q)
         if cause is not None:
             return self._failure(PlanStatus.START_STATE_INVALID, cause, f"{cause}.", begin)
         if self.arm.check(self.field, q[None]).in_collision[0]:
@@ -278,18 +292,19 @@ class GaussianRRTStar:
         return None
 
     def _prepare(self, ends: Array) -> None:
-        """A planner whose eps lets it leave and reach configurations (K, J) that nearly touch something."""
-        room = float(self.arm.native.clearance(self.field.native, ends, 4 * self.eps)[0].min())
-        eps = max(_FINEST, min(self.eps, room / 4))
+        """Choose an eps with which edges can leave and reach configurations (K, J) of small clearance."""
+        clearance = float(self.arm.native.clearance(self.field.native, ends, 4 * self.eps)[0].min())
+        eps = max(_MIN_EPS, min(self.eps, clearance / 4))
         if eps != self._eps:
             self._eps, self._native = eps, self._planner(eps)
 
     def _result(self, end: int, start: Array, goals: Array, before: float, begin: float, until: float) -> PlanResult:
-        status = _ENDS[end]
+        status = _STATUS[end]
         if status is not None:
             cause = blocked_line(self.arm, self.field, start, goals[0], self._eps)
-            why = "cancelled" if status is PlanStatus.PREEMPTED else f"no path was found; on the straight line {cause}"
-            return self._failure(status, cause, f"{why}.", begin)
+            preempted = status is PlanStatus.PREEMPTED
+            reason = "cancelled" if preempted else f"no path was found; on the straight line {cause}"
+            return self._failure(status, cause, f"{reason}.", begin)
         waypoints, cost, history = self._native.best()
         if len(waypoints) == 1:
             waypoints = np.repeat(waypoints, 2, axis=0)
@@ -297,12 +312,12 @@ class GaussianRRTStar:
         path = Path(waypoints, float(cost), self.certificate(waypoints, until))
         if not path.certificate.certified:
             return self._failure(PlanStatus.PLANNING_FAILED, None, "the path found is not certified.", begin)
-        return self._answer(PlanStatus.SUCCESS, path, history, None, "", begin)
+        return self._timed_result(PlanStatus.SUCCESS, path, history, None, "", begin)
 
     def _failure(self, status: PlanStatus, cause: Cause | None, reason: str, begin: float) -> PlanResult:
-        return self._answer(status, None, np.zeros((0, 2)), cause, reason, begin)
+        return self._timed_result(status, None, np.zeros((0, 2)), cause, reason, begin)
 
-    def _answer(
+    def _timed_result(
         self,
         status: PlanStatus,
         path: Path | None,
@@ -311,7 +326,7 @@ class GaussianRRTStar:
         reason: str,
         begin: float,
     ) -> PlanResult:
-        searched = status in _ENDS or path is not None
+        searched = status in _STATUS or path is not None
         return PlanResult(
             status,
             path,
@@ -327,7 +342,7 @@ class GaussianRRTStar:
 
 
 def _for_search(budget_ms: float, spent: float) -> float:
-    """Seconds of the budget that are left for the search."""
+    """Return the part of the budget that is left for the search [s]."""
     budget = 1e-3 * budget_ms
     return max(1e-4, budget - spent - min(_RESERVE, budget / 3))
 

@@ -1,4 +1,4 @@
-"""When the arm is where: a path's corners rounded, its speed as high as limits allow, the timed curve certified."""
+"""Time parametrization of a path: rounded corners, the highest speed within the limits, a certified spline."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from splatbot.planning.problem import Certificate, Path
 from splatbot.planning.trajectory import JointTrajectory
 from splatbot.protocols import Array, KinematicChain
 
-SAME = 1e-4  # [rad or m]; waypoints nearer than this are one
-DEVIATION = 1e-4  # [m] that a sphere may be off the chords which stand for the curve
-CLEARANCE_CUT = 0.05  # [m]; more room than this is not told apart
-_SHORTEST, _LONGEST = 2e-3, 1e-2  # [s] between knots
-_ROUNDS = 8  # of shortening blends
-_LEAST_REACH = 4e-3  # [rad or m] of a blend; where a shorter one is needed, the arm stops at the corner
-_SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the longest blend, tried at once
-_FINE_EPS = 2e-5  # [m] of the certificate of short chords
-_COARSE, _FINEST = 16, 1 / 64  # [spans] of the intervals that clearance is sought in
+MIN_WAYPOINT_STEP = 1e-4  # [rad or m]; waypoints that differ by less in every joint count as one
+DEVIATION = 1e-4  # [m] largest distance between a sphere on the curve and a sphere on the chord that approximates it
+TRAJECTORY_CLEARANCE_CUT = 0.05  # [m] largest clearance of the certificate of a trajectory
+_MIN_STEP, _MAX_STEP = 2e-3, 1e-2  # [s] range of the time between knots
+_MAX_SHORTENINGS = 8  # largest number of times that colliding blends are shortened
+_MIN_REACH = 4e-3  # [rad or m] smallest reach of a blend; at a corner that needs a smaller one the arm stops
+_REACH_FRACTIONS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # candidates, as fractions of the largest reach
+_MIN_CHORD_EPS = 2e-5  # [m] smallest eps of the certificate of short chords
+_MAX_INTERVAL, _MIN_INTERVAL = 16, 1 / 64  # [spans] range of the intervals of the search for the smallest clearance
 
 
 def time_path(
@@ -35,52 +35,55 @@ def time_path(
     velocity_scale: float = 1.0,
     acceleration_scale: float = 1.0,
 ) -> JointTrajectory:
-    """The path as a trajectory within the arm's limits of velocity, acceleration and jerk.
+    """Turn a path into a trajectory within the velocity, acceleration and jerk limits of the arm.
 
-    Corners are rounded as far as the arm stays free; speeds come from reachability analysis, are averaged where jerk
-    asks for it, and become control points of a spline, whose differences bound all three derivatives. What is certified
-    is that spline. Where no rounding is free the arm stops at the corner, in the last resort at every corner: then the
-    curve is the path itself.
+    1. Blends round the corners as far as the arm stays free of collisions.
+    2. Reachability analysis computes the fastest speeds (TOPP-RA: Pham and Pham, T-RO 2018).
+    3. A moving average over ``2 a_max / j_max`` limits the jerk. Its samples are the control points of a cubic
+       B-spline, whose differences bound all three derivatives.
+    4. The spline is certified. A blend that collides is shortened. Below a minimum length the arm stops at the corner.
+
+    If this fails, the arm stops at every corner; the curve is then the path itself.
 
     Args:
-        path: as planned.
-        arm: that shall follow it.
-        field: the map; None: free of the arm itself alone.
-        velocity_scale, acceleration_scale: shares (0..1] of the limits to use; jerk is used in full.
+        path: planned path.
+        arm: the robot.
+        field: collision field. If None, only self-collision is checked.
+        velocity_scale, acceleration_scale: fractions (0..1] of the limits; the jerk limit is used in full.
 
     Returns:
-        A trajectory; ``certificate.certified`` is False only if the path itself is not free.
+        A trajectory. ``certificate.certified`` is False only if the path itself collides.
 
     Raises:
-        InputError: a scale is out of range, a limit is 0, or the path is of another arm.
+        InputError: a scale is out of range, a limit is 0, or the path has another number of joints.
     """
     chain = _scaled(arm.robot.chain, velocity_scale, acceleration_scale)
     if path.waypoints.ndim != 2 or path.waypoints.shape[1] != len(chain) or not np.isfinite(path.waypoints).all():
         raise InputError(f"is {path.waypoints.shape}.", field="path", hint=f"give finite (N, {len(chain)})")
     waypoints = without_duplicates(path.waypoints)
     if len(waypoints) < 2:
-        rest = _Timed(np.repeat(path.waypoints[:1], 4, axis=0), _SHORTEST, np.full(4, -1))
+        rest = _TimedSpline(np.repeat(path.waypoints[:1], 4, axis=0), _MIN_STEP, np.full(4, -1))
         free = not arm.check(field, path.waypoints[:1]).in_collision.any()
         return rest.trajectory(chain, path.certificate.eps, arm, field, free)
-    judge = _Judge(arm, field, path.certificate.eps)
-    reach = judge.longest_blends(waypoints)
-    for _ in range(_ROUNDS):
+    checker = _CurveChecker(arm, field, path.certificate.eps)
+    reach = checker.max_reach(waypoints)
+    for _ in range(_MAX_SHORTENINGS):
         timed = _timed(waypoints, reach, chain)
-        failed = judge.not_free(timed.control)
+        failed = checker.colliding_spans(timed.control)
         if not failed.any():
             return timed.trajectory(chain, path.certificate.eps, arm, field, True)
         if not _shorten(reach, timed, failed):
             break
-    timed = _timed(waypoints, np.zeros(len(waypoints)), chain)  # every point of it is on the path
+    timed = _timed(waypoints, np.zeros(len(waypoints)), chain)  # every point of this curve is on the path
     free = not arm.certify(field, waypoints[:-1], waypoints[1:], eps=path.certificate.eps).in_collision.any()
     return timed.trajectory(chain, path.certificate.eps, arm, field, free)
 
 
 def without_duplicates(waypoints: Array) -> Array:
-    """The waypoints (N, J) without those that are as good as the one before; the ends stay what they are."""
+    """Remove waypoints (N, J) that nearly equal their predecessor; both ends are kept."""
     kept = [waypoints[0]]
     for q in waypoints[1:]:
-        if np.abs(q - kept[-1]).max() > SAME:
+        if np.abs(q - kept[-1]).max() > MIN_WAYPOINT_STEP:
             kept.append(q)
     if len(kept) > 1:
         kept[-1] = waypoints[-1]
@@ -88,8 +91,8 @@ def without_duplicates(waypoints: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Timed:
-    """Control points (M, J) of a spline of knots ``step`` [s] apart, and the corner (M,) that each rounds, -1 none."""
+class _TimedSpline:
+    """Control points (M, J) of a spline with knots ``step`` [s] apart, and the corner (M,) that each rounds, or -1."""
 
     control: Array
     step: float
@@ -98,86 +101,90 @@ class _Timed:
     def trajectory(
         self, chain: KinematicChain, eps: float, arm: RobotSpheres, field: GaussianCollisionField | None, free: bool
     ) -> JointTrajectory:
-        """With its certificate, and slowed down by what is left above a limit."""
-        nothing = Certificate(False, eps, 0.0, arm.margin, -1)
-        found = JointTrajectory(chain.names, self.control, self.step, nothing)
-        v, a, j = found.load(chain)
-        over = max(v, np.sqrt(a), np.cbrt(j), 1.0)
-        step = self.step * float(over) * (1.0 + 1e-9)
-        return JointTrajectory(chain.names, self.control, step, _certificate(eps, arm, field, found, free))
+        """Return the trajectory with its certificate, slowed down where a derivative still exceeds its limit."""
+        uncertified = Certificate(False, eps, 0.0, arm.margin, -1)
+        spline = JointTrajectory(chain.names, self.control, self.step, uncertified)
+        v, a, j = spline.load(chain)
+        slowdown = max(v, np.sqrt(a), np.cbrt(j), 1.0)
+        step = self.step * float(slowdown) * (1.0 + 1e-9)
+        return JointTrajectory(chain.names, self.control, step, _certificate(eps, arm, field, spline, free))
 
 
-def _timed(waypoints: Array, reach: Array, chain: KinematicChain) -> _Timed:
-    """From rest to rest between the corners without a blend."""
+def _timed(waypoints: Array, reach: Array, chain: KinematicChain) -> _TimedSpline:
+    """Time the path; the arm comes to rest at corners without a blend."""
     stops = [0, *(i for i in range(1, len(waypoints) - 1) if reach[i] == 0.0), len(waypoints) - 1]
-    smooth = float((2.0 * chain.acceleration / chain.jerk).max())  # [s] over which accelerations are averaged
-    step = float(np.clip(smooth, _SHORTEST, _LONGEST))
+    smooth = float((2.0 * chain.acceleration / chain.jerk).max())  # [s] window of the moving average
+    step = float(np.clip(smooth, _MIN_STEP, _MAX_STEP))
     wide = int(np.ceil(smooth / step - 1e-9))
     control: list[Array] = []
     corner: list[NDArray[np.int64]] = []
     for a, b in pairwise(stops):
         curve = rounded(waypoints[a : b + 1], reach[a : b + 1], a)
         q, rounds = _sampled(curve, chain, step)
-        pad = wide + 1  # three alike at either end: at rest, without acceleration
+        pad = wide + 1  # three equal control points at each end: velocity and acceleration are 0
         q = np.concatenate([np.repeat(q[:1], pad, axis=0), q, np.repeat(q[-1:], pad, axis=0)])
         rounds = np.concatenate([np.full(pad, -1), rounds, np.full(pad, -1)])
         sums = np.cumsum(np.concatenate([np.zeros((1, q.shape[1])), q - q[0]]), axis=0)
-        even = q[0] + (sums[wide:] - sums[:-wide]) / wide
-        even[:3], even[-3:] = waypoints[a], waypoints[b]
-        keep = slice(3 if control else 0, None)  # a stop is one place
-        control.append(even[keep])
-        corner.append(rounds[wide // 2 :][: len(even)][keep])
-    return _Timed(np.concatenate(control), step, np.concatenate(corner))
+        averaged = q[0] + (sums[wide:] - sums[:-wide]) / wide
+        averaged[:3], averaged[-3:] = waypoints[a], waypoints[b]
+        keep = slice(3 if control else 0, None)  # adjacent pieces share the control points of a stop
+        control.append(averaged[keep])
+        corner.append(rounds[wide // 2 :][: len(averaged)][keep])
+    return _TimedSpline(np.concatenate(control), step, np.concatenate(corner))
 
 
 def _sampled(curve: Curve, chain: KinematicChain, step: float) -> tuple[Array, NDArray[np.int64]]:
-    """Configurations (K, J) every ``step`` [s] of the fastest motion along a curve, and the corners (K,) they round."""
-    s = curve.places()
+    """Sample the fastest motion along a curve every ``step`` [s].
+
+    Returns:
+        Configurations (K, J) and the corners (K,) that they round, -1 on lines.
+    """
+    s = curve.samples()
     _, first, second = curve.at(s)
-    # Just within, for what happens between two places.
+    # Speeds are planned slightly within the limits, because velocities between two samples may be larger.
     squared = fastest_speeds(
         s, np.ascontiguousarray(first), np.ascontiguousarray(second), 0.999 * chain.velocity, 0.99 * chain.acceleration
     )
     speed = np.sqrt(squared)
-    spent = np.where(np.diff(s) > 0, 2.0 * np.diff(s) / np.maximum(speed[:-1] + speed[1:], 1e-12), 0.0)
-    time = np.concatenate([[0.0], np.cumsum(spent)])
+    duration = np.where(np.diff(s) > 0, 2.0 * np.diff(s) / np.maximum(speed[:-1] + speed[1:], 1e-12), 0.0)
+    time = np.concatenate([[0.0], np.cumsum(duration)])
     t = np.append(np.arange(0.0, time[-1], step), time[-1])
-    i = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(spent) - 1)
-    passed = t - time[i]
-    gain = np.where(spent > 0, (speed[1:] - speed[:-1]) / np.maximum(spent, 1e-12), 0.0)[i]
-    at = np.clip(s[i] + speed[i] * passed + 0.5 * gain * passed**2, s[i], s[i + 1])
+    i = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(duration) - 1)
+    elapsed = t - time[i]
+    gain = np.where(duration > 0, (speed[1:] - speed[:-1]) / np.maximum(duration, 1e-12), 0.0)[i]
+    at = np.clip(s[i] + speed[i] * elapsed + 0.5 * gain * elapsed**2, s[i], s[i + 1])
     return curve.at(at)[0], curve.corner[curve.piece_of(at)]
 
 
-def _shorten(reach: Array, timed: _Timed, failed: NDArray[np.bool_]) -> bool:
-    """Half of each blend that a span (M - 3,) which is not free belongs to; False if one belongs to none."""
-    blame = set()
+def _shorten(reach: Array, timed: _TimedSpline, failed: NDArray[np.bool_]) -> bool:
+    """Halve the reach of each blend with a colliding span (M - 3,); return False if a span belongs to no blend."""
+    colliding = set()
     for span in np.flatnonzero(failed):
         near = timed.corner[span : span + 4]
         corners = near[near >= 0]
         if not len(corners):
             return False
-        blame.add(int(corners[0]))
-    for corner in blame:
-        reach[corner] = 0.5 * reach[corner] if reach[corner] > 2.0 * _LEAST_REACH else 0.0
+        colliding.add(int(corners[0]))
+    for corner in colliding:
+        reach[corner] = 0.5 * reach[corner] if reach[corner] > 2.0 * _MIN_REACH else 0.0
     return True
 
 
-class _Judge:
-    """Whether curves of an arm are free."""
+class _CurveChecker:
+    """Collision checks of curves of an arm."""
 
     def __init__(self, arm: RobotSpheres, field: GaussianCollisionField | None, eps: float) -> None:
         self.arm, self.field = arm, field
         self.grown = arm.grown(DEVIATION)
-        self.eps = max(_FINE_EPS, min(eps, DEVIATION))
+        self.eps = max(_MIN_CHORD_EPS, min(eps, DEVIATION))
 
-    def longest_blends(self, waypoints: Array) -> Array:
-        """How far from each waypoint (N,) its blend may reach, as far as chords tell; 0 at the ends."""
+    def max_reach(self, waypoints: Array) -> Array:
+        """Return the largest reach (N,) of a blend at each waypoint whose chords are free; 0 at both ends."""
         edge = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
         reach = np.zeros(len(waypoints))
         inner = range(1, len(waypoints) - 1)
-        tried = [(i, share * 0.49 * min(edge[i - 1], edge[i])) for i in inner for share in _SHARES]
-        tried = [(i, r) for i, r in tried if r >= _LEAST_REACH]
+        tried = [(i, share * 0.49 * min(edge[i - 1], edge[i])) for i in inner for share in _REACH_FRACTIONS]
+        tried = [(i, r) for i, r in tried if r >= _MIN_REACH]
         if not tried:
             return reach
         chords = np.array([blend_chords(waypoints[i - 1], waypoints[i], waypoints[i + 1], r) for i, r in tried])
@@ -189,8 +196,8 @@ class _Judge:
                 reach[i] = max(reach[i], r)
         return reach
 
-    def not_free(self, control: Array) -> NDArray[np.bool_]:
-        """Which spans (M - 3,) of a spline are not known to be free."""
+    def colliding_spans(self, control: Array) -> NDArray[np.bool_]:
+        """Return for each span (M - 3,) of a spline whether it is not certified as free."""
         start, end, first, last = chords(control, self.arm.reach)
         hit = self.grown.certify(self.field, start, end, eps=self.eps).in_collision
         failed = np.zeros(len(control) - 3, np.bool_)
@@ -200,20 +207,22 @@ class _Judge:
 
 
 def chords(control: Array, reach: Array) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Straight edges that no sphere is farther from than ``DEVIATION`` on a spline: starts, ends (K, J), and the spans
-    (K,) that each begins and ends in.
+    """Approximate a spline by chords, such that no sphere deviates from a chord by more than ``DEVIATION``.
 
-    Where control points lie on one line, the curve is on it. Elsewhere the second derivative between two knots is
-    between those at its ends, so that a chord over a share h of a span is off by at most h²/8 of the larger.
+    A spline whose control points are collinear lies on their line. Elsewhere the second derivative is linear between
+    two knots. A chord over a fraction h of a span therefore deviates by at most ``h²/8 max |Δ²c|``.
 
     Args:
-        control: (M, J).
+        control: (M, J) control points [rad or m].
         reach: (S, J), see :attr:`splatbot.collision.RobotSpheres.reach`.
+
+    Returns:
+        Starts and ends (K, J) of the chords, and the spans (K,) in which each begins and ends.
     """
     step = np.diff(control, axis=0)
     straight = _parallel(step[:-1], step[1:])
     straight = straight[:-1] & straight[1:] & _parallel(step[:-2], step[2:])
-    rest = (step[1:-1] == 0).all(axis=1)  # the place between two spans is a stop if the two steps they share are none
+    rest = (step[1:-1] == 0).all(axis=1)  # the knot between two spans is a stop if both steps that they share are 0
     joined = straight[:-1] & straight[1:] & ~(rest[:-1] & rest[1:])
     bend = np.abs(np.diff(control, n=2, axis=0))
     moves = (np.maximum(bend[:-1], bend[1:]) / 8.0 @ reach.T).max(axis=1)
@@ -222,17 +231,17 @@ def chords(control: Array, reach: Array) -> tuple[Array, Array, NDArray[np.int64
     u = (np.arange(len(span)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[span]
     c = control[span[:, None] + np.arange(4)]
     weights = np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], axis=1) / 6.0
-    places = np.concatenate(
+    points = np.concatenate(
         [np.einsum("nk,nkj->nj", weights, c), (control[-3] + 4.0 * control[-2] + control[-1])[None] / 6.0]
     )
     begins = np.concatenate([[True], ~((np.diff(span) == 1) & joined[np.minimum(span[:-1], len(joined) - 1)])])
     first = np.flatnonzero(begins)
     after = np.append(first[1:], len(span))
-    return places[first], places[after], span[first], span[after - 1]
+    return points[first], points[after], span[first], span[after - 1]
 
 
 def _parallel(a: Array, b: Array) -> NDArray[np.bool_]:
-    """Whether vectors (N, J) have one direction, to a nanometre or so; none has any."""
+    """Return whether vectors (N, J) have the same direction within 1e-10 of their length; a zero vector has any."""
     size_a, size_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
     short, long = np.minimum(size_a, size_b), np.maximum(size_a, size_b)
     along = np.abs(a * size_b[:, None] - b * size_a[:, None]).max(axis=1)
@@ -244,44 +253,49 @@ def _certificate(
 ) -> Certificate:
     if field is None:
         return Certificate(free, eps, 0.0, arm.margin, -1)
-    room = least_room(arm, field, trajectory.control) if free else 0.0
-    return Certificate(free, eps, max(0.0, room), arm.margin, field.map_version)
+    clearance = min_clearance(arm, field, trajectory.control) if free else 0.0
+    return Certificate(free, eps, max(0.0, clearance), arm.margin, field.map_version)
 
 
-def least_room(arm: RobotSpheres, field: GaussianCollisionField, control: Array) -> float:
-    """A lower bound of the arm's clearance all along a spline [m], at most ``CLEARANCE_CUT``; to 2 % and 0.1 mm.
+def min_clearance(arm: RobotSpheres, field: GaussianCollisionField, control: Array) -> float:
+    """Return a lower bound of the arm's clearance along a spline [m], at most ``TRAJECTORY_CLEARANCE_CUT``.
 
-    On an interval, the room is at least that in its middle less what a sphere moves in half of it; intervals that may
-    hold the least are halved.
+    The clearance on an interval is at least that at its midpoint less the largest motion of a sphere from there. The
+    search bisects the intervals whose bound is the smallest, until the bound is tight to 2 % and 0.1 mm.
     """
-    from_knot = np.abs(np.diff(control, axis=0)) @ arm.reach.T  # (M - 1, S): a sphere's way between two knots, at most
-    most = np.maximum(np.maximum(from_knot[:-2], from_knot[1:-1]), from_knot[2:])  # (M - 3, S) by span
-    way = np.concatenate([[0.0], np.cumsum(most.max(axis=1))])  # of the fastest sphere, up to each knot
+    from_knot = np.abs(np.diff(control, axis=0)) @ arm.reach.T  # (M - 1, S) bound of a sphere's motion between knots
+    largest = np.maximum(np.maximum(from_knot[:-2], from_knot[1:-1]), from_knot[2:])  # (M - 3, S) by span
+    path_length = np.concatenate([[0.0], np.cumsum(largest.max(axis=1))])  # of the fastest sphere, up to each knot
     spans = len(control) - 3
-    middle, half = np.arange(0, spans, _COARSE) + _COARSE / 2, np.full(-(-spans // _COARSE), _COARSE / 2)
+    middle, half = (
+        np.arange(0, spans, _MAX_INTERVAL) + _MAX_INTERVAL / 2,
+        np.full(-(-spans // _MAX_INTERVAL), _MAX_INTERVAL / 2),
+    )
     spline = JointTrajectory(arm.robot.chain.names, control, 1.0, Certificate(False, 0.0, 0.0, 0.0, -1))
-    low, best = np.inf, CLEARANCE_CUT
+    low, best = np.inf, TRAJECTORY_CLEARANCE_CUT
     while len(middle):
-        at = np.interp(np.stack([middle - half, middle, middle + half]), np.arange(spans + 1), way)
+        at = np.interp(np.stack([middle - half, middle, middle + half]), np.arange(spans + 1), path_length)
         moves = np.maximum(at[2] - at[1], at[1] - at[0])
-        cut = CLEARANCE_CUT + float(moves.max())  # so far that what is beyond needs no halving
-        room = np.minimum(arm.native.clearance(field.native, spline.at(middle).position, cut)[0], cut)
-        best = min(best, float(room.min()))
-        bound = np.minimum(room - moves, CLEARANCE_CUT)
+        cut = TRAJECTORY_CLEARANCE_CUT + float(
+            moves.max()
+        )  # an interval with this clearance at its midpoint needs no bisection
+        clearance = np.minimum(arm.native.clearance(field.native, spline.at(middle).position, cut)[0], cut)
+        best = min(best, float(clearance.min()))
+        bound = np.minimum(clearance - moves, TRAJECTORY_CLEARANCE_CUT)
         open_ = bound < 0.98 * best - 1e-4
         low = min(low, float(bound[~open_].min()) if (~open_).any() else np.inf)
-        if half[0] < _FINEST:
+        if half[0] < _MIN_INTERVAL:
             low = min(low, float(bound.min()))
             break
         middle, half = middle[open_], half[open_] / 2
         middle, half = np.concatenate([middle - half, middle + half]), np.tile(half, 2)
-    return min(low, CLEARANCE_CUT)
+    return min(low, TRAJECTORY_CLEARANCE_CUT)
 
 
 def _scaled(chain: KinematicChain, velocity: float, acceleration: float) -> KinematicChain:
     for name, scale in (("velocity_scale", velocity), ("acceleration_scale", acceleration)):
         if not 0.0 < scale <= 1.0:
-            raise InputError(f"is {scale}.", field=name, hint="give a share above 0, at most 1")
+            raise InputError(f"is {scale}.", field=name, hint="give a fraction above 0, at most 1")
     if min(chain.velocity.min(), chain.acceleration.min(), chain.jerk.min()) <= 0.0:
         raise InputError("has a limit of 0.", field="chain", hint="give velocity, acceleration and jerk above 0")
     return KinematicChain(

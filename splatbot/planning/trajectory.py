@@ -1,4 +1,4 @@
-"""A path with its time: what a controller is given."""
+"""Joint trajectories as uniform cubic B-splines in time, and their export to ROS, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ _CUBIC = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) 
 
 @dataclass(frozen=True, eq=False)
 class JointTrajectory:
-    """A uniform cubic B-spline in time, at rest at both ends.
+    """Uniform cubic B-spline in time, at rest at both ends.
 
-    Velocity, acceleration and jerk are bounded by the first, second and third differences of the control points, over
-    ``step``, its square and its cube: everywhere, not only where they are looked at (de Boor 1978, ch. X).
+    The differences of the control points c bound the derivatives at every time (de Boor 1978, ch. X)::
+
+        |q'| <= max |Δc| / step,   |q''| <= max |Δ²c| / step²,   |q'''| <= max |Δ³c| / step³
 
     Args:
-        names: of the joints.
+        names: names of the joints.
         control: (M, J), M >= 4, control points [rad or m].
-        step: between knots [s].
-        certificate: what is known of the curve, not only of the path that it was made from.
+        step: time between knots [s].
+        certificate: proof for the whole curve.
 
     Raises:
-        InputError: too few control points, a value that is not finite, or a step that is not above 0.
+        InputError: there are too few control points, a value is not finite, or the step is not above 0.
     """
 
     names: tuple[str, ...]
@@ -49,21 +50,21 @@ class JointTrajectory:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return (len(self.control) - 3) * self.step
 
     @property
     def start(self) -> Array:
-        """Where it begins (J,)."""
+        """First configuration (J,) [rad or m]."""
         return self.at(0.0).position
 
     @property
     def end(self) -> Array:
-        """Where it ends (J,)."""
+        """Last configuration (J,) [rad or m]."""
         return self.at(self.duration).position
 
     def at(self, t: ArrayLike) -> State:
-        """The state at times (...) [s]; before the start and after the end, at rest there."""
+        """Return the state at times (...) [s]; before the start and after the end the arm rests at that end."""
         times = np.asarray(t, dtype=np.float64)
         inside = (times >= 0.0) & (times <= self.duration)
         x = np.clip(times, 0.0, self.duration) / self.step
@@ -82,33 +83,33 @@ class JointTrajectory:
         return State(times, *columns)
 
     def reference(self, t: float) -> tuple[Array, Array]:
-        """Position and velocity (J,) at a time [s], as controllers ask for it."""
+        """Return position and velocity (J,) at a time [s], as :class:`splatbot.protocols.TimedPath` requires."""
         state = self.at(t)
         return state.position, state.velocity
 
     def sampled(self, rate: float = 1000.0) -> State:
-        """States at a rate [Hz], the end included."""
+        """Sample the states at a rate [Hz], the end included."""
         if not 0.0 < rate < np.inf:
             raise InputError(f"is {rate}.", field="rate", hint="give hertz above 0")
         count = int(np.ceil(self.duration * rate - 1e-9))
         return self.at(np.append(np.arange(count) / rate, self.duration))
 
     def load(self, chain: KinematicChain) -> tuple[float, float, float]:
-        """The largest shares of the limits of velocity, acceleration and jerk that it uses anywhere; 1 is all."""
+        """Return the largest fractions of the velocity, acceleration and jerk limits that the curve uses."""
         shares = []
         for order, limit in ((1, chain.velocity), (2, chain.acceleration), (3, chain.jerk)):
-            most = np.abs(np.diff(self.control, n=order, axis=0)).max(axis=0) / self.step**order
-            shares.append(float((most / limit).max()))
+            largest = np.abs(np.diff(self.control, n=order, axis=0)).max(axis=0) / self.step**order
+            shares.append(float((largest / limit).max()))
         return shares[0], shares[1], shares[2]
 
     def slowed(self, factor: float) -> JointTrajectory:
-        """The same curve in ``factor`` times the time; the certificate stays, for it speaks of the curve alone."""
+        """Return the same curve with ``factor`` times the duration; the certificate of the curve stays valid."""
         if not 0.0 < factor < np.inf:
             raise InputError(f"is {factor}.", field="factor", hint="give a number above 0, 2 for half the speed")
         return JointTrajectory(self.names, self.control, self.step * factor, self.certificate)
 
     def to_ros(self, *, rate: float = 100.0, frame_id: str = "") -> dict[str, Any]:
-        """``trajectory_msgs/JointTrajectory`` as a dictionary, as rosbridge takes it."""
+        """Return a ``trajectory_msgs/JointTrajectory`` as a dictionary in the format of rosbridge."""
         states = self.sampled(rate)
         points = []
         for i, t in enumerate(states.time):
@@ -126,11 +127,11 @@ class JointTrajectory:
         return {"header": header, "joint_names": list(self.names), "points": points}
 
     def to_json(self, *, rate: float = 100.0) -> str:
-        """:meth:`to_ros` as text."""
+        """Return :meth:`to_ros` as JSON text."""
         return json.dumps(self.to_ros(rate=rate))
 
     def to_csv(self, *, rate: float = 1000.0) -> str:
-        """Time, positions, velocities and accelerations, a line a sample."""
+        """Return time, positions, velocities and accelerations as CSV text, one line per sample."""
         states = self.sampled(rate)
         text = io.StringIO()
         out = csv.writer(text, lineterminator="\n")
@@ -143,12 +144,12 @@ class JointTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the joints are at some times, and how they move.
+    """State of the joints at times (...).
 
     Args:
         time: (...) [s].
         position: (..., J) [rad or m].
-        velocity, acceleration, jerk: (..., J), per s, s² and s³.
+        velocity, acceleration, jerk: (..., J), position units per s, s² and s³.
     """
 
     time: Array

@@ -124,7 +124,7 @@ def test_a_fault_is_an_error_that_names_it_and_ends_with_an_activation(
 
 def test_after_a_release_it_must_be_activated(gripper: RobotiqGripper) -> None:
     gripper.release()
-    with pytest.raises(GripperError, match="told to release"):
+    with pytest.raises(GripperError, match="automatic release"):
         gripper.move(0.02)
     with pytest.raises(FaultError, match="automatic release"):
         gripper.status()
@@ -155,7 +155,7 @@ def test_a_thousand_commands_on_a_line_that_loses_bytes_end_done_or_as_an_error_
                 try:
                     gripper.move(opening)
                     status = gripper.status()
-                    # What it answers is of this command, not of an earlier one.
+                    # The status refers to this command, not to an earlier one.
                     assert status.requested == gripper.model.position(opening)
                     assert status.going
                     done += 1
@@ -230,7 +230,7 @@ def test_another_kind_of_device_is_refused_not_believed(device: FakeRobotiq) -> 
     with RobotiqGripper(device.port, timeout=0.03, retries=0, device=3) as other, pytest.raises(NoAnswerError):
         other.status()
     with RobotiqGripper(device.port, timeout=0.03) as gripper, pytest.raises(RefusedError, match="no such register"):
-        gripper._asked.read(0x1000, 1)
+        gripper._open_client.read(0x1000, 1)
 
 
 def test_fingers_that_never_arrive_are_told_to_stand_still(gripper: RobotiqGripper, device: FakeRobotiq) -> None:

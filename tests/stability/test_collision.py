@@ -19,7 +19,7 @@ UNDER, ROUNDED_UP = 4e-6, 1e-6  # of ClearanceResult
 
 
 def _certified(field: GaussianCollisionField, model: GaussianModel, points: Array, n_sigma: float = 2.0) -> None:
-    """The promise of ClearanceResult, and hits on the safe side of it."""
+    """Check the error bound of ClearanceResult, and that collision checks are conservative."""
     found = field.clearance(points).distance
     v, a = local(model, n_sigma, points)
     truth = signed_distances(v, a)

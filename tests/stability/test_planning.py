@@ -16,7 +16,7 @@ from tests.unit.planning.toys import RADIUS, Slider, around_the_ball, ball_world
 
 
 def _balls(means: Array, scales: Array) -> GaussianCollisionField:
-    """Gaussians along the axes, given by their semi-axes (N, 3) at two sigma."""
+    """Return Gaussians along the axes, given by their semi-axes (N, 3) at two sigma."""
     n = len(means)
     return GaussianCollisionField(
         GaussianModel.from_activated(

@@ -15,7 +15,7 @@ from splatbot.trajectory import Trajectory
 
 
 class OracleSlam(Slam):
-    """Takes every pose from ``reference`` and adds every frame's pixels, but for those told otherwise by index.
+    """Takes every pose from ``reference`` and adds the pixels of every frame, except frames listed by index.
 
     Args:
         reference: the poses; world = first camera, as Slam has it.
@@ -53,11 +53,11 @@ class OracleSlam(Slam):
 
     @property
     def skipped_gradients(self) -> int:
-        """None: nothing is refined."""
+        """Zero, because this class refines nothing."""
         return 0
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
-        """The reference's pose; the frame's pixels enter the map unless it is held out or lost."""
+        """Return the pose of the reference; the frame's pixels enter the map unless it is held out or lost."""
         if frame.index == self._crash_at:
             raise RuntimeError("crashed on purpose")
         self.seen.append((frame.index, hold_out))
@@ -86,18 +86,18 @@ class OracleSlam(Slam):
         return result
 
     def finish(self, stop: Stop = never) -> None:
-        """Nothing to refine."""
+        """Record the call; this class refines nothing."""
         self.finished = True
 
     def close_loops(self) -> None:
-        """That it has been asked to."""
+        """Record the call."""
         self.loops_closed = True
 
     def close(self) -> None:
-        """No thread to end."""
+        """Return; this class has no threads."""
 
     def snapshot(self) -> Snapshot:
-        """A small sphere for every pixel that was added."""
+        """Return a small sphere for every added pixel."""
         if not self._points:
             return Snapshot(GaussianModel.empty(), 0)
         points, colors = np.concatenate(self._points), np.concatenate(self._colors)

@@ -25,13 +25,13 @@ ANGLES = [1e-12, 1e-9, 1e-7, 1e-5, 0.99e-4, 1.01e-4, 1e-3, 0.1, 1.0, 2.0, 3.0, n
 
 
 def axes(rng: np.random.Generator) -> np.ndarray:
-    """Unit vectors: the coordinate axes, their opposites and random ones."""
+    """Return unit vectors: the coordinate axes, their opposites and random ones."""
     v = np.vstack([np.eye(3), -np.eye(3), rng.normal(size=(10, 3))])
     return v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
 def exact_rotation(omega: np.ndarray) -> np.ndarray:
-    """Rodrigues with 50 digits."""
+    """Evaluate Rodrigues' formula with 50 digits."""
     with mpmath.workdps(50):
         w = [mpmath.mpf(float(x)) for x in omega]
         theta = mpmath.sqrt(sum(x * x for x in w))

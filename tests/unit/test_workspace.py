@@ -14,7 +14,7 @@ from splatbot.workspace import NamedPlace, Workspace, find_workspace, fit_worksp
 
 
 def _table(seed: int = 0) -> tuple[GaussianModel, np.ndarray]:
-    """A table, a larger wall behind it and things on it, seen from 0.5 m above; and T_world_table."""
+    """Return a table with objects and a larger wall behind it, seen from 0.5 m above, and T_world_table."""
     rng = np.random.default_rng(seed)
     table = np.c_[rng.uniform(-0.6, 0.6, 3000), rng.uniform(-0.4, 0.4, 3000), rng.normal(0, 1e-3, 3000)]
     wall = np.c_[rng.uniform(-2, 2, 6000), np.full(6000, 0.75), rng.uniform(-0.7, 1.5, 6000)]
@@ -89,7 +89,7 @@ def test_what_is_written_is_read_and_found_beside_a_map(tmp_path: Path) -> None:
         ("gravitation: [0, 0, 1]\n", "gravitation"),
         ("gravity: [0, 0, 2]\n", "gravity: is no unit vector"),
         ("gravity: [0, 0]\n", r"gravity: is \(2,\)"),
-        ("gravity: [a, b, c]\n", "gravity: holds what is no number"),
+        ("gravity: [a, b, c]\n", "gravity: holds a value that is no number"),
         ("T_world_base: [1, 2, 3]\n", "T_world_base: is no pose"),
         ("T_world_base: {translation: [0, 0, 0], quaternion_wxyz: [0, 0, 0, 0]}\n", "quaternion"),
         ("workspace: [[0, 0, 0], [1, 0, 1]]\n", "workspace: is empty"),

@@ -52,7 +52,7 @@ def test_a_run_whose_log_is_gone_still_answers_and_notes_the_skipped_checks(
     out = tmp_path / "out"
     answer = run("grasp", "--map", tmp_path, *BASE, "--target", "red box", "--wanted", 1, "--out", out)
     assert answer.code == 0, answer.err
-    (note,) = [note for note in json.loads((out / "grasp.json").read_text())["notes"] if "saw through" in note]
+    (note,) = [note for note in json.loads((out / "grasp.json").read_text())["notes"] if "Visibility" in note]
     assert "moved" in note
 
 

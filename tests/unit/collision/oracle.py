@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 def gaussians(
     means: ArrayLike, scales: ArrayLike, quats: ArrayLike | None = None, opacities: ArrayLike | None = None
 ) -> GaussianModel:
-    """A grey model of Gaussians; scales (3,) are shared."""
+    """Return a grey model of Gaussians; scales (3,) are shared."""
     m = np.atleast_2d(np.asarray(means, dtype=np.float64))
     n = len(m)
     return GaussianModel.from_activated(
@@ -28,20 +28,20 @@ def gaussians(
 
 
 def random_gaussians(n: int, rng: np.random.Generator, least: float = 1e-3, most: float = 0.05) -> GaussianModel:
-    """In a box of 2 m, scales log-uniform in ``least``..``most`` [m], any rotation."""
+    """Return Gaussians in a box of 2 m, with log-uniform scales in ``least``..``most`` [m] and any rotation."""
     scales = np.exp(rng.uniform(np.log(least), np.log(most), (n, 3)))
     return gaussians(rng.uniform(-1, 1, (n, 3)), scales, rng.normal(size=(n, 4)))
 
 
 def local(model: GaussianModel, n_sigma: float, points: Array) -> tuple[Array, Array]:
-    """Points (P, 3) in the frames of the Gaussians (P, N, 3), and semi-axes (N, 3)."""
+    """Transform points (P, 3) to the frames of the Gaussians (P, N, 3); return also the semi-axes (N, 3)."""
     R = Rotation.from_quat(model.quats.double().numpy(), scalar_first=True).as_matrix()
     axes = n_sigma * np.maximum(model.log_scales.double().exp().numpy(), SCALE_FLOOR)
     return np.einsum("nij,pni->pnj", R, points[:, None] - model.means.double().numpy()), axes
 
 
 def signed_distances(v: Array, a: Array) -> Array:
-    """Signed distances (...) of points ``v`` (..., 3) to axis-aligned ellipsoids ``a`` (..., 3), by bisection.
+    """Compute signed distances (...) of points ``v`` (..., 3) to axis-aligned ellipsoids ``a`` (..., 3), by bisection.
 
     The root t of Σ (a_i v_i / (a_i² + t))² = 1 in t > -min(a)² (Eberly, distance from a point to an ellipsoid).
     """
@@ -61,7 +61,7 @@ def signed_distances(v: Array, a: Array) -> Array:
 
 
 def separation(v: Array, a: Array, r: Array) -> Array:
-    """The largest K(s), s in 0..1, of spheres of radius ``r`` (...) at ``v`` (..., 3): apart where it is above 1.
+    """Compute the largest K(s), s in 0..1, of spheres of radius ``r`` (...) at ``v`` (..., 3); above 1 they are apart.
 
     K(s) = Σ v_i² s (1 - s) / (r² + s (a_i² - r²)), concave in s (Splat-Nav, Chen et al. 2024, proposition 1).
     """

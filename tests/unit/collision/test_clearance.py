@@ -25,7 +25,7 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def _check_certified(found: Array, v: Array, a: Array) -> None:
-    """Found (P,) is never above the least of the true distances (P, N), and below it by no more than promised."""
+    """Check that found (P,) is a lower bound of the least true distance (P, N) with the documented error."""
     truth = signed_distances(v, a)
     nearest = truth.argmin(axis=1)
     rows = np.arange(len(found))

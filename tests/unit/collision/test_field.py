@@ -27,7 +27,7 @@ def _random(n: int, rng: np.random.Generator, least: float = 1e-3, extent: float
 
 
 def _oracle(model: GaussianModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """All distances (P, N) by scipy, from the covariance's inverse in float64; the model's own float32 values."""
+    """Compute all distances (P, N) by scipy in float64, from the inverse covariance of the model's float32 values."""
     R = Rotation.from_quat(model.quats.double().numpy(), scalar_first=True).as_matrix()
     S = np.maximum(model.log_scales.double().exp().numpy(), SCALE_FLOOR)
     inverses = np.einsum("nij,nj,nkj->nik", R, S**-2, R)
@@ -45,7 +45,7 @@ def test_distance_and_index_agree_with_scipy_in_float64(n: int) -> None:
     answer = GaussianCollisionField(model).mahalanobis(points)
     bound = ERROR_BOUND * 1.2 * np.sqrt(3) / float(model.scales.min())
     np.testing.assert_allclose(answer.distance, truth.min(axis=1), atol=bound, rtol=1e-6)
-    # The index may differ from the oracle's only between Gaussians that float32 cannot tell apart.
+    # The index may differ from the oracle's only between Gaussians that float32 cannot distinguish.
     np.testing.assert_allclose(truth[np.arange(101), answer.index], truth.min(axis=1), atol=2 * bound, rtol=1e-6)
     assert (answer.index == truth.argmin(axis=1)).mean() > 0.98
 

@@ -1,4 +1,4 @@
-"""The error of a map's surfaces as its own depth tells it."""
+"""The error of a map's surfaces, measured by its own depth images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CAMERA = Camera(60.0, 60.0, 39.5, 29.5, 80, 60)
 
 
 def _wall(z: float) -> GaussianCollisionField:
-    """Balls of 5 mm, 3 mm apart, so that a plane at ``z`` is their ridge to 0.3 mm."""
+    """Return balls of 5 mm, 3 mm apart, so that a plane at ``z`` is their ridge to 0.3 mm."""
     x, y = np.meshgrid(np.arange(-0.9, 0.9, 0.006), np.arange(-0.7, 0.7, 0.006))
     return GaussianCollisionField(gaussians(np.c_[x.ravel(), y.ravel(), np.full(x.size, z)], 0.005))
 
@@ -48,7 +48,7 @@ def test_no_ball_that_the_margin_enlarges_is_called_free_where_it_reaches_into_w
 def test_only_what_lies_around_a_place_counts_if_one_is_given() -> None:
     field = _wall(1.0)
     depth = np.full((60, 80), 1.0, np.float32)
-    depth[:, 40:] = 0.9  # the right half is off by 10 cm
+    depth[:, 40:] = 0.9  # the right half has an error of 10 cm
     views = [(depth, CAMERA, np.eye(4))]
     assert surface_error(field, views).share(1.0) > 0.08
     assert surface_error(field, views, around=[-0.4, 0.0, 1.0, 0.3]).share(1.0) == 0.0

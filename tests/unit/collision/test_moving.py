@@ -1,4 +1,4 @@
-"""Where something moved: what depth images saw there at times and saw through later, not the edges of what stays."""
+"""Space of dynamic objects: cells that depth images hit at times and passed later, without edges of static surfaces."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EYES = [np.array([0.5 * np.cos(a), 0.5 * np.sin(a), 0.7]) for a in np.linspace(0
 
 
 def _depth(eye: np.ndarray, balls: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Exact depth of a table at z = 0 and balls, and T_world_camera."""
+    """Render exact depth of a table at z = 0 and balls; return it with T_world_camera."""
     T = look_at(eye, np.zeros(3))
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
@@ -41,7 +41,7 @@ def _model(points: np.ndarray) -> GaussianModel:
 
 
 def _mapped(where: list[np.ndarray], flying: float = 0.0) -> tuple[GaussianModel, VisibilityEvidence]:
-    """What each image shows as Gaussians, every other pixel, and the evidence of all images.
+    """Return Gaussians at every other pixel of each image, and the evidence of all images.
 
     ``flying``: share of pixels at the still ball's edge that are somewhere behind it.
     """

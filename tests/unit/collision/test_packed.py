@@ -17,7 +17,7 @@ from splatbot.robots.panda import panda
 from tests.unit.collision.oracle import Array, gaussians, local, random_gaussians, separation, signed_distances
 
 FAR = np.array([900.0, -300.0, 20.0])  # [m]
-STEADY, SHARE = 5e-5, 0.026  # [m] and of the longest semi-axis: what packing may take off a distance
+STEADY, SHARE = 5e-5, 0.026  # [m] and of the longest semi-axis: largest reduction of a distance by packing
 
 
 @pytest.fixture(params=available_isas())
@@ -29,8 +29,10 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def _mixture(n: int, rng: np.random.Generator) -> GaussianModel:
-    """Discs, needles and balls of 0.1 mm to 6 cm, some too large to be packed, some far from the origin; quaternions
-    of four equal components among them, for which leaving out one is worst."""
+    """Return discs, needles and balls of 0.1 mm to 6 cm, some too large to be packed, some far from the origin.
+
+    Some quaternions have four equal components, which is the worst case for leaving one out.
+    """
     model = random_gaussians(n, rng, least=5e-5, most=0.03)
     model.log_scales[: n // 20] += 2.5
     model.means[n // 20 : n // 10] += torch.from_numpy(FAR).float()
@@ -48,7 +50,7 @@ def test_packed_distances_never_exceed_those_of_the_ellipsoids_and_stay_within_t
     v, a = local(model, 2.0, points)
     truth = signed_distances(v, a)
     assert (found <= truth.min(axis=1)).all()
-    # A packed Gaussian may be the nearest where another one is: what it takes off is at most that of some Gaussian.
+    # A packed Gaussian may be the nearest where another one is: its reduction is at most that of some Gaussian.
     slack = STEADY + SHARE * np.minimum(a.max(axis=1), 0.125) + 4e-6 * np.abs(v).sum(axis=-1)
     assert (found >= (truth - slack).min(axis=1)).all()
 

@@ -34,15 +34,15 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
     set_isa("")
 
 
-def _room(arm: RobotSpheres, q: Array) -> Array:
-    """Least distance (C,) of the arm's spheres without the base from the true shapes."""
+def _clearance(arm: RobotSpheres, q: Array) -> Array:
+    """Compute the least distance (C,) of the arm's spheres without the base from the true shapes."""
     moving = arm.spheres.link > 0
     distance = SCENE.distance(arm.centers(q)[:, moving].reshape(-1, 3)).reshape(len(q), -1)
     return np.asarray((distance - arm.spheres.radii[moving]).min(axis=1))
 
 
 def _self_gap(arm: RobotSpheres, q: Array) -> Array:
-    """Least gap (C,) between spheres of links that may not touch."""
+    """Compute the least gap (C,) between spheres of links that may not touch."""
     at, radii, link = arm.centers(q), arm.spheres.radii, arm.spheres.link
     gaps = []
     for a, b in arm.pairs:
@@ -71,7 +71,7 @@ def test_no_configuration_that_touches_the_true_shapes_is_called_free(field: Gau
     arm = RobotSpheres(panda())
     q = panda().random(20_000, rng)
     answer = arm.check(field, q)
-    room = _room(arm, q)
+    room = _clearance(arm, q)
     assert not (~answer.in_collision & (room <= 0)).any()
     own = arm.check(None, q).in_collision
     assert (answer.in_collision & ~own & (room > 0.02)).sum() == 0
@@ -142,10 +142,10 @@ def test_an_edge_that_is_certified_is_free_all_along_and_hits_are_not_far_off(
     free, fractions = ~answer.in_collision, np.linspace(0, 1, 300)
     for a, b in zip(start[free][:60], end[free][:60], strict=True):
         dense = a + fractions[:, None] * (b - a)
-        assert _room(arm, dense).min() > 0
+        assert _clearance(arm, dense).min() > 0
         assert _self_gap(arm, dense).min() > 0
     sampled = arm.sample(field, start, end, samples=513).in_collision
-    assert not (sampled & free).any()  # what a sample finds, no certificate has missed
+    assert not (sampled & free).any()  # an edge with a colliding sample has no certificate
     assert (answer.in_collision & ~sampled).mean() < 0.05
     assert (answer.at[free] == 1).all()
 
@@ -216,7 +216,7 @@ def test_a_robot_and_a_map_moved_together_give_the_same_answers() -> None:
     model.means += model.means.new_tensor(T[:3, 3])
     after = RobotSpheres(panda(), T_world_base=T).check(GaussianCollisionField(model), q).in_collision
     assert (before != after).mean() < 2e-3  # means are rounded to 60 um there
-    room = _room(RobotSpheres(panda()), q)
+    room = _clearance(RobotSpheres(panda()), q)
     assert not (~after & (room <= 0)).any()
 
 

@@ -1,4 +1,4 @@
-"""Fields of a map that changes, against fields built anew."""
+"""Fields of a map that changes, against newly built fields."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.unit.collision.oracle import Array, gaussians, random_gaussians
 
 
 def _same(updated: GaussianCollisionField, fresh: GaussianCollisionField, points: Array) -> None:
-    """Bit by bit the same answers, rows included."""
+    """Check that the results are bit-identical, rows included."""
     spheres = np.c_[points, np.full(len(points), 0.03)]
     np.testing.assert_array_equal(updated.in_collision(spheres), fresh.in_collision(spheres))
     a, b = updated.clearance(points), fresh.clearance(points)
@@ -116,7 +116,7 @@ def test_a_path_is_asked_only_about_what_is_new() -> None:
     still, anew = arm.still_free(before, now, start, end), arm.certify(now, start, end)
     np.testing.assert_array_equal(still.in_collision, anew.in_collision)
     assert 0 < still.in_collision.mean() < 0.9
-    assert not arm.still_free(now, before, start, end).in_collision.any()  # what went away is in nobody's way
+    assert not arm.still_free(now, before, start, end).in_collision.any()  # removed Gaussians block no path
 
 
 @pytest.mark.parametrize(

@@ -45,9 +45,9 @@ def test_every_configuration_of_a_certified_line_is_free_and_it_can_be_timed(fie
     answer = straight_line(ARM, field, START, end)
     assert answer.path is not None
     q = answer.path.at(np.linspace(0, 1, 1000))
-    room = ARM.clearance(field, q, cut=0.05).distance
+    clearance = ARM.clearance(field, q, cut=0.05).distance
     assert not ARM.check(field, q).in_collision.any()
-    assert answer.path.certificate.clearance <= min(0.05, room.min()) + 1e-9
+    assert answer.path.certificate.clearance <= min(0.05, clearance.min()) + 1e-9
     assert answer.path.certificate.clearance > 0
     trajectory = time_path(answer.path, ARM, field)
     assert trajectory.certificate.certified
@@ -67,17 +67,17 @@ def test_there_and_back_again_is_the_same_line(field: GaussianCollisionField) ->
 def test_something_in_the_way_ends_the_line_before_it_and_is_named() -> None:
     T = panda().tcp(START)
     plate = T[:3, 3] + 0.10 * T[:3, 2]
-    thing = GaussianCollisionField(gaussians(plate, 0.01))
-    answer = straight_line(ARM, thing, START, along(T, 0.15))
+    plate_field = GaussianCollisionField(gaussians(plate, 0.01))
+    answer = straight_line(ARM, plate_field, START, along(T, 0.15))
     assert answer.status is PlanStatus.GOAL_IN_COLLISION
     assert answer.cause is not None
     assert answer.cause.gaussian == 0
     assert 0.2 < answer.share < 0.7
     assert answer.path is not None
-    assert not ARM.check(thing, answer.path.at(np.linspace(0, 1, 200))).in_collision.any()
-    # What it holds reaches farther and is stopped earlier.
+    assert not ARM.check(plate_field, answer.path.at(np.linspace(0, 1, 200))).in_collision.any()
+    # The attached object reaches farther, so that the line ends earlier.
     held = RobotSpheres(panda(), opening=0.0, attached=[[0.0, 0.0, 0.107 + 0.1034 + 0.03, 0.02]])
-    assert straight_line(held, thing, START, along(T, 0.15)).share < answer.share
+    assert straight_line(held, plate_field, START, along(T, 0.15)).share < answer.share
 
 
 def test_a_line_out_of_reach_ends_where_the_arm_is_stretched() -> None:

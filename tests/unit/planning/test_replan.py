@@ -19,7 +19,7 @@ START, GOAL = np.array([-0.8, 0.0]), np.array([0.8, 0.0])
 
 
 def _with_ball(model: GaussianModel, at: list[float], sigma: float) -> tuple[GaussianModel, NDArray[np.bool_]]:
-    """The model with one more round Gaussian, and what changed."""
+    """Return the model with one more round Gaussian, and the rows that changed."""
     ball = ball_world()
     ball.means[:] = ball.means.new_tensor([at])
     ball.log_scales[:] = float(np.log(sigma))
@@ -40,7 +40,7 @@ def _later(replanner: Replanner, at: list[float], sigma: float) -> GaussianColli
 
 
 def _side(replanner: Replanner) -> float:
-    """1 if the path passes above the ball, else -1."""
+    """Return 1 if the path passes above the ball, else -1."""
     assert replanner.path is not None
     return float(np.sign(replanner.path.at([0.5])[0, 1]))
 
@@ -72,9 +72,9 @@ def test_what_comes_close_lowers_the_promised_clearance_and_no_more(replanner: R
     assert update.kept
     after = update.result.unwrap()
     along = after.at(np.linspace(0, 1, 2001))
-    room = careful.planner.arm.clearance(careful.planner.field, along).distance.min()
+    clearance = careful.planner.arm.clearance(careful.planner.field, along).distance.min()
     assert update.clearance_before > after.certificate.clearance
-    assert room - 2e-3 < after.certificate.clearance <= room
+    assert clearance - 2e-3 < after.certificate.clearance <= clearance
 
 
 def test_what_disappears_leaves_a_path_as_it_is(replanner: Replanner) -> None:
@@ -116,7 +116,7 @@ def test_a_repair_begins_where_the_arm_is(replanner: Replanner) -> None:
     assert cost[root] == 0.0
 
 
-def test_a_goal_that_is_now_in_the_map_is_told_as_such(replanner: Replanner) -> None:
+def test_a_goal_that_is_now_in_the_map_is_reported(replanner: Replanner) -> None:
     update = replanner.update(_later(replanner, [0.8, 0.0, 0.0], 0.05))
     assert update.result.status is PlanStatus.GOAL_IN_COLLISION
     assert cause_of(update.result).gaussian == 1

@@ -1,4 +1,4 @@
-"""The planner against known optima, and what it promises of its tree, its paths and its time."""
+"""The planner against known optima; guarantees of its tree, its paths and its time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from tests.unit.planning.toys import Slider, around_the_ball, ball_world, cause_of
 
-# Two places of the hand close above the table, with things between them.
+# Two places of the hand close above the table, with objects between them.
 LEFT = np.array([-0.26, 0.79, 1.15, -2.5, 0.29, 3.06, -2.15])
 RIGHT = np.array([-1.95, 1.04, 0.61, -1.56, 0.78, 2.11, -0.97])
 
@@ -104,8 +104,8 @@ def test_a_path_is_free_between_its_waypoints_and_its_cost_is_its_length(planner
     assert path.certificate.map_version == planner.field.map_version
     along = path.at(np.linspace(0, 1, 4001))
     assert not planner.arm.check(planner.field, along).in_collision.any()
-    room = planner.arm.clearance(planner.field, along, cut=0.2).distance.min()
-    assert 0.0 <= path.certificate.clearance <= room < path.certificate.clearance + 2e-3
+    clearance = planner.arm.clearance(planner.field, along, cut=0.2).distance.min()
+    assert 0.0 <= path.certificate.clearance <= clearance < path.certificate.clearance + 2e-3
 
 
 def test_better_paths_come_one_after_the_other(planner: GaussianRRTStar) -> None:
@@ -141,8 +141,8 @@ def test_a_problem_is_solved_as_its_start_and_goal_are(planner: GaussianRRTStar)
 def test_a_margin_is_kept(field: GaussianCollisionField) -> None:
     plain, careful = (GaussianRRTStar(field, panda(), margin=m) for m in (0.0, 0.02))
     path = careful.plan(LEFT, RIGHT, budget_ms=200.0).unwrap()
-    room = plain.arm.clearance(field, path.at(np.linspace(0, 1, 2001)), cut=0.1).distance.min()
-    assert room >= 0.02
+    clearance = plain.arm.clearance(field, path.at(np.linspace(0, 1, 2001)), cut=0.1).distance.min()
+    assert clearance >= 0.02
     assert path.certificate.margin == 0.02
 
 

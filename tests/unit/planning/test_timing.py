@@ -1,4 +1,4 @@
-"""Paths with their time: limits, the curve's own certificate, and what would trip a solver."""
+"""Time parametrization: limits, the certificate of the curve, and degenerate paths."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning import Certificate, JointTrajectory, Path, time_path
 from splatbot.planning.blends import rounded
-from splatbot.planning.timing import chords, least_room, without_duplicates
+from splatbot.planning.timing import chords, min_clearance, without_duplicates
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 
@@ -29,13 +29,13 @@ def arm() -> RobotSpheres:
 
 
 def path_of(waypoints: Array) -> Path:
-    """A path nobody has certified."""
+    """Return a path without a certificate."""
     cost = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
     return Path(waypoints, cost, Certificate(False, 1e-3, 0.0, 0.0, -1))
 
 
 def free_paths(arm: RobotSpheres, field: GaussianCollisionField, count: int, seed: int) -> list[Path]:
-    """Chains of up to four certified edges."""
+    """Return chains of up to four certified edges."""
     rng = np.random.default_rng(seed)
     q = panda().random(3000, rng)
     q = q[~arm.check(field, q).in_collision]
@@ -160,7 +160,7 @@ def test_where_no_rounding_is_free_the_arm_stops_at_the_corner(
 ) -> None:
     path = free_paths(arm, field, 1, 4)[0]
     rounded_time = time_path(path, arm, field).duration
-    monkeypatch.setattr("splatbot.planning.timing._LEAST_REACH", 1e3)  # no blend is long enough
+    monkeypatch.setattr("splatbot.planning.timing._MIN_REACH", 1e3)  # no blend is long enough
     trajectory = time_path(path, arm, field)
     assert trajectory.certificate.certified
     assert trajectory.duration > rounded_time
@@ -207,9 +207,9 @@ def test_the_least_room_is_never_above_what_dense_samples_see(arm: RobotSpheres,
         control = panda().home + np.cumsum(rng.normal(0, 0.02, (60, 7)), axis=0)
         dense = JointTrajectory(CHAIN.names, control, 1.0, Certificate(False, 0, 0, 0, -1)).at(np.linspace(0, 57, 4000))
         seen = min(0.05, float(arm.clearance(field, dense.position, cut=0.05).distance.min()))
-        room = least_room(arm, field, control)
-        assert room <= seen + 1e-9
-        assert room >= 0.97 * seen - 2e-3
+        clearance = min_clearance(arm, field, control)
+        assert clearance <= seen + 1e-9
+        assert clearance >= 0.97 * seen - 2e-3
 
 
 def test_blends_join_with_equal_first_and_second_derivatives() -> None:

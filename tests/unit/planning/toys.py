@@ -47,18 +47,18 @@ class Slider:
         return np.zeros((0, 2), np.int32)
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
-        """One, on the link that x and y move."""
+        """Return one sphere, on the link that x and y move."""
         return LinkSpheres(np.array([2], np.int32), np.zeros((1, 3)), np.array([self._radius]))
 
 
 def _frame(axis: Array) -> Array:
-    """A rotation (3, 3) whose z is the axis."""
+    """Return a rotation (3, 3) whose z axis is ``axis``."""
     other = np.eye(3)[(int(np.argmax(axis)) + 1) % 3]
     return np.stack([other, np.cross(axis, other), axis], axis=1)
 
 
 def ball_world() -> GaussianModel:
-    """One round Gaussian at the origin."""
+    """Return a map of one round Gaussian at the origin."""
     return GaussianModel.from_activated(
         means=np.zeros((1, 3)),
         quats=np.array([[1.0, 0, 0, 0]]),
@@ -69,11 +69,11 @@ def ball_world() -> GaussianModel:
 
 
 def cause_of(result: PlanResult) -> Cause:
-    """What is in the way, which there must be."""
+    """Return the cause of a failure and assert that it exists."""
     assert result.cause is not None
     return result.cause
 
 
 def around_the_ball(far: float) -> float:
-    """The shortest way [m] from (-far, 0) to (far, 0): two tangents and an arc."""
+    """Return the length [m] of the shortest path from (-far, 0) to (far, 0): two tangents and an arc."""
     return float(2 * np.sqrt(far**2 - AROUND**2) + AROUND * (np.pi - 2 * np.arccos(AROUND / far)))

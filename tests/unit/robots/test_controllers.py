@@ -61,9 +61,9 @@ def test_told_to_stop_the_arm_rests_within_one_period(trajectory: JointTrajector
     half = 0.5 * trajectory.duration
     done = follow(controller, trajectory, stop=lambda feedback: feedback.time >= half)
     assert done.state is MotionState.STOPPED
-    told = int(np.argmax(done.time >= half))
-    assert len(done.time) == told + 2  # the period in which it was told, and the next
-    np.testing.assert_array_equal(done.position[-1], done.position[told])
+    stopped = int(np.argmax(done.time >= half))
+    assert len(done.time) == stopped + 2  # the period of the stop command, and the next
+    np.testing.assert_array_equal(done.position[-1], done.position[stopped])
     at = controller.position
     feedback = controller.step()
     assert not feedback.velocity.any()

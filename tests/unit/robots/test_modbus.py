@@ -56,7 +56,7 @@ def test_a_status_says_what_the_manual_says_of_its_bytes() -> None:
 
 
 def test_a_status_that_means_nothing_is_an_error_not_a_guess() -> None:
-    with pytest.raises(GripperError, match="means nothing"):
+    with pytest.raises(GripperError, match="undefined value"):
         Status.from_bytes(bytes([0x21, 0, 0, 0, 0, 0]))
 
 

@@ -29,7 +29,7 @@ _UR5 = (
 
 
 def ur5(folder: Path) -> Path:
-    """A UR5 of cylinders."""
+    """Return a UR5 of cylinders."""
     parts = ['<robot name="ur5"><link name="base"/>']
     before = "base"
     for name, xyz, rpy, axis, radius, length in _UR5:
@@ -56,7 +56,7 @@ def _puma() -> Path:
 
 
 def _chained(path: Path, q: Array) -> Array:
-    """T_root_tip of a file whose joints are in order, each turned about its own axis (scipy)."""
+    """Compute T_root_tip of a file whose joints are in order, each turned about its own axis (scipy)."""
     T = np.eye(4)
     for joint, angle in zip(ElementTree.parse(path).getroot().findall("joint"), q, strict=True):
         origin, axis = joint.find("origin"), joint.find("axis")
@@ -81,7 +81,7 @@ def test_a_ur5_is_where_the_toolboxs_dh_model_has_it(tmp_path: Path, rng: np.ran
     np.testing.assert_allclose(ours[:, :3, 3], theirs[:, :3, 3] @ turn, atol=5e-4)  # its base is 0.3 mm higher
 
 
-def test_a_six_axis_arm_of_the_toolbox_with_meshes_is_read_covered_and_asked(rng: np.random.Generator) -> None:
+def test_a_six_axis_arm_of_the_toolbox_with_meshes_is_read_covered_and_queried(rng: np.random.Generator) -> None:
     reading = read_urdf(_puma(), slack=0.05)
     robot = reading.robot
     assert len(robot) == 6
@@ -152,7 +152,7 @@ def test_a_damaged_robot_file_is_named(tmp_path: Path) -> None:
         read_robot(path)
 
 
-def test_fingers_off_the_arm_are_held_and_told(tmp_path: Path) -> None:
+def test_fingers_off_the_arm_are_fixed_and_reported(tmp_path: Path) -> None:
     text = (
         ur5(tmp_path)
         .read_text()

@@ -1,4 +1,4 @@
-"""Grasps on the map of a run, asked by the command and of the service."""
+"""Grasps on the map of a run, by the command and by the service."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.results.folder import FrameRow, RunFolder
 from splatbot.results.views import subsampled
-from splatbot.robots.graspable_objects import MeasuredMap, measured_map, run_of, things_of
+from splatbot.robots.graspable_objects import MeasuredMap, measured_map, run_of, segment_objects
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
@@ -30,7 +30,7 @@ from splatbot.workspace import Workspace
 from tests.unit.grasping.objects import OBJECTS, TABLE, model
 
 VIEWS = tuple(exact_views(Tabletop((TABLE, *OBJECTS.values())), 8))
-FLYING = np.array([0.56, -0.15, 0.12])  # beside the can, where depth sees through
+FLYING = np.array([0.56, -0.15, 0.12])  # next to the can, where depth sees through
 
 
 def _flying() -> GaussianModel:
@@ -46,7 +46,7 @@ def _flying() -> GaussianModel:
 
 @pytest.fixture
 def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of a map with flying pixels beside the can; its depth is exact."""
+    """A run whose map has flying pixels next to the can; its depth is exact."""
     run = RunFolder.create(tmp_path / "run")
     full = GaussianModel.concatenate([model(), _flying()])
     full.anchors[:] = 0
@@ -88,7 +88,7 @@ def test_service_and_command_give_the_same_grasps_of_a_run(run_folder: Path, tmp
     answer = _of_service(run_folder, target="blue can", wanted=3, samples=100)
     for key in ("grasps", "target", "rejected", "candidates", "notes"):
         assert answer[key] == told[key], key
-    assert not any("saw through" in note for note in answer["notes"])
+    assert not any("Visibility" in note for note in answer["notes"])
 
 
 def test_what_depth_saw_through_is_no_thing_and_the_others_know_who_saw_them(run_folder: Path) -> None:
@@ -101,7 +101,7 @@ def test_what_depth_saw_through_is_no_thing_and_the_others_know_who_saw_them(run
     assert measured.state.map_version == 3
     assert measured.observers is not None
     np.testing.assert_allclose(measured.observers, np.broadcast_to(VIEWS[0][2][:3, 3], left.shape))
-    things = things_of(measured, np.eye(4), None, as_known=False)
+    things = segment_objects(measured, np.eye(4), None, as_known=False)
     assert things.scene.model is measured.state.model
 
 
@@ -135,7 +135,7 @@ def test_a_map_is_measured_once_for_all_questions(run_folder: Path, monkeypatch:
 
 
 def test_thinned_depth_is_of_the_same_places() -> None:
-    """Points on a wall that is not level: what a subsampled image says of them is what the whole one says."""
+    """Points on a wall that is not level: the evidence of a thinned image equals the evidence of the whole image."""
     camera = Camera(900.0, 900.0, 641.3, 352.1, 1280, 720)
     v, u = np.mgrid[0:720, 0:1280]
     depth = (1.0 + 1e-4 * u + 2e-4 * v).astype(np.float32)
