@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from splatbot.collision import RobotSpheres
 from splatbot.errors import FormatError, InputError
 from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
@@ -179,7 +180,10 @@ def _joints(robot: RobotModel, move: Any, before: Array) -> Array:
 def _reach(scene: Scene, robot: RobotModel, at: Sequence[float], rpy: Any, near: Array) -> Array:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_of(rpy), at
-    found = solve_ik(robot, np.linalg.inv(base_of(scene)) @ T, near=near)
+    arm = RobotSpheres(robot)
+    found = solve_ik(
+        robot, np.linalg.inv(base_of(scene)) @ T, near=near, free=lambda q: ~arm.check(None, q).in_collision
+    )
     if not len(found.q):
         raise InputError(
             f"{tuple(at)} cannot be reached.", field="task.moves.tcp", hint="name a nearer place, or turn rpy"

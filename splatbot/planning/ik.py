@@ -125,9 +125,9 @@ def solve_ik(
 ) -> IkSolutions:
     """Return the distinct configurations found that place the tool at ``T_base_tcp`` to :data:`TOLERANCE`.
 
-    The starts are ``near``, the home posture and uniformly random configurations. While none of them reaches the pose,
-    further random starts follow, up to 512 in total. With ``seeds=1`` only ``near`` is solved, so that a sequence of
-    calls follows one branch of solutions. Equal arguments give equal solutions.
+    The starts are ``near``, the home posture and uniformly random configurations. While none of them gives a
+    free solution, further random starts follow, up to 512 in total. With ``seeds=1`` only ``near`` is solved, so that a
+    sequence of calls follows one branch of solutions. Equal arguments give equal solutions.
 
     Args:
         robot: the arm.
@@ -150,17 +150,22 @@ def solve_ik(
     rng = np.random.default_rng(seed)
     starts = np.concatenate([fixed, _random(chain, max(0, seeds - len(fixed)), rng)])[:seeds]
     q, tried = _solutions(robot, T, starts), len(starts)
-    while seeds > 1 and not len(q) and tried < MAX_STARTS:
+    kept = _distinct(q, posture, apart, free)
+    while seeds > 1 and not len(kept) and tried < MAX_STARTS:
         starts = _random(chain, min(seeds, MAX_STARTS - tried), rng)
-        q, tried = _solutions(robot, T, starts), tried + len(starts)
+        q, tried = np.concatenate([q, _solutions(robot, T, starts)]), tried + len(starts)
+        kept = _distinct(q, posture, apart, free)
+    return IkSolutions(kept, tried, len(q))
+
+
+def _distinct(q: Array, posture: Array, apart: float, free: CollisionFilter | None) -> Array:
+    """Return the distinct free configurations (K, J) of ``q`` (N, J), sorted by distance from ``posture``."""
     distinct: list[Array] = []
     for candidate in q[np.argsort(np.linalg.norm(q - posture, axis=1), kind="stable")]:
         if all(np.abs(candidate - other).max() > apart for other in distinct):
             distinct.append(candidate)
-    kept = np.array(distinct).reshape(-1, len(chain))
-    if free is not None and len(kept):
-        kept = kept[free(kept)]
-    return IkSolutions(kept, tried, len(q))
+    kept = np.array(distinct).reshape(-1, len(posture))
+    return kept[free(kept)] if free is not None and len(kept) else kept
 
 
 def _random(chain: KinematicChain, count: int, rng: np.random.Generator) -> Array:
