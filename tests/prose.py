@@ -21,8 +21,6 @@ ROOT = Path(__file__).parents[1]
 VERBS = frozenset((ROOT / "tests" / "prose_verbs.txt").read_text(encoding="utf-8").split())
 """Verbs that a function's docstring may begin with, in the imperative; a new one is added to the file."""
 
-PENDING = ROOT / "tests" / "prose_pending.txt"
-"""Paths whose prose is still to be rewritten; a path given on the command line is checked all the same."""
 MAX_WORDS = 25  # of a sentence
 
 # Each construction with its replacement.
@@ -272,7 +270,7 @@ def findings(path: Path) -> list[Finding]:
 
 
 def tracked(*under: str) -> list[Path]:
-    """Return the files that git tracks or would track, without CHANGELOG.md, this checker and the pending paths."""
+    """Return the files that git tracks or would track, without CHANGELOG.md and this checker."""
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard", *under],
         cwd=ROOT,
@@ -280,13 +278,8 @@ def tracked(*under: str) -> list[Path]:
         text=True,
         check=True,
     ).stdout.split("\n")
-    pending = () if under else tuple(PENDING.read_text(encoding="utf-8").split()) if PENDING.exists() else ()
     exempt = {"CHANGELOG.md", "tests/prose.py", "tests/unit/test_prose.py"}
-    return [
-        ROOT / f
-        for f in sorted(set(listed))
-        if f and f not in exempt and not f.startswith(pending) and (ROOT / f).is_file()
-    ]
+    return [ROOT / f for f in sorted(set(listed)) if f and f not in exempt and (ROOT / f).is_file()]
 
 
 def main(arguments: Sequence[str]) -> int:

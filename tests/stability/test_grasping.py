@@ -1,4 +1,4 @@
-"""Things that are hard to take: a grasp, or a stated reason."""
+"""Objects that are hard to grasp: a grasp, or a stated reason."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _of(model: GaussianModel, solid: Solid) -> tuple[GraspResult, Target]:
 
 
 def _sound(result: GraspResult, solid: Solid) -> None:
-    """Each grasp is on the thing and no wider than the hand; without any, the reasons are counted."""
+    """Check that each grasp is on the object and fits the hand; without a grasp, that the reasons are counted."""
     for g in result.grasps:
         assert np.abs(solid.distance(g.contacts)).max() < 3e-3
         assert g.width <= g.opening <= 0.08

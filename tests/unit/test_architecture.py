@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 FOLDERS = {"splatbot": "splatbot", "services": "splatbot.services", "sim": "splatbot.sim", "robots": "splatbot.robots"}
 """Package of each source folder."""
 
-EXPECTED_TODO: frozenset[str] = frozenset({"ServiceSettings"})
+EXPECTED_TODO: frozenset[str] = frozenset()
 """Class names that still have two meanings."""
 
 

@@ -1,4 +1,4 @@
-"""Camera: conventions, resizing, and what it refuses."""
+"""Camera: conventions, resizing, and invalid inputs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_corner_convention_differs_by_half_a_pixel() -> None:
 
 def test_resizing_keeps_the_rays_of_pixel_areas() -> None:
     half = CAMERA.resized(320, 240)
-    # The outer corners of the image see the same rays, whatever the resolution.
+    # The outer corners of the image see the same rays at any resolution.
     for x, y in ((0.0, 0.0), (1.0, 1.0), (0.25, 0.8)):
         big = ((x * 640 - 0.5 - CAMERA.cx) / CAMERA.fx, (y * 480 - 0.5 - CAMERA.cy) / CAMERA.fy)
         small = ((x * 320 - 0.5 - half.cx) / half.fx, (y * 240 - 0.5 - half.cy) / half.fy)

@@ -1,4 +1,4 @@
-"""Frame: what it accepts, what it mends, what it refuses."""
+"""Frame: accepted, repaired and refused inputs."""
 
 from __future__ import annotations
 

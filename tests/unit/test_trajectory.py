@@ -1,4 +1,4 @@
-"""Trajectory: what it refuses."""
+"""Trajectory: invalid inputs."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from splatbot.errors import InputError
 
 
 @dataclass(frozen=True)
-class ServiceSettings(Settings):
+class ServiceBenchSettings(Settings):
     """Measure the service.
 
     A client pushes frames at the rate of a camera, first alone, then while other clients query distances of 1,000
@@ -64,7 +64,7 @@ class ServiceSettings(Settings):
                 raise InputError(f"is {value}.", field=f"--{name}", hint="give a positive number")
 
 
-def _measure(settings: ServiceSettings, report_progress: ReportProgress) -> Results:
+def _measure(settings: ServiceBenchSettings, report_progress: ReportProgress) -> Results:
     from splatbot.bench.service.load import run_service_bench
 
     return run_service_bench(settings, report_progress)
@@ -76,7 +76,7 @@ _QUERIES = ("queries", "errors", *(f"latency p{share}" for share in (50, 95, 99,
 _CPU = ("CPU of the service", "CPU of the clients", "CPU of the service per answer")
 
 BENCHMARK = Benchmark(
-    ServiceSettings,
+    ServiceBenchSettings,
     _measure,
     tables=(
         Table("Mapped frames", metrics=_FRAMES),

@@ -15,7 +15,7 @@ import numpy as np
 from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
-from splatbot.bench.service import ServiceSettings
+from splatbot.bench.service import ServiceBenchSettings
 from splatbot.bench.service.clients import QueryLoad, QueryOutcome, running_clients
 from splatbot.bench.timing import measure
 from splatbot.client import Client
@@ -29,7 +29,7 @@ _MAP = "live"
 _TURNS = 2
 
 
-def run_service_bench(settings: ServiceSettings, report_progress: ReportProgress = ignore_progress) -> Results:
+def run_service_bench(settings: ServiceBenchSettings, report_progress: ReportProgress = ignore_progress) -> Results:
     """Measure the service of the settings, and write its log into their folder.
 
     Queries are sent at fixed times (open loop), so that a slow answer delays no other query and its delay counts. A
@@ -120,7 +120,7 @@ def _measure_mapping(
     service: Serving,
     client: Client,
     frames: _Stamps,
-    settings: ServiceSettings,
+    settings: ServiceBenchSettings,
     report_progress: ReportProgress,
 ) -> None:
     """Measure with and without queries in turns, because the map grows and the speed of the machine varies."""
@@ -164,7 +164,9 @@ def _add_answers(results: Results, case: str, outcome: QueryOutcome) -> None:
         results.add(case, f"latency p{share}", float(np.percentile(waits, share)), "ms")
 
 
-def _measure_one(results: Results, client: Client, settings: ServiceSettings, report_progress: ReportProgress) -> None:
+def _measure_one(
+    results: Results, client: Client, settings: ServiceBenchSettings, report_progress: ReportProgress
+) -> None:
     """Measure one large query over HTTP and in this process, on the same map."""
     report_progress(f"{settings.many} points at once")
     while client.map(_MAP)["state"] == "mapping":

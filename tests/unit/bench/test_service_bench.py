@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from splatbot.bench.service import BENCHMARK, ServiceSettings
+from splatbot.bench.service import BENCHMARK, ServiceBenchSettings
 
 
 @pytest.mark.long
 def test_queries_are_sent_at_fixed_times_and_all_are_answered(tmp_path: Path) -> None:
-    values = {**ServiceSettings.quick_values, "per_s": 4.0}
-    results = BENCHMARK.run(ServiceSettings(out=tmp_path, **values))
+    values = {**ServiceBenchSettings.quick_values, "per_s": 4.0}
+    results = BENCHMARK.run(ServiceBenchSettings(out=tmp_path, **values))
     case = "3 clients x 4/s"
     asked = results.find(case, "queries")
     assert asked is not None
