@@ -16,6 +16,8 @@ SECTIONS: dict[str, type[_Section]] = {
 }
 EXPERT = "expert"
 
+_NAMED = 12  # old keys that a warning names, at most
+
 # Names of earlier versions, as section.key, with the present ones.
 _RENAMED = {
     **{f"tracking.{key}": f"sensor.{key}" for key in SensorConfig.model_fields},
@@ -97,7 +99,10 @@ def from_layout(values: dict[str, Any]) -> dict[str, Any]:
                 raise ConfigError("is no expert key.", field=f"{EXPERT}.{section}.{key}", hint=hint)
             _assign(flat, section, key, value, f"{EXPERT}.{section}.{key}", old)
     if old:
-        warnings.warn(f"old configuration keys: {'; '.join(old)}", DeprecatedNameWarning, stacklevel=3)
+        rest = f"; and {len(old) - _NAMED} more" if len(old) > _NAMED else ""
+        hint = "`splatbot map --config FILE --dump-config` prints a file with the present keys"
+        names = "; ".join(old[:_NAMED])
+        warnings.warn(f"old configuration keys: {names}{rest}. {hint}", DeprecatedNameWarning, stacklevel=3)
     return flat
 
 

@@ -132,3 +132,10 @@ def test_a_wrong_expert_key_is_named(tmp_path: Path, text: str, field: str) -> N
     with pytest.raises(ConfigError) as caught:
         load_config(write(tmp_path, text), environ={})
     assert caught.value.field == field
+
+
+def test_the_warning_about_many_old_keys_is_short_and_says_how_to_convert_them(tmp_path: Path) -> None:
+    old = "\n".join(f"  {key}: {value}" for key, value in TrackingConfig().model_dump().items() if key != "budget_ms")
+    with pytest.warns(DeprecatedNameWarning, match="more. .*--dump-config") as warned:
+        load_config(write(tmp_path, f"tracking:\n{old}\n"), environ={})
+    assert len(str(warned[0].message)) < 1500
