@@ -73,7 +73,20 @@ def create_app(runtime: Runtime) -> FastAPI:
     install_problem_handlers(app)
     describe_bodies(app)
     for group in (
-        health, maps, frames, distance, collisions, render, views, plans, grasps, picks, trajectories, trials, jobs, ros
-    ):  # fmt: skip
+        health,
+        maps,
+        frames,
+        distance,
+        collisions,
+        render,
+        views,
+        plans,
+        grasps,
+        picks,
+        trajectories,
+        trials,
+        jobs,
+        ros,
+    ):
         app.include_router(group.router)
     return app

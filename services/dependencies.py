@@ -53,7 +53,7 @@ Service = Annotated[Runtime, Depends(_runtime)]
 Store = Annotated[MapStore, Depends(_store)]
 Settings = Annotated[ServiceSettings, Depends(_settings)]
 Served = Annotated[ServedMap, Depends(_served_map)]
-PatientMap = Annotated[ServedMap, Depends(_map_after_frames)]
+ServedAfterFrames = Annotated[ServedMap, Depends(_map_after_frames)]
 """The same for expensive requests: frames that are being mapped have priority."""
 
 
@@ -92,7 +92,7 @@ def version_headers(served: ServedMap, tag: str) -> dict[str, str]:
 
 
 def unchanged(request: Request, served: ServedMap, tag: str) -> Response | None:
-    """Return True if the client's cached copy is current (status 304)."""
+    """Return a response with status 304 if the client's cached copy is current, else None."""
     if tag in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=version_headers(served, tag))
     return None

@@ -116,7 +116,7 @@ def check(path: Path, line: int, text: str, *, lengths: bool = True) -> Iterator
     """Yield the findings in one piece of prose that begins at ``line``."""
     for sentence in sentences(text):
         if lengths and words(sentence) > MAX_WORDS:
-            yield Finding(path, line, f"{words(sentence)} words", sentence)
+            yield Finding(path, line, f"{words(sentence)} words, at most {MAX_WORDS}", sentence)
         if _STARTS.search(sentence):
             yield Finding(path, line, "verbless or inverted", sentence)
         for pattern, fix in (*_CONSTRUCTIONS, *glossary()):
@@ -203,7 +203,10 @@ def _first_word(path: Path, node: ast.AST, line: int, doc: str) -> Iterator[Find
     word = re.sub(r"[^A-Za-z].*", "", doc.split()[0]) if doc.split() else ""
     if word.lower() not in VERBS:
         yield Finding(
-            path, line, f"docstring of {node.name} begins with '{doc.split()[0]}', no verb", doc.splitlines()[0]
+            path,
+            line,
+            f"docstring of {node.name} begins with '{doc.split()[0]}', no verb of tests/prose_verbs.txt",
+            doc.splitlines()[0],
         )
 
 

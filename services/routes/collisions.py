@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Request, Response
 
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import PatientMap, Settings, problems
+from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in
 from splatbot.services.schemas import BASE_EXAMPLE, CollisionsRequest
@@ -44,7 +44,7 @@ _ANSWER = {
 )
 def collisions(
     request: Request,
-    served: PatientMap,
+    served: ServedAfterFrames,
     settings: Settings,
     query: Annotated[CollisionsRequest, Depends(body_of(CollisionsRequest, array="q"))],
 ) -> Response:

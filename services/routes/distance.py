@@ -8,7 +8,7 @@ import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
 
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import PatientMap, Settings, problems
+from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import DistanceRequest
 
@@ -28,7 +28,7 @@ _Body = Annotated[DistanceRequest, Depends(body_of(DistanceRequest, array="point
     responses=gives(_ANSWER, npy="distance (P,) float32") | problems(404, 413, 415, 422, 503),
     openapi_extra=takes(DistanceRequest, _EXAMPLES, npy="points (P, 3)"),
 )
-def distance(request: Request, served: PatientMap, settings: Settings, query: _Body) -> Response:
+def distance(request: Request, served: ServedAfterFrames, settings: Settings, query: _Body) -> Response:
     """Return each point's Mahalanobis distance to the nearest Gaussian, that Gaussian's row, and a verdict.
 
     In an empty map the distance is null (infinity in npy and msgpack) and the index -1.

@@ -16,7 +16,7 @@ from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.summary import summary
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import PatientMap, Service, problems
+from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS, map_topic
@@ -48,7 +48,7 @@ _ANSWER = {
 )
 def grasps(
     request: Request,
-    served: PatientMap,
+    served: ServedAfterFrames,
     service: Service,
     query: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))],
 ) -> Response:

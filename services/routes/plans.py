@@ -12,7 +12,7 @@ from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal, time_path
 from splatbot.planning.ik import solve_ik
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, body_of, gives, takes
-from splatbot.services.dependencies import PatientMap, Service, problems
+from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
@@ -56,7 +56,7 @@ _IK_ANSWER = {"q": [[0.1, 0.2, 0.3, -2.0, 0.0, 1.6, 0.8]], "tried": 32, "reached
 )
 def plan(
     request: Request,
-    served: PatientMap,
+    served: ServedAfterFrames,
     service: Service,
     query: Annotated[PlanRequest, Depends(body_of(PlanRequest))],
 ) -> Response:

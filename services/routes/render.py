@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.rasterize.views import default_view, depth_limits, render_view, to_png
-from splatbot.services.dependencies import PatientMap, Served, Settings, etag, problems, unchanged, version_headers
+from splatbot.services.dependencies import (
+    Served,
+    ServedAfterFrames,
+    Settings,
+    etag,
+    problems,
+    unchanged,
+    version_headers,
+)
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import Mode, Pose, RenderRequest
 from splatbot.services.settings import ServiceSettings
@@ -57,7 +65,7 @@ def render_default(
 
 
 @router.post("/{map_id}/render", response_class=Response, responses=_PNG | problems(404, 413, 422, 503))
-def render(served: PatientMap, settings: Settings, request: Annotated[RenderRequest, _BODY]) -> Response:
+def render(served: ServedAfterFrames, settings: Settings, request: Annotated[RenderRequest, _BODY]) -> Response:
     """Render the map for a given camera and pose."""
     model = served.ready.model
     if request.camera is not None:

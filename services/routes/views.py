@@ -12,7 +12,7 @@ from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.rasterize.views import render_view, to_png
 from splatbot.services.codecs import MSGPACK, NPY, answer, body_of, gives, takes
-from splatbot.services.dependencies import PatientMap, Settings, problems
+from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.routes.render import check_size
 from splatbot.services.schemas import ViewsRequest
@@ -40,7 +40,7 @@ _ANSWER = {"map_version": 12, "views": [{"rgb": "iVBORw0KGgo...", "depth": "iVBO
 )
 def views(
     request: Request,
-    served: PatientMap,
+    served: ServedAfterFrames,
     settings: Settings,
     query: Annotated[ViewsRequest, Depends(body_of(ViewsRequest))],
 ) -> Response:

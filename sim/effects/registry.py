@@ -76,9 +76,11 @@ def make_effects(specs: Sequence[str], *, seed: int = 0, why: str = "") -> Effec
 
 def _value(name: str, key: str, text: str, kind: type) -> Any:
     try:
+        if kind is bool:
+            return {"true": True, "false": False}[text.lower()]
         return kind(text)
-    except ValueError as error:
-        expected = "a whole number" if kind is int else "a number"
+    except (ValueError, KeyError) as error:
+        expected = {int: "a whole number", bool: "true or false"}.get(kind, "a number")
         raise InputError(f"is {text!r}.", field=f"effect {name}: {key}", hint=f"give {expected}") from error
 
 

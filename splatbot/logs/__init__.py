@@ -14,7 +14,8 @@ from splatbot.logs.tum import Missing, TumLog
 __all__ = ["Calibration", "Log", "open_log", "record"]
 
 _LAYOUTS_HINT = (
-    "known layouts: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2); "
+    "known layouts: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), "
+    "a .mcap or .bag file; "
     "`synthetic:tabletop` needs no files"
 )
 
@@ -40,8 +41,8 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
         return _open_bag(str(uri), camera)
     folder = Path(uri)
     if not folder.is_dir():
-        problem = "is a file, logs are folders" if folder.exists() else "does not exist"
-        raise LogError(f"{problem}.", file=folder, field="log", hint="give the folder that holds the recording")
+        problem = "is a file of no known kind" if folder.exists() else "does not exist"
+        raise LogError(f"{problem}.", file=folder, field="log", hint=f"check the path; {_LAYOUTS_HINT}")
     if any((folder / name).exists() for name in ("rgb.txt", "depth.txt")):
         return TumLog(folder, camera=camera, missing=missing)
     if (folder / "results").is_dir() and (folder / "traj.txt").exists():

@@ -42,7 +42,7 @@ _TABLE: dict[str, tuple[float, float]] = {
     "match all": (0.8, 2.3e-6),  # keypoints, times keypoints of a keyframe
     "vote": (0.0, 0.5),  # keyframes
     "gicp": (3.0, 6.0e-3),  # points
-    "rest": (1.0, 0.0),  # work outside the stages: covariance, transfer to mapping, the code between stages
+    "overhead": (1.0, 0.0),  # work outside the stages: covariance, transfer to mapping, the code between stages
 }
 _DEFAULT_WORK = (0.0, 1.0)  # work without a row: its units are milliseconds
 
@@ -111,7 +111,7 @@ class Budget:
         self._counted_ms = 0.0
         if costs is not None:
             costs.begin_frame()
-        self._rest_ms = table_ms("rest", 1) if costs is None else costs.expected_ms("rest", 1, LOST_QUANTILE)
+        self._rest_ms = table_ms("overhead", 1) if costs is None else costs.expected_ms("overhead", 1, LOST_QUANTILE)
 
     @property
     def left_ms(self) -> float:

@@ -83,7 +83,7 @@ class Tracker:
     def record_overhead(self, ms: float) -> None:
         """Record the time [ms] that a frame took outside the stages, for the budgets of later frames."""
         if self._costs is not None:
-            self._costs.record("rest", 1, ms)
+            self._costs.record("overhead", 1, ms)
 
     def forget(self) -> None:
         """Discard the motion: the next frame may be anywhere in the map."""

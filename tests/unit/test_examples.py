@@ -22,7 +22,7 @@ EXPECTED = {
     "05_render_and_differentiate.py": r"step 0: .* 22\.4 mm\n.*step 100: loss 0\.000\d+, camera error [0-4]\.\d mm",
     "06_query_the_service.py": r"map desk has \d+ Gau.*nearest Gau.* sigma away.*certified: True.*motion: succeeded",
     "07_sensor_effect.py": r"(frame \d: centre x (0\.99|1\.0\d), corner x 0\.[2-4]\d\n){3}.*\['vignette'\]",
-    "08_tracking_stage.py": r"frame 1: ok by .*rest stage \d\.\d ms\n.*frame 7: ok by \w+\+direct, rest stage",
+    "08_tracking_stage.py": r"frame 1: ok by .*standstill \d\.\d ms\n.*frame 7: ok by \w+\+direct, standstill",
     "09_log_format.py": r"5 frames of recording: ok, ok, ok, ok, ok; \d{4} Gaussians",
 }
 

@@ -11,7 +11,7 @@ import pytest
 from splatbot.errors import InputError
 from splatbot.sim.effects.base import Effects, settings
 from splatbot.sim.effects.depth_noise import DepthNoise
-from splatbot.sim.effects.registry import EFFECTS, effect_class, make_effect, make_effects
+from splatbot.sim.effects.registry import EFFECTS, _value, effect_class, make_effect, make_effects
 from tests.unit.sim.frames import frame_at
 
 
@@ -30,6 +30,13 @@ def test_every_effect_is_known_by_its_own_name_and_can_say_what_it_is(name: str)
 def test_every_setting_can_be_written_in_a_spec(name: str) -> None:
     spec = f"{name}:" + ",".join(f"{key}={value}" for key, value in settings(effect_class(name)).items())
     assert settings(make_effect(spec)) == settings(make_effect(name))
+
+
+@pytest.mark.parametrize(("text", "value"), [("true", True), ("False", False)])
+def test_a_setting_of_type_bool_is_true_or_false(text: str, value: bool) -> None:
+    assert _value("lens", "flipped", text, bool) is value
+    with pytest.raises(InputError, match="true or false"):
+        _value("lens", "flipped", "0.5", bool)
 
 
 def test_a_spec_sets_what_it_names_and_leaves_the_rest() -> None:

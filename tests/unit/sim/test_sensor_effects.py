@@ -28,7 +28,7 @@ from splatbot.trajectory import Trajectory
 from tests.unit.sim.frames import frame_at
 
 RNG = np.random.default_rng(0)
-TOLD = {"blackout": "blackout:at=2,n=2", "frame_drops": "frame_drops:rate=0.5"}
+SPEC_WITH_EFFECT = {"blackout": "blackout:at=2,n=2", "frame_drops": "frame_drops:rate=0.5"}
 LENS = LensDistortion(k1=-0.2, k2=0.05, p1=0.002, p2=-0.001)
 
 
@@ -47,7 +47,7 @@ def seen(effects: str) -> dict[str, list[object]]:
 @pytest.mark.parametrize("name", EFFECTS)
 def test_without_an_effect_what_it_declares_to_change_is_different(name: str) -> None:
     observable = effect_class(name).observable
-    assert seen(TOLD.get(name, name))[observable] != seen("")[observable]
+    assert seen(SPEC_WITH_EFFECT.get(name, name))[observable] != seen("")[observable]
     assert effect_class(name).cost
 
 

@@ -75,16 +75,16 @@ def test_time_that_has_passed_is_not_left() -> None:
     assert budget.left_ms <= 5.0
     assert not budget.fits(("detect", 2000))
     counted = Budget(50.0, None, time.perf_counter() - 10.0)
-    assert counted.left_ms == 50.0 - table_ms("rest", 1)
+    assert counted.left_ms == 50.0 - table_ms("overhead", 1)
     with counted.run("detect", 1000):
         pass
-    assert counted.left_ms == pytest.approx(50.0 - table_ms("rest", 1) - table_ms("detect", 1000))
+    assert counted.left_ms == pytest.approx(50.0 - table_ms("overhead", 1) - table_ms("detect", 1000))
 
 
 def test_the_overhead_of_most_frames_outside_the_stages_is_reserved() -> None:
     costs = CostModel()
     for ms in (7.0, 3.0, 7.0, 7.0, 60.0):  # the last frame becomes a keyframe
-        costs.record("rest", 1, ms)
+        costs.record("overhead", 1, ms)
     assert Budget(30.0, costs, time.perf_counter()).left_ms == pytest.approx(23.0, abs=0.5)
 
 
@@ -103,7 +103,7 @@ def test_the_slam_reports_its_own_overhead_to_the_tracker(monkeypatch: pytest.Mo
     slam = Slam(config)
     for frame in open_log("synthetic:tabletop?frames=4&width=160&height=120"):
         slam.process(frame)
-    assert slam._tracker._costs.expected_ms("rest", 1, LOST_QUANTILE) > 1e3 * slow  # type: ignore[union-attr]
+    assert slam._tracker._costs.expected_ms("overhead", 1, LOST_QUANTILE) > 1e3 * slow  # type: ignore[union-attr]
 
 
 def test_without_time_for_features_the_frame_is_tracked_and_reports_them_as_skipped() -> None:
