@@ -131,7 +131,7 @@ def test_a_browser_shows_the_moment_of_the_address(
 ) -> None:
     text = _label(browser, tmp_path, address, clicks)
     assert float(text.split()[0]) == pytest.approx(time, abs=1.5 / RATE)
-    assert "of 4.00 s, room" in text
+    assert "of 4.00 s, clearance" in text
 
 
 def test_a_browser_plays_until_it_is_stopped(browser: str, tmp_path: Path) -> None:
