@@ -4,7 +4,7 @@ import numpy as np
 
 from splatbot import GaussianCollisionField, GaussianRRTStar
 from splatbot.bench.tabletop import tabletop
-from splatbot.planning import time_path
+from splatbot.planning import certify_motion, time_path
 from splatbot.planning.follow import follow
 from splatbot.robots.controllers.fake import FakeController
 from splatbot.robots.panda import panda
@@ -23,7 +23,8 @@ trajectory = time_path(path, planner.arm, field)
 print(f"trajectory of {trajectory.duration:.2f} s, certified: {trajectory.certificate.certified}")
 
 controller = FakeController(robot.home, lag=0.005)
-followed = follow(controller, trajectory, stop=lambda feedback: feedback.error > 0.05)
+motion = certify_motion(trajectory, planner.arm, field)  # as it will be executed, in the map of this moment
+followed = follow(controller, motion, stop=lambda feedback: feedback.error > 0.05)
 print(f"followed: {followed.state}, largest error {1e3 * followed.error.max():.1f} mrad")
 
 failure = planner.plan(robot.home, goal + 3.0, budget_ms=20)

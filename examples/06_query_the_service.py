@@ -5,11 +5,12 @@ from pathlib import Path
 from splatbot.client import Client
 from splatbot.serving import serving
 
-BASE = {"translation": [0.0, 0.5, 0.0]}  # the robot stands behind the first camera
+BASE = {"translation": [0.0, 0.5, 0.0]}  # of the robot in the world, which is the first camera
 GOAL = [0.3, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8]
 
 with serving("--data", "maps", log=Path("service.log")) as service, Client(service.url) as client:
-    job = client.create_map("desk", "synthetic:tabletop?frames=6&width=160&height=120")
+    log = "synthetic:tabletop?frames=6&width=160&height=120"
+    job = client.create_map("desk", log, robot_base=BASE)
     client.wait(job["id"])
     print(f"map desk has {client.map('desk')['gaussians']} Gaussians")
 
@@ -17,8 +18,9 @@ with serving("--data", "maps", log=Path("service.log")) as service, Client(servi
     sigmas = ", ".join(f"{distance:.1f}" for distance in found.distance)
     print(f"nearest Gaussians: {sigmas} sigma away, map version {found.map_version}")
 
-    plan = client.plan("desk", goal=GOAL, base=BASE)
+    plan = client.plan("desk", goal=GOAL)
     print(f"plan of {plan['duration_s']:.2f} s, certified: {plan['certified']}")
-    motion = client.send(plan["id"], arm="fake")
-    done = client.wait(motion["id"], under="/v1/trajectories")
+    with client.lease("fake") as lease:  # one owner commands the arm; it stops if the owner is gone
+        motion = lease.send(plan["id"])
+        done = client.wait(motion["id"], under="/v1/trajectories")
     print(f"motion: {done['state']}")

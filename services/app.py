@@ -18,6 +18,7 @@ from splatbot.services.limits import BodyLimit
 from splatbot.services.problems import install_problem_handlers
 from splatbot.services.requests import HEADER, RequestLog
 from splatbot.services.routes import (
+    arms,
     collisions,
     distance,
     frames,
@@ -83,6 +84,7 @@ def create_app(runtime: Runtime) -> FastAPI:
         plans,
         grasps,
         picks,
+        arms,
         trajectories,
         trials,
         jobs,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any
@@ -12,15 +14,20 @@ from typing import Any
 import numpy as np
 
 from splatbot.errors import ControllerError, InputError
-from splatbot.protocols import Controller, Feedback, MotionState, TimedPath
+from splatbot.planning import CertifiedMotion, MotionRefusedError
+from splatbot.protocols import Controller, Feedback, MotionState
 from splatbot.robots.controllers import FakeController
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot, robot_names
-from splatbot.services.bus import Bus
 from splatbot.services.jobs import Job, JobCancelled, JobHandle, Jobs
+from splatbot.services.leases import Lease, Leases
+from splatbot.services.motion_gate import MotionGate, MotionRequest, MotionWatch
+from splatbot.services.store import MapStore
 from splatbot.services.topics import JOINTS, JointState, arm_topic, motion_topic, robot_topic
 
 _FEEDBACK_PERIOD_S = 0.02
+
+_log = logging.getLogger(__name__)
 
 
 @lru_cache(maxsize=8)
@@ -51,7 +58,7 @@ def twin_arm(robot: RobotModel) -> Controller:
 
 @dataclass
 class Arm:
-    """One arm: its robot, how its controller is made, and the controller once it was needed.
+    """One arm: its robot, the factory of its controller, and the controller once it was needed.
 
     Args:
         name: in URLs.
@@ -79,34 +86,58 @@ class Arm:
         return self.lock.locked()
 
 
+@dataclass(frozen=True)
+class EmergencyStop:
+    """An emergency stop that is in force.
+
+    Args:
+        by: client that sent it.
+        since: Unix time [s].
+    """
+
+    by: str
+    since: float
+
+
 class Arms:
     """The service's arms; their joints and feedback are published on the bus.
 
+    A motion is sent by the holder of the arm's lease, and through the gate only. It stops if the lease ends, if the map
+    changes such that the rest of the motion is not free, and at an emergency stop.
+
     Args:
-        bus: receives joints and feedback at 50 Hz while an arm moves.
+        store: the maps, and the bus that receives joints and feedback at 50 Hz while an arm moves.
         makers: factory of each arm's controller.
         robot: name of their model.
     """
 
     def __init__(
         self,
-        bus: Bus,
+        store: MapStore,
         makers: Mapping[str, Callable[[RobotModel], Controller]] | None = None,
         *,
         robot: str = "panda",
     ) -> None:
         makers = {"fake": fake_arm, "twin": twin_arm} if makers is None else makers
-        self._bus = bus
+        self._bus = store.bus
+        self._gate = MotionGate(store)
         self._robot = robot
         self._makers = dict(makers)
         self._arms: dict[str, Arm] = {}
         self._lock = threading.Lock()
-        self.motions = Jobs(bus, workers=max(1, len(self._makers)), capacity=len(self._makers))
+        self._stop: EmergencyStop | None = None
+        self.leases = Leases()
+        self.motions = Jobs(self._bus, workers=max(1, len(self._makers)), capacity=len(self._makers))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the arms."""
         return tuple(self._makers)
+
+    @property
+    def emergency_stop(self) -> EmergencyStop | None:
+        """The emergency stop in force, or None."""
+        return self._stop
 
     def get(self, name: str) -> Arm:
         """Return an arm whose controller is ready.
@@ -115,59 +146,122 @@ class Arms:
             InputError: the name is unknown.
         """
         with self._lock:
-            if name not in self._makers:
-                raise InputError(f"is {name[:80]!r}.", field="arm", hint=f"arms: {', '.join(self._makers)}")
+            self._check_name(name)
             if name not in self._arms:
                 self._arms[name] = Arm(name, known_robot(self._robot), self._makers[name])
             arm = self._arms[name]
             arm.ready()
             return arm
 
-    def send(self, name: str, trajectory: TimedPath, *, key: str | None = None, request: str = "") -> Job:
-        """Let an arm follow a trajectory; the motion is a job: done, faulted ("failed"), or stopped ("cancelled").
+    def lease(
+        self, name: str, owner: str, *, seconds: float | None, preempt: bool = False, admin: bool = False
+    ) -> Lease:
+        """Take the lease of an arm; see :class:`Leases`.
 
         Raises:
-            ControllerError: the arm moves, is at fault, or is not where the trajectory begins.
+            InputError: the name is unknown.
+            LeaseError: another owner holds it.
         """
-        known = self.motions.known(key, request)
+        self._check_name(name)
+        with self._lock:
+            known = self._arms.get(name)
+        moving = known is not None and known.busy
+        return self.leases.acquire(name, owner, seconds=seconds, preempt=preempt, moving=moving, admin=admin)
+
+    def stop_all(self, by: str) -> EmergencyStop:
+        """Stop every arm within one control period and refuse motions until :meth:`reset`. This never waits."""
+        stop = self._stop = EmergencyStop(by, time.time())
+        _log.warning("emergency stop by %s", by)
+        return stop
+
+    def reset(self) -> None:
+        """End the emergency stop; motions that it stopped do not go on."""
+        self._stop = None
+
+    def send(self, name: str, request: MotionRequest, *, lease: str, key: str | None = None, content: str = "") -> Job:
+        """Certify a motion and let an arm execute it.
+
+        The motion is a job: done, faulted or refused by a later map ("failed"), or stopped ("cancelled").
+
+        Args:
+            name: of the arm.
+            request: the motion.
+            lease: valid lease of the arm.
+            key, content: see :meth:`splatbot.services.jobs.Jobs.submit`.
+
+        Raises:
+            LeaseError: the lease has ended.
+            MotionRefusedError: the motion is not certified, or an emergency stop is in force.
+            ControllerError: the arm moves, is at fault, or is not where the motion begins.
+        """
+        known = self.motions.known(key, content)
         if known is not None:
             return known  # a repeated request: the arm must not move twice
         arm = self.get(name)
+        self.leases.check(lease, name)
+        self._check_running()
         if not arm.lock.acquire(blocking=False):
             raise ControllerError("is moving.", field=f"arm {name}", hint="stop it, or wait until it has arrived")
         try:
-            arm.ready().send(trajectory)
-            work = partial(self._follow, arm, trajectory)
-            return self.motions.submit("trajectory", work, key=key, request=request)[0]
+            motion = self._gate.certify(request, arm.robot)
+            arm.ready().send(motion)
+            work = partial(self._follow, arm, request, motion, lease)
+            abandoned = partial(self._abandon, arm)
+            return self.motions.submit("trajectory", work, key=key, request=content, abandoned=abandoned)[0]
         except BaseException:
-            arm.lock.release()
+            self._abandon(arm)
             raise
 
     def close(self, timeout_s: float) -> None:
         """Stop every motion."""
         self.motions.close(timeout_s)
 
-    def _follow(self, arm: Arm, trajectory: TimedPath, handle: JobHandle) -> dict[str, Any]:
+    def _abandon(self, arm: Arm) -> None:
+        """Let an arm rest whose motion does not begin."""
+        controller = arm.ready()
+        controller.stop()
+        arm.feedback = controller.step()
+        arm.lock.release()
+
+    def _check_name(self, name: str) -> None:
+        if name not in self._makers:
+            raise InputError(f"is {name[:80]!r}.", field="arm", hint=f"arms: {', '.join(self._makers)}")
+
+    def _check_running(self) -> None:
+        if (stop := self._stop) is not None:
+            hint = "remove the danger, then DELETE /v1/stop"
+            raise MotionRefusedError(f"An emergency stop by {stop.by} is in force.", field="stop", hint=hint)
+
+    def _follow(
+        self, arm: Arm, request: MotionRequest, motion: CertifiedMotion, lease: str, handle: JobHandle
+    ) -> dict[str, Any]:
         controller = arm.ready()
         published_at, largest = 0.0, 0.0
-        begin, steps = time.perf_counter(), 0
+        begin, steps, reason = time.perf_counter(), 0, ""
         try:
-            while True:
-                if handle.cancelled.is_set():
-                    controller.stop()
-                feedback = arm.feedback = controller.step()
-                steps += 1
-                largest = max(largest, feedback.error)
-                now = time.perf_counter()
-                ended = feedback.state is not MotionState.MOVING
-                if ended or now - published_at >= _FEEDBACK_PERIOD_S:
-                    published_at = now
-                    self._publish_feedback(arm, handle, feedback, trajectory.duration)
-                if ended:
-                    break
-                time.sleep(max(0.0, begin + steps * controller.period - time.perf_counter()))
+            with MotionWatch(self._gate, request, motion, lambda: steps * controller.period) as watch:
+                while True:
+                    reason = reason or self._reason_to_stop(watch, lease)
+                    if reason or handle.cancelled.is_set():
+                        controller.stop()
+                    feedback = arm.feedback = controller.step()
+                    steps += 1
+                    largest = max(largest, feedback.error)
+                    now = time.perf_counter()
+                    ended = feedback.state is not MotionState.MOVING
+                    if ended or now - published_at >= _FEEDBACK_PERIOD_S:
+                        published_at = now
+                        self._publish_feedback(arm, handle, feedback, motion.duration)
+                    if ended:
+                        break
+                    time.sleep(max(0.0, begin + steps * controller.period - time.perf_counter()))
+        except BaseException:
+            controller.stop()
+            raise
         finally:
             arm.lock.release()
+        if feedback.state is MotionState.STOPPED and reason:
+            raise ControllerError(f"was stopped: {reason}", field=f"arm {arm.name}", hint="plan from where it is")
         if feedback.state is MotionState.STOPPED:
             raise JobCancelled
         if feedback.state is MotionState.FAULT:
@@ -175,11 +269,18 @@ class Arms:
             raise ControllerError(f"{feedback.fault}.", field=f"arm {arm.name}", hint="plan from where it is")
         return {"seconds": feedback.time, "largest_error": largest, "position": feedback.position.tolist()}
 
+    def _reason_to_stop(self, watch: MotionWatch, lease: str) -> str:
+        if (stop := self._stop) is not None:
+            return f"emergency stop by {stop.by}"
+        if not self.leases.holds(lease):
+            return "its lease ended; the owner is gone or another owner preempted it"
+        return watch.refused
+
     def _publish_feedback(self, arm: Arm, handle: JobHandle, feedback: Feedback, duration: float) -> None:
         names = arm.robot.chain.names
         joints = JointState(time.time(), names, feedback.position, np.asarray(feedback.velocity))
         self._bus.publish(robot_topic(arm.robot.name, JOINTS), joints)
         self._bus.publish(arm_topic(arm.name, JOINTS), joints)
         self._bus.publish(motion_topic(handle.id), feedback)
-        if not handle.cancelled.is_set():
+        with suppress(JobCancelled):  # the next period stops the arm
             handle.report(feedback.time / duration if duration > 0 else 1.0)

@@ -40,7 +40,7 @@ class Guard:
             hint = "send Authorization: Bearer KEY"
             await _refuse(scope, receive, send, 401, "A valid API key is needed.", hint, {"WWW-Authenticate": "Bearer"})
             return
-        scope.setdefault("state", {})["client"] = client
+        scope.setdefault("state", {}).update(client=client, scopes=frozenset({"read", "map", "move", "admin"}))
         wait = self._wait(client)
         if wait > 0:
             detail = f"More than {self._settings.requests_per_s:g} requests a second."

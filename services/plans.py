@@ -7,8 +7,13 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from uuid import uuid4
 
+import numpy as np
+from numpy.typing import NDArray
+
 from splatbot.errors import InputError
 from splatbot.planning import JointTrajectory, PlanResult
+from splatbot.services.motion_gate import MotionRequest
+from splatbot.services.store import ServedMap
 
 _KEPT = 256
 
@@ -25,17 +30,26 @@ class Plan:
 
     Args:
         id: in URLs.
-        map_id: of the map that it was planned in.
+        map_id, generation: of the map that it was planned in.
         robot: name of the model.
+        T_world_base: (4, 4) base of the robot [m].
         result: of the search; it has a path.
         trajectory: the path with its time.
     """
 
     id: str
     map_id: str
+    generation: int
     robot: str
+    T_world_base: NDArray[np.float64]
     result: PlanResult
     trajectory: JointTrajectory
+
+    @property
+    def motion(self) -> MotionRequest:
+        """The plan as a motion for an arm."""
+        margin = self.trajectory.certificate.margin
+        return MotionRequest(self.trajectory, self.robot, self.map_id, self.generation, self.T_world_base, margin)
 
 
 class Plans:
@@ -45,9 +59,16 @@ class Plans:
         self._lock = threading.Lock()
         self._plans: OrderedDict[str, Plan] = OrderedDict()
 
-    def add(self, map_id: str, robot: str, result: PlanResult, trajectory: JointTrajectory) -> Plan:
+    def add(
+        self,
+        served: ServedMap,
+        robot: str,
+        T_world_base: NDArray[np.float64],
+        result: PlanResult,
+        trajectory: JointTrajectory,
+    ) -> Plan:
         """Keep a plan."""
-        plan = Plan(uuid4().hex[:16], map_id, robot, result, trajectory)
+        plan = Plan(uuid4().hex[:16], served.id, served.generation, robot, T_world_base, result, trajectory)
         with self._lock:
             self._plans[plan.id] = plan
             if len(self._plans) > _KEPT:

@@ -52,7 +52,7 @@ class Runtime:
         self.bus = self.store.bus
         self.config = config or Config()
         self.jobs = Jobs(self.bus, workers=settings.job_workers, capacity=settings.max_jobs)
-        self.arms = Arms(self.bus)
+        self.arms = Arms(self.store)
         self.plans = Plans()
         self.metrics = Metrics(self.store, self.jobs)
         self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None

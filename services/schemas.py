@@ -177,7 +177,9 @@ class PlanRequest(Request):
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     speed: Annotated[float, Field(gt=0, le=1)] = Field(1.0, description="share of the joints' limits of velocity")
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(50.0, description="of the trajectory's points [Hz]")
+    rate: Annotated[float, Field(ge=1, le=1000)] | None = Field(
+        None, description="of the trajectory's points [Hz]; by default its knots, which give the same curve again"
+    )
 
     @model_validator(mode="after")
     def _one_goal(self) -> Self:
@@ -247,8 +249,36 @@ class PicksRequest(Request):
 class TrajectoryRequest(Request):
     """A planned motion to be followed."""
 
-    plan: str = Field(description="id of a plan")
-    arm: str = Field("fake", description="which arm, as GET /v1/arms lists them")
+    plan: str = Field(max_length=64, description="id of a plan")
+    arm: str = Field("fake", max_length=80, description="which arm, as GET /v1/arms lists them")
+    lease: str = Field(max_length=64, description="lease of the arm, from POST /v1/arms/ARM/lease")
+
+
+class LeaseRequest(Request):
+    """The lease of an arm."""
+
+    seconds: Annotated[float, Field(ge=0.5, le=60)] = Field(
+        10.0, description="the arm stops if the lease is not renewed within this time [s]"
+    )
+    preempt: bool = Field(
+        False, description="take it from another owner: while the arm rests; during a motion only with the scope admin"
+    )
+
+
+class LeaseInfo(BaseModel):
+    """A lease of an arm."""
+
+    lease: str = Field(description="motions name it; keep it secret")
+    arm: str
+    seconds: float = Field(description="renew it within this time: PUT /v1/leases/LEASE [s]")
+
+
+class StopInfo(BaseModel):
+    """Whether an emergency stop is in force."""
+
+    stopped: bool
+    by: str | None = None
+    since: float | None = Field(None, description="Unix time [s]")
 
 
 class TrialsRequest(Request):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -44,6 +45,7 @@ class ServedMap:
         workspace: pose of the robot's base in it, if known.
         awaited: the service counts as ready only once this map has a state.
         run: folder of the run that made it; None if there is no such run.
+        generation: number of the map in this process; a later map of the same name has another.
         derived: results computed from the snapshot.
     """
 
@@ -56,6 +58,7 @@ class ServedMap:
     workspace: Workspace | None = None
     awaited: bool = True
     run: RunFolder | None = None
+    generation: int = 0
     derived: Derived = dataclasses.field(default_factory=Derived, repr=False, compare=False)
 
     @property
@@ -97,6 +100,7 @@ class MapStore:
         self.frames_first = FramesFirst()
         self._lock = threading.Lock()
         self._maps: dict[str, ServedMap] = {}
+        self._generations = itertools.count(1)
 
     def add(
         self,
@@ -118,7 +122,8 @@ class MapStore:
         with self._lock:
             if map_id in self._maps:
                 raise MapExistsError(f"map {map_id!r} exists.", field="id", hint="delete it, or choose another id")
-            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited, run)
+            number = next(self._generations)
+            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited, run, number)
             self._put(served)
         return served
 

@@ -34,10 +34,10 @@ class TwinController(SteppedController):
         super().__init__(self._measured(), period=1.0 / twin.rate, following=following)
         self._hold = self._position.copy()
 
-    def send(self, trajectory: TimedPath) -> None:
-        """Begin to follow a trajectory; see :class:`SteppedController`."""
-        super().send(trajectory)
-        self._before = trajectory.reference(0.0)[1]
+    def send(self, motion: TimedPath) -> None:
+        """Begin to follow a motion; see :class:`SteppedController`."""
+        super().send(motion)
+        self._before = motion.reference(0.0)[1]
 
     def step(self) -> Feedback:
         """Simulate one control period in any state of motion."""

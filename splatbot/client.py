@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import ssl
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -106,7 +107,7 @@ class TrackedFrame:
 
 
 class Client:
-    """Connection to a service, for use by one thread at a time.
+    """Connection to a service.
 
     Args:
         url: "http://host:port" or "https://...".
@@ -259,9 +260,29 @@ class Client:
         found: NDArray[np.float64] = self._packed("POST", "/v1/ik", {"pose": dict(pose), **more})["q"]
         return found
 
-    def send(self, plan_id: str, *, arm: str = "fake", key: str | None = None) -> dict[str, Any]:
-        """Send a plan to an arm; return the motion for :meth:`wait` with ``under="/v1/trajectories"``."""
-        return self._json("POST", "/v1/trajectories", {"plan": plan_id, "arm": arm}, _idempotency(key))
+    def lease(self, arm: str = "fake", *, seconds: float = 5.0, preempt: bool = False) -> ArmLease:
+        """Take the lease of an arm, which its motions need; the arm stops when the lease ends.
+
+        Args:
+            arm: name of the arm.
+            seconds: time without a renewal after which the arm stops, 0.5 to 60 [s].
+            preempt: take the lease from the owner of an arm at rest; during a motion this needs a key of an
+                administrator.
+
+        Returns:
+            Context manager that renews the lease in the background and ends it on exit.
+        """
+        body = {"seconds": seconds, "preempt": preempt}
+        taken = self._json("POST", f"/v1/arms/{quote(arm, safe='')}/lease", body)
+        return ArmLease(self, arm, str(taken["lease"]), seconds)
+
+    def emergency_stop(self) -> dict[str, Any]:
+        """Stop every arm at once and refuse motions until :meth:`reset_stop`."""
+        return self._json("POST", "/v1/stop")
+
+    def reset_stop(self) -> dict[str, Any]:
+        """End the emergency stop."""
+        return self._json("DELETE", "/v1/stop")
 
     def stop(self, motion_id: str) -> dict[str, Any]:
         """Stop the motion of an arm."""
@@ -343,6 +364,47 @@ class Client:
         )
         found: dict[str, Any] = msgpack.unpackb(data, object_hook=_unpack)
         return found
+
+
+class ArmLease:
+    """Lease of an arm, renewed in a thread; see :meth:`Client.lease`.
+
+    Attributes:
+        id: its name, which motions need.
+        lost: reason why the last renewal failed, empty while the lease holds.
+    """
+
+    def __init__(self, client: Client, arm: str, lease_id: str, seconds: float) -> None:
+        self.id, self.lost = lease_id, ""
+        self._client, self._arm = client, arm
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._renew, args=(seconds / 3.0,), daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def send(self, plan_id: str, *, key: str | None = None) -> dict[str, Any]:
+        """Send a plan to the arm; return the motion for :meth:`Client.wait` with ``under="/v1/trajectories"``."""
+        body = {"plan": plan_id, "arm": self._arm, "lease": self.id}
+        return self._client._json("POST", "/v1/trajectories", body, _idempotency(key))
+
+    def release(self) -> None:
+        """End the lease; the arm stops if it moves."""
+        self._ended.set()
+        self._thread.join()
+        self._client.request("DELETE", f"/v1/leases/{self.id}")
+
+    def _renew(self, period: float) -> None:
+        while not self._ended.wait(period):
+            try:
+                self._client.request("PUT", f"/v1/leases/{self.id}")
+            except (ServiceError, RuntimeError) as error:  # RuntimeError: the client was closed
+                self.lost = str(error)
+                return
 
 
 def _map_path(map_id: str, *rest: str) -> str:

@@ -179,7 +179,7 @@ class TimedPath(Protocol):
 
 @runtime_checkable
 class Controller(Protocol):
-    """An arm that follows trajectories: a driver, a twin, a recording, or a fake.
+    """An arm that follows certified motions: a driver, a twin, a recording, or a fake.
 
     Each :meth:`step` advances the time by one period; a driver waits for the period of its robot.
     """
@@ -189,11 +189,14 @@ class Controller(Protocol):
         """Control period [s]."""
         ...
 
-    def send(self, trajectory: TimedPath) -> None:
-        """Begin to follow a trajectory from where the arm is.
+    def send(self, motion: TimedPath) -> None:
+        """Begin to follow a motion from where the arm is.
+
+        Args:
+            motion: a :class:`splatbot.planning.CertifiedMotion`; the controller refuses everything else.
 
         Raises:
-            ControllerError: at fault, moving, or the trajectory begins elsewhere.
+            ControllerError: the motion is not certified or begins elsewhere, or the arm is at fault or moving.
         """
         ...
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatbot.errors import ControllerError, InputError
+from splatbot.planning.certify import CertifiedMotion
 from splatbot.protocols import Array, Feedback, MotionState, TimedPath
 
 AT_START = 0.01  # [rad or m] largest distance of the arm from the start of a trajectory that it accepts
@@ -30,7 +31,7 @@ class SteppedController:
         self._position = np.array(position, dtype=np.float64)
         self._velocity = np.zeros_like(self._position)
         self._desired = self._position.copy()
-        self._trajectory: TimedPath | None = None
+        self._motion: TimedPath | None = None
         self._time = 0.0
         self._state, self._fault = MotionState.IDLE, ""
         self._stopping = False
@@ -50,33 +51,36 @@ class SteppedController:
         """State of the motion."""
         return self._state
 
-    def send(self, trajectory: TimedPath) -> None:
-        """Begin to follow a trajectory.
+    def send(self, motion: TimedPath) -> None:
+        """Begin to follow a motion.
 
         Raises:
-            ControllerError: at fault, moving, or the trajectory begins elsewhere.
+            ControllerError: the motion is not certified, begins elsewhere, or the arm is at fault or moving.
         """
+        if not isinstance(motion, CertifiedMotion):
+            hint = "certify it with splatbot.planning.certify_motion"
+            raise ControllerError(f"{type(motion).__name__} is not certified.", field="motion", hint=hint)
         if self._state is MotionState.FAULT:
             raise ControllerError(f"is at fault: {self._fault}.", field="controller", hint="reset it")
         if self._state is MotionState.MOVING:
             raise ControllerError("is moving.", field="controller", hint="stop it, or wait until it has arrived")
-        start = trajectory.reference(0.0)[0]
+        start = motion.reference(0.0)[0]
         if start.shape != self._position.shape:
-            raise ControllerError(f"has {start.size} joints, not {self._position.size}.", field="trajectory")
+            raise ControllerError(f"has {start.size} joints, not {self._position.size}.", field="motion")
         distance = float(np.abs(start - self._position).max())
         if not distance <= AT_START:
             hint = "plan from where the arm is"
-            raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="trajectory", hint=hint)
-        self._trajectory, self._time, self._stopping = trajectory, 0.0, False
+            raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="motion", hint=hint)
+        self._motion, self._time, self._stopping = motion, 0.0, False
         self._state = MotionState.MOVING
 
     def step(self) -> Feedback:
         """Let one period pass."""
-        if self._state is MotionState.MOVING and self._trajectory is not None:
+        if self._state is MotionState.MOVING and self._motion is not None:
             if self._stopping:
                 self._rest(MotionState.STOPPED)
             else:
-                self._follow(self._trajectory)
+                self._follow(self._motion)
         return Feedback(
             self._time, self._position.copy(), self._velocity.copy(), self._desired.copy(), self._state, self._fault
         )
@@ -95,16 +99,16 @@ class SteppedController:
         self._rest(MotionState.IDLE)
         self._fault = ""
 
-    def _follow(self, trajectory: TimedPath) -> None:
+    def _follow(self, motion: TimedPath) -> None:
         self._time += self._period
-        self._desired, velocity = trajectory.reference(self._time)
+        self._desired, velocity = motion.reference(self._time)
         position = self._moved(self._time, self._desired, velocity)
         self._velocity = (position - self._position) / self._period
         self._position = position
         error = float(np.abs(self._position - self._desired).max())
         if not error <= self._following:
             self.fault(f"{error:.4f} from the trajectory at {self._time:.3f} s")
-        elif self._time >= trajectory.duration and error <= AT_START:
+        elif self._time >= motion.duration and error <= AT_START:
             self._rest(MotionState.DONE)
 
     def _rest(self, state: MotionState) -> None:

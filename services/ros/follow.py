@@ -9,19 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError, SplatbotError
 from splatbot.logs.ros_frames import header
 from splatbot.logs.ros_types import Message, build
+from splatbot.planning import WaypointMotion
 from splatbot.protocols import Feedback
-from splatbot.robots.robot import RobotModel
-from splatbot.services.arms import Arms
+from splatbot.services.arms import Arm, Arms
 from splatbot.services.bus import Message as News
 from splatbot.services.jobs import ENDED, Job
+from splatbot.services.motion_gate import MotionRequest
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import waypoints_of
-from splatbot.services.ros.moveit import robot_place
-from splatbot.services.ros.waypoints import Waypoints
+from splatbot.services.ros.moveit import main_map
 from splatbot.services.store import MapStore
 
 _TYPE = "control_msgs/msg/FollowJointTrajectoryAction"
@@ -38,11 +37,27 @@ def action_topic(arm: str, part: str) -> str:
     return f"/{arm}_controller/follow_joint_trajectory/{part}"
 
 
-class FollowJointTrajectory:
-    """Executes trajectories that clients send on the service's arms, if they are free in the main map.
+def _check_supported(goal: Message) -> None:
+    """Check that a goal has no part that would be ignored.
 
-    Straight edges between the goal's points are certified against the map and the arm itself before the arm moves. A
-    goal is rejected with the reason if it is not free, starts elsewhere than the arm, or arrives during a motion.
+    Raises:
+        InputError: it has one; the error names it.
+    """
+    for name in ("path_tolerance", "goal_tolerance"):
+        if len(getattr(goal, name, ())):
+            raise InputError("is not supported.", field=name, hint="leave it empty")
+    stamp = goal.trajectory.header.stamp
+    if stamp.sec + 1e-9 * stamp.nanosec > time.time():
+        raise InputError("is in the future.", field="header.stamp", hint="send the goal when it begins; stamp 0 is now")
+
+
+class FollowJointTrajectory:
+    """Executes trajectories that clients send on the service's arms, if they are certified in the main map.
+
+    The arm follows the cubic spline with continuous acceleration through the points of the goal
+    (:class:`splatbot.planning.WaypointMotion`). If the first point has a time above 0, the motion begins where the arm
+    is. A goal is rejected with the reason if the curve is not certified, begins elsewhere than the arm, or arrives
+    during a motion. The owner of the motion is the client's connection: the arm stops when it ends.
 
     Args:
         graph: where the topics are.
@@ -54,6 +69,8 @@ class FollowJointTrajectory:
         self._graph, self._arms, self._store = graph, arms, store
         self._lock = threading.Lock()
         self._goals: dict[str, tuple[str, Message]] = {}
+        self._leases: dict[tuple[str, int], str] = {}
+        graph.on_leave(self._release)
         topics = []
         for arm in arms.names:
             kinds = {"goal": f"{_TYPE}Goal", "cancel": "actionlib_msgs/msg/GoalID"}
@@ -88,35 +105,45 @@ class FollowJointTrajectory:
                 if news.topic.endswith("/cancel"):
                     self._cancel(arm, news.value.message.id)
                 else:
-                    self._begin(arm, news.value.message)
+                    self._begin(arm, news.value.message, news.value.client)
             except Exception:  # one odd goal must not end the others
                 _log.exception("%s could not be followed", news.topic)
 
-    def _begin(self, arm: str, goal: Message) -> None:
+    def _begin(self, arm: str, goal: Message, client: int) -> None:
         try:
-            path = self._checked(self._arms.get(arm).robot, goal.goal.trajectory)
-            with self._lock:  # before the motion's first news are looked at
-                job = self._arms.send(arm, path)
+            request = self._request(self._arms.get(arm), goal.goal)
+            with self._lock:  # before the first feedback of the motion is published
+                job = self._arms.send(arm, request, lease=self._lease(arm, client))
                 self._goals[job.id] = arm, goal.goal_id
         except SplatbotError as error:
             self._result(arm, goal.goal_id, _REJECTED, _INVALID_GOAL, str(error))
 
-    def _checked(self, robot: RobotModel, trajectory: Message) -> Waypoints:
-        names, times, given = waypoints_of(trajectory)
-        if sorted(names) != sorted(robot.chain.names):
-            hint = f"name {', '.join(robot.chain.names)}"
+    def _request(self, arm: Arm, goal: Message) -> MotionRequest:
+        _check_supported(goal)
+        names, times, given = waypoints_of(goal.trajectory)
+        chain = arm.robot.chain
+        if sorted(names) != sorted(chain.names):
+            hint = f"name {', '.join(chain.names)}"
             raise InputError(f"are {', '.join(names)[:200]}.", field="joint_names", hint=hint)
-        q = given[:, [names.index(name) for name in robot.chain.names]]
-        if not robot.within_limits(q, 1e-6).all():
-            raise InputError("leave the joints' limits.", field="points", hint="plan within them")
-        served, _, base = robot_place(self._store, robot.name)
-        arm = RobotSpheres(robot, T_world_base=base)
-        ends = (q[:-1], q[1:]) if len(q) > 1 else (q, q)
-        edges = arm.certify(served.field, np.ascontiguousarray(ends[0]), np.ascontiguousarray(ends[1]))
-        if edges.in_collision.any():
-            first = int(np.argmax(edges.in_collision))
-            raise InputError(f"are not free after point {first}.", field="points", hint="plan in the map as it is now")
-        return Waypoints(times, q)
+        q = given[:, [names.index(name) for name in chain.names]]
+        if times[0] > 0.0:
+            at = arm.robot.home if arm.feedback is None else arm.feedback.position
+            times, q = np.concatenate([[0.0], times]), np.concatenate([at[None], q])
+        served = main_map(self._store)
+        return MotionRequest(WaypointMotion(times, q), arm.robot.name, served.id, served.generation)
+
+    def _lease(self, arm: str, client: int) -> str:
+        """Return the lease of a client's connection, taken at its first goal."""
+        held = self._leases.get((arm, client))
+        if held is None or not self._arms.leases.holds(held):
+            held = self._leases[arm, client] = self._arms.lease(arm, f"ROS client {client}", seconds=None).id
+        return held
+
+    def _release(self, client: int) -> None:
+        """End the leases of a client that leaves; its arm stops."""
+        with self._lock:
+            for arm, owner in [key for key in self._leases if key[1] == client]:
+                self._arms.leases.release(self._leases.pop((arm, owner)))
 
     def _cancel(self, arm: str, goal: str) -> None:
         """Cancel a goal; an empty id cancels all goals of the arm."""

@@ -50,6 +50,7 @@ class RosGraph:
         self._lock = threading.Lock()
         self._types: dict[str, str] = {}
         self._services: dict[str, Service] = {}
+        self._on_leave: list[Callable[[int], None]] = []
 
     def advertise(self, topic: str, name: str) -> str:
         """Make a topic of a message type known; returns its name with a slash before it.
@@ -134,6 +135,18 @@ class RosGraph:
             found = self._services.get(resolve(name))
             if found is not None and found.client == client:
                 del self._services[resolve(name)]
+
+    def on_leave(self, call: Callable[[int], None]) -> None:
+        """Have ``call`` called with the number of each client that leaves."""
+        with self._lock:
+            self._on_leave.append(call)
+
+    def leave(self, client: int) -> None:
+        """Forget a client whose connection has ended."""
+        with self._lock:
+            calls = list(self._on_leave)
+        for call in calls:
+            call(client)
 
     def service(self, name: str) -> Service:
         """Return the service of that name.

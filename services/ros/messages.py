@@ -25,6 +25,7 @@ from splatbot.trajectory import Trajectory
 
 MAP_FRAME, CAMERA_FRAME = "map", "camera"
 
+_MAX_POINTS = 20_000  # of a JointTrajectory
 _FLOAT32 = 7  # of sensor_msgs/PointField
 _SPLAT_FIELDS = ("opacity", "scale_x", "scale_y", "scale_z", "rot_x", "rot_y", "rot_z", "rot_w")
 _ARROW, _LINE_STRIP = 0, 4  # of visualization_msgs/Marker
@@ -147,8 +148,10 @@ def waypoints_of(message: Message) -> tuple[tuple[str, ...], NDArray[np.float64]
     """Return names, times (N,) [s] and positions (N, J) of a JointTrajectory.
 
     Raises:
-        InputError: it has no points, sizes differ, a value is not finite or the times do not increase.
+        InputError: it has no points or too many, sizes differ, a value is not finite or the times do not increase.
     """
+    if len(message.points) > _MAX_POINTS:
+        raise InputError(f"are more than {_MAX_POINTS}.", field="points", hint="send the motion in parts")
     times = np.array([p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points])
     sizes = {len(p.positions) for p in message.points}
     if sizes != {len(message.joint_names)} or not message.joint_names:

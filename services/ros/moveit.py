@@ -18,16 +18,24 @@ from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
-from splatbot.services.ros.requests import entries, entry, joints, number, pose, vector
+from splatbot.services.ros.requests import entries, entry, has_content, joints, number, pose, vector
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.topics import PLAN, map_topic
 
 PLAN_SERVICE, IK_SERVICE, VALIDITY_SERVICE = "/plan_kinematic_path", "/compute_ik", "/check_state_validity"
 
 # Values of moveit_msgs/MoveItErrorCodes; those of the planner are in PlanStatus.
-_FRAME_TRANSFORM_FAILURE, _INVALID_GOAL = -21, -16
+_FRAME_TRANSFORM_FAILURE, _INVALID_GOAL, _INVALID_GROUP_NAME = -21, -16, -15
 _BUDGET_MS, _LONGEST_MS = 200.0, 10_000.0
-_RATE = 100.0  # points of an answer's trajectory per second
+_IGNORED_IN_PLANS = (
+    "path_constraints",
+    "trajectory_constraints",
+    "reference_trajectories",
+    "max_cartesian_speed",
+    "start_state.attached_collision_objects",
+    "start_state.multi_dof_joint_state.joint_names",
+)
+_IGNORED_IN_IK = ("constraints", "pose_stamped_vector", "ik_link_names")
 
 
 class MoveItServices:
@@ -58,6 +66,7 @@ class MoveItServices:
 
         def work() -> dict[str, Any]:
             request = entry(args, "motion_plan_request")
+            self._check_supported(request, _IGNORED_IN_PLANS)
             served, robot, base = self._place()
             start = joints(request, "start_state.joint_state", robot)
             goal = self._goal(request, robot, base)
@@ -65,11 +74,14 @@ class MoveItServices:
             planner = GaussianRRTStar(served.field, robot, T_world_base=base)
             path = planner.plan(start, goal, budget_ms=budget).unwrap()
             speed = number(request, "max_velocity_scaling_factor") or 1.0
-            trajectory = time_path(path, planner.arm, served.field, velocity_scale=speed)
+            acceleration = number(request, "max_acceleration_scaling_factor") or 1.0
+            trajectory = time_path(
+                path, planner.arm, served.field, velocity_scale=speed, acceleration_scale=acceleration
+            )
             self._store.bus.publish(map_topic(served.id, PLAN), trajectory)
             return {
                 "trajectory_start": {"joint_state": {"name": list(robot.chain.names), "position": start}},
-                "trajectory": {"joint_trajectory": trajectory.to_ros(rate=_RATE)},
+                "trajectory": {"joint_trajectory": trajectory.to_ros()},
             }
 
         response = answer | coded(work)
@@ -80,6 +92,7 @@ class MoveItServices:
 
         def work() -> dict[str, Any]:
             request = entry(args, "ik_request")
+            self._check_supported(request, _IGNORED_IN_IK)
             served, robot, base = self._place()
             near = joints(request, "robot_state.joint_state", robot)
             wanted = pose(request, "pose_stamped.pose")
@@ -104,6 +117,7 @@ class MoveItServices:
         Raises:
             SplatbotError: the request makes no sense, or there is no map: this service has no error code.
         """
+        self._check_supported(args, ("constraints",))
         served, robot, base = self._place()
         q = joints(args, "robot_state.joint_state", robot)[None]
         arm = RobotSpheres(robot, T_world_base=base)
@@ -124,6 +138,20 @@ class MoveItServices:
         limits = [] if inside else [{"result": False, "distance": 0.0}]
         valid = inside and not verdict.in_collision[0]
         return {"valid": valid, "contacts": contacts, "cost_sources": [], "constraint_result": limits}
+
+    def _check_supported(self, request: Any, ignored: tuple[str, ...]) -> None:
+        """Check that a request has no part that would be ignored.
+
+        Raises:
+            InputError: it has one; the error names it.
+        """
+        group = entry(request, "group_name") or self._name
+        groups = (self._name, f"{self._name}_arm")
+        if group not in groups:
+            raise UnknownGroupError(f"{str(group)[:80]!r} is unknown.", field="group_name", hint=f"use {groups[1]}")
+        for path in ignored:
+            if has_content(entry(request, path)):
+                raise InputError("is not supported.", field=path, hint="leave it empty")
 
     def _place(self) -> tuple[ServedMap, RobotModel, NDArray[np.float64]]:
         return robot_place(self._store, self._name)
@@ -168,6 +196,12 @@ class UnknownFrameError(InputError):
     """A frame is unknown (FRAME_TRANSFORM_FAILURE)."""
 
     code = _FRAME_TRANSFORM_FAILURE
+
+
+class UnknownGroupError(InputError):
+    """A planning group is unknown (INVALID_GROUP_NAME)."""
+
+    code = _INVALID_GROUP_NAME
 
 
 def main_map(store: MapStore) -> ServedMap:

@@ -42,6 +42,15 @@ def entry(args: Any, path: str) -> Any:
     return args
 
 
+def has_content(value: Any) -> bool:
+    """Return whether a message contains a number other than 0, a text that is not empty, or True."""
+    if isinstance(value, Mapping):
+        return any(has_content(part) for part in value.values())
+    if isinstance(value, list):
+        return any(has_content(part) for part in value)
+    return bool(value)
+
+
 def entries(args: Any, path: str) -> Sequence[Any]:
     """Return the list at a dotted path, empty if it is missing.
 

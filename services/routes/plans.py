@@ -77,7 +77,7 @@ def plan(
     planner = GaussianRRTStar(served.field, robot, T_world_base=base, margin=query.margin)
     result = planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed)
     trajectory = time_path(result.unwrap(), planner.arm, served.field, velocity_scale=query.speed)
-    kept = service.plans.add(served.id, robot.name, result, trajectory)
+    kept = service.plans.add(served, robot.name, base, result, trajectory)
     service.bus.publish(map_topic(served.id, PLAN), trajectory)
     return answer(request, _description(kept, query.rate))
 
@@ -89,7 +89,7 @@ def get_plan(
     plan_id: Annotated[str, Path(description="as POST .../plans named it", examples=["0d6c1b7f2a3e4f50"])],
 ) -> Response:
     """Return a plan; the latest 256 are kept."""
-    return answer(request, _description(service.plans.get(plan_id), 50.0))
+    return answer(request, _description(service.plans.get(plan_id), None))
 
 
 @router.post(
@@ -118,7 +118,7 @@ def ik(request: Request, service: Service, query: Annotated[IkRequest, Depends(b
     return answer(request, version | {"q": found.q, "tried": found.tried, "reached": found.reached}, array="q")
 
 
-def _description(plan: Plan, rate: float) -> dict[str, Any]:
+def _description(plan: Plan, rate: float | None) -> dict[str, Any]:
     result, trajectory = plan.result, plan.trajectory
     path, certificate = result.unwrap(), trajectory.certificate
     return {

@@ -19,7 +19,6 @@ from splatbot.services.topics import job_topic, motion_topic
 router = APIRouter(prefix="/v1", tags=["motion"])
 
 _JOB = JOB | {"kind": "trajectory", "detail": None}
-_ARM = {"name": "fake", "robot": "panda", "busy": False, "state": "idle", "position": [0.0] * 7}
 _MotionId = Annotated[str, Path(description="as the 202 answer named it", examples=["5f0c2a9b1d3e4f60"])]
 
 
@@ -27,38 +26,24 @@ def _motion(service: Service, job_id: _MotionId) -> Job:
     return service.arms.motions.get(job_id)
 
 
-@router.get("/arms", responses=example({"arms": [_ARM]}))
-def list_arms(service: Service) -> dict[str, Any]:
-    """List the arms that can follow plans: "fake" follows exactly, "twin" is simulated."""
-    return {"arms": [{"name": name} for name in service.arms.names]}
-
-
-@router.get("/arms/{name}", responses=example(_ARM) | problems(422))
-def get_arm(
-    service: Service, name: Annotated[str, Path(description="as GET /v1/arms lists it", examples=["fake"])]
-) -> dict[str, Any]:
-    """Return the joint positions of an arm; plans for it start there."""
-    arm = service.arms.get(name)
-    at = arm.feedback
-    state = at.state.value if at is not None else "idle"
-    position = at.position.tolist() if at is not None else arm.robot.home.tolist()
-    return {"name": name, "robot": arm.robot.name, "busy": arm.busy, "state": state, "position": position}
-
-
 @router.post(
     "/trajectories",
     status_code=202,
     responses=starts("the arm moves") | problems(404, 409, 415, 422, 503),
-    openapi_extra=takes(TrajectoryRequest, {"a plan": {"plan": "0d6c1b7f2a3e4f50", "arm": "fake"}}),
+    openapi_extra=takes(TrajectoryRequest, {"a plan": {"plan": "0d6c1b7f2a3e4f50", "arm": "fake", "lease": "5b8e"}}),
 )
 def send_trajectory(
     service: Service,
     query: Annotated[TrajectoryRequest, Depends(body_of(TrajectoryRequest))],
     key: IdempotencyKey,
 ) -> Response:
-    """Let an arm follow a plan that begins where the arm is. 409: it moves already, or stands elsewhere."""
-    plan = service.plans.get(query.plan)
-    job = service.arms.send(query.arm, plan.trajectory, key=key, request=query.model_dump_json())
+    """Let an arm follow a plan that begins where the arm is.
+
+    The curve is certified again at this moment, and while the arm moves whenever the map changes. 409: it is refused,
+    with the reason; the arm moves already, stands elsewhere, or belongs to another client.
+    """
+    motion = service.plans.get(query.plan).motion
+    job = service.arms.send(query.arm, motion, lease=query.lease, key=key, content=query.model_dump_json())
     return accepted(job, under="/v1/trajectories")
 
 

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatbot.planning import WaypointMotion
 from splatbot.protocols import Array, KinematicChain
 
 RATE = 3.0  # [Hz]
 SECONDS = 2.0
+PERIOD = 0.005  # [s]
 SHARE = 0.6  # fraction of the joints' acceleration limits
 
 
@@ -43,6 +45,12 @@ class Shake:
         swell, turn = np.sin(grow * x) ** 2, np.sin(w * x)
         rate = grow * np.sin(2 * grow * x) * turn + w * swell * np.cos(w * x)
         return self.q + self.amplitude * (swell * turn), self.amplitude * (rate if x == t else 0.0)
+
+    def motion(self) -> WaypointMotion:
+        """Return the spline through the positions at every period of ``PERIOD``."""
+        count = round(self.duration / PERIOD)
+        times = np.linspace(0.0, self.duration, count + 1)
+        return WaypointMotion(times, np.array([self.reference(float(t))[0] for t in times]))
 
 
 def strength(shake: Shake, tool: Array) -> float:

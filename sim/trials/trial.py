@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from splatbot.collision import RobotSpheres
 from splatbot.errors import SplatbotError
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import AffordanceError, Target
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_types import PickOutcome, PickResult, PickStage
+from splatbot.planning import certify_motion
 from splatbot.planning.follow import follow
 from splatbot.protocols import Array
 from splatbot.sim.camera import TwinCamera
@@ -186,7 +188,8 @@ def attempt(
     kept, shaken = rose, ""
     if result and result.q is not None:
         try:
-            done = follow(controller, Shake(decision.sampler.robot.chain, result.q))
+            shake = Shake(decision.sampler.robot.chain, result.q).motion()
+            done = follow(controller, certify_motion(shake, RobotSpheres(decision.sampler.robot), None))
             shaken = "" if done else done.fault or f"the arm ended {done.state}"
         except SplatbotError as error:
             shaken = error.message

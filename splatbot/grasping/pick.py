@@ -11,7 +11,7 @@ from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner
 from splatbot.grasping.pick_types import PickOptions, PickOutcome, PickResult, PickStage, PickStep
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp, GraspResult, NoGraspError
-from splatbot.planning import JointGoal, time_path
+from splatbot.planning import JointGoal, certify_motion, time_path
 from splatbot.planning.follow import follow
 from splatbot.protocols import Array, Controller, Feedback, Gripper, MotionState
 
@@ -192,7 +192,8 @@ class _Pick:
         )
         if not trajectory.certificate.certified:
             raise _EndedError(PickOutcome.NO_PLAN, "the timed trajectory is not certified as free")
-        done = follow(self.controller, trajectory, stop=self._stop_requested)
+        motion = certify_motion(trajectory, segment.arm, segment.around)
+        done = follow(self.controller, motion, stop=self._stop_requested)
         self.q = trajectory.end
         if done.state is MotionState.STOPPED and self._stop_requested(None):
             raise _EndedError(PickOutcome.STOPPED, "a stop was requested")

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatbot.protocols import Array, Controller, Feedback, MotionState, TimedPath
+from splatbot.planning.certify import CertifiedMotion
+from splatbot.protocols import Array, Controller, Feedback, MotionState
 
 _SETTLING_TIME = 1.0  # [s] after the end of the trajectory in which the arm may still arrive
 
@@ -39,21 +40,21 @@ class Followed:
 
 
 def follow(
-    controller: Controller, trajectory: TimedPath, *, stop: Callable[[Feedback], bool] | None = None
+    controller: Controller, motion: CertifiedMotion, *, stop: Callable[[Feedback], bool] | None = None
 ) -> Followed:
-    """Send a trajectory and step until the arm arrives, is stopped or reports a fault.
+    """Send a certified motion and step until the arm arrives, is stopped or reports a fault.
 
     Args:
         controller: controller of the arm.
-        trajectory: trajectory that begins at the arm's position.
+        motion: motion that begins at the arm's position, see :func:`splatbot.planning.certify_motion`.
         stop: predicate that is evaluated at each period; True stops the arm within the next period.
 
     Raises:
-        ControllerError: the controller does not take the trajectory.
+        ControllerError: the controller does not take the motion.
     """
-    controller.send(trajectory)
+    controller.send(motion)
     feedback: list[Feedback] = []
-    max_periods = int((trajectory.duration + _SETTLING_TIME) / controller.period) + 2
+    max_periods = int((motion.duration + _SETTLING_TIME) / controller.period) + 2
     while len(feedback) < max_periods:
         feedback.append(controller.step())
         if feedback[-1].state is not MotionState.MOVING:

@@ -12,12 +12,12 @@ from splatbot._native import fastest_speeds
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning.blends import Curve, blend_chords, rounded
+from splatbot.planning.cubics import DEVIATION
 from splatbot.planning.problem import Certificate, Path
-from splatbot.planning.trajectory import JointTrajectory
+from splatbot.planning.trajectory import JointTrajectory, spline_pieces
 from splatbot.protocols import Array, KinematicChain
 
 MIN_WAYPOINT_STEP = 1e-4  # [rad or m]; waypoints that differ by less in every joint count as one
-DEVIATION = 1e-4  # [m] largest distance between a sphere on the curve and a sphere on the chord that approximates it
 TRAJECTORY_CLEARANCE_CUT = 0.05  # [m] largest clearance of the certificate of a trajectory
 _MIN_STEP, _MAX_STEP = 2e-3, 1e-2  # [s] range of the time between knots
 _MAX_SHORTENINGS = 8  # largest number of times that colliding blends are shortened
@@ -198,54 +198,12 @@ class _CurveChecker:
 
     def colliding_spans(self, control: Array) -> NDArray[np.bool_]:
         """Return for each span (M - 3,) of a spline whether it is not certified as free."""
-        start, end, first, last = chords(control, self.arm.reach)
-        hit = self.grown.certify(self.field, start, end, eps=self.eps).in_collision
+        chords = spline_pieces(control).chords(self.arm.reach)
+        hit = self.grown.certify(self.field, chords.start, chords.end, eps=self.eps).in_collision
         failed = np.zeros(len(control) - 3, np.bool_)
-        for a, b in zip(first[hit], last[hit], strict=True):
+        for a, b in zip(chords.first[hit], chords.last[hit], strict=True):
             failed[a : b + 1] = True
         return failed
-
-
-def chords(control: Array, reach: Array) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Approximate a spline by chords, such that no sphere deviates from a chord by more than ``DEVIATION``.
-
-    A spline whose control points are collinear lies on their line. Elsewhere the second derivative is linear between
-    two knots. A chord over a fraction h of a span therefore deviates by at most ``h²/8 max |Δ²c|``.
-
-    Args:
-        control: (M, J) control points [rad or m].
-        reach: (S, J), see :attr:`splatbot.collision.RobotSpheres.reach`.
-
-    Returns:
-        Starts and ends (K, J) of the chords, and the spans (K,) in which each begins and ends.
-    """
-    step = np.diff(control, axis=0)
-    straight = _parallel(step[:-1], step[1:])
-    straight = straight[:-1] & straight[1:] & _parallel(step[:-2], step[2:])
-    rest = (step[1:-1] == 0).all(axis=1)  # the knot between two spans is a stop if both steps that they share are 0
-    joined = straight[:-1] & straight[1:] & ~(rest[:-1] & rest[1:])
-    bend = np.abs(np.diff(control, n=2, axis=0))
-    moves = (np.maximum(bend[:-1], bend[1:]) / 8.0 @ reach.T).max(axis=1)
-    parts = np.where(straight, 1, np.maximum(1, np.ceil(np.sqrt(moves / DEVIATION)))).astype(np.int64)
-    span = np.repeat(np.arange(len(parts)), parts)
-    u = (np.arange(len(span)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[span]
-    c = control[span[:, None] + np.arange(4)]
-    weights = np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], axis=1) / 6.0
-    points = np.concatenate(
-        [np.einsum("nk,nkj->nj", weights, c), (control[-3] + 4.0 * control[-2] + control[-1])[None] / 6.0]
-    )
-    begins = np.concatenate([[True], ~((np.diff(span) == 1) & joined[np.minimum(span[:-1], len(joined) - 1)])])
-    first = np.flatnonzero(begins)
-    after = np.append(first[1:], len(span))
-    return points[first], points[after], span[first], span[after - 1]
-
-
-def _parallel(a: Array, b: Array) -> NDArray[np.bool_]:
-    """Return whether vectors (N, J) have the same direction within 1e-10 of their length; a zero vector has any."""
-    size_a, size_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
-    short, long = np.minimum(size_a, size_b), np.maximum(size_a, size_b)
-    along = np.abs(a * size_b[:, None] - b * size_a[:, None]).max(axis=1)
-    return np.asarray((short == 0) | (along <= 1e-10 * np.maximum(long, 1e-30)))
 
 
 def _certificate(

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError
+from splatbot.planning.cubics import CubicPieces
 from splatbot.planning.problem import Certificate
 from splatbot.protocols import Array, KinematicChain
 
@@ -94,6 +95,10 @@ class JointTrajectory:
         count = int(np.ceil(self.duration * rate - 1e-9))
         return self.at(np.append(np.arange(count) / rate, self.duration))
 
+    def pieces(self) -> CubicPieces:
+        """Return the cubic pieces of the curve."""
+        return spline_pieces(self.control, self.step)
+
     def load(self, chain: KinematicChain) -> tuple[float, float, float]:
         """Return the largest fractions of the velocity, acceleration and jerk limits that the curve uses."""
         shares = []
@@ -108,9 +113,18 @@ class JointTrajectory:
             raise InputError(f"is {factor}.", field="factor", hint="give a number above 0, 2 for half the speed")
         return JointTrajectory(self.names, self.control, self.step * factor, self.certificate)
 
-    def to_ros(self, *, rate: float = 100.0, frame_id: str = "") -> dict[str, Any]:
-        """Return a ``trajectory_msgs/JointTrajectory`` as a dictionary in the format of rosbridge."""
-        states = self.sampled(rate)
+    def at_knots(self) -> State:
+        """Return the states at the knots; :class:`splatbot.planning.WaypointMotion` turns them into the curve again."""
+        return self.at(np.minimum(np.arange(len(self.control) - 2) * self.step, self.duration))
+
+    def to_ros(self, *, rate: float | None = None, frame_id: str = "") -> dict[str, Any]:
+        """Return a ``trajectory_msgs/JointTrajectory`` as a dictionary in the format of rosbridge.
+
+        Args:
+            rate: points per second [Hz]. If None, one point at each knot, from which the service executes this curve.
+            frame_id: frame in the header.
+        """
+        states = self.at_knots() if rate is None else self.sampled(rate)
         points = []
         for i, t in enumerate(states.time):
             nanoseconds = round(float(t) * 1e9)
@@ -157,3 +171,34 @@ class State:
     velocity: Array
     acceleration: Array
     jerk: Array
+
+
+def spline_pieces(control: Array, step: float = 1.0) -> CubicPieces:
+    """Return the cubic pieces of a uniform cubic B-spline.
+
+    A spline whose control points are collinear lies on their line.
+
+    Args:
+        control: (M, J) control points [rad or m].
+        step: time between knots [s].
+    """
+    move = np.diff(control, axis=0)
+    parallel = _parallel(move[:-1], move[1:])
+    straight = parallel[:-1] & parallel[1:] & _parallel(move[:-2], move[2:])
+    rest = (move[1:-1] == 0).all(axis=1)  # the knot between two spans is a stop if both steps that they share are 0
+    joined = straight[:-1] & straight[1:] & ~(rest[:-1] & rest[1:])
+    line = np.where(straight, np.cumsum(np.concatenate([[True], ~joined])), -1)
+    return CubicPieces(
+        time=np.arange(len(control) - 2, dtype=np.float64) * step,
+        position=(control[:-2] + 4.0 * control[1:-1] + control[2:]) / 6.0,
+        acceleration=np.diff(control, n=2, axis=0) / step**2,
+        line=line,
+    )
+
+
+def _parallel(a: Array, b: Array) -> NDArray[np.bool_]:
+    """Return whether vectors (N, J) have the same direction within 1e-10 of their length; a zero vector has any."""
+    size_a, size_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+    short, long = np.minimum(size_a, size_b), np.maximum(size_a, size_b)
+    along = np.abs(a * size_b[:, None] - b * size_a[:, None]).max(axis=1)
+    return np.asarray((short == 0) | (along <= 1e-10 * np.maximum(long, 1e-30)))

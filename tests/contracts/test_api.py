@@ -17,12 +17,14 @@ from splatbot.camera import Camera
 from splatbot.client import Client, ServiceError
 from splatbot.collision import RobotSpheres
 from splatbot.gaussians import GaussianModel
+from splatbot.geometry import pose_from_quat
 from splatbot.logs import open_log
 from splatbot.rasterize.views import render_view
 from splatbot.robots.panda import panda
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.trajectory import Trajectory
+from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running, table_with_box, wall
 
 LOG = "synthetic:tabletop?frames=6&width=160&height=120&arc=4"
@@ -36,6 +38,8 @@ def api() -> Iterator[Service]:
     path = Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
     store.add("default", source="wall.ply", state="static", snapshot=wall(), trajectory=path)
     store.add("table", source="a table", state="static", snapshot=table_with_box())
+    beside = Workspace(T_world_base=pose_from_quat(BASE["translation"], BASE["quat_wxyz"]))
+    store.add("lab", source="wall.ply", state="static", snapshot=wall(), workspace=beside)
     with running(ServiceSettings(), store) as service:
         yield service
 
@@ -48,17 +52,21 @@ def robot(api: Service) -> Iterator[Client]:
 
 def test_every_documented_example_is_answered_as_documented(api: Service) -> None:
     """Each request example of the OpenAPI document is posted; places of the URL take the documented example, too."""
-    plan = api.client.post("/v1/maps/default/plans", json={"goal": [0.3, *HOME[1:]], "base": BASE}).json()["id"]
+    home = api.client.get("/v1/arms/fake").json()["position"]
+    goal = [0.3, *home[1:]]
+    plan = api.client.post("/v1/maps/lab/plans", json={"start": home, "goal": goal}).json()["id"]
+    lease = api.client.post("/v1/arms/fake/lease", json={}).json()["lease"]
+    known = {"plan": plan, "lease": lease}
     asked = 0
     for path, item in api.client.get("/openapi.json").json()["paths"].items():
         for name, example in _examples(item.get("post", {})).items():
-            where = path.replace("{map_id}", "default")
+            where = path.replace("{map_id}", "default").replace("{name}", "twin")
             if where.endswith("/frames"):
                 api.client.post("/v1/maps", json={"id": "frames"})
                 where = "/v1/maps/frames/frames"
             if where.endswith("/grasps"):
                 where = "/v1/maps/table/grasps"
-            body = example | ({"plan": plan} if "plan" in example else {})
+            body = example | {field: value for field, value in known.items() if field in example}
             response = api.client.post(where, json=body)
             assert response.status_code in (200, 201, 202), f"{path}, {name}: {response.text}"
             asked += 1
@@ -141,27 +149,29 @@ def test_views_of_several_cameras_come_in_one_answer(api: Service, robot: Client
 def test_a_plan_is_followed_watched_and_ends_where_it_should(api: Service, robot: Client) -> None:
     at = api.client.get("/v1/arms/twin").json()["position"]
     goal = [at[0] + 0.2, *at[1:]]
-    plan = robot.plan("default", start=at, goal=goal, base=BASE, budget_ms=50)
+    plan = robot.plan("lab", start=at, goal=goal, budget_ms=50)
     assert plan["certified"]
-    motion = robot.send(plan["id"], arm="twin", key="once")
-    assert robot.send(plan["id"], arm="twin", key="once")["id"] == motion["id"], "asked again, it moves once"
+    lease = robot.lease("twin", preempt=True)
+    motion = lease.send(plan["id"], key="once")
+    assert lease.send(plan["id"], key="once")["id"] == motion["id"], "a repeated request moves the arm once"
     events = list(robot.events(f"/v1/trajectories/{motion['id']}/events"))
     assert events[-1][0] == "succeeded"
     assert "feedback" in {name for name, _ in events}
     np.testing.assert_allclose(api.client.get("/v1/arms/twin").json()["position"], goal, atol=0.02)
-    with pytest.raises(ServiceError, match="where the arm is") as caught:
-        robot.send(plan["id"], arm="twin")
+    with lease, pytest.raises(ServiceError, match="where the arm is") as caught:
+        lease.send(plan["id"])
     assert caught.value.status == 409
 
 
 def test_a_motion_that_is_stopped_is_cancelled_and_the_arm_stands_still(api: Service, robot: Client) -> None:
     at = api.client.get("/v1/arms/twin").json()["position"]
-    plan = robot.plan("default", start=at, goal=[at[0] - 0.6, *at[1:]], base=BASE, speed=0.05)
-    motion = robot.send(plan["id"], arm="twin")
-    with pytest.raises(ServiceError, match="is moving"):
-        robot.send(plan["id"], arm="twin")
-    robot.stop(motion["id"])
-    assert robot.wait(motion["id"], under="/v1/trajectories", timeout_s=20)["state"] == "cancelled"
+    plan = robot.plan("lab", start=at, goal=[at[0] - 0.6, *at[1:]], speed=0.05)
+    with robot.lease("twin", preempt=True) as lease:
+        motion = lease.send(plan["id"])
+        with pytest.raises(ServiceError, match="is moving"):
+            lease.send(plan["id"])
+        robot.stop(motion["id"])
+        assert robot.wait(motion["id"], under="/v1/trajectories", timeout_s=20)["state"] == "cancelled"
     assert api.client.get("/v1/arms/twin").json()["busy"] is False
 
 

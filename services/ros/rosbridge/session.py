@@ -92,6 +92,7 @@ class RosbridgeSession:
     async def close(self) -> None:
         """Forget the client."""
         await self._subscriptions.close()
+        self._graph.leave(self.number)
         for name in self._served:
             self._graph.withdraw(name, self.number)
         for answer in list(self._answers.values()):

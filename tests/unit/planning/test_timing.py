@@ -11,7 +11,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning import Certificate, JointTrajectory, Path, time_path
 from splatbot.planning.blends import rounded
-from splatbot.planning.timing import chords, min_clearance, without_duplicates
+from splatbot.planning.timing import min_clearance, without_duplicates
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 
@@ -187,7 +187,8 @@ def test_a_path_that_is_not_free_is_timed_and_said_not_to_be(arm: RobotSpheres, 
 def test_no_sphere_is_farther_from_the_chords_than_stated(arm: RobotSpheres, field: GaussianCollisionField) -> None:
     for path in free_paths(arm, field, 2, 6):
         trajectory = time_path(path, arm, field)
-        start, end, first, last = chords(trajectory.control, arm.reach)
+        chords = trajectory.pieces().chords(arm.reach)
+        start, end, first, last = chords.start, chords.end, chords.first, chords.last
         assert first[0] == 0
         assert last[-1] == len(trajectory.control) - 4
         np.testing.assert_allclose(start[1:], end[:-1], atol=1e-12)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicHermiteSpline
 
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import pose_from_quat
@@ -18,7 +17,6 @@ from splatbot.services.arms import Arms
 from splatbot.services.bus import Subscription
 from splatbot.services.ros.follow import FollowJointTrajectory, action_topic
 from splatbot.services.ros.graph import RosGraph
-from splatbot.services.ros.waypoints import Waypoints
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
 
@@ -45,7 +43,7 @@ class Scene:
         self.graph, self.store = RosGraph(), MapStore()
         workspace = Workspace(T_world_base=BASE)
         self.store.add("desk", source="a", state="static", snapshot=Snapshot(ball, 1), workspace=workspace)
-        self.arms = Arms(self.store.bus, {"fake": lambda robot: FakeController(robot.home, period=0.005)})
+        self.arms = Arms(self.store, {"fake": lambda robot: FakeController(robot.home, period=0.005)})
         self.action = FollowJointTrajectory(self.graph, self.arms, self.store)
         self.action.start()
         self.results = self.read("result")
@@ -54,10 +52,11 @@ class Scene:
     def read(self, part: str) -> Subscription:
         return self.graph.subscribe(action_topic("fake", part), capacity=1000)
 
-    def send(self, points: list[dict[str, Any]], name: str = "1") -> None:
+    def send(self, points: list[dict[str, Any]], name: str = "1", *, client: int = 1, part: str = "") -> None:
         trajectory = {"joint_names": list(PANDA.chain.names)[::-1], "points": points}
-        message = build(GOAL, goal_id={"id": name}, goal={"trajectory": trajectory})
-        self.graph.publish(action_topic("fake", "goal"), message, client=1)
+        more = {part: [{"name": "panda_joint1", "position": 0.01}]} if part else {}
+        message = build(GOAL, goal_id={"id": name}, goal={"trajectory": trajectory} | more)
+        self.graph.publish(action_topic("fake", "goal"), message, client=client)
 
     def result(self) -> Any:
         news = self.results.get(20)
@@ -110,11 +109,11 @@ def test_what_is_not_free_or_makes_no_sense_is_rejected_and_nothing_moves() -> N
         scene.send(_points())
         done = scene.result()
         assert (done.status.status, done.result.error_code) == (5, -1)
-        assert "not free" in done.result.error_string
+        assert "not certified as free" in done.result.error_string
         for points, why in (
             ([], "points"),
             ([{"positions": [0.0] * 3}], "points"),
-            ([{"positions": [9.0] * 7}], "limits"),
+            ([{"positions": [9.0] * 7, "time_from_start": {"sec": 9}}], "limit"),
         ):
             scene.send(points)
             assert why in scene.result().result.error_string
@@ -136,17 +135,33 @@ def test_a_goal_that_begins_elsewhere_or_while_the_arm_moves_is_rejected(scene: 
     assert scene.result().status.goal_id.id == "first"
 
 
-def test_the_curve_is_scipy_s_hermite_spline_and_rests_at_its_ends() -> None:
-    rng = np.random.default_rng(4)
-    times, q = np.cumsum(rng.uniform(0.1, 0.5, 8)), rng.normal(size=(8, 3))
-    v = np.zeros_like(q)
-    v[1:-1] = (q[2:] - q[:-2]) / (times[2:] - times[:-2])[:, None]
-    oracle, curve = CubicHermiteSpline(times, q, v), Waypoints(times, q)
-    for t in np.linspace(times[0], times[-1], 50)[1:-1]:
-        position, velocity = curve.reference(float(t))
-        np.testing.assert_allclose(position, oracle(t), atol=1e-12)
-        np.testing.assert_allclose(velocity, oracle(t, 1), atol=1e-12)
-    for t, end in ((-1.0, 0), (0.0, 0), (100.0, -1)):
-        position, velocity = curve.reference(t)
-        np.testing.assert_array_equal(position, q[end])
-        assert not velocity.any()
+def test_a_single_point_is_reached_from_where_the_arm_is(scene: Scene) -> None:
+    goal = np.asarray(PANDA.home) + 0.2 * np.eye(7)[0]
+    scene.send([{"positions": list(goal[::-1]), "time_from_start": {"sec": 1}}])
+    assert scene.result().status.status == 3
+    np.testing.assert_allclose(scene.arms.get("fake").feedback.position, goal, atol=1e-6)  # type: ignore[union-attr]
+
+
+def test_the_arm_stops_when_its_client_leaves(scene: Scene) -> None:
+    scene.send(_points(seconds=30.0))
+    assert scene.feedback.get(10) is not None
+    scene.graph.leave(1)
+    done = scene.result()
+    assert done.status.status == 4
+    assert "owner is gone" in done.result.error_string
+    assert scene.arms.leases.of("fake") is None
+
+
+def test_another_client_cannot_command_a_leased_arm(scene: Scene) -> None:
+    scene.send(_points(seconds=1.0))
+    assert scene.result().status.status == 3
+    scene.send(_points(), "second", client=2)
+    done = scene.result()
+    assert (done.status.goal_id.id, done.status.status) == ("second", 5)
+    assert "another client" in done.result.error_string
+
+
+def test_parts_of_a_goal_that_would_be_ignored_are_refused_by_name(scene: Scene) -> None:
+    for part in ("path_tolerance", "goal_tolerance"):
+        scene.send(_points(), part=part)
+        assert part in scene.result().result.error_string

@@ -12,6 +12,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import pose_from_quat, rotation_to_quat
+from splatbot.planning import WaypointMotion, certify_motion
 from splatbot.robots.store import load_robot
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.moveit import IK_SERVICE, PLAN_SERVICE, VALIDITY_SERVICE, MoveItServices
@@ -130,6 +131,48 @@ def test_where_the_robot_stands_must_be_known() -> None:
     answer = _plan(graph, _joint_goal(GOAL))
     assert answer["error_code"]["val"] == -21
     assert "scene.yaml" in answer["error_code"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("path_constraints", {"name": "up", "orientation_constraints": [{"link_name": "hand", "weight": 1.0}]}),
+        ("trajectory_constraints", {"constraints": [{"name": "a"}]}),
+        ("reference_trajectories", [{"joint_trajectory": [{"joint_names": ["a"]}]}]),
+        ("max_cartesian_speed", 0.1),
+        ("group_name", "left_arm"),
+        ("max_velocity_scaling_factor", 2.0),
+        ("max_acceleration_scaling_factor", -1.0),
+    ],
+)
+def test_parts_of_a_planning_request_that_are_not_supported_are_refused_by_name(part: str, value: Any) -> None:
+    graph, _ = _graph(_ball((3.0, 0.0, 0.0)))
+    response = _plan(graph, _joint_goal(GOAL), **{part: value})
+    assert response["error_code"]["val"] == (-15 if part == "group_name" else -16)
+    name = part.removeprefix("max_").removesuffix("_scaling_factor")
+    assert name in response["error_code"]["message"]
+    assert not response["trajectory"]
+
+
+def test_empty_parts_and_the_scales_of_a_planning_request_are_heeded() -> None:
+    graph, _ = _graph(_ball((3.0, 0.0, 0.0)))
+    empty = {"path_constraints": {"name": "", "joint_constraints": []}, "group_name": "panda_arm"}
+
+    def last(**more: Any) -> float:
+        points = _plan(graph, _joint_goal(GOAL), **empty, **more)["trajectory"]["joint_trajectory"]["points"]
+        stamp = points[-1]["time_from_start"]
+        return float(stamp["sec"] + 1e-9 * stamp["nanosec"])
+
+    assert last(max_velocity_scaling_factor=0.1) > 4.0 * last()
+    assert last(max_acceleration_scaling_factor=0.01) > 2.0 * last()
+
+
+def test_a_planned_trajectory_of_moveit_is_certified_as_a_goal_of_the_arm() -> None:
+    graph, store = _graph(_ball((0.5, 0.3, 0.5)))
+    points = _plan(graph, _joint_goal(GOAL))["trajectory"]["joint_trajectory"]["points"]
+    times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in points]
+    motion = WaypointMotion(times, [p["positions"] for p in points])
+    certify_motion(motion, RobotSpheres(PANDA, T_world_base=T_WORLD_BASE), store.get("desk").field)
 
 
 def test_ik_reaches_a_pose_of_the_map_and_avoids_what_is_there_when_asked() -> None:
