@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class MotionRequest:
-    """A motion and what it was made for.
+    """Motion with the robot, the base and the map that it was made for.
 
     Args:
         motion: the curve.
@@ -102,7 +102,7 @@ class MotionWatch:
 
     Args:
         gate: gives the current map.
-        request: what was sent.
+        request: motion as it was sent.
         motion: as certified when it was sent.
         time: returns the time since the start of the motion [s].
 

@@ -274,7 +274,7 @@ class LeaseInfo(BaseModel):
 
 
 class StopInfo(BaseModel):
-    """Whether an emergency stop is in force."""
+    """State of the emergency stop."""
 
     stopped: bool
     by: str | None = None

@@ -137,7 +137,7 @@ class RosGraph:
                 del self._services[resolve(name)]
 
     def on_leave(self, call: Callable[[int], None]) -> None:
-        """Have ``call`` called with the number of each client that leaves."""
+        """Register a function that is called with the number of each client that leaves."""
         with self._lock:
             self._on_leave.append(call)
 

@@ -66,7 +66,7 @@ def take_lease(
 
 @router.put("/leases/{lease_id}", responses=example(_LEASE) | problems(409))
 def renew_lease(service: Service, lease_id: _LeaseId) -> LeaseInfo:
-    """Renew a lease by its time."""
+    """Extend a lease by its time."""
     return _info(service.arms.leases.renew(lease_id))
 
 

@@ -87,8 +87,8 @@ def certify_motion(motion: Motion, arm: RobotSpheres, field: GaussianCollisionFi
         field: map. If None, only self-collision is checked.
 
     Raises:
-        MotionRefusedError: the motion has another number of joints, exceeds a limit, does not rest at its ends, or is
-            not free; the message names joint and time.
+        MotionRefusedError: the motion exceeds a limit, does not rest at its ends, or is not free. The message names joint
+            and time.
     """
     pieces = motion.pieces()
     chain = arm.robot.chain

@@ -1,8 +1,8 @@
 """Random motions, half of them spoiled, over every interface, against a float64 check of the executed curve at 1 kHz.
 
-Run `python -m tests.attacks.random_motions --count 100000`. The check is independent of the gate: it samples the curve
-that the controller follows, takes finite differences, and computes distances of the spheres to the obstacles, which are
-balls, in closed form.
+Run `python -m tests.attacks.random_motions --count 100000`. The check is independent of the gate. It
+samples the curve that the controller follows and takes finite differences. The obstacles are balls, so that distances
+have a closed form.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _stamps(world: World, rng: np.random.Generator) -> MotionRequest:
 
 
 def _chord(world: World, rng: np.random.Generator) -> MotionRequest:
-    """A curve that leaves the chords between its waypoints."""
+    """Return a curve that leaves the chords between its waypoints."""
     times, q = _smooth(rng)
     inner = rng.normal(0.0, 0.5, (len(q) + 3, 7)) + q[0]
     control = np.concatenate([np.repeat(inner[:1], 3, axis=0), inner, np.repeat(inner[-1:], 3, axis=0)])
