@@ -87,8 +87,8 @@ def certify_motion(motion: Motion, arm: RobotSpheres, field: GaussianCollisionFi
         field: map. If None, only self-collision is checked.
 
     Raises:
-        MotionRefusedError: the motion exceeds a limit, does not rest at its ends, or is not free. The message names joint
-            and time.
+        MotionRefusedError: the motion exceeds a limit, does not rest at its ends, or is not free. The message names
+            joint and time.
     """
     pieces = motion.pieces()
     chain = arm.robot.chain
