@@ -20,6 +20,7 @@ from splatbot.protocols import Array, KinematicChain
 MIN_WAYPOINT_STEP = 1e-4  # [rad or m]; waypoints that differ by less in every joint count as one
 TRAJECTORY_CLEARANCE_CUT = 0.05  # [m] largest clearance of the certificate of a trajectory
 _MIN_STEP, _MAX_STEP = 2e-3, 1e-2  # [s] range of the time between knots
+_SAFETY = 1.0005  # factor that keeps the limits although times in messages are rounded to nanoseconds
 _MAX_SHORTENINGS = 8  # largest number of times that colliding blends are shortened
 _MIN_REACH = 4e-3  # [rad or m] smallest reach of a blend; at a corner that needs a smaller one the arm stops
 _REACH_FRACTIONS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # candidates, as fractions of the largest reach
@@ -105,8 +106,8 @@ class _TimedSpline:
         uncertified = Certificate(False, eps, 0.0, arm.margin, -1)
         spline = JointTrajectory(chain.names, self.control, self.step, uncertified)
         v, a, j = spline.load(chain)
-        slowdown = max(v, np.sqrt(a), np.cbrt(j), 1.0)
-        step = self.step * float(slowdown) * (1.0 + 1e-9)
+        slowdown = max(_SAFETY * max(v, np.sqrt(a), np.cbrt(j)), 1.0)
+        step = self.step * float(slowdown)
         return JointTrajectory(chain.names, self.control, step, _certificate(eps, arm, field, spline, free))
 
 

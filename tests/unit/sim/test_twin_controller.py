@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatbot.collision import RobotSpheres
 from splatbot.errors import ControllerError, InputError
-from splatbot.protocols import Array, Controller, MotionState
+from splatbot.planning import CertifiedMotion, WaypointMotion, certify_motion
+from splatbot.protocols import Controller, MotionState
 from splatbot.robots.panda import panda
 from splatbot.sim.controller import TwinController
 from splatbot.sim.motion import minimum_jerk
@@ -16,21 +18,12 @@ from splatbot.sim.twin import Twin
 pytest.importorskip("mujoco")
 
 
-class Swing:
-    """Minimum jerk from one configuration to another."""
-
-    def __init__(self, start: Array, end: Array, duration: float) -> None:
-        self.duration = duration
-        self._times, self._knots = np.array([0.0, duration]), np.stack([start, end])
-
-    def reference(self, t: float) -> tuple[Array, Array]:
-        at = np.clip([t], 0.0, self.duration)
-        position, velocity = (minimum_jerk(at, self._times, self._knots, order)[0] for order in (0, 1))
-        return position, velocity
-
-
-def _swing(duration: float = 1.0) -> Swing:
-    return Swing(panda().home, panda().home + np.array([0.5, 0.2, -0.3, 0.2, 0.3, -0.2, 0.4]), duration)
+def _swing(duration: float = 1.0) -> CertifiedMotion:
+    """Return a minimum-jerk motion."""
+    ends = np.stack([panda().home, panda().home + np.array([0.5, 0.2, -0.3, 0.2, 0.3, -0.2, 0.4])])
+    times = np.linspace(0.0, duration, 101)
+    motion = WaypointMotion(times, minimum_jerk(times, np.array([0.0, duration]), ends, 0))
+    return certify_motion(motion, RobotSpheres(panda()), None)
 
 
 def test_it_is_a_controller_that_follows_within_two_milliradians_and_arrives() -> None:
