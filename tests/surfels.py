@@ -39,7 +39,8 @@ def render(scene: Scene, render_mode: str = "RGB", **options: Any) -> tuple[dict
 
 def reference(scene: Scene, render_mode: str = "RGB", **options: Any) -> tuple[dict[str, Tensor], Any]:
     """Render through the reference, in the type of the scene."""
-    *images, meta = rasterization_2dgs_reference(**arguments(scene), render_mode=render_mode, **options)
+    given = {"backgrounds": scene.backgrounds, "render_mode": render_mode, **options}
+    *images, meta = rasterization_2dgs_reference(scene.gaussians, scene.viewpoints, **given)
     return {n: image for n, image in zip(IMAGES, images, strict=True) if image is not None}, meta
 
 
