@@ -12,9 +12,9 @@ import json
 import ssl
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 from urllib.parse import quote, urlsplit
 
 import httpx
@@ -105,6 +105,9 @@ class TrackedFrame:
     stage_ms: dict[str, float]
 
 
+_Result = TypeVar("_Result", Distances, Collisions, TrackedFrame)
+
+
 class Client:
     """Connection to a service, for use by one thread at a time.
 
@@ -176,14 +179,7 @@ class Client:
             "joints": None if frame.joints is None else frame.joints.tolist(),
         }
         answer = self._packed("POST", _map_path(map_id, "frames"), body)
-        return TrackedFrame(
-            T_world_camera=answer["T_world_camera"],
-            verdict=answer["verdict"],
-            keyframe=answer["keyframe"],
-            gaussians=answer["gaussians"],
-            map_version=answer["map_version"],
-            stage_ms=answer["stage_ms"],
-        )
+        return _result(TrackedFrame, answer)
 
     def end(self, map_id: str) -> None:
         """End the stream of pushed frames."""
@@ -193,7 +189,7 @@ class Client:
         """Query the Mahalanobis distance of points (P, 3) [m] to the map."""
         body = {"points": np.asarray(points, dtype=np.float64).reshape(-1, 3), "n_sigma": n_sigma}
         answer = self._packed("POST", _map_path(map_id, "distance"), body)
-        return Distances(answer["distance"], answer["index"], answer["inside"], answer["map_version"])
+        return _result(Distances, answer)
 
     def distance_npy(self, map_id: str, points: ArrayLike) -> NDArray[np.float32]:
         """Query the distances (P,) of points (P, 3) [m] alone, with the smallest bodies in both directions."""
@@ -214,14 +210,7 @@ class Client:
         """
         body = {"q": np.atleast_2d(np.asarray(q, dtype=np.float64)), "gradient": gradient, **more}
         answer = self._packed("POST", _map_path(map_id, "collisions"), body)
-        return Collisions(
-            in_collision=answer["in_collision"],
-            link=answer["link"],
-            other=answer["other"],
-            clearance=answer["clearance"],
-            gradient=answer.get("gradient"),
-            map_version=answer["map_version"],
-        )
+        return _result(Collisions, {"gradient": None} | answer)
 
     def views(
         self, map_id: str, views: Sequence[Mapping[str, Any]], modes: Sequence[str] = ("rgb",)
@@ -343,6 +332,11 @@ class Client:
         )
         found: dict[str, Any] = msgpack.unpackb(data, object_hook=_unpack)
         return found
+
+
+def _result(kind: type[_Result], answer: Mapping[str, Any]) -> _Result:
+    """Build a result from those entries of an answer that have the names of its fields."""
+    return kind(**{field.name: answer[field.name] for field in fields(kind)})
 
 
 def _map_path(map_id: str, *rest: str) -> str:

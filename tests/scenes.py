@@ -60,6 +60,11 @@ class Scene:
         given = {"backgrounds": self.backgrounds, "render_mode": render_mode, **options}
         return rasterization_reference(self.gaussians, self.viewpoints, **given)
 
+    def alone(self, i: int) -> Scene:
+        """Return Gaussian i alone, before a black background."""
+        rows = {n: getattr(self, n)[i : i + 1] for n in ("means", "quats", "scales", "opacities", "colors")}
+        return Scene(**rows, viewmats=self.viewmats, Ks=self.Ks, width=self.width, height=self.height)
+
     def to(self, dtype: torch.dtype, requires_grad: bool = False) -> Scene:
         """Return a copy whose tensors are leaves of ``dtype``."""
         tensors = {

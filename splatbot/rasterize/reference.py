@@ -83,8 +83,8 @@ def rasterization_reference(
 ) -> tuple[Tensor, Tensor, ReferenceMeta]:
     """Render as :func:`splatbot.rasterize.rasterization`, computed in the type of the means by torch alone.
 
-    Args and returns: see there, but without batch dimensions; the colours are (N, D), (C, N, D) or None, with
-    ``sh_degree`` (N, K, 3) or (C, N, K, 3). ``project``: another camera than the pinhole, see ``reference_cameras``.
+    Args and returns: see there, but without batch dimensions. Colours are (N, D), (C, N, D) or None, with ``sh_degree``
+    (N, K, 3) or (C, N, K, 3). ``project``: another camera than the pinhole, see ``reference_cameras``.
 
     Raises:
         InputError: an unknown render mode.
@@ -136,7 +136,7 @@ def _colors_of_view(
     render_mode: str,
     sh_degree: int | None,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return the colours (N, D) and the background (D,) of view i; None for what the mode does not render."""
+    """Return the colours (N, D) and the background (D,) of view i, each None where the mode does not render it."""
     colors = gaussians.colors
     if colors is None or "RGB" not in render_mode:
         return None, None

@@ -75,13 +75,7 @@ def test_hits_are_where_the_rays_meet_the_discs() -> None:
     K = scene.Ks[0].double().numpy()
     checked = 0
     for i in range(40):
-        alone = Scene(
-            **{n: getattr(scene, n)[i : i + 1] for n in ("means", "quats", "scales", "opacities", "colors")},
-            viewmats=scene.viewmats,
-            Ks=scene.Ks,
-            width=scene.width,
-            height=scene.height,
-        )
+        alone = scene.alone(i)
         images, _ = reference(alone.to(torch.float64), "RGB+ED")
         R = R_camera_world @ quat_to_rotation(scene.quats[i].double().numpy())
         p = R_camera_world @ scene.means[i].double().numpy() + t

@@ -201,13 +201,7 @@ def test_radii_bound_what_a_surfel_touches() -> None:
     for seed in range(20):
         scene = hard_surfels(seed, n=10)
         for i in range(10):
-            alone = Scene(
-                **{n: getattr(scene, n)[i : i + 1] for n in ("means", "quats", "scales", "opacities", "colors")},
-                viewmats=scene.viewmats,
-                Ks=scene.Ks,
-                width=scene.width,
-                height=scene.height,
-            )
+            alone = scene.alone(i)
             images, meta = render(alone)
             y, x = torch.nonzero(images["alphas"][0, ..., 0] > 0, as_tuple=True)
             if len(x) == 0:
