@@ -12,9 +12,10 @@ import json
 import ssl
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import quote, urlsplit
 
 import httpx
@@ -108,7 +109,7 @@ class TrackedFrame:
 _Result = TypeVar("_Result", Distances, Collisions, TrackedFrame)
 
 
-class Client:
+class Client(AbstractContextManager["Client"]):
     """Connection to a service, for use by one thread at a time.
 
     Args:
@@ -309,9 +310,6 @@ class Client:
     def close(self) -> None:
         """Close the connection."""
         self._http.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

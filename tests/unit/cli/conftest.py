@@ -21,6 +21,13 @@ class Answer:
     err: str
 
 
+def assert_refused(answer: Answer, message: str) -> None:
+    """Assert that a command refuses its words in plain text."""
+    assert answer.code in (1, 2)
+    assert message in answer.err
+    assert "Traceback" not in answer.err
+
+
 RunCommand = Callable[..., Answer]
 
 
