@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The Python module of what only `splatbot bench` runs.
+// The Python module of code that only `splatbot bench` runs.
 #include <nanobind/stl/string.h>
 
 #include "../bindings/arrays.hpp"
