@@ -48,6 +48,15 @@ def run(capsys: pytest.CaptureFixture[str]) -> RunCommand:
 
 
 @pytest.fixture
+def work_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, empty."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
 def log_folder(make_log: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Path:
     """A sound log of 16 frames; SLAM is the oracle that knows its poses."""
     folder = make_log(16)
