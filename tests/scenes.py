@@ -37,15 +37,14 @@ class Scene:
     backgrounds: Tensor | None = None
     covars: Tensor | None = None
 
-    @property
-    def gaussians(self) -> Gaussians:
-        """Arguments of a render that do not change from view to view."""
-        return Gaussians(self.means, self.quats, self.scales, self.opacities, self.colors, self.covars)
+    def gaussians(self, sh_degree: int | None = None) -> Gaussians:
+        """Return the arguments of a render that do not change from view to view."""
+        return Gaussians(self.means, self.quats, self.scales, self.opacities, self.colors, self.covars, sh_degree)
 
     @property
     def viewpoints(self) -> Viewpoints:
-        """Poses and intrinsics of the views."""
-        return Viewpoints(self.viewmats, self.Ks, self.width, self.height)
+        """Poses, intrinsics and backgrounds of the views."""
+        return Viewpoints(self.viewmats, self.Ks, self.width, self.height, self.backgrounds)
 
     def render(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
         """Render through the native kernels."""
@@ -55,10 +54,11 @@ class Scene:
         """Render through the float64 reference."""
         return self.to(torch.float64).reference_leaves(render_mode, **options)
 
-    def reference_leaves(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
+    def reference_leaves(
+        self, render_mode: str = "RGB", *, sh_degree: int | None = None, **options: Any
+    ) -> tuple[Tensor, Tensor, Any]:
         """Render through the reference with these tensors, so that gradients reach them."""
-        given = {"backgrounds": self.backgrounds, "render_mode": render_mode, **options}
-        return rasterization_reference(self.gaussians, self.viewpoints, **given)
+        return rasterization_reference(self.gaussians(sh_degree), self.viewpoints, render_mode=render_mode, **options)
 
     def alone(self, i: int) -> Scene:
         """Return Gaussian i alone, before a black background."""

@@ -95,10 +95,8 @@ class Inputs:
 def check_inputs(
     gaussians: Gaussians,
     views: Viewpoints,
-    *,
     render_mode: str,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
+    *,
     masks: Tensor | None = None,
     tile_size: int = DEFAULT_TILE_SIZE,
 ) -> Inputs:
@@ -106,10 +104,8 @@ def check_inputs(
 
     Args:
         gaussians: of every view.
-        views: poses and image size.
+        views: poses, image size and backgrounds.
         render_mode: colours and backgrounds have no effect on a mode without colours.
-        sh_degree: None, or the degree of the harmonics whose coefficients ``gaussians.colors`` holds.
-        backgrounds: see ``rasterization``.
         masks: see ``rasterization``.
         tile_size: of the tiles of ``masks`` [px].
 
@@ -117,9 +113,9 @@ def check_inputs(
         InputError: naming the argument.
     """
     wants_color, _ = parse_mode(render_mode)
-    colors = gaussians.colors
+    colors, sh_degree, backgrounds = gaussians.colors, gaussians.sh_degree, views.backgrounds
     if not wants_color:
-        colors, backgrounds, sh_degree = None, None, None
+        colors = sh_degree = backgrounds = None
     elif colors is None:
         raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
     for name, pixels in (("width", views.width), ("height", views.height), ("tile_size", tile_size)):

@@ -171,11 +171,9 @@ def rasterization(
     check_choice("backend", backend, ("native", "gsplat"))
     options = _check_options(arguments)
     inputs = check_inputs(
-        Gaussians(means, quats, scales, opacities, colors, covars),
-        Viewpoints(viewmats, Ks, width, height),
-        render_mode=render_mode,
-        sh_degree=sh_degree,
-        backgrounds=backgrounds,
+        Gaussians(means, quats, scales, opacities, colors, covars, sh_degree),
+        Viewpoints(viewmats, Ks, width, height, backgrounds),
+        render_mode,
         masks=masks,
         tile_size=options.tile_size,
     )

@@ -72,8 +72,6 @@ def rasterization_reference(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     *,
@@ -83,8 +81,8 @@ def rasterization_reference(
 ) -> tuple[Tensor, Tensor, ReferenceMeta]:
     """Render as :func:`splatbot.rasterize.rasterization`, computed in the type of the means by torch alone.
 
-    Args and returns: see there, but without batch dimensions. Colours are (N, D), (C, N, D) or None, with ``sh_degree``
-    (N, K, 3) or (C, N, K, 3). ``project``: another camera than the pinhole, see ``reference_cameras``.
+    Args and returns: see there, but without batch dimensions. Colours are (N, D), (C, N, D) or None, with a degree of
+    harmonics (N, K, 3) or (C, N, K, 3). ``project``: another camera than the pinhole, see ``reference_cameras``.
 
     Raises:
         InputError: an unknown render mode.
@@ -95,7 +93,7 @@ def rasterization_reference(
     pixels = _pixel_centers(width, height, gaussians.means)
     renders, alphas, metas = [], [], []
     for i, view in enumerate(_views_of(viewpoints)):
-        view_colors, background = _colors_of_view(gaussians, backgrounds, view, i, render_mode, sh_degree)
+        view_colors, background = _colors_of_view(gaussians, viewpoints, i, render_mode)
         projected = _project(gaussians, view, eps2d, depth_mode) if project is None else project(gaussians, view, eps2d)
         antialiased = rasterize_mode == "antialiased"
         blended = gaussians.opacities * _antialias(projected) if antialiased else gaussians.opacities
@@ -129,20 +127,15 @@ def _views_of(viewpoints: Viewpoints) -> list[ReferenceView]:
 
 
 def _colors_of_view(
-    gaussians: Gaussians,
-    backgrounds: Tensor | None,
-    view: ReferenceView,
-    i: int,
-    render_mode: str,
-    sh_degree: int | None,
+    gaussians: Gaussians, viewpoints: Viewpoints, i: int, render_mode: str
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return the colours (N, D) and the background (D,) of view i, each None where the mode does not render it."""
-    colors = gaussians.colors
+    colors, sh_degree, backgrounds = gaussians.colors, gaussians.sh_degree, viewpoints.backgrounds
     if colors is None or "RGB" not in render_mode:
         return None, None
     shown = colors[i] if colors.ndim == (3 if sh_degree is None else 4) else colors
     if sh_degree is not None:
-        shown = _shade(shown, sh_degree, gaussians.means, view.viewmat)
+        shown = _shade(shown, sh_degree, gaussians.means, viewpoints.viewmats[i])
     return shown, None if backgrounds is None else backgrounds[i]
 
 

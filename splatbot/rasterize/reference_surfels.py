@@ -62,8 +62,6 @@ def rasterization_2dgs_reference(
     viewpoints: Viewpoints,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     distloss: bool = False,
     depth_mode: Literal["expected", "median"] = "expected",
@@ -82,7 +80,7 @@ def rasterization_2dgs_reference(
     pixels = _pixel_centers(width, height, means)
     views = []
     for i, view in enumerate(_views_of(viewpoints)):
-        shown, background = _colors_of_view(surfels, backgrounds, view, i, render_mode, sh_degree)
+        shown, background = _colors_of_view(surfels, viewpoints, i, render_mode)
         R, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
         centers = means @ R.T + t
         axes = R @ reference_rotations(quats)

@@ -17,13 +17,15 @@ class Gaussians:
     opacities: Tensor
     colors: Tensor | None = None
     covars: Tensor | None = None
+    sh_degree: int | None = None
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Poses and intrinsics of C views of one size; the fields are the arguments of ``rasterization``."""
+    """Poses, intrinsics and backgrounds of C views of one size; the fields are the arguments of ``rasterization``."""
 
     viewmats: Tensor
     Ks: Tensor
     width: int
     height: int
+    backgrounds: Tensor | None = None

@@ -154,7 +154,7 @@ def visible_gaussians(
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f"{rasterize_mode!r} is not supported.", field="rasterize_mode", hint="classic, antialiased")
     _one_scene(viewpoints)
-    inputs = check_inputs(gaussians, viewpoints, render_mode="D").detached()
+    inputs = check_inputs(gaussians, viewpoints, "D").detached()
     try:
         settings = CameraSettings(camera_model, **camera)
     except TypeError as error:

@@ -98,11 +98,9 @@ def rasterization_2dgs(
     check_choice("render_mode", render_mode, _MODES)
     _, depth = parse_mode(render_mode)
     inputs = check_inputs(
-        Gaussians(means, quats, scales, opacities, colors),
-        Viewpoints(viewmats, Ks, width, height),
-        render_mode=render_mode,
-        sh_degree=sh_degree,
-        backgrounds=backgrounds,
+        Gaussians(means, quats, scales, opacities, colors, sh_degree=sh_degree),
+        Viewpoints(viewmats, Ks, width, height, backgrounds),
+        render_mode,
     )
     if inputs.layout.batch:
         raise InputError("has batch dimensions.", field="means", hint="render surfels of one scene at a time")

@@ -105,8 +105,9 @@ def _reference_case(*, quick: bool) -> tuple[dict[str, Any], Tensor, Tensor]:
     """Return arguments, their image in float64, and a mask of the pixels that rounding cannot flip."""
     scene = random_box(200 if quick else 2000, shrink=3.0)
     size = (24, 16) if quick else (96, 64)
+    means, quats, scales, opacities, colors = (t.detach().double() for t in scene.tensors())
     exact, _, meta = rasterization_reference(
-        Gaussians(*(t.detach().double() for t in scene.tensors())),
+        Gaussians(means, quats, scales, opacities, colors),
         Viewpoints(scene.viewmat[None].double(), scene.intrinsics(*size).double(), *size),
     )
     return _detached(scene, size), exact, (meta.margins > 1e-4)[..., None].reshape(*exact.shape[:-1], 1)

@@ -22,7 +22,7 @@ PIXELS = torch.tensor([[0, 0], [74, 52], [31, 15], [32, 16], [40, 20], [41, 20],
 
 
 def render_pixels(scene: Scene, pixels: Tensor = PIXELS, **options: Any) -> tuple[Tensor, Tensor, Any]:
-    return rasterize_pixels(scene.gaussians, scene.viewpoints, pixels, backgrounds=scene.backgrounds, **options)
+    return rasterize_pixels(scene.gaussians(), scene.viewpoints, pixels, **options)
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "D", "RGB+MD"])
@@ -67,7 +67,7 @@ def test_tiles_are_bit_for_bit_those_of_the_whole_picture(size: int) -> None:
     scene = hard_scene(3)
     columns, rows = -(-75 // size), -(-53 // size)
     tiles = torch.tensor([[0, 0], [columns - 1, rows - 1], [2, 1]])
-    colors, alphas, _ = rasterize_tiles(scene.gaussians, scene.viewpoints, tiles, size, backgrounds=scene.backgrounds)
+    colors, alphas, _ = rasterize_tiles(scene.gaussians(), scene.viewpoints, tiles, size)
     image, alpha, _ = scene.render("RGB")
     for i, (column, row) in enumerate(tiles.tolist()):
         part = slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size)
@@ -82,7 +82,7 @@ def test_contributors_are_the_front_gaussians_with_their_blend_weights(k: int) -
     scene = hard_scene(4, n=120, views=2)
     weights = exact_weights(scene)
     exact = scene.to(torch.float64)
-    found = contributing_gaussians(scene.gaussians, scene.viewpoints, PIXELS, k=k)
+    found = contributing_gaussians(scene.gaussians(), scene.viewpoints, PIXELS, k=k)
     assert found.ids.shape == (2, len(PIXELS), k)
     for c in range(2):
         depth = exact.means @ exact.viewmats[c, 2, :3] + exact.viewmats[c, 2, 3]
@@ -99,7 +99,7 @@ def test_contributors_are_the_front_gaussians_with_their_blend_weights(k: int) -
 
 def test_the_weights_of_all_contributors_sum_to_alpha() -> None:
     scene = hard_scene(5)
-    found = contributing_gaussians(scene.gaussians, scene.viewpoints, PIXELS, k=400)
+    found = contributing_gaussians(scene.gaussians(), scene.viewpoints, PIXELS, k=400)
     alpha = scene.render("RGB")[1][:, PIXELS[:, 1], PIXELS[:, 0], 0]
     assert torch.allclose(found.weights.sum(-1), alpha, atol=1e-5)
 
@@ -110,7 +110,7 @@ def test_the_weights_of_all_contributors_sum_to_alpha() -> None:
 def test_visible_are_those_that_a_render_projects(options: dict[str, Any]) -> None:
     scene = hard_scene(6, views=2)
     want = scene.render("RGB", **options)[2]["visibility"]
-    got = visible_gaussians(scene.gaussians, scene.viewpoints, **options)
+    got = visible_gaussians(scene.gaussians(), scene.viewpoints, **options)
     assert torch.equal(got, want)
     assert 0 < int(got.sum()) < got.numel()
 
@@ -142,4 +142,4 @@ def test_a_non_finite_input_is_named_by_visibility_too() -> None:
     scene = hard_scene(8, n=10)
     scene.scales[3, 1] = torch.nan
     with pytest.raises(InputError, match="row 3"):
-        visible_gaussians(scene.gaussians, scene.viewpoints)
+        visible_gaussians(scene.gaussians(), scene.viewpoints)
