@@ -1,24 +1,23 @@
 """Write a sensor effect, a coloured vignette, and apply it to a synthetic log."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from splatbot import Frame, open_log
-from splatbot.sim.effects.base import Effects, Observable
+from splatbot.sim.effects.base import Effects, SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class Vignette:
+class Vignette(SensorEffect):
     """Darkens the image with the squared distance from its centre, and adds a little noise."""
 
-    strength: float = 0.5
-    noise: float = 1.0  # standard deviation [grey levels]
-    why: str = "example"
-    name: str = "vignette"
-    cost: ClassVar[str] = "one multiplication for each pixel and channel"
-    observable: ClassVar[Observable] = "colors"
+    name = "vignette"
+    cost = "one multiplication for each pixel and channel"
+    observable = "colors"
+
+    strength: float = setting(0.5, "give a share in 0..1", low=0, high=1)
+    noise: float = setting(1.0, "give grey levels >= 0", low=0)  # standard deviation [grey levels]
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Return the darkened frame; ``frame`` is not written to."""
@@ -30,7 +29,7 @@ class Vignette:
 
 
 log = open_log("synthetic:tabletop?frames=3&width=160&height=120")
-effects = Effects([Vignette(strength=0.8)], seed=0)
+effects = Effects([Vignette(strength=0.8, why="example")], seed=0)
 for ideal, real in zip(log, effects.over(log), strict=True):
     corner, centre = (slice(0, 10), slice(0, 10)), (slice(55, 65), slice(75, 85))
     ratios = [real.rgb[at].mean() / ideal.rgb[at].mean() for at in (centre, corner)]

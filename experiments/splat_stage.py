@@ -25,7 +25,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.logs.synthetic import SyntheticLog
 from splatbot.mapping.insertion import view_of
-from splatbot.rasterize import rasterize_pixels
+from splatbot.rasterize import Gaussians, Viewpoints, rasterize_pixels
 from splatbot.slam import Slam
 from splatbot.tracking.prepare import Level, PreparedFrame, normals_of, prepare, smoothed
 from splatbot.tracking.reference import sampled_pixels, slopes_of
@@ -124,11 +124,12 @@ def _render(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Ar
 
 def _min_ms(model: GaussianModel, level: Level, pixels: Mask, T_camera_world: Array) -> float:
     """Measure the time [ms] of one projection of the map and one blend of the chosen pixels."""
-    arguments = model.means, model.quats, model.scales, model.opacities, model.colors
+    gaussians = Gaussians(model.means, model.quats, model.scales, model.opacities, model.colors)
     camera, at = level.camera, torch.from_numpy(np.argwhere(pixels)[:, ::-1].copy())
     viewmat, K = torch.from_numpy(T_camera_world)[None], torch.from_numpy(camera.K_corner)[None]
+    viewpoints = Viewpoints(viewmat, K, camera.width, camera.height)
     start = time.perf_counter()
-    rasterize_pixels(*arguments, viewmat, K, camera.width, camera.height, at, render_mode="RGB+ED", depth_mode="plane")
+    rasterize_pixels(gaussians, viewpoints, at, render_mode="RGB+ED", depth_mode="plane")
     return 1e3 * (time.perf_counter() - start)
 
 

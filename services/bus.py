@@ -7,10 +7,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Message:
     time: float
 
 
-class Subscription:
+class Subscription(AbstractContextManager["Subscription"]):
     """Queue of unread messages, oldest first; when it is full, the oldest is dropped and counted.
 
     Read from a thread (:meth:`get`, iteration) or from asyncio (:meth:`receive`, ``async for``); closing ends both.
@@ -92,9 +93,6 @@ class Subscription:
     async def __aiter__(self) -> AsyncIterator[Message]:
         while (message := await self.receive()) is not None:
             yield message
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

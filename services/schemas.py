@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,15 @@ Mode = Literal["rgb", "depth", "normal", "alpha"]
 
 class Request(BaseModel):
     model_config = ConfigDict(extra="forbid")
+
+    one_of: ClassVar[tuple[str, ...]] = ()  # fields of which a request gives exactly one
+
+    @model_validator(mode="after")
+    def _given_one(self) -> Self:
+        if self.one_of and sum(getattr(self, name) is not None for name in self.one_of) != 1:
+            *others, last = self.one_of
+            raise ValueError(f"give one of {', '.join(others)} and {last}")
+        return self
 
 
 BASE_EXAMPLE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
@@ -168,6 +177,8 @@ class IkRequest(Request):
 class PlanRequest(Request):
     """A motion to be planned; the goal is joints or a pose of the tool."""
 
+    one_of = ("goal", "goal_pose")
+
     start: list[float] | None = Field(None, description="(J,) [rad or m]; default: the robot's home")
     goal: list[float] | None = Field(None, description="(J,) [rad or m]")
     goal_pose: Pose | None = Field(None, description="T_base_tcp")
@@ -181,30 +192,22 @@ class PlanRequest(Request):
         None, description="of the trajectory's points [Hz]; by default its knots, which give the same curve again"
     )
 
-    @model_validator(mode="after")
-    def _one_goal(self) -> Self:
-        if (self.goal is None) == (self.goal_pose is None):
-            raise ValueError("give one of goal and goal_pose")
-        return self
-
 
 class PictureHint(Request):
     """A place in a picture: a pixel, or the corners of a rectangle."""
+
+    one_of = ("pixel", "box")
 
     camera: CameraIn
     pose: Pose = Field(description="T_world_camera")
     pixel: tuple[float, float] | None = Field(None, description="(u, v) [px]")
     box: Vector4 | None = Field(None, description="(u0, v0, u1, v1) [px]")
 
-    @model_validator(mode="after")
-    def _one_place(self) -> Self:
-        if (self.pixel is None) == (self.box is None):
-            raise ValueError("give one of pixel and box")
-        return self
-
 
 class GraspsRequest(Request):
     """An object to grasp: by name, by a point in the world, or by a pixel of an image."""
+
+    one_of = ("target", "point", "picture")
 
     target: str | None = Field(None, max_length=200, description='words, as "largest box" or "red cup"')
     point: Vector3 | None = Field(None, description="on or in the object, world frame [m]")
@@ -223,12 +226,6 @@ class GraspsRequest(Request):
         1, description="least number of keyframes of a Gaussian"
     )
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-
-    @model_validator(mode="after")
-    def _one_hint(self) -> Self:
-        if sum(hint is not None for hint in (self.target, self.point, self.picture)) != 1:
-            raise ValueError("give one of target, point and picture")
-        return self
 
 
 class PicksRequest(Request):

@@ -13,9 +13,10 @@ import ssl
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, TypeVar
 from urllib.parse import quote, urlsplit
 
 import httpx
@@ -106,7 +107,10 @@ class TrackedFrame:
     stage_ms: dict[str, float]
 
 
-class Client:
+_Result = TypeVar("_Result", Distances, Collisions, TrackedFrame)
+
+
+class Client(AbstractContextManager["Client"]):
     """Connection to a service.
 
     Args:
@@ -177,14 +181,7 @@ class Client:
             "joints": None if frame.joints is None else frame.joints.tolist(),
         }
         answer = self._packed("POST", _map_path(map_id, "frames"), body)
-        return TrackedFrame(
-            T_world_camera=answer["T_world_camera"],
-            verdict=answer["verdict"],
-            keyframe=answer["keyframe"],
-            gaussians=answer["gaussians"],
-            map_version=answer["map_version"],
-            stage_ms=answer["stage_ms"],
-        )
+        return _result(TrackedFrame, answer)
 
     def end(self, map_id: str) -> None:
         """End the stream of pushed frames."""
@@ -194,7 +191,7 @@ class Client:
         """Query the Mahalanobis distance of points (P, 3) [m] to the map."""
         body = {"points": np.asarray(points, dtype=np.float64).reshape(-1, 3), "n_sigma": n_sigma}
         answer = self._packed("POST", _map_path(map_id, "distance"), body)
-        return Distances(answer["distance"], answer["index"], answer["inside"], answer["map_version"])
+        return _result(Distances, answer)
 
     def distance_npy(self, map_id: str, points: ArrayLike) -> NDArray[np.float32]:
         """Query the distances (P,) of points (P, 3) [m] alone, with the smallest bodies in both directions."""
@@ -215,14 +212,7 @@ class Client:
         """
         body = {"q": np.atleast_2d(np.asarray(q, dtype=np.float64)), "gradient": gradient, **more}
         answer = self._packed("POST", _map_path(map_id, "collisions"), body)
-        return Collisions(
-            in_collision=answer["in_collision"],
-            link=answer["link"],
-            other=answer["other"],
-            clearance=answer["clearance"],
-            gradient=answer.get("gradient"),
-            map_version=answer["map_version"],
-        )
+        return _result(Collisions, {"gradient": None} | answer)
 
     def views(
         self, map_id: str, views: Sequence[Mapping[str, Any]], modes: Sequence[str] = ("rgb",)
@@ -342,9 +332,6 @@ class Client:
         """Close the connection."""
         self._http.close()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -366,7 +353,7 @@ class Client:
         return found
 
 
-class ArmLease:
+class ArmLease(AbstractContextManager["ArmLease"]):
     """Lease of an arm, renewed in a thread; see :meth:`Client.lease`.
 
     Attributes:
@@ -380,9 +367,6 @@ class ArmLease:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._renew, args=(seconds / 3.0,), daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.release()
@@ -405,6 +389,11 @@ class ArmLease:
             except (ServiceError, RuntimeError) as error:  # RuntimeError: the client was closed
                 self.lost = str(error)
                 return
+
+
+def _result(kind: type[_Result], answer: Mapping[str, Any]) -> _Result:
+    """Build a result from those entries of an answer that have the names of its fields."""
+    return kind(**{field.name: answer[field.name] for field in fields(kind)})
 
 
 def _map_path(map_id: str, *rest: str) -> str:

@@ -29,6 +29,27 @@ def logging_as_it_was() -> Iterator[None]:
     root.setLevel(level)
 
 
+@pytest.fixture
+def one_torch_thread() -> Iterator[None]:
+    """Runs torch on one thread: more would wait for each other on small tensors, and take cores from the kernels."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def default_kernels() -> Iterator[None]:
+    """Restores the threads and the instruction set of the native kernels."""
+    from splatbot.rasterize.native import native
+
+    yield
+    native().set_num_threads(0)
+    native().set_isa("")
+
+
 @pytest.fixture(scope="session")
 def data_root() -> Path:
     """Folder of the real recordings: SPLATBOT_TEST_DATA, else shared/data next to the repository."""

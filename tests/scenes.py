@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatbot.rasterize import rasterization, rasterization_reference
+from splatbot.rasterize import Gaussians, Viewpoints, rasterization, rasterization_reference
 from splatbot.rasterize.native import native
 from splatbot.rasterize.reference import Projector
 
@@ -37,17 +37,33 @@ class Scene:
     backgrounds: Tensor | None = None
     covars: Tensor | None = None
 
+    def gaussians(self, sh_degree: int | None = None) -> Gaussians:
+        """Return the arguments of a render that do not change from view to view."""
+        return Gaussians(self.means, self.quats, self.scales, self.opacities, self.colors, self.covars, sh_degree)
+
+    @property
+    def viewpoints(self) -> Viewpoints:
+        """Poses, intrinsics and backgrounds of the views."""
+        return Viewpoints(self.viewmats, self.Ks, self.width, self.height, self.backgrounds)
+
     def render(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
         """Render through the native kernels."""
-        return rasterization(**self._arguments(), render_mode=render_mode, **options)
+        return rasterization(**vars(self), render_mode=render_mode, **options)
 
     def reference(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
         """Render through the float64 reference."""
         return self.to(torch.float64).reference_leaves(render_mode, **options)
 
-    def reference_leaves(self, render_mode: str = "RGB", **options: Any) -> tuple[Tensor, Tensor, Any]:
+    def reference_leaves(
+        self, render_mode: str = "RGB", *, sh_degree: int | None = None, **options: Any
+    ) -> tuple[Tensor, Tensor, Any]:
         """Render through the reference with these tensors, so that gradients reach them."""
-        return rasterization_reference(**self._arguments(), render_mode=render_mode, **options)
+        return rasterization_reference(self.gaussians(sh_degree), self.viewpoints, render_mode=render_mode, **options)
+
+    def alone(self, i: int) -> Scene:
+        """Return Gaussian i alone, before a black background."""
+        rows = {n: getattr(self, n)[i : i + 1] for n in ("means", "quats", "scales", "opacities", "colors")}
+        return Scene(**rows, viewmats=self.viewmats, Ks=self.Ks, width=self.width, height=self.height)
 
     def to(self, dtype: torch.dtype, requires_grad: bool = False) -> Scene:
         """Return a copy whose tensors are leaves of ``dtype``."""
@@ -57,9 +73,6 @@ class Scene:
             for value in [getattr(self, name)]
         }
         return Scene(**tensors, width=self.width, height=self.height)  # type: ignore[arg-type]
-
-    def _arguments(self) -> dict[str, Any]:
-        return dict(vars(self))
 
 
 @dataclass
@@ -91,13 +104,14 @@ def compare(
     """
     reference_options = options if project is None else {"project": project, **(reference_extra or {})}
     sides = []
-    for render, dtype in ((rasterization_reference, torch.float64), (rasterization, torch.float32)):
+    for dtype in (torch.float64, torch.float32):
         leaves = scene.to(dtype, requires_grad=True)
         for name in fixed:
             getattr(leaves, name).requires_grad_(False)
-        call: Callable[..., tuple[Tensor, Tensor, Any]] = render
-        given = reference_options if call is rasterization_reference else options
-        image, alpha, meta = call(**leaves._arguments(), render_mode=render_mode, **given)
+        if dtype == torch.float64:
+            image, alpha, meta = leaves.reference_leaves(render_mode, **reference_options)
+        else:
+            image, alpha, meta = leaves.render(render_mode, **options)
         sides.append((leaves, image, alpha, meta))
     (exact, exact_image, exact_alpha, meta), (native, image, alpha, _) = sides
     safe = (meta.margins > jump_margin)[..., None]
@@ -125,6 +139,21 @@ def relative_l2(got: Tensor | None, want: Tensor) -> float:
     assert got is not None
     norm = float(want.double().norm())
     return float((got.double() - want.double()).norm()) / (norm if norm > 0 else 1.0)
+
+
+def assert_alone_equal_together(
+    gradients: Callable[[tuple[str, ...]], dict[str, Tensor | None]], names: tuple[str, ...], wanted: tuple[str, ...]
+) -> None:
+    """Assert that ``gradients`` of the inputs ``wanted`` are those of all ``names``, and that no other appears."""
+    together, alone = gradients(names), gradients(wanted)
+    for name in names:
+        got, want = alone[name], together[name]
+        if name not in wanted:
+            assert got is None
+        else:
+            assert got is not None
+            assert want is not None
+            assert torch.equal(got, want), name
 
 
 def pinhole(width: int, height: int, focal: float | None = None, views: int = 1) -> Tensor:

@@ -37,9 +37,12 @@ def render(scene: Scene, render_mode: str = "RGB", **options: Any) -> tuple[dict
     return {n: image for n, image in zip(IMAGES, images, strict=True) if image is not None}, meta
 
 
-def reference(scene: Scene, render_mode: str = "RGB", **options: Any) -> tuple[dict[str, Tensor], Any]:
+def reference(
+    scene: Scene, render_mode: str = "RGB", *, sh_degree: int | None = None, **options: Any
+) -> tuple[dict[str, Tensor], Any]:
     """Render through the reference, in the type of the scene."""
-    *images, meta = rasterization_2dgs_reference(**arguments(scene), render_mode=render_mode, **options)
+    given = scene.gaussians(sh_degree), scene.viewpoints
+    *images, meta = rasterization_2dgs_reference(*given, render_mode=render_mode, **options)
     return {n: image for n, image in zip(IMAGES, images, strict=True) if image is not None}, meta
 
 

@@ -8,6 +8,7 @@ import select
 import threading
 import time
 import tty
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -42,7 +43,7 @@ class LineFaults:
     silent: bool = False
 
 
-class FakeRobotiq:
+class FakeRobotiq(AbstractContextManager["FakeRobotiq"]):
     """Gripper whose fingers move at their speed, stop at an object, and respond on the serial port ``port``.
 
     Args:
@@ -85,9 +86,6 @@ class FakeRobotiq:
         self._plugged = True
         self._thread = threading.Thread(target=self._serve, name="fake-robotiq", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> FakeRobotiq:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.unplug()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from types import TracebackType
 
@@ -73,7 +73,7 @@ MODELS = {
 }
 
 
-class RobotiqGripper:
+class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
     """A :class:`splatbot.protocols.Gripper` on a serial port.
 
     Every failure (no response, repeated wrong checksums, a lost port, a fault) raises
@@ -104,9 +104,6 @@ class RobotiqGripper:
         self._unsafe = "it is not activated"
         self._sent: Command | None = None
         self._client: ModbusClient | None = self._opened()
-
-    def __enter__(self) -> RobotiqGripper:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()

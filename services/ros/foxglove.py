@@ -8,11 +8,13 @@ import logging
 import secrets
 import struct
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from splatbot.errors import InputError
 from splatbot.logs.ros_types import definition
 from splatbot.services.bus import Subscription
+from splatbot.services.ros.deliveries import Deliveries
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.requests import json_object
 from splatbot.services.ros.rosbridge.subscriptions import Send
@@ -42,7 +44,7 @@ class FoxgloveSession:
         self._graph, self._to_client, self._most_bytes = graph, send, most_bytes
         self._sending = asyncio.Lock()
         self._channels: dict[str, int] = {}
-        self._tasks: dict[int, tuple[asyncio.Task[None], Subscription]] = {}
+        self._deliveries: Deliveries[int] = Deliveries(graph)
         self._watch: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
@@ -61,13 +63,11 @@ class FoxgloveSession:
 
     async def close(self) -> None:
         """Forget the client."""
-        tasks = [task for task, _ in self._tasks.values()] + ([self._watch] if self._watch else [])
-        for number in list(self._tasks):
-            self._stop(number)
-        for task in tasks:
-            task.cancel()
+        await self._deliveries.close()
+        if self._watch is not None:
+            self._watch.cancel()
             with suppress(asyncio.CancelledError, Exception):
-                await task
+                await self._watch
 
     def _do(self, values: dict[str, Any]) -> None:
         if values.get("op") == "subscribe":
@@ -75,7 +75,7 @@ class FoxgloveSession:
                 self._subscribe(wish.get("id"), wish.get("channelId"))
         elif values.get("op") == "unsubscribe":
             for number in _entries(values, "subscriptionIds", int):
-                self._stop(number)
+                self._deliveries.stop(number)
         else:
             hint = "the known operations are subscribe and unsubscribe"
             raise InputError(f"{str(values.get('op'))[:40]!r} is not offered.", field="op", hint=hint)
@@ -84,20 +84,12 @@ class FoxgloveSession:
         topic = next((topic for topic, known in self._channels.items() if known == channel), None)
         if topic is None:
             raise InputError(f"no channel {str(channel)[:40]}.", field="channelId", hint="take an advertised one")
-        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 2**32 or number in self._tasks:
+        fits = isinstance(number, int) and not isinstance(number, bool) and 0 <= number < 2**32
+        if not fits or number in self._deliveries:
             raise InputError(f"is {str(number)[:40]}.", field="id", hint="give a new number for each subscription")
-        if len(self._tasks) >= _MOST:
+        if len(self._deliveries) >= _MOST:
             raise InputError("there are too many.", field="subscriptions", hint=f"at most {_MOST}")
-        reader = self._graph.subscribe(topic, capacity=_WAITING)
-        first = self._graph.latched(topic)
-        task = asyncio.get_running_loop().create_task(self._deliver(number, reader, first))
-        self._tasks[number] = task, reader
-
-    def _stop(self, number: int) -> None:
-        task, reader = self._tasks.pop(number, (None, None))
-        if task is not None and reader is not None:
-            reader.close()
-            task.cancel()
+        self._deliveries.start(number, topic, partial(self._deliver, number), capacity=_WAITING)
 
     async def _deliver(self, number: int, reader: Subscription, first: RosMessage | None) -> None:
         if first is not None:

@@ -34,6 +34,7 @@ _ANSWER = {
     "gaussian": [977],
     "gradient": [[0.0, -0.02, 0.0, 0.1, 0.0, 0.05, 0.0]],
 }
+_Body = Annotated[CollisionsRequest, Depends(body_of(CollisionsRequest, array="q"))]
 
 
 @router.post(
@@ -42,12 +43,7 @@ _ANSWER = {
     responses=gives(_ANSWER, npy="in_collision (C,) bool") | problems(404, 413, 415, 422, 503),
     openapi_extra=takes(CollisionsRequest, _EXAMPLES, npy="q (C, 7) for a Panda in a map that knows its base"),
 )
-def collisions(
-    request: Request,
-    served: ServedAfterFrames,
-    settings: Settings,
-    query: Annotated[CollisionsRequest, Depends(body_of(CollisionsRequest, array="q"))],
-) -> Response:
+def collisions(request: Request, served: ServedAfterFrames, settings: Settings, query: _Body) -> Response:
     """Check each configuration: verdict, colliding link, its partner (`other`; -1 is the map), and clearance.
 
     "No" is certain for the map's ellipsoids at two standard deviations. `clearance` is the least distance [m] of the

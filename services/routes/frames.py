@@ -82,6 +82,7 @@ _ANSWER = {
     "T_world_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
     "stage_ms": {"prepare": 3.1, "mapping": 12.0},
 }
+_Body = Annotated[FrameRequest, Depends(body_of(FrameRequest))]
 
 
 @router.post(
@@ -90,12 +91,7 @@ _ANSWER = {
     responses=gives(_ANSWER) | problems(404, 409, 413, 415, 422, 503),
     openapi_extra=takes(FrameRequest, {"a small frame": _example()}),
 )
-def push_frame(
-    request: Request,
-    served: Served,
-    service: Service,
-    query: Annotated[FrameRequest, Depends(body_of(FrameRequest))],
-) -> Response:
+def push_frame(request: Request, served: Served, service: Service, query: _Body) -> Response:
     """Track a frame and map it; the answer says where the camera was. 503: as many frames wait as may."""
     frames = service.stream(served.id)
     pushed = frames.push(_frame(query, service.settings.max_pixels))

@@ -38,6 +38,7 @@ _ANSWER = {
     "notes": [],
     "seconds": {"contacts": 0.05},
 }
+_Body = Annotated[GraspsRequest, Depends(body_of(GraspsRequest))]
 
 
 @router.post(
@@ -46,12 +47,7 @@ _ANSWER = {
     responses=gives(_ANSWER) | problems(404, 415, 422, 503),
     openapi_extra=takes(GraspsRequest, _EXAMPLES),
 )
-def grasps(
-    request: Request,
-    served: ServedAfterFrames,
-    service: Service,
-    query: Annotated[GraspsRequest, Depends(body_of(GraspsRequest))],
-) -> Response:
+def grasps(request: Request, served: ServedAfterFrames, service: Service, query: _Body) -> Response:
     """Rank grasps of one object with each term of their scores; no grasp is a problem with the reasons.
 
     Words match names, colours, shapes, sizes and places; an ambiguous description is refused.

@@ -46,6 +46,7 @@ _IK_EXAMPLES = {
     "near a posture": {"pose": _DOWN, "seeds": 16, "near": [0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8]},
 }
 _IK_ANSWER = {"q": [[0.1, 0.2, 0.3, -2.0, 0.0, 1.6, 0.8]], "tried": 32, "reached": 30}
+_PlanBody = Annotated[PlanRequest, Depends(body_of(PlanRequest))]
 
 
 @router.post(
@@ -54,12 +55,7 @@ _IK_ANSWER = {"q": [[0.1, 0.2, 0.3, -2.0, 0.0, 1.6, 0.8]], "tried": 32, "reached
     responses=gives(_ANSWER) | problems(404, 413, 415, 422, 503),
     openapi_extra=takes(PlanRequest, _EXAMPLES),
 )
-def plan(
-    request: Request,
-    served: ServedAfterFrames,
-    service: Service,
-    query: Annotated[PlanRequest, Depends(body_of(PlanRequest))],
-) -> Response:
+def plan(request: Request, served: ServedAfterFrames, service: Service, query: _PlanBody) -> Response:
     """Plan a certified motion; `trajectory` is a ROS JointTrajectory, `id` is for POST /v1/trajectories.
 
     No motion is a problem (422) whose `code` is that of moveit_msgs/MoveItErrorCodes.

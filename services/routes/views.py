@@ -30,6 +30,7 @@ _EXAMPLES = {
     }
 }
 _ANSWER = {"map_version": 12, "views": [{"rgb": "iVBORw0KGgo...", "depth": "iVBORw0KGgo..."}]}
+_Body = Annotated[ViewsRequest, Depends(body_of(ViewsRequest))]
 
 
 @router.post(
@@ -38,12 +39,7 @@ _ANSWER = {"map_version": 12, "views": [{"rgb": "iVBORw0KGgo...", "depth": "iVBO
     responses=gives(_ANSWER, npy="of one mode and one size: (N, H, W[, 3])") | problems(404, 413, 415, 422, 503),
     openapi_extra=takes(ViewsRequest, _EXAMPLES),
 )
-def views(
-    request: Request,
-    served: ServedAfterFrames,
-    settings: Settings,
-    query: Annotated[ViewsRequest, Depends(body_of(ViewsRequest))],
-) -> Response:
+def views(request: Request, served: ServedAfterFrames, settings: Settings, query: _Body) -> Response:
     """Render the view of each camera.
 
     JSON holds PNGs in base64. msgpack and npy hold arrays: rgb uint8, depth float32 [m] (0: nothing there), normal

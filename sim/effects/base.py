@@ -1,12 +1,12 @@
-"""Protocol of sensor effects, and the sequence of effects of a run with its cost."""
+"""Base class of sensor effects, and the sequence of effects of a run with its cost."""
 
 from __future__ import annotations
 
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import fields, is_dataclass
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -14,63 +14,111 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.trajectory import Trajectory
 
+T = TypeVar("T", int, float)
+
 Observable = Literal["colors", "depth", "stamps", "arrivals"]
 """Property of a frame stream that an effect changes."""
 
-# Fields of an effect's dataclass that are no settings: its name, the reason for it, and the camera path.
-_NO_SETTINGS = ("name", "why", "path")
+# Fields of an effect's dataclass that are no settings: the reason for it, and the camera path.
+_NO_SETTINGS = ("why", "path")
 
 
-class Effect(Protocol):
-    """Simulated deviation of a real sensor from an ideal frame; a frozen dataclass whose fields are its settings.
+@dataclass(frozen=True)
+class SettingRange:
+    """Range of a number: finite, from ``low`` to ``high``, both included, and less than ``below``."""
 
-    ``cost`` describes the computation per frame, ``observable`` the property of the frames that changes.
+    low: float
+    high: float
+    below: float
+    hint: str
+
+    def check(self, name: str, value: float) -> None:
+        """Check the value of the setting ``name``.
+
+        Raises:
+            InputError: the value is out of range.
+        """
+        if not (np.isfinite(value) and self.low <= value <= self.high and value < self.below):
+            raise InputError(f"is {value}.", field=name, hint=self.hint)
+
+
+def setting(
+    default: T,
+    hint: str = "give a finite number",
+    *,
+    low: float = -np.inf,
+    high: float = np.inf,
+    below: float = np.inf,
+) -> T:
+    """Declare a numeric field of an effect with the range of its finite values.
+
+    Args:
+        default: default value.
+        hint: description of the range in an error.
+        low: least value.
+        high: greatest value.
+        below: number that every value is less than.
+    """
+    declared: T = field(default=default, metadata={"range": SettingRange(low, high, below, hint)})
+    return declared
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorEffect:
+    """Simulated deviation of a real sensor from an ideal frame; a subclass is a frozen dataclass of its settings.
+
+    ``name`` is that in the registry, ``cost`` describes the computation per frame, and ``observable`` is the property
+    of the frames that changes. The ranges of the fields that :func:`setting` declares are checked.
+
+    Args:
+        why: short reason for the effect; it appears in the run's report.
+
+    Raises:
+        InputError: a setting is out of range.
     """
 
+    name: ClassVar[str]
     cost: ClassVar[str]
     observable: ClassVar[Observable]
 
-    @property
-    def name(self) -> str:
-        """Short name, as in the registry."""
-        ...
+    why: str = "requested"
 
-    @property
-    def why(self) -> str:
-        """Short reason for the effect; it appears in the run's report."""
-        ...
-
-    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """Simulate the sensor's frame: a pure function of ``frame`` and ``rng`` that does not write to ``frame``."""
-        ...
-
-
-@runtime_checkable
-class FollowsPath(Protocol):
-    """An effect that requires the camera path."""
-
-    def along(self, path: Trajectory) -> Effect:
-        """Return the effect for a camera that moves along ``path``."""
-        ...
-
-
-@runtime_checkable
-class DropsFrames(Protocol):
-    """An effect that loses whole frames."""
-
-    def drops(self, index: int, generator: Callable[[int], np.random.Generator]) -> bool:
-        """Return whether frame ``index`` is lost; ``generator(k)`` is the generator of frame k."""
-        ...
-
-
-@runtime_checkable
-class BlanksDepth(Protocol):
-    """An effect that may leave a frame without any depth."""
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if "range" in f.metadata:
+                f.metadata["range"].check(f.name, getattr(self, f.name))
 
     @property
     def blanks_depth(self) -> bool:
         """Return whether the effect can remove all depth of a frame."""
-        ...
+        return False
+
+    def along(self, path: Trajectory) -> Self:
+        """Return the effect for a camera that moves along ``path``."""
+        return self
+
+    def drops(self, index: int, generator: Callable[[int], np.random.Generator]) -> bool:
+        """Return whether frame ``index`` is lost; ``generator(k)`` is the generator of frame k."""
+        return False
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        """Simulate the sensor's frame: a pure function of ``frame`` and ``rng`` that does not write to ``frame``."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraMotionEffect(SensorEffect):
+    """Sensor effect of the camera's motion.
+
+    Args:
+        path: camera path; it must be known when the effect is applied.
+    """
+
+    path: Trajectory | None = None
+
+    def along(self, path: Trajectory) -> Self:
+        """Return the effect for a camera that moves along ``path``."""
+        return replace(self, path=path)
 
 
 class Effects:
@@ -81,7 +129,7 @@ class Effects:
     not change the draws of the others.
     """
 
-    def __init__(self, effects: Sequence[Effect], *, seed: int = 0) -> None:
+    def __init__(self, effects: Sequence[SensorEffect], *, seed: int = 0) -> None:
         self.effects = tuple(effects)
         self.seed = seed
         self._frames = 0
@@ -103,7 +151,7 @@ class Effects:
 
     def along(self, path: Trajectory) -> Effects:
         """Return the same effects for a camera that moves along ``path``, with a new cost count."""
-        return Effects([e.along(path) if isinstance(e, FollowsPath) else e for e in self.effects], seed=self.seed)
+        return Effects([effect.along(path) for effect in self.effects], seed=self.seed)
 
     def kept(self, count: int) -> list[int]:
         """Return the indices of those of ``count`` frames that arrive."""
@@ -112,7 +160,7 @@ class Effects:
     @property
     def blanks_depth(self) -> bool:
         """Return whether a frame can lose all depth."""
-        return any(isinstance(effect, BlanksDepth) and effect.blanks_depth for effect in self.effects)
+        return any(effect.blanks_depth for effect in self.effects)
 
     def report(self) -> list[dict[str, Any]]:
         """Return for each effect: name, why, settings, frames and ms_per_frame (None before the first frame)."""
@@ -124,24 +172,12 @@ class Effects:
 
     def _drops(self, index: int) -> bool:
         return any(
-            isinstance(effect, DropsFrames) and effect.drops(index, lambda k, i=i: self._generator(i, k))  # type: ignore[misc]
+            effect.drops(index, lambda k, i=i: self._generator(i, k))  # type: ignore[misc]
             for i, effect in enumerate(self.effects)
         )
 
     def _generator(self, effect: int, index: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, index, *self._streams[effect]])
-
-
-def check_fields(effect: object, *names: str, hint: str, low: float = 0.0, high: float = np.inf) -> None:
-    """Check that fields of an effect are finite and in ``low`` to ``high``, both included.
-
-    Raises:
-        InputError: a value is out of range; ``hint`` describes the range.
-    """
-    for name in names:
-        value = getattr(effect, name)
-        if not (np.isfinite(value) and low <= value <= high):
-            raise InputError(f"is {value}.", field=name, hint=hint)
 
 
 def check_span(at: int, until: int) -> None:
@@ -156,10 +192,8 @@ def check_span(at: int, until: int) -> None:
         raise InputError(f"is {until}.", field="until", hint=f"give a frame after {at}, or 0 for never")
 
 
-def settings(effect: Effect | type) -> dict[str, Any]:
+def settings(effect: SensorEffect | type[SensorEffect]) -> dict[str, Any]:
     """Return the settings of an effect, or the default settings of a class."""
-    if not is_dataclass(effect):
-        return {}
     return {f.name: getattr(effect, f.name) for f in fields(effect) if f.name not in _NO_SETTINGS}
 
 

@@ -3,39 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class Blackout:
+class Blackout(SensorEffect):
     """Simulated black frames.
 
     Args:
         at: first black frame.
         n: number of frames; 15 are half a second at 30 Hz.
         depth: "lost", as under a hand, or "kept", as after a light failure with an active depth sensor.
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    at: int = 30
-    n: int = 15
+    name = "blackout"
+    cost = "nothing"
+    observable = "colors"
+
+    at: int = setting(30, "give a number of frames >= 0", low=0)
+    n: int = setting(15, "give a number of frames >= 0", low=0)
     depth: str = "lost"
-    why: str = "requested"
-    name: str = "blackout"
-    cost: ClassVar[str] = "nothing"
-    observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
-        check_fields(self, "at", "n", hint="give a number of frames >= 0")
+        super().__post_init__()
         if self.depth not in ("lost", "kept"):
             raise InputError(f"is {self.depth!r}.", field="depth", hint="lost or kept")
 

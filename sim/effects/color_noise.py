@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class ColorNoise:
+class ColorNoise(SensorEffect):
     """Simulated shot and read noise; depth is unchanged.
 
     The model is the linear one of EMVA Standard 1288: v' = (Poisson(k v) + σ_read ε) / k with ε ~ N(0, 1) and
@@ -21,22 +20,17 @@ class ColorNoise:
     Args:
         full_well: electrons at 255; small sensors hold a few thousand. Fewer electrons are noisier, as at a high gain.
         read: standard deviation σ_read [electrons] of the read noise.
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    full_well: float = 4000.0
-    read: float = 8.0
-    why: str = "requested"
-    name: str = "color_noise"
-    cost: ClassVar[str] = "two random numbers for each pixel and channel"
-    observable: ClassVar[Observable] = "colors"
+    name = "color_noise"
+    cost = "two random numbers for each pixel and channel"
+    observable = "colors"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "full_well", low=1.0, hint="give at least 1 electron")
-        check_fields(self, "read", hint="give electrons >= 0")
+    full_well: float = setting(4000.0, "give at least 1 electron", low=1)
+    read: float = setting(8.0, "give electrons >= 0", low=0)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Add noise to the colours."""

@@ -27,17 +27,13 @@ class Contact(PhysicsEffect):
     cost = "collision detection, and a solver for the contacts"
     observable = "contact_steps"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if two bodies can collide."""
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether two bodies can collide, and why."""
         if scene.movable or scene.soft:
-            return f"{names_of((*scene.movable, *scene.soft))} can be pushed, and rest on something"
+            return True, f"{names_of((*scene.movable, *scene.soft))} can be pushed, and rest on something"
         if scene.robot is not None and (scene.objects or scene.map is not None):
-            return "the arm moves among objects"
-        return ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if no two bodies can collide."""
-        return "no two bodies can collide"
+            return True, "the arm moves among objects"
+        return False, "no two bodies can collide"
 
     def build(self, draft: Draft) -> None:
         """Set the masks of every geom and enable contacts."""

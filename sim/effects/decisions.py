@@ -19,10 +19,10 @@ class EffectDecision:
     by: str = "scene"
 
 
-def decide(name: str, scene: Scene, reason_on: str, reason_off: str) -> EffectDecision:
-    """Decide on an effect that the scene requires if ``reason_on`` is not empty; forbid and force take precedence."""
+def decide(name: str, scene: Scene, required: bool, reason: str) -> EffectDecision:
+    """Decide on an effect that the scene requires or not for ``reason``; forbid and force take precedence."""
     if name in scene.effects.forbid:
-        return EffectDecision(name, False, f"forbidden by the scene; {reason_on or reason_off}", "forbidden")
-    if name in scene.effects.force and not reason_on:
-        return EffectDecision(name, True, f"forced by the scene; {reason_off}", "forced")
-    return EffectDecision(name, bool(reason_on), reason_on or reason_off)
+        return EffectDecision(name, False, f"forbidden by the scene; {reason}", "forbidden")
+    if name in scene.effects.force and not required:
+        return EffectDecision(name, True, f"forced by the scene; {reason}", "forced")
+    return EffectDecision(name, required, reason)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class DepthHoles:
+class DepthHoles(SensorEffect):
     """Simulated blobs without depth, different in every frame; colour is unchanged.
 
     Smooth noise is thresholded at the quantile ``share`` of the valid pixels, so each frame loses exactly that share.
@@ -23,23 +21,17 @@ class DepthHoles:
     Args:
         share: of the pixels with depth that lose it, 0..1.
         size: typical width of a blob [px].
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    share: float = 0.4
-    size: float = 40.0
-    why: str = "requested"
-    name: str = "depth_holes"
-    cost: ClassVar[str] = "smooth noise, and a partial sort of the pixels"
-    observable: ClassVar[Observable] = "depth"
+    name = "depth_holes"
+    cost = "smooth noise, and a partial sort of the pixels"
+    observable = "depth"
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.share < 1:
-            raise InputError(f"is {self.share}.", field="share", hint="give a share in 0..1, 1 excluded")
-        check_fields(self, "size", low=1.0, hint="give at least 1 pixel")
+    share: float = setting(0.4, "give a share in 0..1, 1 excluded", low=0, below=1)
+    size: float = setting(40.0, "give at least 1 pixel", low=1)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Remove the depth inside the blobs."""

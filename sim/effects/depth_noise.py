@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -11,13 +10,13 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import SensorEffect, setting
 
 _MAX_TILT = np.radians(85.0)  # [rad] the fit of the noise has no data beyond, and diverges
 
 
 @dataclass(frozen=True)
-class DepthNoise:
+class DepthNoise(SensorEffect):
     """Simulated axial noise of depth cameras, quantization and edge holes; colour is unchanged.
 
     The standard deviation is that of :func:`axial_sigma` (Nguyen, Izadi, Lovell 2012, eq. 3), for structured-light and
@@ -29,25 +28,20 @@ class DepthNoise:
         edge_loss: fraction of the pixels near a depth edge that lose their depth, 0..1.
         edge_jump: relative depth step that counts as an edge.
         edge_reach: distance [px] from an edge within which depth is lost.
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    strength: float = 1.0
-    step: float = 0.001
-    edge_loss: float = 0.5
-    edge_jump: float = 0.03
-    edge_reach: int = 2
-    why: str = "requested"
-    name: str = "depth_noise"
-    cost: ClassVar[str] = "a random number, a tilt and a rounding for each pixel"
-    observable: ClassVar[Observable] = "depth"
+    name = "depth_noise"
+    cost = "a random number, a tilt and a rounding for each pixel"
+    observable = "depth"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "strength", "step", "edge_jump", "edge_reach", hint="give a finite number >= 0")
-        check_fields(self, "edge_loss", high=1.0, hint="give a share in 0..1")
+    strength: float = setting(1.0, "give a finite number >= 0", low=0)
+    step: float = setting(0.001, "give a finite number >= 0", low=0)
+    edge_loss: float = setting(0.5, "give a share in 0..1", low=0, high=1)
+    edge_jump: float = setting(0.03, "give a finite number >= 0", low=0)
+    edge_reach: int = setting(2, "give a finite number >= 0", low=0)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Add noise to the depth; pixels without depth stay without."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields, check_span
+from splatbot.sim.effects.base import SensorEffect, check_span, setting
 
 
 @dataclass(frozen=True)
-class Exposure:
+class Exposure(SensorEffect):
     """Simulated change of exposure: v' = clip(gain v + offset, 0, 255); depth is unchanged.
 
     The affine model is the one that photometric trackers fit (Engel, Koltun, Cremers 2018, section 2.1). It applies to
@@ -24,25 +23,23 @@ class Exposure:
         at: first frame of the step.
         until: first frame after it; 0 for never.
         drift: doublings of the gain per second, from stamp 0 on; negative darkens.
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    step: float = 2.0
-    offset: float = 0.0
+    name = "exposure"
+    cost = "a table look-up"
+    observable = "colors"
+
+    step: float = setting(2.0, "give a finite gain >= 0", low=0)
+    offset: float = setting(0.0)
     at: int = 0
     until: int = 0
-    drift: float = 0.0
-    why: str = "requested"
-    name: str = "exposure"
-    cost: ClassVar[str] = "a table look-up"
-    observable: ClassVar[Observable] = "colors"
+    drift: float = setting(0.0)
 
     def __post_init__(self) -> None:
-        check_fields(self, "step", hint="give a finite gain >= 0")
-        check_fields(self, "offset", "drift", low=-np.inf, hint="give a finite number")
+        super().__post_init__()
         check_span(self.at, self.until)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:

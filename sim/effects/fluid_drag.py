@@ -23,13 +23,11 @@ class FluidDrag(PhysicsEffect):
     cost = "two forces for each moving body"
     observable = "travelled"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if the scene has a medium."""
-        return f"the scene is filled with {scene.medium.density:g} kg/m³" if scene.medium is not None else ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if the scene has no medium."""
-        return "no medium is given"
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the scene has a medium, and why."""
+        if scene.medium is None:
+            return False, "no medium is given"
+        return True, f"the scene is filled with {scene.medium.density:g} kg/m³"
 
     def build(self, draft: Draft) -> None:
         """Set the medium; if it is forced without one, compute the forces of a vacuum."""

@@ -23,17 +23,13 @@ class Friction(PhysicsEffect):
     cost = "three to four solver rows for each contact instead of one"
     observable = "tangential_n"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if an object can move or the task rubs on a surface."""
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether an object can move or the task rubs on a surface, and why."""
         if scene.movable or scene.soft:
-            return f"friction holds and stops {names_of((*scene.movable, *scene.soft))}"
+            return True, f"friction holds and stops {names_of((*scene.movable, *scene.soft))}"
         if scene.task.kind == "wipe":
-            return "the tool rubs on a surface"
-        return ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if no surface slides on another."""
-        return "no movable object is in contact"
+            return True, "the tool rubs on a surface"
+        return False, "no movable object is in contact"
 
     def build(self, draft: Draft) -> None:
         """Set ``condim`` of every geom; the coefficients are those of the objects."""

@@ -27,19 +27,15 @@ class GripperCompliance(PhysicsEffect):
     cost = "no additional computation; softer contacts have more overlap"
     observable = "opening"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if the task grasps an object or the scene gives a stiffness."""
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the task grasps an object or the scene gives a stiffness, and why."""
         if scene.robot is None:
-            return ""
+            return False, "there is no robot"
         if scene.robot.motors.finger_stiffness is not None:
-            return f"the fingers' servo has {scene.robot.motors.finger_stiffness:g} N/m"
+            return True, f"the fingers' servo has {scene.robot.motors.finger_stiffness:g} N/m"
         if scene.task.kind in _GRASPING_TASKS:
-            return f"to {scene.task.kind} requires compliant pads"
-        return ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if the task grasps no object."""
-        return "the task grasps no object" if scene.robot is not None else "there is no robot"
+            return True, f"to {scene.task.kind} requires compliant pads"
+        return False, "the task grasps no object"
 
     def build(self, draft: Draft) -> None:
         """Set the contact parameters of the pads and the gain of the servo."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class Latency:
+class Latency(SensorEffect):
     """Simulated latency: the stamp is the arrival time t + delay + U(0, jitter), and the images are those of t.
 
     Joints and poses that are paired by stamp are therefore later than the images, as with a driver that stamps on
@@ -22,21 +21,17 @@ class Latency:
     Args:
         delay: minimum latency [s].
         jitter: range [s] of the uniform random addition. It must be below the frame period, or frames change order.
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    delay: float = 0.05
-    jitter: float = 0.0
-    why: str = "requested"
-    name: str = "latency"
-    cost: ClassVar[str] = "a random number for a frame"
-    observable: ClassVar[Observable] = "stamps"
+    name = "latency"
+    cost = "a random number for a frame"
+    observable = "stamps"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "delay", "jitter", hint="give seconds >= 0")
+    delay: float = setting(0.05, "give seconds >= 0", low=0)
+    jitter: float = setting(0.0, "give seconds >= 0", low=0)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Stamp the frame with its arrival time."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +11,14 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import SensorEffect, setting
 from splatbot.sim.effects.warping import color_at, depth_at
 
 _ITERATIONS = 40
 
 
 @dataclass(frozen=True)
-class LensDistortion:
+class LensDistortion(SensorEffect):
     """Simulated radial and tangential distortion of colour and depth; the frame's camera stays the pinhole.
 
     The model is OpenCV's (Brown-Conrady), with coefficients k1, k2, p1, p2, k3. Each distorted pixel samples the ideal
@@ -28,24 +27,20 @@ class LensDistortion:
 
     Args:
         k1, k2, p1, p2, k3: OpenCV's coefficients; k1 below 0 is barrel distortion.
-        why: reason for the effect.
 
     Raises:
         InputError: a coefficient is not finite; on application, if the image would fold over itself.
     """
 
-    k1: float = -0.05
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
-    why: str = "requested"
-    name: str = "lens_distortion"
-    cost: ClassVar[str] = "one warp of colour and one of depth; the warp map is computed once"
-    observable: ClassVar[Observable] = "colors"
+    name = "lens_distortion"
+    cost = "one warp of colour and one of depth; the warp map is computed once"
+    observable = "colors"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "k1", "k2", "p1", "p2", "k3", low=-np.inf, hint="give a finite number")
+    k1: float = setting(-0.05)
+    k2: float = setting(0.0)
+    p1: float = setting(0.0)
+    p2: float = setting(0.0)
+    k3: float = setting(0.0)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Distort the frame."""

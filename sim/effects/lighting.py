@@ -39,15 +39,13 @@ class Lighting(PhysicsEffect):
     cost = "a shadow pass for each rendered image"
     observable = "light"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if the scene has a camera and lamps."""
-        if scene.lights and scene.camera is not None:
-            return f"a camera sees {len(scene.lights)} lamps"
-        return ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if the scene has no lamps or no camera."""
-        return "there is no camera" if scene.camera is None else "no lamp is given"
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the scene has a camera and lamps, and why."""
+        if scene.camera is None:
+            return False, "there is no camera"
+        if not scene.lights:
+            return False, "no lamp is given"
+        return True, f"a camera sees {len(scene.lights)} lamps"
 
     def build(self, draft: Draft) -> None:
         """Add the lamps, directed at the origin, and dim the headlight."""

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import CameraMotionEffect, setting
 from splatbot.sim.effects.warping import flow, grid, motion_during
-from splatbot.trajectory import Trajectory
 
 _MIN_BLUR_PX = 0.1  # [px] below this no pixel changes
 
 
 @dataclass(frozen=True)
-class MotionBlur:
+class MotionBlur(CameraMotionEffect):
     """Simulated motion blur: the mean of sub-exposures, each the frame warped by its own depth and the camera motion.
 
     Warping works for any source with a known camera path: a ray caster, the twin, or a recording with ground truth. It
@@ -31,28 +29,17 @@ class MotionBlur:
     Args:
         exposure: exposure time [s].
         samples: maximum number of sub-exposures; there are fewer if the longest blur [px] is shorter.
-        why: reason for the effect.
-        path: camera path.
 
     Raises:
         InputError: an argument is out of range; on application, if the path is not known.
     """
 
-    exposure: float = 0.02
-    samples: int = 32
-    why: str = "requested"
-    name: str = "motion_blur"
-    path: Trajectory | None = None
-    cost: ClassVar[str] = "one warp for each pixel of blur, at most `samples`"
-    observable: ClassVar[Observable] = "colors"
+    name = "motion_blur"
+    cost = "one warp for each pixel of blur, at most `samples`"
+    observable = "colors"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "exposure", hint="give seconds >= 0")
-        check_fields(self, "samples", low=2, hint="give at least 2")
-
-    def along(self, path: Trajectory) -> MotionBlur:
-        """Return the blur of a camera that moves along ``path``."""
-        return replace(self, path=path)
+    exposure: float = setting(0.02, "give seconds >= 0", low=0)
+    samples: int = setting(32, "give at least 2", low=2)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Smear the colours of the frame."""

@@ -45,13 +45,11 @@ class MovingObstacles(PhysicsEffect):
     cost = "one interpolation for each obstacle, and changing contacts"
     observable = "obstacle_travel"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if an obstacle has a path."""
-        return f"{names_of(scene.carried)} moves on a path" if scene.carried else ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if no obstacle has a path."""
-        return "no object moves on a path"
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether an obstacle has a path, and why."""
+        if not scene.carried:
+            return False, "no object moves on a path"
+        return True, f"{names_of(scene.carried)} moves on a path"
 
     def build(self, draft: Draft) -> None:
         """Make the obstacles mocap bodies."""

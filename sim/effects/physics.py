@@ -57,12 +57,8 @@ class PhysicsEffect:
     cost: str
     observable: str
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return the reason why the scene requires the effect, or an empty string."""
-        raise NotImplementedError
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return the reason why the scene does not require the effect."""
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the scene requires the effect, and the reason for or against it."""
         raise NotImplementedError
 
     def build(self, draft: Draft) -> None:
@@ -82,14 +78,12 @@ class MotorEffect(PhysicsEffect):
     parameter: str
     quantity: str
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if the scene gives the parameter."""
-        value = 0.0 if scene.robot is None else float(getattr(scene.robot.motors, self.parameter))
-        return self.describe(value) if value > 0 else ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if the scene does not give the parameter."""
-        return f"no {self.quantity} is given" if scene.robot is not None else "there is no robot"
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the scene gives the parameter, and why."""
+        if scene.robot is None:
+            return False, "there is no robot"
+        value = float(getattr(scene.robot.motors, self.parameter))
+        return (True, self.describe(value)) if value > 0 else (False, f"no {self.quantity} is given")
 
     def describe(self, value: float) -> str:
         """Describe the parameter's effect in a reason."""
@@ -106,7 +100,7 @@ def physics_effect(name: str) -> PhysicsEffect:
 def effects_for(scene: Scene) -> tuple[EffectDecision, ...]:
     """Decide on every effect: physics in the order of :data:`PHYSICS`, then the sensor effects of the camera."""
     physics = (physics_effect(name) for name in PHYSICS)
-    decided = (decide(e.name, scene, e.reason_on(scene), e.reason_off(scene)) for e in physics)
+    decided = (decide(effect.name, scene, *effect.required(scene)) for effect in physics)
     return (*decided, *sensor_effects_for(scene))
 
 

@@ -7,41 +7,42 @@ from collections.abc import Sequence
 from typing import Any
 
 from splatbot.errors import InputError
-from splatbot.sim.effects.base import Effect, Effects, settings
+from splatbot.sim.effects.base import Effects, SensorEffect, settings
 
-_CLASSES = {
-    "motion_blur": ("splatbot.sim.effects.motion_blur", "MotionBlur"),
-    "rolling_shutter": ("splatbot.sim.effects.rolling_shutter", "RollingShutter"),
-    "lens_distortion": ("splatbot.sim.effects.lens_distortion", "LensDistortion"),
-    "exposure": ("splatbot.sim.effects.exposure", "Exposure"),
-    "white_balance": ("splatbot.sim.effects.white_balance", "WhiteBalance"),
-    "color_noise": ("splatbot.sim.effects.color_noise", "ColorNoise"),
-    "depth_noise": ("splatbot.sim.effects.depth_noise", "DepthNoise"),
-    "stereo_holes": ("splatbot.sim.effects.stereo_holes", "StereoHoles"),
-    "depth_holes": ("splatbot.sim.effects.depth_holes", "DepthHoles"),
-    "blackout": ("splatbot.sim.effects.blackout", "Blackout"),
-    "frame_drops": ("splatbot.sim.effects.frame_drops", "FrameDrops"),
-    "latency": ("splatbot.sim.effects.latency", "Latency"),
-}
+EFFECTS = (
+    "motion_blur",
+    "rolling_shutter",
+    "lens_distortion",
+    "exposure",
+    "white_balance",
+    "color_noise",
+    "depth_noise",
+    "stereo_holes",
+    "depth_holes",
+    "blackout",
+    "frame_drops",
+    "latency",
+)
+"""Names in the order in which the effects occur in a sensor; each is a module of this package with one class.
 
-EFFECTS = tuple(_CLASSES)
-"""Names in the order in which the effects occur in a sensor."""
+The class of the module ``motion_blur`` is ``MotionBlur``.
+"""
 
 
-def effect_class(name: str) -> type[Any]:
+def effect_class(name: str) -> type[SensorEffect]:
     """Return the class of an effect.
 
     Raises:
         InputError: the name is unknown.
     """
-    if name not in _CLASSES:
+    if name not in EFFECTS:
         raise InputError(f"there is no {name!r}.", field="effect", hint=f"effects: {', '.join(EFFECTS)}")
-    module, attribute = _CLASSES[name]
-    found: type[Any] = getattr(importlib.import_module(module), attribute)
+    module = importlib.import_module(f"splatbot.sim.effects.{name}")
+    found: type[SensorEffect] = getattr(module, name.title().replace("_", ""))
     return found
 
 
-def make_effect(spec: str, *, why: str = "") -> Effect:
+def make_effect(spec: str, *, why: str = "") -> SensorEffect:
     """Create the effect of ``spec``: `name`, or `name:option=value,option=value`.
 
     Args:
@@ -63,10 +64,9 @@ def make_effect(spec: str, *, why: str = "") -> Effect:
             )
         values[key] = _value(name, key, value, type(known[key]))
     try:
-        made: Effect = kind(why=why or f"requested as {spec}", **values)
+        return kind(why=why or f"requested as {spec}", **values)
     except InputError as error:
         raise InputError(error.message, field=f"effect {name}: {error.field}", hint=error.hint) from error
-    return made
 
 
 def make_effects(specs: Sequence[str], *, seed: int = 0, why: str = "") -> Effects:

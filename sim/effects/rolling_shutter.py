@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +10,12 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.frame import Frame
 from splatbot.geometry import Array, inverse
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import CameraMotionEffect, setting
 from splatbot.sim.effects.warping import color_at, depth_at, flow, grid, motion_during
-from splatbot.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
-class RollingShutter:
+class RollingShutter(CameraMotionEffect):
     """Simulated rolling shutter: each line of colour and depth as seen at its readout time, from top to bottom.
 
     The stamp is that of the middle line. The frame is warped by its own depth and the camera motion, as in
@@ -28,26 +26,16 @@ class RollingShutter:
 
     Args:
         readout: time from the first line to the last [s].
-        why: reason for the effect.
-        path: camera path.
 
     Raises:
         InputError: the time is out of range; on application, if the path is not known.
     """
 
-    readout: float = 0.02
-    why: str = "requested"
-    name: str = "rolling_shutter"
-    path: Trajectory | None = None
-    cost: ClassVar[str] = "two warps of depth and one of colour"
-    observable: ClassVar[Observable] = "colors"
+    name = "rolling_shutter"
+    cost = "two warps of depth and one of colour"
+    observable = "colors"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "readout", hint="give seconds >= 0")
-
-    def along(self, path: Trajectory) -> RollingShutter:
-        """Return the shutter of a camera that moves along ``path``."""
-        return replace(self, path=path)
+    readout: float = setting(0.02, "give seconds >= 0", low=0)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Warp the frame line by line."""

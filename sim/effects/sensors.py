@@ -16,7 +16,7 @@ def sensor_effects_for(scene: Scene) -> tuple[EffectDecision, ...]:
     named = {_name(spec): spec for spec in (scene.camera.sensor if scene.camera is not None else ())}
     absent = "there is no camera" if scene.camera is None else "the camera's sensor does not name it"
     return tuple(
-        decide(name, scene, f"the camera's sensor names {named[name]}" if name in named else "", absent)
+        decide(name, scene, name in named, f"the camera's sensor names {named[name]}" if name in named else absent)
         for name in EFFECTS
     )
 

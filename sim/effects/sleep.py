@@ -23,19 +23,15 @@ class Sleep(PhysicsEffect):
     cost = "negative: bodies at rest are skipped"
     observable = "asleep"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if movable objects come to rest."""
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether movable objects come to rest, and why."""
         if scene.soft:  # a flex that wakes up has stale elastic forces
-            return ""
+            return False, "soft bodies must stay awake"
+        if not scene.movable:
+            return False, "there is no movable object"
         if scene.medium is not None and any(scene.medium.wind):
-            return ""
-        return "movable objects come to rest, and bodies at rest can be skipped" if scene.movable else ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if no body can come to rest."""
-        if scene.soft:
-            return "soft bodies must stay awake"
-        return "in wind no body comes to rest" if scene.movable else "there is no movable object"
+            return False, "in wind no body comes to rest"
+        return True, "movable objects come to rest, and bodies at rest can be skipped"
 
     def build(self, draft: Draft) -> None:
         """Set MuJoCo's flag."""

@@ -25,13 +25,11 @@ class SoftBodies(PhysicsEffect):
     cost = "elastic forces and degrees of freedom for each grid corner of each body"
     observable = "deformation"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if the scene has soft objects."""
-        return f"{names_of(scene.soft)} deform" if scene.soft else ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if all objects are rigid."""
-        return "everything is rigid"
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the scene has soft objects, and why."""
+        if not scene.soft:
+            return False, "everything is rigid"
+        return True, f"{names_of(scene.soft)} deform"
 
     def build(self, draft: Draft) -> None:
         """Replace the rigid boxes by flexes, with an integrator that is stable for stiff springs."""

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields
+from splatbot.sim.effects.base import SensorEffect, setting
 
 _DISPARITY_TOLERANCE = 1.0  # [px] between a surface and itself
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
 @dataclass(frozen=True)
-class StereoHoles:
+class StereoHoles(SensorEffect):
     """Simulated missing depth of a stereo camera, in the left image; colour is unchanged.
 
     Depth is missing in three regions:
@@ -35,25 +34,19 @@ class StereoHoles:
         scatter: fraction of the other pixels that fail, 0..1.
         dark: pixels darker than this (0..255) fail for lack of light; 0 for none.
         bright: pixels at least this bright (0..255) fail by glare; 256 for none.
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    baseline: float = 0.05
-    scatter: float = 0.01
-    dark: int = 0
-    bright: int = 256
-    why: str = "requested"
-    name: str = "stereo_holes"
-    cost: ClassVar[str] = "the disparity of each pixel, and a random number"
-    observable: ClassVar[Observable] = "depth"
+    name = "stereo_holes"
+    cost = "the disparity of each pixel, and a random number"
+    observable = "depth"
 
-    def __post_init__(self) -> None:
-        check_fields(self, "baseline", hint="give metres >= 0")
-        check_fields(self, "scatter", high=1.0, hint="give a share in 0..1")
-        check_fields(self, "dark", "bright", high=256, hint="give a brightness in 0..256")
+    baseline: float = setting(0.05, "give metres >= 0", low=0)
+    scatter: float = setting(0.01, "give a share in 0..1", low=0, high=1)
+    dark: int = setting(0, "give a brightness in 0..256", low=0, high=256)
+    bright: int = setting(256, "give a brightness in 0..256", low=0, high=256)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Remove the depth that a stereo camera cannot measure."""

@@ -22,15 +22,13 @@ class TorqueLimits(PhysicsEffect):
     cost = "one clamp for each motor"
     observable = "overload"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if the task presses on an object, so that position errors would create large torques."""
-        if scene.robot is not None and scene.task.kind in _CONTACT_TASKS:
-            return f"to {scene.task.kind} creates contact forces, and motors stop at their limits"
-        return ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if the arm moves freely."""
-        return "the task creates no contact forces" if scene.robot is not None else "there is no robot"
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the task presses on an object, so that position errors would create large torques, and why."""
+        if scene.robot is None:
+            return False, "there is no robot"
+        if scene.task.kind not in _CONTACT_TASKS:
+            return False, "the task creates no contact forces"
+        return True, f"to {scene.task.kind} creates contact forces, and motors stop at their limits"
 
     def build(self, draft: Draft) -> None:
         """Enable the limits; their ranges are already in the specification."""

@@ -21,19 +21,15 @@ class ViewColor(PhysicsEffect):
     cost = "spherical harmonics of each visible Gaussian, in each rendered image"
     observable = "harmonics"
 
-    def reason_on(self, scene: Scene) -> str:
-        """Return a reason if the scene has a camera and a map with harmonics beyond degree 0."""
-        if scene.camera is not None and scene.map is not None and scene.map.harmonics:
-            return f"a camera sees a map with colours of degree {scene.map.harmonics}"
-        return ""
-
-    def reason_off(self, scene: Scene) -> str:
-        """Return a reason if there is no map, no camera, or no view-dependent colour."""
+    def required(self, scene: Scene) -> tuple[bool, str]:
+        """Return whether the scene has a camera and a map with harmonics beyond degree 0, and why."""
         if scene.map is None:
-            return "there is no map"
+            return False, "there is no map"
         if scene.camera is None:
-            return "there is no camera"
-        return "the map's colours are of degree 0"
+            return False, "there is no camera"
+        if not scene.map.harmonics:
+            return False, "the map's colours are of degree 0"
+        return True, f"a camera sees a map with colours of degree {scene.map.harmonics}"
 
     def build(self, draft: Draft) -> None:
         """Leave the physics unchanged; see :class:`splatbot.sim.map_view.MapView` for the rendering."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from splatbot.frame import Frame
-from splatbot.sim.effects.base import Observable, check_fields, check_span
+from splatbot.sim.effects.base import SensorEffect, check_span, setting
 
 
 @dataclass(frozen=True)
-class WhiteBalance:
+class WhiteBalance(SensorEffect):
     """Simulated white balance: v' = clip(gain v, 0, 255) with one gain per channel; depth is unchanged.
 
     This is the diagonal model of von Kries (1902), applied to 8-bit values without the camera's response curve.
@@ -21,24 +20,23 @@ class WhiteBalance:
         red, green, blue: gains from frame ``at`` on.
         at: first frame of the shift.
         until: first frame after it; 0 for never.
-        why: reason for the effect.
 
     Raises:
         InputError: an argument is out of range.
     """
 
-    red: float = 1.15
-    green: float = 1.0
-    blue: float = 0.85
+    name = "white_balance"
+    cost = "a table look-up for each channel"
+    observable = "colors"
+
+    red: float = setting(1.15, "give a finite gain >= 0", low=0)
+    green: float = setting(1.0, "give a finite gain >= 0", low=0)
+    blue: float = setting(0.85, "give a finite gain >= 0", low=0)
     at: int = 0
     until: int = 0
-    why: str = "requested"
-    name: str = "white_balance"
-    cost: ClassVar[str] = "a table look-up for each channel"
-    observable: ClassVar[Observable] = "colors"
 
     def __post_init__(self) -> None:
-        check_fields(self, "red", "green", "blue", hint="give a finite gain >= 0")
+        super().__post_init__()
         check_span(self.at, self.until)
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:

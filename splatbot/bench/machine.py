@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from splatbot import __version__
-from splatbot.bench.timing import isa, threads
+from splatbot.bench.native import bench_native
 from splatbot.rasterize.native import native
 
 
@@ -46,8 +46,7 @@ def raise_peaks(machine: dict[str, Any], count: int, *, peak_ms: float) -> None:
 
 def measured_peak(name: str, count: int, milliseconds: float) -> float:
     """Measure GFLOP/s of independent multiply-adds (two operations each; without FMA a product and a sum)."""
-    with threads(count), isa(name):
-        return float(native().multiply_add_peak(milliseconds))
+    return float(bench_native().multiply_add_peak(name, count, milliseconds))
 
 
 def _cpu_name() -> str:

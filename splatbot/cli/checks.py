@@ -110,8 +110,7 @@ def rasterizer_error() -> float:
     """Return the largest colour difference between kernels and reference for eight smooth Gaussians, 0..1."""
     import torch
 
-    from splatbot.rasterize import rasterization
-    from splatbot.rasterize.reference import rasterization_reference
+    from splatbot.rasterize import Gaussians, Viewpoints, rasterization, rasterization_reference
 
     n, turn = 8, torch.arange(8) * (2 * torch.pi / 8)
     scene = (
@@ -126,7 +125,9 @@ def rasterizer_error() -> float:
     means, quats, scales, opacities, colors, viewmats, Ks = scene
     fast = rasterization(means, quats, scales, opacities, colors, viewmats, Ks, 64, 48)[0]
     means, quats, scales, opacities, colors, viewmats, Ks = (t.double() for t in scene)
-    exact = rasterization_reference(means, quats, scales, opacities, colors, viewmats, Ks, 64, 48)[0]
+    exact = rasterization_reference(
+        Gaussians(means, quats, scales, opacities, colors), Viewpoints(viewmats, Ks, 64, 48)
+    )[0]
     return float((fast.double() - exact).abs().max())
 
 

@@ -33,15 +33,8 @@ def read_depth(path: Path, units_per_metre: float, *, empty: bool = False) -> ND
     Raises:
         LogError: the file is missing, truncated, corrupt, of another pixel type, or (unless ``empty``) without depth.
     """
-    image = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
-        channels = 1 if image.ndim == 2 else image.shape[2]
-        raise LogError(
-            f"has {channels} channel(s) of {image.dtype}.",
-            file=path,
-            field="depth",
-            hint="write one channel: 16-bit PNG (units of depth_scale) or 32-bit float TIFF (metres)",
-        )
+    hint = "write one channel: 16-bit PNG (units of depth_scale) or 32-bit float TIFF (metres)"
+    image = _one_channel(path, "depth", (np.uint16, np.float32), hint)
     if image.dtype == np.uint16:
         depth = image.astype(np.float32) / np.float32(units_per_metre)
     else:
@@ -62,16 +55,17 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises:
         LogError: no such file, truncated, corrupt, or not one channel of 8 bits.
     """
-    image = _decode(path, "mask", cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2 or image.dtype != np.uint8:
+    hint = "write a grey 8-bit PNG: white where a pixel may be used, black where not"
+    return _one_channel(path, "mask", (np.uint8,), hint) > 0
+
+
+def _one_channel(path: Path, field: str, types: tuple[type[np.generic], ...], hint: str) -> NDArray[Any]:
+    """Decode an image (H, W) of one of the pixel types."""
+    image = _decode(path, field, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype not in types:
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise LogError(
-            f"has {channels} channel(s) of {image.dtype}.",
-            file=path,
-            field="mask",
-            hint="write a grey 8-bit PNG: white where a pixel may be used, black where not",
-        )
-    return image > 0
+        raise LogError(f"has {channels} channel(s) of {image.dtype}.", file=path, field=field, hint=hint)
+    return image
 
 
 def _decode(path: Path, field: str, flags: int) -> NDArray[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -19,7 +20,7 @@ COLOR, DEPTH, INFO = "/camera/color/image_raw", "/camera/depth/image_raw", "/cam
 MASK, JOINTS, TRUTH = "/camera/mask/image_raw", "/joint_states", "/ground_truth/pose"
 
 
-class McapFile:
+class McapFile(AbstractContextManager["McapFile"]):
     """Writer of a recording; the file appears under its name only when it is complete.
 
     Until then the messages are in the folder `.NAME.partial` next to it, which remains after a crash.
@@ -60,9 +61,6 @@ class McapFile:
         (made,) = self._partial.glob("*.mcap")
         made.replace(self.path)
         shutil.rmtree(self._partial)
-
-    def __enter__(self) -> McapFile:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, _error: object, _trace: TracebackType | None) -> None:
         self.close()

@@ -6,6 +6,7 @@ from splatbot.rasterize.cameras import RollingShutterType, UnscentedTransformPar
 from splatbot.rasterize.rasterization import rasterization
 from splatbot.rasterize.reference import rasterization_reference
 from splatbot.rasterize.reference_surfels import rasterization_2dgs_reference
+from splatbot.rasterize.scene import Gaussians, Viewpoints
 from splatbot.rasterize.sparse import (
     Contributors,
     contributing_gaussians,
@@ -17,8 +18,10 @@ from splatbot.rasterize.surfels import rasterization_2dgs
 
 __all__ = [
     "Contributors",
+    "Gaussians",
     "RollingShutterType",
     "UnscentedTransformParameters",
+    "Viewpoints",
     "contributing_gaussians",
     "rasterization",
     "rasterization_2dgs",

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
+from splatbot.rasterize.options import DEFAULT_TILE_SIZE, parse_mode
+from splatbot.rasterize.scene import Gaussians, Viewpoints
 
 MAX_SH_DEGREE = 4
 
@@ -91,45 +93,48 @@ class Inputs:
 
 
 def check_inputs(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor | None,
-    sh_degree: int | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    masks: Tensor | None,
-    size: tuple[int, int],
-    tile_size: int,
+    gaussians: Gaussians,
+    views: Viewpoints,
+    render_mode: str,
+    *,
+    masks: Tensor | None = None,
+    tile_size: int = DEFAULT_TILE_SIZE,
 ) -> Inputs:
-    """Check, make contiguous and flatten the batch dimensions; ``colors`` None becomes (N, 0).
+    """Check, make contiguous and flatten the batch dimensions; colours that are not rendered become (N, 0).
 
     Args:
-        size: width and height of the image [px].
+        gaussians: of every view.
+        views: poses, image size and backgrounds.
+        render_mode: colours and backgrounds have no effect on a mode without colours.
+        masks: see ``rasterization``.
         tile_size: of the tiles of ``masks`` [px].
 
     Raises:
         InputError: naming the argument.
     """
-    for name, pixels in (("width", size[0]), ("height", size[1]), ("tile_size", tile_size)):
+    wants_color, _ = parse_mode(render_mode)
+    colors, sh_degree, backgrounds = gaussians.colors, gaussians.sh_degree, views.backgrounds
+    if not wants_color:
+        colors = sh_degree = backgrounds = None
+    elif colors is None:
+        raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
+    for name, pixels in (("width", views.width), ("height", views.height), ("tile_size", tile_size)):
         if isinstance(pixels, bool) or not isinstance(pixels, int) or pixels < 1:
             raise InputError(f"is {pixels!r}.", field=name, hint="give a positive integer [px]")
-    _require_tensor("means", means)
-    batch = tuple(means.shape[:-2])
-    means = _floats("means", means, (*batch, None, 3))
+    _require_tensor("means", gaussians.means)
+    batch = tuple(gaussians.means.shape[:-2])
+    means = _floats("means", gaussians.means, (*batch, None, 3))
     n = means.shape[-2]
-    viewmats = _floats("viewmats", viewmats, (*batch, None, 4, 4), double=True)
+    viewmats = _floats("viewmats", views.viewmats, (*batch, None, 4, 4), double=True)
     c = viewmats.shape[-3]
-    Ks = _floats("Ks", Ks, (*batch, c, 3, 3), double=True)
+    Ks = _floats("Ks", views.Ks, (*batch, c, 3, 3), double=True)
     _check_cameras(viewmats, Ks)
-    if covars is not None:
-        covars, quats, scales = _floats("covars", covars, (*batch, n, 3, 3)), None, None
+    quats = scales = covars = None
+    if gaussians.covars is not None:
+        covars = _floats("covars", gaussians.covars, (*batch, n, 3, 3))
     else:
-        quats = _floats("quats", quats, (*batch, n, 4))
-        scales = _floats("scales", scales, (*batch, n, 3))
+        quats = _floats("quats", gaussians.quats, (*batch, n, 4))
+        scales = _floats("scales", gaussians.scales, (*batch, n, 3))
     colors, view_colors = _check_colors(colors, sh_degree, means, (*batch, c))
     channels = colors.shape[-1]
     if backgrounds is not None:
@@ -137,9 +142,9 @@ def check_inputs(
         if not torch.isfinite(backgrounds).all():
             raise InputError("is not finite.", field="backgrounds")
     if masks is not None:
-        masks = _check_masks(masks, (*batch, c, -(-size[1] // tile_size), -(-size[0] // tile_size)))
+        masks = _check_masks(masks, (*batch, c, -(-views.height // tile_size), -(-views.width // tile_size)))
 
-    opacities = _floats("opacities", opacities, (*batch, n))
+    opacities = _floats("opacities", gaussians.opacities, (*batch, n))
     tensors = (means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds, None, masks)
     flat = [t if t is None or not batch else t.reshape(-1, *t.shape[len(batch) :]) for t in tensors]
     return Inputs(Layout(batch, c, n, view_colors), *flat)  # type: ignore[arg-type]

@@ -9,6 +9,20 @@ from types import ModuleType
 from splatbot.errors import NativeError
 
 
+def load_extension(name: str) -> ModuleType:
+    """Return the extension module of that name.
+
+    Raises:
+        NativeError: it is missing or damaged.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise NativeError(
+            f"cannot be imported ({error}).", file=name, hint="build it: pip install --editable ."
+        ) from error
+
+
 @functools.cache
 def native() -> ModuleType:
     """Return the extension module ``splatbot._native``.
@@ -16,12 +30,7 @@ def native() -> ModuleType:
     Raises:
         NativeError: it is missing, damaged, or its kernels cannot run on this CPU.
     """
-    try:
-        module = importlib.import_module("splatbot._native")
-    except ImportError as error:
-        raise NativeError(
-            f"cannot be imported ({error}).", file="splatbot._native", hint="build it: pip install --editable ."
-        ) from error
+    module = load_extension("splatbot._native")
     try:
         module.isa()
         module.num_threads()

@@ -70,6 +70,12 @@ def parse_mode(render_mode: str) -> tuple[bool, str]:
     return _MODES[render_mode]
 
 
+def harmonics_degree(render_mode: str, sh_degree: int | None) -> int:
+    """Return the degree of the harmonics that the mode renders; -1 where colours are colours, or none are rendered."""
+    wants_color, _ = parse_mode(render_mode)
+    return sh_degree if wants_color and sh_degree is not None else -1
+
+
 def check_choice(name: str, value: object, known: tuple[str, ...]) -> None:
     """Raise InputError unless the value is one of those known."""
     if value not in known:

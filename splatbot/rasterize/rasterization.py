@@ -28,10 +28,12 @@ from splatbot.rasterize.options import (
     TRANSMITTANCE_MIN,
     RasterOptions,
     check_choice,
+    harmonics_degree,
     parse_mode,
     refuse_absent,
 )
 from splatbot.rasterize.passes import run_forward
+from splatbot.rasterize.scene import Gaussians, Viewpoints
 
 DepthMode = Literal["center", "plane"]
 
@@ -168,25 +170,12 @@ def rasterization(
         return _to_gsplat(arguments)
     check_choice("backend", backend, ("native", "gsplat"))
     options = _check_options(arguments)
-    wants_color, _ = parse_mode(render_mode)
-    if not wants_color:
-        colors, backgrounds, sh_degree = None, None, None
-    elif colors is None:
-        raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
     inputs = check_inputs(
-        means,
-        quats,
-        scales,
-        covars,
-        opacities,
-        colors,
-        sh_degree,
-        viewmats,
-        Ks,
-        backgrounds,
-        masks,
-        (width, height),
-        options.tile_size,
+        Gaussians(means, quats, scales, opacities, colors, covars, sh_degree),
+        Viewpoints(viewmats, Ks, width, height, backgrounds),
+        render_mode,
+        masks=masks,
+        tile_size=options.tile_size,
     )
     if options.sparse_grad and inputs.layout.batch:
         raise InputError(
@@ -201,6 +190,7 @@ def rasterization(
     )
     renders, alphas, meta = _render(inputs, options)
     if render_mode.endswith("MD"):
+        wants_color, _ = parse_mode(render_mode)
         renders = _with_median(inputs, options, renders if wants_color else None, meta)
     if return_normals:
         meta["normals"] = _render_normals(inputs, options, parallel=camera_model == "ortho")
@@ -272,8 +262,7 @@ def _check_options(given: dict[str, Any]) -> RasterOptions:
         raise InputError("is set together with depth_mode='plane'.", field="covars", hint="give quats and scales")
     if given["render_mode"].endswith("MD") and given["depth_mode"] == "plane":
         raise InputError("'plane' is not for median depth.", field="depth_mode", hint="use 'center'")
-    wants_color, depth = parse_mode(given["render_mode"])
-    sh_degree = given["sh_degree"] if wants_color else None
+    _, depth = parse_mode(given["render_mode"])
     return RasterOptions(
         width=given["width"],
         height=given["height"],
@@ -281,7 +270,7 @@ def _check_options(given: dict[str, Any]) -> RasterOptions:
         far_plane=float(given["far_plane"]),
         radius_clip=float(given["radius_clip"]),
         eps2d=float(given["eps2d"]),
-        sh_degree=-1 if sh_degree is None else sh_degree,
+        sh_degree=harmonics_degree(given["render_mode"], given["sh_degree"]),
         depth=depth,
         plane_depth=given["depth_mode"] == "plane" and depth != "none",
         antialiased=given["rasterize_mode"] == "antialiased",

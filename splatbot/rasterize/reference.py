@@ -14,6 +14,7 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.rasterize.harmonics import harmonics_basis
+from splatbot.rasterize.scene import Gaussians, Viewpoints
 
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
@@ -51,63 +52,54 @@ class ReferenceProjection:
     slope: Tensor  # (N, 2) change of depth per pixel
 
 
-# Arguments: means, quats, scales, covars (or None, then quats and scales), viewmat (4, 4), K (3, 3), width, height,
-# eps2d.
-Projector = Callable[
-    [Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor, Tensor, int, int, float], ReferenceProjection
-]
+@dataclass(frozen=True)
+class ReferenceView:
+    """One view, seen from ``viewmat`` (4, 4) with the intrinsics ``K`` (3, 3)."""
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+
+# Arguments: the Gaussians (covars, or quats and scales), the view, eps2d.
+Projector = Callable[[Gaussians, ReferenceView, float], ReferenceProjection]
 
 
 def rasterization_reference(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    gaussians: Gaussians,
+    viewpoints: Viewpoints,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    covars: Tensor | None = None,
     *,
     depth_mode: Literal["center", "plane"] = "center",
     transmittance_min: float = TRANSMITTANCE_MIN,
     project: Projector | None = None,
 ) -> tuple[Tensor, Tensor, ReferenceMeta]:
-    """Render as :func:`splatbot.rasterize.rasterization`, computed in the type of ``means`` by torch alone.
+    """Render as :func:`splatbot.rasterize.rasterization`, computed in the type of the means by torch alone.
 
-    Args and returns: see there, but without batch dimensions; ``colors`` (N, D), (C, N, D) or None, with ``sh_degree``
-    (N, K, 3) or (C, N, K, 3). ``project``: another camera than the pinhole, see ``reference_cameras``.
+    Args and returns: see there, but without batch dimensions. Colours are (N, D), (C, N, D) or None, with a degree of
+    harmonics (N, K, 3) or (C, N, K, 3). ``project``: another camera than the pinhole, see ``reference_cameras``.
 
     Raises:
         InputError: an unknown render mode.
     """
-    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
-        raise InputError(f"is {render_mode!r}.", field="render_mode", hint="one of RGB, D, ED, RGB+D, RGB+ED")
+    _check_mode(render_mode)
+    near, far = _planes(near_plane, far_plane)
+    width, height = viewpoints.width, viewpoints.height
+    pixels = _pixel_centers(width, height, gaussians.means)
     renders, alphas, metas = [], [], []
-    for i in range(len(viewmats)):
-        view_colors = None
-        if colors is not None and "RGB" in render_mode:
-            view_colors = colors[i] if colors.ndim == (3 if sh_degree is None else 4) else colors
-        if view_colors is not None and sh_degree is not None:
-            view_colors = _shade(view_colors, sh_degree, means, viewmats[i])
-        background = None if backgrounds is None or view_colors is None else backgrounds[i]
-        given = (means, quats, scales, covars, viewmats[i], Ks[i], width, height, eps2d)
-        projected = _project(*given, depth_mode) if project is None else project(*given)
-        blended = opacities * _antialias(projected) if rasterize_mode == "antialiased" else opacities
-        # The kernels hold the planes in float32: a float32 Gaussian on the plane must be kept here as well.
-        near, far = (float(torch.tensor(plane, dtype=torch.float32)) for plane in (near_plane, far_plane))
+    for i, view in enumerate(_views_of(viewpoints)):
+        view_colors, background = _colors_of_view(gaussians, viewpoints, i, render_mode)
+        projected = _project(gaussians, view, eps2d, depth_mode) if project is None else project(gaussians, view, eps2d)
+        antialiased = rasterize_mode == "antialiased"
+        blended = gaussians.opacities * _antialias(projected) if antialiased else gaussians.opacities
         keep = (projected.depth >= near) & (projected.depth <= far)
         order = torch.argsort(projected.depth.detach().float(), stable=True)
         order = order[keep[order]]
-        pixels = _pixel_centers(width, height, means)
         weights, left, margin = _blend(projected, blended, order, pixels, transmittance_min)
         channels = _channels(projected, view_colors, order, pixels, render_mode)
         image = _composite(weights, channels, left, background, render_mode)
@@ -116,6 +108,35 @@ def rasterization_reference(
         metas.append((projected.mean2d, projected.covar2d, projected.depth, margin.reshape(height, width)))
     meta = ReferenceMeta(*(torch.stack(column) for column in zip(*metas, strict=True)))
     return torch.stack(renders), torch.stack(alphas), meta
+
+
+def _check_mode(render_mode: str) -> None:
+    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
+        raise InputError(f"is {render_mode!r}.", field="render_mode", hint="one of RGB, D, ED, RGB+D, RGB+ED")
+
+
+def _planes(near_plane: float, far_plane: float) -> tuple[float, float]:
+    """Round the planes to float32, as the kernels hold them: a float32 Gaussian on the plane must be kept as well."""
+    near, far = (float(torch.tensor(plane, dtype=torch.float32)) for plane in (near_plane, far_plane))
+    return near, far
+
+
+def _views_of(viewpoints: Viewpoints) -> list[ReferenceView]:
+    size = viewpoints.width, viewpoints.height
+    return [ReferenceView(viewmat, K, *size) for viewmat, K in zip(viewpoints.viewmats, viewpoints.Ks, strict=True)]
+
+
+def _colors_of_view(
+    gaussians: Gaussians, viewpoints: Viewpoints, i: int, render_mode: str
+) -> tuple[Tensor | None, Tensor | None]:
+    """Return the colours (N, D) and the background (D,) of view i, each None where the mode does not render it."""
+    colors, sh_degree, backgrounds = gaussians.colors, gaussians.sh_degree, viewpoints.backgrounds
+    if colors is None or "RGB" not in render_mode:
+        return None, None
+    shown = colors[i] if colors.ndim == (3 if sh_degree is None else 4) else colors
+    if sh_degree is not None:
+        shown = _shade(shown, sh_degree, gaussians.means, viewpoints.viewmats[i])
+    return shown, None if backgrounds is None else backgrounds[i]
 
 
 def _shade(coefficients: Tensor, degree: int, means: Tensor, viewmat: Tensor) -> Tensor:
@@ -146,19 +167,10 @@ def reference_rotations(quats: Tensor) -> Tensor:
     return torch.stack(rows, -2)
 
 
-def _project(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    eps2d: float,
-    depth_mode: str,
-) -> ReferenceProjection:
+def _project(gaussians: Gaussians, view: ReferenceView, eps2d: float, depth_mode: str) -> ReferenceProjection:
     """Project by EWA splatting (Zwicker et al. 2001, eq. 24 and 29)."""
+    means, quats, scales = gaussians.means, gaussians.quats, gaussians.scales
+    viewmat, K, width, height = view.viewmat, view.K, view.width, view.height
     W, t = viewmat[:3, :3].to(means.dtype), viewmat[:3, 3].to(means.dtype)
     fx, fy, cx, cy = (v.to(means.dtype) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     p = means @ W.T + t
@@ -170,8 +182,8 @@ def _project(
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).reshape(-1, 2, 3)
     slopes = torch.zeros(len(means), 2, dtype=means.dtype)
-    if covars is not None:
-        upper = covars.triu()
+    if gaussians.covars is not None:
+        upper = gaussians.covars.triu()
         sharp2d = J @ W @ (upper + upper.triu(1).mT) @ W.mT @ J.mT
     elif quats is not None and scales is not None:
         axes = W @ reference_rotations(quats)  # columns: the Gaussian's axes in the camera frame

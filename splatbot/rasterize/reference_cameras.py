@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
-from splatbot.rasterize.reference import Projector, ReferenceProjection, reference_rotations
+from splatbot.rasterize.reference import Projector, ReferenceProjection, ReferenceView, reference_rotations
+from splatbot.rasterize.scene import Gaussians
 
 # Pixels (..., 2) of points (..., 3) of the camera frame; the intrinsics are (3, 3).
 PointCamera = Callable[[Tensor, Tensor], Tensor]
@@ -62,22 +63,12 @@ def ortho_points(points: Tensor, K: Tensor) -> Tensor:
 def affine_projector(camera: PointCamera) -> Projector:
     """Return the EWA projector: the covariance through the camera's derivative at the centre, J Σ Jᵀ."""
 
-    def project(
-        means: Tensor,
-        quats: Tensor | None,
-        scales: Tensor | None,
-        covars: Tensor | None,
-        viewmat: Tensor,
-        K: Tensor,
-        width: int,
-        height: int,
-        eps2d: float,
-    ) -> ReferenceProjection:
-        p = _to_camera(means, viewmat)
-        derivative = torch.func.vmap(torch.func.jacrev(lambda point: camera(point, K)))(p)
-        J = derivative @ viewmat[:3, :3]
-        covar2d = J @ _covariances(quats, scales, covars) @ J.mT
-        return _projection(camera(p, K), covar2d, p[:, 2], eps2d)
+    def project(gaussians: Gaussians, view: ReferenceView, eps2d: float) -> ReferenceProjection:
+        p = _to_camera(gaussians.means, view.viewmat)
+        derivative = torch.func.vmap(torch.func.jacrev(lambda point: camera(point, view.K)))(p)
+        J = derivative @ view.viewmat[:3, :3]
+        covar2d = J @ _covariances(gaussians) @ J.mT
+        return _projection(camera(p, view.K), covar2d, p[:, 2], eps2d)
 
     return project
 
@@ -101,17 +92,8 @@ def unscented_projector(
         shutter: one of ``LINES``, whose lines are read from the view's pose to ``last``, (4, 4).
     """
 
-    def project(
-        means: Tensor,
-        quats: Tensor | None,
-        scales: Tensor | None,
-        covars: Tensor | None,
-        viewmat: Tensor,
-        K: Tensor,
-        width: int,
-        height: int,
-        eps2d: float,
-    ) -> ReferenceProjection:
+    def project(gaussians: Gaussians, view: ReferenceView, eps2d: float) -> ReferenceProjection:
+        means, quats, scales = gaussians.means, gaussians.quats, gaussians.scales
         if quats is None or scales is None:
             raise InputError("are missing.", field="quats, scales", hint="the unscented transform needs the axes")
         spread = alpha**2 * (3 + kappa)
@@ -122,12 +104,12 @@ def unscented_projector(
         covar_weights = weights.clone()
         covar_weights[0] += 1 - alpha**2 + beta
         if shutter is None or last is None:
-            middle = viewmat
-            inside = _to_camera(points, viewmat)
-            pixels = camera(inside, K)
+            middle = view.viewmat
+            inside = _to_camera(points, view.viewmat)
+            pixels = camera(inside, view.K)
         else:
-            middle = _pose_between(viewmat, last, torch.tensor(0.5, dtype=means.dtype))
-            pixels, inside = _read(points, lambda p: camera(p, K), viewmat, last, LINES[shutter], width, height)
+            middle = _pose_between(view.viewmat, last, torch.tensor(0.5, dtype=means.dtype))
+            pixels, inside = _read(points, camera, view, last, LINES[shutter])
         mean2d = (weights[:, None] * pixels).sum(1)
         d = pixels - mean2d[:, None]
         covar2d = torch.einsum("p,npi,npj->nij", covar_weights, d, d)
@@ -139,10 +121,11 @@ def unscented_projector(
     return project
 
 
-def _covariances(quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -> Tensor:
+def _covariances(gaussians: Gaussians) -> Tensor:
     """Return the covariances (N, 3, 3) [m²]; of given ones, the upper triangle counts."""
-    if covars is not None:
-        upper = covars.triu()
+    quats, scales = gaussians.quats, gaussians.scales
+    if gaussians.covars is not None:
+        upper = gaussians.covars.triu()
         return upper + upper.triu(1).mT
     if quats is None or scales is None:
         raise InputError("are missing.", field="quats, scales", hint="give them, or covars")
@@ -156,23 +139,17 @@ def _projection(mean2d: Tensor, sharp2d: Tensor, depth: Tensor, eps2d: float) ->
 
 
 def _read(
-    points: Tensor,
-    camera: Callable[[Tensor], Tensor],
-    first: Tensor,
-    last: Tensor,
-    lines: Lines,
-    width: int,
-    height: int,
+    points: Tensor, camera: PointCamera, view: ReferenceView, last: Tensor, lines: Lines
 ) -> tuple[Tensor, Tensor]:
     """Project world points, each at the readout time of its line; return pixels and points in the camera frame."""
     time = torch.full(points.shape[:-1], 0.5, dtype=points.dtype)
     inside = points
     for _ in range(_SHUTTER_ROUNDS):
-        poses = _pose_between(first, last, time)
+        poses = _pose_between(view.viewmat, last, time)
         inside = (poses[..., :3, :3] @ points[..., None])[..., 0] + poses[..., :3, 3]
-        line, count = lines(camera(inside), width, height)
+        line, count = lines(camera(inside, view.K), view.width, view.height)
         time = (line / max(count - 1, 1)).clamp(0.0, 1.0) if count > 1 else torch.zeros_like(line)
-    return camera(inside), inside
+    return camera(inside, view.K), inside
 
 
 def _pose_between(first: Tensor, last: Tensor, time: Tensor) -> Tensor:

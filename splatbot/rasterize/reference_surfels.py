@@ -16,11 +16,15 @@ from splatbot.rasterize.reference import (
     ALPHA_MAX,
     ALPHA_MIN,
     TRANSMITTANCE_MIN,
+    _check_mode,
+    _colors_of_view,
     _margins,
     _pixel_centers,
-    _shade,
+    _planes,
+    _views_of,
     reference_rotations,
 )
+from splatbot.rasterize.scene import Gaussians, Viewpoints
 
 FILTER = 2.0  # 1 / variance of the screen-space low-pass filter [px⁻²]
 LEAST_SCALE = 1e-6  # [px] a thinner disc counts as this thick: below, only the low-pass filter is seen
@@ -54,60 +58,49 @@ class _Hits:
 
 
 def rasterization_2dgs_reference(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    surfels: Gaussians,
+    viewpoints: Viewpoints,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     distloss: bool = False,
     depth_mode: Literal["expected", "median"] = "expected",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, SurfelReferenceMeta]:
-    """Render as :func:`splatbot.rasterize.rasterization_2dgs`, computed in the type of ``means`` by torch alone.
+    """Render as :func:`splatbot.rasterize.rasterization_2dgs`, computed in the type of the means by torch alone.
 
     Raises:
-        InputError: an unknown render mode.
+        InputError: an unknown render mode, or the surfels have no axes.
     """
-    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
-        raise InputError(f"is {render_mode!r}.", field="render_mode", hint="one of RGB, D, ED, RGB+D, RGB+ED")
+    _check_mode(render_mode)
+    means, quats, scales = surfels.means, surfels.quats, surfels.scales
+    if quats is None or scales is None:
+        raise InputError("are missing.", field="quats, scales", hint="give the axes of the surfels")
+    near, far = _planes(near_plane, far_plane)
+    width, height = viewpoints.width, viewpoints.height
     pixels = _pixel_centers(width, height, means)
-    near, far = (float(torch.tensor(plane, dtype=torch.float32)) for plane in (near_plane, far_plane))
     views = []
-    for i in range(len(viewmats)):
-        R, t = viewmats[i, :3, :3], viewmats[i, :3, 3]
+    for i, view in enumerate(_views_of(viewpoints)):
+        shown, background = _colors_of_view(surfels, viewpoints, i, render_mode)
+        R, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
         centers = means @ R.T + t
         axes = R @ reference_rotations(quats)
         z = centers[:, 2]
         order = torch.argsort(z.detach().float(), stable=True)
         order = order[((z >= near) & (z <= far))[order]]
-        hits = _hit(centers[order], axes[order], scales[order], opacities[order], Ks[i], pixels, near)
+        hits = _hit(centers[order], axes[order], scales[order], surfels.opacities[order], view.K, pixels, near)
         facing = torch.where((axes[..., 2] * centers).sum(-1, keepdim=True) < 0, 1.0, -1.0).detach()
         normals = reference_rotations(quats)[..., 2] * facing
-        shown = None
-        if colors is not None and "RGB" in render_mode:
-            shown = colors[i] if colors.ndim == (3 if sh_degree is None else 4) else colors
-        if shown is not None and sh_degree is not None:
-            shown = _shade(shown, sh_degree, means, viewmats[i])
-        background = None if backgrounds is None or shown is None else backgrounds[i]
         images = _composite(
             hits, None if shown is None else shown[order], normals[order], background, render_mode, distloss
         )
-        projected = torch.stack([Ks[i, k, k] * centers[:, k] / z + Ks[i, k, 2] for k in (0, 1)], -1)
+        projected = torch.stack([view.K[k, k] * centers[:, k] / z + view.K[k, 2] for k in (0, 1)], -1)
         views.append((*(image.reshape(height, width, -1) for image in images), projected, z))
     render, alpha, normal, distort, median, ratio, margin, means2d, depths = (
         torch.stack(column) for column in zip(*views, strict=True)
     )
     surf_normals = None
     if "D" in render_mode:
-        surf_normals = depth_to_normal(median if depth_mode == "median" else ratio, viewmats, Ks)
+        surf_normals = depth_to_normal(median if depth_mode == "median" else ratio, viewpoints.viewmats, viewpoints.Ks)
     meta = SurfelReferenceMeta(means2d, depths, margin[..., 0])
     return render, alpha, normal, surf_normals, distort if distloss else None, median, meta
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from splatbot.rasterize.inputs import check_inputs
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import native
 from splatbot.rasterize.rasterization import rasterization
+from splatbot.rasterize.scene import Gaussians, Viewpoints
 
 _CELL = 4  # [px] side of the squares that the kernels leave out or render
 
@@ -32,25 +33,15 @@ class Contributors:
 
 
 def rasterize_pixels(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    pixels: Tensor,
-    **options: Any,
+    gaussians: Gaussians, viewpoints: Viewpoints, pixels: Tensor, **options: Any
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render P pixels of each of C views; bit for bit those of the whole picture; differentiable.
 
     All Gaussians are projected, as for the whole; blending is done in the 4x4 blocks that hold a requested pixel.
 
     Args:
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, options: as of ``rasterization``, without
-            batch dimensions, ``masks`` and ``tile_size``.
+        gaussians, viewpoints: without batch dimensions.
+        options: as of ``rasterization``, without ``masks`` and ``tile_size``.
         pixels: (P, 2), or (C, P, 2) for other pixels in each view: integers x, y; may repeat.
 
     Returns:
@@ -59,27 +50,17 @@ def rasterize_pixels(
     Raises:
         InputError: a pixel lies outside the image, or as ``rasterization``.
     """
-    at = _pixels_of(pixels, viewmats, width, height)
-    masks = _cells(at // _CELL, width, height, _CELL)
+    at = _pixels_of(pixels, viewpoints)
     _refuse(options, "masks", "tile_size")
-    renders, alphas, meta = rasterization(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, masks=masks, tile_size=_CELL, **options
-    )
+    renders, alphas, meta = _render_cells(gaussians, viewpoints, at // _CELL, _CELL, options)
     view = torch.arange(len(at))[:, None]
     x, y = at.unbind(-1)
     return renders[view, y, x], alphas[view, y, x], meta
 
 
 def rasterize_tiles(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    gaussians: Gaussians,
+    viewpoints: Viewpoints,
     tiles: Tensor,
     tile_size: int = 16,
     **options: Any,
@@ -87,8 +68,8 @@ def rasterize_tiles(
     """Render T square tiles of each of C views; bit for bit those of the whole picture; differentiable.
 
     Args:
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, options: as of ``rasterization``, without
-            batch dimensions and ``masks``.
+        gaussians, viewpoints: without batch dimensions.
+        options: as of ``rasterization``, without ``masks``.
         tiles: (T, 2), or (C, T, 2): integers column, row; may repeat.
         tile_size: side of a tile [px].
 
@@ -101,24 +82,11 @@ def rasterize_tiles(
     """
     if isinstance(tile_size, bool) or not isinstance(tile_size, int) or tile_size < 1:
         raise InputError(f"is {tile_size!r}.", field="tile_size", hint="give a positive integer [px]")
-    columns, rows = -(-width // tile_size), -(-height // tile_size)
-    at = _pixels_of(tiles, viewmats, columns, rows, name="tiles")
+    width, height = viewpoints.width, viewpoints.height
+    grid = replace(viewpoints, width=-(-width // tile_size), height=-(-height // tile_size))
+    at = _pixels_of(tiles, grid, name="tiles")
     _refuse(options, "masks")
-    masks = _cells(at, width, height, tile_size)
-    renders, alphas, meta = rasterization(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        masks=masks,
-        tile_size=tile_size,
-        **options,
-    )
+    renders, alphas, meta = _render_cells(gaussians, viewpoints, at, tile_size, options)
     inside = torch.arange(tile_size)
     x = (at[..., 0, None] * tile_size + inside)[..., None, :]
     y = (at[..., 1, None] * tile_size + inside)[..., :, None]
@@ -130,14 +98,8 @@ def rasterize_tiles(
 
 
 def contributing_gaussians(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    gaussians: Gaussians,
+    viewpoints: Viewpoints,
     pixels: Tensor,
     k: int = 8,
     **options: Any,
@@ -145,8 +107,8 @@ def contributing_gaussians(
     """Return the front k Gaussians that contribute to each of P pixels and their weights; without gradients.
 
     Args:
-        means, quats, scales, opacities, viewmats, Ks, width, height, options: as of ``rasterization``, without batch
-            dimensions, ``masks``, ``tile_size`` and ``render_mode``.
+        gaussians, viewpoints: without batch dimensions; colours have no effect.
+        options: as of ``rasterization``, without ``masks``, ``tile_size`` and ``render_mode``.
         pixels: (P, 2), or (C, P, 2) for other pixels in each view: integers x, y; may repeat.
         k: how many to a pixel, at least 1.
 
@@ -155,29 +117,14 @@ def contributing_gaussians(
     """
     if isinstance(k, bool) or not isinstance(k, int) or k < 1:
         raise InputError(f"is {k!r}.", field="k", hint="give a positive integer")
-    at = _pixels_of(pixels, viewmats, width, height)
-    masks = _cells(at // _CELL, width, height, _CELL)
-    _refuse(options, "masks", "tile_size", "render_mode", "colors")
+    at = _pixels_of(pixels, viewpoints)
+    _refuse(options, "masks", "tile_size", "render_mode")
     with torch.no_grad():
-        _, _, meta = rasterization(
-            means,
-            quats,
-            scales,
-            opacities,
-            None,
-            viewmats,
-            Ks,
-            width,
-            height,
-            render_mode="D",
-            masks=masks,
-            tile_size=_CELL,
-            **options,
-        )
+        _, _, meta = _render_cells(gaussians, viewpoints, at // _CELL, _CELL, {**options, "render_mode": "D"})
     ids = torch.empty(*at.shape[:2], k, dtype=torch.int64)
     weights = torch.empty(*at.shape[:2], k)
     for c, state in enumerate(meta.states):
-        unique, inverse = torch.unique(at[c, :, 1] * width + at[c, :, 0], return_inverse=True)
+        unique, inverse = torch.unique(at[c, :, 1] * viewpoints.width + at[c, :, 0], return_inverse=True)
         found = torch.empty(len(unique), k, dtype=torch.int32)
         shares = torch.empty(len(unique), k)
         state.fronts(unique.numpy(), found.numpy(), shares.numpy())
@@ -186,42 +133,34 @@ def contributing_gaussians(
 
 
 def visible_gaussians(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    gaussians: Gaussians,
+    viewpoints: Viewpoints,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     rasterize_mode: str = "classic",
     camera_model: str = "pinhole",
-    covars: Tensor | None = None,
     **camera: Any,
 ) -> Tensor:
     """Mark the Gaussians (C, N) bool in each view's frustum, hidden behind others or not. Render no image.
 
-    The arguments are those of ``rasterization`` without batch dimensions; ``camera`` holds ``with_ut`` and its options.
+    The options are those of ``rasterization``; ``camera`` holds ``with_ut`` and its options. The tensors have no batch
+    dimensions.
 
     Raises:
         InputError: as ``rasterization``.
     """
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f"{rasterize_mode!r} is not supported.", field="rasterize_mode", hint="classic, antialiased")
-    _one_scene(viewmats)
-    inputs = check_inputs(
-        means, quats, scales, covars, opacities, None, None, viewmats, Ks, None, None, (width, height), _CELL
-    ).detached()
+    _one_scene(viewpoints)
+    inputs = check_inputs(gaussians, viewpoints, "D").detached()
     try:
         settings = CameraSettings(camera_model, **camera)
     except TypeError as error:
         raise InputError(f"are not all known ({error}).", field="options", hint="see rasterization") from error
     lenses, poses, _ = cameras_of(settings, inputs.viewmats, float(near_plane))
-    seen = torch.zeros(len(poses), len(means), dtype=torch.bool)
+    seen = torch.zeros(len(poses), inputs.layout.n_gaussians, dtype=torch.bool)
     for c in range(len(poses)):
         found = native().visible_gaussians(
             inputs.means,
@@ -231,8 +170,8 @@ def visible_gaussians(
             inputs.opacities,
             poses[c].double().contiguous(),
             inputs.Ks[c].double().contiguous(),
-            width,
-            height,
+            viewpoints.width,
+            viewpoints.height,
             float(near_plane),
             float(far_plane),
             float(radius_clip),
@@ -246,10 +185,10 @@ def visible_gaussians(
     return seen
 
 
-def _pixels_of(pixels: Tensor, viewmats: Tensor, width: int, height: int, name: str = "pixels") -> Tensor:
+def _pixels_of(pixels: Tensor, viewpoints: Viewpoints, name: str = "pixels") -> Tensor:
     """Return the checked pixels (C, P, 2) int64."""
-    _one_scene(viewmats)
-    views = len(viewmats)
+    _one_scene(viewpoints)
+    views, width, height = len(viewpoints.viewmats), viewpoints.width, viewpoints.height
     if not isinstance(pixels, Tensor) or pixels.is_floating_point() or pixels.is_complex():
         raise InputError("holds no integers.", field=name, hint="give an integer tensor (P, 2)")
     if pixels.shape[-1:] != (2,) or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and len(pixels) != views):
@@ -262,16 +201,19 @@ def _pixels_of(pixels: Tensor, viewmats: Tensor, width: int, height: int, name: 
     return at
 
 
-def _one_scene(viewmats: Tensor) -> None:
+def _one_scene(viewpoints: Viewpoints) -> None:
+    viewmats = viewpoints.viewmats
     if not isinstance(viewmats, Tensor) or viewmats.ndim != 3:
         raise InputError("is not (C, 4, 4).", field="viewmats", hint="batch dimensions are for rasterization()")
 
 
-def _cells(at: Tensor, width: int, height: int, size: int) -> Tensor:
-    """Mask (C, rows, columns) of the square cells at (C, P, 2)."""
-    masks = torch.zeros(len(at), -(-height // size), -(-width // size), dtype=torch.bool)
+def _render_cells(
+    gaussians: Gaussians, viewpoints: Viewpoints, at: Tensor, size: int, options: dict[str, Any]
+) -> tuple[Tensor, Tensor, RenderMeta]:
+    """Render the square cells at (C, P, 2) alone."""
+    masks = torch.zeros(len(at), -(-viewpoints.height // size), -(-viewpoints.width // size), dtype=torch.bool)
     masks[torch.arange(len(at))[:, None], at[..., 1], at[..., 0]] = True
-    return masks
+    return rasterization(**vars(gaussians), **vars(viewpoints), masks=masks, tile_size=size, **options)
 
 
 def _refuse(options: dict[str, Any], *names: str) -> None:

@@ -11,7 +11,8 @@ from splatbot.errors import InputError
 from splatbot.rasterize.depth_normals import depth_to_normal
 from splatbot.rasterize.inputs import Inputs, check_inputs
 from splatbot.rasterize.native import native
-from splatbot.rasterize.options import DEFAULT_TILE_SIZE, check_choice, parse_mode
+from splatbot.rasterize.options import check_choice, harmonics_degree, parse_mode
+from splatbot.rasterize.scene import Gaussians, Viewpoints
 from splatbot.rasterize.surfel_autograd import RasterizeSurfels, SurfelOptions
 from splatbot.rasterize.surfel_meta import SurfelMeta
 
@@ -95,25 +96,11 @@ def rasterization_2dgs(
     """
     _reject_unsupported(sparse_grad, absgrad, depth_mode)
     check_choice("render_mode", render_mode, _MODES)
-    wants_color, depth = parse_mode(render_mode)
-    if not wants_color:
-        colors, backgrounds, sh_degree = None, None, None
-    elif colors is None:
-        raise InputError(f"is missing for {render_mode}.", field="colors", hint="give colours, or render_mode='D'")
+    _, depth = parse_mode(render_mode)
     inputs = check_inputs(
-        means,
-        quats,
-        scales,
-        None,
-        opacities,
-        colors,
-        sh_degree,
-        viewmats,
-        Ks,
-        backgrounds,
-        None,
-        (width, height),
-        DEFAULT_TILE_SIZE,
+        Gaussians(means, quats, scales, opacities, colors, sh_degree=sh_degree),
+        Viewpoints(viewmats, Ks, width, height, backgrounds),
+        render_mode,
     )
     if inputs.layout.batch:
         raise InputError("has batch dimensions.", field="means", hint="render surfels of one scene at a time")
@@ -123,7 +110,7 @@ def rasterization_2dgs(
         near_plane=float(near_plane),
         far_plane=float(far_plane),
         radius_clip=float(radius_clip),
-        sh_degree=-1 if sh_degree is None else sh_degree,
+        sh_degree=harmonics_degree(render_mode, sh_degree),
         view_colors=inputs.layout.view_colors,
         depth=depth,
         distortion=distloss,

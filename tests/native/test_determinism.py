@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,12 +17,7 @@ from tests.scenes import NAMES, Scene, compare, hard_scene, relative_l2
 
 TESTS = Path(__file__).parents[1]
 
-
-@pytest.fixture(autouse=True)
-def _restore() -> Iterator[None]:
-    yield
-    native().set_num_threads(0)
-    native().set_isa("")
+pytestmark = pytest.mark.usefixtures("default_kernels")
 
 
 def large_scene() -> Scene:

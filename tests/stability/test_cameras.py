@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatbot.geometry import se3_exp
 from splatbot.rasterize.cameras import pinhole_limit
-from splatbot.rasterize.reference import Projector
+from splatbot.rasterize.reference import Projector, ReferenceView
 from splatbot.rasterize.reference_cameras import (
     affine_projector,
     fisheye_points,
@@ -181,9 +181,7 @@ def test_every_camera_ten_kilometres_from_the_origin(camera: str) -> None:
     project, options = CAMERAS[camera]
     _, _, meta = Scene(**{**vars(scene), "viewmats": viewmats}).render("RGB", packed=False, **options)
     exact = scene.to(torch.float64)
-    want = project(
-        exact.means, exact.quats, exact.scales, None, viewmats[0], exact.Ks[0], scene.width, scene.height, 0.3
-    )
+    want = project(exact.gaussians(), ReferenceView(viewmats[0], exact.Ks[0], scene.width, scene.height), 0.3)
     seen = meta["visibility"][0]
     assert int(seen.sum()) > 50
     near_image = (want.mean2d[seen].abs() < 1000).all(-1)

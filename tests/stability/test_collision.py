@@ -13,7 +13,7 @@ from splatbot.collision.solids import SCALE_FLOOR
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.robots.panda import panda
-from tests.unit.collision.oracle import Array, gaussians, local, random_gaussians, signed_distances
+from tests.unit.collision.oracle import Array, gaussians, local, moved, random_gaussians, signed_distances
 
 UNDER, ROUNDED_UP = 4e-6, 1e-6  # of ClearanceResult
 
@@ -199,13 +199,8 @@ def test_rotating_map_and_points_changes_no_distance_by_more_than_its_error() ->
     model = random_gaussians(200, rng, least=5e-3)
     points = rng.uniform(-1, 1, (300, 3))
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
-    turned = gaussians(
-        turn.apply(model.means.double().numpy()),
-        model.scales.double().numpy(),
-        (turn * Rotation.from_quat(model.quats.double().numpy(), scalar_first=True)).as_quat(scalar_first=True),
-    )
     before = GaussianCollisionField(model).clearance(points).distance
-    after = GaussianCollisionField(turned).clearance(turn.apply(points)).distance
+    after = GaussianCollisionField(moved(model, turn)).clearance(turn.apply(points)).distance
     np.testing.assert_allclose(after, before, atol=5e-6)
 
 

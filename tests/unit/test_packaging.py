@@ -76,14 +76,14 @@ def test_the_package_is_whole_when_installed_from(pattern: str, built: Path, tmp
         "import sys; sys.meta_path[:] = [f for f in sys.meta_path if 'Editable' not in type(f).__name__"
         " and 'ScikitBuild' not in type(f).__name__]; sys.path.insert(0, sys.argv[1])\n"
         "import importlib, splatbot\n"
-        "for name in ('services', 'sim', 'robots', 'configs', '_native'):\n"
+        "for name in ('services', 'sim', 'robots', 'configs', '_native', '_bench_native'):\n"
         "    print(importlib.import_module(f'splatbot.{name}').__file__)\n"
         "from importlib.resources import files\n"
         "print(files('splatbot.configs') / 'default.yaml')"
     )
     environ = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     places = _run(sys.executable, "-c", code, str(target), cwd=tmp_path, env=environ).split()
-    assert len(places) == 6
+    assert len(places) == 7
     assert all(place.startswith(str(target)) and Path(place).is_file() for place in places), places
     assert not (target / "splatbot" / "native").exists(), "C++ sources belong into the sdist alone"
     assert not any((target / name).exists() for name in LINKED), "a generic top-level name landed in site-packages"

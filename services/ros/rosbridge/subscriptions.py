@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from splatbot.errors import InputError
 from splatbot.logs.ros_types import full_name
 from splatbot.services.bus import Subscription
+from splatbot.services.ros.deliveries import Deliveries
 from splatbot.services.ros.graph import RosGraph, resolve
 from splatbot.services.ros.rosbridge.packing import (
     Compression,
@@ -56,7 +57,7 @@ class Subscriptions:
     def __init__(self, graph: RosGraph, send: Send, most: int = 256) -> None:
         self._graph, self._send, self._most = graph, send, most
         self._wishes: dict[str, dict[Any, _SubscribeOptions]] = {}
-        self._tasks: dict[str, tuple[asyncio.Task[None], Subscription]] = {}
+        self._deliveries: Deliveries[str] = Deliveries(graph)
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -102,19 +103,14 @@ class Subscriptions:
             self._restart(topic, latched=False)
         else:
             self._wishes.pop(topic, None)
-            self._stop(topic)
+            self._deliveries.stop(topic)
 
     async def close(self) -> None:
         """Read nothing any more."""
-        tasks = [task for task, _ in self._tasks.values()]
-        for topic in list(self._tasks):
-            self._stop(topic)
-        for task in tasks:
-            with suppress(asyncio.CancelledError, Exception):
-                await task
+        await self._deliveries.close()
 
     def _restart(self, topic: str, *, latched: bool) -> None:
-        self._stop(topic)
+        self._deliveries.stop(topic)
         wishes = list(self._wishes[topic].values())
         merged = _SubscribeOptions(
             throttle=min(w.throttle for w in wishes),
@@ -123,19 +119,11 @@ class Subscriptions:
             compression=next(c for c in _STRONGEST if any(w.compression == c for w in wishes)),
         )
         capacity = merged.queue or (1 if merged.throttle else _UNTHROTTLED)
-        reader = self._graph.subscribe(topic, capacity=capacity)
-        first = self._graph.latched(topic) if latched else None
-        task = asyncio.get_running_loop().create_task(self._deliver(topic, reader, merged, first))
-        self._tasks[topic] = task, reader
-
-    def _stop(self, topic: str) -> None:
-        task, reader = self._tasks.pop(topic, (None, None))
-        if task is not None and reader is not None:
-            reader.close()
-            task.cancel()
+        deliver = partial(self._deliver, topic, merged)
+        self._deliveries.start(topic, topic, deliver, capacity=capacity, latched=latched)
 
     async def _deliver(
-        self, topic: str, reader: Subscription, wish: _SubscribeOptions, first: RosMessage | None
+        self, topic: str, wish: _SubscribeOptions, reader: Subscription, first: RosMessage | None
     ) -> None:
         loop = asyncio.get_running_loop()
         if first is not None:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from splatbot.bench.native import bench_native
 from splatbot.bench.raster.scenes import NAMES, SplatScene
-from splatbot.rasterize.native import native
 
 TILE = 16  # [px]
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, MAX_SIGMAS, EPS2D, FOV_MARGIN = 1.0 / 255.0, 0.99, 1e-4, 3.33, 0.3, 0.3
@@ -72,7 +72,7 @@ def scalar_render(scene: SplatScene, width: int, height: int, grad: Tensor | Non
     }
     K = scene.intrinsics(width, height)[0]
     tensors = [t.contiguous() for t in (*scene.tensors(), scene.viewmat)]
-    native().scalar_baseline(*tensors, K, width, height, image, alpha, grad, *gradients.values())
+    bench_native().scalar_baseline(*tensors, K, width, height, image, alpha, grad, *gradients.values())
     return PeerRender(image, alpha, gradients if grad is not None else {})
 
 

@@ -16,7 +16,7 @@ from splatbot.bench.raster.scenes import SplatScene, random_box, surface_map
 from splatbot.bench.results import Results
 from splatbot.bench.timing import isa, measure
 from splatbot.errors import InputError
-from splatbot.rasterize import rasterization, rasterization_reference
+from splatbot.rasterize import Gaussians, Viewpoints, rasterization, rasterization_reference
 from splatbot.rasterize.native import native
 from splatbot.rasterize.work import RasterWork, raster_work
 
@@ -104,10 +104,13 @@ def error_against_reference() -> float:
 def _reference_case(*, quick: bool) -> tuple[dict[str, Any], Tensor, Tensor]:
     """Return arguments, their image in float64, and a mask of the pixels that rounding cannot flip."""
     scene = random_box(200 if quick else 2000, shrink=3.0)
-    arguments = _detached(scene, (24, 16) if quick else (96, 64))
-    doubled: dict[str, Any] = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    exact, _, meta = rasterization_reference(**doubled)
-    return arguments, exact, (meta.margins > 1e-4)[..., None].reshape(*exact.shape[:-1], 1)
+    size = (24, 16) if quick else (96, 64)
+    means, quats, scales, opacities, colors = (t.detach().double() for t in scene.tensors())
+    exact, _, meta = rasterization_reference(
+        Gaussians(means, quats, scales, opacities, colors),
+        Viewpoints(scene.viewmat[None].double(), scene.intrinsics(*size).double(), *size),
+    )
+    return _detached(scene, size), exact, (meta.margins > 1e-4)[..., None].reshape(*exact.shape[:-1], 1)
 
 
 def _detached(scene: SplatScene, size: tuple[int, int]) -> dict[str, Any]:

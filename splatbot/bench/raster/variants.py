@@ -80,7 +80,7 @@ def _build_and_measure(variant: Variant, threads: int) -> MeasuredVariant:
             *("-S", str(_SOURCE), "-B", str(build), f"-DPython_EXECUTABLE={sys.executable}"),
             *(f"-DCMAKE_LIBRARY_OUTPUT_DIRECTORY={out}", f"-DSPLATBOT_ISAS={_ISA}", variant.option),
         )
-        _run("cmake", "--build", str(build), "--parallel", "2")
+        _run("cmake", "--build", str(build), "--target", "_native", "--parallel", "2")
         [module] = out.glob("_native*")
         text = _run(sys.executable, "-m", "splatbot.bench.raster.variants", str(module), str(threads))
         return MeasuredVariant(**json.loads(text))

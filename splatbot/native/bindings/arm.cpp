@@ -30,6 +30,13 @@ void check(const Arm& arm, const Configurations& q) {
   }
 }
 
+// Three numbers for each sphere of each configuration: (C, S, 3).
+template <class T, class Fill>
+nb::ndarray<nb::numpy, T> of_spheres(const Arm& arm, const Configurations& q, Fill&& fill) {
+  check(arm, q);
+  return filled<T>({q.shape(0), static_cast<std::size_t>(arm.spheres()), 3}, fill);
+}
+
 template <class Ask>
 nb::tuple edges(const Arm& arm, const Configurations& from, const Configurations& to, Ask&& ask) {
   check(arm, from);
@@ -74,38 +81,19 @@ void define_arm(nb::module_& m) {
           [](const Arm& self, Configurations q) {
             check(self, q);
             const std::size_t n = q.shape(0), links = static_cast<std::size_t>(self.joints()) + 1;
-            std::vector<double> poses(16 * n * links);
-            {
-              nb::gil_scoped_release release;
-              self.forward(span_of(q), poses);
-            }
-            return owned(std::move(poses), {n, links, 4, 4});
+            return filled<double>({n, links, 4, 4}, [&](std::span<double> out) { self.forward(span_of(q), out); });
           },
           "q"_a.noconvert(), "T_world_link (C, J + 1, 4, 4)")
       .def(
           "centers",
           [](const Arm& self, Configurations q) {
-            check(self, q);
-            const std::size_t n = q.shape(0), spheres = static_cast<std::size_t>(self.spheres());
-            std::vector<double> out(3 * n * spheres);
-            {
-              nb::gil_scoped_release release;
-              self.centers(span_of(q), out);
-            }
-            return owned(std::move(out), {n, spheres, 3});
+            return of_spheres<double>(self, q, [&](std::span<double> out) { self.centers(span_of(q), out); });
           },
           "q"_a.noconvert(), "Centres of the spheres (C, S, 3) in float64")
       .def(
           "centers_float",
           [](const Arm& self, Configurations q) {
-            check(self, q);
-            const std::size_t n = q.shape(0), spheres = static_cast<std::size_t>(self.spheres());
-            std::vector<float> out(3 * n * spheres);
-            {
-              nb::gil_scoped_release release;
-              self.centers_float(span_of(q), out);
-            }
-            return owned(std::move(out), {n, spheres, 3});
+            return of_spheres<float>(self, q, [&](std::span<float> out) { self.centers_float(span_of(q), out); });
           },
           "q"_a.noconvert(), "The same as the kernels see them, in float32")
       .def(
@@ -120,13 +108,9 @@ void define_arm(nb::module_& m) {
           "configurations",
           [](const Arm& self, const CollisionField* field, Configurations q) {
             check(self, q);
-            std::vector<std::int32_t> verdict(q.shape(0));
-            {
-              nb::gil_scoped_release release;
+            return filled<std::int32_t>({q.shape(0)}, [&](std::span<std::int32_t> verdict) {
               self.configurations(field, span_of(q), verdict);
-            }
-            const std::size_t n = verdict.size();
-            return owned(std::move(verdict), {n});
+            });
           },
           "field"_a.none(), "q"_a.noconvert(), "Verdicts (C): -1 free, a sphere, or ARM_SELF + a pair")
       .def(

@@ -13,6 +13,7 @@
 #include <span>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "splatbot/rasterizer.hpp"
@@ -32,6 +33,8 @@ using InN3 = Array<const float, nb::shape<-1, 3>>;
 using InN4 = Array<const float, nb::shape<-1, 4>>;
 using Out2 = Array<float, nb::shape<-1, -1>>;
 using Out3 = Array<float, nb::shape<-1, -1, -1>>;
+using OutDoubles = Array<double, nb::shape<-1>>;
+using OutCamera = Array<double, nb::shape<splatbot::kCameraSums>>;
 using Matrix3 = Array<const double, nb::shape<3, 3>>;
 using Matrix4 = Array<const double, nb::shape<4, 4>>;
 
@@ -69,8 +72,12 @@ inline splatbot::Gaussians gaussians_of(const InN3& means, const std::optional<I
 }
 
 // The camera's centre is -R^-1 t; x -> R (x - origin) + translation, all in float64 before rounding.
-inline splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int width, int height) {
+inline splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int width, int height,
+                              const splatbot::Lens* lens = nullptr) {
   splatbot::View view{};
+  if (lens != nullptr) {
+    view.lens = *lens;
+  }
   const auto r = [&](int i, int j) { return viewmat(i % 3, j % 3); };
   double determinant = 0.0, center[3] = {};
   for (int i = 0; i < 3; ++i) {
@@ -104,18 +111,63 @@ inline splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int widt
   return view;
 }
 
-inline splatbot::DepthMode depth_mode(const std::string& name) {
-  if (name == "none") {
-    return splatbot::DepthMode::none;
+// The value that goes by the name, of an argument that takes one of several.
+template <class Value, std::size_t N>
+Value choice_of(const char* argument, const std::string& name, const std::pair<const char*, Value> (&choices)[N]) {
+  std::string names;
+  for (std::size_t i = 0; i < N; ++i) {
+    if (name == choices[i].first) {
+      return choices[i].second;
+    }
+    names += (i == 0 ? "" : i + 1 < N ? ", " : " or ") + std::string(choices[i].first);
   }
-  if (name == "accumulated") {
-    return splatbot::DepthMode::accumulated;
-  }
-  if (name == "expected") {
-    return splatbot::DepthMode::expected;
-  }
-  throw std::invalid_argument("depth is '" + name + "', must be none, accumulated or expected");
+  throw std::invalid_argument(std::string(argument) + " is '" + name + "', must be " + names);
 }
+
+inline splatbot::DepthMode depth_mode(const std::string& name) {
+  using splatbot::DepthMode;
+  return choice_of<DepthMode>("depth", name,
+                              {{"none", DepthMode::none}, {"accumulated", DepthMode::accumulated}, {"expected", DepthMode::expected}});
+}
+
+// Destinations of the gradients that both kinds of splats have.
+inline splatbot::Gradients gradients_of(const std::optional<OutAny>& means, const std::optional<OutAny>& quats,
+                                        const std::optional<OutAny>& scales, const std::optional<OutAny>& opacities,
+                                        const std::optional<OutAny>& colors, const std::optional<OutCamera>& camera,
+                                        const std::optional<OutDoubles>& background,
+                                        const std::optional<OutAny>& means2d, bool accumulate) {
+  return {.means = span_of<float>(means),
+          .quats = span_of<float>(quats),
+          .scales = span_of<float>(scales),
+          .covars = {},
+          .opacities = span_of<float>(opacities),
+          .colors = span_of<float>(colors),
+          .camera = span_of<double>(camera),
+          .background = span_of<double>(background),
+          .means2d = span_of<float>(means2d),
+          .absolute2d = {},
+          .accumulate = accumulate};
+}
+
+// What result() gives after render(), which runs without the GIL, or (field, row) of the input that is not finite.
+template <class Render, class Result>
+nb::object unless_faulty(Render&& render, Result&& result) {
+  std::optional<splatbot::Fault> fault;
+  {
+    const nb::gil_scoped_release release;
+    fault = render();
+  }
+  if (fault) {
+    return nb::make_tuple(nb::str(fault->field.data(), fault->field.size()), fault->row);
+  }
+  return nb::cast(result());
+}
+
+// A render's leftovers for its backward pass and its meta.
+template <class Pointer>
+struct StateHandle {
+  Pointer state;
+};
 
 template <class T>
 nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
@@ -125,6 +177,21 @@ nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<s
     const std::unique_ptr<std::vector<T>> released(static_cast<std::vector<T>*>(p));
   });
   return nb::ndarray<nb::numpy, T>(data, shape, owner);
+}
+
+// An array whose values fill() writes, without the GIL.
+template <class T, class Fill>
+nb::ndarray<nb::numpy, T> filled(std::initializer_list<std::size_t> shape, Fill&& fill) {
+  std::size_t size = 1;
+  for (const std::size_t length : shape) {
+    size *= length;
+  }
+  std::vector<T> values(size);
+  {
+    const nb::gil_scoped_release release;
+    fill(std::span<T>(values));
+  }
+  return owned(std::move(values), shape);
 }
 
 inline nb::ndarray<nb::numpy, std::int64_t> indices_of(std::span<const std::uint32_t> ids) {
@@ -139,4 +206,15 @@ inline nb::dict dict_of(const splatbot::TileInfo& info) {
   d["n_isects"] = info.pairs;
   d["state_bytes"] = info.state_bytes;
   return d;
+}
+
+// A Python class of such leftovers with what both kinds of splats tell of them.
+template <class Handle>
+nb::class_<Handle> define_state(nb::module_& m, const char* name, const char* doc, nb::dict (*describe)(const Handle&)) {
+  return nb::class_<Handle>(m, name, doc)
+      .def("describe", describe, "Projections as a dict of arrays.")
+      .def("visible", [](const Handle& handle) { return indices_of(splatbot::visible_ids(*handle.state)); },
+           "Indices (V,) of the splats in view.")
+      .def("tiles", [](const Handle& handle) { return dict_of(splatbot::tile_info(*handle.state)); },
+           "Tile grid, pairs and bytes held.");
 }

@@ -6,7 +6,6 @@
 
 void define_align(nanobind::module_& m);
 void define_arm(nanobind::module_& m);
-void define_baseline(nanobind::module_& m);
 void define_depth(nanobind::module_& m);
 void define_field(nanobind::module_& m);
 void define_matching(nanobind::module_& m);

@@ -20,41 +20,33 @@ splatbot::DepthImage view(const Image& depth) {
   return {static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)), span_of(depth)};
 }
 
+template <class Fill>
+nb::ndarray<nb::numpy, float> like(const Image& image, Fill&& fill) {
+  return filled<float>({image.shape(0), image.shape(1)}, fill);
+}
+
 }  // namespace
 
 void define_depth(nb::module_& m) {
   m.def(
       "valid_depth",
       [](Image depth, float near, float far, float step) {
-        std::vector<float> out(depth.size());
-        {
-          nb::gil_scoped_release release;
-          splatbot::valid_depth(view(depth), near, far, step, out);
-        }
-        return owned(std::move(out), {depth.shape(0), depth.shape(1)});
+        return like(depth, [&](std::span<float> out) { splatbot::valid_depth(view(depth), near, far, step, out); });
       },
       "depth"_a.noconvert(), "near"_a, "far"_a, "step"_a, "Depth without implausible and flying pixels.");
   m.def(
       "halve_depth",
       [](Image depth) {
         const std::size_t height = depth.shape(0) / 2, width = depth.shape(1) / 2;
-        std::vector<float> out(height * width);
-        {
-          nb::gil_scoped_release release;
-          splatbot::halve_depth(view(depth), out);
-        }
-        return owned(std::move(out), {height, width});
+        return filled<float>({height, width}, [&](std::span<float> out) { splatbot::halve_depth(view(depth), out); });
       },
       "depth"_a.noconvert(), "Half the size, the nearest surface of each 2x2 block.");
   m.def(
       "depth_around",
       [](Image depth, Pixels pixels) {
-        std::vector<double> out(pixels.shape(0));
-        {
-          nb::gil_scoped_release release;
+        return filled<double>({pixels.shape(0)}, [&](std::span<double> out) {
           splatbot::depth_around(view(depth), span_of(pixels), out);
-        }
-        return owned(std::move(out), {pixels.shape(0)});
+        });
       },
       "depth"_a.noconvert(), "pixels"_a.noconvert(), "Median depth of the 5x5 pixels around each; NaN where two surfaces meet.");
   m.def(
@@ -63,35 +55,24 @@ void define_depth(nb::module_& m) {
         if (gray.shape(0) != depth.shape(0) || gray.shape(1) != depth.shape(1)) {
           throw std::invalid_argument("gray and depth differ in shape");
         }
-        std::vector<float> out(depth.size());
-        {
-          nb::gil_scoped_release release;
+        return like(depth, [&](std::span<float> out) {
           splatbot::gray_of_one_surface(view(depth), span_of(gray), step, floor, quad, out);
-        }
-        return owned(std::move(out), {depth.shape(0), depth.shape(1)});
+        });
       },
       "depth"_a.noconvert(), "gray"_a.noconvert(), "step"_a, "floor"_a, "quad"_a,
       "Grey, NaN where surfaces of different depth meet.");
   m.def(
       "smooth_depth",
       [](Image depth, float step, float floor, float quad) {
-        std::vector<float> out(depth.size());
-        {
-          nb::gil_scoped_release release;
-          splatbot::smooth_depth(view(depth), step, floor, quad, out);
-        }
-        return owned(std::move(out), {depth.shape(0), depth.shape(1)});
+        return like(depth, [&](std::span<float> out) { splatbot::smooth_depth(view(depth), step, floor, quad, out); });
       },
       "depth"_a.noconvert(), "step"_a, "floor"_a, "quad"_a, "Depth averaged over the 3x3 pixels of each one's surface.");
   m.def(
       "normals_of",
       [](Image depth, double fx, double fy, double cx, double cy) {
-        std::vector<float> out(3 * depth.size());
-        {
-          nb::gil_scoped_release release;
+        return filled<float>({depth.shape(0), depth.shape(1), 3}, [&](std::span<float> out) {
           splatbot::normals_of(view(depth), {fx, fy, cx, cy}, out);
-        }
-        return owned(std::move(out), {depth.shape(0), depth.shape(1), 3});
+        });
       },
       "depth"_a.noconvert(), "fx"_a, "fy"_a, "cx"_a, "cy"_a, "Normals by central differences; zero where there is none.");
 }

@@ -90,14 +90,10 @@ void define_field(nb::module_& m) {
       .def(
           "hits",
           [](const CollisionField& self, Points centers, Radii radii) {
-            std::vector<std::uint8_t> out(centers.shape(0));
             const auto queries = queries_of(centers, radii);
-            {
-              nb::gil_scoped_release release;
+            return filled<std::uint8_t>({centers.shape(0)}, [&](std::span<std::uint8_t> out) {
               self.hits(queries, out.size(), out);
-            }
-            const std::size_t n = out.size();
-            return owned(std::move(out), {n});
+            });
           },
           "centers"_a.noconvert(), "radii"_a.noconvert().none(), "1 where a sphere may touch an ellipsoid")
       .def("nearest", &nearest, "centers"_a.noconvert(), "radii"_a.noconvert().none(), "cut"_a,
@@ -135,13 +131,8 @@ void define_field(nb::module_& m) {
       .def(
           "grid_bounds",
           [](const CollisionField& self, Points points) {
-            std::vector<float> out(points.shape(0));
-            {
-              nb::gil_scoped_release release;
-              self.grid_bounds(span_of(points), out);
-            }
-            const std::size_t n = out.size();
-            return owned(std::move(out), {n});
+            return filled<float>({points.shape(0)},
+                                 [&](std::span<float> out) { self.grid_bounds(span_of(points), out); });
           },
           "points"_a.noconvert(), "The grid's lower bound of the distance (P); 0 where it has none")
       .def("grid_cells",

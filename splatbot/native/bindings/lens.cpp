@@ -9,24 +9,17 @@
 #include <stdexcept>
 #include <string>
 
+#include "arrays.hpp"
 #include "bindings.hpp"
 
-namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
 
 splatbot::CameraModel model_of(const std::string& name) {
-  if (name == "pinhole") {
-    return splatbot::CameraModel::pinhole;
-  }
-  if (name == "ortho") {
-    return splatbot::CameraModel::ortho;
-  }
-  if (name == "fisheye") {
-    return splatbot::CameraModel::fisheye;
-  }
-  throw std::invalid_argument("model is '" + name + "', must be pinhole, ortho or fisheye");
+  using splatbot::CameraModel;
+  return choice_of<CameraModel>("model", name,
+                                {{"pinhole", CameraModel::pinhole}, {"ortho", CameraModel::ortho}, {"fisheye", CameraModel::fisheye}});
 }
 
 splatbot::Lens unscented(const std::string& model, const std::array<double, 6>& radial,

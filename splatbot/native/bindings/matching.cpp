@@ -28,12 +28,9 @@ void define_matching(nb::module_& m) {
       [](Pixels expected, Descriptors expected_descriptors, Pixels found, Descriptors found_descriptors, float radius,
          int max_distance, float ratio) {
         const splatbot::Keypoints wanted = view(expected, expected_descriptors), seen = view(found, found_descriptors);
-        std::vector<std::int32_t> matches(expected.shape(0));
-        {
-          nb::gil_scoped_release release;
+        return filled<std::int32_t>({expected.shape(0)}, [&](std::span<std::int32_t> matches) {
           splatbot::match_near(wanted, seen, radius, max_distance, ratio, matches);
-        }
-        return owned(std::move(matches), {expected.shape(0)});
+        });
       },
       "expected"_a.noconvert(), "expected_descriptors"_a.noconvert(), "found"_a.noconvert(),
       "found_descriptors"_a.noconvert(), "radius"_a, "max_distance"_a, "ratio"_a,

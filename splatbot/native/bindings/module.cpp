@@ -8,7 +8,6 @@ NB_MODULE(_native, m) {
   splatbot::keep_freed_memory();
   define_align(m);
   define_arm(m);
-  define_baseline(m);
   define_depth(m);
   define_field(m);
   define_matching(m);

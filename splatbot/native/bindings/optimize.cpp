@@ -11,7 +11,6 @@
 
 #include "splatbot/adam.hpp"
 #include "splatbot/loss.hpp"
-#include "splatbot/peak.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -59,11 +58,6 @@ std::size_t adam_step(const std::vector<Values>& values, const std::vector<Const
                              {beta1, beta2, eps});
 }
 
-double multiply_add_peak(double milliseconds) {
-  const nb::gil_scoped_release release;
-  return splatbot::multiply_add_peak(milliseconds);
-}
-
 }  // namespace
 
 void define_optimize(nb::module_& m) {
@@ -74,6 +68,4 @@ void define_optimize(nb::module_& m) {
         "second"_a.noconvert(), "rates"_a, "chosen"_a.noconvert(), "steps"_a.noconvert(), "beta1"_a, "beta2"_a, "eps"_a,
         "One step of Adam, in place, of the rows that `chosen` (N,) marks, with each row's own count of `steps`;"
         " rows whose gradient is not finite are left alone, and their number is returned.");
-  m.def("multiply_add_peak", &multiply_add_peak, "milliseconds"_a,
-        "GFLOP/s of independent multiply-adds on the kernels and threads in use.");
 }

@@ -20,14 +20,10 @@ void define_path_speed(nb::module_& m) {
   m.def(
       "fastest_speeds",
       [](Column s, Table first, Table second, Column velocity, Column acceleration) {
-        std::vector<double> squared(s.shape(0));
-        {
-          nb::gil_scoped_release release;
+        return filled<double>({s.shape(0)}, [&](std::span<double> squared) {
           splatbot::fastest_speeds(
               {span_of(s), span_of(first), span_of(second), span_of(velocity), span_of(acceleration)}, squared);
-        }
-        const std::size_t n = squared.size();
-        return owned(std::move(squared), {n});
+        });
       },
       "s"_a.noconvert(), "first"_a.noconvert(), "second"_a.noconvert(), "velocity"_a.noconvert(),
       "acceleration"_a.noconvert(), "Squared path speeds (N) under limits of velocity and acceleration");

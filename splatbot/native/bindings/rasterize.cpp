@@ -22,10 +22,7 @@ using namespace nb::literals;
 
 namespace {
 
-// A render's leftovers for its backward pass and its meta.
-struct State {
-  splatbot::RasterStatePtr state;
-};
+using State = StateHandle<splatbot::RasterStatePtr>;
 
 nb::object forward(const InN3& means, const std::optional<InN4>& quats, const std::optional<InN3>& scales,
                    const std::optional<InN33>& covars, const In1& opacities, const InAny& colors, int sh_degree,
@@ -35,10 +32,7 @@ nb::object forward(const InN3& means, const std::optional<InN4>& quats, const st
                    const std::optional<In1>& background, const std::optional<InMask>& mask, int mask_size,
                    const Out3& out_colors, const Out2& out_alphas, const splatbot::Lens* lens) {
   const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
-  splatbot::View view = view_of(viewmat, K, width, height);
-  if (lens != nullptr) {
-    view.lens = *lens;
-  }
+  const splatbot::View view = view_of(viewmat, K, width, height, lens);
   const splatbot::RasterOptions options = {.near_plane = near_plane,
                                            .far_plane = far_plane,
                                            .radius_clip = radius_clip,
@@ -49,16 +43,11 @@ nb::object forward(const InN3& means, const std::optional<InN4>& quats, const st
                                            .transmittance_min = transmittance_min};
   const splatbot::TileMask tiles = {.keep = span_of<const std::uint8_t>(mask), .size = mask_size};
   State state;
-  std::optional<splatbot::Fault> fault;
-  {
-    const nb::gil_scoped_release release;
-    fault = splatbot::rasterize_forward(gaussians, view, options, span_of<const float>(background), tiles,
-                                        span_of(out_colors), span_of(out_alphas), state.state);
-  }
-  if (fault) {
-    return nb::make_tuple(nb::str(fault->field.data(), fault->field.size()), fault->row);
-  }
-  return nb::cast(std::move(state));
+  const auto render = [&] {
+    return splatbot::rasterize_forward(gaussians, view, options, span_of<const float>(background), tiles,
+                                       span_of(out_colors), span_of(out_alphas), state.state);
+  };
+  return unless_faulty(render, [&] { return std::move(state); });
 }
 
 void backward(const State& state, const InN3& means, const std::optional<InN4>& quats,
@@ -68,22 +57,15 @@ void backward(const State& state, const InN3& means, const std::optional<InN4>& 
               const std::optional<OutAny>& grad_means, const std::optional<OutAny>& grad_quats,
               const std::optional<OutAny>& grad_scales, const std::optional<OutAny>& grad_covars,
               const std::optional<OutAny>& grad_opacities, const std::optional<OutAny>& grad_colors,
-              const std::optional<Array<double, nb::shape<splatbot::kCameraSums>>>& grad_camera,
-              const std::optional<Array<double, nb::shape<-1>>>& grad_background,
+              const std::optional<OutCamera>& grad_camera,
+              const std::optional<OutDoubles>& grad_background,
               const std::optional<OutAny>& grad_means2d, const std::optional<OutAny>& absolute_means2d,
               bool accumulate) {
   const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
-  const splatbot::Gradients out = {.means = span_of<float>(grad_means),
-                                   .quats = span_of<float>(grad_quats),
-                                   .scales = span_of<float>(grad_scales),
-                                   .covars = span_of<float>(grad_covars),
-                                   .opacities = span_of<float>(grad_opacities),
-                                   .colors = span_of<float>(grad_colors),
-                                   .camera = span_of<double>(grad_camera),
-                                   .background = span_of<double>(grad_background),
-                                   .means2d = span_of<float>(grad_means2d),
-                                   .absolute2d = span_of<float>(absolute_means2d),
-                                   .accumulate = accumulate};
+  splatbot::Gradients out = gradients_of(grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_camera,
+                                         grad_background, grad_means2d, accumulate);
+  out.covars = span_of<float>(grad_covars);
+  out.absolute2d = span_of<float>(absolute_means2d);
   const nb::gil_scoped_release release;
   splatbot::rasterize_backward(*state.state, gaussians, span_of<const float>(background),
                                span_of<const float>(grad_render), span_of<const float>(grad_alphas), out);
@@ -107,13 +89,9 @@ nb::dict describe(const State& state) {
 }
 
 nb::ndarray<nb::numpy, std::int32_t> contributions(const State& state) {
-  std::vector<std::int32_t> counts(splatbot::gaussian_count(*state.state));
-  {
-    const nb::gil_scoped_release release;
+  return filled<std::int32_t>({splatbot::gaussian_count(*state.state)}, [&](std::span<std::int32_t> counts) {
     splatbot::count_contributions(*state.state, counts);
-  }
-  const std::size_t n = counts.size();
-  return owned(std::move(counts), {n});
+  });
 }
 
 nb::object find_visible(const InN3& means, const std::optional<InN4>& quats, const std::optional<InN3>& scales,
@@ -127,25 +105,15 @@ nb::object find_visible(const InN3& means, const std::optional<InN4>& quats, con
                                    .covars = span_of<const float>(covars),
                                    .opacities = span_of(opacities),
                                    .colors = {}};
-  splatbot::View view = view_of(viewmat, K, width, height);
-  if (lens != nullptr) {
-    view.lens = *lens;
-  }
+  const splatbot::View view = view_of(viewmat, K, width, height, lens);
   const splatbot::RasterOptions options = {.near_plane = near_plane,
                                            .far_plane = far_plane,
                                            .radius_clip = radius_clip,
                                            .eps2d = eps2d,
                                            .antialiased = antialiased};
   std::vector<std::uint32_t> ids;
-  std::optional<splatbot::Fault> fault;
-  {
-    const nb::gil_scoped_release release;
-    fault = splatbot::find_visible(gaussians, view, options, ids);
-  }
-  if (fault) {
-    return nb::make_tuple(nb::str(fault->field.data(), fault->field.size()), fault->row);
-  }
-  return nb::cast(indices_of(ids));
+  return unless_faulty([&] { return splatbot::find_visible(gaussians, view, options, ids); },
+                       [&] { return indices_of(ids); });
 }
 
 void medians(const State& state, const Array<std::int32_t, nb::shape<-1, -1>>& out) {
@@ -175,14 +143,9 @@ nb::dict work(const State& state) {
 }  // namespace
 
 void define_rasterize(nb::module_& m) {
-  nb::class_<State>(m, "RasterState", "What a render leaves for its backward pass.")
-      .def("describe", &describe, "Projections as a dict of arrays.")
+  define_state<State>(m, "RasterState", "What a render leaves for its backward pass.", &describe)
       .def("contributions", &contributions, "In how many pixels (N,) each Gaussian counts.")
       .def_prop_ro("n_visible", [](const State& state) { return splatbot::visible_ids(*state.state).size(); })
-      .def("visible", [](const State& state) { return indices_of(splatbot::visible_ids(*state.state)); },
-           "Indices (V,) of the Gaussians in view.")
-      .def("tiles", [](const State& state) { return dict_of(splatbot::tile_info(*state.state)); },
-           "Tile grid, pairs and bytes held.")
       .def("medians", &medians, "out"_a.noconvert(),
            "Write to out (H, W) the Gaussian at which transmittance falls to 1/2, -1 where it does not.")
       .def("fronts", &fronts, "pixels"_a.noconvert(), "ids"_a.noconvert(), "weights"_a.noconvert(),

@@ -14,9 +14,7 @@ using namespace nb::literals;
 namespace {
 
 // A render's leftovers for its backward pass and its meta.
-struct SurfelHandle {
-  splatbot::SurfelStatePtr state;
-};
+using SurfelHandle = StateHandle<splatbot::SurfelStatePtr>;
 
 nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities, const InAny& colors,
                    int sh_degree, const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane,
@@ -36,15 +34,10 @@ nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, con
                                       .median = span_of(out_median),
                                       .distortion = span_of<float>(out_distortion)};
   SurfelHandle state;
-  std::optional<splatbot::Fault> fault;
-  {
-    const nb::gil_scoped_release release;
-    fault = splatbot::surfels_forward(surfels, view, options, span_of<const float>(background), out, state.state);
-  }
-  if (fault) {
-    return nb::make_tuple(nb::str(fault->field.data(), fault->field.size()), fault->row);
-  }
-  return nb::cast(std::move(state));
+  const auto render = [&] {
+    return splatbot::surfels_forward(surfels, view, options, span_of<const float>(background), out, state.state);
+  };
+  return unless_faulty(render, [&] { return std::move(state); });
 }
 
 void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
@@ -54,8 +47,8 @@ void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, c
               const std::optional<In2>& grad_distortion, const std::optional<OutAny>& out_means,
               const std::optional<OutAny>& out_quats, const std::optional<OutAny>& out_scales,
               const std::optional<OutAny>& out_opacities, const std::optional<OutAny>& out_colors,
-              const std::optional<Array<double, nb::shape<splatbot::kCameraSums>>>& out_camera,
-              const std::optional<Array<double, nb::shape<-1>>>& out_background,
+              const std::optional<OutCamera>& out_camera,
+              const std::optional<OutDoubles>& out_background,
               const std::optional<OutAny>& out_means2d, bool accumulate) {
   const splatbot::Gaussians surfels = gaussians_of(means, quats, scales, std::nullopt, opacities, colors, sh_degree);
   const splatbot::SurfelImageGradients grads = {.colors = span_of<const float>(grad_colors),
@@ -63,17 +56,8 @@ void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, c
                                                 .normals = span_of<const float>(grad_normals),
                                                 .median = span_of<const float>(grad_median),
                                                 .distortion = span_of<const float>(grad_distortion)};
-  const splatbot::Gradients out = {.means = span_of<float>(out_means),
-                                   .quats = span_of<float>(out_quats),
-                                   .scales = span_of<float>(out_scales),
-                                   .covars = {},
-                                   .opacities = span_of<float>(out_opacities),
-                                   .colors = span_of<float>(out_colors),
-                                   .camera = span_of<double>(out_camera),
-                                   .background = span_of<double>(out_background),
-                                   .means2d = span_of<float>(out_means2d),
-                                   .absolute2d = {},
-                                   .accumulate = accumulate};
+  const splatbot::Gradients out = gradients_of(out_means, out_quats, out_scales, out_opacities, out_colors, out_camera,
+                                               out_background, out_means2d, accumulate);
   const nb::gil_scoped_release release;
   splatbot::surfels_backward(*state.state, surfels, span_of<const float>(background), grads, out);
 }
@@ -98,12 +82,7 @@ nb::dict describe(const SurfelHandle& state) {
 }  // namespace
 
 void define_surfels(nb::module_& m) {
-  nb::class_<SurfelHandle>(m, "SurfelState", "What a render of surfels leaves for its backward pass.")
-      .def("describe", &describe, "Projections as a dict of arrays.")
-      .def("visible", [](const SurfelHandle& state) { return indices_of(splatbot::visible_ids(*state.state)); },
-           "Indices (V,) of the surfels in view.")
-      .def("tiles", [](const SurfelHandle& state) { return dict_of(splatbot::tile_info(*state.state)); },
-           "Tile grid, pairs and bytes held.");
+  define_state<SurfelHandle>(m, "SurfelState", "What a render of surfels leaves for its backward pass.", &describe);
 
   m.attr("MAX_SURFEL_CHANNELS") = splatbot::kMaxSurfelChannels;
 

@@ -34,6 +34,8 @@ float rounded_up(double x) {
   return static_cast<double>(f) < x ? std::nextafter(f, std::numeric_limits<float>::infinity()) : f;
 }
 
+const SolidsView* solids_of(const CollisionField* field) { return field != nullptr ? &field->view() : nullptr; }
+
 double norm(const double* v) { return std::hypot(v[0], v[1], v[2]); }
 
 }  // namespace
@@ -192,19 +194,23 @@ void Arm::forward(std::span<const double> q, std::span<double> poses) const {
   });
 }
 
+void Arm::place_spheres(const double* poses, double* centers) const {
+  for (std::size_t s = 0; s < link_.size(); ++s) {
+    const double* T = poses + 16 * static_cast<std::size_t>(link_[s]);
+    const double* c = &exact_centers_[3 * s];
+    for (std::size_t k = 0; k < 3; ++k) {
+      centers[3 * s + k] = T[4 * k] * c[0] + T[4 * k + 1] * c[1] + T[4 * k + 2] * c[2] + T[4 * k + 3];
+    }
+  }
+}
+
 void Arm::centers(std::span<const double> q, std::span<double> out) const {
   const std::size_t n = exact_.size(), spheres = link_.size();
   in_parts(q.size() / n, 64, [&](std::size_t begin, std::size_t end) {
     double poses[16 * (kMostJoints + 1)];
     for (std::size_t i = begin; i < end; ++i) {
       forward_one(q.data() + i * n, poses);
-      for (std::size_t s = 0; s < spheres; ++s) {
-        const double* T = poses + 16 * static_cast<std::size_t>(link_[s]);
-        const double* c = &exact_centers_[3 * s];
-        for (std::size_t k = 0; k < 3; ++k) {
-          out[3 * (i * spheres + s) + k] = T[4 * k] * c[0] + T[4 * k + 1] * c[1] + T[4 * k + 2] * c[2] + T[4 * k + 3];
-        }
-      }
+      place_spheres(poses, out.data() + 3 * i * spheres);
     }
   });
 }
@@ -218,27 +224,24 @@ void Arm::centers_float(std::span<const double> q, std::span<float> out) const {
 
 void Arm::configurations(const CollisionField* field, std::span<const double> q, std::span<std::int32_t> verdict) const {
   const ArmKernels& k = *kernels().arm;
-  const SolidsView* solids = field != nullptr ? &field->view() : nullptr;
   in_parts(verdict.size(), 64, [&](std::size_t begin, std::size_t end) {
-    k.configurations(view_, solids, q.data(), begin, end, verdict.data());
+    k.configurations(view_, solids_of(field), q.data(), begin, end, verdict.data());
   });
 }
 
 void Arm::certify(const CollisionField* field, std::span<const double> from, std::span<const double> to, float eps,
                   std::span<ArmEdge> out) const {
   const ArmKernels& k = *kernels().arm;
-  const SolidsView* solids = field != nullptr ? &field->view() : nullptr;
   in_parts(out.size(), kFewest, [&](std::size_t begin, std::size_t end) {
-    k.certify(view_, solids, from.data(), to.data(), eps, begin, end, out.data());
+    k.certify(view_, solids_of(field), from.data(), to.data(), eps, begin, end, out.data());
   });
 }
 
 void Arm::sample(const CollisionField* field, std::span<const double> from, std::span<const double> to, int samples,
                  std::span<ArmEdge> out) const {
   const ArmKernels& k = *kernels().arm;
-  const SolidsView* solids = field != nullptr ? &field->view() : nullptr;
   in_parts(out.size(), kFewest, [&](std::size_t begin, std::size_t end) {
-    k.sample(view_, solids, from.data(), to.data(), samples, begin, end, out.data());
+    k.sample(view_, solids_of(field), from.data(), to.data(), samples, begin, end, out.data());
   });
 }
 
@@ -253,13 +256,7 @@ void Arm::clearance(const CollisionField& field, std::span<const double> q, doub
     double poses[16 * (kMostJoints + 1)];
     for (std::size_t i = begin; i < end; ++i) {
       forward_one(q.data() + i * n, poses);
-      for (std::size_t s = 0; s < spheres; ++s) {
-        const double* T = poses + 16 * static_cast<std::size_t>(link_[s]);
-        const double* c = &exact_centers_[3 * s];
-        for (std::size_t a = 0; a < 3; ++a) {
-          at[3 * s + a] = T[4 * a] * c[0] + T[4 * a + 1] * c[1] + T[4 * a + 2] * c[2] + T[4 * a + 3];
-        }
-      }
+      place_spheres(poses, at.data());
       k.grid_bounds(field.view(), at.data(), 0, spheres, bound.data());
       std::iota(order.begin(), order.end(), std::size_t{0});
       std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {

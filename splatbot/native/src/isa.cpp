@@ -1,44 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "splatbot/isa.hpp"
 
+#include <algorithm>
 #include <atomic>
 #include <cstdlib>
+#include <iterator>
 #include <stdexcept>
 
+#include "splatbot/isas.hpp"
 #include "splatbot/kernels.hpp"
 
 namespace splatbot {
 
 namespace {
 
+#define SPLATBOT_KERNELS_OF(isa) &isa::kKernels,
+const Kernels* const kBuilt[] = {SPLATBOT_EACH_ISA(SPLATBOT_KERNELS_OF)};
+
 std::vector<const Kernels*> runnable() {
-#if defined(SPLATBOT_X86)
-  __builtin_cpu_init();
-  const bool level2 = __builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt");
-  const bool level3 = level2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                      __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2");
-  const bool level4 = level3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-                      __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
-                      __builtin_cpu_supports("avx512vl");
   std::vector<const Kernels*> found;
-  const auto add_if = [&found](bool runs, const Kernels& kernels) {
-    if (runs) {
-      found.push_back(&kernels);
-    }
-  };
-#if defined(SPLATBOT_HAS_v2)
-  add_if(level2, v2::kKernels);
-#endif
-#if defined(SPLATBOT_HAS_v3)
-  add_if(level3, v3::kKernels);
-#endif
-#if defined(SPLATBOT_HAS_v4)
-  add_if(level4, v4::kKernels);
-#endif
+  std::copy_if(std::begin(kBuilt), std::end(kBuilt), std::back_inserter(found),
+               [](const Kernels* kernels) { return cpu_runs(kernels->name); });
   return found;
-#else
-  return {&baseline::kKernels};
-#endif
 }
 
 const Kernels& choose(std::string_view name) {

@@ -364,6 +364,7 @@ int main() {
   check_errors();
   check_path_speed();
   check_depth();
+  check_bench();
   for (const std::string& isa : available_isas()) {
     set_isa(isa);
     run_all(isa);

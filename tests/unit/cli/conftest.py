@@ -21,6 +21,13 @@ class Answer:
     err: str
 
 
+def assert_refused(answer: Answer, message: str) -> None:
+    """Assert that a command refuses its words in plain text."""
+    assert answer.code in (1, 2)
+    assert message in answer.err
+    assert "Traceback" not in answer.err
+
+
 RunCommand = Callable[..., Answer]
 
 
@@ -38,6 +45,15 @@ def run(capsys: pytest.CaptureFixture[str]) -> RunCommand:
         return Answer(code, captured.out, captured.err)
 
     return call
+
+
+@pytest.fixture
+def work_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, empty."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
 
 
 @pytest.fixture

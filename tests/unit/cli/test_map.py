@@ -32,12 +32,11 @@ def test_quiet_says_nothing(run: RunCommand, log_folder: Path, tmp_path: Path) -
 
 
 def test_without_out_the_run_is_dated_and_latest_points_to_it(
-    run: RunCommand, log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunCommand, log_folder: Path, work_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     for _ in range(2):  # the link is replaced, not tripped over
         assert run("map", log_folder, "--quiet").code == 0
-    latest = tmp_path / "runs" / "latest"
+    latest = work_folder / "runs" / "latest"
     assert latest.is_symlink()
     assert latest.resolve().name.startswith("log-")
     assert (latest / "metrics.json").exists()
@@ -160,10 +159,9 @@ def test_phases_after_the_frames_are_named() -> None:
     ],
 )
 def test_a_saved_run_that_cannot_be_used_is_reported_before_anything_is_written(
-    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], what: str
+    run: RunCommand, work_folder: Path, words: list[str], what: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     answer = run("map", *words)
     assert answer.code == 2
     assert what in answer.err
-    assert list(tmp_path.iterdir()) == []
+    assert list(work_folder.iterdir()) == []

@@ -80,11 +80,10 @@ def test_render_writes_an_image_of_the_given_size(run: RunCommand, run_folder: P
 
 
 def test_render_without_out_names_the_picture_after_map_and_mode(
-    run: RunCommand, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunCommand, run_folder: Path, work_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     assert run("render", run_folder / "map.ply", "--mode", "depth").out.strip() == "map-depth.png"
-    assert (tmp_path / "map-depth.png").exists()
+    assert (work_folder / "map-depth.png").exists()
 
 
 def test_render_takes_a_pose_by_hand_or_by_index(run: RunCommand, run_folder: Path, tmp_path: Path) -> None:

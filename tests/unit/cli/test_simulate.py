@@ -108,14 +108,13 @@ def test_the_list_names_all_there_is(run: RunCommand) -> None:
     ],
 )
 def test_wrong_words_are_named_and_nothing_is_written(
-    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], named: str
+    run: RunCommand, work_folder: Path, words: list[str], named: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     answer = run("simulate", *words)
     assert answer.code == 2
     assert named in answer.err
     assert "Fix:" in answer.err
-    assert not list(tmp_path.iterdir())
+    assert not list(work_folder.iterdir())
 
 
 def test_a_recording_is_not_overwritten_nor_given_effects(run: RunCommand, make_log: object, tmp_path: Path) -> None:

@@ -33,6 +33,15 @@ def random_gaussians(n: int, rng: np.random.Generator, least: float = 1e-3, most
     return gaussians(rng.uniform(-1, 1, (n, 3)), scales, rng.normal(size=(n, 4)))
 
 
+def moved(model: GaussianModel, turn: Rotation, shift: float = 0.0) -> GaussianModel:
+    """Return a grey copy, turned around the origin and then shifted [m] along every axis."""
+    return gaussians(
+        turn.apply(model.means.double().numpy()) + shift,
+        model.scales.double().numpy(),
+        (turn * Rotation.from_quat(model.quats.double().numpy(), scalar_first=True)).as_quat(scalar_first=True),
+    )
+
+
 def local(model: GaussianModel, n_sigma: float, points: Array) -> tuple[Array, Array]:
     """Transform points (P, 3) to the frames of the Gaussians (P, N, 3); return also the semi-axes (N, 3)."""
     R = Rotation.from_quat(model.quats.double().numpy(), scalar_first=True).as_matrix()

@@ -17,6 +17,7 @@ from splatbot.collision.field import SCALE_FLOOR
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel, Snapshot
 from tests.unit.collision.oracle import gaussians as _model
+from tests.unit.collision.oracle import moved
 
 ERROR_BOUND = 1.5e-6  # of the class docstring: times L / least scale
 
@@ -100,13 +101,8 @@ def test_rotating_and_moving_map_and_points_together_changes_nothing() -> None:
     model = _random(100, rng, least=5e-3)
     points = rng.uniform(-1, 1, (50, 3))
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
-    turned = _model(
-        turn.apply(model.means.double().numpy()) + 3,
-        model.scales.double().numpy(),
-        (turn * Rotation.from_quat(model.quats.double().numpy(), scalar_first=True)).as_quat(scalar_first=True),
-    )
     before = GaussianCollisionField(model).mahalanobis(points)
-    after = GaussianCollisionField(turned).mahalanobis(turn.apply(points) + 3)
+    after = GaussianCollisionField(moved(model, turn, shift=3.0)).mahalanobis(turn.apply(points) + 3)
     np.testing.assert_allclose(after.distance, before.distance, rtol=1e-3)
 
 

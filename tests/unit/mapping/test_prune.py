@@ -8,28 +8,18 @@ import torch
 
 from splatbot.gaussians import GaussianModel
 from splatbot.mapping.prune import best_supported, keep_mask
+from tests.models import random_model
 from tests.rgbd import small_config
 
 CONFIG = small_config(mapping__min_opacity=0.05, mapping__max_scale=0.5).mapping
 
 
-def model_of(n: int, rng: np.random.Generator) -> GaussianModel:
-    """Make valid Gaussians: opacity 0.1 to 0.9, 1 to 10 cm."""
-    return GaussianModel.from_activated(
-        means=rng.normal(size=(n, 3)),
-        quats=rng.normal(size=(n, 4)),
-        scales=rng.uniform(0.01, 0.1, (n, 3)),
-        opacities=rng.uniform(0.1, 0.9, n),
-        colors=rng.uniform(0, 1, (n, 3)),
-    )
-
-
 def test_sound_gaussians_stay(rng: np.random.Generator) -> None:
-    assert keep_mask(model_of(50, rng), CONFIG).all()
+    assert keep_mask(random_model(50, rng), CONFIG).all()
 
 
 def test_the_faint_and_the_huge_go_and_their_neighbours_stay(rng: np.random.Generator) -> None:
-    model = model_of(6, rng)
+    model = random_model(6, rng)
     model.opacity_logits[:2] = torch.logit(torch.tensor([0.049, 0.051]))
     model.log_scales[2:4, 1] = torch.tensor([0.501, 0.499]).log()
     assert keep_mask(model, CONFIG).tolist() == [False, True, False, True, True, True]
@@ -38,14 +28,14 @@ def test_the_faint_and_the_huge_go_and_their_neighbours_stay(rng: np.random.Gene
 @pytest.mark.parametrize("column", ["means", "quats", "log_scales", "opacity_logits"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_gaussians_that_are_not_finite_are_removed(column: str, value: float, rng: np.random.Generator) -> None:
-    model = model_of(5, rng)
+    model = random_model(5, rng)
     getattr(model, column)[3] = value
     assert keep_mask(model, CONFIG).tolist() == [True, True, True, False, True]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_colour_that_is_not_finite_goes(value: float, rng: np.random.Generator) -> None:
-    model = model_of(3, rng)
+    model = random_model(3, rng)
     model.sh[1, 0, 2] = value
     assert keep_mask(model, CONFIG).tolist() == [True, False, True]
 
@@ -59,7 +49,7 @@ def test_an_empty_model_has_nothing_to_prune() -> None:
 def test_the_cap_holds_exactly_and_keeps_those_seen_most_often_then_the_most_opaque(
     count: int, rng: np.random.Generator
 ) -> None:
-    model = model_of(100, rng)
+    model = random_model(100, rng)
     model.observations = torch.from_numpy(rng.integers(0, 6, 100).astype(np.int32))
     kept = best_supported(model, count).tolist()
     merit = sorted(range(100), key=lambda i: (-int(model.observations[i]), -float(model.opacities[i])))
@@ -67,12 +57,12 @@ def test_the_cap_holds_exactly_and_keeps_those_seen_most_often_then_the_most_opa
 
 
 def test_guesses_are_the_first_to_go(rng: np.random.Generator) -> None:
-    model = model_of(10, rng)
+    model = random_model(10, rng)
     model.observations[:4] = 0
     model.opacity_logits[:4] = 5.0
     assert best_supported(model, 6).tolist() == [4, 5, 6, 7, 8, 9]
 
 
 def test_of_equals_the_oldest_stay(rng: np.random.Generator) -> None:
-    model = model_of(1, rng).select(torch.zeros(20, dtype=torch.long))
+    model = random_model(1, rng).select(torch.zeros(20, dtype=torch.long))
     assert best_supported(model, 7).tolist() == list(range(7))

@@ -9,18 +9,9 @@ from torch import Tensor
 
 from splatbot.gaussians import GaussianModel
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
+from tests.models import random_model
 
 RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 5e-3, "opacity_logits": 2e-2, "sh": 1e-2}
-
-
-def model_of(n: int, rng: np.random.Generator) -> GaussianModel:
-    return GaussianModel.from_activated(
-        means=rng.normal(size=(n, 3)),
-        quats=rng.normal(size=(n, 4)),
-        scales=rng.uniform(0.01, 0.1, (n, 3)),
-        opacities=rng.uniform(0.1, 0.9, n),
-        colors=rng.uniform(0, 1, (n, 3)),
-    )
 
 
 def gradients(model: GaussianModel, rng: np.random.Generator) -> dict[str, Tensor]:
@@ -63,25 +54,19 @@ class Oracle:
 
 
 def started(n: int, rng: np.random.Generator) -> tuple[GaussianModel, GaussianAdam, Oracle]:
-    model = model_of(n, rng)
+    model = random_model(n, rng)
     adam = GaussianAdam(RATES)
     adam.extend(model)
     return model, adam, Oracle(model)
 
 
-def test_equals_torch_adam_in_float64(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_equals_torch_adam_in_float64_and_each_gaussian_counts_the_steps_it_was_seen_in(
+    share: float, rng: np.random.Generator
+) -> None:
     model, adam, oracle = started(8, rng)
     for _ in range(30):
-        grads, all_rows = gradients(model, rng), torch.ones(8, dtype=torch.bool)
-        adam.step(model, grads, all_rows)
-        oracle.step(grads, all_rows)
-    oracle.assert_equals(model)
-
-
-def test_each_gaussian_counts_the_steps_it_was_seen_in(rng: np.random.Generator) -> None:
-    model, adam, oracle = started(8, rng)
-    for _ in range(20):
-        grads, visible = gradients(model, rng), torch.from_numpy(rng.random(8) < 0.4)
+        grads, visible = gradients(model, rng), torch.from_numpy(rng.random(8) < share)
         adam.step(model, grads, visible)
         oracle.step(grads, visible)
     oracle.assert_equals(model)
@@ -91,7 +76,7 @@ def test_rows_added_and_removed_in_between_keep_their_own_moments(rng: np.random
     model, adam, oracle = started(6, rng)
     for i in range(24):
         if i % 6 == 2:
-            model = GaussianModel.concatenate([model, model_of(3, rng)])
+            model = GaussianModel.concatenate([model, random_model(3, rng)])
             adam.extend(model)
             oracle.extend(model)
         if i % 6 == 4:
@@ -140,7 +125,7 @@ def test_an_empty_model_takes_a_step_and_rows_afterwards(rng: np.random.Generato
     adam, empty = GaussianAdam(RATES), GaussianModel.empty()
     adam.extend(empty)
     adam.step(empty, {n: torch.zeros_like(getattr(empty, n)) for n in PARAMETERS}, torch.zeros(0, dtype=torch.bool))
-    model = model_of(3, rng)
+    model = random_model(3, rng)
     adam.extend(model)
     oracle = Oracle(model)
     grads, visible = gradients(model, rng), torch.ones(3, dtype=torch.bool)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
@@ -15,15 +13,7 @@ from splatbot.rasterize.native import native
 SHAPES = {"a": (3,), "b": (4,), "c": (), "d": (16, 3)}
 RATES = {"a": 1e-3, "b": 3e-3, "c": 5e-2, "d": 2e-3}
 
-
-@pytest.fixture(autouse=True)
-def _restore() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # torch's spin, and starve the kernels'
-    yield
-    torch.set_num_threads(threads)
-    native().set_num_threads(0)
-    native().set_isa("")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "default_kernels")
 
 
 class Run:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
@@ -14,15 +12,7 @@ from splatbot.evaluation import ssim
 from splatbot.optimize.losses import Padding, l1_dssim
 from splatbot.rasterize.native import native
 
-
-@pytest.fixture(autouse=True)
-def _restore() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # torch's spin, and starve the kernels'
-    yield
-    torch.set_num_threads(threads)
-    native().set_num_threads(0)
-    native().set_isa("")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "default_kernels")
 
 
 def reference(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from splatbot.rasterize import contributing_gaussians
+from splatbot.rasterize import Gaussians, Viewpoints, contributing_gaussians
 
 SIDE = 32
 
@@ -33,9 +33,8 @@ def test_gaussians_are_met_front_to_back_and_in_order_of_index_at_one_depth(
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, -1).contiguous()
     K = torch.tensor([[[SIDE, 0.0, SIDE / 2], [0.0, SIDE, SIDE / 2], [0.0, 0.0, 1.0]]])
     pixels = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
-    found = contributing_gaussians(
-        means, quats, scales, torch.full((count,), 0.1), torch.eye(4)[None], K, SIDE, SIDE, pixels, k=16
-    )
+    gaussians = Gaussians(means, quats, scales, torch.full((count,), 0.1))
+    found = contributing_gaussians(gaussians, Viewpoints(torch.eye(4)[None], K, SIDE, SIDE), pixels, k=16)
     ids = found.ids[0]
     both = (ids[:, :-1] >= 0) & (ids[:, 1:] >= 0)
     assert int(both.sum()) > 5 * len(pixels)

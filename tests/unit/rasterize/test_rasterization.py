@@ -11,7 +11,7 @@ from torch import Tensor
 from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.rasterize import rasterization
-from tests.scenes import NAMES, compare, hard_scene, one_gaussian, relative_l2
+from tests.scenes import NAMES, assert_alone_equal_together, compare, hard_scene, one_gaussian, relative_l2
 
 FORWARD_BOUND = 1e-5
 GRADIENT_BOUND = 1e-4
@@ -98,15 +98,7 @@ def test_gradients_asked_for_alone_equal_those_asked_for_together(wanted: tuple[
         return {name: getattr(scene, name).grad for name in names_all}
 
     names_all = tuple(name for name in NAMES if name != "covars")
-    together, alone = gradients(names_all), gradients(wanted)
-    for name in names_all:
-        got, want = alone[name], together[name]
-        if name not in wanted:
-            assert got is None
-        else:
-            assert got is not None
-            assert want is not None
-            assert torch.equal(got, want), name
+    assert_alone_equal_together(gradients, names_all, wanted)
 
 
 def test_gradient_of_alpha_alone_equals_the_reference() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,13 +14,7 @@ from tests.surfels import NAMES, RENDERED, loss, reference
 
 STEP = 1e-6
 
-
-@pytest.fixture(autouse=True)
-def _one_torch_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the reference's tensors are small: threads would only wait for each other
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 @pytest.mark.parametrize("image", [*RENDERED, "surf_normals"])
@@ -82,13 +75,7 @@ def test_hits_are_where_the_rays_meet_the_discs() -> None:
     K = scene.Ks[0].double().numpy()
     checked = 0
     for i in range(40):
-        alone = Scene(
-            **{n: getattr(scene, n)[i : i + 1] for n in ("means", "quats", "scales", "opacities", "colors")},
-            viewmats=scene.viewmats,
-            Ks=scene.Ks,
-            width=scene.width,
-            height=scene.height,
-        )
+        alone = scene.alone(i)
         images, _ = reference(alone.to(torch.float64), "RGB+ED")
         R = R_camera_world @ quat_to_rotation(scene.quats[i].double().numpy())
         p = R_camera_world @ scene.means[i].double().numpy() + t

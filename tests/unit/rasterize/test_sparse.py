@@ -21,15 +21,15 @@ from tests.unit.rasterize.test_median import exact_weights
 PIXELS = torch.tensor([[0, 0], [74, 52], [31, 15], [32, 16], [40, 20], [41, 20], [40, 20], [5, 50]])
 
 
-def arguments(scene: Scene, *without: str) -> dict[str, Any]:
-    return {k: v for k, v in vars(scene).items() if k not in without}
+def render_pixels(scene: Scene, pixels: Tensor = PIXELS, **options: Any) -> tuple[Tensor, Tensor, Any]:
+    return rasterize_pixels(scene.gaussians(), scene.viewpoints, pixels, **options)
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "D", "RGB+MD"])
 def test_pixels_are_bit_for_bit_those_of_the_whole_picture(mode: str) -> None:
     scene = hard_scene(0, views=2)
     image, alpha, _ = scene.render(mode)
-    colors, alphas, _ = rasterize_pixels(**arguments(scene), pixels=PIXELS, render_mode=mode)
+    colors, alphas, _ = render_pixels(scene, render_mode=mode)
     x, y = PIXELS.unbind(-1)
     assert torch.equal(colors, image[:, y, x])
     assert torch.equal(alphas, alpha[:, y, x])
@@ -38,7 +38,7 @@ def test_pixels_are_bit_for_bit_those_of_the_whole_picture(mode: str) -> None:
 def test_each_view_may_have_pixels_of_its_own() -> None:
     scene = hard_scene(1, views=2)
     own = torch.stack([PIXELS, PIXELS.flip(0)])
-    colors, _, _ = rasterize_pixels(**arguments(scene), pixels=own, camera_model="fisheye")
+    colors, _, _ = render_pixels(scene, own, camera_model="fisheye")
     image = scene.render("RGB", camera_model="fisheye")[0]
     for c in range(2):
         assert torch.equal(colors[c], image[c, own[c, :, 1], own[c, :, 0]])
@@ -48,7 +48,7 @@ def test_gradients_of_pixels_are_those_of_the_whole_picture() -> None:
     def gradients(sparse: bool) -> dict[str, Tensor | None]:
         leaves = hard_scene(2).to(torch.float32, requires_grad=True)
         if sparse:
-            colors, alphas, _ = rasterize_pixels(**arguments(leaves), pixels=PIXELS, render_mode="RGB+ED")
+            colors, alphas, _ = render_pixels(leaves, render_mode="RGB+ED")
         else:
             image, alpha, _ = leaves.render("RGB+ED")
             x, y = PIXELS.unbind(-1)
@@ -67,7 +67,7 @@ def test_tiles_are_bit_for_bit_those_of_the_whole_picture(size: int) -> None:
     scene = hard_scene(3)
     columns, rows = -(-75 // size), -(-53 // size)
     tiles = torch.tensor([[0, 0], [columns - 1, rows - 1], [2, 1]])
-    colors, alphas, _ = rasterize_tiles(**arguments(scene), tiles=tiles, tile_size=size)
+    colors, alphas, _ = rasterize_tiles(scene.gaussians(), scene.viewpoints, tiles, size)
     image, alpha, _ = scene.render("RGB")
     for i, (column, row) in enumerate(tiles.tolist()):
         part = slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size)
@@ -82,7 +82,7 @@ def test_contributors_are_the_front_gaussians_with_their_blend_weights(k: int) -
     scene = hard_scene(4, n=120, views=2)
     weights = exact_weights(scene)
     exact = scene.to(torch.float64)
-    found = contributing_gaussians(**arguments(scene, "colors", "backgrounds"), pixels=PIXELS, k=k)
+    found = contributing_gaussians(scene.gaussians(), scene.viewpoints, PIXELS, k=k)
     assert found.ids.shape == (2, len(PIXELS), k)
     for c in range(2):
         depth = exact.means @ exact.viewmats[c, 2, :3] + exact.viewmats[c, 2, 3]
@@ -99,7 +99,7 @@ def test_contributors_are_the_front_gaussians_with_their_blend_weights(k: int) -
 
 def test_the_weights_of_all_contributors_sum_to_alpha() -> None:
     scene = hard_scene(5)
-    found = contributing_gaussians(**arguments(scene, "colors", "backgrounds"), pixels=PIXELS, k=400)
+    found = contributing_gaussians(scene.gaussians(), scene.viewpoints, PIXELS, k=400)
     alpha = scene.render("RGB")[1][:, PIXELS[:, 1], PIXELS[:, 0], 0]
     assert torch.allclose(found.weights.sum(-1), alpha, atol=1e-5)
 
@@ -110,7 +110,7 @@ def test_the_weights_of_all_contributors_sum_to_alpha() -> None:
 def test_visible_are_those_that_a_render_projects(options: dict[str, Any]) -> None:
     scene = hard_scene(6, views=2)
     want = scene.render("RGB", **options)[2]["visibility"]
-    got = visible_gaussians(**arguments(scene, "colors", "backgrounds"), **options)
+    got = visible_gaussians(scene.gaussians(), scene.viewpoints, **options)
     assert torch.equal(got, want)
     assert 0 < int(got.sum()) < got.numel()
 
@@ -121,18 +121,25 @@ def test_visible_are_those_that_a_render_projects(options: dict[str, Any]) -> No
         ({"pixels": torch.tensor([[75, 0]])}, "pixels"),
         ({"pixels": torch.tensor([[0.0, 0.0]])}, "pixels"),
         ({"pixels": torch.zeros(3, 4, 2, dtype=torch.int64)}, "pixels"),
-        ({"pixels": PIXELS, "masks": torch.ones(1)}, "masks"),
-        ({"pixels": PIXELS, "viewmats": torch.eye(4)[None, None]}, "viewmats"),
+        ({"masks": torch.ones(1)}, "masks"),
     ],
 )
 def test_pixels_that_make_no_sense_are_refused(change: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError) as caught:
-        rasterize_pixels(**{**arguments(hard_scene(7, n=10)), **change})
+        render_pixels(hard_scene(7, n=10), **change)
     assert caught.value.field == field
+
+
+def test_batch_dimensions_are_refused() -> None:
+    scene = hard_scene(7, n=10)
+    scene.viewmats = torch.eye(4)[None, None]
+    with pytest.raises(InputError) as caught:
+        render_pixels(scene)
+    assert caught.value.field == "viewmats"
 
 
 def test_a_non_finite_input_is_named_by_visibility_too() -> None:
     scene = hard_scene(8, n=10)
     scene.scales[3, 1] = torch.nan
     with pytest.raises(InputError, match="row 3"):
-        visible_gaussians(**arguments(scene, "colors", "backgrounds"))
+        visible_gaussians(scene.gaussians(), scene.viewpoints)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -15,21 +14,13 @@ from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.rasterize import rasterization_2dgs
 from splatbot.rasterize.native import native
-from tests.scenes import Scene, one_gaussian, relative_l2
+from tests.scenes import Scene, assert_alone_equal_together, one_gaussian, relative_l2
 from tests.surfels import NAMES, RENDERED, arguments, compare_surfels, hard_surfels, loss, reference, render, wall
 
 FORWARD_BOUND = 1e-5
 GRADIENT_BOUND = 1e-4
 
-
-@pytest.fixture(autouse=True)
-def _restore() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the reference's tensors are small: threads would only wait for each other
-    yield
-    torch.set_num_threads(threads)
-    native().set_num_threads(0)
-    native().set_isa("")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "default_kernels")
 
 
 def assert_equal(scene: Scene, mode: str, **options: Any) -> None:
@@ -172,15 +163,7 @@ def test_gradients_asked_for_alone_equal_those_asked_for_together(wanted: tuple[
         loss(render(scene, "RGB+ED", distloss=True)[0], torch.ones(()), RENDERED).backward()
         return {name: getattr(scene, name).grad for name in NAMES}
 
-    together, alone = gradients(NAMES), gradients(wanted)
-    for name in NAMES:
-        got, want = alone[name], together[name]
-        if name not in wanted:
-            assert got is None
-        else:
-            assert got is not None
-            assert want is not None
-            assert torch.equal(got, want), name
+    assert_alone_equal_together(gradients, NAMES, wanted)
 
 
 def test_gradient_2dgs_is_that_of_moving_the_image_of_a_surfel() -> None:
@@ -218,13 +201,7 @@ def test_radii_bound_what_a_surfel_touches() -> None:
     for seed in range(20):
         scene = hard_surfels(seed, n=10)
         for i in range(10):
-            alone = Scene(
-                **{n: getattr(scene, n)[i : i + 1] for n in ("means", "quats", "scales", "opacities", "colors")},
-                viewmats=scene.viewmats,
-                Ks=scene.Ks,
-                width=scene.width,
-                height=scene.height,
-            )
+            alone = scene.alone(i)
             images, meta = render(alone)
             y, x = torch.nonzero(images["alphas"][0, ..., 0] > 0, as_tuple=True)
             if len(x) == 0:

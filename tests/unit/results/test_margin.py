@@ -14,6 +14,7 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.errors import FormatError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
+from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import own_margin
 from splatbot.robots.in_view import reopen_log
@@ -21,12 +22,21 @@ from splatbot.run.masked import MaskedLog
 from splatbot.workspace import fit_workspace
 
 
-def test_the_margin_of_a_run_is_what_its_depth_leaves_outside_of_the_ellipsoids(tmp_path: Path) -> None:
-    run = tmp_path / "table"
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GaussianModel, Array]:
+    """A run of two frames, its map, and the pose of the base in it."""
+    run = tmp_path_factory.mktemp("runs") / "table"
     assert main(["map", "synthetic:tabletop?frames=2&width=160&height=120", "--out", str(run), "--quiet"]) == 0
     model = GaussianModel.load(run / "map.ply")
     T = fit_workspace(model).T_world_base
     assert T is not None
+    return run, model, T
+
+
+def test_the_margin_of_a_run_is_what_its_depth_leaves_outside_of_the_ellipsoids(
+    mapped: tuple[Path, GaussianModel, Array],
+) -> None:
+    run, model, T = mapped
     thin, thick = (own_margin(run, reopen_log(RunFolder(run)), GaussianCollisionField(model, n), T) for n in (0.2, 3.0))
     assert 0.0 <= thick < thin < 0.3
 
@@ -37,12 +47,8 @@ def test_a_folder_that_holds_no_run_has_none(tmp_path: Path) -> None:
         own_margin(tmp_path, reopen_log(RunFolder(tmp_path)), field, np.eye(4))
 
 
-def test_what_the_run_left_out_does_not_count(tmp_path: Path) -> None:
-    run = tmp_path / "table"
-    assert main(["map", "synthetic:tabletop?frames=2&width=160&height=120", "--out", str(run), "--quiet"]) == 0
-    model = GaussianModel.load(run / "map.ply")
-    T = fit_workspace(model).T_world_base
-    assert T is not None
+def test_what_the_run_left_out_does_not_count(mapped: tuple[Path, GaussianModel, Array]) -> None:
+    run, model, T = mapped
     field, log = GaussianCollisionField(model), reopen_log(RunFolder(run))
 
     def with_an_arm_in_view(frame: Frame, *, masked: bool) -> Frame:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatbot.frame import PosePrior
 from splatbot.geometry import inverse, se3_exp
@@ -14,6 +15,7 @@ from splatbot.tracking.health import Health
 from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis
 from splatbot.tracking.motion_model import ConstantVelocity, Prediction
 from splatbot.tracking.priors import fuse, is_consistent, mahalanobis_distance
+from splatbot.tracking.tracker import PoseEstimate
 from tests.rgbd import wall_frame
 from tests.unit.tracking.test_tracker import Run
 
@@ -23,6 +25,19 @@ PRECISE = np.diag([1e-6] * 3 + [1e-6] * 3)  # 1 mm, 0.06°
 def pose(twist: list[float]) -> ScoredHypothesis:
     found = Alignment(se3_exp(twist), np.eye(6), np.eye(6), np.eye(6), 48, 525.0)
     return ScoredHypothesis(Hypothesis("direct", found, []), Health(1, 1, 1, 1, 0.5, 1), "ok", (), None, np.eye(6))
+
+
+def tracked_with_prior(run: Run, i: int, T_world_camera: NDArray[np.float64], *, absolute: bool) -> PoseEstimate:
+    """Track frame i after frame 1 with a precise prior: its pose, or its motion since frame 1."""
+    relative = inverse(run.poses[1]) @ T_world_camera
+    prior = (
+        PosePrior(PRECISE, T_world_camera=T_world_camera)
+        if absolute
+        else PosePrior(PRECISE, T_previous_camera=relative)
+    )
+    estimate = run.track(replace(run.frames[i], prior=prior))
+    assert estimate.verdict == "ok", estimate.reasons
+    return estimate
 
 
 def test_fusion_is_the_information_weighted_mean_and_the_parallel_sum_of_covariances() -> None:
@@ -60,14 +75,7 @@ def test_a_correct_prior_tracks_a_jump_outside_the_basin_of_features_and_alignme
     """The camera moves 10 cm in one frame at 30 Hz, without features."""
     run = Run(tracking__features="needed", tracking__features_motion=10.0, tracking__features_rotation=10.0)
     run.track(run.frames[1])
-    T = run.poses[9]
-    prior = (
-        PosePrior(PRECISE, T_world_camera=T)
-        if absolute
-        else PosePrior(PRECISE, T_previous_camera=inverse(run.poses[1]) @ T)
-    )
-    estimate = run.track(replace(run.frames[9], prior=prior))
-    assert estimate.verdict == "ok", estimate.reasons
+    estimate = tracked_with_prior(run, 9, run.poses[9], absolute=absolute)
     assert run.error(estimate, 9)[0] < 2e-3
     assert not estimate.reasons
 
@@ -79,13 +87,7 @@ def test_a_wrong_prior_is_rejected_and_reported(absolute: bool, shift: float) ->
     run = Run()
     run.track(run.frames[1])
     wrong = run.poses[2] @ se3_exp([shift, -shift, 0.5 * shift, 0, 0, 0])
-    prior = (
-        PosePrior(PRECISE, T_world_camera=wrong)
-        if absolute
-        else PosePrior(PRECISE, T_previous_camera=inverse(run.poses[1]) @ wrong)
-    )
-    estimate = run.track(replace(run.frames[2], prior=prior))
-    assert estimate.verdict == "ok", estimate.reasons
+    estimate = tracked_with_prior(run, 2, wrong, absolute=absolute)
     assert run.error(estimate, 2)[0] < 1.5e-3
     assert any("the prior is" in reason and "left out" in reason for reason in estimate.reasons)
 

@@ -58,6 +58,7 @@ class Arm {
 
  private:
   void forward_one(const double* q, double* poses) const;
+  void place_spheres(const double* poses, double* centers) const;
 
   struct Joint {
     double R[9], t[3];

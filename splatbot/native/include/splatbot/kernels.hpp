@@ -4,6 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "splatbot/isas.hpp"
 #include "splatbot/raster_state.hpp"
 #include "splatbot/surfel_kernels.hpp"
 
@@ -212,33 +213,20 @@ struct Kernels {
   SurfelKernels surfels;
   void (*loss)(const LossArgs&, std::size_t tile, float* scratch, LossSums& sums);
   void (*adam)(const AdamGroup&, const AdamBlock&);
-  float (*multiply_add)(std::size_t rounds);  // kMultiplyAddFlops x lanes x rounds floating-point operations
   const FieldKernels* field;
   const ArmKernels* arm;
   const PlanKernels* plan;
   int lanes;
 };
 
-inline constexpr int kMultiplyAddChains = 12;  // enough to hide the latency of two units
-inline constexpr std::size_t kMultiplyAddFlops = 2 * kMultiplyAddChains;
-
 // The kernels in use (isa.cpp).
 const Kernels& kernels();
 
-#if defined(SPLATBOT_X86)
-namespace v2 {
-extern const Kernels kKernels;
-}
-namespace v3 {
-extern const Kernels kKernels;
-}
-namespace v4 {
-extern const Kernels kKernels;
-}
-#else
-namespace baseline {
-extern const Kernels kKernels;
-}
-#endif
+#define SPLATBOT_DECLARE_KERNELS(isa) \
+  namespace isa {                      \
+  extern const Kernels kKernels;       \
+  }
+SPLATBOT_EACH_ISA(SPLATBOT_DECLARE_KERNELS)
+#undef SPLATBOT_DECLARE_KERNELS
 
 }  // namespace splatbot

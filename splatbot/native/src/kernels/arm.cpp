@@ -396,6 +396,18 @@ SB_INLINE int reversed(int i, int log2) {
   return r;
 }
 
+// Up to W configurations from `first` on, before `end`; returns their number. The first one fills the other lanes.
+SB_INLINE int load_joints(const ArmView& arm, const double* q, std::size_t first, std::size_t end, JointLanes& joints) {
+  const int n = end - first < static_cast<std::size_t>(W) ? static_cast<int>(end - first) : W;
+  for (int i = 0; i < W; ++i) {
+    const double* row = q + (first + static_cast<std::size_t>(i < n ? i : 0)) * static_cast<std::size_t>(arm.joints);
+    for (int j = 0; j < arm.joints; ++j) {
+      put_joint(joints, j, i, row[j]);
+    }
+  }
+  return n;
+}
+
 }  // namespace
 
 void arm_configurations(const ArmView& arm, const SolidsView* field, const double* q, std::size_t begin,
@@ -403,13 +415,7 @@ void arm_configurations(const ArmView& arm, const SolidsView* field, const doubl
   std::int32_t lanes[W];
   JointLanes joints;
   for (std::size_t first = begin; first < end; first += W) {
-    const int n = end - first < static_cast<std::size_t>(W) ? static_cast<int>(end - first) : W;
-    for (int i = 0; i < W; ++i) {
-      const double* row = q + (first + static_cast<std::size_t>(i < n ? i : 0)) * static_cast<std::size_t>(arm.joints);
-      for (int j = 0; j < arm.joints; ++j) {
-        put_joint(joints, j, i, row[j]);
-      }
-    }
+    const int n = load_joints(arm, q, first, end, joints);
     check_lanes(arm, field, joints, n == W ? kAllLanes : (1U << n) - 1U, lanes);
     for (int i = 0; i < n; ++i) {
       verdict[first + static_cast<std::size_t>(i)] = lanes[i];
@@ -476,13 +482,7 @@ void arm_centers(const ArmView& arm, const double* q, std::size_t begin, std::si
   Pose link[kMostJoints + 1];
   Placed placed;
   for (std::size_t first = begin; first < end; first += W) {
-    const int n = end - first < static_cast<std::size_t>(W) ? static_cast<int>(end - first) : W;
-    for (int i = 0; i < W; ++i) {
-      const double* row = q + (first + static_cast<std::size_t>(i < n ? i : 0)) * static_cast<std::size_t>(arm.joints);
-      for (int j = 0; j < arm.joints; ++j) {
-        put_joint(joints, j, i, row[j]);
-      }
-    }
+    const int n = load_joints(arm, q, first, end, joints);
     forward(arm, joints, link);
     place_all(arm, link, placed);
     for (int i = 0; i < n; ++i) {

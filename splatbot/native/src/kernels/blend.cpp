@@ -2,8 +2,7 @@
 // Front-to-back blending of one tile, 64 Gaussians at a time. Their block masks are found first. Then each block goes
 // through the Gaussians that reach it, with its transmittance and colours in registers.
 #include "entry.hpp"
-#include "image.hpp"
-#include "reach.hpp"
+#include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -38,16 +37,9 @@ struct Extras {
 };
 
 void start(const BlendArgs& args, const TileFrame& frame, int channels, TileState& state) {
-  for (int i = 0; i < kTilePixels; ++i) {
-    const bool inside =
-        kCenters.x[i] < static_cast<float>(frame.width) && kCenters.y[i] < static_cast<float>(frame.height);
-    state.through[i] = inside ? 1.0F : 0.0F;
-    state.transmittance[i] = 1.0F;
-  }
-  for (int y = 0; args.mask != nullptr && y < frame.height; ++y) {
-    for (int x = 0; x < frame.width; ++x) {
-      state.through[pixel_index(x, y)] = kept(args, frame.x0 + x, frame.y0 + y) ? 1.0F : 0.0F;
-    }
+  open_pixels(args, frame, state.through);
+  for (float& transmittance : state.transmittance) {
+    transmittance = 1.0F;
   }
   for (int c = 0; c < channels; ++c) {
     std::memset(state.channels[c], 0, sizeof(state.channels[c]));
@@ -123,47 +115,15 @@ SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, int block,
   }
 }
 
-std::uint32_t live_blocks(const TileState& state, F limit) {
-  std::uint32_t live = 0;
-  for (int b = 0; b < kBlocks; ++b) {
-    std::uint32_t open = 0;
-    for (int part = 0; part < kParts; ++part) {
-      open |= bits(load(state.through + b * kBlockPixels + part * W) > limit);
-    }
-    live |= static_cast<std::uint32_t>(open != 0) << b;
-  }
-  return live;
-}
-
 template <int C, Extras E>
 void blend_lists(const BlendArgs& args, const TileFrame& frame, std::size_t tile, TileState& state) {
-  Chunk chunk;
-  const std::uint32_t begin = args.tile_begin[tile];
-  const std::uint32_t end = args.tile_begin[tile + 1];
-  std::uint32_t at = begin;
   const F limit = set1(args.transmittance_min);
-  std::uint32_t live = live_blocks(state, limit);
-  while (at < end && live != 0) {
-    const int n = end - at < kChunk ? static_cast<int>(end - at) : kChunk;
+  const auto load_pairs = [&](std::uint32_t at, int n, std::uint32_t live, Chunk& chunk) SB_INLINE_LAMBDA {
     load_chunk<C>(args, frame, args.pairs + at, n, live, E.plane, chunk);
-    for (std::uint32_t next = at + kChunk; next < at + 2 * kChunk && next < end; ++next) {
-      __builtin_prefetch(args.records + args.pairs[next].id);
-    }
-    std::memcpy(args.masks + at, chunk.masks, static_cast<std::size_t>(n) * sizeof(chunk.masks[0]));
-    transpose_masks(chunk.masks, chunk.columns);
-    for (std::uint32_t left = live; left != 0; left &= left - 1) {
-      const int block = __builtin_ctz(left);
-      const std::uint64_t members = chunk.columns[block];
-      if (members != 0) {
-        for (int part = 0; part < kParts; ++part) {
-          blend_block<C, E>(chunk, members, block, part, limit, state);
-        }
-      }
-    }
-    live = live_blocks(state, limit);
-    at += static_cast<std::uint32_t>(n);
-  }
-  args.tile_done[tile] = at - begin;
+  };
+  const auto blend_part = [&](const Chunk& chunk, std::uint64_t members, std::uint32_t, int block, int part)
+                              SB_INLINE_LAMBDA { blend_block<C, E>(chunk, members, block, part, limit, state); };
+  blend_chunks<Chunk>(args, tile, state.through, limit, load_pairs, blend_part);
 }
 
 // Converts sums to outputs: adds the background, divides depth by the weights.

@@ -5,7 +5,7 @@
 // without a division by T. Order and masks are those of the forward pass. The sums of one (Gaussian, tile) pair
 // go to their own slot. Threads share no sums, and the result does not depend on their number.
 #include "entry.hpp"
-#include "image.hpp"
+#include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -21,7 +21,7 @@ void load_gradients(const BlendBackwardArgs& args, const TileFrame& frame, int c
   const BlendArgs& f = args.forward;
   const auto width = static_cast<std::size_t>(f.view.width);
   const int given = args.grad_colors != nullptr ? f.pass->count : 0;
-  const bool whole = frame.width == kTileWidth && frame.height == kTileHeight;
+  const bool whole = whole_tile(frame);
   for (int c = whole ? given : 0; c < channels; ++c) {
     std::memset(state.gradient[c], 0, sizeof(state.gradient[c]));
   }
@@ -42,25 +42,13 @@ void load_gradients(const BlendBackwardArgs& args, const TileFrame& frame, int c
   }
 }
 
-void open_pixels(const BlendArgs& args, const TileFrame& frame, TileGradient& state) {
-  const bool whole = frame.width == kTileWidth && frame.height == kTileHeight && args.mask == nullptr;
-  for (float& through : state.through) {
-    through = whole ? 1.0F : 0.0F;
-  }
-  for (int y = 0; y < frame.height && !whole; ++y) {
-    for (int x = 0; x < frame.width; ++x) {
-      state.through[pixel_index(x, y)] = kept(args, frame.x0 + x, frame.y0 + y) ? 1.0F : 0.0F;
-    }
-  }
-}
-
 // Gradients to the sums that blend() had before the background was added and expected depth was divided.
 void load_tile(const BlendBackwardArgs& args, const TileFrame& frame, int channels, const float* saved,
                TileGradient& state) {
   const ChannelPass& pass = *args.forward.pass;
   const float* background = args.forward.background;
   load_gradients(args, frame, channels, state);
-  open_pixels(args.forward, frame, state);
+  open_pixels(args.forward, frame, state.through);
   for (std::size_t i = 0; i < kPlane; i += W) {
     F grad_t = -load(state.rest + i);  // of alphas
     F rest = set1(0.0F);
@@ -100,56 +88,47 @@ SB_INLINE void sum_pair(const Record& record, const Lines& lines, const float* c
   for (int i = 0; i < 16; ++i) {
     acc[i] = set1(0.0F);
   }
-  do {
-    const int block = __builtin_ctz(mask);
-    mask &= mask - 1;
-#pragma GCC unroll 4
-    for (int part = 0; part < kParts; ++part) {
-      const std::size_t first = static_cast<std::size_t>(block * kBlockPixels + part * W);
-      const AlphaAt a = alpha_at(lines, block, first);
-      F through = load(state.through + first);
-      const Step step = advance(a, through, limit);
-      F along = set1(0.0F);
+  each_part_of(mask, [&](int block, std::size_t first) SB_INLINE_LAMBDA {
+    const AlphaAt a = alpha_at(lines, block, first);
+    F through = load(state.through + first);
+    const Step step = advance(a, through, limit);
+    F along = set1(0.0F);
 #pragma GCC unroll 8
-      for (int c = 0; c < C; ++c) {
-        const F g = load(state.gradient[c] + first);
-        F value = set1(channels[c]);
-        if (Plane && c == 0) {
-          const F x = load(kCenters.x + first), y = load(kCenters.y + first);
-          value = fma(set1(plane.slope_x), x, fma(set1(plane.slope_y), y, set1(plane.corner)));
-        }
-        if (Kind != Sums::none) {
-          along = fma(value, g, along);
-        }
-        if (c < S) {
-          acc[kMoments + c] = fma(step.weight, g, acc[kMoments + c]);
-        }
+    for (int c = 0; c < C; ++c) {
+      const F g = load(state.gradient[c] + first);
+      F value = set1(channels[c]);
+      if (Plane && c == 0) {
+        const F x = load(kCenters.x + first), y = load(kCenters.y + first);
+        value = fma(set1(plane.slope_x), x, fma(set1(plane.slope_y), y, set1(plane.corner)));
       }
-      store(state.through + first, through);
-      if (Kind == Sums::none) {
-        continue;
+      if (Kind != Sums::none) {
+        along = fma(value, g, along);
       }
-      const F rest = fnma(step.weight, along, load(state.rest + first));
-      store(state.rest + first, rest);
-      // alpha x d loss / d alpha; none where the cap holds alpha, nor in closed pixels.
-      const F other = a.alpha * reciprocal(a.left) * rest;
-      const M free = step.open & (a.power <= set1(kAlphaMax));
-      const F v = zero_unless(free, fms(step.weight, along, other));
-      const F vu = v * a.u;
-      const F w = load_quad(lines.w + first_line(block));
-      const F vw = v * w;
-      acc[0] = acc[0] + v;
-      acc[1] = acc[1] + vu;
-      acc[2] = acc[2] + vw;
-      acc[3] = fma(vu, a.u, acc[3]);
-      acc[4] = fma(vu, w, acc[4]);
-      acc[5] = fma(vw, w, acc[5]);
-      if (Kind == Sums::absolute) {
-        acc[kAbsolute] = acc[kAbsolute] + abs(vu);
-        acc[kAbsolute + 1] = acc[kAbsolute + 1] + abs(fma(set1(record.l21), vu, set1(record.l22) * vw));
+      if (c < S) {
+        acc[kMoments + c] = fma(step.weight, g, acc[kMoments + c]);
       }
     }
-  } while (mask != 0);
+    store(state.through + first, through);
+    if (Kind == Sums::none) {
+      return;
+    }
+    const F rest = fnma(step.weight, along, load(state.rest + first));
+    store(state.rest + first, rest);
+    const F v = pull_back_alpha(a, step, along, rest);
+    const F vu = v * a.u;
+    const F w = load_quad(lines.w + first_line(block));
+    const F vw = v * w;
+    acc[0] = acc[0] + v;
+    acc[1] = acc[1] + vu;
+    acc[2] = acc[2] + vw;
+    acc[3] = fma(vu, a.u, acc[3]);
+    acc[4] = fma(vu, w, acc[4]);
+    acc[5] = fma(vw, w, acc[5]);
+    if (Kind == Sums::absolute) {
+      acc[kAbsolute] = acc[kAbsolute] + abs(vu);
+      acc[kAbsolute + 1] = acc[kAbsolute + 1] + abs(fma(set1(record.l21), vu, set1(record.l22) * vw));
+    }
+  });
   store_sums<Kind == Sums::absolute ? kSlot : kMoments + S>(slot, acc);
 }
 
@@ -157,21 +136,7 @@ template <int C, int S, bool Plane, Sums Kind>
 void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::size_t tile, TileGradient& state) {
   const BlendArgs& f = args.forward;
   const F limit = set1(f.transmittance_min);
-  const std::uint32_t begin = f.tile_begin[tile];
-  const std::uint32_t end = f.tile_begin[tile + 1];
-  const std::uint32_t done = begin + f.tile_done[tile];
-  for (std::uint32_t at = begin; at < end; ++at) {
-    float* slot = args.slots + static_cast<std::size_t>(f.pairs[at].slot) * kSlot;
-    const std::uint32_t mask = at < done ? f.masks[at] : 0U;
-    if (mask == 0) {
-      std::memset(slot, 0, kSlot * sizeof(float));
-      continue;
-    }
-    constexpr std::uint32_t kAhead = 8;
-    if (at + kAhead < done) {
-      __builtin_prefetch(f.records + f.pairs[at + kAhead].id);
-      __builtin_prefetch(args.slots + static_cast<std::size_t>(f.pairs[at + kAhead].slot) * kSlot, 1);
-    }
+  each_slot<kSlot>(args, tile, [&](std::uint32_t at, std::uint32_t mask, float* slot) SB_INLINE_LAMBDA {
     const std::size_t id = f.pairs[at].id;
     const Record& record = f.records[id];
     Lines lines;
@@ -179,7 +144,7 @@ void backward_lists(const BlendBackwardArgs& args, const TileFrame& frame, std::
     const float* channels = f.channels + id * f.channel_stride;
     const PlaneDepth plane = Plane ? plane_depth(record, channels, frame) : PlaneDepth{};
     sum_pair<C, S, Plane, Kind>(record, lines, channels, plane, mask, limit, state, slot);
-  }
+  });
 }
 
 template <int C, bool Plane>

@@ -1,24 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // In how many pixels each Gaussian of a tile counts: the forward pass over again, with counts in place of colours.
 #include "entry.hpp"
-#include "tile.hpp"
+#include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
-
-struct Through {
-  alignas(64) float values[kTilePixels];  // see advance()
-};
-
-void open_pixels(const BlendArgs& args, const TileFrame& frame, Through& through) {
-  std::memset(through.values, 0, sizeof(through.values));
-  for (int y = 0; y < frame.height; ++y) {
-    for (int x = 0; x < frame.width; ++x) {
-      through.values[pixel_index(x, y)] = kept(args, frame.x0 + x, frame.y0 + y) ? 1.0F : 0.0F;
-    }
-  }
-}
 
 std::uint32_t count_pair(const Lines& lines, std::uint32_t mask, F limit, Through& through) {
   std::uint32_t count = 0;
@@ -42,7 +29,7 @@ void contributions(const ContributionArgs& args, std::size_t tile) {
   const TileFrame frame = tile_frame(f.view, f.columns, tile);
   const F limit = set1(f.transmittance_min);
   Through through;
-  open_pixels(f, frame, through);
+  open_pixels(f, frame, through.values);
   const std::uint32_t begin = f.tile_begin[tile], done = begin + f.tile_done[tile];
   for (std::uint32_t at = begin; at < f.tile_begin[tile + 1]; ++at) {
     const Pair& pair = f.pairs[at];

@@ -18,6 +18,5 @@ void medians(const MedianArgs& args, std::size_t tile);
 void fronts(const FrontArgs& args, std::size_t tile);
 void loss(const LossArgs& args, std::size_t tile, float* scratch, LossSums& sums);
 void adam(const AdamGroup& group, const AdamBlock& block);
-float multiply_add(std::size_t rounds);
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -25,6 +25,13 @@ SB_INLINE bool goes_before(std::int32_t id, const Found& found) {
   return found.block >= 0 && static_cast<std::uint32_t>(id) < static_cast<std::uint32_t>(found.id);
 }
 
+SB_INLINE void keep_nearer(float distance, const Found& candidate, float& best, Found& found) {
+  if (distance < best || (distance == best && goes_before(candidate.id, found))) {
+    best = distance;
+    found = candidate;
+  }
+}
+
 // Unused children lie infinitely far off.
 template <class Search>
 SB_INLINE float limit_of(const Search& search) {
@@ -132,11 +139,7 @@ struct NearestSearch {
       store(d, distance_bound<8>(l));
       for (std::uint32_t m = near; m != 0; m &= m - 1) {
         const int i = __builtin_ctz(m);
-        const std::int32_t id = leaf.leaf->id[at + i];
-        if (d[i] < best || (d[i] == best && goes_before(id, found))) {
-          best = d[i];
-          found = {at_leaf.block, at_leaf.leaf, at + i, id};
-        }
+        keep_nearer(d[i], {at_leaf.block, at_leaf.leaf, at + i, leaf.leaf->id[at + i]}, best, found);
       }
     }
   }
@@ -241,11 +244,7 @@ struct MahalanobisSearch {
       store(d, squared);
       for (; near != 0; near &= near - 1) {
         const int i = __builtin_ctz(near);
-        const std::int32_t id = leaf.leaf->id[at + i];
-        if (d[i] < best || (d[i] == best && goes_before(id, found))) {
-          best = d[i];
-          found = {at_leaf.block, at_leaf.leaf, at + i, id};
-        }
+        keep_nearer(d[i], {at_leaf.block, at_leaf.leaf, at + i, leaf.leaf->id[at + i]}, best, found);
       }
     }
   }

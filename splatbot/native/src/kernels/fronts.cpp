@@ -1,24 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // The first Gaussians of each pixel: the forward pass again, with ids in place of colours, up to the last one needed.
 #include "entry.hpp"
-#include "tile.hpp"
+#include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
 namespace {
-
-struct Through {
-  alignas(64) float values[kTilePixels];  // see advance()
-};
-
-void open_pixels(const BlendArgs& args, const TileFrame& frame, Through& through) {
-  std::memset(through.values, 0, sizeof(through.values));
-  for (int y = 0; y < frame.height; ++y) {
-    for (int x = 0; x < frame.width; ++x) {
-      through.values[pixel_index(x, y)] = kept(args, frame.x0 + x, frame.y0 + y) ? 1.0F : 0.0F;
-    }
-  }
-}
 
 // Names the Gaussian in the pixels of a block that it takes from above to half; true if some pixel is still above.
 bool halve_block(const Lines& lines, std::uint32_t id, int block, F limit, Through& through, std::int32_t* ids) {
@@ -91,26 +78,15 @@ void medians(const MedianArgs& args, std::size_t tile) {
   const F limit = set1(f.transmittance_min);
   const TileFrame frame = tile_frame(f.view, f.columns, tile);
   Through through;
-  open_pixels(f, frame, through);
+  open_pixels(f, frame, through.values);
   std::int32_t ids[kTilePixels];
   std::memset(ids, 0xff, sizeof(ids));
   std::uint32_t waiting = ~0U;
-  const std::uint32_t begin = f.tile_begin[tile], done = begin + f.tile_done[tile];
-  for (std::uint32_t at = begin; at < done && waiting != 0; ++at) {
-    std::uint32_t mask = f.masks[at] & waiting;
-    if (mask == 0) {
-      continue;
+  each_reached(f, frame, tile, waiting, [&](const Lines& lines, std::uint32_t id, int block) {
+    if (!halve_block(lines, id, block, limit, through, ids)) {
+      waiting &= ~(1U << block);
     }
-    const std::uint32_t id = f.pairs[at].id;
-    Lines lines;
-    localize(f.records[id], frame, lines);
-    for (; mask != 0; mask &= mask - 1) {
-      const int block = __builtin_ctz(mask);
-      if (!halve_block(lines, id, block, limit, through, ids)) {
-        waiting &= ~(1U << block);
-      }
-    }
-  }
+  });
   for (int y = 0; y < frame.height; ++y) {
     std::int32_t* line = args.ids + static_cast<std::size_t>(frame.y0 + y) * static_cast<std::size_t>(f.view.width);
     for (int x = 0; x < frame.width; ++x) {
@@ -128,21 +104,11 @@ void fronts(const FrontArgs& args, std::size_t tile) {
   }
   const TileFrame frame = tile_frame(f.view, f.columns, tile);
   Through through;
-  open_pixels(f, frame, through);
+  open_pixels(f, frame, through.values);
   Wanted wanted(args.pixels + first_entry, entries);
-  const std::uint32_t begin = f.tile_begin[tile], done = begin + f.tile_done[tile];
-  for (std::uint32_t at = begin; at < done && wanted.blocks != 0; ++at) {
-    std::uint32_t mask = f.masks[at] & wanted.blocks;
-    if (mask == 0) {
-      continue;
-    }
-    const std::uint32_t id = f.pairs[at].id;
-    Lines lines;
-    localize(f.records[id], frame, lines);
-    for (; mask != 0; mask &= mask - 1) {
-      pick_block(args, lines, id, __builtin_ctz(mask), first_entry, limit, through, wanted);
-    }
-  }
+  each_reached(f, frame, tile, wanted.blocks, [&](const Lines& lines, std::uint32_t id, int block) {
+    pick_block(args, lines, id, block, first_entry, limit, through, wanted);
+  });
 }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

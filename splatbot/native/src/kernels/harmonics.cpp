@@ -4,7 +4,7 @@
 // (Kerbl et al. 2023; polynomials after Sloan, JCGT 2013). Beyond the unit sphere they continue as these polynomials,
 // which has no effect, since only gradients along the sphere are used.
 #include "entry.hpp"
-#include "simd.hpp"
+#include "lanes.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -243,49 +243,44 @@ void backward_block(const HarmonicsBackwardArgs& args, const std::uint32_t* visi
   }
 }
 
+template <int Degree>
+struct DegreeConstant {
+  constexpr operator int() const { return Degree; }
+};
+
+// Calls each() with the degree as a constant.
+template <class Each>
+void with_degree(int degree, Each each) {
+  switch (degree) {
+    case 0:
+      return each(DegreeConstant<0>{});
+    case 1:
+      return each(DegreeConstant<1>{});
+    case 2:
+      return each(DegreeConstant<2>{});
+    case 3:
+      return each(DegreeConstant<3>{});
+    default:
+      return each(DegreeConstant<4>{});
+  }
+}
+
 }  // namespace
 
 void harmonics(const HarmonicsArgs& args, std::size_t block) {
   const std::uint32_t* visible = args.visible + block * kProjectBlock;
   const std::uint32_t count = args.blocks[block].visible;
-  switch (args.degree) {
-    case 0:
-      return color_block<0>(args, visible, count);
-    case 1:
-      return color_block<1>(args, visible, count);
-    case 2:
-      return color_block<2>(args, visible, count);
-    case 3:
-      return color_block<3>(args, visible, count);
-    default:
-      return color_block<4>(args, visible, count);
-  }
+  with_degree(args.degree, [&](auto degree) { color_block<degree>(args, visible, count); });
 }
 
 void harmonics_backward(const HarmonicsBackwardArgs& args, std::size_t block) {
   const std::uint32_t* visible = args.forward.visible + block * kProjectBlock;
   const std::uint32_t count = args.forward.blocks[block].visible;
-  const std::size_t begin = block * kProjectBlock;
-  const std::size_t end =
-      begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
+  const BlockRows rows = rows_of_block(block, args.forward.count);
   CenterSums center{};
-  switch (args.forward.degree) {
-    case 0:
-      backward_block<0>(args, visible, count, begin, center);
-      break;
-    case 1:
-      backward_block<1>(args, visible, count, begin, center);
-      break;
-    case 2:
-      backward_block<2>(args, visible, count, begin, center);
-      break;
-    case 3:
-      backward_block<3>(args, visible, count, begin, center);
-      break;
-    default:
-      backward_block<4>(args, visible, count, begin, center);
-  }
-  zero_coefficients(args, count == 0 ? begin : std::size_t{visible[count - 1]} + 1, end);
+  with_degree(args.forward.degree,
+              [&](auto degree) { backward_block<degree>(args, visible, count, rows.begin, center); });
+  zero_coefficients(args, count == 0 ? rows.begin : std::size_t{visible[count - 1]} + 1, rows.end);
   for (int c = 0; c < 3 && args.center != nullptr; ++c) {
     double sum = 0.0;
     for (int i = 0; i < W; ++i) {

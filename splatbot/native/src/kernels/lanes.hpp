@@ -28,9 +28,20 @@ inline std::size_t first_not_finite(const float* values, std::size_t n) {
   return n;
 }
 
-// The first input of Gaussians [begin, end) that is not finite, if there is one.
+// Rows of one projection block.
+struct BlockRows {
+  std::size_t begin, end;
+};
+
+SB_INLINE BlockRows rows_of_block(std::size_t block, std::size_t count) {
+  const std::size_t begin = block * kProjectBlock;
+  return {begin, begin + kProjectBlock < count ? begin + kProjectBlock : count};
+}
+
+// Begins a block's result with the first input of its Gaussians that is not finite, if there is one.
 template <class Args>
-bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
+bool find_fault(const Args& args, const BlockRows& rows, ProjectedBlock& out) {
+  out = ProjectedBlock{};
   const bool harmonics = args.sh_degree >= 0;
   const float* fields[] = {args.means, args.quats, args.scales, args.covars, args.opacities, args.colors};
   const auto columns = static_cast<std::size_t>(harmonics ? 3 * args.coefficients : args.channels);
@@ -39,15 +50,102 @@ bool find_fault(const Args& args, std::size_t begin, std::size_t end, ProjectedB
     if (fields[f] == nullptr) {
       continue;
     }
-    const std::size_t n = (end - begin) * widths[f];
-    const std::size_t bad = first_not_finite(fields[f] + begin * widths[f], n);
+    const std::size_t n = (rows.end - rows.begin) * widths[f];
+    const std::size_t bad = first_not_finite(fields[f] + rows.begin * widths[f], n);
     if (bad < n) {
       out.fault_field = f;
-      out.fault_row = begin + bad / widths[f];
+      out.fault_row = rows.begin + bad / widths[f];
       return true;
     }
   }
   return false;
+}
+
+// Calls each(first, n) for W rows of a block at a time, fewer at its end.
+template <class Each>
+SB_INLINE void each_lanes(const BlockRows& rows, Each each) {
+  for (std::size_t first = rows.begin; first < rows.end; first += W) {
+    const std::size_t left = rows.end - first;
+    each(first, left < W ? static_cast<int>(left) : W);
+  }
+}
+
+// Calls each(ids, n) for W splats in view of block b at a time. `args` are those of a backward pass.
+template <class Args, class Each>
+SB_INLINE void each_visible(const Args& args, std::size_t b, Each each) {
+  const ProjectedBlock& block = args.blocks[b];
+  const std::uint32_t* visible = args.forward.visible + b * kProjectBlock;
+  for (std::uint32_t at = 0; at < block.visible; at += W) {
+    each(visible + at, block.visible - at < W ? static_cast<int>(block.visible - at) : W);
+  }
+}
+
+// Loads means, opacities and centres of n splats from `first` on; a mask of those between the planes that are not
+// too faint.
+template <class Args>
+SB_INLINE M load_centers(const Args& args, const CameraLanes& cam, std::size_t first, int n, GaussianLanes& g,
+                         F& opacity, Projected& o) {
+  F opacities[1];
+  load_lanes<3>(args.means, first, n, g.mean);
+  load_lanes<1>(args.opacities, first, n, opacities);
+  from_origin(cam, g.mean);
+  project_center(g, cam, o);
+  opacity = opacities[0];
+  return (o.p[2] >= set1(args.options.near_plane)) & (o.p[2] <= set1(args.options.far_plane)) &
+         (o.p[2] > set1(0.0F)) & (opacity >= set1(kAlphaMin));
+}
+
+template <class Args>
+SB_INLINE void gather_axes(const Args& forward, const std::uint32_t* ids, int n, GaussianLanes& g) {
+  gather_lanes<4>(forward.quats, ids, n, g.quat);
+  gather_lanes<3>(forward.scales, ids, n, g.scale);
+}
+
+// Tiles that a box meets, clamped to the image: x in the low half, y in the high half.
+struct TileBox {
+  I corner, size;
+};
+
+SB_INLINE TileBox tile_box(int columns, int rows, F left, F right, F top, F bottom) {
+  const auto tile = [](F at, int pixels, int tiles) {
+    const F last = set1(static_cast<float>(tiles - 1));
+    return to_int(clamp(floor(at * set1(1.0F / static_cast<float>(pixels))), set1(0.0F), last));
+  };
+  const I x0 = tile(left, kTileWidth, columns), x1 = tile(right, kTileWidth, columns);
+  const I y0 = tile(top, kTileHeight, rows), y1 = tile(bottom, kTileHeight, rows);
+  return {x0 | shift_left<16>(y0), (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1))};
+}
+
+// Zeros rows of an array of `width` columns; no array, nothing to do.
+SB_INLINE void clear_rows(float* array, const BlockRows& rows, std::size_t width) {
+  if (array != nullptr) {
+    std::memset(array + rows.begin * width, 0, (rows.end - rows.begin) * width * sizeof(float));
+  }
+}
+
+// Zeros the gradients to the inputs of either kind of splat.
+template <class Args>
+SB_INLINE void clear_inputs(const Args& args, const BlockRows& rows) {
+  clear_rows(args.means, rows, 3);
+  clear_rows(args.quats, rows, 4);
+  clear_rows(args.scales, rows, 3);
+  clear_rows(args.opacities, rows, 1);
+}
+
+// Writes the gradients to the inputs of either kind of splat; `grad_log_opacity` is that to the opacity's logarithm.
+template <class Args, class Gradients>
+SB_INLINE void scatter_inputs(const Args& args, const std::uint32_t* ids, int n, const Gradients& grads,
+                              F grad_log_opacity) {
+  scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
+  scatter_lanes<4>(args.quats, ids, n, grads.quat, args.accumulate);
+  scatter_lanes<3>(args.scales, ids, n, grads.scale, args.accumulate);
+  scatter_lanes<2>(args.means2d, ids, n, grads.mean2d, false);
+  if (args.opacities != nullptr) {
+    F opacity[1];
+    gather_lanes<1>(args.forward.opacities, ids, n, opacity);
+    const F gradient[1] = {grad_log_opacity / opacity[0]};
+    scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
+  }
 }
 
 // Gradients of the camera's rotation, translation, intrinsics and motion, lane by lane until the end.

@@ -77,16 +77,6 @@ SB_INLINE void weigh(const LinearizeArgs& args, M used, F r, F sigma, float* wei
   cost = cost + zero_unless(used, set1(0.5F * 0.69314718F * (args.nu + 1.0F)) * log2(fma(s2, set1(1.0F / args.nu), set1(1.0F))));
 }
 
-SB_INLINE float total(F a) {
-  alignas(64) float lanes[W];
-  store(lanes, a);
-  float sum = 0.0F;
-  for (int i = 0; i < W; ++i) {
-    sum += lanes[i];
-  }
-  return sum;
-}
-
 // H += Jᵀ W J (upper triangle, n states) and g += Jᵀ W r over a chunk.
 template <int N>
 void accumulate(const Residuals& residuals, int count, LinearizeSums& sums) {

@@ -88,16 +88,6 @@ void mark(const Tile& t, int row, const Lines& lines) {
   }
 }
 
-SB_INLINE float total(F v) {
-  alignas(64) float lanes[W];
-  store(lanes, v);
-  float sum = 0.0F;
-  for (int i = 0; i < W; ++i) {
-    sum += lanes[i];
-  }
-  return sum;
-}
-
 // Mean of the target's rows that are in the tile, of every fourth.
 float tile_mean(const Tile& t, const Lines& lines) {
   const int elements = (t.x1 - t.x0) * t.args.channels;

@@ -157,16 +157,9 @@ SB_INLINE void write(const ProjectArgs& args, std::size_t first, int n, M keep, 
 
 // Extent of the ellipse in tiles, clamped to the image.
 SB_INLINE void cover_tiles(const ProjectArgs& args, F mx, F my, F rx, F ry, Written& w) {
-  const F zero = set1(0.0F);
-  const F left = mx - rx, right = mx + rx, top = my - ry, bottom = my + ry;
-  const F last_x = set1(static_cast<float>(args.columns - 1));
-  const F last_y = set1(static_cast<float>(args.rows - 1));
-  const I x0 = to_int(clamp(floor(left * set1(1.0F / kTileWidth)), zero, last_x));
-  const I x1 = to_int(clamp(floor(right * set1(1.0F / kTileWidth)), zero, last_x));
-  const I y0 = to_int(clamp(floor(top * set1(1.0F / kTileHeight)), zero, last_y));
-  const I y1 = to_int(clamp(floor(bottom * set1(1.0F / kTileHeight)), zero, last_y));
-  w.corner = x0 | shift_left<16>(y0);
-  w.size = (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1));
+  const TileBox box = tile_box(args.columns, args.rows, mx - rx, mx + rx, my - ry, my + ry);
+  w.corner = box.corner;
+  w.size = box.size;
 }
 
 // Where the box about the ellipse, in whole pixels from its centre, meets the image: gsplat's test of visibility.
@@ -193,14 +186,9 @@ template <Projection P>
 void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t first, int n, std::uint32_t* visible,
                    DepthRange& depths, ProjectedBlock& out) {
   GaussianLanes g;
-  F opacity[1];
-  load_lanes<3>(args.means, first, n, g.mean);
-  from_origin(cam, g.mean);
-  load_lanes<1>(args.opacities, first, n, opacity);
+  F opacity;
   Projected o;
-  project_center(g, cam, o);
-  M keep = (o.p[2] >= set1(args.options.near_plane)) & (o.p[2] <= set1(args.options.far_plane)) &
-           (o.p[2] > set1(0.0F)) & (opacity[0] >= set1(kAlphaMin));
+  M keep = load_centers(args, cam, first, n, g, opacity, o);
   const std::uint32_t wanted = (1U << n) - 1U;
   std::uint32_t kept = bits(keep) & wanted;
   if (kept != 0) {
@@ -214,11 +202,11 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
     Affine lens;
     project_image<P>(g, cam, args.view, set1(args.options.eps2d), of_covar, o, lens);
     if (args.options.antialiased) {
-      opacity[0] = opacity[0] * sqrt(antialias_squared(o));
-      keep = keep & (opacity[0] >= set1(kAlphaMin));
+      opacity = opacity * sqrt(antialias_squared(o));
+      keep = keep & (opacity >= set1(kAlphaMin));
     }
     Written w;
-    const F lo = log2(max(opacity[0], set1(kAlphaMin)));
+    const F lo = log2(max(opacity, set1(kAlphaMin)));
     const F reach = sqrt(max(lo - set1(kLog2AlphaMin), set1(0.0F)));
     const Root root = root_of_inverse(o);
     const F sigmas = reach * set1(1.0F / kRootHalfLog2e);
@@ -257,13 +245,12 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
 }
 
 template <Projection P>
-void project_all(const ProjectArgs& args, std::size_t begin, std::size_t end, ProjectedBlock& out) {
+void project_all(const ProjectArgs& args, const BlockRows& rows, ProjectedBlock& out) {
   const CameraLanes cam(args.view);
   DepthRange depths;
-  for (std::size_t first = begin; first < end; first += W) {
-    const std::size_t left = end - first;
-    project_lanes<P>(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, depths, out);
-  }
+  each_lanes(rows, [&](std::size_t first, int n) {
+    project_lanes<P>(args, cam, first, n, args.visible + rows.begin, depths, out);
+  });
   float least[W], most[W];
   store(least, depths.least);
   store(most, depths.most);
@@ -280,21 +267,19 @@ void project_all(const ProjectArgs& args, std::size_t begin, std::size_t end, Pr
 }  // namespace
 
 void project(const ProjectArgs& args, std::size_t block, ProjectedBlock& out) {
-  const std::size_t begin = block * kProjectBlock;
-  const std::size_t end = begin + kProjectBlock < args.count ? begin + kProjectBlock : args.count;
-  out = ProjectedBlock{};
-  if (find_fault(args, begin, end, out)) {
+  const BlockRows rows = rows_of_block(block, args.count);
+  if (find_fault(args, rows, out)) {
     return;
   }
   switch (projection_of(args.view)) {
     case Projection::pinhole:
-      return project_all<Projection::pinhole>(args, begin, end, out);
+      return project_all<Projection::pinhole>(args, rows, out);
     case Projection::ortho:
-      return project_all<Projection::ortho>(args, begin, end, out);
+      return project_all<Projection::ortho>(args, rows, out);
     case Projection::fisheye:
-      return project_all<Projection::fisheye>(args, begin, end, out);
+      return project_all<Projection::fisheye>(args, rows, out);
     case Projection::unscented:
-      return project_all<Projection::unscented>(args, begin, end, out);
+      return project_all<Projection::unscented>(args, rows, out);
   }
 }
 

@@ -264,19 +264,10 @@ void gather_covars(const float* rows, const std::uint32_t* ids, int n, F (&out)[
 
 void write_gradients(const ProjectBackwardArgs& args, const std::uint32_t* ids, int n, const LaneGradients& grads,
                      const LaneSums& sums, const Root& root) {
-  scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
-  scatter_lanes<4>(args.quats, ids, n, grads.quat, args.accumulate);
-  scatter_lanes<3>(args.scales, ids, n, grads.scale, args.accumulate);
+  scatter_inputs(args, ids, n, grads, sums.moments[0]);
   if (args.covars != nullptr) {
     scatter_covars(args.covars, ids, n, grads.covar, args.accumulate);
   }
-  if (args.opacities != nullptr) {
-    F opacity[1];
-    gather_lanes<1>(args.forward.opacities, ids, n, opacity);
-    const F gradient[1] = {sums.moments[0] / opacity[0]};
-    scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
-  }
-  scatter_lanes<2>(args.means2d, ids, n, grads.mean2d, false);
   if (args.absolute2d != nullptr) {
     const F scale = set1(1.0F / kHalfLog2e);
     const F absolute[2] = {scale * root.l11 * sums.absolute[0], scale * sums.absolute[1]};
@@ -284,25 +275,17 @@ void write_gradients(const ProjectBackwardArgs& args, const std::uint32_t* ids, 
   }
 }
 
-void zero_rows(const ProjectBackwardArgs& args, std::size_t begin, std::size_t end) {
-  const auto clear = [&](float* rows, std::size_t width) {
-    if (rows != nullptr) {
-      std::memset(rows + begin * width, 0, (end - begin) * width * sizeof(float));
-    }
-  };
+void zero_rows(const ProjectBackwardArgs& args, const BlockRows& rows) {
   if (args.first && !args.accumulate_colors) {
-    clear(args.colors, static_cast<std::size_t>(args.forward.channels));
+    clear_rows(args.colors, rows, static_cast<std::size_t>(args.forward.channels));
   }
   if (args.last) {
-    clear(args.means2d, 2);
-    clear(args.absolute2d, 2);
+    clear_rows(args.means2d, rows, 2);
+    clear_rows(args.absolute2d, rows, 2);
   }
   if (args.last && !args.accumulate) {
-    clear(args.means, 3);
-    clear(args.quats, 4);
-    clear(args.scales, 3);
-    clear(args.covars, 9);
-    clear(args.opacities, 1);
+    clear_inputs(args, rows);
+    clear_rows(args.covars, rows, 9);
   }
 }
 
@@ -368,23 +351,19 @@ SB_INLINE void collect(const ProjectBackwardArgs& args, const ProjectedBlock& bl
 
 template <Projection P>
 void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
-  const std::size_t begin = b * kProjectBlock;
-  const std::size_t end = begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
   const ProjectedBlock& block = args.blocks[b];
-  const std::uint32_t* visible = args.forward.visible + begin;
-  if (block.visible < end - begin) {
-    zero_rows(args, begin, end);
+  const BlockRows rows = rows_of_block(b, args.forward.count);
+  if (block.visible < rows.end - rows.begin) {
+    zero_rows(args, rows);
   }
   CameraSums camera_sums;
   const bool of_covar = args.forward.covars != nullptr;
   const CameraLanes cam(args.forward.view);
-  for (std::uint32_t at = 0; at < block.visible; at += W) {
-    const std::uint32_t* ids = visible + at;
-    const int n = block.visible - at < W ? static_cast<int>(block.visible - at) : W;
+  each_visible(args, b, [&](const std::uint32_t* ids, int n) {
     LaneSums sums;
     collect(args, block, ids, n, sums);
     if (!args.last || !args.geometry) {
-      continue;
+      return;
     }
     GaussianLanes g;
     gather_lanes<3>(args.forward.means, ids, n, g.mean);
@@ -392,8 +371,7 @@ void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
     if (of_covar) {
       gather_covars(args.forward.covars, ids, n, g.covar);
     } else {
-      gather_lanes<4>(args.forward.quats, ids, n, g.quat);
-      gather_lanes<3>(args.forward.scales, ids, n, g.scale);
+      gather_axes(args.forward, ids, n, g);
     }
     Projected o;
     project_center(g, cam, o);
@@ -411,7 +389,7 @@ void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
         camera_sums.add_motion(grads.moved.motion, n);
       }
     }
-  }
+  });
   if (args.camera != nullptr && args.last) {
     camera_sums.write(args.camera + b * kCameraSums);
   }

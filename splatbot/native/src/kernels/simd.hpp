@@ -396,6 +396,17 @@ SB_INLINE F log2(F a) {
   return fma(s, fma(p, s2, set1(2.8853901F)), to_float(exponent));
 }
 
+// Sum over lanes, from the first to the last.
+SB_INLINE float total(F a) {
+  alignas(64) float lanes[W];
+  store(lanes, a);
+  float sum = 0.0F;
+  for (int i = 0; i < W; ++i) {
+    sum += lanes[i];
+  }
+  return sum;
+}
+
 // The 16 sums over lanes of acc[0..n-1], zero beyond n, in a fixed order.
 #if SPLATBOT_SIMD == 512
 SB_INLINE F add_pairs(F a, F b) {

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Front-to-back blending of one tile of surfels, as in blend.cpp.
-#include "reach.hpp"
 #include "surfel.hpp"
 #include "surfel_entry.hpp"
+#include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -86,7 +86,8 @@ SB_INLINE void find_masks_of(const ChunkEllipses& e, int n, std::uint32_t* masks
   }
 }
 
-SB_INLINE void find_masks(Chunk& chunk, int n) {
+// Masks of the live blocks that n surfels reach, 0 beyond.
+SB_INLINE void find_masks(Chunk& chunk, int n, std::uint32_t live) {
   find_masks_of(chunk.ellipses, n, chunk.masks);
   if (chunk.any_circle) {
     find_masks_of(chunk.circles, n, chunk.circle_masks);
@@ -96,6 +97,9 @@ SB_INLINE void find_masks(Chunk& chunk, int n) {
   }
   for (std::uint64_t left = chunk.unbounded; left != 0; left &= left - 1) {
     chunk.masks[__builtin_ctzll(left)] = ~0U;
+  }
+  for (int j = 0; j < kChunk; ++j) {
+    chunk.masks[j] = j < n ? chunk.masks[j] & live : 0;
   }
 }
 
@@ -168,55 +172,20 @@ SB_INLINE void blend_block(const Chunk& chunk, std::uint64_t members, int place,
   }
 }
 
-std::uint32_t live_blocks(const TileState& state) {
-  std::uint32_t live = 0;
-  for (int b = 0; b < kBlocks; ++b) {
-    std::uint32_t open = 0;
-    for (int part = 0; part < kParts; ++part) {
-      open |= bits(load(state.through + b * kBlockPixels + part * W) > set1(kTransmittanceMin));
-    }
-    live |= static_cast<std::uint32_t>(open != 0) << b;
-  }
-  return live;
-}
-
 template <int C, bool Distort>
 void blend_lists(const SurfelBlendArgs& args, const TileFrame& frame, std::size_t tile, TileState& state) {
-  Chunk chunk;
   const F near = set1(args.options.near_plane);
   const std::uint32_t begin = args.tile_begin[tile];
-  const std::uint32_t end = args.tile_begin[tile + 1];
-  std::uint32_t at = begin;
-  std::uint32_t live = live_blocks(state);
-  while (at < end && live != 0) {
-    const int n = end - at < kChunk ? static_cast<int>(end - at) : kChunk;
+  const auto load_pairs = [&](std::uint32_t at, int n, std::uint32_t live, Chunk& chunk) SB_INLINE_LAMBDA {
     load_chunk<C>(args, frame, args.pairs + at, n, chunk);
-    for (std::uint32_t next = at + kChunk; next < at + 2 * kChunk && next < end; ++next) {
-      __builtin_prefetch(args.records + args.pairs[next].id);
-    }
-    find_masks(chunk, n);
-    for (int j = 0; j < n; ++j) {
-      chunk.masks[j] &= live;
-      args.masks[at + static_cast<std::uint32_t>(j)] = chunk.masks[j];
-    }
-    for (int j = n; j < kChunk; ++j) {
-      chunk.masks[j] = 0;
-    }
-    transpose_masks(chunk.masks, chunk.columns);
-    for (std::uint32_t left = live; left != 0; left &= left - 1) {
-      const int block = __builtin_ctz(left);
-      const std::uint64_t members = chunk.columns[block];
-      if (members != 0) {
-        for (int part = 0; part < kParts; ++part) {
-          blend_block<C, Distort>(chunk, members, static_cast<int>(at - begin), near,
-                                  static_cast<std::size_t>(block * kBlockPixels + part * W), state);
-        }
-      }
-    }
-    live = live_blocks(state);
-    at += static_cast<std::uint32_t>(n);
-  }
-  args.tile_done[tile] = at - begin;
+    find_masks(chunk, n, live);
+  };
+  const auto blend_part = [&](const Chunk& chunk, std::uint64_t members, std::uint32_t at, int block, int part)
+                              SB_INLINE_LAMBDA {
+    blend_block<C, Distort>(chunk, members, static_cast<int>(at - begin), near,
+                            static_cast<std::size_t>(block * kBlockPixels + part * W), state);
+  };
+  blend_chunks<Chunk>(args, tile, state.through, set1(kTransmittanceMin), load_pairs, blend_part);
 }
 
 void write_tile(const SurfelBlendArgs& args, const TileFrame& frame, const TileState& state) {

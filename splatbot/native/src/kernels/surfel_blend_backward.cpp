@@ -7,6 +7,7 @@
 // w_i (s_i A_i - sum_{j>i} s_j w_j). It is of degree 2 in the weights: R counts it twice (Euler).
 #include "surfel.hpp"
 #include "surfel_entry.hpp"
+#include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -148,36 +149,27 @@ SB_INLINE void sum_pair(const float* row, F near, std::int32_t place, std::uint3
     acc[i] = channels[i] = set1(0.0F);
   }
   const I own = set1(place);
-  do {
-    const int block = __builtin_ctz(mask);
-    mask &= mask - 1;
-#pragma GCC unroll 4
-    for (int part = 0; part < kParts; ++part) {
-      const std::size_t first = static_cast<std::size_t>(block * kBlockPixels + part * W);
-      const SurfelHit hit = hit_at(load(kCenters.x + first), load(kCenters.y + first), row, near);
-      F through = load(state.through + first);
-      const Step step = advance(hit.alpha, through, set1(kTransmittanceMin));
-      const M median = bit_cast_int(load(state.median_place + first)) == own;
-      const Along along = along_at<C, Distort>(row, hit, step.weight, median, first, state);
-      const F rest = fnma(step.weight, along.weight, load(state.rest + first));
-      store(state.through + first, through);
-      store(state.rest + first, rest);
-      // alpha x d loss / d alpha; none where the cap holds alpha, nor in closed pixels.
-      const F other = hit.alpha.alpha * reciprocal(hit.alpha.left) * rest;
-      const M free = step.open & (hit.alpha.power <= set1(kAlphaMax));
-      const F v = zero_unless(free, fms(step.weight, along.weight, other));
-      add_geometry(hit, v, along.depth, acc);
-      if (Sum) {
-        for (int i = 0; i < 3; ++i) {
-          channels[i] = fma(step.weight, load(state.normal[i] + first), channels[i]);
-        }
+  each_part_of(mask, [&](int, std::size_t first) SB_INLINE_LAMBDA {
+    const SurfelHit hit = hit_at(load(kCenters.x + first), load(kCenters.y + first), row, near);
+    F through = load(state.through + first);
+    const Step step = advance(hit.alpha, through, set1(kTransmittanceMin));
+    const M median = bit_cast_int(load(state.median_place + first)) == own;
+    const Along along = along_at<C, Distort>(row, hit, step.weight, median, first, state);
+    const F rest = fnma(step.weight, along.weight, load(state.rest + first));
+    store(state.through + first, through);
+    store(state.rest + first, rest);
+    const F v = pull_back_alpha(hit.alpha, step, along.weight, rest);
+    add_geometry(hit, v, along.depth, acc);
+    if (Sum) {
+      for (int i = 0; i < 3; ++i) {
+        channels[i] = fma(step.weight, load(state.normal[i] + first), channels[i]);
+      }
 #pragma GCC unroll 8
-        for (int c = 0; c < C; ++c) {
-          channels[3 + c] = fma(step.weight, load(state.color[c] + first), channels[3 + c]);
-        }
+      for (int c = 0; c < C; ++c) {
+        channels[3 + c] = fma(step.weight, load(state.color[c] + first), channels[3 + c]);
       }
     }
-  } while (mask != 0);
+  });
   store_sums<kSurfelGeometrySums>(slot, acc);
   if (Sum) {
     store_sums<3 + C>(slot + kSumNormal, channels);
@@ -190,26 +182,11 @@ void backward_lists(const SurfelBlendBackwardArgs& args, const TileFrame& frame,
   const SurfelBlendArgs& f = args.forward;
   const F near = set1(f.options.near_plane);
   const std::uint32_t begin = f.tile_begin[tile];
-  const std::uint32_t end = f.tile_begin[tile + 1];
-  const std::uint32_t done = begin + f.tile_done[tile];
   alignas(64) float row[kSurfelRow];
-  for (std::uint32_t at = begin; at < end; ++at) {
-    float* slot = args.slots + static_cast<std::size_t>(f.pairs[at].slot) * kSurfelSlot;
-    const std::uint32_t mask = at < done ? f.masks[at] : 0U;
-    if (mask == 0) {
-      std::memset(slot, 0, kSurfelSlot * sizeof(float));
-      continue;
-    }
-    constexpr std::uint32_t kAhead = 8;
-    if (at + kAhead < done) {
-      const char* record = reinterpret_cast<const char*>(f.records + f.pairs[at + kAhead].id);
-      __builtin_prefetch(record);
-      __builtin_prefetch(record + 64);
-      __builtin_prefetch(args.slots + static_cast<std::size_t>(f.pairs[at + kAhead].slot) * kSurfelSlot, 1);
-    }
+  each_slot<kSurfelSlot>(args, tile, [&](std::uint32_t at, std::uint32_t mask, float* slot) SB_INLINE_LAMBDA {
     localize<C>(f.records[f.pairs[at].id], frame, row);
     sum_pair<C, Distort, Sum>(row, near, static_cast<std::int32_t>(at - begin), mask, state, slot);
-  }
+  });
 }
 
 template <int C, bool Distort>

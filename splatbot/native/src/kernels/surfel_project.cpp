@@ -89,14 +89,9 @@ struct Lanes {
 // Tiles that the box meets, clamped to the image; a mask of lanes that reach it.
 SB_INLINE M cover_tiles(const SurfelProjectArgs& args, const Cover& c, Lanes& lanes) {
   const F zero = set1(0.0F);
-  const F last_x = set1(static_cast<float>(args.columns - 1));
-  const F last_y = set1(static_cast<float>(args.rows - 1));
-  const I x0 = to_int(clamp(floor(c.left * set1(1.0F / kTileWidth)), zero, last_x));
-  const I x1 = to_int(clamp(floor(c.right * set1(1.0F / kTileWidth)), zero, last_x));
-  const I y0 = to_int(clamp(floor(c.top * set1(1.0F / kTileHeight)), zero, last_y));
-  const I y1 = to_int(clamp(floor(c.bottom * set1(1.0F / kTileHeight)), zero, last_y));
-  store(lanes.corner, x0 | shift_left<16>(y0));
-  store(lanes.size, (x1 - x0 + set1(1)) | shift_left<16>(y1 - y0 + set1(1)));
+  const TileBox box = tile_box(args.columns, args.rows, c.left, c.right, c.top, c.bottom);
+  store(lanes.corner, box.corner);
+  store(lanes.size, box.size);
   return (c.right > zero) & (c.left < set1(static_cast<float>(args.view.width))) & (c.bottom > zero) &
          (c.top < set1(static_cast<float>(args.view.height)));
 }
@@ -163,16 +158,9 @@ SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const L
 void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::size_t first, int n,
                    std::uint32_t* visible, ProjectedBlock& out) {
   GaussianLanes g;
-  F opacity[1];
-  F means[3];
-  load_lanes<3>(args.means, first, n, means);
-  load_lanes<1>(args.opacities, first, n, opacity);
-  std::memcpy(g.mean, means, sizeof(means));
-  from_origin(cam, g.mean);
+  F opacity;
   Projected o;
-  project_center(g, cam, o);
-  M keep = (o.p[2] >= set1(args.options.near_plane)) & (o.p[2] <= set1(args.options.far_plane)) &
-           (o.p[2] > set1(0.0F)) & (opacity[0] >= set1(kAlphaMin));
+  M keep = load_centers(args, cam, first, n, g, opacity, o);
   const std::uint32_t wanted = (1U << n) - 1U;
   std::uint32_t kept = bits(keep) & wanted;
   if (kept != 0) {
@@ -180,10 +168,12 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
     load_lanes<3>(args.scales, first, n, g.scale);
     Surfel s;
     project_surfel(g, cam, o, s);
-    const F lo = log2(max(opacity[0], set1(kAlphaMin)));
+    const F lo = log2(max(opacity, set1(kAlphaMin)));
     constexpr float kTwoLn2 = 1.3862944F;
     const F reach2 = set1(kTwoLn2) * max(lo - set1(kLog2AlphaMin), set1(0.0F));
     Lanes lanes;
+    F means[3];
+    load_lanes<3>(args.means, first, n, means);
     project_precisely(means, g, args.view, lanes.precise);
     recall(lanes.precise, o, s);
     const Cover c = cover(o, s, cam, reach2);
@@ -207,17 +197,14 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
 }  // namespace
 
 void surfel_project(const SurfelProjectArgs& args, std::size_t block, ProjectedBlock& out) {
-  const std::size_t begin = block * kProjectBlock;
-  const std::size_t end = begin + kProjectBlock < args.count ? begin + kProjectBlock : args.count;
-  out = ProjectedBlock{};
-  if (find_fault(args, begin, end, out)) {
+  const BlockRows rows = rows_of_block(block, args.count);
+  if (find_fault(args, rows, out)) {
     return;
   }
   const CameraLanes cam(args.view);
-  for (std::size_t first = begin; first < end; first += W) {
-    const std::size_t left = end - first;
-    project_lanes(args, cam, first, left < W ? static_cast<int>(left) : W, args.visible + begin, out);
-  }
+  each_lanes(rows, [&](std::size_t first, int n) {
+    project_lanes(args, cam, first, n, args.visible + rows.begin, out);
+  });
 }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -15,7 +15,7 @@ struct LaneSums {
 };
 
 struct LaneGradients {
-  F mean[3], quat[4], scale[3], point[2];
+  F mean[3], quat[4], scale[3], mean2d[2];
   F rotation[9], translation[3], intrinsics[4];  // of the camera
 };
 
@@ -98,8 +98,8 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   const auto sum = [&](int k) { return load(sums.of[k]); };
   const F filter = set1(kFilter);
   const F su = sum(kSumU + 2), sv = sum(kSumV + 2), sd = sum(kSumD + 2);
-  out.point[0] = fms(filter, sum(kSumPointX), fma(s.b[0], su, fma(s.b[2], sv, s.hx * sd)));
-  out.point[1] = fms(filter, sum(kSumPointY), fma(s.b[1], su, fma(s.b[3], sv, s.hy * sd)));
+  out.mean2d[0] = fms(filter, sum(kSumPointX), fma(s.b[0], su, fma(s.b[2], sv, s.hx * sd)));
+  out.mean2d[1] = fms(filter, sum(kSumPointY), fma(s.b[1], su, fma(s.b[3], sv, s.hy * sd)));
   const DiscGradients d = pull_back_disc(o, s, cam, sums);
   const F zero = set1(0.0F);
   for (int i = 0; i < 2; ++i) {
@@ -109,8 +109,8 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   out.scale[2] = zero;
 
   const F inverse_z = set1(1.0F) / o.p[2];
-  const F gx = fma(out.point[0], cam.fx, d.slope[0]) * inverse_z;
-  const F gy = fma(out.point[1], cam.fy, d.slope[1]) * inverse_z;
+  const F gx = fma(out.mean2d[0], cam.fx, d.slope[0]) * inverse_z;
+  const F gy = fma(out.mean2d[1], cam.fy, d.slope[1]) * inverse_z;
   const F gp[3] = {gx, gy, fnma(gx, s.slope[0], fnma(gy, s.slope[1], d.z))};
   F ga[9];
   for (int i = 0; i < 3; ++i) {
@@ -129,10 +129,10 @@ void pull_back(const GaussianLanes& g, const CameraLanes& cam, const Projected& 
   // b and h fall with the inverse of the focal lengths.
   const F fall_x = fma(s.b[0], sum(kSumU), fma(s.b[2], sum(kSumV), s.hx * sum(kSumD)));
   const F fall_y = fma(s.b[1], sum(kSumU + 1), fma(s.b[3], sum(kSumV + 1), s.hy * sum(kSumD + 1)));
-  out.intrinsics[0] = fms(out.point[0], s.slope[0], fall_x / cam.fx);
-  out.intrinsics[1] = fms(out.point[1], s.slope[1], fall_y / cam.fy);
-  out.intrinsics[2] = out.point[0];
-  out.intrinsics[3] = out.point[1];
+  out.intrinsics[0] = fms(out.mean2d[0], s.slope[0], fall_x / cam.fx);
+  out.intrinsics[1] = fms(out.mean2d[1], s.slope[1], fall_y / cam.fy);
+  out.intrinsics[2] = out.mean2d[0];
+  out.intrinsics[3] = out.mean2d[1];
   F r[9];
   pull_back_axes(cam, ga, r);
   for (int i = 0; i < 3; ++i) {
@@ -171,47 +171,33 @@ void recall(const SurfelRecord* records, const std::uint32_t* ids, int n, const 
   s.flip = flip;
 }
 
-void zero_rows(const SurfelProjectBackwardArgs& args, std::size_t begin, std::size_t end) {
-  const auto clear = [&](float* rows, std::size_t width) {
-    if (rows != nullptr) {
-      std::memset(rows + begin * width, 0, (end - begin) * width * sizeof(float));
-    }
-  };
+void zero_rows(const SurfelProjectBackwardArgs& args, const BlockRows& rows) {
   if (!args.accumulate_colors) {
-    clear(args.colors, static_cast<std::size_t>(args.forward.channels));
+    clear_rows(args.colors, rows, static_cast<std::size_t>(args.forward.channels));
   }
-  clear(args.means2d, 2);
-  if (args.accumulate) {
-    return;
+  clear_rows(args.means2d, rows, 2);
+  if (!args.accumulate) {
+    clear_inputs(args, rows);
   }
-  clear(args.means, 3);
-  clear(args.quats, 4);
-  clear(args.scales, 3);
-  clear(args.opacities, 1);
 }
 
 }  // namespace
 
 void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t b) {
-  const std::size_t begin = b * kProjectBlock;
-  const std::size_t end = begin + kProjectBlock < args.forward.count ? begin + kProjectBlock : args.forward.count;
   const ProjectedBlock& block = args.blocks[b];
-  const std::uint32_t* visible = args.forward.visible + begin;
-  if (block.visible < end - begin) {
-    zero_rows(args, begin, end);
+  const BlockRows rows = rows_of_block(b, args.forward.count);
+  if (block.visible < rows.end - rows.begin) {
+    zero_rows(args, rows);
   }
   CameraSums camera_sums;
   const CameraLanes cam(args.forward.view);
-  for (std::uint32_t at = 0; at < block.visible; at += W) {
-    const std::uint32_t* ids = visible + at;
-    const int n = block.visible - at < W ? static_cast<int>(block.visible - at) : W;
+  each_visible(args, b, [&](const std::uint32_t* ids, int n) {
     LaneSums sums;
     collect(args, block, ids, n, sums);
     GaussianLanes g;
     gather_lanes<3>(args.forward.means, ids, n, g.mean);
     from_origin(cam, g.mean);
-    gather_lanes<4>(args.forward.quats, ids, n, g.quat);
-    gather_lanes<3>(args.forward.scales, ids, n, g.scale);
+    gather_axes(args.forward, ids, n, g);
     Projected o;
     project_center(g, cam, o);
     Surfel s;
@@ -219,20 +205,11 @@ void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t 
     recall(args.forward.records, ids, n, cam, o, s);
     LaneGradients grads;
     pull_back(g, cam, o, s, sums, grads);
-    scatter_lanes<3>(args.means, ids, n, grads.mean, args.accumulate);
-    scatter_lanes<4>(args.quats, ids, n, grads.quat, args.accumulate);
-    scatter_lanes<3>(args.scales, ids, n, grads.scale, args.accumulate);
-    scatter_lanes<2>(args.means2d, ids, n, grads.point, false);
-    if (args.opacities != nullptr) {
-      F opacity[1];
-      gather_lanes<1>(args.forward.opacities, ids, n, opacity);
-      const F gradient[1] = {load(sums.of[kSumAlpha]) / opacity[0]};
-      scatter_lanes<1>(args.opacities, ids, n, gradient, args.accumulate);
-    }
+    scatter_inputs(args, ids, n, grads, load(sums.of[kSumAlpha]));
     if (args.camera != nullptr) {
       camera_sums.add(grads.rotation, grads.translation, grads.intrinsics, n);
     }
-  }
+  });
   if (args.camera != nullptr) {
     camera_sums.write(args.camera + b * kCameraSums);
   }

@@ -24,6 +24,10 @@ SB_INLINE TileFrame tile_frame(const View& view, int columns, std::size_t tile) 
   return {x0, y0, width, height};
 }
 
+SB_INLINE bool whole_tile(const TileFrame& frame) {
+  return frame.width == kTileWidth && frame.height == kTileHeight;
+}
+
 // True if a pixel of the image is requested.
 SB_INLINE bool kept(const BlendArgs& args, int x, int y) {
   return args.mask == nullptr || args.mask[(y / args.mask_size) * args.mask_columns + x / args.mask_size] != 0;

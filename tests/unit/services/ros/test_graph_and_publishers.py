@@ -35,16 +35,7 @@ from splatbot.services.store import MapStore
 from splatbot.services.topics import FRAME, RESULT, JointState, arm_topic, map_topic, robot_topic
 from splatbot.slam import FrameResult
 from tests.conftest import MakeLog
-
-
-def _model(rng: np.random.Generator, n: int = 100) -> GaussianModel:
-    return GaussianModel.from_activated(
-        means=rng.normal(size=(n, 3)),
-        quats=rng.normal(size=(n, 4)),
-        scales=rng.uniform(0.001, 0.1, (n, 3)),
-        opacities=rng.uniform(0.1, 0.9, n),
-        colors=rng.uniform(0, 1, (n, 3)),
-    )
+from tests.models import random_model
 
 
 def _until(found: Callable[[], Any]) -> Any:
@@ -66,7 +57,7 @@ def told() -> Iterator[tuple[MapStore, RosGraph]]:
 
 
 def test_a_cloud_keeps_the_whole_splat(rng: np.random.Generator) -> None:
-    model = _model(rng)
+    model = random_model(100, rng, least=0.001)
     back = points_of(from_cdr(to_cdr(point_cloud_message(model, 1.0)), "sensor_msgs/msg/PointCloud2"))
     np.testing.assert_array_equal(np.stack([back["x"], back["y"], back["z"]], -1), model.means.numpy())
     np.testing.assert_allclose(back["rgb"], model.colors.numpy(), atol=0.5 / 255 + 1e-6)
@@ -111,7 +102,7 @@ def test_news_of_a_map_come_out_under_their_ros_names(
 ) -> None:
     store, graph = told
     reader = graph.subscribe(ODOMETRY, TF, COLOR, DEPTH, INFO, capacity=16)
-    store.add("default", source="a", state="mapping", snapshot=Snapshot(_model(rng), 1, 3.0))
+    store.add("default", source="a", state="mapping", snapshot=Snapshot(random_model(100, rng, least=0.001), 1, 3.0))
     cloud = _until(lambda: graph.latched(POINTS)).message
     assert (cloud.width, cloud.header.stamp.sec) == (100, 3)
     T = pose_from_quat((1, 2, 3), (0.5, 0.5, -0.5, 0.5))
@@ -132,7 +123,7 @@ def test_news_of_a_map_come_out_under_their_ros_names(
 def test_a_second_map_has_names_of_its_own(told: tuple[MapStore, RosGraph], rng: np.random.Generator) -> None:
     store, graph = told
     for name in ("default", "desk-2"):
-        store.add(name, source="a", state="static", snapshot=Snapshot(_model(rng), 1))
+        store.add(name, source="a", state="static", snapshot=Snapshot(random_model(100, rng, least=0.001), 1))
     assert _until(lambda: graph.latched("/maps/desk_2/map/points")) is not None
 
 

@@ -1,9 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 // The yardstick of `splatbot bench`: independent multiply-adds in registers, as fast as this instruction set goes.
-#include "entry.hpp"
-#include "simd.hpp"
+#include "multiply_add.hpp"
+
+#include "../src/kernels/simd.hpp"
+
+#define SB_TEXT(name) #name
+#define SB_EXPANDED_TEXT(name) SB_TEXT(name)
 
 namespace splatbot::SPLATBOT_KERNELS {
+
+namespace {
 
 float multiply_add(std::size_t rounds) {
   F sums[kMultiplyAddChains];
@@ -25,5 +31,9 @@ float multiply_add(std::size_t rounds) {
   store(lanes, all);
   return lanes[0];
 }
+
+}  // namespace
+
+const MultiplyAdd kMultiplyAdd = {SB_EXPANDED_TEXT(SPLATBOT_KERNELS), multiply_add, W};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "splatbot/scalar_baseline.hpp"
+#include "scalar_baseline.hpp"
 
 #include <algorithm>
 #include <cmath>

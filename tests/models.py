@@ -1,0 +1,18 @@
+"""Random maps for tests of code that takes any model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatbot.gaussians import GaussianModel
+
+
+def random_model(n: int, rng: np.random.Generator, *, least: float = 0.01) -> GaussianModel:
+    """Return Gaussians within a few metres, with scales from ``least`` to 0.1 m and opacities from 0.1 to 0.9."""
+    return GaussianModel.from_activated(
+        means=rng.normal(size=(n, 3)),
+        quats=rng.normal(size=(n, 4)),
+        scales=rng.uniform(least, 0.1, (n, 3)),
+        opacities=rng.uniform(0.1, 0.9, n),
+        colors=rng.uniform(0, 1, (n, 3)),
+    )
