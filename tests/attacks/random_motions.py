@@ -1,4 +1,4 @@
-"""Random motions, half of them spoiled, over every interface, against a float64 check of the executed curve at 1 kHz.
+"""Random motions, half of them spoiled, as curves and as ROS goals, against a float64 check of the executed curve at 1 kHz.
 
 Run `python -m tests.attacks.random_motions --count 100000`. The check is independent of the gate. It
 samples the curve that the controller follows and takes finite differences. The obstacles are balls, so that distances
@@ -20,11 +20,15 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import pose_from_quat
+from splatbot.logs.ros_types import build
 from splatbot.planning import JointTrajectory, WaypointMotion
 from splatbot.planning.problem import Certificate
 from splatbot.protocols import Array, TimedPath
 from splatbot.robots.panda import panda
+from splatbot.services.arms import Arms
 from splatbot.services.motion_gate import MotionGate, MotionRequest
+from splatbot.services.ros.follow import FollowJointTrajectory
+from splatbot.services.ros.graph import RosGraph
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
 
@@ -64,6 +68,8 @@ class World:
         self.store = MapStore()
         self.generation = self._serve("desk").generation
         self.gate = MotionGate(self.store)
+        self.arms = Arms(self.store)
+        self.action = FollowJointTrajectory(RosGraph(), self.arms, self.store)
 
     def _serve(self, name: str) -> Any:
         n = len(self.centers)
@@ -76,6 +82,21 @@ class World:
         )
         workspace = Workspace(T_world_base=_BASE)
         return self.store.add(name, source="balls", state="static", snapshot=Snapshot(model, 1), workspace=workspace)
+
+    def from_goal(self, motion: Any, rng: np.random.Generator) -> MotionRequest:
+        """Return the motion of a FollowJointTrajectory goal with samples of a motion, as a ROS client sends it."""
+        count = int(rng.integers(2, 200))
+        times = np.linspace(0.0, motion.duration, count)
+        order = rng.permutation(7)
+        points = []
+        for t in times:
+            nanoseconds = round(float(t) * 1e9)
+            stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
+            points.append({"positions": motion.reference(float(t))[0][order].tolist(), "time_from_start": stamp})
+        names = [panda().chain.names[i] for i in order]
+        goal = {"trajectory": {"joint_names": names, "points": points}}
+        message = build("control_msgs/msg/FollowJointTrajectoryActionGoal", goal=goal)
+        return self.action._request(self.arms.get("fake"), message.goal)
 
     def rejected(self, motion: TimedPath) -> str:
         """Return why the check rejects the curve as it is executed; empty if it does not."""
@@ -165,11 +186,14 @@ def run(count: int, seed: int = 0, *, show: Callable[[int], None] = lambda done:
     world = World(rng)
     for k in range(count):
         if k % 100 == 0:
+            world.arms.close(0.0)
             world = World(rng)
             show(k)
         kind = "valid" if k % 2 == 0 else str(rng.choice(list(SPOILED)))
         try:
             made = _request(world, WaypointMotion(*_smooth(rng))) if kind == "valid" else SPOILED[kind](world, rng)
+            if k % 3 == 0 and kind not in ("base", "map"):
+                made = world.from_goal(made.motion, rng)
             motion = world.gate.certify(made, panda())
         except SplatbotError as error:
             tally.refused[kind] += 1
