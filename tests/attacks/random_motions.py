@@ -1,4 +1,4 @@
-"""Random motions, half of them spoiled, as curves and as ROS goals, against a float64 check of the executed curve at 1 kHz.
+"""Random motions, half of them spoiled, as curves and as ROS goals, against a float64 check of the executed curve.
 
 Run `python -m tests.attacks.random_motions --count 100000`. The check is independent of the gate. It
 samples the curve that the controller follows and takes finite differences. The obstacles are balls, so that distances
