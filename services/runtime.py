@@ -201,14 +201,20 @@ class Runtime:
 
 
 def check_exposure(settings: ServiceSettings) -> None:
-    """Check that addresses other machines can reach require keys, and that TLS is complete.
+    """Check that services other machines can reach require keys, and that TLS is complete.
 
     Raises:
         ConfigError: it is not so.
     """
+    if settings.insecure_no_auth and (settings.api_keys or not settings.loopback):
+        hint = "leave it out, or listen on 127.0.0.1 without api_keys"
+        raise ConfigError("is for loopback without keys.", field="insecure_no_auth", hint=hint)
     if not settings.loopback and not settings.api_keys:
         hint = "make one with `splatbot serve --new-key` and set SPLATBOT_API_KEYS, or listen on 127.0.0.1"
         raise ConfigError(f"{settings.host} can be reached by others and there is no key.", field="api_keys", hint=hint)
+    if settings.trusted_proxies and not settings.api_keys:
+        hint = "make one with `splatbot serve --new-key` and set SPLATBOT_API_KEYS"
+        raise ConfigError("a proxy lets others reach the service and there is no key.", field="api_keys", hint=hint)
     if (settings.tls_cert is None) != (settings.tls_key is None):
         raise ConfigError("one of the two is missing.", field="tls_cert, tls_key", hint="give both")
     for name in ("tls_cert", "tls_key"):

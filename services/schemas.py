@@ -57,7 +57,6 @@ class HealthResponse(BaseModel):
 
     status: Literal["ok", "ready"]
     version: str = Field(description="of splatbot")
-    maps: dict[str, int] = Field(default_factory=dict, description="map_version by map id")
 
 
 class Bounds(BaseModel):

@@ -17,7 +17,7 @@ from starlette.responses import FileResponse
 
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.formats import WRITTEN, save_gaussians
-from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.codecs import ZIP, answer, body_of, gives, takes
 from splatbot.services.dependencies import (
     IdempotencyKey,
     Served,
@@ -109,7 +109,7 @@ def create_map(
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+            "content": {ZIP: {"schema": {"type": "string", "format": "binary"}}},
         }
     },
 )
@@ -121,7 +121,7 @@ async def upload_map(
 ) -> Response:
     """Make a map of a recording that is sent as a zip of a folder in TUM layout; a job unpacks and maps it."""
     check_id(map_id)
-    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/zip":
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != ZIP:
         raise HTTPException(415, "The body is no application/zip.")
     if (known := service.jobs.known(key, f"upload {map_id}")) is not None:
         return accepted(known)
