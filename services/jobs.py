@@ -99,7 +99,8 @@ class Jobs:
     def __init__(self, bus: Bus, *, workers: int = 1, capacity: int = 16) -> None:
         self._bus = bus
         self._capacity = capacity
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._jobs: dict[str, Job] = {}
         self._handles: dict[str, JobHandle] = {}
         self._keys: dict[str, tuple[str, str]] = {}
@@ -192,6 +193,17 @@ class Jobs:
             abandoned()
         return job
 
+    def end(self, job_id: str, timeout_s: float) -> bool:
+        """Cancel a job and wait for its end up to ``timeout_s`` [s]; return whether it has ended or is unknown."""
+        try:
+            self.cancel(job_id)
+        except JobNotFoundError:
+            return True
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: job_id not in self._jobs or self._jobs[job_id].state in ENDED, timeout_s
+            )
+
     def close(self, timeout_s: float) -> None:
         """Take no more, cancel all, and wait for those that run up to ``timeout_s`` [s]."""
         with self._lock:
@@ -237,6 +249,8 @@ class Jobs:
     def _put(self, job: Job) -> Job:
         self._jobs[job.id] = job
         self._publish(job)
+        if job.state in ENDED:
+            self._changed.notify_all()
         return job
 
     def _publish(self, job: Job) -> None:

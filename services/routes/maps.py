@@ -92,13 +92,15 @@ def create_map(
         return accepted(known)
     log = open_allowed(query.log, service.settings.log_roots, camera=query.camera)
     total = check_length(log, service.settings.max_frames, query.max_frames)
-    service.store.add(query.id, source=log.name, state="mapping", workspace=workspace_of(log.uri, base), awaited=False)
+    workspace = workspace_of(log.uri, base)
+    served = service.store.add(query.id, source=log.name, state="mapping", workspace=workspace, awaited=False)
     try:
-        work = map_recording(service, query.id, log, total)
-        gone = partial(_forget, service, query.id)
-        return accepted(service.jobs.submit("map", work, key=key, request=request, abandoned=gone)[0])
+        work = map_recording(service, served, log, total)
+        return accepted(
+            service.make(served, work, key=key, request=request, abandoned=partial(_forget, service, served))
+        )
     except Exception:
-        service.store.remove(query.id)  # the queue is full: undo the creation
+        _forget(service, served)  # the queue is full: undo the creation
         raise
 
 
@@ -125,16 +127,15 @@ async def upload_map(
         raise HTTPException(415, "The body is no application/zip.")
     if (known := service.jobs.known(key, f"upload {map_id}")) is not None:
         return accepted(known)
-    service.store.add(map_id, source="an upload", state="mapping", awaited=False)
+    served = service.store.add(map_id, source="an upload", state="mapping", awaited=False)
     folder = FilePath(tempfile.mkdtemp(prefix="splatbot-upload-"))
     try:
         await _receive(request, folder / "recording.zip", service.settings.max_upload_bytes)
-        work = map_upload(service, map_id, folder / "recording.zip")
-        gone = partial(_forget, service, map_id, folder)
-        return accepted(service.jobs.submit("map", work, key=key, request=f"upload {map_id}", abandoned=gone)[0])
+        work = map_upload(service, served, folder / "recording.zip")
+        gone = partial(_forget, service, served, folder)
+        return accepted(service.make(served, work, key=key, request=f"upload {map_id}", abandoned=gone))
     except BaseException:  # also of a client that has gone: nothing is left of it
-        service.store.remove(map_id)
-        await run_in_threadpool(_discard, folder)
+        await run_in_threadpool(_forget, service, served, folder)
         raise
 
 
@@ -151,7 +152,7 @@ def get_map(served: Served, request: Request, response: Response) -> Any:
 @router.delete("/{map_id}", status_code=204, responses=problems(404))
 def delete_map(served: Served, service: Service) -> Response:
     """End the map's making, and forget it, on disk too. Answers that are under way keep the state they took."""
-    service.remove(served.id)
+    service.remove(served)
     return Response(status_code=204)
 
 
@@ -218,10 +219,10 @@ async def _receive(request: Request, path: FilePath, most: int) -> None:
             await run_in_threadpool(file.write, chunk)
 
 
-def _forget(service: Service, map_id: str, folder: FilePath | None = None) -> None:
-    """Leave nothing of a map whose making was cancelled before it began."""
+def _forget(service: Service, served: ServedMap, folder: FilePath | None = None) -> None:
+    """Leave nothing of a map whose making never began."""
     with suppress(MapNotFoundError):
-        service.remove(map_id)
+        service.remove(served)
     if folder is not None:
         _discard(folder)
 

@@ -126,8 +126,8 @@ def _follow(runtime: Runtime, source: Log | FrameSource) -> None:
     from splatbot.slam import Slam
 
     workspace = workspace_of(source.uri.removeprefix(PREFIX), None)
-    runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace)
-    runtime.follow(MAP_ID, source, Slam(runtime.config))
+    served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace)
+    runtime.follow(served, source, Slam(runtime.config))
 
 
 def _print_new_key(words: str | None) -> int:
