@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,10 @@ from splatbot.errors import InputError, LogError, MapNotFoundError
 from splatbot.logs import Log
 from splatbot.services.jobs import JobCancelled, JobHandle, Work
 from splatbot.services.live import LiveMapping
+from splatbot.services.problems import disk_error
 from splatbot.services.recordings import open_allowed, unpack
 from splatbot.services.runtime import Runtime
+from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import ServedMap
 from splatbot.slam import FrameResult
 from splatbot.workspace import Workspace, find_workspace
@@ -37,26 +39,47 @@ def map_recording(runtime: Runtime, served: ServedMap, log: Log, total: int) -> 
     return lambda handle: _map(runtime, served, log, total, runtime.config, handle)
 
 
-def map_upload(runtime: Runtime, served: ServedMap, archive: Path) -> Work:
-    """Return the work of a job that unpacks an uploaded recording, maps it, and removes both files."""
+def map_upload(runtime: Runtime, served: ServedMap, archive: Path, discard: Callable[[], None]) -> Work:
+    """Return the work of a job that unpacks an uploaded recording, maps it, and calls ``discard`` at the end."""
 
     def work(handle: JobHandle) -> dict[str, Any]:
-        settings = runtime.settings
         try:
-            handle.report(0.0, "unpacking")
-            folder = archive.with_suffix("")
-            home = unpack(archive, folder, max_bytes=settings.max_unpacked_bytes, max_pixels=settings.max_pixels)
-            log = open_allowed(str(home), [str(folder)])
-            total = check_length(log, settings.max_frames, None)
+            try:
+                log = _unpacked(runtime.settings, archive, handle)
+                total = check_length(log, runtime.settings.max_frames, None)
+            except (InputError, OSError, JobCancelled) as error:
+                with suppress(MapNotFoundError):  # deleted meanwhile
+                    runtime.store.set_state(served.id, "failed", _reason(error), generation=served.generation)
+                raise
             return _map(runtime, served, log, total, runtime.config, handle)
-        except InputError as error:
-            with suppress(MapNotFoundError):  # deleted meanwhile
-                runtime.store.set_state(served.id, "failed", error.message, generation=served.generation)
-            raise
         finally:
-            shutil.rmtree(archive.parent, ignore_errors=True)
+            discard()
 
     return work
+
+
+def _unpacked(settings: ServiceSettings, archive: Path, handle: JobHandle) -> Log:
+    folder = archive.with_suffix("")
+    shown = -1
+
+    def progress(share: float) -> None:
+        nonlocal shown
+        handle.check()
+        if round(100 * share) != shown:
+            shown = round(100 * share)
+            handle.report(0.0, f"unpacking, {shown} % done")
+
+    home = unpack(
+        archive, folder, max_bytes=settings.max_unpacked_bytes, max_pixels=settings.max_pixels, progress=progress
+    )
+    archive.unlink()
+    return open_allowed(str(home), [str(folder)])
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, InputError):
+        return error.message
+    return disk_error(error).message if isinstance(error, OSError) else "the job was cancelled"
 
 
 def workspace_of(uri: str, robot_base: Any) -> Workspace | None:

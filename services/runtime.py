@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -20,6 +22,7 @@ from splatbot.services.live import LiveMapper, LiveMapping
 from splatbot.services.metrics import Metrics
 from splatbot.services.plans import Plans
 from splatbot.services.pushed import PushedFrames, StreamEndedError
+from splatbot.services.scratch import sweep_scratch
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapExistsError, MapStore, ServedMap
 from splatbot.workspace import Workspace
@@ -52,12 +55,15 @@ class Runtime:
         self.store = store or MapStore()
         self.bus = self.store.bus
         self.config = config or Config()
+        self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
+        if self.library is not None:
+            self.library.lock()
         self.jobs = Jobs(self.bus, workers=settings.job_workers, capacity=settings.max_jobs)
         self.arms = Arms(self.store)
         self.plans = Plans()
-        self.metrics = Metrics(self.store, self.jobs)
-        self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
+        self.metrics = Metrics(self.store, self.jobs, self.library)
         self.draining = False
+        self._deadline = math.inf
         # Writers by the generation of their map.
         self._streams: dict[int, PushedFrames] = {}
         self._mappings: dict[int, LiveMapping] = {}
@@ -74,6 +80,7 @@ class Runtime:
 
     def start(self) -> None:
         """Serve the saved maps, start saving, and start to map the sources that are followed."""
+        sweep_scratch()
         if self.library is not None:
             self.library.load_all(self.store)
             self._keeper.start()
@@ -111,7 +118,7 @@ class Runtime:
             frames,
             Slam(self.config),
             on_result=frames.answer,
-            on_end=lambda: frames.abandon("mapping has ended"),
+            on_end=lambda: self._stream_ended(served.generation, frames),
         )
         with self._lock:
             self._streams[served.generation], self._mappings[served.generation] = frames, mapping
@@ -191,23 +198,35 @@ class Runtime:
             self.library.save(served)
 
     def drain(self) -> None:
-        """Begin to end: take no more work, close event streams; answers that are under way are still given."""
+        """Begin to end: take no more work, cancel jobs, close event streams; answers under way are still given."""
         self.draining = True
+        self._deadline = min(self._deadline, time.monotonic() + self.settings.shutdown_s)
+        self.jobs.stop()
         self.bus.close()
 
     def close(self) -> None:
         """End jobs, motions and mappings, and save every map."""
-        self.draining = True
-        timeout = float(self.settings.shutdown_s)
-        self.arms.close(timeout)
-        self.jobs.close(timeout)
+        self.drain()
+        self.arms.close(self._time_left())
+        self.jobs.close(self._time_left())
         for generation in list(self._mappings):
-            self._end(generation, "the service stops", timeout)
+            self._end(generation, "the service stops", self._time_left())
         if not self._ended.is_set():
             self._ended.set()
             self._save_all()
+            if self.library is not None:
+                self.library.unlock()
         self.metrics.close()
-        self.bus.close()
+
+    def _time_left(self) -> float:
+        """Return the time [s] that one part may take to end: the rest of ``shutdown_s``, at least 0.5 s."""
+        return max(0.5, self._deadline - time.monotonic())
+
+    def _stream_ended(self, generation: int, frames: PushedFrames) -> None:
+        """Fail the requests that still wait, and free the mapper."""
+        frames.abandon("mapping has ended")
+        with self._lock:
+            self._mappings.pop(generation, None)
 
     def _begin(self, mapping: LiveMapping) -> None:
         self._starter.submit(mapping.start).result()

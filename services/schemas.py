@@ -57,6 +57,7 @@ class HealthResponse(BaseModel):
 
     status: Literal["ok", "ready"]
     version: str = Field(description="of splatbot")
+    unsaved: int = Field(0, description="maps whose last save failed; they are served from memory")
 
 
 class Bounds(BaseModel):

@@ -61,7 +61,7 @@ class ServiceSettings(BaseSettings):
     max_streams: int = Field(64, ge=1, description="event streams that are open at once")
     max_jobs: int = Field(16, ge=1, description="jobs that may wait")
     job_workers: int = Field(2, ge=1, description="jobs that run at once")
-    shutdown_s: int = Field(10, ge=0, description="how long running requests may take to end after SIGTERM [s]")
+    shutdown_s: int = Field(6, ge=0, description="how long running requests may take to end after SIGTERM [s]")
     niceness: int = Field(10, ge=0, le=19, description="of the threads that answer: mapping and arms go first")
     log_json: bool = Field(False, description="one JSON object a line instead of text")
 

@@ -15,7 +15,7 @@ from splatbot.services.schemas import HealthResponse
 router = APIRouter(tags=["health"])
 
 
-@router.get("/healthz", responses=example({"status": "ok", "version": "0.1.0"}))
+@router.get("/healthz", responses=example({"status": "ok", "version": "0.1.0"}), response_model_exclude={"unsaved"})
 def healthz() -> HealthResponse:
     """Report that the process answers."""
     return HealthResponse(status="ok", version=splatbot.__version__)
@@ -23,7 +23,7 @@ def healthz() -> HealthResponse:
 
 @router.get(
     "/readyz",
-    responses=example({"status": "ready", "version": "0.1.0"}) | problems(503),
+    responses=example({"status": "ready", "version": "0.1.0", "unsaved": 0}) | problems(503),
 )
 def readyz(service: Service) -> HealthResponse:
     """Check that the native module loads, the initial maps have a state, and the service is not ending."""
@@ -38,7 +38,8 @@ def readyz(service: Service) -> HealthResponse:
     waiting = sum(m.awaited and m.snapshot is None for m in service.store.list())
     if waiting:
         raise MapNotReadyError(f"{waiting} of the initial maps have no state yet.", hint="see GET /v1/maps")
-    return HealthResponse(status="ready", version=splatbot.__version__)
+    unsaved = len(service.library.failing) if service.library is not None else 0
+    return HealthResponse(status="ready", version=splatbot.__version__, unsaved=unsaved)
 
 
 @router.get(

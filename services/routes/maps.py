@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import hashlib
+import os
 from contextlib import suppress
 from functools import partial
 from pathlib import Path as FilePath
@@ -35,6 +35,7 @@ from splatbot.services.problems import MapNotReadyError, TooLargeError
 from splatbot.services.recordings import open_allowed
 from splatbot.services.routes.jobs import accepted, starts
 from splatbot.services.schemas import Bounds, MapInfo, MapList, MapRequest
+from splatbot.services.scratch import Scratch
 from splatbot.services.store import ServedMap
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
@@ -125,17 +126,21 @@ async def upload_map(
     check_id(map_id)
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != ZIP:
         raise HTTPException(415, "The body is no application/zip.")
-    if (known := service.jobs.known(key, f"upload {map_id}")) is not None:
-        return accepted(known)
+    if key is not None and service.jobs.uses(key):
+        digest = await _receive(request, FilePath(os.devnull), service.settings.max_upload_bytes)
+        if (known := service.jobs.known(key, f"upload {map_id} {digest}")) is not None:
+            return accepted(known)
     served = service.store.add(map_id, source="an upload", state="mapping", awaited=False)
-    folder = FilePath(tempfile.mkdtemp(prefix="splatbot-upload-"))
+    scratch = None
     try:
-        await _receive(request, folder / "recording.zip", service.settings.max_upload_bytes)
-        work = map_upload(service, served, folder / "recording.zip")
-        gone = partial(_forget, service, served, folder)
-        return accepted(service.make(served, work, key=key, request=f"upload {map_id}", abandoned=gone))
+        scratch = Scratch("upload")
+        archive = scratch.path / "recording.zip"
+        digest = await _receive(request, archive, service.settings.max_upload_bytes)
+        work = map_upload(service, served, archive, scratch.discard)
+        gone = partial(_forget, service, served, scratch)
+        return accepted(service.make(served, work, key=key, request=f"upload {map_id} {digest}", abandoned=gone))
     except BaseException:  # also of a client that has gone: nothing is left of it
-        await run_in_threadpool(_forget, service, served, folder)
+        await run_in_threadpool(_forget, service, served, scratch)
         raise
 
 
@@ -169,15 +174,15 @@ def export_map(served: Served, request: Request, format: _FormatName) -> Respons
     tag = etag(served, format)
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
-    folder = FilePath(tempfile.mkdtemp(prefix="splatbot-export-"))
-    path = folder / f"{served.id}.{format}"
+    scratch = Scratch("export")
+    path = scratch.path / f"{served.id}.{format}"
     try:
         save_gaussians(snapshot.model, path)
     except BaseException:
-        _discard(folder)
+        scratch.discard()
         raise
     headers = version_headers(served, tag)
-    after = BackgroundTask(_discard, folder)
+    after = BackgroundTask(scratch.discard)
     kind = "application/octet-stream"
     return FileResponse(path, media_type=kind, filename=path.name, headers=headers, background=after)
 
@@ -207,28 +212,26 @@ def trajectory(served: Served, request: Request) -> Response:
     return answer(request, body, array="T_world_camera", headers=version_headers(served, tag))
 
 
-async def _receive(request: Request, path: FilePath, most: int) -> None:
-    """Write the body to a file as it comes."""
-    taken = 0
-    with path.open("xb") as file:
+async def _receive(request: Request, path: FilePath, most: int) -> str:
+    """Write the body to a file as it comes; return its SHA-256."""
+    taken, digest = 0, hashlib.sha256()
+    with path.open("wb") as file:
         async for chunk in request.stream():
             taken += len(chunk)
             if taken > most:
                 hint = "send a shorter recording, or raise SPLATBOT_MAX_UPLOAD_BYTES"
                 raise TooLargeError(f"has more than {most} bytes.", field="upload", hint=hint)
+            digest.update(chunk)
             await run_in_threadpool(file.write, chunk)
+    return digest.hexdigest()
 
 
-def _forget(service: Service, served: ServedMap, folder: FilePath | None = None) -> None:
+def _forget(service: Service, served: ServedMap, scratch: Scratch | None = None) -> None:
     """Leave nothing of a map whose making never began."""
     with suppress(MapNotFoundError):
         service.remove(served)
-    if folder is not None:
-        _discard(folder)
-
-
-def _discard(folder: FilePath) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
+    if scratch is not None:
+        scratch.discard()
 
 
 def _info(served: ServedMap) -> MapInfo:
