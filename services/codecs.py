@@ -159,7 +159,7 @@ def plain(value: Any) -> Any:
 
 
 def describe_bodies(app: FastAPI) -> None:
-    """Let the OpenAPI document name the models that :func:`takes` refers to."""
+    """Let the OpenAPI document name the models that :func:`takes` refers to, and how a key is sent."""
     original = app.openapi
 
     def described() -> dict[str, Any]:
@@ -169,6 +169,8 @@ def describe_bodies(app: FastAPI) -> None:
                 [(model, "validation") for model in _BODIES.values()], ref_template="#/components/schemas/{model}"
             )
             document.setdefault("components", {}).setdefault("schemas", {}).update(found.get("$defs", {}))
+            document["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer"}}
+            document["security"] = [{"key": []}, {}]
             app.openapi_schema = document
         return app.openapi_schema
 

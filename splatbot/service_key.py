@@ -12,9 +12,14 @@ from splatbot.errors import ConfigError
 
 def key_file() -> Path:
     """Return $XDG_STATE_HOME/splatbot/service-key, by default in ~/.local/state."""
-    state = os.environ.get("XDG_STATE_HOME", "")
-    home = Path(state) if Path(state).is_absolute() else Path.home() / ".local" / "state"
-    return home / "splatbot" / "service-key"
+    state = Path(os.environ.get("XDG_STATE_HOME", ""))
+    if not state.is_absolute():
+        try:
+            home = Path.home()
+        except RuntimeError:  # the user has no home
+            home = Path("/nonexistent")
+        state = home / ".local" / "state"
+    return state / "splatbot" / "service-key"
 
 
 def read_key(path: Path) -> str | None:

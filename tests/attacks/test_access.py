@@ -331,6 +331,26 @@ def test_rosbridge_checks_the_scope_of_the_key(keyed: Service) -> None:
         assert _told(mover)["id"] == "d"
 
 
+def test_foxglove_clients_only_read(keyed: Service) -> None:
+    url = f"{keyed.ws('/foxglove')}?api_key={USUAL}"
+    before = dict(keyed.app.state.ros.graph.topics)
+    with connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as it:
+        assert _told(it)["capabilities"] == []
+        for wrong in (
+            {"op": "advertise", "channels": [{"id": 1, "topic": "/x", "encoding": "json", "schemaName": ""}]},
+            {"op": "setParameters", "parameters": []},
+            {"op": "advertiseServices", "services": []},
+        ):
+            it.send(json.dumps(wrong))
+        it.send(b"\x01\x01\x00\x00\x00{}")  # client publish
+        told: list[dict[str, Any]] = []
+        while len(told) < 4:
+            if isinstance(message := it.recv(timeout=10), str) and json.loads(message)["op"] == "status":
+                told.append(json.loads(message))
+    assert {one["level"] for one in told} == {2}
+    assert keyed.app.state.ros.graph.topics == before
+
+
 # ------------------------------------------------------------------ the viewer
 
 
