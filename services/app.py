@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
 
 import splatbot
 from splatbot.priority import lower_priority, switch_quickly
+from splatbot.services.access import Access
 from splatbot.services.codecs import describe_bodies
 from splatbot.services.guard import Guard
 from splatbot.services.integrations import Integrations
@@ -35,6 +36,7 @@ from splatbot.services.routes import (
     views,
 )
 from splatbot.services.runtime import Runtime
+from splatbot.services.scopes import check_scope
 
 _DESCRIPTION = """
 Questions about maps of 3D Gaussians. Lengths are metres in the map's world frame, angles radians, quaternions wxyz,
@@ -46,7 +48,8 @@ camera axes OpenCV's (x right, y down, z forward). Every answer names the `map_v
 def create_app(runtime: Runtime) -> FastAPI:
     """Create the service on ``runtime``, which starts and stops with the application."""
     settings = runtime.settings
-    integrations = Integrations(settings, runtime.store, runtime.arms, on_frame=runtime.take)
+    access = Access(settings)
+    integrations = Integrations(settings, access, runtime.store, runtime.arms, on_frame=runtime.take)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -58,13 +61,19 @@ def create_app(runtime: Runtime) -> FastAPI:
         await run_in_threadpool(integrations.stop)
         await run_in_threadpool(runtime.close)
 
-    app = FastAPI(title="splatbot", version=splatbot.__version__, description=_DESCRIPTION, lifespan=lifespan)
+    app = FastAPI(
+        title="splatbot",
+        version=splatbot.__version__,
+        description=_DESCRIPTION,
+        lifespan=lifespan,
+        dependencies=[Depends(check_scope)],
+    )
     app.state.runtime = runtime
     app.state.ros = integrations.ros
     # The last one added is the first to see a request.
     uploads = {"/upload": settings.max_upload_bytes}
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, larger=uploads)
-    app.add_middleware(Guard, settings=settings)
+    app.add_middleware(Guard, settings=settings, access=access)
     if settings.cors_origins:
         headers = ["Authorization", "Content-Type", "X-API-Key", "Idempotency-Key", HEADER]
         app.add_middleware(

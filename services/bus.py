@@ -175,10 +175,14 @@ class Bus:
         return reader
 
     def forget(self, prefix: str) -> None:
-        """Drop the latest messages of all topics that begin with ``prefix``."""
+        """Drop the latest messages of all topics that begin with ``prefix``, e.g. "maps/desk/"."""
         with self._lock:
             for topic in [topic for topic in self._latest if topic.startswith(prefix)]:
                 del self._latest[topic], self._numbers[topic]
+            for topic in [topic for topic in self._dropped if topic.startswith(prefix)]:
+                first, _, *rest = topic.split("/")
+                kind = "/".join([first, "*", *rest])
+                self._dropped[kind] = self._dropped.get(kind, 0) + self._dropped.pop(topic)
 
     @property
     def dropped(self) -> dict[str, int]:

@@ -23,6 +23,7 @@ from splatbot.errors import InputError
 JSON = "application/json"
 NPY = "application/x-npy"
 MSGPACK = "application/msgpack"
+ZIP = "application/zip"
 
 _M = TypeVar("_M", bound=BaseModel)
 _KINDS = "biuf"  # of numpy's dtypes that travel
@@ -39,7 +40,7 @@ def body_of(model: type[_M], *, array: str | None = None) -> Callable[[Request],
     _BODIES[model.__name__] = model
 
     async def read(request: Request) -> _M:
-        kind = request.headers.get("content-type", JSON).partition(";")[0].strip().lower()
+        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         body = await request.body()
         try:
             if kind == NPY and array is not None:
@@ -158,7 +159,7 @@ def plain(value: Any) -> Any:
 
 
 def describe_bodies(app: FastAPI) -> None:
-    """Let the OpenAPI document name the models that :func:`takes` refers to."""
+    """Let the OpenAPI document name the models that :func:`takes` refers to, and how a key is sent."""
     original = app.openapi
 
     def described() -> dict[str, Any]:
@@ -168,6 +169,8 @@ def describe_bodies(app: FastAPI) -> None:
                 [(model, "validation") for model in _BODIES.values()], ref_template="#/components/schemas/{model}"
             )
             document.setdefault("components", {}).setdefault("schemas", {}).update(found.get("$defs", {}))
+            document["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer"}}
+            document["security"] = [{"key": []}, {}]
             app.openapi_schema = document
         return app.openapi_schema
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from splatbot.frame import Frame
+from splatbot.services.access import Access
 from splatbot.services.arms import Arms
 from splatbot.services.ros.node import RosNode
 from splatbot.services.ros.recorder import McapRecorder
@@ -20,6 +21,7 @@ class Integrations:
 
     Args:
         settings: which of them there are.
+        access: rights to open the viewer.
         store: the maps.
         arms: executes the motions that ROS clients send.
         on_frame: called with each frame that ROS clients publish.
@@ -30,16 +32,21 @@ class Integrations:
     """
 
     def __init__(
-        self, settings: ServiceSettings, store: MapStore, arms: Arms, *, on_frame: Callable[[Frame], Any]
+        self,
+        settings: ServiceSettings,
+        access: Access,
+        store: MapStore,
+        arms: Arms,
+        *,
+        on_frame: Callable[[Frame], Any],
     ) -> None:
         self.ros = RosNode(store, arms=arms, on_frame=on_frame)
         router = settings.zenoh_router
         self._zenoh = ZenohBridge(self.ros.graph, router, domain=settings.ros_domain) if router is not None else None
         self._record = settings.record
         self._recorder: McapRecorder | None = None
-        # The viewer checks no keys: remote users need a tunnel.
-        port = settings.viewer_port
-        self.viewer = Viewer(store, host="127.0.0.1", port=port) if port is not None else None
+        port = settings.viewer_port  # it speaks no TLS: remote users need a tunnel
+        self.viewer = Viewer(store, access, host="127.0.0.1", port=port) if port is not None else None
 
     def start(self) -> None:
         """Begin.

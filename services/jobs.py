@@ -13,7 +13,7 @@ from uuid import uuid4
 
 from splatbot.errors import InputError, SplatbotError
 from splatbot.services.bus import Bus
-from splatbot.services.problems import BusyError
+from splatbot.services.problems import DISK_ERRORS, BusyError, disk_error
 from splatbot.services.topics import job_topic
 
 _log = logging.getLogger(__name__)
@@ -73,14 +73,22 @@ class JobHandle:
         self.id = job_id
         self.cancelled = threading.Event()
 
+    def check(self) -> None:
+        """Check that the job is still wanted.
+
+        Raises:
+            JobCancelled: it was cancelled.
+        """
+        if self.cancelled.is_set():
+            raise JobCancelled
+
     def report(self, progress: float, detail: str | None = None) -> None:
         """Report the progress (0..1) and the present activity.
 
         Raises:
             JobCancelled: the job was cancelled.
         """
-        if self.cancelled.is_set():
-            raise JobCancelled
+        self.check()
         self._jobs._change(self.id, progress=min(max(progress, 0.0), 1.0), detail=detail)
 
 
@@ -99,7 +107,8 @@ class Jobs:
     def __init__(self, bus: Bus, *, workers: int = 1, capacity: int = 16) -> None:
         self._bus = bus
         self._capacity = capacity
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._jobs: dict[str, Job] = {}
         self._handles: dict[str, JobHandle] = {}
         self._keys: dict[str, tuple[str, str]] = {}
@@ -161,6 +170,11 @@ class Jobs:
         with self._lock:
             return self._known(key, request)
 
+    def uses(self, key: str) -> bool:
+        """Return whether a request with this key created a job."""
+        with self._lock:
+            return key in self._keys
+
     def get(self, job_id: str) -> Job:
         """Return the present state of a job.
 
@@ -192,14 +206,29 @@ class Jobs:
             abandoned()
         return job
 
-    def close(self, timeout_s: float) -> None:
-        """Take no more, cancel all, and wait for those that run up to ``timeout_s`` [s]."""
+    def end(self, job_id: str, timeout_s: float) -> bool:
+        """Cancel a job and wait for its end up to ``timeout_s`` [s]; return whether it has ended or is unknown."""
+        try:
+            self.cancel(job_id)
+        except JobNotFoundError:
+            return True
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: job_id not in self._jobs or self._jobs[job_id].state in ENDED, timeout_s
+            )
+
+    def stop(self) -> None:
+        """Take no more and cancel all."""
         with self._lock:
             self._closed = True
             running = list(self._jobs.values())
         for job in running:
             if job.state not in ENDED:
                 self.cancel(job.id)
+
+    def close(self, timeout_s: float) -> None:
+        """Take no more, cancel all, and wait for those that run up to ``timeout_s`` [s]."""
+        self.stop()
         for _ in self._threads:
             self._waiting.put(None)
         deadline = time.monotonic() + timeout_s
@@ -225,7 +254,11 @@ class Jobs:
         except SplatbotError as error:
             detail = f"{error.field}: {error.message}" if error.field else error.message
             self._change(handle.id, state="failed", detail=detail, ended=time.time())
-        except Exception:
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+                _log.error("job %s failed: %s", handle.id, error)
+                self._change(handle.id, state="failed", detail=disk_error(error).message, ended=time.time())
+                return
             _log.exception("job %s failed", handle.id)
             detail = "unexpected error; the service's log says more"
             self._change(handle.id, state="failed", detail=detail, ended=time.time())
@@ -237,6 +270,8 @@ class Jobs:
     def _put(self, job: Job) -> Job:
         self._jobs[job.id] = job
         self._publish(job)
+        if job.state in ENDED:
+            self._changed.notify_all()
         return job
 
     def _publish(self, job: Job) -> None:

@@ -1,19 +1,26 @@
-"""Maps on disk: a saved version is complete or absent, and a restart serves the latest complete one."""
+"""Maps on disk: a saved state is whole or not there, and a restart serves the newest whole one."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import logging
+import os
 import re
 import secrets
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from splatbot.atomic import atomic_write
+from splatbot.atomic import atomic_write, replace, sweep_drafts, sync_folder
+from splatbot.checksums import NAME as SUMS
+from splatbot.checksums import check_folder, write_sums
 from splatbot.errors import FormatError, InputError, SplatbotError
 from splatbot.formats.ply import load_ply, save_ply
 from splatbot.gaussians import Snapshot
+from splatbot.services.problems import SaveError
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import NAME as WORKSPACE
@@ -21,6 +28,10 @@ from splatbot.workspace import find_workspace
 
 _log = logging.getLogger(__name__)
 
+_LOCK = ".lock"
+_CURRENT = "current"
+_DELETED = ".deleted-"
+_HINT = "the state before it is served; the folder is kept for inspection"
 _ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
@@ -35,17 +46,12 @@ def check_id(map_id: str) -> str:
     return map_id
 
 
-class SaveError(SplatbotError):
-    """A map cannot be written to disk; the state saved before is still there."""
-
-    http_status = 507
-
-
 class MapLibrary:
-    """A folder with a folder for each map, in which ``current`` names the state in force.
+    """A folder with a folder for each map, which holds the two latest saved states as folders ``vN``.
 
-    A state's folder is first written under another name. ``current`` is replaced last, so that a
-    process killed in between leaves the earlier state in force.
+    A state's folder is written under another name, flushed and renamed, with the checksums of its files. The
+    newest whole state is in force; ``current`` names it for people. Files that are damaged are set aside as
+    ``vN.damaged``.
 
     Args:
         folder: made if need be.
@@ -56,11 +62,46 @@ class MapLibrary:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
+        self.failing: dict[str, str] = {}
+        self.failures = 0
+        self._kept: dict[str, tuple[int, int]] = {}
+        self._lock_file: int | None = None
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             hint = "name a folder that can be written to"
             raise InputError(f"cannot be made ({error.strerror}).", file=folder, field="data_dir", hint=hint) from error
+
+    def lock(self) -> None:
+        """Reserve the folder for this process until :meth:`unlock`.
+
+        Raises:
+            InputError: another process has it, or it cannot be written to.
+        """
+        path = self.folder / _LOCK
+        try:
+            path.touch()
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # an open writer would prevent a remount
+        except OSError as error:
+            hint = "name a folder that can be written to"
+            raise InputError(f"cannot be locked ({error.strerror}).", file=path, field="data_dir", hint=hint) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.write_text(f"{os.getpid()}\n")
+        except OSError as error:
+            holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()
+            os.close(descriptor)
+            busy = isinstance(error, BlockingIOError)
+            why = f"is in use by process {holder or '?'}." if busy else f"cannot be locked ({error.strerror})."
+            hint = "stop that service, or name another folder" if busy else "name a folder that can be written to"
+            raise InputError(why, file=self.folder, field="data_dir", hint=hint) from error
+        self._lock_file = descriptor
+
+    def unlock(self) -> None:
+        """Release the folder."""
+        if self._lock_file is not None:
+            os.close(self._lock_file)
+            self._lock_file = None
 
     def save(self, served: ServedMap) -> None:
         """Keep the map's present state; nothing is done for a map without one, or for a state that is kept already.
@@ -68,45 +109,107 @@ class MapLibrary:
         Raises:
             SaveError: it cannot be written, as when the disk is full.
         """
-        if served.snapshot is None or self._current(served.id) == f"v{served.map_version}":
+        if served.snapshot is None or self._kept.get(served.id) == (served.generation, served.map_version):
             return
         home = self.folder / check_id(served.id)
         draft = home / f".{secrets.token_hex(4)}.tmp"
+        state = home / f"v{served.map_version}"
         try:
-            draft.mkdir(parents=True)
+            self._check_lock()
+            home.mkdir(exist_ok=True)
+            if self._kept.get(served.id, (0, 0))[0] != served.generation:
+                for earlier in _states(home):  # of another life of the name, which could not be read
+                    _set_aside(earlier)
+            draft.mkdir()
             self._write(served, served.snapshot, draft)
-            state = home / f"v{served.map_version}"
-            shutil.rmtree(state, ignore_errors=True)  # of another life of a map of this name
-            draft.rename(state)
-            with atomic_write(home / "current") as file:
+            write_sums(draft, [path.name for path in draft.iterdir()])
+            replace(draft, state)
+            with atomic_write(home / _CURRENT) as file:
                 file.write(state.name.encode())
+            sync_folder(self.folder)
         except OSError as error:
-            hint = "free some space, or point SPLATBOT_DATA_DIR elsewhere"
-            raise SaveError(f"map {served.id!r} cannot be saved ({error.strerror}).", hint=hint) from error
+            self.failures += 1
+            self.failing[served.id] = error.strerror or str(error)
+            hint = "free some space, check the disk, or point SPLATBOT_DATA_DIR elsewhere"
+            raise SaveError(f"map {served.id!r} cannot be saved ({self.failing[served.id]}).", hint=hint) from error
         finally:
             shutil.rmtree(draft, ignore_errors=True)
-        self._sweep(home, keep=state.name)
+        self.failing.pop(served.id, None)
+        self._kept[served.id] = served.generation, served.map_version
+        _sweep(home, keep=[path.name for path in _states(home)[:2]])
 
     def remove(self, map_id: str) -> None:
-        """Forget a map; one that was never saved is no error."""
+        """Forget a map; one that was never saved is no error.
+
+        Raises:
+            SaveError: it cannot be deleted.
+        """
+        grave = self.folder / f"{_DELETED}{secrets.token_hex(4)}"
         home = self.folder / check_id(map_id)
-        (home / "current").unlink(missing_ok=True)  # first: from here on the map is deleted
-        shutil.rmtree(home, ignore_errors=True)
+        try:
+            self._check_lock()
+            if home.exists():
+                replace(home, grave)  # from here on the map is deleted
+        except OSError as error:
+            hint = "check that the disk is mounted for writing"
+            raise SaveError(f"map {map_id!r} cannot be deleted ({error.strerror}).", hint=hint) from error
+        shutil.rmtree(grave, ignore_errors=True)
+        self.failing.pop(map_id, None)
+        self._kept.pop(map_id, None)
 
     def load_all(self, store: MapStore) -> list[str]:
-        """Serve the saved maps and return their ids; unreadable ones are skipped and logged."""
+        """Serve the saved maps and return their ids; damaged states are set aside and logged."""
         loaded = []
         for home in sorted(self.folder.iterdir()):
-            name = self._current(home.name) if _ID.fullmatch(home.name) else None
-            if name is None:
+            if home.name.startswith(_DELETED):
+                shutil.rmtree(home, ignore_errors=True)
+            if not _ID.fullmatch(home.name) or not home.is_dir():
                 continue
             try:
-                self._load(store, home.name, home / name)
-                loaded.append(home.name)
-            except SplatbotError as error:
+                if self._load(store, home):
+                    loaded.append(home.name)
+            except (SplatbotError, OSError) as error:
                 _log.error("map %s is left out: %s", home.name, error)
-            self._sweep(home, keep=name)
         return loaded
+
+    def _load(self, store: MapStore, home: Path) -> bool:
+        """Serve the newest whole state of a map; return whether there is one."""
+        named = _current(home)
+        states = [path for path in _states(home) if path.name == named or (path / SUMS).exists()]
+        for state in states:
+            try:
+                saved = _read(state)
+            except InputError as error:
+                _log.error("map %s: %s is damaged and set aside: %s", home.name, state.name, error)
+                _set_aside(state)
+                continue
+            served = store.add(home.name, state="ended", **saved)
+            self._kept[home.name] = served.generation, served.map_version
+            if named != state.name:
+                _log.error("map %s: %s names %s, %s is served", home.name, _CURRENT, named, state.name)
+                with atomic_write(home / _CURRENT) as file:
+                    file.write(state.name.encode())
+            _sweep(home, keep=[path.name for path in states])
+            return True
+        if states or named is not None:
+            _log.error("map %s is left out: no state of it is whole", home.name)
+        _sweep(home, keep=[])
+        return False
+
+    def _check_lock(self) -> None:
+        """Check that the locked folder is still there.
+
+        Raises:
+            OSError: it is not, as after unmounting its disk.
+        """
+        if self._lock_file is None:
+            return
+        try:
+            same = os.path.samestat((self.folder / _LOCK).stat(), os.fstat(self._lock_file))
+        except FileNotFoundError:
+            same = False
+        if not same:
+            raise OSError(errno.ESTALE, "the folder was unmounted or replaced")
 
     def _write(self, served: ServedMap, snapshot: Snapshot, folder: Path) -> None:
         save_ply(snapshot.model, folder / "map.ply", bookkeeping=True)
@@ -114,40 +217,63 @@ class MapLibrary:
             served.trajectory.save(folder / "trajectory.tum")
         if served.workspace is not None:
             served.workspace.save(folder / WORKSPACE)
-        saved = {"source": served.source, "map_version": snapshot.map_version, "stamp": snapshot.stamp}
-        (folder / "map.json").write_text(json.dumps(saved))
-
-    def _load(self, store: MapStore, map_id: str, folder: Path) -> None:
-        saved = _read_json(folder / "map.json")
-        path = folder / "trajectory.tum"
-        store.add(
-            map_id,
-            source=str(saved["source"]),
-            state="ended",
-            snapshot=Snapshot(load_ply(folder / "map.ply"), int(saved["map_version"]), float(saved["stamp"])),
-            trajectory=Trajectory.load(path) if path.is_file() else None,
-            workspace=find_workspace(folder),
-        )
-
-    def _current(self, map_id: str) -> str | None:
-        """Return the folder of the version in force."""
-        try:
-            name = (self.folder / map_id / "current").read_text()
-        except (OSError, UnicodeDecodeError):
-            return None
-        return name if re.fullmatch(r"v\d+", name) else None
-
-    @staticmethod
-    def _sweep(home: Path, *, keep: str) -> None:
-        """Remove older versions and the remains of a killed process."""
-        for old in home.iterdir():
-            if old.is_dir() and old.name != keep:
-                shutil.rmtree(old, ignore_errors=True)
+        saved = {"format": 2, "source": served.source, "map_version": snapshot.map_version, "stamp": snapshot.stamp}
+        with atomic_write(folder / "map.json") as file:
+            file.write(json.dumps(saved).encode())
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _states(home: Path) -> list[Path]:
+    """Return the folders of a map's states, newest first."""
+    found = [path for path in home.iterdir() if re.fullmatch(r"v\d+", path.name) and path.is_dir()]
+    return sorted(found, key=lambda path: int(path.name[1:]), reverse=True)
+
+
+def _current(home: Path) -> str | None:
+    """Return the text of ``current``, or None if the file is missing."""
     try:
-        saved: dict[str, Any] = json.loads(path.read_text())
-        return {"source": saved["source"], "map_version": saved["map_version"], "stamp": saved["stamp"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"is damaged ({error}).", file=path, hint="delete the map's folder") from error
+        return (home / _CURRENT).read_text(errors="replace")
+    except FileNotFoundError:
+        return None
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    """Read a state as arguments of :meth:`MapStore.add`.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    listed = check_folder(folder)
+    path = folder / "map.json"
+    try:
+        saved = json.loads(path.read_text())
+        source, version, stamp = str(saved["source"]), int(saved["map_version"]), float(saved["stamp"])
+        whole = listed or saved.get("format", 1) == 1
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise FormatError(f"is damaged ({error}).", file=path, hint=_HINT) from error
+    if not whole or folder.name != f"v{version}":
+        why = "belongs to another folder." if whole else f"is saved with checksums, and there is no {SUMS}."
+        raise FormatError(why, file=path, hint=_HINT)
+    if not listed:
+        _log.warning("%s has no checksums: an earlier version saved it", folder)
+    trajectory = folder / "trajectory.tum"
+    return {
+        "source": source,
+        "snapshot": Snapshot(load_ply(folder / "map.ply"), version, stamp),
+        "trajectory": Trajectory.load(trajectory) if trajectory.is_file() else None,
+        "workspace": find_workspace(folder),
+    }
+
+
+def _set_aside(state: Path) -> None:
+    """Rename a state that cannot be served, for inspection; an earlier one of that name is replaced."""
+    aside = state.with_name(f"{state.name}.damaged")
+    shutil.rmtree(aside, ignore_errors=True)
+    replace(state, aside)
+
+
+def _sweep(home: Path, *, keep: Sequence[str]) -> None:
+    """Remove older states and the remains of a killed process."""
+    sweep_drafts(home)
+    for old in home.iterdir():
+        if old.is_dir() and old.name not in keep and not old.name.endswith(".damaged"):
+            shutil.rmtree(old, ignore_errors=True)

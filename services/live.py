@@ -12,8 +12,8 @@ from splatbot.errors import MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
 from splatbot.protocols import FrameSource
-from splatbot.services.store import MapStore, State
-from splatbot.services.topics import FRAME, RESULT, map_topic
+from splatbot.services.store import MapStore, ServedMap, State
+from splatbot.services.topics import FRAME, RESULT
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
 
@@ -52,28 +52,32 @@ class LiveMapping:
     :meth:`start` does so in a thread of its own, :meth:`run` in the caller's.
 
     Args:
-        store: where ``map_id`` has been added.
+        store: store of the map.
+        served: map that receives the frames; once it is deleted, mapping ends.
         source: frames in their order: a log, a camera, or the frames that clients push.
         mapper: only the mapping thread touches it once started.
         on_result: called in the mapping thread after each frame.
+        on_end: called in the mapping thread at its end.
     """
 
     def __init__(
         self,
         store: MapStore,
-        map_id: str,
+        served: ServedMap,
         source: Iterable[Frame],
         mapper: LiveMapper,
         *,
         on_result: Callable[[FrameResult], None] | None = None,
+        on_end: Callable[[], None] = lambda: None,
     ) -> None:
         self._store = store
-        self._map_id = map_id
+        self._served = served
         self._source = source
         self._mapper = mapper
         self._on_result = on_result
+        self._on_end = on_end
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self.run, name=f"mapping-{map_id}", daemon=True)
+        self._thread = threading.Thread(target=self.run, name=f"mapping-{served.id}", daemon=True)
 
     def start(self) -> None:
         """Begin."""
@@ -96,28 +100,29 @@ class LiveMapping:
         """Map until the frames end, :meth:`stop`, or an error, which becomes the map's state."""
         try:
             self._feed()
+        except MapNotFoundError:
+            _log.info("mapping %s stopped: the map was deleted", self._served.id)
         except SplatbotError as error:
-            _log.error("mapping %s stopped: %s", self._map_id, error)
+            _log.error("mapping %s stopped: %s", self._served.id, error)
             self._end("failed", error.message)
         except Exception:
-            _log.exception("mapping %s failed", self._map_id)
+            _log.exception("mapping %s failed", self._served.id)
             self._end("failed", "unexpected error; the service's log says more")
         else:
             self._end("ended")
         finally:
             self._mapper.close()
+            self._on_end()
 
     def _feed(self) -> None:
-        bus = self._store.bus
-        frame_topic, result_topic = map_topic(self._map_id, FRAME), map_topic(self._map_id, RESULT)
         shown = -1
         for frame in self._source:
             if self._stop.is_set():
                 break
-            bus.publish(frame_topic, frame)
+            self._store.tell(self._served, FRAME, frame)
             with self._store.frames_first.mapping():
                 result = self._mapper.process(frame)
-            bus.publish(result_topic, result)
+            self._store.tell(self._served, RESULT, result)
             if result.keyframe:
                 self._publish()
                 shown = result.index
@@ -130,8 +135,9 @@ class LiveMapping:
             self._publish()  # without the final refinement: a stop request wants a quick end
 
     def _publish(self) -> None:
-        self._store.publish(self._map_id, self._mapper.snapshot(), self._mapper.trajectory)
+        served, mapper = self._served, self._mapper
+        self._store.publish(served.id, mapper.snapshot(), mapper.trajectory, generation=served.generation)
 
     def _end(self, state: State, detail: str | None = None) -> None:
         with suppress(MapNotFoundError):  # deleted meanwhile
-            self._store.set_state(self._map_id, state, detail)
+            self._store.set_state(self._served.id, state, detail, generation=self._served.generation)

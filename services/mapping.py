@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import shutil
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from splatbot.config import Config
-from splatbot.errors import InputError, LogError
+from splatbot.errors import InputError, LogError, MapNotFoundError
 from splatbot.logs import Log
 from splatbot.services.jobs import JobCancelled, JobHandle, Work
 from splatbot.services.live import LiveMapping
+from splatbot.services.problems import disk_error
 from splatbot.services.recordings import open_allowed, unpack
 from splatbot.services.runtime import Runtime
+from splatbot.services.settings import ServiceSettings
+from splatbot.services.store import ServedMap
 from splatbot.slam import FrameResult
 from splatbot.workspace import Workspace, find_workspace
 
@@ -30,30 +34,52 @@ def check_length(log: Log, settings_max: int, wanted: int | None) -> int:
     return total
 
 
-def map_recording(runtime: Runtime, map_id: str, log: Log, total: int) -> Work:
-    """Return the work of a job that maps the first ``total`` frames of a log into ``map_id``, which is in the store."""
-    return lambda handle: _map(runtime, map_id, log, total, runtime.config, handle)
+def map_recording(runtime: Runtime, served: ServedMap, log: Log, total: int) -> Work:
+    """Return the work of a job that maps the first ``total`` frames of a log into ``served``."""
+    return lambda handle: _map(runtime, served, log, total, runtime.config, handle)
 
 
-def map_upload(runtime: Runtime, map_id: str, archive: Path) -> Work:
-    """Return the work of a job that unpacks an uploaded recording, maps it, and removes both files."""
+def map_upload(runtime: Runtime, served: ServedMap, archive: Path, discard: Callable[[], None]) -> Work:
+    """Return the work of a job that unpacks an uploaded recording, maps it, and calls ``discard`` at the end."""
 
     def work(handle: JobHandle) -> dict[str, Any]:
-        settings = runtime.settings
         try:
-            handle.report(0.0, "unpacking")
-            folder = archive.with_suffix("")
-            home = unpack(archive, folder, max_bytes=settings.max_unpacked_bytes, max_pixels=settings.max_pixels)
-            log = open_allowed(str(home), [str(folder)])
-            total = check_length(log, settings.max_frames, None)
-            return _map(runtime, map_id, log, total, runtime.config, handle)
-        except InputError as error:
-            runtime.store.set_state(map_id, "failed", error.message)
-            raise
+            try:
+                log = _unpacked(runtime.settings, archive, handle)
+                total = check_length(log, runtime.settings.max_frames, None)
+            except (InputError, OSError, JobCancelled) as error:
+                with suppress(MapNotFoundError):  # deleted meanwhile
+                    runtime.store.set_state(served.id, "failed", _reason(error), generation=served.generation)
+                raise
+            return _map(runtime, served, log, total, runtime.config, handle)
         finally:
-            shutil.rmtree(archive.parent, ignore_errors=True)
+            discard()
 
     return work
+
+
+def _unpacked(settings: ServiceSettings, archive: Path, handle: JobHandle) -> Log:
+    folder = archive.with_suffix("")
+    shown = -1
+
+    def progress(share: float) -> None:
+        nonlocal shown
+        handle.check()
+        if round(100 * share) != shown:
+            shown = round(100 * share)
+            handle.report(0.0, f"unpacking, {shown} % done")
+
+    home = unpack(
+        archive, folder, max_bytes=settings.max_unpacked_bytes, max_pixels=settings.max_pixels, progress=progress
+    )
+    archive.unlink()
+    return open_allowed(str(home), [str(folder)])
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, InputError):
+        return error.message
+    return disk_error(error).message if isinstance(error, OSError) else "the job was cancelled"
 
 
 def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
@@ -63,7 +89,9 @@ def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
     return None if uri.startswith("synthetic:") else find_workspace(uri)
 
 
-def _map(runtime: Runtime, map_id: str, log: Log, total: int, config: Config, handle: JobHandle) -> dict[str, Any]:
+def _map(
+    runtime: Runtime, served: ServedMap, log: Log, total: int, config: Config, handle: JobHandle
+) -> dict[str, Any]:
     from splatbot.slam import Slam
 
     frames = (log.read(i) for i in range(total))
@@ -77,12 +105,15 @@ def _map(runtime: Runtime, map_id: str, log: Log, total: int, config: Config, ha
         else:
             handle.report((result.index + 1) / total, f"frame {result.index + 1} of {total}")
 
-    mapping = LiveMapping(runtime.store, map_id, frames, Slam(config), on_result=on_result)
+    mapping = LiveMapping(runtime.store, served, frames, Slam(config), on_result=on_result)
     mapping.run()
-    served = runtime.store.get(map_id)
-    runtime.save(map_id)
+    try:
+        made = runtime.store.get(served.id, generation=served.generation)
+    except MapNotFoundError as error:
+        raise JobCancelled from error
+    runtime.save(made)
     if handle.cancelled.is_set():
         raise JobCancelled
-    if served.state == "failed":
-        raise LogError(served.detail or "mapping failed.", field="log")
-    return {"map": map_id, "map_version": served.map_version, "frames": total, "tracked": tracked}
+    if made.state == "failed":
+        raise LogError(made.detail or "mapping failed.", field="log")
+    return {"map": made.id, "map_version": made.map_version, "frames": total, "tracked": tracked}

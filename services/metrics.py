@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter as Count
 from collections.abc import Iterator
+from contextlib import suppress
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -12,6 +13,7 @@ from prometheus_client.registry import Collector
 
 from splatbot.services.bus import Bus
 from splatbot.services.jobs import Jobs
+from splatbot.services.library import MapLibrary
 from splatbot.services.store import MapStore
 from splatbot.services.topics import RESULT, map_topic
 from splatbot.slam import FrameResult
@@ -27,9 +29,10 @@ class Metrics:
     Args:
         store: source of the maps, and of the bus that is subscribed to.
         jobs: that are counted.
+        library: maps on disk, if they are saved.
     """
 
-    def __init__(self, store: MapStore, jobs: Jobs) -> None:
+    def __init__(self, store: MapStore, jobs: Jobs, library: MapLibrary | None = None) -> None:
         self.registry = CollectorRegistry()
         r = self.registry
         self._requests = Histogram(
@@ -40,7 +43,9 @@ class Metrics:
             "splatbot_frame_stage_seconds", "Stages of the frames", ["stage"], buckets=_STAGE_S, registry=r
         )
         self._frames = Counter("splatbot_frames", "Frames by verdict", ["map", "verdict"], registry=r)
-        r.register(_Present(store, jobs))
+        self._counted: dict[tuple[str, str], None] = {}
+        self._store = store
+        r.register(_Present(store, jobs, library))
         self._results = store.bus.subscribe(map_topic("*", RESULT), capacity=_WAITING, latched=False)
         self._thread = threading.Thread(target=self._count_frames, name="metrics", daemon=True)
         self._thread.start()
@@ -51,6 +56,7 @@ class Metrics:
 
     def text(self) -> bytes:
         """Return all metrics in Prometheus' text format."""
+        self._forget_deleted()
         return generate_latest(self.registry)
 
     def close(self) -> None:
@@ -61,16 +67,28 @@ class Metrics:
     def _count_frames(self) -> None:
         for message in self._results:
             result: FrameResult = message.value
-            self._frames.labels(message.topic.split("/")[1], result.verdict).inc()
+            series = message.topic.split("/")[1], result.verdict
+            if series not in self._counted:
+                self._forget_deleted()
+                self._counted[series] = None
+            self._frames.labels(*series).inc()
             for stage, ms in result.stage_ms.items():
                 self._stages.labels(stage).observe(1e-3 * ms)
+
+    def _forget_deleted(self) -> None:
+        """Remove the series of deleted maps."""
+        present = {served.id for served in self._store.list()}
+        for series in [series for series in tuple(self._counted) if series[0] not in present]:
+            self._counted.pop(series, None)
+            with suppress(KeyError):
+                self._frames.remove(*series)
 
 
 class _Present(Collector):
     """Gauges that are read when Prometheus collects them."""
 
-    def __init__(self, store: MapStore, jobs: Jobs) -> None:
-        self._store, self._bus, self._jobs = store, store.bus, jobs
+    def __init__(self, store: MapStore, jobs: Jobs, library: MapLibrary | None) -> None:
+        self._store, self._bus, self._jobs, self._library = store, store.bus, jobs, library
 
     def collect(self) -> Iterator[Metric]:
         """Collect the metric families."""
@@ -85,6 +103,11 @@ class _Present(Collector):
             for served in maps:
                 family.add_metric([served.id], value(served))
             yield family
+        if self._library is not None:
+            name, help_text = "splatbot_map_save_failures", "Saves of maps that failed"
+            yield CounterMetricFamily(name, help_text, value=self._library.failures)
+            unsaved = len(self._library.failing)
+            yield GaugeMetricFamily("splatbot_maps_unsaved", "Maps whose last save failed", value=unsaved)
         yield _dropped(self._bus)
         yield GaugeMetricFamily("splatbot_bus_readers", "Open subscriptions", value=self._bus.readers)
         family = GaugeMetricFamily("splatbot_jobs", "Jobs by state", labels=["kind", "state"])
@@ -97,7 +120,15 @@ def _dropped(bus: Bus) -> Metric:
     family = CounterMetricFamily("splatbot_bus_dropped", "Messages that readers were too slow for", labels=["topic"])
     kinds: Count[str] = Count()
     for topic, number in bus.dropped.items():
-        kinds[topic.split("/")[0] + "/" + topic.rsplit("/", 1)[-1] if topic.startswith("maps/") else topic] += number
+        kinds[_kind(topic)] += number
     for kind, number in kinds.items():
         family.add_metric([kind], number)
     return family
+
+
+def _kind(topic: str) -> str:
+    """Return one name for the topics of all maps, jobs or motions; each of them is short-lived."""
+    first, *rest = topic.split("/")
+    if first == "maps":
+        return f"maps/{rest[-1]}"
+    return first if first in ("jobs", "motions") else topic

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 import re
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -17,6 +19,8 @@ from starlette.requests import ClientDisconnect
 from splatbot.errors import InputError, SplatbotError
 
 MEDIA_TYPE = "application/problem+json"
+_log = logging.getLogger(__name__)
+
 _MAX_ERRORS = 10  # a request with a hundred thousand wrong points names the first ten
 
 
@@ -48,6 +52,22 @@ class BusyError(SplatbotError):
     """The service has as much to do as it can; the same request may do later."""
 
     http_status = 503
+
+
+class SaveError(SplatbotError):
+    """The disk is full, read-only or gone; earlier saved states remain."""
+
+    http_status = 507
+
+
+DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ESTALE})
+"""Errors of a disk, which no request can repair."""
+
+
+def disk_error(error: OSError) -> SaveError:
+    """Return the error of a disk that cannot be written to."""
+    hint = "free some space and check that the disk is mounted for writing"
+    return SaveError(f"The service cannot write to its disk ({error.strerror}).", hint=hint)
 
 
 def problem(
@@ -86,6 +106,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_invalid_request)
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(ClientDisconnect, _on_client_gone)
+    app.add_exception_handler(OSError, _on_os_error)
     app.add_exception_handler(Exception, _on_unexpected_error)
 
 
@@ -122,6 +143,14 @@ def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
 
 def _on_client_gone(request: Request, _error: Exception) -> ProblemResponse:
     return problem(400, "The body was not sent to its end.", map_version=_version(request))  # the client is gone
+
+
+def _on_os_error(request: Request, error: Exception) -> ProblemResponse:
+    assert isinstance(error, OSError)
+    if error.errno not in DISK_ERRORS:
+        raise error
+    _log.error("%s", error)
+    return _on_splatbot_error(request, disk_error(error))
 
 
 def _on_unexpected_error(request: Request, _error: Exception) -> ProblemResponse:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import IO, BinaryIO
 
@@ -13,7 +13,7 @@ from splatbot.errors import InputError, LogError
 from splatbot.logs import Log, open_log
 from splatbot.logs.index import read_index
 from splatbot.logs.presets import PRESETS
-from splatbot.services.problems import TooLargeError
+from splatbot.services.problems import DISK_ERRORS, TooLargeError
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".txt", ".json", ".yaml"})
 _MAX_FILES = 200_000
@@ -43,30 +43,47 @@ def open_allowed(uri: str, roots: Sequence[str], *, camera: str | None = None) -
     raise InputError("is no recording that may be mapped.", field="log", hint=hint)
 
 
-def unpack(archive: Path, folder: Path, *, max_bytes: int, max_pixels: int) -> Path:
+def unpack(
+    archive: Path,
+    folder: Path,
+    *,
+    max_bytes: int,
+    max_pixels: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Path:
     """Unpack an uploaded zip of a recording into ``folder``; the folder that holds its rgb.txt.
+
+    Args:
+        progress: called with the share that is done, at least once per MiB; its exceptions end the work.
 
     Raises:
         LogError: it is not a zip, is damaged, holds files of other kinds, or has paths that leave the archive.
         TooLargeError: it unpacks to more than ``max_bytes``, or an image has more than ``max_pixels``.
+        OSError: the disk is full or not available.
     """
     try:
         with zipfile.ZipFile(archive) as pack:
             members = [member for member in pack.infolist() if not member.is_dir()]
             if len(members) > _MAX_FILES or sum(member.file_size for member in members) > max_bytes:
                 raise _too_large(max_bytes)
-            left = max_bytes
+            left, total = max_bytes, max(1, sum(member.file_size for member in members))
+
+            def step(copied: int) -> None:
+                progress(min(1.0, (max_bytes - left + copied) / total))
+
             for member in members:
                 target = folder / _inside(member)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with pack.open(member) as source, target.open("xb") as file:
-                    left -= _copy(source, file, left, max_bytes)
+                    left -= _copy(source, file, left, max_bytes, step)
                 check_picture(target, max_pixels)
     except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError, EOFError) as error:
         raise LogError("is no zip that can be unpacked.", field="upload", hint="zip the recording's folder") from error
     except FileExistsError as error:
         raise LogError("holds a file twice.", field="upload", hint="zip the recording's folder") from error
     except (OSError, struct.error, ValueError, zlib.error) as error:
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            raise
         raise LogError("cannot be unpacked.", field="upload", hint="zip the recording's folder again") from error
     homes = sorted(folder.rglob("rgb.txt"), key=lambda path: len(path.parts))
     if not homes:
@@ -160,14 +177,16 @@ def _inside(member: zipfile.ZipInfo) -> PurePosixPath:
     return path
 
 
-def _copy(source: IO[bytes], file: BinaryIO, left: int, max_bytes: int) -> int:
+def _copy(source: IO[bytes], file: BinaryIO, left: int, max_bytes: int, step: Callable[[int], None]) -> int:
     """Copy at most ``left`` bytes: the sizes in an archive's directory may be wrong."""
     copied = 0
+    step(copied)
     while chunk := source.read(_CHUNK):
         copied += len(chunk)
         if copied > left:
             raise _too_large(max_bytes)
         file.write(chunk)
+        step(copied)
     return copied
 
 

@@ -18,6 +18,7 @@ request_id: ContextVar[str] = ContextVar("request_id", default="")
 
 _log = logging.getLogger("splatbot.requests")
 _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_SECRET = re.compile(r"spb_[\w-]+|(?<=api_key=)[^&\s\"']+")
 
 
 class RequestCounter(Protocol):
@@ -64,6 +65,16 @@ class RequestLog:
             request_id.reset(token)
 
 
+def hide_keys(text: str) -> str:
+    """Replace API keys by asterisks."""
+    return _SECRET.sub("***", text)
+
+
+def one_line(text: str) -> str:
+    """Hide API keys, and escape control characters, which forge lines of a log."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in hide_keys(text))
+
+
 class JsonFormatter(logging.Formatter):
     """One JSON object a line."""
 
@@ -73,25 +84,26 @@ class JsonFormatter(logging.Formatter):
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": record.getMessage(),
+            "message": hide_keys(record.getMessage()),
             "request_id": request_id.get() or None,
-            "error": self.formatException(record.exc_info) if record.exc_info else None,
+            "error": hide_keys(self.formatException(record.exc_info)) if record.exc_info else None,
         }
         return json.dumps({name: value for name, value in fields.items() if value is not None})
 
 
 class TextFormatter(logging.Formatter):
-    """``LEVEL: message``, with the request where there is one."""
+    """``LEVEL: message``, with the request where there is one; lines of a traceback are indented."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Format a record as a line."""
-        line = super().format(record)
+        """Format a record as a line, and lines of its traceback."""
         this = request_id.get()
-        return f"{line} [{this}]" if this else line
+        line = f"{record.levelname}: {one_line(record.getMessage())}" + (f" [{this}]" if this else "")
+        trace = self.formatException(record.exc_info).splitlines() if record.exc_info else []
+        return "\n    ".join([line, *map(one_line, trace)])
 
 
 def configure_logging(*, as_json: bool) -> None:
     """Log to stderr, from INFO on."""
     handler = logging.StreamHandler()
-    handler.setFormatter(JsonFormatter() if as_json else TextFormatter("%(levelname)s: %(message)s"))
+    handler.setFormatter(JsonFormatter() if as_json else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from typing import Any
 
 from splatbot.config import Config
-from splatbot.errors import ConfigError, SplatbotError
+from splatbot.errors import ConfigError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.rasterize.native import native
 from splatbot.services.arms import Arms
-from splatbot.services.jobs import Jobs
+from splatbot.services.jobs import Job, Jobs, Work
 from splatbot.services.library import MapLibrary
 from splatbot.services.live import LiveMapper, LiveMapping
 from splatbot.services.metrics import Metrics
 from splatbot.services.plans import Plans
 from splatbot.services.pushed import PushedFrames, StreamEndedError
+from splatbot.services.scratch import sweep_scratch
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapExistsError, MapStore, ServedMap
 from splatbot.workspace import Workspace
@@ -51,17 +55,23 @@ class Runtime:
         self.store = store or MapStore()
         self.bus = self.store.bus
         self.config = config or Config()
+        self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
+        if self.library is not None:
+            self.library.lock()
         self.jobs = Jobs(self.bus, workers=settings.job_workers, capacity=settings.max_jobs)
         self.arms = Arms(self.store)
         self.plans = Plans()
-        self.metrics = Metrics(self.store, self.jobs)
-        self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
+        self.metrics = Metrics(self.store, self.jobs, self.library)
         self.draining = False
-        self._streams: dict[str, PushedFrames] = {}
-        self._mappings: dict[str, LiveMapping] = {}
+        self._deadline = math.inf
+        # Writers by the generation of their map.
+        self._streams: dict[int, PushedFrames] = {}
+        self._mappings: dict[int, LiveMapping] = {}
+        self._jobs_of: dict[int, str] = {}
         self._waiting: list[LiveMapping] = []
         self._started = False
         self._lock = threading.Lock()
+        self._disk = threading.Lock()  # a map is either saved or deleted
         self._ended = threading.Event()
         self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
         # A thread has the priority of the one that starts it, and those that answer have a lower one.
@@ -70,6 +80,7 @@ class Runtime:
 
     def start(self) -> None:
         """Serve the saved maps, start saving, and start to map the sources that are followed."""
+        sweep_scratch()
         if self.library is not None:
             self.library.load_all(self.store)
             self._keeper.start()
@@ -79,11 +90,11 @@ class Runtime:
         for mapping in waiting:
             self._begin(mapping)
 
-    def follow(self, map_id: str, source: Iterable[Frame], mapper: LiveMapper) -> None:
-        """Map frames in a thread of their own, once the service has begun; ``map_id`` is in the store."""
-        mapping = LiveMapping(self.store, map_id, source, mapper)
+    def follow(self, served: ServedMap, source: Iterable[Frame], mapper: LiveMapper) -> None:
+        """Map frames in a thread of their own, once the service has begun."""
+        mapping = LiveMapping(self.store, served, source, mapper)
         with self._lock:
-            self._mappings[map_id] = mapping
+            self._mappings[served.generation] = mapping
             if not self._started:
                 self._waiting.append(mapping)  # a recording of the service holds its first frame too
                 return
@@ -101,11 +112,17 @@ class Runtime:
 
         served = self.store.add(map_id, source="pushed frames", state="mapping", workspace=workspace, awaited=False)
         frames = PushedFrames(self.settings.max_waiting_frames)
-        mapping = LiveMapping(self.store, map_id, frames, Slam(self.config), on_result=frames.answer)
+        mapping = LiveMapping(
+            self.store,
+            served,
+            frames,
+            Slam(self.config),
+            on_result=frames.answer,
+            on_end=lambda: self._stream_ended(served.generation, frames),
+        )
         with self._lock:
-            self._streams[map_id], self._mappings[map_id] = frames, mapping
+            self._streams[served.generation], self._mappings[served.generation] = frames, mapping
         self._begin(mapping)
-        threading.Thread(target=_abandon_after, args=(mapping, frames), name=f"stream-{map_id}", daemon=True).start()
         return served
 
     def stream(self, map_id: str) -> PushedFrames:
@@ -115,9 +132,9 @@ class Runtime:
             MapNotFoundError: no map of that name.
             StreamEndedError: it is not made of pushed frames.
         """
-        self.store.get(map_id)
+        generation = self.store.get(map_id).generation
         with self._lock:
-            frames = self._streams.get(map_id)
+            frames = self._streams.get(generation)
         if frames is None:
             hint = 'create a map for frames: POST /v1/maps {"id": ...}'
             raise StreamEndedError(f"map {map_id!r} is not made of pushed frames.", hint=hint)
@@ -134,51 +151,89 @@ class Runtime:
             self.open_stream(map_id)
         self.stream(map_id).push(frame)
 
-    def remove(self, map_id: str) -> None:
-        """Stop mapping it, remove it from the service, and delete its saved versions.
+    def make(self, served: ServedMap, work: Work, **more: Any) -> Job:
+        """Queue the job that makes a map; deleting the map cancels it.
+
+        Args:
+            more: arguments of :meth:`splatbot.services.jobs.Jobs.submit`.
 
         Raises:
-            MapNotFoundError: no map of that name.
+            BusyError: as many jobs wait as may.
+            IdempotencyError: the key belongs to another request.
         """
-        self.store.remove(map_id)
-        self._end(map_id, "the map was deleted", 0.0)
-        if self.library is not None:
-            self.library.remove(map_id)
+        job, _ = self.jobs.submit("map", work, **more)
+        with self._lock:
+            self._jobs_of[served.generation] = job.id
+        return job
 
-    def save(self, map_id: str) -> None:
-        """Keep the map's present state on disk, where there is a folder for it.
+    def remove(self, served: ServedMap) -> None:
+        """Remove a map and its saved versions, and end its mapping; wait for that up to ``shutdown_s``.
+
+        Raises:
+            MapNotFoundError: the map was deleted.
+            SaveError: the saved versions cannot be deleted; the map is still served.
+        """
+        with self._disk:
+            self.store.get(served.id, generation=served.generation)
+            if self.library is not None:
+                self.library.remove(served.id)
+            self.store.remove(served.id, generation=served.generation)
+        with self._lock:
+            job_id = self._jobs_of.pop(served.generation, None)
+        timeout = float(self.settings.shutdown_s)
+        if job_id is not None:
+            self.jobs.end(job_id, timeout)
+        self._end(served.generation, "the map was deleted", timeout)
+
+    def save(self, served: ServedMap) -> None:
+        """Keep the map's present state on disk if there is a folder for it and the map is not deleted.
 
         Raises:
             SaveError: it cannot be written.
         """
-        if self.library is not None:
-            self.library.save(self.store.get(map_id))
+        if self.library is None:
+            return
+        with self._disk, suppress(MapNotFoundError):
+            self.store.get(served.id, generation=served.generation)
+            self.library.save(served)
 
     def drain(self) -> None:
-        """Begin to end: take no more work, close event streams; answers that are under way are still given."""
+        """Begin to end: take no more work, cancel jobs, close event streams; answers under way are still given."""
         self.draining = True
+        self._deadline = min(self._deadline, time.monotonic() + self.settings.shutdown_s)
+        self.jobs.stop()
         self.bus.close()
 
     def close(self) -> None:
         """End jobs, motions and mappings, and save every map."""
-        self.draining = True
-        timeout = float(self.settings.shutdown_s)
-        self.arms.close(timeout)
-        self.jobs.close(timeout)
-        for map_id in list(self._mappings):
-            self._end(map_id, "the service stops", timeout)
+        self.drain()
+        self.arms.close(self._time_left())
+        self.jobs.close(self._time_left())
+        for generation in list(self._mappings):
+            self._end(generation, "the service stops", self._time_left())
         if not self._ended.is_set():
             self._ended.set()
             self._save_all()
+            if self.library is not None:
+                self.library.unlock()
         self.metrics.close()
-        self.bus.close()
+
+    def _time_left(self) -> float:
+        """Return the time [s] that one part may take to end: the rest of ``shutdown_s``, at least 0.5 s."""
+        return max(0.5, self._deadline - time.monotonic())
+
+    def _stream_ended(self, generation: int, frames: PushedFrames) -> None:
+        """Fail the requests that still wait, and free the mapper."""
+        frames.abandon("mapping has ended")
+        with self._lock:
+            self._mappings.pop(generation, None)
 
     def _begin(self, mapping: LiveMapping) -> None:
         self._starter.submit(mapping.start).result()
 
-    def _end(self, map_id: str, why: str, timeout_s: float) -> None:
+    def _end(self, generation: int, why: str, timeout_s: float) -> None:
         with self._lock:
-            frames, mapping = self._streams.pop(map_id, None), self._mappings.pop(map_id, None)
+            frames, mapping = self._streams.pop(generation, None), self._mappings.pop(generation, None)
         if frames is not None:
             frames.end(why)
         if mapping is not None:
@@ -195,28 +250,29 @@ class Runtime:
             if served.state == "static":
                 continue  # it is a file already
             try:
-                self.library.save(served)
+                self.save(served)
             except SplatbotError as error:
                 _log.error("%s", error)
 
 
 def check_exposure(settings: ServiceSettings) -> None:
-    """Check that addresses other machines can reach require keys, and that TLS is complete.
+    """Check that services other machines can reach require keys, and that TLS is complete.
 
     Raises:
         ConfigError: it is not so.
     """
+    if settings.insecure_no_auth and (settings.api_keys or not settings.loopback):
+        hint = "leave it out, or listen on 127.0.0.1 without api_keys"
+        raise ConfigError("is for loopback without keys.", field="insecure_no_auth", hint=hint)
     if not settings.loopback and not settings.api_keys:
         hint = "make one with `splatbot serve --new-key` and set SPLATBOT_API_KEYS, or listen on 127.0.0.1"
         raise ConfigError(f"{settings.host} can be reached by others and there is no key.", field="api_keys", hint=hint)
+    if settings.trusted_proxies and not settings.api_keys:
+        hint = "make one with `splatbot serve --new-key` and set SPLATBOT_API_KEYS"
+        raise ConfigError("a proxy lets others reach the service and there is no key.", field="api_keys", hint=hint)
     if (settings.tls_cert is None) != (settings.tls_key is None):
         raise ConfigError("one of the two is missing.", field="tls_cert, tls_key", hint="give both")
     for name in ("tls_cert", "tls_key"):
         path = getattr(settings, name)
         if path is not None and not path.is_file():
             raise ConfigError("does not exist.", file=path, field=name, hint="check the path")
-
-
-def _abandon_after(mapping: LiveMapping, frames: PushedFrames) -> None:
-    mapping.wait()
-    frames.abandon("mapping has ended")

@@ -57,7 +57,7 @@ class HealthResponse(BaseModel):
 
     status: Literal["ok", "ready"]
     version: str = Field(description="of splatbot")
-    maps: dict[str, int] = Field(default_factory=dict, description="map_version by map id")
+    unsaved: int = Field(0, description="maps whose last save failed; they are served from memory")
 
 
 class Bounds(BaseModel):

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 from collections.abc import Callable
 from types import FrameType
 
 import uvicorn
+from fastapi import FastAPI
 
 from splatbot.errors import InputError
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime, check_exposure
+from splatbot.services.settings import ServiceSettings
+
+_log = logging.getLogger(__name__)
 
 
 class _Server(uvicorn.Server):
@@ -38,22 +43,15 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
     """
     settings = runtime.settings
     check_exposure(settings)
+    if settings.insecure_no_auth:
+        _log.warning("insecure_no_auth: every process on this machine may map, move and delete without a key")
+    config = server_config(create_app(runtime), settings)
     listeners = [listen(settings.host, settings.port)]
     if settings.ros_port is not None:
         listeners.append(listen(settings.host, settings.ros_port))
     host, port = listeners[0].getsockname()[:2]
     scheme = "https" if settings.tls_cert is not None else "http"
     on_start(f"{scheme}://{'[' + host + ']' if ':' in host else host}:{port}")
-    config = uvicorn.Config(
-        create_app(runtime),
-        log_config=None,  # the process' own, see splatbot.services.requests
-        access_log=False,  # the application's names the request's id, and no query, which may hold a key
-        timeout_graceful_shutdown=settings.shutdown_s,
-        ws_max_size=settings.max_message_bytes,
-        ssl_certfile=settings.tls_cert,
-        ssl_keyfile=settings.tls_key,
-        server_header=False,
-    )
     # After its graceful end uvicorn raises the signal again for other handlers; here it has no further effect.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
@@ -61,6 +59,24 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def server_config(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
+    """Configure uvicorn."""
+    return uvicorn.Config(
+        app,
+        host=settings.host,
+        port=settings.port,
+        log_config=None,  # the process' own, see splatbot.services.requests
+        access_log=False,  # the application's names the request's id, and no query
+        timeout_graceful_shutdown=settings.shutdown_s,
+        ws_max_size=settings.max_message_bytes,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
+        server_header=False,
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
+    )
 
 
 def listen(host: str, port: int) -> socket.socket:

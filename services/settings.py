@@ -36,9 +36,12 @@ class ServiceSettings(BaseSettings):
     viewer_port: int | None = Field(None, ge=0, le=65535, description="port of the viewer, on this machine alone")
     record: Path | None = Field(None, description="an MCAP file that every topic is recorded into")
     api_keys: Words = Field((), description="hashes that `splatbot serve --new-key` prints; needed beyond loopback")
+    insecure_no_auth: bool = Field(False, description="on loopback, mapping and moving need no key")
     tls_cert: Path | None = Field(None, description="certificate chain (PEM); with tls_key the service speaks HTTPS")
     tls_key: Path | None = Field(None, description="its private key (PEM)")
     cors_origins: Words = Field((), description="web pages' origins that may ask; none by default")
+    allowed_hosts: Words = Field((), description="more names of the service in Host headers")
+    trusted_proxies: Words = Field((), description="addresses of proxies whose X-Forwarded-For and -Proto count")
     data_dir: Path | None = Field(None, description="folder of saved maps; without it maps live in memory")
     log_roots: Words = Field((), description="folders whose recordings may be mapped by POST /v1/maps")
     save_every_s: float = Field(30.0, gt=0, description="how often growing maps are saved to data_dir [s]")
@@ -58,11 +61,11 @@ class ServiceSettings(BaseSettings):
     max_streams: int = Field(64, ge=1, description="event streams that are open at once")
     max_jobs: int = Field(16, ge=1, description="jobs that may wait")
     job_workers: int = Field(2, ge=1, description="jobs that run at once")
-    shutdown_s: int = Field(10, ge=0, description="how long running requests may take to end after SIGTERM [s]")
+    shutdown_s: int = Field(6, ge=0, description="how long running requests may take to end after SIGTERM [s]")
     niceness: int = Field(10, ge=0, le=19, description="of the threads that answer: mapping and arms go first")
     log_json: bool = Field(False, description="one JSON object a line instead of text")
 
-    @field_validator("api_keys", "cors_origins", "log_roots", mode="before")
+    @field_validator("api_keys", "cors_origins", "allowed_hosts", "trusted_proxies", "log_roots", mode="before")
     @classmethod
     def _split(cls, value: Any) -> Any:
         return tuple(word.strip() for word in value.split(",") if word.strip()) if isinstance(value, str) else value

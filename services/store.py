@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import threading
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError, MapNotFoundError
@@ -127,14 +127,23 @@ class MapStore:
             self._put(served)
         return served
 
-    def publish(self, map_id: str, snapshot: Snapshot, trajectory: Trajectory | None = None) -> None:
+    def publish(
+        self,
+        map_id: str,
+        snapshot: Snapshot,
+        trajectory: Trajectory | None = None,
+        *,
+        generation: int | None = None,
+    ) -> None:
         """Let ``snapshot`` be the map's latest state; one that is not newer is ignored, so versions only grow.
 
+        ``generation`` is that of the map which the writer was started for.
+
         Raises:
-            MapNotFoundError: no map of that name.
+            MapNotFoundError: no map of that name, or it is of another generation.
         """
         with self._lock:
-            current = self._find(map_id)
+            current = self._find(map_id, generation)
             if current.snapshot is not None and snapshot.map_version <= current.map_version:
                 return
             later = trajectory or current.trajectory
@@ -142,34 +151,44 @@ class MapStore:
             if trajectory is not None:
                 self.bus.publish(map_topic(map_id, TRAJECTORY), trajectory)
 
-    def set_state(self, map_id: str, state: State, detail: str | None = None) -> None:
+    def set_state(self, map_id: str, state: State, detail: str | None = None, *, generation: int | None = None) -> None:
         """Set the state of the map's creation.
 
         Raises:
-            MapNotFoundError: no map of that name.
+            MapNotFoundError: no map of that name, or it is of another generation.
         """
         with self._lock:
-            self._put(replace(self._find(map_id), state=state, detail=detail))
+            self._put(replace(self._find(map_id, generation), state=state, detail=detail))
 
-    def remove(self, map_id: str) -> None:
+    def tell(self, served: ServedMap, kind: str, value: Any) -> None:
+        """Publish a result about a map on the bus.
+
+        Raises:
+            MapNotFoundError: the map was deleted.
+        """
+        with self._lock:
+            self._find(served.id, served.generation)
+            self.bus.publish(map_topic(served.id, kind), value)
+
+    def remove(self, map_id: str, *, generation: int | None = None) -> None:
         """Remove a map; readers keep the version that they hold.
 
         Raises:
-            MapNotFoundError: no map of that name.
+            MapNotFoundError: no map of that name, or it is of another generation.
         """
         with self._lock:
-            self._find(map_id)
+            self._find(map_id, generation)
             del self._maps[map_id]
             self.bus.forget(map_topic(map_id, ""))
 
-    def get(self, map_id: str) -> ServedMap:
+    def get(self, map_id: str, *, generation: int | None = None) -> ServedMap:
         """Return the latest version of a map.
 
         Raises:
-            MapNotFoundError: no map of that name.
+            MapNotFoundError: no map of that name, or it is of another generation.
         """
         with self._lock:
-            return self._find(map_id)
+            return self._find(map_id, generation)
 
     def list(self) -> tuple[ServedMap, ...]:
         """List the latest versions of all maps in the order of their creation."""
@@ -180,8 +199,11 @@ class MapStore:
         self._maps[served.id] = served
         self.bus.publish(map_topic(served.id, STATE), served)
 
-    def _find(self, map_id: str) -> ServedMap:
+    def _find(self, map_id: str, generation: int | None = None) -> ServedMap:
         if map_id not in self._maps:
             names = ", ".join(self._maps) or "none"
             raise MapNotFoundError(f"No map {map_id!r}.", hint=f"the maps are: {names}")
-        return self._maps[map_id]
+        found = self._maps[map_id]
+        if generation is not None and found.generation != generation:
+            raise MapNotFoundError(f"Map {map_id!r} was deleted.", hint="the map of that name is another one")
+        return found

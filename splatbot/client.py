@@ -8,7 +8,9 @@
 from __future__ import annotations
 
 import io
+import ipaddress
 import json
+import os
 import ssl
 import threading
 import time
@@ -26,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError, SplatbotError
 from splatbot.frame import Frame
+from splatbot.service_key import key_file, read_key
 
 _MSGPACK = "application/msgpack"
 _NPY = "application/x-npy"
@@ -115,13 +118,15 @@ class Client(AbstractContextManager["Client"]):
 
     Args:
         url: "http://host:port" or "https://...".
-        key: API key, if the service requires one.
+        key: API key. If None, that of SPLATBOT_API_KEY, else for a service on loopback that of
+            :func:`splatbot.service_key.key_file`, if there is one.
         timeout_s: longest wait for an answer [s].
         retries: number of repetitions after the statuses 429 and 503.
         tls: context for https. If None, the certificates of the system are trusted.
 
     Raises:
         InputError: the URL is not one of HTTP.
+        ConfigError: the file of the key is open to other users.
     """
 
     def __init__(
@@ -136,6 +141,8 @@ class Client(AbstractContextManager["Client"]):
         parts = urlsplit(url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise InputError(f"is {url!r}.", field="url", hint="give http://host:port")
+        if key is None:
+            key = os.environ.get("SPLATBOT_API_KEY") or (read_key(key_file()) if _loopback(parts.hostname) else None)
         self._retries = retries
         self._http = httpx.Client(
             base_url=f"{parts.scheme}://{parts.netloc}",
@@ -394,6 +401,13 @@ class ArmLease(AbstractContextManager["ArmLease"]):
 def _result(kind: type[_Result], answer: Mapping[str, Any]) -> _Result:
     """Build a result from those entries of an answer that have the names of its fields."""
     return kind(**{field.name: answer[field.name] for field in fields(kind)})
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _map_path(map_id: str, *rest: str) -> str:

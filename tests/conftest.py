@@ -50,6 +50,15 @@ def default_kernels() -> Iterator[None]:
     native().set_isa("")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def service_key_of_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keeps the service's key in a folder of the tests, which commands of tests inherit."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        patch.delenv("SPLATBOT_API_KEY", raising=False)
+        yield
+
+
 @pytest.fixture(scope="session")
 def data_root() -> Path:
     """Folder of the real recordings: SPLATBOT_TEST_DATA, else shared/data next to the repository."""

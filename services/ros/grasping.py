@@ -22,7 +22,7 @@ from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.moveit import coded, robot_place
 from splatbot.services.ros.requests import entries, entry, vector
 from splatbot.services.store import MapStore
-from splatbot.services.topics import GRASPS, map_topic
+from splatbot.services.topics import GRASPS
 
 GRASP_SERVICE = "/plan_grasps"
 
@@ -53,7 +53,7 @@ class GraspServices:
             found = objects.with_notes(objects.sampler(robot).sample(target, GraspOptions()))
             found.unwrap()
             stamp = served.ready.stamp
-            self._store.bus.publish(map_topic(served.id, GRASPS), found)
+            self._store.tell(served, GRASPS, found)
             return {"grasps": [_grasp_message(i, grasp, robot, stamp) for i, grasp in enumerate(found.grasps)]}
 
         return {"grasps": []} | coded(work)

@@ -20,7 +20,7 @@ from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.requests import entries, entry, has_content, joints, number, pose, vector
 from splatbot.services.store import MapStore, ServedMap
-from splatbot.services.topics import PLAN, map_topic
+from splatbot.services.topics import PLAN
 
 PLAN_SERVICE, IK_SERVICE, VALIDITY_SERVICE = "/plan_kinematic_path", "/compute_ik", "/check_state_validity"
 
@@ -78,7 +78,7 @@ class MoveItServices:
             trajectory = time_path(
                 path, planner.arm, served.field, velocity_scale=speed, acceleration_scale=acceleration
             )
-            self._store.bus.publish(map_topic(served.id, PLAN), trajectory)
+            self._store.tell(served, PLAN, trajectory)
             return {
                 "trajectory_start": {"joint_state": {"name": list(robot.chain.names), "position": start}},
                 "trajectory": {"joint_trajectory": trajectory.to_ros()},

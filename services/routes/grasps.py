@@ -19,7 +19,7 @@ from splatbot.services.codecs import answer, body_of, gives, takes
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
-from splatbot.services.topics import GRASPS, map_topic
+from splatbot.services.topics import GRASPS
 
 router = APIRouter(prefix="/v1/maps", tags=["grasping"])
 
@@ -67,7 +67,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     )
     result = objects.with_notes(sampler.sample(found, options))
     result.unwrap()
-    service.bus.publish(map_topic(served.id, GRASPS), result)
+    service.store.tell(served, GRASPS, result)
     return answer(request, summary(result) | {"map_version": served.map_version})
 
 

@@ -8,22 +8,22 @@ from fastapi import APIRouter, Response
 
 import splatbot
 from splatbot.errors import NativeError
-from splatbot.services.dependencies import Service, Store, example, problems
+from splatbot.services.dependencies import Service, example, problems
 from splatbot.services.problems import MapNotReadyError, NotReadyError
 from splatbot.services.schemas import HealthResponse
 
 router = APIRouter(tags=["health"])
 
 
-@router.get("/healthz", responses=example({"status": "ok", "version": "0.1.0", "maps": {"default": 3}}))
-def healthz(store: Store) -> HealthResponse:
+@router.get("/healthz", responses=example({"status": "ok", "version": "0.1.0"}), response_model_exclude={"unsaved"})
+def healthz() -> HealthResponse:
     """Report that the process answers."""
-    return HealthResponse(status="ok", version=splatbot.__version__, maps=_versions(store))
+    return HealthResponse(status="ok", version=splatbot.__version__)
 
 
 @router.get(
     "/readyz",
-    responses=example({"status": "ready", "version": "0.1.0", "maps": {"default": 3}}) | problems(503),
+    responses=example({"status": "ready", "version": "0.1.0", "unsaved": 0}) | problems(503),
 )
 def readyz(service: Service) -> HealthResponse:
     """Check that the native module loads, the initial maps have a state, and the service is not ending."""
@@ -35,10 +35,11 @@ def readyz(service: Service) -> HealthResponse:
         ) from error
     if service.draining:
         raise NotReadyError("The service is about to end.", hint="ask another one")
-    waiting = [m.id for m in service.store.list() if m.awaited and m.snapshot is None]
+    waiting = sum(m.awaited and m.snapshot is None for m in service.store.list())
     if waiting:
-        raise MapNotReadyError(f"No state yet: {', '.join(waiting)}.", hint="see GET /v1/maps")
-    return HealthResponse(status="ready", version=splatbot.__version__, maps=_versions(service.store))
+        raise MapNotReadyError(f"{waiting} of the initial maps have no state yet.", hint="see GET /v1/maps")
+    unsaved = len(service.library.failing) if service.library is not None else 0
+    return HealthResponse(status="ready", version=splatbot.__version__, unsaved=unsaved)
 
 
 @router.get(
@@ -49,7 +50,3 @@ def readyz(service: Service) -> HealthResponse:
 def metrics(service: Service) -> Response:
     """Return the metrics for Prometheus."""
     return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
-
-
-def _versions(store: Store) -> dict[str, int]:
-    return {m.id: m.map_version for m in store.list() if m.snapshot is not None}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import hashlib
+import os
 from contextlib import suppress
 from functools import partial
 from pathlib import Path as FilePath
@@ -17,7 +17,7 @@ from starlette.responses import FileResponse
 
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.formats import WRITTEN, save_gaussians
-from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.codecs import ZIP, answer, body_of, gives, takes
 from splatbot.services.dependencies import (
     IdempotencyKey,
     Served,
@@ -35,6 +35,7 @@ from splatbot.services.problems import MapNotReadyError, TooLargeError
 from splatbot.services.recordings import open_allowed
 from splatbot.services.routes.jobs import accepted, starts
 from splatbot.services.schemas import Bounds, MapInfo, MapList, MapRequest
+from splatbot.services.scratch import Scratch
 from splatbot.services.store import ServedMap
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
@@ -92,13 +93,15 @@ def create_map(
         return accepted(known)
     log = open_allowed(query.log, service.settings.log_roots, camera=query.camera)
     total = check_length(log, service.settings.max_frames, query.max_frames)
-    service.store.add(query.id, source=log.name, state="mapping", workspace=workspace_of(log.uri, base), awaited=False)
+    workspace = workspace_of(log.uri, base)
+    served = service.store.add(query.id, source=log.name, state="mapping", workspace=workspace, awaited=False)
     try:
-        work = map_recording(service, query.id, log, total)
-        gone = partial(_forget, service, query.id)
-        return accepted(service.jobs.submit("map", work, key=key, request=request, abandoned=gone)[0])
+        work = map_recording(service, served, log, total)
+        return accepted(
+            service.make(served, work, key=key, request=request, abandoned=partial(_forget, service, served))
+        )
     except Exception:
-        service.store.remove(query.id)  # the queue is full: undo the creation
+        _forget(service, served)  # the queue is full: undo the creation
         raise
 
 
@@ -109,7 +112,7 @@ def create_map(
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+            "content": {ZIP: {"schema": {"type": "string", "format": "binary"}}},
         }
     },
 )
@@ -121,20 +124,23 @@ async def upload_map(
 ) -> Response:
     """Make a map of a recording that is sent as a zip of a folder in TUM layout; a job unpacks and maps it."""
     check_id(map_id)
-    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/zip":
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != ZIP:
         raise HTTPException(415, "The body is no application/zip.")
-    if (known := service.jobs.known(key, f"upload {map_id}")) is not None:
-        return accepted(known)
-    service.store.add(map_id, source="an upload", state="mapping", awaited=False)
-    folder = FilePath(tempfile.mkdtemp(prefix="splatbot-upload-"))
+    if key is not None and service.jobs.uses(key):
+        digest = await _receive(request, FilePath(os.devnull), service.settings.max_upload_bytes)
+        if (known := service.jobs.known(key, f"upload {map_id} {digest}")) is not None:
+            return accepted(known)
+    served = service.store.add(map_id, source="an upload", state="mapping", awaited=False)
+    scratch = None
     try:
-        await _receive(request, folder / "recording.zip", service.settings.max_upload_bytes)
-        work = map_upload(service, map_id, folder / "recording.zip")
-        gone = partial(_forget, service, map_id, folder)
-        return accepted(service.jobs.submit("map", work, key=key, request=f"upload {map_id}", abandoned=gone)[0])
+        scratch = Scratch("upload")
+        archive = scratch.path / "recording.zip"
+        digest = await _receive(request, archive, service.settings.max_upload_bytes)
+        work = map_upload(service, served, archive, scratch.discard)
+        gone = partial(_forget, service, served, scratch)
+        return accepted(service.make(served, work, key=key, request=f"upload {map_id} {digest}", abandoned=gone))
     except BaseException:  # also of a client that has gone: nothing is left of it
-        service.store.remove(map_id)
-        await run_in_threadpool(_discard, folder)
+        await run_in_threadpool(_forget, service, served, scratch)
         raise
 
 
@@ -151,7 +157,7 @@ def get_map(served: Served, request: Request, response: Response) -> Any:
 @router.delete("/{map_id}", status_code=204, responses=problems(404))
 def delete_map(served: Served, service: Service) -> Response:
     """End the map's making, and forget it, on disk too. Answers that are under way keep the state they took."""
-    service.remove(served.id)
+    service.remove(served)
     return Response(status_code=204)
 
 
@@ -168,15 +174,15 @@ def export_map(served: Served, request: Request, format: _FormatName) -> Respons
     tag = etag(served, format)
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
-    folder = FilePath(tempfile.mkdtemp(prefix="splatbot-export-"))
-    path = folder / f"{served.id}.{format}"
+    scratch = Scratch("export")
+    path = scratch.path / f"{served.id}.{format}"
     try:
         save_gaussians(snapshot.model, path)
     except BaseException:
-        _discard(folder)
+        scratch.discard()
         raise
     headers = version_headers(served, tag)
-    after = BackgroundTask(_discard, folder)
+    after = BackgroundTask(scratch.discard)
     kind = "application/octet-stream"
     return FileResponse(path, media_type=kind, filename=path.name, headers=headers, background=after)
 
@@ -206,28 +212,26 @@ def trajectory(served: Served, request: Request) -> Response:
     return answer(request, body, array="T_world_camera", headers=version_headers(served, tag))
 
 
-async def _receive(request: Request, path: FilePath, most: int) -> None:
-    """Write the body to a file as it comes."""
-    taken = 0
-    with path.open("xb") as file:
+async def _receive(request: Request, path: FilePath, most: int) -> str:
+    """Write the body to a file as it comes; return its SHA-256."""
+    taken, digest = 0, hashlib.sha256()
+    with path.open("wb") as file:
         async for chunk in request.stream():
             taken += len(chunk)
             if taken > most:
                 hint = "send a shorter recording, or raise SPLATBOT_MAX_UPLOAD_BYTES"
                 raise TooLargeError(f"has more than {most} bytes.", field="upload", hint=hint)
+            digest.update(chunk)
             await run_in_threadpool(file.write, chunk)
+    return digest.hexdigest()
 
 
-def _forget(service: Service, map_id: str, folder: FilePath | None = None) -> None:
-    """Leave nothing of a map whose making was cancelled before it began."""
+def _forget(service: Service, served: ServedMap, scratch: Scratch | None = None) -> None:
+    """Leave nothing of a map whose making never began."""
     with suppress(MapNotFoundError):
-        service.remove(map_id)
-    if folder is not None:
-        _discard(folder)
-
-
-def _discard(folder: FilePath) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
+        service.remove(served)
+    if scratch is not None:
+        scratch.discard()
 
 
 def _info(served: ServedMap) -> MapInfo:

@@ -17,7 +17,7 @@ from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
 from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
-from splatbot.services.topics import PLAN, map_topic
+from splatbot.services.topics import PLAN
 
 router = APIRouter(tags=["motion"])
 
@@ -74,7 +74,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     result = planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed)
     trajectory = time_path(result.unwrap(), planner.arm, served.field, velocity_scale=query.speed)
     kept = service.plans.add(served, robot.name, base, result, trajectory)
-    service.bus.publish(map_topic(served.id, PLAN), trajectory)
+    service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))
 
 

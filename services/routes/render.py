@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Body, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.rasterize.views import default_view, depth_limits, render_view, to_png
+from splatbot.services.codecs import body_of, takes
 from splatbot.services.dependencies import (
     Served,
     ServedAfterFrames,
@@ -29,20 +30,16 @@ router = APIRouter(prefix="/v1/maps", tags=["views"])
 _PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {}}, "description": "PNG; X-Map-Version and ETag name the state that was drawn"}
 }
-_BODY = Body(
-    openapi_examples={
-        "default view": {"value": {"mode": "rgb"}},
-        "depth at a pose": {
-            "value": {
-                "mode": "depth",
-                "camera": {"fx": 525, "fy": 525, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480},
-                "translation": [0.0, 0.0, -0.2],
-                "quat_wxyz": [1.0, 0.0, 0.0, 0.0],
-                "depth_range_m": [0.3, 2.0],
-            }
-        },
-    }
-)
+_EXAMPLES = {
+    "default view": {"mode": "rgb"},
+    "depth at a pose": {
+        "mode": "depth",
+        "camera": {"fx": 525, "fy": 525, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480},
+        "translation": [0.0, 0.0, -0.2],
+        "quat_wxyz": [1.0, 0.0, 0.0, 0.0],
+        "depth_range_m": [0.3, 2.0],
+    },
+}
 
 
 @router.get("/{map_id}/render", response_class=Response, responses=_PNG | problems(404, 413, 422, 503))
@@ -64,8 +61,17 @@ def render_default(
     return _png(served, tag, camera, pose, mode, None)
 
 
-@router.post("/{map_id}/render", response_class=Response, responses=_PNG | problems(404, 413, 422, 503))
-def render(served: ServedAfterFrames, settings: Settings, request: Annotated[RenderRequest, _BODY]) -> Response:
+@router.post(
+    "/{map_id}/render",
+    response_class=Response,
+    responses=_PNG | problems(404, 413, 415, 422, 503),
+    openapi_extra=takes(RenderRequest, _EXAMPLES),
+)
+def render(
+    served: ServedAfterFrames,
+    settings: Settings,
+    request: Annotated[RenderRequest, Depends(body_of(RenderRequest))],
+) -> Response:
     """Render the map for a given camera and pose."""
     model = served.ready.model
     if request.camera is not None:

@@ -26,7 +26,8 @@ async def rosbridge(socket: WebSocket) -> None:
     """Serve a rosbridge v2 client until it leaves."""
     await socket.accept()
     wire = _Wire(socket)
-    await wire.serve(RosbridgeSession(wire.graph, wire.send, most_bytes=wire.most_bytes))
+    scopes = socket.state.scopes
+    await wire.serve(RosbridgeSession(wire.graph, wire.send, most_bytes=wire.most_bytes, scopes=scopes))
 
 
 @router.websocket("/foxglove")

@@ -21,6 +21,7 @@ from splatbot.grasping.types import Grasp
 from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import default_view
+from splatbot.services.viewer.door import Check, guarded, no_connection
 from splatbot.services.viewer.splats import Coloring, pieces
 from splatbot.trajectory import Trajectory
 
@@ -31,14 +32,18 @@ _GREY, _BLUE, _AMBER = (150, 150, 150), (40, 120, 255), (255, 170, 0)
 _PATH_POINTS = 60
 
 
-def open_server(host: str, port: int) -> viser.ViserServer:
+def open_server(host: str, port: int, check: Check = no_connection) -> viser.ViserServer:
     """Open viser's server without its banner; if ``port`` is taken, at the next free port.
+
+    Args:
+        host, port: where it listens.
+        check: checks each connection; the default refuses all.
 
     Raises:
         InputError: the address cannot be listened on.
     """
     try:
-        with contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), guarded(check):
             return viser.ViserServer(host=host, port=port, label="splatbot", verbose=False)
     except OSError as error:
         raise InputError(f"cannot listen on {host} port {port}.", field="viewer_port", hint="give another") from error

@@ -16,10 +16,12 @@ from splatbot.frame import Frame
 from splatbot.grasping.types import GraspResult
 from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
+from splatbot.services.access import Access
 from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
+from splatbot.services.viewer.door import Door
 from splatbot.services.viewer.scene import ViewerScene, close_server, open_server
 from splatbot.services.viewer.splats import COLORINGS, Coloring
 from splatbot.slam import FrameResult
@@ -49,6 +51,7 @@ class Viewer:
 
     Args:
         store: the maps; ``map_id`` is shown, or the first one there is.
+        access: rights to open the page.
         host, port: where the page is served, at the next free port where that one is taken; 0 takes any.
         robot: the arm that is shown where its base is known.
         map_id: name of the map. If None, the first map is shown.
@@ -60,6 +63,7 @@ class Viewer:
     def __init__(
         self,
         store: MapStore,
+        access: Access,
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
@@ -67,7 +71,7 @@ class Viewer:
         map_id: str | None = None,
     ) -> None:
         self._store, self._map_id, self._robot_name = store, map_id, robot
-        self.server = open_server(host, port)
+        self.server = open_server(host, port, Door(access))
         self._host, self.port = host, self.server.get_port()
         self._scene = ViewerScene(self.server)
         self._news, self._lock = _News(), threading.Lock()
@@ -88,7 +92,7 @@ class Viewer:
         """Begin."""
         for thread in self._threads:
             thread.start()
-        _log.info("the viewer is at http://%s:%d", self._host, self.port)
+        _log.info("the viewer is at http://%s:%d/?key=KEY, with the key of the service", self._host, self.port)
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """End, and close the page's connections."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +11,7 @@ if TYPE_CHECKING:
     from splatbot.logs import Log
     from splatbot.protocols import FrameSource
     from splatbot.services.runtime import Runtime
+    from splatbot.services.settings import ServiceSettings
 
 MAP_ID = "default"
 
@@ -26,7 +29,9 @@ def serve(
     record: Path | None = None,
     config: Path | None = None,
     service_config: Path | None = None,
+    insecure_no_auth: bool = False,
     new_key: bool = False,
+    scopes: str | None = None,
 ) -> int:
     """Serve maps over HTTP until Ctrl-C or SIGTERM.
 
@@ -35,7 +40,7 @@ def serve(
         splatbot serve --log recordings/desk --port 8080
         splatbot serve --camera "replay:recordings/desk?loop=1" --viewer-port 8001 --ros-port 9090
         SPLATBOT_LOG_ROOTS=recordings splatbot serve --data maps
-        splatbot serve --new-key
+        splatbot serve --new-key --scopes read,move
         curl localhost:8000/v1/maps/default/distance -H 'content-type: application/json' -d '{"points": [[0, 0, 1]]}'
 
     http://localhost:8000/docs lists every route with examples, and
@@ -51,16 +56,21 @@ def serve(
         port: port to listen on (default 8000; 0 takes a free one), or SPLATBOT_PORT.
         ros_port: additional port for roslib clients that need a separate one (usually 9090). rosbridge is always at
             /rosbridge of --port, Foxglove at /foxglove.
-        viewer_port: show the map in the browser at this port, on this machine alone.
+        viewer_port: show the map in the browser at this port, on this machine alone. The page needs a key.
         record: record every topic into this MCAP file, from which the frames can be mapped again.
         config: YAML file with the configuration of mapping.
         service_config: YAML file with the service's address, keys and limits.
+        insecure_no_auth: on loopback, let clients map and move without a key.
         new_key: print a new API key and its hash for SPLATBOT_API_KEYS, and leave.
+        scopes: scopes of the new key, separated by commas: read, map, move (these by default) and admin, which may
+            preempt the owner of a moving arm.
     """
     from splatbot.errors import InputError
 
     if new_key:
-        return _print_new_key()
+        return _print_new_key(scopes)
+    if scopes is not None:
+        raise InputError("is for a new key.", field="--scopes", hint="give --new-key, too")
     from splatbot.config import load_config
     from splatbot.logs import open_log
     from splatbot.robots.cameras import is_camera, open_camera
@@ -70,6 +80,7 @@ def serve(
     from splatbot.services.settings import load_settings
 
     given = {"host": host, "port": port, "ros_port": ros_port, "viewer_port": viewer_port, "record": record}
+    given["insecure_no_auth"] = insecure_no_auth or None
     settings = load_settings(service_config, data_dir=data, **given)
     configure_logging(as_json=settings.log_json)
     device = camera if camera is not None and is_camera(camera) else None
@@ -86,7 +97,7 @@ def serve(
     elif log is not None:
         _follow(runtime, open_log(log, camera=camera))
     try:
-        run_service(runtime, on_start=_announce)
+        run_service(runtime, on_start=partial(_announce, settings))
     finally:
         runtime.close()
     return 0
@@ -115,18 +126,31 @@ def _follow(runtime: Runtime, source: Log | FrameSource) -> None:
     from splatbot.slam import Slam
 
     workspace = workspace_of(source.uri.removeprefix(PREFIX), None)
-    runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace)
-    runtime.follow(MAP_ID, source, Slam(runtime.config))
+    served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace)
+    runtime.follow(served, source, Slam(runtime.config))
 
 
-def _print_new_key() -> int:
-    from splatbot.services.keys import hash_key, new_key
+def _print_new_key(words: str | None) -> int:
+    from splatbot.errors import InputError
+    from splatbot.services.keys import check_scopes, hash_key, new_key
 
+    try:
+        scopes = check_scopes([word.strip() for word in words.split(",")]) if words is not None else None
+    except ValueError as error:
+        raise InputError(f"{error}.", field="--scopes", hint="e.g. --scopes read,move") from error
     key = new_key()
     print(f"key (for clients; shown once): {key}")
-    print(f"hash (for the service):        SPLATBOT_API_KEYS={hash_key(key)}")
+    print(f"hash (for the service):        SPLATBOT_API_KEYS={hash_key(key, scopes)}")
     return 0
 
 
-def _announce(url: str) -> None:
+def _announce(settings: ServiceSettings, url: str) -> None:
+    """Print the address, and the file of the key; the key itself only on a terminal, for other output becomes a log."""
+    from splatbot.service_key import key_file
+    from splatbot.services.access import Access
+
     print(f"serving on {url}  (routes: {url}/docs, an image: {url}/v1/maps/{MAP_ID}/render)", flush=True)
+    access = Access(settings)
+    if access.uses_key_file:
+        key = access.shown_key(to_terminal=sys.stdout.isatty())
+        print(f"key to map and to move: {f'{key}, ' if key else ''}in {key_file()}", flush=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -27,13 +28,17 @@ def view(
 
     Args:
         map: a map file, or a run folder that holds map.ply.
-        host: address to listen on.
+        host: address to listen on; beyond 127.0.0.1 the page needs a key of SPLATBOT_API_KEYS.
         port: port to listen on; 0 takes a free one.
         robot: the arm to show, if a scene.yaml next to the map defines its base.
         html: write one self-contained page, and exit.
     """
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel, Snapshot
+    from splatbot.service_key import key_file
+    from splatbot.services.access import Access
+    from splatbot.services.runtime import check_exposure
+    from splatbot.services.settings import load_settings
     from splatbot.services.store import MapStore
     from splatbot.services.viewer.page import map_page
     from splatbot.services.viewer.viewer import Viewer
@@ -58,9 +63,14 @@ def view(
         trajectory=trajectory,
         workspace=workspace,
     )
-    viewer = Viewer(store, host=host, port=port, robot=robot)
+    settings = load_settings(host=host)
+    check_exposure(settings)
+    access = Access(settings)
+    viewer = Viewer(store, access, host=host, port=port, robot=robot)
     viewer.start()
-    print(f"http://{host}:{viewer.port} shows {file}; Ctrl-C ends", flush=True)
+    key = access.shown_key(to_terminal=sys.stdout.isatty())
+    where = f" (KEY is in {key_file()})" if key is None and access.uses_key_file else ""
+    print(f"http://{host}:{viewer.port}/?key={key or 'KEY'} shows {file}{where}; Ctrl-C ends", flush=True)
     try:
         threading.Event().wait()
     finally:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from splatbot.atomic import atomic_write
+from splatbot.checksums import check_file
 from splatbot.errors import FormatError
 from splatbot.gaussians.model import OPACITY_MAX, OPACITY_MIN, SCALE_MIN, GaussianModel
 
@@ -39,11 +40,13 @@ def load_ply(path: str | Path) -> GaussianModel:
     """Read a 3DGS PLY of SH degree 0 to 4, with or without normals; other properties are ignored.
 
     Zero quaternions become the identity. Infinite opacities, and scales of exactly 0 (logarithm -inf), become the
-    nearest finite ones. Each replacement logs a warning.
+    nearest finite ones. Each replacement logs a warning. A map with bookkeeping, which splatbot saved, has no zero
+    quaternions unless it is damaged.
 
     Raises:
-        FormatError: no such file, truncated, a property is missing, or a value is NaN or infinite.
+        FormatError: no such file, truncated, damaged, a property is missing, or a value is NaN or infinite.
     """
+    check_file(path)
     vertex = _read_vertices(path)
     present = [p.name for p in vertex.properties]
     rest = _rest_names(path, present)
@@ -59,6 +62,8 @@ def load_ply(path: str | Path) -> GaussianModel:
     table = _table(vertex, names)
     n_rest = len(rest)
     means, dc, f_rest, opacity, log_scales, quats = np.split(table, np.cumsum([3, 3, n_rest, 1, 3]), axis=1)
+    if "observations" in present:
+        _check_quats(path, quats)
     _replace_degenerate(path, opacity, log_scales, quats)
     _check_finite(path, table, names)
     sh = np.concatenate([dc[:, None, :], f_rest.reshape(len(table), 3, n_rest // 3).transpose(0, 2, 1)], axis=1)
@@ -153,6 +158,18 @@ def _column(vertex: PlyElement, present: list[str], name: str, default: int) -> 
     if name not in present:
         return torch.from_numpy(np.full(vertex.count, default, kind))
     return torch.from_numpy(vertex[name].astype(kind))
+
+
+def _check_quats(path: str | Path, quats: Table) -> None:
+    zero = ~quats.any(axis=1)
+    if zero.any():
+        first = int(np.argmax(zero))
+        raise FormatError(
+            f"is damaged: {int(zero.sum())} of {len(quats)} rows have a zero quaternion, the first is row {first}.",
+            file=path,
+            field="rot_0",
+            hint="restore the file from a copy, or map the log again",
+        )
 
 
 def _replace_degenerate(path: str | Path, opacity: Table, log_scales: Table, quats: Table) -> None:

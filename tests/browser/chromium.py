@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import time
 import urllib.request
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -50,12 +51,14 @@ class Chromium:
     Args:
         profile: an empty folder for it.
         width, height: of the page [px].
+        flags: more options of the command.
     """
 
-    def __init__(self, profile: Path, *, width: int = 640, height: int = 480) -> None:
+    def __init__(self, profile: Path, *, width: int = 640, height: int = 480, flags: Sequence[str] = ()) -> None:
         command = [
             find_chromium(),
             *_FLAGS,
+            *flags,
             f"--user-data-dir={profile}",
             f"--window-size={width},{height}",
             "about:blank",

@@ -17,6 +17,9 @@ from splatbot.geometry import inverse, look_at, pose_from_quat, transform_points
 from splatbot.planning import Certificate, JointTrajectory
 from splatbot.rasterize.views import render_view
 from splatbot.robots.store import load_robot
+from splatbot.service_key import key_file, read_key
+from splatbot.services.access import Access
+from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.services.topics import PLAN, RESULT, map_topic
 from splatbot.services.viewer.page import map_page
@@ -87,7 +90,7 @@ def _plan(robot_home: NDArray[np.float64], names: tuple[str, ...]) -> JointTraje
 def test_the_viewer_draws_the_splats_as_the_rasterizer_does_and_the_robot_and_its_path(browser: Chromium) -> None:
     store, model, robot = MapStore(), _wall(), load_robot("panda")
     store.add("desk", source="a", state="mapping", snapshot=Snapshot(model, 1), workspace=Workspace(T_world_base=BASE))
-    viewer = Viewer(store, port=0)
+    viewer = Viewer(store, Access(ServiceSettings()), port=0)
     viewer._scene._up = np.array([0.0, 0.0, 1.0])
     viewer.server.scene.set_up_direction("+z")
     viewer.start()
@@ -98,7 +101,7 @@ def test_the_viewer_draws_the_splats_as_the_rasterizer_does_and_the_robot_and_it
         store.bus.publish(map_topic("desk", RESULT), FrameResult(3, 1.0, None, "lost", stage_ms={"direct": 7.5}))
         time.sleep(1.5)
         viewer._scene.look(EYE, TARGET, fov_deg=FOV)
-        browser.open(f"http://127.0.0.1:{viewer.port}")
+        browser.open(f"http://127.0.0.1:{viewer.port}/?key={read_key(key_file())}")
         left, right = np.array([-0.6, -0.7, 0.2]), np.array([-0.6, 0.55, 0.2])
         image = _shot(browser, left, np.array([230.0, 26, 26]))
         expected = render_view(model, _camera(), look_at(EYE, TARGET), "rgb")

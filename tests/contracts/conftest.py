@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import pose_from_quat
+from splatbot.service_key import key_file, read_key
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime
+from splatbot.services.server import server_config
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
@@ -27,12 +29,13 @@ from splatbot.workspace import Workspace
 
 @dataclass(frozen=True)
 class Service:
-    """A running service: its address for clients, and its parts."""
+    """A running service: its address for clients, its parts, and the key that ``client`` and ``ws`` use, if any."""
 
     client: httpx.Client
     runtime: Runtime
     app: FastAPI
     url: str
+    key: str | None = None
 
     @property
     def store(self) -> MapStore:
@@ -40,8 +43,9 @@ class Service:
         return self.runtime.store
 
     def ws(self, path: str) -> str:
-        """Return the address of a WebSocket."""
-        return f"ws://127.0.0.1:{self.client.base_url.port}{path}"
+        """Return the address of a WebSocket, with the key."""
+        query = f"?api_key={self.key}" if self.key else ""
+        return f"ws://127.0.0.1:{self.client.base_url.port}{path}{query}"
 
 
 @contextmanager
@@ -49,15 +53,8 @@ def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterato
     """Run a real server on a real socket until the block ends."""
     runtime = Runtime(settings, store)
     app = create_app(runtime)
-    config = uvicorn.Config(
-        app,
-        host="127.0.0.1",
-        port=0,
-        log_level="warning",
-        ws_max_size=settings.max_message_bytes,
-        ssl_certfile=settings.tls_cert,
-        ssl_keyfile=settings.tls_key,
-    )
+    config = server_config(app, settings)
+    config.port = 0
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
@@ -67,8 +64,10 @@ def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterato
     scheme = "http" if settings.tls_cert is None else "https"
     url = f"{scheme}://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
     trusted = True if settings.tls_cert is None else ssl.create_default_context(cafile=str(settings.tls_cert))
-    with httpx.Client(base_url=url, timeout=60, verify=trusted) as client:
-        yield Service(client, runtime, app, url)
+    key = None if settings.api_keys else read_key(key_file())
+    headers = {"Authorization": f"Bearer {key}"} if key else {}
+    with httpx.Client(base_url=url, timeout=60, verify=trusted, headers=headers) as client:
+        yield Service(client, runtime, app, url, key)
     runtime.drain()
     server.should_exit = True
     thread.join(20)

@@ -65,6 +65,8 @@ def test_roslibjs_in_a_browser_reads_clouds_and_odometry_in_every_compression_an
 ) -> None:
     result = FrameResult(0, 4.0, pose_from_quat((1, 2, 3), (0, 0, 0, 1)), "ok")
     with Chromium(tmp_path / "profile") as browser:
+        browser.open(f"{service.url}/healthz")  # a page of the service: others may not connect
+        time.sleep(1.0)
         browser.evaluate(roslibjs + "; 1")
         browser.evaluate(PAGE.read_text() + f"; start({json.dumps(service.ws('/rosbridge'))})")
         for _ in range(100):

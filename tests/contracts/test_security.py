@@ -283,7 +283,8 @@ def test_a_client_that_vanishes_in_the_middle_of_an_upload_leaves_no_map(open_: 
     host, port = open_.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port))) as line:
         line.sendall(
-            b"POST /v1/maps/gone/upload HTTP/1.1\r\nHost: x\r\nContent-Type: application/zip\r\n"
+            b"POST /v1/maps/gone/upload HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/zip\r\n"
+            b"Authorization: Bearer " + str(open_.key).encode() + b"\r\n"
             b"Content-Length: 1000000\r\n\r\nPK\x03\x04"
         )
         deadline = time.monotonic() + 10

@@ -15,6 +15,7 @@ import httpx
 import pytest
 
 from splatbot.cli import main
+from splatbot.service_key import key_file, read_key
 from tests.contracts.conftest import wall
 
 COMMAND = (sys.executable, "-m", "splatbot", "serve")
@@ -28,7 +29,8 @@ def serving(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], httpx.Clie
         assert process.stdout is not None
         url = re.search(r"http://\S+", process.stdout.readline())
         assert url, f"exit code {process.wait(10)}"
-        with httpx.Client(base_url=url[0], timeout=60) as client:
+        key = {"Authorization": f"Bearer {read_key(key_file())}"}
+        with httpx.Client(base_url=url[0], timeout=60, headers=key) as client:
             yield process, client
     finally:
         process.kill()
@@ -52,7 +54,7 @@ def map_file(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("by", ["file", "run folder"])
 def test_a_map_is_served_until_sigterm_which_ends_cleanly(map_file: Path, by: str) -> None:
     with serving("--map", str(map_file if by == "file" else map_file.parent)) as (process, client):
-        assert client.get("/readyz").json()["maps"] == {"default": 1}
+        assert [m["id"] for m in client.get("/v1/maps").json()["maps"]] == ["default"]
         answer = client.post("/v1/maps/default/distance", json={"points": [[0, 0, 1.0], [0, 0, 0.5]]}).json()
         assert answer["inside"] == [True, False]
         assert client.get("/v1/maps/default").json()["source"] == "map.ply"

@@ -7,11 +7,13 @@ import inspect
 import itertools
 import json
 import logging
+import re
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, cast
 
 from splatbot.errors import InputError, SplatbotError
 from splatbot.logs.ros_types import build, full_name
+from splatbot.services.keys import Scope
 from splatbot.services.ros.graph import Handler, RosGraph, Service, resolve
 from splatbot.services.ros.requests import json_object
 from splatbot.services.ros.rosbridge.packing import (
@@ -23,11 +25,15 @@ from splatbot.services.ros.rosbridge.packing import (
     unpack_png,
 )
 from splatbot.services.ros.rosbridge.subscriptions import Send, Subscriptions
+from splatbot.services.scopes import ScopeError
 
 _LEVELS = ("none", "error", "warning", "info")
 _CALLS = 16  # services that one client may have called without an answer
 _ANSWER_S = 60.0  # [s] that a client may take to serve a call
 _numbers = itertools.count(1)
+_READING = frozenset({"subscribe", "unsubscribe", "fragment", "png", "set_level", "status", "auth", "call_service"})
+_MAPPING = frozenset({"advertise", "unadvertise", "advertise_service", "unadvertise_service", "service_response"})
+_COMMANDS = re.compile(r"/\w+_controller/.*|.*/(goal|cancel)")
 
 _log = logging.getLogger(__name__)
 
@@ -42,11 +48,12 @@ class RosbridgeSession:
         graph: topics and services.
         send: takes text or bytes for the client; one at a time, and may wait.
         most_bytes: of one message.
+        scopes: rights of the client. Reading includes calls of the service's own services, which change nothing.
     """
 
-    def __init__(self, graph: RosGraph, send: Send, *, most_bytes: int) -> None:
+    def __init__(self, graph: RosGraph, send: Send, *, most_bytes: int, scopes: frozenset[Scope] = frozenset()) -> None:
         self.number = next(_numbers)
-        self._graph, self._most_bytes = graph, most_bytes
+        self._graph, self._most_bytes, self._scopes = graph, most_bytes, scopes
         self._to_client = send
         self._sending = asyncio.Lock()
         self._subscriptions = Subscriptions(graph, self._send)
@@ -78,7 +85,9 @@ class RosbridgeSession:
         operation: dict[str, Any] = {}
         try:
             operation = json_object(text, self._most_bytes)
-            done = self._operation(operation.get("op"))(operation)
+            operate = self._operation(operation.get("op"))
+            self._check_scope(operation)
+            done = operate(operation)
             if inspect.isawaitable(done):
                 await done
         except SplatbotError as error:
@@ -106,6 +115,24 @@ class RosbridgeSession:
             known = ", ".join(self._operations)
             raise InputError("is not a known operation.", field="op", hint=f"the operations are {known}")
         return self._operations[name]
+
+    def _check_scope(self, operation: Mapping[str, Any]) -> None:
+        """Check that the client may do an operation.
+
+        Raises:
+            ScopeError: it lacks the scope.
+        """
+        name, scope = operation["op"], cast(Scope, "move")
+        if name in _READING:
+            scope = "read"
+        elif name in _MAPPING or (name == "publish" and not _COMMANDS.fullmatch(resolve(operation.get("topic")))):
+            scope = "map"
+        self._require(scope, str(name))
+
+    def _require(self, scope: Scope, what: str) -> None:
+        if scope not in self._scopes:
+            hint = "connect with ?api_key=KEY; splatbot serve names the file of its key at the start"
+            raise ScopeError(f"{what} needs a key with the scope {scope!r}.", field="op", hint=hint)
 
     async def _send(self, data: str | bytes) -> None:
         async with self._sending:
@@ -165,6 +192,8 @@ class RosbridgeSession:
             if not isinstance(args, Mapping):
                 raise InputError("is no object.", field="args", hint="name the request's fields")
             service = self._graph.service(name)
+            if service.client:  # it is another client's, and may do anything
+                self._require("map", f"a call of {name}")
             if inspect.iscoroutinefunction(service.call):
                 values = await service.call(args)
             else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
 import zlib
 from collections.abc import Sequence
@@ -32,9 +31,6 @@ def write_container(path: Path, header: dict[str, Any], arrays: Sequence[Array])
         file.write(MAGIC + _LENGTHS.pack(len(text), zlib.crc32(text)) + text)
         for array in plain:
             file.write(array.data if array.size else b"")
-        file.flush()
-        os.fsync(file.fileno())
-    _sync_folder(path.parent)
 
 
 def read_container(path: Path) -> tuple[dict[str, Any], list[Array]]:
@@ -77,15 +73,3 @@ def _read_header(path: Path, data: bytes) -> tuple[dict[str, Any], int]:
         raise FormatError("is damaged: a checksum does not fit.", file=path, field="header", hint=_HINT)
     header: dict[str, Any] = json.loads(text)
     return header, start + length
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush the new file name to the disk; not possible on Windows, where folders cannot be opened."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.atomic import sync, sync_folder
 from splatbot.errors import FormatError
 from splatbot.run.state.pixels import Packed, pack, unpack
 
@@ -70,7 +70,8 @@ class Journal:
         """Flush the appended arrays to the disk; needed before a state file refers to them."""
         if self._end:
             with self.path.open("r+b") as file:
-                os.fsync(file.fileno())
+                sync(file)
+            sync_folder(self.folder)
 
     def finish(self) -> None:
         """End a save: forget unused arrays and remove journals that the state file does not refer to."""

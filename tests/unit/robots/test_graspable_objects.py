@@ -67,7 +67,7 @@ def _of_service(map_: Path, **asked: Any) -> dict[str, Any]:
 
     async def ask() -> httpx.Response:
         transport = httpx.ASGITransport(app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://test") as client:
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
             return await client.post("/v1/maps/default/grasps", json=asked)
 
     response = asyncio.run(ask())

@@ -60,7 +60,9 @@ def test_a_restart_serves_what_was_saved_last(tmp_path: Path) -> None:
     assert found.workspace is not None
     assert found.workspace.T_world_base is not None
     assert np.array_equal(found.workspace.T_world_base, np.eye(4))
-    assert sorted(p.name for p in (tmp_path / "desk").iterdir()) == ["current", "v7"]
+    assert sorted(p.name for p in (tmp_path / "desk").iterdir()) == ["current", "v3", "v7"]
+    library.save(_served(9))
+    assert sorted(p.name for p in (tmp_path / "desk").iterdir()) == ["current", "v7", "v9"]
 
 
 def test_a_full_disk_is_told_and_leaves_the_state_before_in_force(tmp_path: Path) -> None:

@@ -89,8 +89,8 @@ class _Mapper:
 
 def _follow(log: _Log, mapper: _Mapper | None = None) -> tuple[MapStore, LiveMapping]:
     store = MapStore()
-    store.add("live", source=log.name, state="mapping")
-    mapping = LiveMapping(store, "live", log, mapper or _Mapper())
+    served = store.add("live", source=log.name, state="mapping")
+    mapping = LiveMapping(store, served, log, mapper or _Mapper())
     mapping.start()
     return store, mapping
 

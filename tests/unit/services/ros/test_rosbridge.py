@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from splatbot.logs.ros_types import build, from_cdr
+from splatbot.services.keys import SCOPES
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.rosapi import RosApi
 from splatbot.services.ros.rosbridge import RosbridgeSession
@@ -29,7 +30,7 @@ class Client:
         self.sent: list[Any] = []
         self.gate = asyncio.Event()
         self.gate.set()
-        self.session = RosbridgeSession(graph, self._take, most_bytes=LIMIT)
+        self.session = RosbridgeSession(graph, self._take, most_bytes=LIMIT, scopes=SCOPES)
 
     async def _take(self, data: str | bytes) -> None:
         await self.gate.wait()

@@ -1,0 +1,30 @@
+"""Points at which a test kills the process: before and after each write, flush and rename.
+
+``SPLATBOT_FAILPOINT=rename:3`` kills it at the third rename, and ``any:17`` at the seventeenth point. ``any:17:torn``
+also cuts off a part of the file that is not flushed yet, as a power failure does.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+VARIABLE = "SPLATBOT_FAILPOINT"
+
+_point, _, _rest = os.environ.get(VARIABLE, "").partition(":")
+_left = int(_rest.partition(":")[0] or 0)
+_torn = _rest.endswith(":torn")
+
+
+def reach(point: str, path: Path | None = None) -> None:
+    """End the process with SIGKILL if this is the chosen point; ``path`` is the file that is not flushed yet."""
+    global _left
+    if point != _point and _point != "any":
+        return
+    _left -= 1
+    if _left != 0:
+        return
+    if _torn and path is not None and path.is_file():
+        os.truncate(path, path.stat().st_size * 2 // 3)
+    os.kill(os.getpid(), signal.SIGKILL)
