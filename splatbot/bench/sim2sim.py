@@ -18,7 +18,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_err
 from splatbot.formats.ply import save_ply
 from splatbot.geometry import inverse
 from splatbot.protocols import Array
-from splatbot.results.margin import RADIUS, SHARE
+from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.compare.push import PushCase, PushTask, push_policies
@@ -86,8 +86,8 @@ class MappedTable:
 
     def own_margin(self, field: GaussianCollisionField) -> float:
         """Return the error [m] of the map's surfaces near the arm, measured against its own depth images."""
-        around = [*self.mapped.T_map_scene[:3, 3], RADIUS]
-        return surface_error(field, self.mapped.views(), around=around).share(SHARE)
+        around = [*self.mapped.T_map_scene[:3, 3], MARGIN.radius]
+        return surface_error(field, self.mapped.views(), around=around).share(MARGIN.share)
 
 
 def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, share: None) -> tuple[TrialResults, ...]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from splatbot.grasping.antipodal import Pairs
 from splatbot.grasping.hands import Hands
-from splatbot.grasping.reach import ARM_FULL_SCORE_CLEARANCE_M, Reached
+from splatbot.grasping.reach import CONSTANTS as REACH
+from splatbot.grasping.reach import Reached
 from splatbot.grasping.volume import Volume
 from splatbot.protocols import Array, HandShape
 
@@ -138,7 +139,7 @@ def friction_load(load: float, aside: Array, hand: HandShape, friction: float) -
 def arm_terms(reached: Reached) -> dict[str, float]:
     """Compute the score terms of an arm that reaches the grasp."""
     return {
-        "arm": float(np.clip(reached.clearance / ARM_FULL_SCORE_CLEARANCE_M, 0.0, 1.0)),
+        "arm": float(np.clip(reached.clearance / REACH.full_score_clearance, 0.0, 1.0)),
         "limits": float(np.clip(3 * reached.limits, 0.0, 1.0)),
     }
 

@@ -24,7 +24,8 @@ from splatbot.results.margin import own_margin
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
 from splatbot.tracking.prepare import usable_depth
-from splatbot.workspace import AHEAD, Workspace, find_workspace, fit_workspace
+from splatbot.workspace import CONSTANTS as WORKSPACE
+from splatbot.workspace import Workspace, find_workspace, fit_workspace
 
 _FRAMES = 40  # least number of frames whose depth is compared with the paths
 _PIXEL_STRIDE = 5  # between the compared pixels
@@ -79,7 +80,7 @@ def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
     for degrees in _TURNS:
         turn = np.eye(4)
         turn[:3, :3] = so3_exp([0.0, 0.0, np.radians(degrees)])
-        turn[:3, 3] = [AHEAD, 0.0, 0.0] - turn[:3, :3] @ [AHEAD, 0.0, 0.0]
+        turn[:3, 3] = [WORKSPACE.ahead, 0.0, 0.0] - turn[:3, :3] @ [WORKSPACE.ahead, 0.0, 0.0]
         arm = RobotSpheres(panda(), T_world_base=T @ turn)
         if (~arm.check(field, some).in_collision).mean() > _MIN_FREE:
             return place if degrees == 0 else replace(place, T_world_base=T @ turn, box=np.array(_BOX))
