@@ -8,16 +8,30 @@ import numpy as np
 
 from splatbot.protocols import Array, KinematicChain
 
-RATE = 3.0  # [Hz]
-SECONDS = 2.0
-SHARE = 0.6  # fraction of the joints' acceleration limits
+
+@dataclass(frozen=True)
+class ShakeConstants:
+    """Constants of the shaking motion.
+
+    Args:
+        rate: [Hz] frequency of the motion.
+        duration: [s] length of the motion.
+        acceleration_share: fraction of the joints' acceleration limits.
+    """
+
+    rate: float = 3.0
+    duration: float = 2.0
+    acceleration_share: float = 0.6
+
+
+CONSTANTS = ShakeConstants()
 
 
 @dataclass(frozen=True, eq=False)
 class Shake:
     """Sinusoidal motion of every joint about its position, with a smooth start and end.
 
-    Accelerations stay within ``SHARE`` of the joints' limits in the middle, and joints within their ranges.
+    Accelerations stay within the constant share of the joints' limits in the middle, and joints within their ranges.
 
     Args:
         chain: of the arm.
@@ -27,19 +41,19 @@ class Shake:
 
     chain: KinematicChain
     q: Array
-    duration: float = SECONDS
+    duration: float = CONSTANTS.duration
 
     @property
     def amplitude(self) -> Array:
         """Amplitude of each joint (J,) [rad]; signs alternate."""
-        most = SHARE * self.chain.acceleration / (2 * np.pi * RATE) ** 2
+        most = CONSTANTS.acceleration_share * self.chain.acceleration / (2 * np.pi * CONSTANTS.rate) ** 2
         inside = np.minimum(self.q - self.chain.lower, self.chain.upper - self.q)
         return np.asarray(np.minimum(most, np.maximum(inside, 0.0)) * (-1.0) ** np.arange(len(self.q)))
 
     def reference(self, t: float) -> tuple[Array, Array]:
         """Implement :meth:`splatbot.protocols.TimedPath.reference`."""
         x = float(np.clip(t, 0.0, self.duration))
-        w, grow = 2 * np.pi * RATE, np.pi / self.duration
+        w, grow = 2 * np.pi * CONSTANTS.rate, np.pi / self.duration
         swell, turn = np.sin(grow * x) ** 2, np.sin(w * x)
         rate = grow * np.sin(2 * grow * x) * turn + w * swell * np.cos(w * x)
         return self.q + self.amplitude * (swell * turn), self.amplitude * (rate if x == t else 0.0)
