@@ -14,7 +14,8 @@ from splatbot.errors import FormatError, InputError
 from splatbot.geometry import so3_exp, transform_points
 from splatbot.protocols import Array
 from splatbot.robots.joints import Joint
-from splatbot.robots.robot import SLACK, Inertial, RobotModel
+from splatbot.robots.robot import CONSTANTS as COVER
+from splatbot.robots.robot import Inertial, RobotModel
 from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -30,7 +31,7 @@ class Reading:
     notes: tuple[str, ...]
 
 
-def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = SLACK) -> Reading:
+def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = COVER.slack) -> Reading:
     """Read the serial arm from the root to ``tip``.
 
     Fixed links belong to the link of the arm that carries them. Moving joints outside the arm (fingers) are fixed at
