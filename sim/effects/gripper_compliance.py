@@ -33,16 +33,14 @@ CONSTANTS = ComplianceConstants()
 _GRASPING_TASKS = ("grasp", "hang", "squeeze")
 
 
-class GripperCompliance(PhysicsEffect):
+class GripperCompliance(
+    PhysicsEffect, cost="no additional computation; softer contacts have more overlap", observable="opening"
+):
     """Softer finger servo and softer finger contacts.
 
     The servo is a spring of ``robot.motors.finger_stiffness`` [N/m]. The pads use MuJoCo's ``solref`` and ``solimp`` of
     rubber.
     """
-
-    name = "gripper_compliance"
-    cost = "no additional computation; softer contacts have more overlap"
-    observable = "opening"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the task grasps an object or the scene gives a stiffness, and why."""
