@@ -108,10 +108,8 @@ class TwinResult:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as values for JSON, with contacts as ``touches`` and the clearance as ``near``."""
-        values = asdict(self)
-        near = values.pop("clearance")
-        return values | {"touches": values.pop("contacts"), "near": {"room": near.pop("value"), **near}}
+        """Return the result as values for JSON."""
+        return asdict(self)
 
 
 @dataclass

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Path, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from splatbot.protocols import Feedback
-from splatbot.services.codecs import body_of, plain, takes
+from splatbot.services.codecs import body_of, plain, request_body
 from splatbot.services.dependencies import IdempotencyKey, Service, example, problems
 from splatbot.services.jobs import ENDED, Job
 from splatbot.services.routes.jobs import JOB, accepted, info, starts
@@ -49,7 +49,7 @@ def get_arm(
     "/trajectories",
     status_code=202,
     responses=starts("the arm moves") | problems(404, 409, 415, 422, 503),
-    openapi_extra=takes(TrajectoryRequest, {"a plan": {"plan": "0d6c1b7f2a3e4f50", "arm": "fake"}}),
+    openapi_extra=request_body(TrajectoryRequest, {"a plan": {"plan": "0d6c1b7f2a3e4f50", "arm": "fake"}}),
 )
 def send_trajectory(
     service: Service,

@@ -78,9 +78,8 @@ class Replay:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the replay as values for JSON; contacts are ``touches`` and the clearance is ``room`` there."""
-        values = asdict(self)
-        return values | {"touches": values.pop("contacts"), "room": values.pop("clearance")}
+        """Return the replay as values for JSON."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)
