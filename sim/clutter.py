@@ -16,7 +16,8 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_to_rotation, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap, Support, fit, segment
-from splatbot.segmentation.objects import FEWEST, MIN_OPACITY, solid_rows
+from splatbot.segmentation.objects import CONSTANTS as SEGMENTATION
+from splatbot.segmentation.objects import solid_rows
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge, surface_points
 from splatbot.sim.scene import Clutter, Scene, SceneObject
 from splatbot.sim.solids import pose_at, rpy_of
@@ -137,7 +138,7 @@ def _beyond(ellipsoids: Ellipsoids, model: GaussianModel, T_scene_map: Array) ->
     if not len(ellipsoids.centers):
         return np.zeros(1)
     points = surface_points(ellipsoids)
-    field = GaussianCollisionField(model, min_opacity=MIN_OPACITY)
+    field = GaussianCollisionField(model, min_opacity=SEGMENTATION.min_opacity)
     in_map = transform_points(inverse(T_scene_map), points.reshape(-1, 3))
     clearance = field.clearance(in_map).distance.reshape(points.shape[:2])
     return np.maximum(clearance.max(axis=1), 0.0)
@@ -159,7 +160,7 @@ def _table(support: Support, on: Array) -> SceneObject:
     along /= np.linalg.norm(along)
     flat = np.stack([along, np.cross(n, along)], axis=1)
     seen = on @ flat
-    if len(seen) < FEWEST:
+    if len(seen) < SEGMENTATION.min_gaussians:
         roll, pitch = float(np.arctan2(-n[1], n[2])), float(np.arcsin(np.clip(n[0], -1, 1)))
         values = {"shapes": [{"kind": "plane"}], "at": (n * support.offset).tolist(), "rpy": [roll, pitch, 0.0]}
         return SceneObject.model_validate({"name": "map-table", **values})

@@ -69,30 +69,29 @@ class SphereGeom(_Geom):
         return [self.radius]
 
 
-class CylinderGeom(_Geom):
+class _RoundGeom(_Geom):
+    kind: str
+    radius: Positive
+    height: Positive
+
+    def _sizes(self) -> list[float]:
+        return [self.radius, self.height / 2]
+
+
+class CylinderGeom(_RoundGeom):
     """A cylinder along z about its centre."""
 
     geom_type = mujoco.mjtGeom.mjGEOM_CYLINDER
 
     kind: Literal["cylinder"]
-    radius: Positive
-    height: Positive
-
-    def _sizes(self) -> list[float]:
-        return [self.radius, self.height / 2]
 
 
-class CapsuleGeom(_Geom):
+class CapsuleGeom(_RoundGeom):
     """A capsule along z about its centre; ``height`` is without the caps."""
 
     geom_type = mujoco.mjtGeom.mjGEOM_CAPSULE
 
     kind: Literal["capsule"]
-    radius: Positive
-    height: Positive
-
-    def _sizes(self) -> list[float]:
-        return [self.radius, self.height / 2]
 
 
 class EllipsoidGeom(_Geom):

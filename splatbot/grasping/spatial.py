@@ -24,7 +24,7 @@ from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapObject, SegmentedMap
 from splatbot.segmentation.faces import find_faces, nearest_of
-from splatbot.segmentation.objects import FEWEST, LARGEST
+from splatbot.segmentation.objects import CONSTANTS as SEGMENTATION
 
 
 @dataclass(frozen=True)
@@ -147,18 +147,18 @@ def _around(scene: SegmentedMap, point: Array) -> MapObject | None:
 def _face_at(scene: SegmentedMap, point: Array) -> NDArray[np.int64]:
     """Return the Gaussians of the separate face at a point, such as the spine of a book in a shelf; else no rows."""
     local = transform_points(inverse(scene.T_world_base), point)
-    rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < LARGEST / 2).all(axis=1))
+    rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < SEGMENTATION.max_extent / 2).all(axis=1))
     rows = rows[scene.labels[rows] >= -1]
-    if len(rows) < FEWEST:
+    if len(rows) < SEGMENTATION.min_gaussians:
         return rows[:0]
-    faces = find_faces(scene.points[rows], fewest=FEWEST)
+    faces = find_faces(scene.points[rows], fewest=SEGMENTATION.min_gaussians)
     away = np.linalg.norm(scene.points[rows] - local, axis=1)
     k = int(np.argmin(away))
     own = rows[faces.owner == faces.owner[k]]
     if (
         away[k] > CONSTANTS.max_distance
         or faces.owner[k] < 0
-        or np.ptp(scene.points[own], axis=0).max() > 0.9 * LARGEST
+        or np.ptp(scene.points[own], axis=0).max() > 0.9 * SEGMENTATION.max_extent
     ):
         return rows[:0]
     return own
@@ -188,7 +188,7 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
         )
     found = scene.objects[k]
     label, score = found.name or f"object {k}", float(votes[k] / votes.sum())
-    if exact and votes[k] >= FEWEST:
+    if exact and votes[k] >= SEGMENTATION.min_gaussians:
         shown = _visible(scene, view, np.ones_like(mask))
         shown = shown[scene.labels[shown] == k]
         own, other = seeds[labels == k], np.setdiff1d(shown, seeds)

@@ -59,8 +59,10 @@ def _dataclass(cls: type) -> SavedType:
     return SavedType(cls, {field.name: field.name for field in fields(cls)})
 
 
-def _fields(*same: str, **renamed: str) -> dict[str, str]:
-    return {name: name for name in same} | renamed
+def _fields(*attributes: str) -> dict[str, str]:
+    """Return attributes by field name: an attribute without underscore, or ``field=attribute``."""
+    pairs = (text.split("=") for text in attributes)
+    return {pair[0].lstrip("_"): pair[-1] for pair in pairs}
 
 
 TYPES: Mapping[str, SavedType] = {
@@ -69,19 +71,19 @@ TYPES: Mapping[str, SavedType] = {
         _fields(
             "config",
             "results",
-            tracker="_tracker",
-            mapper="_mapper",
-            location="_location",
-            image_size="_image_size",
-            localization_only="_localization_only",
-            joint_motion="_joint_motion",
+            "_tracker",
+            "_mapper",
+            "_location",
+            "_image_size",
+            "_localization_only",
+            "_joint_motion",
         ),
         transient=frozenset({"_executor"}),
         create=Slam,
     ),
     "frame_result": _dataclass(FrameResult),
     "graph_location": _dataclass(GraphLocation),
-    "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", last="_last")),
+    "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", "_last")),
     "camera": _dataclass(Camera),
     "gaussians": _dataclass(GaussianModel),
     "keyframe": _dataclass(Keyframe),
@@ -94,53 +96,51 @@ TYPES: Mapping[str, SavedType] = {
             "pending_iterations",
             "version",
             "loops",
-            refiner="_refiner",
-            dynamic_objects="_dynamic_objects",
-            depth_noise="_depth_noise",
-            unmapped_seen="_unmapped_seen",
-            robot_moving="_robot_moving",
-            frozen="_frozen",
-            stamp="_stamp",
-            observed_stamp="_observed_stamp",
+            "_refiner",
+            "_dynamic_objects",
+            "_depth_noise",
+            "_unmapped_seen",
+            "_robot_moving",
+            "_frozen",
+            "_stamp",
+            "_observed_stamp",
         ),
         transient=frozenset({"_lock", "_submitted", "_latest", "_added", "_inserted"}),
         create=Mapper,
     ),
     "loop_closer": SavedType(
         LoopCloser,
-        _fields("config", "graph", "adjacency", "correction", "closed", "rejected", unconfirmed="_unconfirmed"),
+        _fields("config", "graph", "adjacency", "correction", "closed", "rejected", "_unconfirmed"),
         create=LoopCloser,
     ),
     "pose_graph": _dataclass(PoseGraph),
     "edge": _dataclass(Edge),
-    "refiner": SavedType(Refiner, _fields("config", "adam", random="_random", latest_refined="_latest_refined")),
+    "refiner": SavedType(Refiner, _fields("config", "adam", "_random", "_latest_refined")),
     "adam": SavedType(GaussianAdam, _fields("rates", "steps", "skipped", "first", "second")),
-    "dynamic_objects": SavedType(
-        DynamicObjectFilter, _fields(timeout="timeout_s", cells="_cells", since="_since", seen="_seen")
-    ),
+    "dynamic_objects": SavedType(DynamicObjectFilter, _fields("timeout=timeout_s", "_cells", "_since", "_seen")),
     "depth_noise": _dataclass(DepthNoiseModel),
     "tracker": SavedType(
         Tracker,
         _fields(
             "config",
             "motion",
-            lost="_lost",
-            uncertainties="_keyframe_uncertainty",
-            last_covariance="_last_covariance",
-            costs="_costs",
-            place_search="_search",
-            relocalization_candidate="_candidate",
+            "_lost",
+            "uncertainties=_keyframe_uncertainty",
+            "_last_covariance",
+            "_costs",
+            "place_search=_search",
+            "relocalization_candidate=_candidate",
         ),
         transient=frozenset({"_stages"}),
         create=lambda config: Tracker(config.tracking),
     ),
     "motion_model": SavedType(
         ConstantVelocity,
-        _fields(last="_last", twist="_twist", interval="_interval", dead_reckoning="_dead_reckoning"),
+        _fields("_last", "_twist", "_interval", "_dead_reckoning"),
         create=lambda _: ConstantVelocity(),
     ),
-    "stage_costs": SavedType(CostModel, _fields(frame="_frame", runs="_runs"), create=lambda _: CostModel()),
-    "place_search": SavedType(PlaceSearch, _fields(next="_next"), create=lambda _: PlaceSearch()),
+    "stage_costs": SavedType(CostModel, _fields("_frame", "_runs"), create=lambda _: CostModel()),
+    "place_search": SavedType(PlaceSearch, _fields("_next"), create=lambda _: PlaceSearch()),
     "relocalization_candidate": _dataclass(RelocalizationCandidate),
     "uncertainty": _dataclass(Uncertainty),
     "features": _dataclass(Features),
