@@ -23,7 +23,7 @@ _MOVING = ("revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class DefaultLimits:
-    """Limits where a URDF has none: it never has limits of acceleration and jerk, and often none of velocity.
+    """Limits that a URDF lacks: always those of acceleration and jerk, often that of velocity.
 
     Args:
         velocity: [rad/s or m/s] limit of velocity.
