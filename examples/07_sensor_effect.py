@@ -9,12 +9,8 @@ from splatbot.sim.effects.base import Effects, SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class Vignette(SensorEffect):
+class Vignette(SensorEffect, cost="one multiplication for each pixel and channel", observable="colors"):
     """Darkens the image with the squared distance from its centre, and adds a little noise."""
-
-    name = "vignette"
-    cost = "one multiplication for each pixel and channel"
-    observable = "colors"
 
     strength: float = setting(0.5, "give a share in 0..1", low=0, high=1)
     noise: float = setting(1.0, "give grey levels >= 0", low=0)  # standard deviation [grey levels]

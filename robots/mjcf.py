@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,10 +14,25 @@ from splatbot.protocols import Array
 from splatbot.robots.robot import GripperGeometry, RobotModel
 from splatbot.robots.shapes import Box, Capsule, Shape
 
-DAMPING = 1.0  # [Nm s/rad] of arm joints; an estimate
-FINGER_MASS = 0.015  # [kg]
-FINGER_DRIVE = 0.5  # [kg] reflected mass of the drive, an estimate; with the 15 g of a finger alone, contacts are soft
-FINGER_GAIN = 2000.0  # [N/m] of the fingers' position servo, capped by the gripper's force
+
+@dataclass(frozen=True)
+class DriveConstants:
+    """Constants of joints and fingers in MuJoCo models.
+
+    Args:
+        damping: [Nm s/rad] damping of arm joints; an estimate.
+        finger_mass: [kg] mass of a finger.
+        finger_drive: [kg] reflected mass of the drive, an estimate; with the 15 g of a finger alone, contacts are soft.
+        finger_gain: [N/m] gain of the fingers' position servo, capped by the gripper's force.
+    """
+
+    damping: float = 1.0
+    finger_mass: float = 0.015
+    finger_drive: float = 0.5
+    finger_gain: float = 2000.0
+
+
+CONSTANTS = DriveConstants()
 
 
 def to_mjcf(robot: RobotModel) -> str:
@@ -40,7 +56,7 @@ def to_mjcf(robot: RobotModel) -> str:
         kind = "slide" if joint.prismatic else "hinge"
         ElementTree.SubElement(
             body, "joint", name=joint.name, type=kind, axis="0 0 1", range=_text([joint.lower, joint.upper]),
-            damping=_text([DAMPING]),
+            damping=_text([CONSTANTS.damping]),
         )  # fmt: skip
         gain = 50.0 * joint.effort  # full torque at 20 mrad
         ElementTree.SubElement(
@@ -109,10 +125,12 @@ def _add_gripper(
             axis="0 1 0",
             range=_text([0.0, gripper.stroke]),
             damping="10",
-            armature=_text([FINGER_DRIVE]),
+            armature=_text([CONSTANTS.finger_drive]),
         )
-        inertia = _text([FINGER_MASS / 6 * 4e-4] * 3)
-        ElementTree.SubElement(body, "inertial", pos="0 0.01 0.02", mass=_text([FINGER_MASS]), diaginertia=inertia)
+        inertia = _text([CONSTANTS.finger_mass / 6 * 4e-4] * 3)
+        ElementTree.SubElement(
+            body, "inertial", pos="0 0.01 0.02", mass=_text([CONSTANTS.finger_mass]), diaginertia=inertia
+        )
         for shape in gripper.shapes:
             ElementTree.SubElement(body, "geom", _geom(shape) | {"friction": "1 0.005 0.0001"})
     tendon = ElementTree.SubElement(ElementTree.SubElement(root, "tendon"), "fixed", name="opening")
@@ -123,7 +141,7 @@ def _add_gripper(
         equality, "joint", joint1=names[0], joint2=names[1], solimp="0.95 0.99 0.001", solref="0.005 1"
     )
     ElementTree.SubElement(
-        actuators, "position", name="opening", tendon="opening", kp=_text([FINGER_GAIN]), kv="50",
+        actuators, "position", name="opening", tendon="opening", kp=_text([CONSTANTS.finger_gain]), kv="50",
         ctrlrange=_text([0.0, 2 * gripper.stroke]), forcerange=_text([-gripper.force, gripper.force]),
     )  # fmt: skip
 

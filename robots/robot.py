@@ -16,9 +16,23 @@ from splatbot.robots.cover import cover
 from splatbot.robots.joints import Joint
 from splatbot.robots.shapes import Shape
 
-SLACK = 0.008  # [m] by which generated spheres may extend beyond the collision geometry
-_PAD_DEPTH = 1e-4  # [m] depth of the layer of a finger that counts as the face of its pad
-_SPACING = 2e-3  # [m] between the surface points from which the dimensions of the hand are measured
+
+@dataclass(frozen=True)
+class CoverConstants:
+    """Constants of the spheres and the hand of a robot.
+
+    Args:
+        slack: [m] distance by which generated spheres may extend beyond the collision geometry.
+        pad_depth: [m] depth of the layer of a finger that counts as the face of its pad.
+        spacing: [m] distance between the surface points from which the dimensions of the hand are measured.
+    """
+
+    slack: float = 0.008
+    pad_depth: float = 1e-4
+    spacing: float = 2e-3
+
+
+CONSTANTS = CoverConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +91,7 @@ class RobotModel:
     home: Array
     inertials: tuple[Inertial, ...] = field(default=(), repr=False)
     gripper: GripperGeometry | None = field(default=None, repr=False)
-    slack: float = SLACK
+    slack: float = CONSTANTS.slack
     allowed: tuple[tuple[int, int], ...] = ()
     covering: LinkSpheres | None = field(default=None, repr=False)
     pairs: NDArray[np.int32] | None = field(default=None, repr=False)
@@ -175,10 +189,10 @@ class RobotModel:
             return None
         T_tcp_link = inverse(self.T_link_tcp)
         T_tcp_finger = T_tcp_link @ self.gripper.T_link_finger[0]
-        finger = np.concatenate([shape.surface(_SPACING) for shape in self.gripper.shapes])
+        finger = np.concatenate([shape.surface(CONSTANTS.spacing) for shape in self.gripper.shapes])
         finger = transform_points(T_tcp_finger, finger) * [1.0, np.sign(T_tcp_finger[1, 1]), 1.0]
-        pad = finger[finger[:, 1] < finger[:, 1].min() + _PAD_DEPTH]
-        own = [shape.surface(_SPACING) for shape in self.shapes if shape.link == len(self)]
+        pad = finger[finger[:, 1] < finger[:, 1].min() + CONSTANTS.pad_depth]
+        own = [shape.surface(CONSTANTS.spacing) for shape in self.shapes if shape.link == len(self)]
         body = transform_points(T_tcp_link, np.concatenate(own)) if own else np.zeros((0, 3))
         palm = body[body[:, 2] > finger[:, 2].min()]  # parts next to the fingers or between them
         front = palm if len(palm) else finger[finger[:, 2] == finger[:, 2].min()]

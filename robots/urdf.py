@@ -14,12 +14,29 @@ from splatbot.errors import FormatError, InputError
 from splatbot.geometry import so3_exp, transform_points
 from splatbot.protocols import Array
 from splatbot.robots.joints import Joint
-from splatbot.robots.robot import SLACK, Inertial, RobotModel
+from splatbot.robots.robot import CONSTANTS as COVER
+from splatbot.robots.robot import Inertial, RobotModel
 from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
 
 _MOVING = ("revolute", "continuous", "prismatic")
-# A URDF has no limits of acceleration and jerk, and often none of velocity.
-VELOCITY, ACCELERATION_PER_VELOCITY, JERK_PER_VELOCITY = 1.0, 5.0, 50.0  # [rad/s or m/s], [1/s], [1/s²]
+
+
+@dataclass(frozen=True)
+class DefaultLimits:
+    """Limits that a URDF lacks: always those of acceleration and jerk, often that of velocity.
+
+    Args:
+        velocity: [rad/s or m/s] limit of velocity.
+        acceleration_per_velocity: [1/s] ratio of the limits.
+        jerk_per_velocity: [1/s²] ratio of the limits.
+    """
+
+    velocity: float = 1.0
+    acceleration_per_velocity: float = 5.0
+    jerk_per_velocity: float = 50.0
+
+
+CONSTANTS = DefaultLimits()
 
 
 @dataclass(frozen=True)
@@ -30,7 +47,7 @@ class Reading:
     notes: tuple[str, ...]
 
 
-def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = SLACK) -> Reading:
+def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = COVER.slack) -> Reading:
     """Read the serial arm from the root to ``tip``.
 
     Fixed links belong to the link of the arm that carries them. Moving joints outside the arm (fingers) are fixed at
@@ -125,8 +142,8 @@ class _UrdfReader:
             raise FormatError("has no limits of position.", file=self.file, field=name, hint="add lower and upper")
         velocity = values["velocity"] or 0.0
         if velocity <= 0:
-            velocity = VELOCITY
-            self.notes.append(f"{name} has no limit of velocity: {VELOCITY:g} per second is assumed")
+            velocity = CONSTANTS.velocity
+            self.notes.append(f"{name} has no limit of velocity: {CONSTANTS.velocity:g} per second is assumed")
         try:
             return Joint(
                 name=name,
@@ -134,8 +151,8 @@ class _UrdfReader:
                 lower=low,
                 upper=high,
                 velocity=velocity,
-                acceleration=ACCELERATION_PER_VELOCITY * velocity,
-                jerk=JERK_PER_VELOCITY * velocity,
+                acceleration=CONSTANTS.acceleration_per_velocity * velocity,
+                jerk=CONSTANTS.jerk_per_velocity * velocity,
                 effort=values["effort"] or 0.0,
                 prismatic=e.get("type") == "prismatic",
             )

@@ -58,7 +58,7 @@ def body_of(model: type[_M], *, array: str | None = None) -> Callable[[Request],
     return read
 
 
-def takes(model: type[BaseModel], examples: Mapping[str, Any], *, npy: str = "") -> dict[str, Any]:
+def request_body(model: type[BaseModel], examples: Mapping[str, Any], *, npy: str = "") -> dict[str, Any]:
     """Return the OpenAPI entry of a request's body; ``npy`` describes a bare array."""
     schema = {"$ref": f"#/components/schemas/{model.__name__}"}
     content: dict[str, Any] = {
@@ -70,7 +70,7 @@ def takes(model: type[BaseModel], examples: Mapping[str, Any], *, npy: str = "")
     return {"requestBody": {"required": True, "content": content}}
 
 
-def gives(example: Mapping[str, Any], *, npy: str = "") -> dict[int | str, dict[str, Any]]:
+def answers(example: Mapping[str, Any], *, npy: str = "") -> dict[int | str, dict[str, Any]]:
     """Return the OpenAPI entry of an answer; ``npy`` describes a bare array."""
     content: dict[str, Any] = {
         JSON: {"example": dict(example)},
@@ -159,7 +159,7 @@ def plain(value: Any) -> Any:
 
 
 def describe_bodies(app: FastAPI) -> None:
-    """Let the OpenAPI document name the models that :func:`takes` refers to, and how a key is sent."""
+    """Let the OpenAPI document name the models that :func:`request_body` refers to, and how a key is sent."""
     original = app.openapi
 
     def described() -> dict[str, Any]:

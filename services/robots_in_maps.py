@@ -47,7 +47,7 @@ def objects_in(served: ServedMap, base: NDArray[np.float64], *, as_known: bool) 
     """
     measured = served.derived.get("measured", lambda: measured_map(served.ready, served.run))
     return served.derived.get(
-        ("things", base.tobytes(), as_known),
+        ("objects", base.tobytes(), as_known),
         lambda: segment_objects(measured, base, served.workspace, as_known=as_known),
     )
 

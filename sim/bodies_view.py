@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -14,9 +15,23 @@ from splatbot.protocols import Array
 from splatbot.sim.view import TwinView
 from splatbot.sim.world import MAP_GROUP, World
 
-FINER = 2  # samples along a pixel's side
-_BACKGROUND = 0.999  # fraction of the far plane's distance beyond which a sample is background
-_SURFACE_TOLERANCE = 0.02  # relative difference of depth within one surface in a pixel
+
+@dataclass(frozen=True)
+class BodiesViewConstants:
+    """Constants of views of bodies.
+
+    Args:
+        supersampling: samples along a pixel's side.
+        background: fraction of the far plane's distance beyond which a sample is background.
+        same_surface: relative difference of depth within one surface in a pixel.
+    """
+
+    supersampling: int = 2
+    background: float = 0.999
+    same_surface: float = 0.02
+
+
+CONSTANTS = BodiesViewConstants()
 
 
 class BodiesView:
@@ -36,10 +51,10 @@ class BodiesView:
 
     def __init__(self, world: World, camera: Camera, *, map_too: bool) -> None:
         self.camera, self._of_robot, m = camera, world.of_robot, world.model
-        width, height = FINER * camera.width, FINER * camera.height
+        width, height = CONSTANTS.supersampling * camera.width, CONSTANTS.supersampling * camera.height
         m.vis.global_.offwidth, m.vis.global_.offheight = width, height
         m.vis.quality.offsamples = 0
-        self._far = _BACKGROUND * float(m.vis.map.zfar * m.stat.extent)
+        self._far = CONSTANTS.background * float(m.vis.map.zfar * m.stat.extent)
         self._shown = mujoco.MjvOption()
         self._shown.geomgroup[MAP_GROUP] = int(map_too)
         self._shown.sitegroup[:] = 0  # markers such as that of the tool, which a real camera does not see
@@ -89,15 +104,15 @@ class BodiesView:
 
 def _pixels(samples: NDArray[np.float32]) -> NDArray[np.float32]:
     """Group the samples of each pixel: (H, W, 4)."""
-    height, width = samples.shape[0] // FINER, samples.shape[1] // FINER
-    grouped = samples.reshape(height, FINER, width, FINER).transpose(0, 2, 1, 3)
-    return grouped.reshape(height, width, FINER * FINER)
+    height, width = samples.shape[0] // CONSTANTS.supersampling, samples.shape[1] // CONSTANTS.supersampling
+    grouped = samples.reshape(height, CONSTANTS.supersampling, width, CONSTANTS.supersampling).transpose(0, 2, 1, 3)
+    return grouped.reshape(height, width, CONSTANTS.supersampling * CONSTANTS.supersampling)
 
 
 def _nearest(samples: NDArray[np.float32]) -> NDArray[np.float32]:
     """Average the depth (H, W) of the nearest surface among samples (H, W, S), so that no mean crosses an edge."""
     nearest = samples.min(axis=-1)
-    same = samples <= (1.0 + _SURFACE_TOLERANCE) * nearest[..., None]
+    same = samples <= (1.0 + CONSTANTS.same_surface) * nearest[..., None]
     total = np.where(same & np.isfinite(samples), samples, 0.0).sum(axis=-1)
     return np.where(np.isfinite(nearest), total / np.maximum(same.sum(axis=-1), 1), np.float32(np.inf)).astype(
         np.float32

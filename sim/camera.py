@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,21 @@ from splatbot.sim.view import TwinView, composite
 from splatbot.sim.world import World, robot_joints
 from splatbot.trajectory import Trajectory
 
-_MAX_RANGE = 20.0  # [m] of the depth camera
-_STAMP_TOLERANCE = 1e-9  # [s] by which a frame may be late
+
+@dataclass(frozen=True)
+class TwinCameraConstants:
+    """Constants of the twin's camera.
+
+    Args:
+        max_range: [m] range of the depth camera.
+        stamp_tolerance: [s] time by which a frame may be late.
+    """
+
+    max_range: float = 20.0
+    stamp_tolerance: float = 1e-9
+
+
+CONSTANTS = TwinCameraConstants()
 
 
 class TwinCamera:
@@ -64,10 +77,12 @@ class TwinCamera:
         Without latency it is the current view, or None if the sensor drops the frame.
         """
         seen = self.view(data)
-        frame = Frame(stamp, seen.rgb(), seen.measured(_MAX_RANGE), self.camera, index, source=f"twin#{index}")
+        frame = Frame(stamp, seen.rgb(), seen.measured(CONSTANTS.max_range), self.camera, index, source=f"twin#{index}")
         self._in_transit.extend(self.effects.over([frame]))
-        arrived = [pending for pending in self._in_transit if pending.stamp <= stamp + _STAMP_TOLERANCE]
-        self._in_transit = [pending for pending in self._in_transit if pending.stamp > stamp + _STAMP_TOLERANCE]
+        arrived = [pending for pending in self._in_transit if pending.stamp <= stamp + CONSTANTS.stamp_tolerance]
+        self._in_transit = [
+            pending for pending in self._in_transit if pending.stamp > stamp + CONSTANTS.stamp_tolerance
+        ]
         return replace(arrived[-1], joints=self._joints(data)) if arrived else None
 
     def _joints(self, data: Any) -> Array | None:

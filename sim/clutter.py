@@ -16,14 +16,31 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_to_rotation, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap, Support, fit, segment
-from splatbot.segmentation.objects import FEWEST, MIN_OPACITY, solid_rows
+from splatbot.segmentation.objects import CONSTANTS as SEGMENTATION
+from splatbot.segmentation.objects import solid_rows
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge, surface_points
 from splatbot.sim.scene import Clutter, Scene, SceneObject
 from splatbot.sim.solids import pose_at, rpy_of
 
-_TABLE_THICKNESS = 0.02  # [m]; depth below the table top is hardly observed
-_RIM = 0.5  # [%] of the table's Gaussians that may lie beyond its edge on each side
-_STRAY_DISTANCE = 0.03  # [m] from a movable object within which remaining Gaussians belong to it
+
+@dataclass(frozen=True)
+class ClutterConstants:
+    """Constants of twins of mapped tables.
+
+    Args:
+        table_thickness: [m] depth below the table top is hardly observed.
+        rim: [%] share of the table's Gaussians that may lie beyond its edge on each side.
+        stray_distance: [m] distance to a movable object within which remaining Gaussians belong to it.
+    """
+
+    table_thickness: float = 0.02
+    rim: float = 0.5
+    stray_distance: float = 0.03
+
+
+CONSTANTS = ClutterConstants()
+
+
 _ON_TABLE = -2  # label of segmentation
 
 
@@ -121,7 +138,7 @@ def _beyond(ellipsoids: Ellipsoids, model: GaussianModel, T_scene_map: Array) ->
     if not len(ellipsoids.centers):
         return np.zeros(1)
     points = surface_points(ellipsoids)
-    field = GaussianCollisionField(model, min_opacity=MIN_OPACITY)
+    field = GaussianCollisionField(model, min_opacity=SEGMENTATION.min_opacity)
     in_map = transform_points(inverse(T_scene_map), points.reshape(-1, 3))
     clearance = field.clearance(in_map).distance.reshape(points.shape[:2])
     return np.maximum(clearance.max(axis=1), 0.0)
@@ -143,16 +160,19 @@ def _table(support: Support, on: Array) -> SceneObject:
     along /= np.linalg.norm(along)
     flat = np.stack([along, np.cross(n, along)], axis=1)
     seen = on @ flat
-    if len(seen) < FEWEST:
+    if len(seen) < SEGMENTATION.min_gaussians:
         roll, pitch = float(np.arctan2(-n[1], n[2])), float(np.arcsin(np.clip(n[0], -1, 1)))
         values = {"shapes": [{"kind": "plane"}], "at": (n * support.offset).tolist(), "rpy": [roll, pitch, 0.0]}
         return SceneObject.model_validate({"name": "map-table", **values})
     yaw = float(np.radians(cv2.minAreaRect(seen.astype(np.float32))[2]))
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    low, high = np.percentile(seen @ turn, [_RIM, 100 - _RIM], axis=0)
+    low, high = np.percentile(seen @ turn, [CONSTANTS.rim, 100 - CONSTANTS.rim], axis=0)
     axes = flat @ turn
-    at = axes @ ((low + high) / 2) + n * (support.offset - _TABLE_THICKNESS / 2)
-    shape = {"kind": "box", "size": [*np.maximum(high - low, _TABLE_THICKNESS).tolist(), _TABLE_THICKNESS]}
+    at = axes @ ((low + high) / 2) + n * (support.offset - CONSTANTS.table_thickness / 2)
+    shape = {
+        "kind": "box",
+        "size": [*np.maximum(high - low, CONSTANTS.table_thickness).tolist(), CONSTANTS.table_thickness],
+    }
     rpy = rpy_of(np.c_[axes, n])
     return SceneObject.model_validate({"name": "map-table", "shapes": [shape], "at": at.tolist(), "rpy": rpy})
 
@@ -199,5 +219,5 @@ def _gather_strays(points: Array, used: np.ndarray, support: Support, labels: np
     for part in np.array_split(loose, max(1, len(loose) * len(fitted) // 1_000_000)):
         away = np.linalg.norm(points[part, None] - points[None, fitted], axis=-1)
         nearest = away.argmin(axis=1)
-        near = away[np.arange(len(part)), nearest] < _STRAY_DISTANCE
+        near = away[np.arange(len(part)), nearest] < CONSTANTS.stray_distance
         labels[used[part[near]]] = here[fitted[nearest[near]]]

@@ -6,7 +6,8 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.protocols import Array, Feedback, MotionState, TimedPath
-from splatbot.robots.controllers.base import FOLLOWING, SteppedController
+from splatbot.robots.controllers.base import CONSTANTS as CONTROLLER
+from splatbot.robots.controllers.base import SteppedController
 from splatbot.sim.gripper import TwinGripper
 from splatbot.sim.twin import Twin
 
@@ -24,7 +25,7 @@ class TwinController(SteppedController):
             InputError: the twin has no robot.
     """
 
-    def __init__(self, twin: Twin, *, following: float = FOLLOWING) -> None:
+    def __init__(self, twin: Twin, *, following: float = CONTROLLER.max_tracking_error) -> None:
         if twin.follower is None:
             raise InputError("has no robot.", field=twin.scene.name, hint="give the scene a robot")
         self.twin, self._follower = twin, twin.follower

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from splatbot.errors import InputError
@@ -9,10 +11,25 @@ from splatbot.robots.grippers.checks import check_move
 from splatbot.sim.twin import Twin
 from splatbot.sim.world import gripper_joints
 
-SPEED = 0.1  # [m/s] of the opening
-_TOLERANCE = 1e-3  # [m] of the opening
-_REST_SPEED = 2e-3  # [m/s] of a finger
-_PRESSED = 0.9  # fraction of the force above which an object is held
+
+@dataclass(frozen=True)
+class GripperConstants:
+    """Constants of the twin's gripper.
+
+    Args:
+        speed: [m/s] speed of the opening.
+        opening_tolerance: [m] error of the opening at the goal.
+        rest_speed: [m/s] speed of a finger below which it rests.
+        pressed_share: fraction of the force above which an object is held.
+    """
+
+    speed: float = 0.1
+    opening_tolerance: float = 1e-3
+    rest_speed: float = 2e-3
+    pressed_share: float = 0.9
+
+
+CONSTANTS = GripperConstants()
 
 
 class TwinGripper:
@@ -37,7 +54,7 @@ class TwinGripper:
         self._stiffness = float(twin.world.model.actuator_gainprm[act, 0])
         twin.world.model.actuator_ctrllimited[act] = 0  # to press, the command lies beyond the closed fingers
         self._goal = self._command = self.opening()
-        self._force, self._speed = self._own.force, SPEED
+        self._force, self._speed = self._own.force, CONSTANTS.speed
 
     @property
     def stroke(self) -> float:
@@ -58,11 +75,11 @@ class TwinGripper:
         check_move(self.stroke, opening, force, speed)
         self._goal = opening
         self._force = self._own.force if force is None else min(force, self._own.force)
-        self._speed = SPEED if speed is None else min(speed, 2 * self._own.speed)
+        self._speed = CONSTANTS.speed if speed is None else min(speed, 2 * self._own.speed)
 
     def moving(self) -> bool:
         """Return whether the fingers are still moving to their goal."""
-        fast = float(np.abs(self._twin.data.qvel[self._dofs]).max()) > _REST_SPEED
+        fast = float(np.abs(self._twin.data.qvel[self._dofs]).max()) > CONSTANTS.rest_speed
         return not self._at_goal() and (fast or not self._presses())
 
     def opening(self) -> float:
@@ -88,7 +105,7 @@ class TwinGripper:
         return self._command
 
     def _at_goal(self) -> bool:
-        return abs(self.opening() - self._goal) < _TOLERANCE
+        return abs(self.opening() - self._goal) < CONSTANTS.opening_tolerance
 
     def _presses(self) -> bool:
-        return abs(self._command - self.opening()) * self._stiffness > _PRESSED * self._force
+        return abs(self._command - self.opening()) * self._stiffness > CONSTANTS.pressed_share * self._force

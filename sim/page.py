@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -15,11 +16,29 @@ from splatbot.sim.solids import rotation_of
 from splatbot.sim.twin import TwinResult
 from splatbot.sim.world import MAP_GROUP, World
 
-_MAX_POINTS = 20_000  # of the map
-_POINTS_PER_ROBOT_GEOM, _POINTS_PER_OBJECT_GEOM = 300, 400
-_CROP_RADIUS = 1.6  # [m] of the map around the robot that is shown
-_FLOOR = 0.8  # [m] half-extent of planes
-_SIZE = 0.006  # [m] of a point
+
+@dataclass(frozen=True)
+class TwinPageConstants:
+    """Constants of the page of a run.
+
+    Args:
+        max_points: points of the map.
+        points_per_robot_geom: points of a geom of the robot.
+        points_per_object_geom: points of a geom of an object.
+        crop_radius: [m] radius of the map around the robot that is shown.
+        floor: [m] half-extent of planes.
+        point_size: [m] size of a point.
+    """
+
+    max_points: int = 20_000
+    points_per_robot_geom: int = 300
+    points_per_object_geom: int = 400
+    crop_radius: float = 1.6
+    floor: float = 0.8
+    point_size: float = 0.006
+
+
+CONSTANTS = TwinPageConstants()
 
 
 def twin_html(recording: TwinRecording, result: TwinResult) -> str:
@@ -47,7 +66,7 @@ def twin_html(recording: TwinRecording, result: TwinResult) -> str:
         "times": np.round(recording.times, 4).tolist(),
         "middle": [0.35, 0.0, 0.25],
         "distance": 2.2,
-        "size": _SIZE,
+        "size": CONSTANTS.point_size,
     }
     return moving_page(result.scene, _facts(result), document, "twin_view.js", curve=True)
 
@@ -78,7 +97,9 @@ def _clouds(world: World) -> tuple[Array, Array, np.ndarray, Array, Array]:
         number = int(m.geom_bodyid[geom])
         if int(m.geom_group[geom]) == MAP_GROUP and fixed[number]:
             continue
-        points = surface_points(m, geom, _POINTS_PER_ROBOT_GEOM if world.of_robot[geom] else _POINTS_PER_OBJECT_GEOM)
+        points = surface_points(
+            m, geom, CONSTANTS.points_per_robot_geom if world.of_robot[geom] else CONSTANTS.points_per_object_geom
+        )
         R = np.zeros(9)
         mujoco.mju_quat2Mat(R, m.geom_quat[geom])
         points = points @ R.reshape(3, 3).T + m.geom_pos[geom]
@@ -101,8 +122,8 @@ def _map_points(world: World) -> tuple[Array, Array]:
     model, labels = world.parts.model, world.parts.labels
     means = model.means.double().numpy() @ rotation_of(world.scene.map.rpy).T + world.scene.map.at
     loose = [label for label, obj in enumerate(world.parts.objects) if obj.movable]
-    rows = np.flatnonzero((np.abs(means).max(axis=1) < _CROP_RADIUS) & ~np.isin(labels, loose))
-    rows = rows[evenly_spaced(len(rows), _MAX_POINTS)]
+    rows = np.flatnonzero((np.abs(means).max(axis=1) < CONSTANTS.crop_radius) & ~np.isin(labels, loose))
+    rows = rows[evenly_spaced(len(rows), CONSTANTS.max_points)]
     return means[rows], model.colors.double().numpy()[rows]
 
 
@@ -111,7 +132,7 @@ def surface_points(m: Any, geom: int, count: int) -> Array:
     kind, size = int(m.geom_type[geom]), np.asarray(m.geom_size[geom])
     types = mujoco.mjtGeom
     if kind == int(types.mjGEOM_PLANE):
-        side = np.linspace(-_FLOOR, _FLOOR, int(np.sqrt(4 * count)))
+        side = np.linspace(-CONSTANTS.floor, CONSTANTS.floor, int(np.sqrt(4 * count)))
         x, y = (part.ravel() for part in np.meshgrid(side, side))
         return np.stack([x, y, np.zeros_like(x)], axis=1)
     if kind == int(types.mjGEOM_MESH):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -11,8 +12,21 @@ from splatbot.protocols import Array
 from splatbot.sim.contact_monitor import FAR, ClearanceMonitor, MinimumClearance
 from splatbot.sim.world import World
 
-RATE = 30.0  # [Hz]
-_MIN_FORCE = 0.05  # [N] of a contact that is recorded
+
+@dataclass(frozen=True)
+class RecordingConstants:
+    """Constants of recordings.
+
+    Args:
+        rate: [Hz] samples per second.
+        min_force: [N] least force of a contact that is recorded.
+    """
+
+    rate: float = 30.0
+    min_force: float = 0.05
+
+
+CONSTANTS = RecordingConstants()
 
 
 class TwinRecording:
@@ -38,7 +52,7 @@ class TwinRecording:
 
     def __call__(self, data: Any, time: float) -> None:
         """Record the state if the next sample is due."""
-        if time * RATE < len(self.times):
+        if time * CONSTANTS.rate < len(self.times):
             return
         self.times.append(time)
         turned = np.array(data.xmat).reshape(-1, 3, 3)
@@ -63,5 +77,5 @@ class TwinRecording:
         for i, pair in enumerate(data.contact.geom[: int(data.ncon)]):
             if any(geom >= 0 and self.world.of_robot[geom] for geom in pair):
                 mujoco.mj_contactForce(self.world.model, data, i, self._force)
-                if self._force[0] > _MIN_FORCE:
+                if self._force[0] > CONSTANTS.min_force:
                     yield (*data.contact.pos[i].tolist(), float(self._force[0]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 
@@ -17,17 +19,38 @@ from splatbot.sim.rays import cast, pixel_rays
 from splatbot.sim.twin import Twin
 from splatbot.tracking.prepare import normals_of
 
-SPACING = 4e-3  # [m] between discs
-_DISTANCE = 0.65  # [m] of the camera from the centre of the objects
-_ELEVATIONS = (np.radians(60.0), np.radians(30.0))  # [rad] over the support, alternating
-_MAX_RANGE = 3.0  # [m] of the camera
-_SIGMA = 0.55  # [spacing] of a disc in its plane
-_THICKNESS = 1e-3  # [m] of a disc
-_BASE_RADIUS = 0.2  # [m] around the robot's base, whose stand is not mapped
-_MIN_COSINE = 0.2  # between surface normal and ray; grazing measurements are inaccurate
+
+@dataclass(frozen=True)
+class ScanConstants:
+    """Constants of maps from rendered views.
+
+    Args:
+        spacing: [m] distance between discs.
+        distance: [m] distance of the camera from the centre of the objects.
+        elevations: [rad] elevations of the camera over the support, alternating.
+        max_range: [m] range of the camera.
+        tangential_sigma: [spacing] standard deviation of a disc in its plane.
+        thickness: [m] thickness of a disc.
+        base_radius: [m] radius around the robot's base, whose stand is not mapped.
+        min_cosine: least cosine between surface normal and ray; grazing measurements are inaccurate.
+    """
+
+    spacing: float = 4e-3
+    distance: float = 0.65
+    elevations: tuple[float, float] = (np.radians(60.0), np.radians(30.0))
+    max_range: float = 3.0
+    tangential_sigma: float = 0.55
+    thickness: float = 1e-3
+    base_radius: float = 0.2
+    min_cosine: float = 0.2
 
 
-def scan(twin: Twin, *, views: int = 8, width: int = 320, spacing: float = SPACING, seed: int = 0) -> GaussianModel:
+CONSTANTS = ScanConstants()
+
+
+def scan(
+    twin: Twin, *, views: int = 8, width: int = 320, spacing: float = CONSTANTS.spacing, seed: int = 0
+) -> GaussianModel:
     """Create discs on the surfaces that a depth camera at exact poses measures, in the twin's world frame.
 
     Depth is cast against the twin's collision geometry, with the sensor effects of the scene's camera if any. The arm
@@ -56,7 +79,7 @@ def scan(twin: Twin, *, views: int = 8, width: int = 320, spacing: float = SPACI
     points, normals, colors = (np.concatenate(c) for c in zip(*(
         _measured(frame, poses[frame.index]) for frame in effects.over(frames)), strict=True))  # fmt: skip
     base = base_of(twin.scene)
-    away = np.linalg.norm((points - base[:3, 3])[:, :2], axis=1) > _BASE_RADIUS
+    away = np.linalg.norm((points - base[:3, 3])[:, :2], axis=1) > CONSTANTS.base_radius
     return discs(*_averaged(points[away], normals[away], colors[away], spacing), spacing)
 
 
@@ -65,7 +88,10 @@ def discs(points: Array, normals: Array, colors: Array, spacing: float) -> Gauss
     return GaussianModel.from_activated(
         means=points,
         quats=rotation_to_quat(_upright(normals)),
-        scales=np.tile([_SIGMA * spacing, _SIGMA * spacing, _THICKNESS], (len(points), 1)),
+        scales=np.tile(
+            [CONSTANTS.tangential_sigma * spacing, CONSTANTS.tangential_sigma * spacing, CONSTANTS.thickness],
+            (len(points), 1),
+        ),
         opacities=np.full(len(points), 0.9),
         colors=colors,
     )
@@ -81,15 +107,15 @@ def _middle(twin: Twin) -> Array:
 
 
 def _pose(middle: Array, k: int, views: int) -> Array:
-    turn, steep = 2 * np.pi * (k + 0.5) / views, _ELEVATIONS[k % len(_ELEVATIONS)]
+    turn, steep = 2 * np.pi * (k + 0.5) / views, CONSTANTS.elevations[k % len(CONSTANTS.elevations)]
     side = np.array([np.cos(turn) * np.cos(steep), np.sin(turn) * np.cos(steep), np.sin(steep)])
-    return look_at(middle + _DISTANCE * side, middle)
+    return look_at(middle + CONSTANTS.distance * side, middle)
 
 
 def _frame(twin: Twin, camera: Camera, T_world_camera: Array, index: int) -> Frame:
     """Render depth along the optical axis and colours; pixels of the arm are 0 in both."""
     world = twin.world
-    geoms, depth = cast(world.model, twin.data, pixel_rays(camera), T_world_camera, _MAX_RANGE)
+    geoms, depth = cast(world.model, twin.data, pixel_rays(camera), T_world_camera, CONSTANTS.max_range)
     hit = (depth > 0) & ~world.of_robot[geoms]
     rgb = np.where(hit[..., None], 255.0 * np.asarray(world.model.geom_rgba)[geoms, :3], 0.0)
     return Frame(
@@ -107,7 +133,7 @@ def _measured(frame: Frame, T_world_camera: Array) -> tuple[Array, Array, Array]
     normals = normals_of(frame.depth, frame.camera).astype(np.float64)
     points = frame.camera.backproject(frame.depth).astype(np.float64)
     rays = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
-    good = (frame.depth > 0) & (-(normals * rays).sum(axis=-1) > _MIN_COSINE)
+    good = (frame.depth > 0) & (-(normals * rays).sum(axis=-1) > CONSTANTS.min_cosine)
     R = T_world_camera[:3, :3]
     return transform_points(T_world_camera, points[good]), normals[good] @ R.T, frame.rgb[good] / 255.0
 

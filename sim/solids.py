@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -19,82 +19,97 @@ Positive = Annotated[float, Field(gt=0)]
 
 class _Geom(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    geom_type: ClassVar[mujoco.mjtGeom]
 
     at: Vec3 = Field(default=(0.0, 0.0, 0.0), description="in the object's frame [m]")
     rpy: Vec3 = Field(default=(0.0, 0.0, 0.0), description="roll, pitch, yaw [rad]")
 
     def geom(self, spec: Any, folder: Path) -> dict[str, Any]:
         """Return the arguments of ``MjsBody.add_geom``."""
-        kind, size = self._sizes(spec, folder)
-        return {"type": kind, "size": [*size, 0.0, 0.0][:3], "pos": list(self.at), "quat": quat_of(self.rpy)}
+        size = [*self._sizes(), 0.0, 0.0][:3]
+        return {"type": self.geom_type, "size": size, "pos": list(self.at), "quat": quat_of(self.rpy)}
 
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
+    def _sizes(self) -> list[float]:
+        """Return MuJoCo's sizes of the geom [m]."""
         raise NotImplementedError
 
 
 class PlaneGeom(_Geom):
     """An infinite plane; its normal is z."""
 
+    geom_type = mujoco.mjtGeom.mjGEOM_PLANE
+
     kind: Literal["plane"]
 
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
-        return mujoco.mjtGeom.mjGEOM_PLANE, [0.0, 0.0, 0.01]
+    def _sizes(self) -> list[float]:
+        return [0.0, 0.0, 0.01]
 
 
 class BoxGeom(_Geom):
     """A box; ``size`` is its length, width and height [m]."""
 
+    geom_type = mujoco.mjtGeom.mjGEOM_BOX
+
     kind: Literal["box"]
     size: tuple[Positive, Positive, Positive]
 
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
-        return mujoco.mjtGeom.mjGEOM_BOX, [s / 2 for s in self.size]
+    def _sizes(self) -> list[float]:
+        return [s / 2 for s in self.size]
 
 
 class SphereGeom(_Geom):
     """A sphere."""
 
+    geom_type = mujoco.mjtGeom.mjGEOM_SPHERE
+
     kind: Literal["sphere"]
     radius: Positive
 
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
-        return mujoco.mjtGeom.mjGEOM_SPHERE, [self.radius]
+    def _sizes(self) -> list[float]:
+        return [self.radius]
 
 
-class CylinderGeom(_Geom):
+class _RoundGeom(_Geom):
+    kind: str
+    radius: Positive
+    height: Positive
+
+    def _sizes(self) -> list[float]:
+        return [self.radius, self.height / 2]
+
+
+class CylinderGeom(_RoundGeom):
     """A cylinder along z about its centre."""
 
+    geom_type = mujoco.mjtGeom.mjGEOM_CYLINDER
+
     kind: Literal["cylinder"]
-    radius: Positive
-    height: Positive
-
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
-        return mujoco.mjtGeom.mjGEOM_CYLINDER, [self.radius, self.height / 2]
 
 
-class CapsuleGeom(_Geom):
+class CapsuleGeom(_RoundGeom):
     """A capsule along z about its centre; ``height`` is without the caps."""
 
-    kind: Literal["capsule"]
-    radius: Positive
-    height: Positive
+    geom_type = mujoco.mjtGeom.mjGEOM_CAPSULE
 
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
-        return mujoco.mjtGeom.mjGEOM_CAPSULE, [self.radius, self.height / 2]
+    kind: Literal["capsule"]
 
 
 class EllipsoidGeom(_Geom):
     """An ellipsoid with three half-axes [m]."""
 
+    geom_type = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+
     kind: Literal["ellipsoid"]
     axes: tuple[Positive, Positive, Positive]
 
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
-        return mujoco.mjtGeom.mjGEOM_ELLIPSOID, list(self.axes)
+    def _sizes(self) -> list[float]:
+        return list(self.axes)
 
 
 class MeshGeom(_Geom):
     """The convex hull of a mesh file (OBJ, STL), or of points (P, 3) [m]."""
+
+    geom_type = mujoco.mjtGeom.mjGEOM_MESH
 
     kind: Literal["mesh"]
     file: str | None = None
@@ -116,7 +131,7 @@ class MeshGeom(_Geom):
         else:
             raise ConfigError("has neither a file nor four points.", field="mesh", hint="give file or points")
         pose = {"pos": list(self.at), "quat": quat_of(self.rpy)}
-        return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name, **pose}
+        return {"type": self.geom_type, "meshname": name, **pose}
 
 
 class SoftGeom(_Geom):
@@ -130,6 +145,8 @@ class SoftGeom(_Geom):
         density: [kg/m³].
     """
 
+    geom_type = mujoco.mjtGeom.mjGEOM_BOX
+
     kind: Literal["soft"]
     size: tuple[Positive, Positive, Positive]
     cells: tuple[int, int, int] = (4, 4, 4)
@@ -137,8 +154,8 @@ class SoftGeom(_Geom):
     poisson: Annotated[float, Field(ge=0, lt=0.5)] = 0.2
     density: Positive = 100.0
 
-    def _sizes(self, spec: Any, folder: Path) -> tuple[Any, list[float]]:
-        return mujoco.mjtGeom.mjGEOM_BOX, [s / 2 for s in self.size]
+    def _sizes(self) -> list[float]:
+        return [s / 2 for s in self.size]
 
 
 Shape = Annotated[

@@ -24,10 +24,26 @@ from splatbot.sim.object_monitor import ObjectMonitor
 from splatbot.sim.scene import Scene
 from splatbot.sim.world import World, build_world
 
-_CLEARANCE_PERIOD = 0.02  # [s] between clearance computations
-_MAX_ACCURATE_STEP = 0.008  # [s]; contacts are visibly soft at longer steps
+
+@dataclass(frozen=True)
+class TwinConstants:
+    """Constants of a running twin.
+
+    Args:
+        clearance_period: [s] time between clearance computations.
+        max_accurate_step: [s] contacts are visibly soft at longer steps.
+        max_penetration: [m] largest penetration without a warning.
+    """
+
+    clearance_period: float = 0.02
+    max_accurate_step: float = 0.008
+    max_penetration: float = 0.005
+
+
+CONSTANTS = TwinConstants()
+
+
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in ("BADQPOS", "BADQVEL", "BADQACC")]
-_MAX_PENETRATION = 0.005  # [m] without a warning
 
 
 @dataclass(frozen=True)
@@ -92,10 +108,8 @@ class TwinResult:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as values for JSON, with contacts as ``touches`` and the clearance as ``near``."""
-        values = asdict(self)
-        near = values.pop("clearance")
-        return values | {"touches": values.pop("contacts"), "near": {"room": near.pop("value"), **near}}
+        """Return the result as values for JSON."""
+        return asdict(self)
 
 
 @dataclass
@@ -238,7 +252,7 @@ class Twin:
     ) -> int:
         period = 1.0 / self.rate
         q, v, a, opening = targets_of(motion, count, period)
-        every, report_every = max(1, round(_CLEARANCE_PERIOD * self.rate)), max(1, count // 50)
+        every, report_every = max(1, round(CONSTANTS.clearance_period * self.rate)), max(1, count // 50)
         limits = np.maximum(np.abs(self.world.model.actuator_forcerange).max(axis=1), 1e-9)
         log.clearance.update(self.data, 0.0)
         for k in range(count):
@@ -325,7 +339,7 @@ class Twin:
         found = []
         if self._broken():
             found.append(f"physics became unstable and was stopped: take steps below {1e3 * self.timestep:g} ms")
-        if self.timestep > _MAX_ACCURATE_STEP and "contact" in self.world.on:
+        if self.timestep > CONSTANTS.max_accurate_step and "contact" in self.world.on:
             found.append(f"steps of {1e3 * self.timestep:g} ms: contacts are too soft; use 2 ms")
         if self.rate < self._requested_rate:
             found.append(
@@ -333,7 +347,7 @@ class Twin:
                 f"not at {self._requested_rate:g}"
             )
         deepest = max((contact.depth for contact in log.contacts.found), default=0.0)
-        if deepest > _MAX_PENETRATION:
+        if deepest > CONSTANTS.max_penetration:
             found.append(f"contacts overlap by {1e3 * deepest:.1f} mm: forces are inaccurate")
         return tuple(found)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.rasterize.views import MIN_ALPHA
+from splatbot.rasterize.views import CONSTANTS as VIEWS
 
 Image = NDArray[np.float32]
 
@@ -34,7 +34,7 @@ class TwinView:
 
     def measured(self, reach: float) -> Image:
         """Return depth (H, W) [m] as in a frame: 0 where the pixel is mostly empty, or beyond ``reach`` [m]."""
-        seen = (self.alpha >= MIN_ALPHA) & (self.depth <= reach)
+        seen = (self.alpha >= VIEWS.min_alpha) & (self.depth <= reach)
         return np.where(seen, self.depth, np.float32(0))
 
 
@@ -54,6 +54,6 @@ def composite(a: TwinView, b: TwinView) -> TwinView:
     return TwinView(
         color + rest[..., None] * color_under,
         alpha + rest * under,
-        np.where((alpha >= MIN_ALPHA) | (under < MIN_ALPHA), depth, depth_under),
+        np.where((alpha >= VIEWS.min_alpha) | (under < VIEWS.min_alpha), depth, depth_under),
         bodies + rest * bodies_under,
     )

@@ -14,8 +14,21 @@ from pathlib import Path
 
 from splatbot.errors import SplatbotError
 
-_START_S = 120.0  # [s]; the service imports torch first
-_END_S = 20.0
+
+@dataclass(frozen=True)
+class ServingConstants:
+    """Constants of a service process.
+
+    Args:
+        start_timeout: [s] longest time to start; the service imports torch first.
+        end_timeout: [s] longest time to end.
+    """
+
+    start_timeout: float = 120.0
+    end_timeout: float = 20.0
+
+
+CONSTANTS = ServingConstants()
 
 
 @dataclass(frozen=True)
@@ -45,7 +58,7 @@ def serving(*arguments: str, log: Path) -> Iterator[Serving]:
         finally:
             process.terminate()
             try:
-                process.communicate(timeout=_END_S)
+                process.communicate(timeout=CONSTANTS.end_timeout)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.communicate()
@@ -57,11 +70,13 @@ def _ready(process: subprocess.Popen[str], log: Path) -> str:
     found = re.search(r"http://[^\s/]+", process.stdout.readline())
     if found is None:
         raise SplatbotError("the service did not start.", file=log, hint="that file says why")
-    deadline = time.monotonic() + _START_S
+    deadline = time.monotonic() + CONSTANTS.start_timeout
     while time.monotonic() < deadline:
         try:
             with urllib.request.urlopen(f"{found[0]}/readyz", timeout=5):
                 return found[0]
         except OSError:
             time.sleep(0.1)
-    raise SplatbotError(f"the service was not ready within {_START_S:.0f} s.", file=log, hint="that file says why")
+    raise SplatbotError(
+        f"the service was not ready within {CONSTANTS.start_timeout:.0f} s.", file=log, hint="that file says why"
+    )

@@ -19,11 +19,28 @@ Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
 _KEYS = ("T_world_base", "gravity", "support_plane", "workspace", "T_link_camera", "camera_link", "objects")
-_RANSAC_TRIALS = 4000  # a plane with a tenth of the points is hit by one triple in a thousand
-_INLIER_DISTANCE = 0.01  # [m] largest distance of an inlier from its plane
-_TILT_EXPONENT = 6  # exponent of the cosine of a plane's tilt, which weights its inliers
-AHEAD = 0.55  # [m] from the base of a robot to the middle of its workspace
-_HEIGHT = 0.8  # [m] height of the workspace above the plane
+
+
+@dataclass(frozen=True)
+class WorkspaceConstants:
+    """Constants of the search for the work surface.
+
+    Args:
+        ransac_trials: sampled planes; one triple in a thousand hits a plane with a tenth of the points.
+        inlier_distance: [m] largest distance of an inlier from its plane.
+        tilt_exponent: exponent of the cosine of a plane's tilt, which weights its inliers.
+        ahead: [m] distance from the base of a robot to the middle of its workspace.
+        height: [m] height of the workspace above the plane.
+    """
+
+    ransac_trials: int = 4000
+    inlier_distance: float = 0.01
+    tilt_exponent: int = 6
+    ahead: float = 0.55
+    height: float = 0.8
+
+
+CONSTANTS = WorkspaceConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,23 +193,23 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
     rng = np.random.default_rng(seed)
     some = points[rng.choice(len(points), min(len(points), 4000), replace=False)]
     best, best_score, count = np.zeros(4), 0.0, 0
-    for trio in rng.integers(0, len(some), (_RANSAC_TRIALS, 3)):
+    for trio in rng.integers(0, len(some), (CONSTANTS.ransac_trials, 3)):
         a, b, c = some[trio]
         plane = _through(np.cross(b - a, c - a), a, upward)
         if plane is None or plane[3] <= 0.0:
             continue
-        inliers = int((np.abs(some @ plane[:3] + plane[3]) < _INLIER_DISTANCE).sum())
-        score = inliers * float(plane[:3] @ upward) ** _TILT_EXPONENT
+        inliers = int((np.abs(some @ plane[:3] + plane[3]) < CONSTANTS.inlier_distance).sum())
+        score = inliers * float(plane[:3] @ upward) ** CONSTANTS.tilt_exponent
         if score > best_score:
             best, best_score, count = plane, score, inliers
     if count < len(some) / 20:
         raise InputError("has no upward surface.", field="map", hint="write scene.yaml by hand")
     for _ in range(5):  # least squares on the inliers
-        on = points[np.abs(points @ best[:3] + best[3]) < _INLIER_DISTANCE]
+        on = points[np.abs(points @ best[:3] + best[3]) < CONSTANTS.inlier_distance]
         middle = on.mean(axis=0)
         refined = _through(np.linalg.svd(on - middle, full_matrices=False)[2][2], middle, upward)
         best = best if refined is None else refined
-    return _around(best, points[np.abs(points @ best[:3] + best[3]) < _INLIER_DISTANCE])
+    return _around(best, points[np.abs(points @ best[:3] + best[3]) < CONSTANTS.inlier_distance])
 
 
 def _through(normal: Array, point: Array, up: Array) -> Array | None:
@@ -214,10 +231,10 @@ def _around(plane: Array, on: Array) -> Workspace:
     forward = forward / length if length > 1e-6 else np.linalg.svd(up[None])[2][1]
     T = np.eye(4)
     T[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
-    T[:3, 3] = middle - AHEAD * forward
+    T[:3, 3] = middle - CONSTANTS.ahead * forward
     local = transform_points(np.linalg.inv(T), on)
     low, high = np.percentile(local, [1, 99], axis=0)
-    box = np.array([[low[0], low[1], 0.0], [high[0], high[1], _HEIGHT]])
+    box = np.array([[low[0], low[1], 0.0], [high[0], high[1], CONSTANTS.height]])
     return Workspace(T, -up, plane, box)
 
 

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from splatbot.errors import ControllerError, InputError
 from splatbot.planning.certify import CertifiedMotion
 from splatbot.protocols import Array, Feedback, MotionState, TimedPath
 
-AT_START = 0.01  # [rad or m] largest distance of the arm from the start of a trajectory that it accepts
-FOLLOWING = 0.05  # [rad or m] largest tracking error before a fault
+
+@dataclass(frozen=True)
+class ControllerConstants:
+    """Constants of controllers.
+
+    Args:
+        max_start_error: [rad or m] largest distance of the arm from the start of a trajectory that it accepts.
+        max_tracking_error: [rad or m] largest tracking error before a fault.
+    """
+
+    max_start_error: float = 0.01
+    max_tracking_error: float = 0.05
+
+
+CONSTANTS = ControllerConstants()
 
 
 class SteppedController:
@@ -24,7 +39,9 @@ class SteppedController:
         InputError: the period or ``following`` is not above 0.
     """
 
-    def __init__(self, position: Array, *, period: float = 1e-3, following: float = FOLLOWING) -> None:
+    def __init__(
+        self, position: Array, *, period: float = 1e-3, following: float = CONSTANTS.max_tracking_error
+    ) -> None:
         if not (0.0 < period < np.inf and following > 0.0):
             raise InputError(f"is {period}.", field="period", hint="give seconds above 0, and a distance above 0")
         self._period, self._following = period, following
@@ -68,7 +85,7 @@ class SteppedController:
         if start.shape != self._position.shape:
             raise ControllerError(f"has {start.size} joints, not {self._position.size}.", field="motion")
         distance = float(np.abs(start - self._position).max())
-        if not distance <= AT_START:
+        if not distance <= CONSTANTS.max_start_error:
             hint = "plan from where the arm is"
             raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="motion", hint=hint)
         self._motion, self._time, self._stopping = motion, 0.0, False
@@ -108,7 +125,7 @@ class SteppedController:
         error = float(np.abs(self._position - self._desired).max())
         if not error <= self._following:
             self.fault(f"{error:.4f} from the trajectory at {self._time:.3f} s")
-        elif self._time >= motion.duration and error <= AT_START:
+        elif self._time >= motion.duration and error <= CONSTANTS.max_start_error:
             self._rest(MotionState.DONE)
 
     def _rest(self, state: MotionState) -> None:

@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike
 
 from splatbot.errors import InputError
 from splatbot.protocols import Array
-from splatbot.robots.controllers.base import FOLLOWING, SteppedController
+from splatbot.robots.controllers.base import CONSTANTS as CONTROLLER
+from splatbot.robots.controllers.base import SteppedController
 
 
 class FakeController(SteppedController):
@@ -32,7 +33,7 @@ class FakeController(SteppedController):
         period: float = 1e-3,
         lag: float = 0.0,
         noise: float = 0.0,
-        following: float = FOLLOWING,
+        following: float = CONTROLLER.max_tracking_error,
         seed: int = 0,
     ) -> None:
         super().__init__(np.asarray(position, dtype=np.float64), period=period, following=following)

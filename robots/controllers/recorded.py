@@ -10,7 +10,8 @@ import numpy as np
 
 from splatbot.errors import LogError
 from splatbot.protocols import Array
-from splatbot.robots.controllers.base import FOLLOWING, SteppedController
+from splatbot.robots.controllers.base import CONSTANTS as CONTROLLER
+from splatbot.robots.controllers.base import SteppedController
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,9 @@ class RecordedController(SteppedController):
         following: see :class:`SteppedController`.
     """
 
-    def __init__(self, recording: JointRecording, *, period: float = 1e-3, following: float = FOLLOWING) -> None:
+    def __init__(
+        self, recording: JointRecording, *, period: float = 1e-3, following: float = CONTROLLER.max_tracking_error
+    ) -> None:
         super().__init__(recording.positions[0], period=period, following=following)
         self._recording = recording
 

@@ -23,8 +23,23 @@ from splatbot.robots.grippers.registers import (
     Status,
 )
 
-_POLL = 0.01  # [s] between two status requests
-_ECHO = 0.5  # [s] within which the status must echo the commanded position
+
+@dataclass(frozen=True)
+class RobotiqConstants:
+    """Constants of the communication with a Robotiq gripper.
+
+    Args:
+        poll_period: [s] time between two status requests.
+        echo_timeout: [s] time within which the status must echo the commanded position.
+    """
+
+    poll_period: float = 0.01
+    echo_timeout: float = 0.5
+
+
+CONSTANTS = RobotiqConstants()
+
+
 _log = logging.getLogger(__name__)
 
 
@@ -255,7 +270,7 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
 
     def _status(self) -> Status:
         """Read the status until its echo matches the last command; an older status describes an earlier motion."""
-        until = time.monotonic() + _ECHO
+        until = time.monotonic() + CONSTANTS.echo_timeout
         while True:
             status = self._read()
             if status.fault == NO_COMMUNICATION:
@@ -267,7 +282,7 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
             if time.monotonic() > until:
                 hint = "check that nothing else commands it; activate it"
                 raise GripperError("does not echo the last command.", field=self._port, hint=hint)
-            time.sleep(_POLL)
+            time.sleep(CONSTANTS.poll_period)
 
     def _read(self) -> Status:
         return Status.from_bytes(self._open_client.read(STATUS, REGISTERS))
@@ -285,7 +300,7 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
                 raise GripperError(
                     f"{failure} after {seconds:g} s.", field=self._port, hint="check its power; activate it"
                 )
-            time.sleep(_POLL)
+            time.sleep(CONSTANTS.poll_period)
 
     @contextmanager
     def _secured(self) -> Iterator[None]:

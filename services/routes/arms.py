@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Request, Response
 
-from splatbot.services.codecs import body_of, takes
+from splatbot.services.codecs import body_of, request_body
 from splatbot.services.dependencies import Service, example, problems
 from splatbot.services.leases import Lease
 from splatbot.services.schemas import LeaseInfo, LeaseRequest, StopInfo
@@ -50,7 +50,7 @@ def get_arm(service: Service, name: _Name) -> dict[str, Any]:
     "/arms/{name}/lease",
     status_code=201,
     responses=_TAKEN | problems(409, 415, 422),
-    openapi_extra=takes(LeaseRequest, {"ten seconds": {"seconds": 10.0}}),
+    openapi_extra=request_body(LeaseRequest, {"ten seconds": {"seconds": 10.0}}),
 )
 def take_lease(
     service: Service,

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request, Response
 
-from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in
@@ -40,8 +40,8 @@ _Body = Annotated[CollisionsRequest, Depends(body_of(CollisionsRequest, array="q
 @router.post(
     "/{map_id}/collisions",
     response_class=Response,
-    responses=gives(_ANSWER, npy="in_collision (C,) bool") | problems(404, 413, 415, 422, 503),
-    openapi_extra=takes(CollisionsRequest, _EXAMPLES, npy="q (C, 7) for a Panda in a map that knows its base"),
+    responses=answers(_ANSWER, npy="in_collision (C,) bool") | problems(404, 413, 415, 422, 503),
+    openapi_extra=request_body(CollisionsRequest, _EXAMPLES, npy="q (C, 7) for a Panda in a map that knows its base"),
 )
 def collisions(request: Request, served: ServedAfterFrames, settings: Settings, query: _Body) -> Response:
     """Check each configuration: verdict, colliding link, its partner (`other`; -1 is the map), and clearance.

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
 
-from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import DistanceRequest
@@ -25,8 +25,8 @@ _Body = Annotated[DistanceRequest, Depends(body_of(DistanceRequest, array="point
 @router.post(
     "/{map_id}/distance",
     response_class=Response,
-    responses=gives(_ANSWER, npy="distance (P,) float32") | problems(404, 413, 415, 422, 503),
-    openapi_extra=takes(DistanceRequest, _EXAMPLES, npy="points (P, 3)"),
+    responses=answers(_ANSWER, npy="distance (P,) float32") | problems(404, 413, 415, 422, 503),
+    openapi_extra=request_body(DistanceRequest, _EXAMPLES, npy="points (P, 3)"),
 )
 def distance(request: Request, served: ServedAfterFrames, settings: Settings, query: _Body) -> Response:
     """Return each point's Mahalanobis distance to the nearest Gaussian, that Gaussian's row, and a verdict.

@@ -16,7 +16,7 @@ from pydantic import Field, field_validator
 from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.frame import Frame
-from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import Served, Service, problems
 from splatbot.services.problems import BusyError, TooLargeError
 from splatbot.services.recordings import checked_picture
@@ -88,8 +88,8 @@ _Body = Annotated[FrameRequest, Depends(body_of(FrameRequest))]
 @router.post(
     "/{map_id}/frames",
     response_class=Response,
-    responses=gives(_ANSWER) | problems(404, 409, 413, 415, 422, 503),
-    openapi_extra=takes(FrameRequest, {"a small frame": _example()}),
+    responses=answers(_ANSWER) | problems(404, 409, 413, 415, 422, 503),
+    openapi_extra=request_body(FrameRequest, {"a small frame": _example()}),
 )
 def push_frame(request: Request, served: Served, service: Service, query: _Body) -> Response:
     """Track a frame and map it; the answer says where the camera was. 503: as many frames wait as may."""

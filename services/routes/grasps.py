@@ -15,7 +15,7 @@ from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.summary import summary
 from splatbot.services.arms import known_robot
-from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
@@ -44,8 +44,8 @@ _Body = Annotated[GraspsRequest, Depends(body_of(GraspsRequest))]
 @router.post(
     "/{map_id}/grasps",
     response_class=Response,
-    responses=gives(_ANSWER) | problems(404, 415, 422, 503),
-    openapi_extra=takes(GraspsRequest, _EXAMPLES),
+    responses=answers(_ANSWER) | problems(404, 415, 422, 503),
+    openapi_extra=request_body(GraspsRequest, _EXAMPLES),
 )
 def grasps(request: Request, served: ServedAfterFrames, service: Service, query: _Body) -> Response:
     """Rank grasps of one object with each term of their scores; no grasp is a problem with the reasons.

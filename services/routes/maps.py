@@ -17,7 +17,7 @@ from starlette.responses import FileResponse
 
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.formats import WRITTEN, save_gaussians
-from splatbot.services.codecs import ZIP, answer, body_of, gives, takes
+from splatbot.services.codecs import ZIP, answer, answers, body_of, request_body
 from splatbot.services.dependencies import (
     IdempotencyKey,
     Served,
@@ -75,7 +75,7 @@ def list_maps(store: Store) -> MapList:
     responses=starts("a job maps the recording")
     | {201: {"description": "an empty map, to which frames can be pushed", "model": MapInfo}}
     | problems(409, 415, 422, 503),
-    openapi_extra=takes(MapRequest, _CREATE),
+    openapi_extra=request_body(MapRequest, _CREATE),
 )
 def create_map(
     query: Annotated[MapRequest, Depends(body_of(MapRequest))], service: Service, key: IdempotencyKey
@@ -190,7 +190,7 @@ def export_map(served: Served, request: Request, format: _FormatName) -> Respons
 @router.get(
     "/{map_id}/trajectory",
     response_class=Response,
-    responses=gives(
+    responses=answers(
         {
             "map_version": 12,
             "stamps": [0.0, 0.033],

@@ -10,7 +10,7 @@ from splatbot.errors import InputError
 from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_types import PickOptions, PickStage, PickStep
-from splatbot.services.codecs import body_of, plain, takes
+from splatbot.services.codecs import body_of, plain, request_body
 from splatbot.services.dependencies import IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobCancelled, JobHandle
 from splatbot.services.problems import TooLargeError
@@ -32,7 +32,7 @@ _STAGES = list(PickStage)
     status_code=202,
     responses=starts("a job picks it; its result holds the outcome, each stage, and the lift of each object")
     | problems(404, 409, 413, 415, 422, 503),
-    openapi_extra=takes(PicksRequest, _EXAMPLES),
+    openapi_extra=request_body(PicksRequest, _EXAMPLES),
 )
 def pick(
     service: Service, query: Annotated[PicksRequest, Depends(body_of(PicksRequest))], key: IdempotencyKey

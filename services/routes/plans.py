@@ -11,7 +11,7 @@ from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal, time_path
 from splatbot.planning.ik import solve_ik
 from splatbot.services.arms import known_robot
-from splatbot.services.codecs import answer, body_of, gives, takes
+from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
@@ -52,8 +52,8 @@ _PlanBody = Annotated[PlanRequest, Depends(body_of(PlanRequest))]
 @router.post(
     "/v1/maps/{map_id}/plans",
     response_class=Response,
-    responses=gives(_ANSWER) | problems(404, 413, 415, 422, 503),
-    openapi_extra=takes(PlanRequest, _EXAMPLES),
+    responses=answers(_ANSWER) | problems(404, 413, 415, 422, 503),
+    openapi_extra=request_body(PlanRequest, _EXAMPLES),
 )
 def plan(request: Request, served: ServedAfterFrames, service: Service, query: _PlanBody) -> Response:
     """Plan a certified motion; `trajectory` is a ROS JointTrajectory, `id` is for POST /v1/trajectories.
@@ -78,7 +78,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     return answer(request, _description(kept, query.rate))
 
 
-@router.get("/v1/plans/{plan_id}", response_class=Response, responses=gives(_ANSWER) | problems(404))
+@router.get("/v1/plans/{plan_id}", response_class=Response, responses=answers(_ANSWER) | problems(404))
 def get_plan(
     request: Request,
     service: Service,
@@ -91,8 +91,8 @@ def get_plan(
 @router.post(
     "/v1/ik",
     response_class=Response,
-    responses=gives(_IK_ANSWER, npy="q (K, J)") | problems(404, 415, 422, 503),
-    openapi_extra=takes(IkRequest, _IK_EXAMPLES),
+    responses=answers(_IK_ANSWER, npy="q (K, J)") | problems(404, 415, 422, 503),
+    openapi_extra=request_body(IkRequest, _IK_EXAMPLES),
 )
 def ik(request: Request, service: Service, query: Annotated[IkRequest, Depends(body_of(IkRequest))]) -> Response:
     """Solve the IK of a tool pose, nearest to `near` first; with `map`, keep solutions that are free in it."""

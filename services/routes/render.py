@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.rasterize.views import default_view, depth_limits, render_view, to_png
-from splatbot.services.codecs import body_of, takes
+from splatbot.services.codecs import body_of, request_body
 from splatbot.services.dependencies import (
     Served,
     ServedAfterFrames,
@@ -65,7 +65,7 @@ def render_default(
     "/{map_id}/render",
     response_class=Response,
     responses=_PNG | problems(404, 413, 415, 422, 503),
-    openapi_extra=takes(RenderRequest, _EXAMPLES),
+    openapi_extra=request_body(RenderRequest, _EXAMPLES),
 )
 def render(
     served: ServedAfterFrames,

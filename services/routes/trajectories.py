@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Path, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from splatbot.protocols import Feedback
-from splatbot.services.codecs import body_of, plain, takes
+from splatbot.services.codecs import body_of, plain, request_body
 from splatbot.services.dependencies import IdempotencyKey, Service, example, problems
 from splatbot.services.jobs import ENDED, Job
 from splatbot.services.routes.jobs import JOB, accepted, info, starts
@@ -18,6 +18,7 @@ from splatbot.services.topics import job_topic, motion_topic
 
 router = APIRouter(prefix="/v1", tags=["motion"])
 
+_EXAMPLE = {"plan": "0d6c1b7f2a3e4f50", "arm": "fake", "lease": "5b8e"}
 _JOB = JOB | {"kind": "trajectory", "detail": None}
 _MotionId = Annotated[str, Path(description="as the 202 answer named it", examples=["5f0c2a9b1d3e4f60"])]
 
@@ -30,7 +31,9 @@ def _motion(service: Service, job_id: _MotionId) -> Job:
     "/trajectories",
     status_code=202,
     responses=starts("the arm moves") | problems(404, 409, 415, 422, 503),
-    openapi_extra=takes(TrajectoryRequest, {"a plan": {"plan": "0d6c1b7f2a3e4f50", "arm": "fake", "lease": "5b8e"}}),
+    openapi_extra=request_body(
+        TrajectoryRequest, {"a plan": {"plan": "0d6c1b7f2a3e4f50", "arm": "fake", "lease": "5b8e"}}
+    ),
 )
 def send_trajectory(
     service: Service,

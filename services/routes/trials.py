@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Response
 
 from splatbot.errors import InputError
 from splatbot.planning import JointTrajectory
-from splatbot.services.codecs import body_of, plain, takes
+from splatbot.services.codecs import body_of, plain, request_body
 from splatbot.services.dependencies import IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobHandle
 from splatbot.services.robots_in_maps import base_in
@@ -26,7 +26,7 @@ router = APIRouter(prefix="/v1/sim", tags=["simulation"])
     "/trials",
     status_code=202,
     responses=starts("a job runs the trials; its result holds one entry for each") | problems(404, 415, 422, 503),
-    openapi_extra=takes(
+    openapi_extra=request_body(
         TrialsRequest,
         {
             "three displaced scenes": {"scene": "tabletop_clutter", "trials": 3},

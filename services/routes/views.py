@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.rasterize.views import render_view, to_png
-from splatbot.services.codecs import MSGPACK, NPY, answer, body_of, gives, takes
+from splatbot.services.codecs import MSGPACK, NPY, answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.routes.render import check_size
@@ -36,8 +36,8 @@ _Body = Annotated[ViewsRequest, Depends(body_of(ViewsRequest))]
 @router.post(
     "/{map_id}/views",
     response_class=Response,
-    responses=gives(_ANSWER, npy="of one mode and one size: (N, H, W[, 3])") | problems(404, 413, 415, 422, 503),
-    openapi_extra=takes(ViewsRequest, _EXAMPLES),
+    responses=answers(_ANSWER, npy="of one mode and one size: (N, H, W[, 3])") | problems(404, 413, 415, 422, 503),
+    openapi_extra=request_body(ViewsRequest, _EXAMPLES),
 )
 def views(request: Request, served: ServedAfterFrames, settings: Settings, query: _Body) -> Response:
     """Render the view of each camera.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,11 +26,28 @@ from splatbot.services.viewer.door import Check, guarded, no_connection
 from splatbot.services.viewer.splats import Coloring, pieces
 from splatbot.trajectory import Trajectory
 
-_MOST_FRUSTA = 60
-_FRUSTUM = 0.04  # [m]
-_ROOM = 0.1  # [m] of clearance and more is green
+
+@dataclass(frozen=True)
+class ViewerSceneConstants:
+    """Constants of the viewer's scene.
+
+    Args:
+        max_frusta: largest number of shown cameras.
+        frustum: [m] size of a camera.
+        full_clearance: [m] an arm with at least this clearance is green.
+        path_points: points of a shown path.
+    """
+
+    max_frusta: int = 60
+    frustum: float = 0.04
+    full_clearance: float = 0.1
+    path_points: int = 60
+
+
+CONSTANTS = ViewerSceneConstants()
+
+
 _GREY, _BLUE, _AMBER = (150, 150, 150), (40, 120, 255), (255, 170, 0)
-_PATH_POINTS = 60
 
 
 def open_server(host: str, port: int, check: Check = no_connection) -> viser.ViserServer:
@@ -111,7 +129,9 @@ class ViewerScene:
         if len(at) >= 2:
             lines = np.stack([at[:-1], at[1:]], axis=1)
             self._server.scene.add_line_segments("/camera/way", lines, _BLUE, thickness=0.002)
-        chosen = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MOST_FRUSTA)).astype(int)) if len(at) else ()
+        chosen = (
+            np.unique(np.linspace(0, len(at) - 1, min(len(at), CONSTANTS.max_frusta)).astype(int)) if len(at) else ()
+        )
         for number, i in enumerate(chosen):
             self._frustum(f"/camera/frusta/{number}", trajectory.T_world_camera[i], camera, _GREY)
 
@@ -141,7 +161,7 @@ class ViewerScene:
 
     def show_plan(self, arm: RobotSpheres, plan: JointTrajectory) -> None:
         """Show the tool's path along a planned motion."""
-        q = plan.at(np.linspace(0.0, plan.duration, _PATH_POINTS)).position
+        q = plan.at(np.linspace(0.0, plan.duration, CONSTANTS.path_points)).position
         last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])
         at = arm.centers(q)[:, last].astype(np.float32)
         lines = np.stack([at[:-1], at[1:]], axis=1)
@@ -169,7 +189,7 @@ class ViewerScene:
             name,
             float(fov),
             aspect,
-            scale=_FRUSTUM,
+            scale=CONSTANTS.frustum,
             color=color,
             wxyz=rotation_to_quat(T[:3, :3]),
             position=T[:3, 3],
@@ -182,7 +202,7 @@ def clearance_colors(
     """Color spheres (S, 3), (S,) [m] by clearance: red at 0, yellow at 5 cm, green from 10 cm; grey without a map."""
     if field is None or not len(field):
         return np.tile(np.array(_GREY, np.uint8), (len(centers), 1))
-    clearance = field.clearance(np.column_stack([centers, radii]), cut=_ROOM).distance
-    share = np.clip(clearance / _ROOM, 0.0, 1.0)
+    clearance = field.clearance(np.column_stack([centers, radii]), cut=CONSTANTS.full_clearance).distance
+    share = np.clip(clearance / CONSTANTS.full_clearance, 0.0, 1.0)
     red, green = np.clip(2 - 2 * share, 0, 1), np.clip(2 * share, 0, 1)
     return np.rint(255 * np.column_stack([red, green, 0.1 * np.ones_like(share)])).astype(np.uint8)

@@ -21,9 +21,23 @@ from splatbot.rasterize.views import facing_normals
 Coloring = Literal["rgb", "depth", "normal", "uncertainty"]
 COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
 
-_EDGE = 0.5  # [m] of a piece
-_MOST_PIECES = 256
-_LEAST_VARIANCE = 1.2e-7  # [m²]: covariances travel as 16-bit floats, whose steps are 6e-8 here
+
+@dataclass(frozen=True)
+class SplatConstants:
+    """Constants of splats in the viewer.
+
+    Args:
+        edge: [m] edge length of a piece.
+        max_pieces: largest number of pieces.
+        min_variance: [m²] covariances travel as 16-bit floats, whose steps are 6e-8 here.
+    """
+
+    edge: float = 0.5
+    max_pieces: int = 256
+    min_variance: float = 1.2e-7
+
+
+CONSTANTS = SplatConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +77,14 @@ def pieces(
     if not len(model):
         return {}
     means = model.means.numpy()
-    edge = _EDGE
-    while len(keys := np.unique(np.floor(means / edge).astype(np.int64), axis=0)) > _MOST_PIECES:
+    edge = CONSTANTS.edge
+    while len(keys := np.unique(np.floor(means / edge).astype(np.int64), axis=0)) > CONSTANTS.max_pieces:
         edge *= 2
     keys, piece = np.unique(np.floor(means / edge).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(piece.ravel(), kind="stable")
     bounds = np.searchsorted(piece.ravel()[order], np.arange(len(keys) + 1))
     with torch.no_grad():
-        spread = covariances(model).numpy() + np.eye(3, dtype=np.float32) * np.float32(_LEAST_VARIANCE)
+        spread = covariances(model).numpy() + np.eye(3, dtype=np.float32) * np.float32(CONSTANTS.min_variance)
         opacity = model.opacities.numpy()[:, None]
     rgb = colors(model, coloring, T_world_camera=T_world_camera)
     found = {}

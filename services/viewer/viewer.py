@@ -27,8 +27,22 @@ from splatbot.services.viewer.splats import COLORINGS, Coloring
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
 
-_PERIOD_S = 0.5
-_WAITING = 256
+
+@dataclass(frozen=True)
+class ViewerConstants:
+    """Constants of the viewer.
+
+    Args:
+        period: [s] time between two updates.
+        max_waiting: largest number of messages that wait.
+    """
+
+    period: float = 0.5
+    max_waiting: int = 256
+
+
+CONSTANTS = ViewerConstants()
+
 
 _log = logging.getLogger(__name__)
 
@@ -83,7 +97,7 @@ class Viewer:
         self._coloring: Coloring = "rgb"
         self._stale = False
         self._add_controls()
-        self._reader = store.bus.subscribe("maps/*", "robot/*/joints", capacity=_WAITING)
+        self._reader = store.bus.subscribe("maps/*", "robot/*/joints", capacity=CONSTANTS.max_waiting)
         self._stopping = threading.Event()
         work = {"viewer-collect": self._collect, "viewer-draw": self._draw}
         self._threads = [threading.Thread(target=run, name=name, daemon=True) for name, run in work.items()]
@@ -159,7 +173,7 @@ class Viewer:
                 self._show(news)
             except Exception:  # one odd value must not end the view
                 _log.exception("the viewer could not show the update")
-            self._stopping.wait(max(_PERIOD_S - (time.monotonic() - begun), 0.05))
+            self._stopping.wait(max(CONSTANTS.period - (time.monotonic() - begun), 0.05))
 
     def _show(self, news: _News) -> None:
         self._camera = news.camera or self._camera

@@ -17,16 +17,41 @@ from splatbot.sim.solids import CapsuleGeom, CylinderGeom, Shape, SphereGeom, ro
 from splatbot.sim.twin import Twin, TwinResult
 from splatbot.sim.world import OBJECT
 
-NEAR = 0.03  # [m] from the goal within which the task succeeds
-_UPRIGHT = float(np.cos(0.5))  # an object that leans by more than 0.5 rad has tipped over
-_TIP = 0.01  # [m] from the tool frame to the finger tips
-_TILT = np.pi / 4  # [rad] of the tool from straight down, so that the fingers and not the hand make contact
-_MIN_HEIGHT = 0.03  # [m] of the tool over the table
-_RUN_UP = 0.05  # [m] before contact
-_START_HEIGHT = 0.25  # [m] over the table
-_APPROACH, _DESCENT, _REST = 2.0, 1.0, 0.5  # [s]
-_MAX_POSTURES = 8  # postures above the object that are tried
-_RATE = 50.0  # [Hz] of the samples; between them a motion is a cubic
+
+@dataclass(frozen=True)
+class PushConstants:
+    """Constants of pushes.
+
+    Args:
+        goal_radius: [m] distance from the goal within which the task succeeds.
+        upright_cosine: an object that leans by more than 0.5 rad has tipped over.
+        tip: [m] distance from the tool frame to the finger tips.
+        tilt: [rad] tilt of the tool from straight down, so that the fingers and not the hand make contact.
+        min_height: [m] height of the tool over the table.
+        run_up: [m] distance before contact.
+        start_height: [m] height of the start over the table.
+        approach: [s] time of the approach.
+        descent: [s] time of the descent.
+        rest: [s] time at rest.
+        max_postures: postures above the object that are tried.
+        rate: [Hz] samples per second; between them a motion is a cubic.
+    """
+
+    goal_radius: float = 0.03
+    upright_cosine: float = float(np.cos(0.5))
+    tip: float = 0.01
+    tilt: float = np.pi / 4
+    min_height: float = 0.03
+    run_up: float = 0.05
+    start_height: float = 0.25
+    approach: float = 2.0
+    descent: float = 1.0
+    rest: float = 0.5
+    max_postures: int = 8
+    rate: float = 50.0
+
+
+CONSTANTS = PushConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +91,11 @@ class PushTask(MapTask[PushCase]):
         if result.stopped is not None:
             return "; ".join(result.warnings) or "stopped"
         body = twin.data.body(OBJECT + name)
-        if float(np.asarray(body.xmat)[8]) < _UPRIGHT:
+        if float(np.asarray(body.xmat)[8]) < CONSTANTS.upright_cosine:
             return "tipped over"
         moved = np.asarray(body.xpos)[:2] - np.asarray(objects[name].at)[:2]
         error = moved - case.distance * case.direction
-        if np.linalg.norm(error) <= NEAR:
+        if np.linalg.norm(error) <= CONSTANTS.goal_radius:
             return ""
         along = float(error @ case.direction)
         lateral = float(np.linalg.norm(error - along * case.direction))
@@ -102,23 +127,28 @@ class Pusher:
         d = np.append(case.direction, 0.0)
         back, tall = extents(case.believed, d)
         middle = np.asarray(case.believed.at) * [1, 1, 0] + self.offset * np.array([-d[1], d[0], 0.0])
-        z = np.array([0.0, 0.0, max(_MIN_HEIGHT, self.height * tall)])
-        begin, end = middle - (back + _TIP + _RUN_UP) * d + z, middle + (case.distance - back - _TIP) * d + z
-        above = np.array([begin[0], begin[1], _START_HEIGHT])
-        z_tool = np.sin(_TILT) * d - np.array([0.0, 0.0, np.cos(_TILT)])
+        z = np.array([0.0, 0.0, max(CONSTANTS.min_height, self.height * tall)])
+        begin, end = (
+            middle - (back + CONSTANTS.tip + CONSTANTS.run_up) * d + z,
+            middle + (case.distance - back - CONSTANTS.tip) * d + z,
+        )
+        above = np.array([begin[0], begin[1], CONSTANTS.start_height])
+        z_tool = np.sin(CONSTANTS.tilt) * d - np.array([0.0, 0.0, np.cos(CONSTANTS.tilt)])
         y_tool = np.array([d[1], -d[0], 0.0])  # as at home: the opposite sign is near the wrist's limits
         return self._motion(above, begin, end, np.stack([np.cross(y_tool, z_tool), y_tool, z_tool], axis=1))
 
     def _motion(self, above: Array, begin: Array, end: Array, R: Array) -> PolicyAction | None:
         """Return the motion from the first posture above the object whose whole path is within the joint limits."""
-        stretch = max(float(np.linalg.norm(end - begin)) / self.speed, 2 / _RATE)
-        times, places = _sampled_lines([(above, begin, _DESCENT), (begin, end, stretch), (end, end, _REST)])
-        for first in solve_ik(self.robot, _pose(R, above), near=self.robot.home).q[:_MAX_POSTURES]:
+        stretch = max(float(np.linalg.norm(end - begin)) / self.speed, 2 / CONSTANTS.rate)
+        times, places = _sampled_lines(
+            [(above, begin, CONSTANTS.descent), (begin, end, stretch), (end, end, CONSTANTS.rest)]
+        )
+        for first in solve_ik(self.robot, _pose(R, above), near=self.robot.home).q[: CONSTANTS.max_postures]:
             q = self._along(first, places, R)
             if q is not None:
-                t = np.arange(0.0, _APPROACH, 1 / _RATE)
-                approach = minimum_jerk(t, np.array([0.0, _APPROACH]), np.stack([self.robot.home, first]), 0)
-                motion = motion_from_samples(np.append(t, _APPROACH + times), np.concatenate([approach, q]))
+                t = np.arange(0.0, CONSTANTS.approach, 1 / CONSTANTS.rate)
+                approach = minimum_jerk(t, np.array([0.0, CONSTANTS.approach]), np.stack([self.robot.home, first]), 0)
+                motion = motion_from_samples(np.append(t, CONSTANTS.approach + times), np.concatenate([approach, q]))
                 return PolicyAction(replace(motion, opening=np.zeros(len(motion.time))))
         return None
 
@@ -136,7 +166,7 @@ def _sampled_lines(lines: Sequence[tuple[Array, Array, float]]) -> tuple[Array, 
     """Sample times (N,) [s] and positions (N, 3) on lines (from, to, seconds), with rest at the end of each."""
     times, places, now = [], [], 0.0
     for a, b, seconds in lines:
-        t = np.linspace(0.0, seconds, max(3, round(seconds * _RATE)), endpoint=False)
+        t = np.linspace(0.0, seconds, max(3, round(seconds * CONSTANTS.rate)), endpoint=False)
         times.append(now + t)
         places.append(minimum_jerk(t, np.array([0.0, seconds]), np.stack([a, b]), 0))
         now += seconds

@@ -14,9 +14,23 @@ from splatbot.sim.compare.trials import MapTask, PolicyAction
 from splatbot.sim.motion import motion_from_trajectory
 from splatbot.sim.twin import Twin, TwinResult
 
-_GOAL_TOLERANCE = 0.02  # [rad] in every joint
-_BUDGET_MS = 10_000.0  # ample: iterations end a search, not time, so equal calls give equal paths
-_CUTS = 100  # shortcut attempts
+
+@dataclass(frozen=True)
+class ReachConstants:
+    """Constants of reaches.
+
+    Args:
+        goal_tolerance: [rad] largest error of every joint.
+        budget_ms: [ms] ample: iterations end a search, not time, so equal calls give equal paths.
+        cuts: shortcut attempts.
+    """
+
+    goal_tolerance: float = 0.02
+    budget_ms: float = 10_000.0
+    cuts: int = 100
+
+
+CONSTANTS = ReachConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +59,7 @@ class ReachTask(MapTask[ReachCase]):
         if result.stopped is not None or twin.follower is None:
             return "; ".join(result.warnings) or "stopped"
         error = float(np.abs(np.asarray(twin.data.qpos)[twin.follower.qpos] - case.goal).max())
-        return f"{1e3 * error:.0f} mrad from the goal" if error > _GOAL_TOLERANCE else ""
+        return f"{1e3 * error:.0f} mrad from the goal" if error > CONSTANTS.goal_tolerance else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +107,7 @@ class Shortcut:
             return None
         rng = np.random.default_rng(case.seed)
         q = path.waypoints
-        for _ in range(_CUTS):
+        for _ in range(CONSTANTS.cuts):
             q = self._cut(q, rng)
         return _timed(self.planner, _uncertified(q), 1.0, certified=False)
 
@@ -156,7 +170,9 @@ def reach_policies(
 
 
 def _path(planner: GaussianRRTStar, case: ReachCase, iterations: int) -> Path | None:
-    return planner.plan(case.start, case.goal, budget_ms=_BUDGET_MS, seed=case.seed, iterations=iterations).path
+    return planner.plan(
+        case.start, case.goal, budget_ms=CONSTANTS.budget_ms, seed=case.seed, iterations=iterations
+    ).path
 
 
 def _uncertified(waypoints: Array) -> Path:

@@ -20,10 +20,27 @@ from splatbot.workspace import Workspace, find_workspace
 TOOL_POSES = "ee_poses.txt"
 _MOUNT = "ee_T_camera"
 _INTRINSICS = "intrinsics.json"
-_OUTLIER = 3.0  # times the median difference
+
+
+@dataclass(frozen=True)
+class RecordedConstants:
+    """Constants of the comparison with recorded poses.
+
+    Args:
+        outlier: [median] an outlier's difference exceeds this multiple of the median.
+        iterations: rounds of outlier removal.
+        max_stamp_error: [s] largest difference between the stamps of a pose and a frame.
+    """
+
+    outlier: float = 3.0
+    iterations: int = 4
+    max_stamp_error: float = 0.01
+
+
+CONSTANTS = RecordedConstants()
+
+
 _TOLERANCE = np.array([1e-3, 2e-3])  # [m], [rad] differences that are never outliers
-_ITERATIONS = 4
-_MAX_STAMP_ERROR = 0.01  # [s] between the stamps of a pose and a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +64,11 @@ class ArmRecord:
         if self.tool is None or not len(self.tool):
             return None
         k = int(np.argmin(np.abs(self.tool.stamps - stamp)))
-        return self.tool.T_world_camera[k] if abs(float(self.tool.stamps[k]) - stamp) <= _MAX_STAMP_ERROR else None
+        return (
+            self.tool.T_world_camera[k]
+            if abs(float(self.tool.stamps[k]) - stamp) <= CONSTANTS.max_stamp_error
+            else None
+        )
 
     def camera_at(self, stamp: float, robot: RobotModel) -> Array | None:
         """Return T_base_camera (4, 4) from the tool's pose or else from the joints, or None if neither is recorded."""
@@ -139,10 +160,10 @@ def base_in_map(T_base_camera: Mapping[int, Array], T_world_camera: Mapping[int,
         )
     theirs, ours = (np.array([poses[i] for i in frames]) for poses in (T_base_camera, T_world_camera))
     kept = np.ones(len(frames), np.bool_)
-    for _ in range(_ITERATIONS):
+    for _ in range(CONSTANTS.iterations):
         T = _between(theirs[kept], ours[kept])
         gaps = np.array([pose_gap(T @ a, b) for a, b in zip(theirs, ours, strict=True)])
-        limit = np.maximum(_OUTLIER * np.median(gaps, axis=0), _TOLERANCE)
+        limit = np.maximum(CONSTANTS.outlier * np.median(gaps, axis=0), _TOLERANCE)
         again = (gaps <= limit).all(axis=1)
         if (again == kept).all():
             break

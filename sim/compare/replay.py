@@ -18,11 +18,28 @@ from splatbot.sim.twin import Twin
 
 BY_IK = "joints by IK, not recorded"
 RECORDED = "recorded joints"
-_STATIC_SPACING = 0.5  # [s] between frames from which the log is one of separate static poses
-_RATE = 250.0  # [Hz] at which the motion between rests is sampled
-_PEAK = 1.875  # peak over mean speed of a minimum-jerk motion
-_SPEED_FRACTION = 0.9  # of the joints' speed limits
-_DWELL = 0.1  # [s] at rest at each pose until the tool pose is read
+
+
+@dataclass(frozen=True)
+class ReplayConstants:
+    """Constants of the replay of a log.
+
+    Args:
+        static_spacing: [s] time between frames from which the log is one of separate static poses.
+        rate: [Hz] samples per second of the motion between rests.
+        peak: peak over mean speed of a minimum-jerk motion.
+        speed_share: fraction of the joints' speed limits.
+        dwell: [s] time at rest at each pose until the tool pose is read.
+    """
+
+    static_spacing: float = 0.5
+    rate: float = 250.0
+    peak: float = 1.875
+    speed_share: float = 0.9
+    dwell: float = 0.1
+
+
+CONSTANTS = ReplayConstants()
 
 
 @dataclass(frozen=True)
@@ -61,9 +78,8 @@ class Replay:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the replay as values for JSON; contacts are ``touches`` and the clearance is ``room`` there."""
-        values = asdict(self)
-        return values | {"touches": values.pop("contacts"), "room": values.pop("clearance")}
+        """Return the replay as values for JSON."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,16 +181,18 @@ def replay(knots: Knots, twin: Twin) -> Replay:
 def _motion(knots: Knots, robot: RobotModel) -> tuple[JointMotion, Array, float]:
     """Return the motion, the times (K,) [s] of its knots, and the factor by which it is slower than recorded."""
     spans = np.diff(knots.stamps)
-    if np.median(spans) < _STATIC_SPACING:
-        speed = np.abs(np.gradient(knots.q, knots.stamps, axis=0)) / (_SPEED_FRACTION * robot.chain.velocity)
+    if np.median(spans) < CONSTANTS.static_spacing:
+        speed = np.abs(np.gradient(knots.q, knots.stamps, axis=0)) / (CONSTANTS.speed_share * robot.chain.velocity)
         slower = max(1.0, float(speed.max()))
         ends = slower * (knots.stamps - knots.stamps[0])
         return motion_from_samples(ends, knots.q), ends, slower
-    least = (_PEAK * np.abs(np.diff(knots.q, axis=0)) / (_SPEED_FRACTION * robot.chain.velocity)).max(axis=1) + _DWELL
+    least = (CONSTANTS.peak * np.abs(np.diff(knots.q, axis=0)) / (CONSTANTS.speed_share * robot.chain.velocity)).max(
+        axis=1
+    ) + CONSTANTS.dwell
     slower = float(np.maximum(least / spans, 1.0).max())
     ends = slower * (knots.stamps - knots.stamps[0])
-    times = np.sort(np.concatenate([ends, ends[1:] - _DWELL]))  # arrive a little early and rest
+    times = np.sort(np.concatenate([ends, ends[1:] - CONSTANTS.dwell]))  # arrive a little early and rest
     at = np.repeat(knots.q, 2, axis=0)[1:]
-    t = np.unique(np.concatenate([np.arange(0.0, times[-1], 1 / _RATE), times]))
+    t = np.unique(np.concatenate([np.arange(0.0, times[-1], 1 / CONSTANTS.rate), times]))
     q, v, a = (minimum_jerk(t, times, at, order) for order in range(3))
     return JointMotion(t, q, v, a), ends, slower

@@ -115,10 +115,8 @@ class Trial:
     why_held_out: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the trial as values for JSON; the clearances are ``room_*`` and the contact is ``touched`` there."""
-        values = asdict(self)
-        old = {"room_map": "clearance_map", "room_held_out": "clearance_held_out", "touched": "in_contact"}
-        return values | {key: values.pop(name) for key, name in old.items()}
+        """Return the trial as values for JSON."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +164,7 @@ class TrialResults:
                 "task": self.task,
                 "cases": len(self.cases),
                 "agreement": None if found is None else asdict(found),
-                "reliability": [_with_old_key(asdict(row)) for row in self.reliability()],
+                "reliability": [asdict(row) for row in self.reliability()],
                 "trials": [trial.to_dict() for trial in self.trials],
                 "interrupted": self.interrupted,
             }
@@ -227,10 +225,6 @@ def _trial(
         why_map=why_map,
         why_held_out=why_held_out,
     )
-
-
-def _with_old_key(row: dict[str, Any]) -> dict[str, Any]:
-    return row | {"touched": row.pop("in_contact")}
 
 
 def join(a: TrialResults, b: TrialResults) -> TrialResults:

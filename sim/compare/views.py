@@ -24,11 +24,28 @@ from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.solids import rpy_of
 from splatbot.sim.world import World, build_world
 
-ABOVE = 0.01  # [m] over the support plane; lower points are sensor noise of the plane
-_MIN_OPACITY = 0.3  # of Gaussians that count as surface
-_BELOW_SUPPORT = 0.05  # [m] of the map below the support plane that the twin keeps
-_RAYS = 160  # across an image of the collision geometry
-_MAX_RANGE = 20.0  # [m]
+
+@dataclass(frozen=True)
+class ViewConstants:
+    """Constants of views of maps and twins.
+
+    Args:
+        min_height: [m] height over the support plane; lower points are sensor noise of the plane.
+        min_opacity: least opacity of Gaussians that count as surface.
+        below_support: [m] depth of the map below the support plane that the twin keeps.
+        rays: rays across an image of the collision geometry.
+        max_range: [m] length of the rays.
+    """
+
+    min_height: float = 0.01
+    min_opacity: float = 0.3
+    below_support: float = 0.05
+    rays: int = 160
+    max_range: float = 20.0
+
+
+CONSTANTS = ViewConstants()
+
 
 Mask = NDArray[np.bool_]
 
@@ -116,7 +133,7 @@ class Surroundings:
         """Return whether points (..., 3) [m] in the base frame are in the simulated part above the support plane."""
         if self.support is None:
             return np.zeros(points.shape[:-1], np.bool_)
-        return np.asarray(self.inside(points) & (self.support.height(points) > ABOVE))
+        return np.asarray(self.inside(points) & (self.support.height(points) > CONSTANTS.min_height))
 
 
 def surroundings(
@@ -134,14 +151,16 @@ def surroundings(
     T_base_world = inverse(T_world_base)
     points = transform_points(T_base_world, model.means.detach().double().numpy())
     shoulder, reach = _reach(robot)
-    near = (np.linalg.norm(points - shoulder, axis=1) < reach) & (model.opacities.detach().numpy() >= _MIN_OPACITY)
+    near = (np.linalg.norm(points - shoulder, axis=1) < reach) & (
+        model.opacities.detach().numpy() >= CONSTANTS.min_opacity
+    )
     if plane is None:
         support = find_support(points[near])
     else:
         support = given_support(points[near], plane[:3] @ T_world_base[:3, :3], -float(plane @ T_world_base[:, 3]))
     low, high = shoulder - reach, shoulder + reach
     if support is not None:
-        low[2] = support.offset / support.normal[2] - _BELOW_SUPPORT
+        low[2] = support.offset / support.normal[2] - CONSTANTS.below_support
     clutter: dict[str, Any] = {
         "file": str(file.resolve()),
         "at": T_base_world[:3, 3].tolist(),
@@ -179,7 +198,7 @@ class TwinViews:
         rows, columns = _grid(frame.camera)
         coarse = np.ix_(rows, columns)
         rays = pixel_rays(frame.camera, rows, columns)
-        shapes = cast(self.world.model, self._data, rays, T_base_camera, _MAX_RANGE)[1].astype(np.float32)
+        shapes = cast(self.world.model, self._data, rays, T_base_camera, CONSTANTS.max_range)[1].astype(np.float32)
         points = _points(sensor, frame.camera, T_base_camera)
         part = np.where(self._around.inside(points), sensor, np.float32(0))
         above = self._around.above_support(points) & (sensor > 0)
@@ -221,7 +240,7 @@ def overlap(a: Mask, b: Mask, among: Mask) -> float | None:
 
 
 def _grid(camera: Camera) -> tuple[Pixels, Pixels]:
-    step = max(1, camera.width // _RAYS)
+    step = max(1, camera.width // CONSTANTS.rays)
     return np.arange(step // 2, camera.height, step), np.arange(step // 2, camera.width, step)
 
 

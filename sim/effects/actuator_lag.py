@@ -12,16 +12,13 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 
-class ActuatorLag(MotorEffect):
+class ActuatorLag(MotorEffect, cost="one activation state for each actuator"):
     """First-order lag of the arm's actuators: τ da/dt = u - a, with command u and activation a.
 
     The time constant τ [s] is ``robot.motors.lag`` of the scene. MuJoCo integrates the filter exactly
     (``dyntype="filterexact"``).
     """
 
-    name = "actuator_lag"
-    cost = "one activation state for each actuator"
-    observable = "tracking_rms"
     parameter = "lag"
     quantity = "lag"
 

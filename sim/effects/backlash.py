@@ -30,15 +30,12 @@ class PlayOperator(Hook):
         return self._at
 
 
-class Backlash(MotorEffect):
+class Backlash(MotorEffect, cost="one clamp for each joint and control period"):
     """Hysteresis of the joint targets by the play operator (Visintin 1994, ch. III).
 
     The gap [rad] is ``robot.motors.backlash`` of the scene, the same for each joint.
     """
 
-    name = "backlash"
-    cost = "one clamp for each joint and control period"
-    observable = "tracking_rms"
     parameter = "backlash"
     quantity = "backlash"
 

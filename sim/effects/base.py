@@ -12,6 +12,7 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
+from splatbot.sim.effects.declaration import DeclaredEffect
 from splatbot.trajectory import Trajectory
 
 T = TypeVar("T", int, float)
@@ -64,11 +65,11 @@ def setting(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorEffect:
+class SensorEffect(DeclaredEffect):
     """Simulated deviation of a real sensor from an ideal frame; a subclass is a frozen dataclass of its settings.
 
-    ``name`` is that in the registry, ``cost`` describes the computation per frame, and ``observable`` is the property
-    of the frames that changes. The ranges of the fields that :func:`setting` declares are checked.
+    ``cost`` describes the computation per frame, and ``observable`` is the property of the frames that changes. The
+    ranges of the fields that :func:`setting` declares are checked.
 
     Args:
         why: short reason for the effect; it appears in the run's report.
@@ -77,8 +78,6 @@ class SensorEffect:
         InputError: a setting is out of range.
     """
 
-    name: ClassVar[str]
-    cost: ClassVar[str]
     observable: ClassVar[Observable]
 
     why: str = "requested"

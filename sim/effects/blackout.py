@@ -12,7 +12,7 @@ from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class Blackout(SensorEffect):
+class Blackout(SensorEffect, cost="nothing", observable="colors"):
     """Simulated black frames.
 
     Args:
@@ -23,10 +23,6 @@ class Blackout(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "blackout"
-    cost = "nothing"
-    observable = "colors"
 
     at: int = setting(30, "give a number of frames >= 0", low=0)
     n: int = setting(15, "give a number of frames >= 0", low=0)

@@ -11,7 +11,7 @@ from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class ColorNoise(SensorEffect):
+class ColorNoise(SensorEffect, cost="two random numbers for each pixel and channel", observable="colors"):
     """Simulated shot and read noise; depth is unchanged.
 
     The model is the linear one of EMVA Standard 1288: v' = (Poisson(k v) + σ_read ε) / k with ε ~ N(0, 1) and
@@ -24,10 +24,6 @@ class ColorNoise(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "color_noise"
-    cost = "two random numbers for each pixel and channel"
-    observable = "colors"
 
     full_well: float = setting(4000.0, "give at least 1 electron", low=1)
     read: float = setting(8.0, "give electrons >= 0", low=0)

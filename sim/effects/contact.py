@@ -16,16 +16,12 @@ FIXED, MOVABLE, ROBOT = 1, 2, 4  # bits of ``contype`` and ``conaffinity``
 COLLIDES_WITH = {FIXED: 0, MOVABLE: FIXED | MOVABLE, ROBOT: FIXED | MOVABLE | ROBOT}
 
 
-class Contact(PhysicsEffect):
+class Contact(PhysicsEffect, cost="collision detection, and a solver for the contacts", observable="contact_steps"):
     """MuJoCo's collision detection and contact solver; two fixed bodies are never tested against each other.
 
     Geoms collide if ``contype & conaffinity`` of the pair is not zero. Without the effect bodies pass through each
     other. Contact softness is MuJoCo's default ``solref`` and ``solimp``.
     """
-
-    name = "contact"
-    cost = "collision detection, and a solver for the contacts"
-    observable = "contact_steps"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether two bodies can collide, and why."""

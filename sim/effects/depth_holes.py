@@ -13,7 +13,7 @@ from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class DepthHoles(SensorEffect):
+class DepthHoles(SensorEffect, cost="smooth noise, and a partial sort of the pixels", observable="depth"):
     """Simulated blobs without depth, different in every frame; colour is unchanged.
 
     Smooth noise is thresholded at the quantile ``share`` of the valid pixels, so each frame loses exactly that share.
@@ -25,10 +25,6 @@ class DepthHoles(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "depth_holes"
-    cost = "smooth noise, and a partial sort of the pixels"
-    observable = "depth"
 
     share: float = setting(0.4, "give a share in 0..1, 1 excluded", low=0, below=1)
     size: float = setting(40.0, "give at least 1 pixel", low=1)

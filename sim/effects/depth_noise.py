@@ -16,7 +16,7 @@ _MAX_TILT = np.radians(85.0)  # [rad] the fit of the noise has no data beyond, a
 
 
 @dataclass(frozen=True)
-class DepthNoise(SensorEffect):
+class DepthNoise(SensorEffect, cost="a random number, a tilt and a rounding for each pixel", observable="depth"):
     """Simulated axial noise of depth cameras, quantization and edge holes; colour is unchanged.
 
     The standard deviation is that of :func:`axial_sigma` (Nguyen, Izadi, Lovell 2012, eq. 3), for structured-light and
@@ -32,10 +32,6 @@ class DepthNoise(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "depth_noise"
-    cost = "a random number, a tilt and a rounding for each pixel"
-    observable = "depth"
 
     strength: float = setting(1.0, "give a finite number >= 0", low=0)
     step: float = setting(0.001, "give a finite number >= 0", low=0)

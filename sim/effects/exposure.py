@@ -11,7 +11,7 @@ from splatbot.sim.effects.base import SensorEffect, check_span, setting
 
 
 @dataclass(frozen=True)
-class Exposure(SensorEffect):
+class Exposure(SensorEffect, cost="a table look-up", observable="colors"):
     """Simulated change of exposure: v' = clip(gain v + offset, 0, 255); depth is unchanged.
 
     The affine model is the one that photometric trackers fit (Engel, Koltun, Cremers 2018, section 2.1). It applies to
@@ -27,10 +27,6 @@ class Exposure(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "exposure"
-    cost = "a table look-up"
-    observable = "colors"
 
     step: float = setting(2.0, "give a finite gain >= 0", low=0)
     offset: float = setting(0.0)

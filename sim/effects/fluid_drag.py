@@ -13,15 +13,11 @@ if TYPE_CHECKING:
 _VACUUM = 1e-300  # [kg/m³]: MuJoCo computes the forces, and they change no bit of the state
 
 
-class FluidDrag(PhysicsEffect):
+class FluidDrag(PhysicsEffect, cost="two forces for each moving body", observable="travelled"):
     """Drag and viscous resistance by MuJoCo's inertia-box fluid model on every body.
 
     Density [kg/m³], viscosity [Pa s] and wind [m/s] are those of ``medium`` in the scene.
     """
-
-    name = "fluid_drag"
-    cost = "two forces for each moving body"
-    observable = "travelled"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the scene has a medium, and why."""

@@ -12,7 +12,7 @@ from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class FrameDrops(SensorEffect):
+class FrameDrops(SensorEffect, cost="a random number for a frame", observable="arrivals"):
     """Simulated random loss of frames; the others keep their stamps.
 
     Args:
@@ -22,10 +22,6 @@ class FrameDrops(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "frame_drops"
-    cost = "a random number for a frame"
-    observable = "arrivals"
 
     rate: float = setting(0.1, "give a share in 0..1, 1 excluded", low=0, below=1)
     burst: int = setting(1, "give at least 1 frame", low=1)

@@ -13,15 +13,13 @@ if TYPE_CHECKING:
 _FINGERS = ("finger1", "finger2")
 
 
-class Friction(PhysicsEffect):
+class Friction(
+    PhysicsEffect, cost="three to four solver rows for each contact instead of one", observable="tangential_n"
+):
     """Coulomb friction: contacts of ``condim`` 3 instead of 1, and 4 at the fingers, which adds torsional friction.
 
     The coefficients are those of the objects in the scene.
     """
-
-    name = "friction"
-    cost = "three to four solver rows for each contact instead of one"
-    observable = "tangential_n"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether an object can move or the task rubs on a surface, and why."""

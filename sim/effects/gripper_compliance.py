@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from splatbot.sim.effects.physics import PhysicsEffect
@@ -10,22 +11,36 @@ if TYPE_CHECKING:
     from splatbot.sim.scene import Scene
     from splatbot.sim.world import Draft
 
-_DEFAULT_STIFFNESS = 2000.0  # [N/m] of the servo if the scene gives none
-_PAD_SOLREF = (0.005, 1.0)  # [s] time constant, damping ratio; at 10 ms a force of 70 N sinks 7 mm into a 50 g object
-_PAD_SOLIMP = (0.8, 0.95, 0.002, 0.5, 2.0)
+
+@dataclass(frozen=True)
+class ComplianceConstants:
+    """Constants of compliant fingers.
+
+    Args:
+        default_stiffness: [N/m] stiffness of the servo if the scene gives none.
+        pad_solref: [s] time constant, and damping ratio; at 10 ms a force of 70 N sinks 7 mm into a 50 g object.
+        pad_solimp: MuJoCo's impedance of the pads.
+    """
+
+    default_stiffness: float = 2000.0
+    pad_solref: tuple[float, float] = (0.005, 1.0)
+    pad_solimp: tuple[float, ...] = (0.8, 0.95, 0.002, 0.5, 2.0)
+
+
+CONSTANTS = ComplianceConstants()
+
+
 _GRASPING_TASKS = ("grasp", "hang", "squeeze")
 
 
-class GripperCompliance(PhysicsEffect):
+class GripperCompliance(
+    PhysicsEffect, cost="no additional computation; softer contacts have more overlap", observable="opening"
+):
     """Softer finger servo and softer finger contacts.
 
     The servo is a spring of ``robot.motors.finger_stiffness`` [N/m]. The pads use MuJoCo's ``solref`` and ``solimp`` of
     rubber.
     """
-
-    name = "gripper_compliance"
-    cost = "no additional computation; softer contacts have more overlap"
-    observable = "opening"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the task grasps an object or the scene gives a stiffness, and why."""
@@ -41,13 +56,13 @@ class GripperCompliance(PhysicsEffect):
         """Set the contact parameters of the pads and the gain of the servo."""
         if draft.robot is None or draft.robot.gripper is None or draft.scene.robot is None:
             return
-        stiffness = draft.scene.robot.motors.finger_stiffness or _DEFAULT_STIFFNESS
+        stiffness = draft.scene.robot.motors.finger_stiffness or CONSTANTS.default_stiffness
         servo = draft.spec.actuator("opening")
         servo.gainprm[0], servo.biasprm[1] = stiffness, -stiffness
         for body in draft.robot_bodies:
             if body.name.startswith("finger"):
                 for geom in body.geoms:
-                    geom.solref, geom.solimp = list(_PAD_SOLREF), list(_PAD_SOLIMP)
+                    geom.solref, geom.solimp = list(CONSTANTS.pad_solref), list(CONSTANTS.pad_solimp)
                     geom.priority = 1
 
 

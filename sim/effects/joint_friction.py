@@ -10,15 +10,12 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 
-class JointFriction(MotorEffect):
+class JointFriction(MotorEffect, cost="one solver row for each joint"):
     """Coulomb friction of each joint, by MuJoCo's ``frictionloss`` [N m].
 
     The friction is ``robot.motors.friction``, a fraction of the joint's maximum torque.
     """
 
-    name = "joint_friction"
-    cost = "one solver row for each joint"
-    observable = "tracking_rms"
     parameter = "friction"
     quantity = "joint friction"
 

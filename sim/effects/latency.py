@@ -11,7 +11,7 @@ from splatbot.sim.effects.base import SensorEffect, setting
 
 
 @dataclass(frozen=True)
-class Latency(SensorEffect):
+class Latency(SensorEffect, cost="a random number for a frame", observable="stamps"):
     """Simulated latency: the stamp is the arrival time t + delay + U(0, jitter), and the images are those of t.
 
     Joints and poses that are paired by stamp are therefore later than the images, as with a driver that stamps on
@@ -25,10 +25,6 @@ class Latency(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "latency"
-    cost = "a random number for a frame"
-    observable = "stamps"
 
     delay: float = setting(0.05, "give seconds >= 0", low=0)
     jitter: float = setting(0.0, "give seconds >= 0", low=0)

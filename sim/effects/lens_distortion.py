@@ -18,7 +18,9 @@ _ITERATIONS = 40
 
 
 @dataclass(frozen=True)
-class LensDistortion(SensorEffect):
+class LensDistortion(
+    SensorEffect, cost="one warp of colour and one of depth; the warp map is computed once", observable="colors"
+):
     """Simulated radial and tangential distortion of colour and depth; the frame's camera stays the pinhole.
 
     The model is OpenCV's (Brown-Conrady), with coefficients k1, k2, p1, p2, k3. Each distorted pixel samples the ideal
@@ -31,10 +33,6 @@ class LensDistortion(SensorEffect):
     Raises:
         InputError: a coefficient is not finite; on application, if the image would fold over itself.
     """
-
-    name = "lens_distortion"
-    cost = "one warp of colour and one of depth; the warp map is computed once"
-    observable = "colors"
 
     k1: float = setting(-0.05)
     k2: float = setting(0.0)

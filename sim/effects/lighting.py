@@ -29,15 +29,11 @@ class Dimmer(Hook):
             self._model.light_diffuse[i] = value
 
 
-class Lighting(PhysicsEffect):
+class Lighting(PhysicsEffect, cost="a shadow pass for each rendered image", observable="light"):
     """MuJoCo lights with shadows at the positions [m] and brightnesses (0..1) of the scene's ``lights``.
 
     It costs rendering time, not physics time.
     """
-
-    name = "lighting"
-    cost = "a shadow pass for each rendered image"
-    observable = "light"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the scene has a camera and lamps, and why."""

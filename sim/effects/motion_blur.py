@@ -16,7 +16,7 @@ _MIN_BLUR_PX = 0.1  # [px] below this no pixel changes
 
 
 @dataclass(frozen=True)
-class MotionBlur(CameraMotionEffect):
+class MotionBlur(CameraMotionEffect, cost="one warp for each pixel of blur, at most `samples`", observable="colors"):
     """Simulated motion blur: the mean of sub-exposures, each the frame warped by its own depth and the camera motion.
 
     Warping works for any source with a known camera path: a ray caster, the twin, or a recording with ground truth. It
@@ -33,10 +33,6 @@ class MotionBlur(CameraMotionEffect):
     Raises:
         InputError: an argument is out of range; on application, if the path is not known.
     """
-
-    name = "motion_blur"
-    cost = "one warp for each pixel of blur, at most `samples`"
-    observable = "colors"
 
     exposure: float = setting(0.02, "give seconds >= 0", low=0)
     samples: int = setting(32, "give at least 2", low=2)

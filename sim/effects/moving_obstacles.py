@@ -35,15 +35,13 @@ class PathFollower(Hook):
             data.mocap_pos[body] = position_on_path(obj, time)
 
 
-class MovingObstacles(PhysicsEffect):
+class MovingObstacles(
+    PhysicsEffect, cost="one interpolation for each obstacle, and changing contacts", observable="obstacle_travel"
+):
     """Kinematic obstacles (MuJoCo mocap bodies), whose position is set in each control period.
 
     They push other bodies and are not pushed. The path is piecewise linear through waypoints (time [s], position [m]).
     """
-
-    name = "moving_obstacles"
-    cost = "one interpolation for each obstacle, and changing contacts"
-    observable = "obstacle_travel"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether an obstacle has a path, and why."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatbot.protocols import Array
 from splatbot.sim.effects.decisions import EffectDecision, decide
+from splatbot.sim.effects.declaration import DeclaredEffect
 from splatbot.sim.effects.sensors import sensor_effects_for
 
 if TYPE_CHECKING:
@@ -46,16 +47,12 @@ class Hook:
         """Update the simulation before the physics of a control period that begins at ``time`` [s]."""
 
 
-class PhysicsEffect:
+class PhysicsEffect(DeclaredEffect):
     """A physical phenomenon that can be left out of the simulation.
 
-    ``name`` is that of its module, ``cost`` describes the computation in MuJoCo. ``observable`` names the result of a
-    run that changes if a scene that requires the effect runs without it.
+    ``cost`` describes the computation in MuJoCo. ``observable`` names the result of a run that changes if a scene that
+    requires the effect runs without it.
     """
-
-    name: str
-    cost: str
-    observable: str
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the scene requires the effect, and the reason for or against it."""
@@ -69,7 +66,7 @@ class PhysicsEffect:
         return None
 
 
-class MotorEffect(PhysicsEffect):
+class MotorEffect(PhysicsEffect, observable="tracking_rms"):
     """An effect that the scene requires if one of the ``robot.motors`` parameters is above zero.
 
     ``parameter`` names that parameter, ``quantity`` describes it.

@@ -15,7 +15,7 @@ from splatbot.sim.effects.warping import color_at, depth_at, flow, grid, motion_
 
 
 @dataclass(frozen=True)
-class RollingShutter(CameraMotionEffect):
+class RollingShutter(CameraMotionEffect, cost="two warps of depth and one of colour", observable="colors"):
     """Simulated rolling shutter: each line of colour and depth as seen at its readout time, from top to bottom.
 
     The stamp is that of the middle line. The frame is warped by its own depth and the camera motion, as in
@@ -30,10 +30,6 @@ class RollingShutter(CameraMotionEffect):
     Raises:
         InputError: the time is out of range; on application, if the path is not known.
     """
-
-    name = "rolling_shutter"
-    cost = "two warps of depth and one of colour"
-    observable = "colors"
 
     readout: float = setting(0.02, "give seconds >= 0", low=0)
 

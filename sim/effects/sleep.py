@@ -13,15 +13,11 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 
-class Sleep(PhysicsEffect):
+class Sleep(PhysicsEffect, cost="negative: bodies at rest are skipped", observable="asleep"):
     """MuJoCo's sleeping islands (``mjENBL_SLEEP``): bodies at rest are skipped until a contact or force wakes them.
 
     It saves time, and suppresses the last millimetres of creep.
     """
-
-    name = "sleep"
-    cost = "negative: bodies at rest are skipped"
-    observable = "asleep"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether movable objects come to rest, and why."""

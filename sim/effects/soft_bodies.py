@@ -15,15 +15,15 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 
-class SoftBodies(PhysicsEffect):
+class SoftBodies(
+    PhysicsEffect,
+    cost="elastic forces and degrees of freedom for each grid corner of each body",
+    observable="deformation",
+):
     """Linear elastic finite elements on a grid (MuJoCo flex, trilinear) in place of a rigid box.
 
     Young's modulus [Pa], Poisson ratio, density [kg/m³] and grid cells are those of the scene's soft shape.
     """
-
-    name = "soft_bodies"
-    cost = "elastic forces and degrees of freedom for each grid corner of each body"
-    observable = "deformation"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the scene has soft objects, and why."""

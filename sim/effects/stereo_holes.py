@@ -16,7 +16,7 @@ _LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
 @dataclass(frozen=True)
-class StereoHoles(SensorEffect):
+class StereoHoles(SensorEffect, cost="the disparity of each pixel, and a random number", observable="depth"):
     """Simulated missing depth of a stereo camera, in the left image; colour is unchanged.
 
     Depth is missing in three regions:
@@ -38,10 +38,6 @@ class StereoHoles(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "stereo_holes"
-    cost = "the disparity of each pixel, and a random number"
-    observable = "depth"
 
     baseline: float = setting(0.05, "give metres >= 0", low=0)
     scatter: float = setting(0.01, "give a share in 0..1", low=0, high=1)

@@ -15,12 +15,8 @@ if TYPE_CHECKING:
 _CONTACT_TASKS = ("grasp", "hang", "wipe", "squeeze")
 
 
-class TorqueLimits(PhysicsEffect):
+class TorqueLimits(PhysicsEffect, cost="one clamp for each motor", observable="overload"):
     """Actuator forces [N m], clamped to the limits of the robot's description."""
-
-    name = "torque_limits"
-    cost = "one clamp for each motor"
-    observable = "overload"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the task presses on an object, so that position errors would create large torques, and why."""

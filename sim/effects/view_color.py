@@ -11,15 +11,13 @@ if TYPE_CHECKING:
     from splatbot.sim.world import Draft
 
 
-class ViewColor(PhysicsEffect):
+class ViewColor(
+    PhysicsEffect, cost="spherical harmonics of each visible Gaussian, in each rendered image", observable="harmonics"
+):
     """Spherical harmonics of the Gaussians up to the map's degree (Kerbl et al. 2023); degree 0 without the effect.
 
     It costs rendering time, not physics time.
     """
-
-    name = "view_color"
-    cost = "spherical harmonics of each visible Gaussian, in each rendered image"
-    observable = "harmonics"
 
     def required(self, scene: Scene) -> tuple[bool, str]:
         """Return whether the scene has a camera and a map with harmonics beyond degree 0, and why."""

@@ -11,7 +11,7 @@ from splatbot.sim.effects.base import SensorEffect, check_span, setting
 
 
 @dataclass(frozen=True)
-class WhiteBalance(SensorEffect):
+class WhiteBalance(SensorEffect, cost="a table look-up for each channel", observable="colors"):
     """Simulated white balance: v' = clip(gain v, 0, 255) with one gain per channel; depth is unchanged.
 
     This is the diagonal model of von Kries (1902), applied to 8-bit values without the camera's response curve.
@@ -24,10 +24,6 @@ class WhiteBalance(SensorEffect):
     Raises:
         InputError: an argument is out of range.
     """
-
-    name = "white_balance"
-    cost = "a table look-up for each channel"
-    observable = "colors"
 
     red: float = setting(1.15, "give a finite gain >= 0", low=0)
     green: float = setting(1.0, "give a finite gain >= 0", low=0)

@@ -9,11 +9,29 @@ import numpy as np
 from splatbot.geometry import quat_to_rotation, rotation_to_quat
 from splatbot.protocols import Array
 
-REACH = 0.9  # [m] from the base; reach of an arm of this size
-_TANGENT, _NORMAL = 2.2, 1.0  # [sigma] half-axes: wide enough to close gaps, thin enough not to lift resting objects
-_MIN_AXIS = 1e-3  # [m]
-_MIN_CELL = 0.005  # [m]
-_GROWTH = 1.15  # factor between tried cell sizes
+
+@dataclass(frozen=True)
+class EllipsoidConstants:
+    """Constants of collision ellipsoids of a map.
+
+    Args:
+        reach: [m] distance from the base; reach of an arm of this size.
+        tangent_sigmas: [sigma] half-axis in the surface: wide enough to close gaps.
+        normal_sigmas: [sigma] half-axis across it: thin enough not to lift resting objects.
+        min_axis: [m] shortest half-axis.
+        min_cell: [m] smallest cell size.
+        growth: factor between tried cell sizes.
+    """
+
+    reach: float = 0.9
+    tangent_sigmas: float = 2.2
+    normal_sigmas: float = 1.0
+    min_axis: float = 1e-3
+    min_cell: float = 0.005
+    growth: float = 1.15
+
+
+CONSTANTS = EllipsoidConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +68,12 @@ def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: 
     empty = np.zeros((0, 3))
     if limit == 0 or not len(means):
         return Ellipsoids(empty, empty, np.zeros((0, 4)), 0.0, 0.0)
-    size = _MIN_CELL
+    size = CONSTANTS.min_cell
     while True:
         cell = _cells(means, base, size)
         if int(cell.max()) < limit:
             break
-        size *= _GROWTH
+        size *= CONSTANTS.growth
     count = int(cell.max()) + 1
     total = np.bincount(cell, weights, count)
     centers = np.stack([np.bincount(cell, weights * means[:, k], count) / total for k in range(3)], axis=1)
@@ -66,8 +84,12 @@ def merge(means: Array, covariances: Array, weights: Array, base: Array, limit: 
     )
     values, R = np.linalg.eigh(merged.reshape(-1, 3, 3))
     R[np.linalg.det(R) < 0, :, 0] *= -1
-    axes = np.sqrt(np.maximum(values, 0)) * [_NORMAL, _TANGENT, _TANGENT]
-    axes = np.maximum(axes, _MIN_AXIS)
+    axes = np.sqrt(np.maximum(values, 0)) * [
+        CONSTANTS.normal_sigmas,
+        CONSTANTS.tangent_sigmas,
+        CONSTANTS.tangent_sigmas,
+    ]
+    axes = np.maximum(axes, CONSTANTS.min_axis)
     distance = np.abs(_distance(np.einsum("nij,ni->nj", R[cell], away), axes[cell]))
     return Ellipsoids(
         centers, axes, rotation_to_quat(R), float(distance.mean()), float(np.percentile(distance, 95))
@@ -86,8 +108,8 @@ def surface_points(ellipsoids: Ellipsoids) -> Array:
 
 def _cells(means: Array, base: Array, size: float) -> np.ndarray:
     """Assign a cell number to each Gaussian; cells double in size in shells beyond the reach."""
-    beyond = np.maximum(np.linalg.norm(means - base, axis=1) - REACH, 0.0)
-    shell = np.minimum(np.ceil(np.log2(1.0 + beyond / (0.5 * REACH))), 6).astype(np.int64)
+    beyond = np.maximum(np.linalg.norm(means - base, axis=1) - CONSTANTS.reach, 0.0)
+    shell = np.minimum(np.ceil(np.log2(1.0 + beyond / (0.5 * CONSTANTS.reach))), 6).astype(np.int64)
     index = np.floor(means / (size * 2.0**shell)[:, None]).astype(np.int64)
     return np.asarray(np.unique(np.c_[shell, index], axis=0, return_inverse=True)[1]).ravel()
 

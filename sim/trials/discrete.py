@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +13,28 @@ from splatbot.protocols import Array
 
 Free = Callable[[Array], NDArray[np.bool_]]  # configurations (C, J) -> free (C,)
 
-RESOLUTION = 1 / 32  # [rad] between the checked configurations of an edge
-_STEP = 0.6  # [rad] extension of a tree
-_CUTS = 40  # shortcut attempts
+
+@dataclass(frozen=True)
+class DiscreteConstants:
+    """Constants of the planner that checks discrete configurations.
+
+    Args:
+        resolution: [rad] distance between the checked configurations of an edge.
+        step: [rad] extension of a tree.
+        cuts: shortcut attempts.
+    """
+
+    resolution: float = 1 / 32
+    step: float = 0.6
+    cuts: int = 40
+
+
+CONSTANTS = DiscreteConstants()
 
 
 def edge_free(free: Free, a: Array, b: Array) -> bool:
     """Return whether the configurations on the straight edge between two (J,) are free, ``b`` included."""
-    count = max(1, int(np.ceil(np.linalg.norm(b - a) / RESOLUTION)))
+    count = max(1, int(np.ceil(np.linalg.norm(b - a) / CONSTANTS.resolution)))
     shares = np.arange(1, count + 1) / count
     return bool(free(a + shares[:, None] * (b - a)).all())
 
@@ -54,7 +69,7 @@ def connect(free: Free, lower: Array, upper: Array, start: Array, goal: Array, *
 
 def shortened(free: Free, path: Array, rng: np.random.Generator) -> Array:
     """Shorten a path (N, J) by straight connections between two random positions on it."""
-    for _ in range(_CUTS):
+    for _ in range(CONSTANTS.cuts):
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         low, high = np.sort(rng.uniform(0.0, along[-1], 2))
         a, b = (np.array([np.interp(s, along, column) for column in path.T]) for s in (low, high))
@@ -72,7 +87,7 @@ class _Tree:
         nearest = int(np.argmin(np.linalg.norm(np.array(self.nodes) - to, axis=1)))
         direction = to - self.nodes[nearest]
         length = float(np.linalg.norm(direction))
-        end = self.nodes[nearest] + direction * min(1.0, _STEP / max(length, 1e-12))
+        end = self.nodes[nearest] + direction * min(1.0, CONSTANTS.step / max(length, 1e-12))
         if length < 1e-9 or not edge_free(free, self.nodes[nearest], end):
             return None
         self.nodes.append(end)

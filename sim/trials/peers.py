@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,17 +20,38 @@ from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
 from splatbot.sim.scan import discs
-from splatbot.sim.trials.scan import FARTHEST, TrialScan, usable_depth
+from splatbot.sim.trials.scan import CONSTANTS as SCAN
+from splatbot.sim.trials.scan import TrialScan, usable_depth
 from splatbot.sim.trials.solid import SolidPickPlanner, SolidReach, SolidWorld
 from splatbot.sim.trials.stacks import OPTIONS, StackMap
 
-VOXEL = 0.004  # [m] of the distance field and of the cloud
-LEAF = 0.01  # [m] of the octree
-_OBSERVER_DISTANCE = 0.5  # [m] along the normal from a surface to its assumed observer
-_GREY = 0.6  # of the mesh, whose colours are not used
-_SEE_THROUGH = 0.03  # [m] measured depth behind a point that contradicts it
-_NORMALS = 0.012, 24  # [m] radius and number of neighbours of a normal estimate
-_MIN_NEIGHBOURS = 3  # points with fewer are outliers
+
+@dataclass(frozen=True)
+class PeerConstants:
+    """Constants of the map representations that are compared.
+
+    Args:
+        voxel: [m] voxel size of the distance field and of the cloud.
+        leaf: [m] leaf size of the octree.
+        observer_distance: [m] distance along the normal from a surface to its assumed observer.
+        grey: grey level of the mesh, whose colours are not used.
+        see_through: [m] measured depth behind a point that contradicts it.
+        normals: [m] radius, and number of neighbours, of a normal estimate.
+        min_neighbours: points with fewer are outliers.
+    """
+
+    voxel: float = 0.004
+    leaf: float = 0.01
+    observer_distance: float = 0.5
+    grey: float = 0.6
+    see_through: float = 0.03
+    normals: tuple[float, int] = (0.012, 24)
+    min_neighbours: int = 3
+
+
+CONSTANTS = PeerConstants()
+
+
 _NODE, _LEAF_NODE = 256, 16  # [bytes] of FCL's BVNode<OBBRSS>, as measured, and of OctoMap's OcTreeNode
 _SINGLE = 2  # ratio of float64 to float32, in which coordinates could be stored
 
@@ -42,7 +64,7 @@ class MeshStack:
     def learn(self, scan: TrialScan) -> StackMap:
         """Implement :meth:`splatbot.sim.trials.stacks.Stack.learn`."""
         begin = time.perf_counter()
-        fusion = DepthFusion(VOXEL, FARTHEST)
+        fusion = DepthFusion(CONSTANTS.voxel, SCAN.max_depth)
         for view in scan.views:
             fusion.add(*view)
         mesh = fusion.mesh()
@@ -56,7 +78,7 @@ class MeshStack:
 
         world = SolidWorld(vertices, fcl_mesh(vertices, triangles), around)
         size = vertices.nbytes // _SINGLE + triangles.nbytes + 2 * len(triangles) * _NODE
-        return _stack_map(scan, vertices, normals, np.full_like(vertices, _GREY), world, size, begin)
+        return _stack_map(scan, vertices, normals, np.full_like(vertices, CONSTANTS.grey), world, size, begin)
 
 
 class CloudStack:
@@ -71,11 +93,11 @@ class CloudStack:
         points, normals, colors = (np.asarray(x) for x in (cloud.points, cloud.normals, cloud.colors))
 
         def around(rows: NDArray[np.int64]) -> Any:
-            return fcl_octree(np.delete(points, rows, axis=0), LEAF)
+            return fcl_octree(np.delete(points, rows, axis=0), CONSTANTS.leaf)
 
-        world = SolidWorld(points, fcl_octree(points, LEAF), around)
-        voxels = len(np.unique(np.floor(points / LEAF).astype(np.int64), axis=0))
-        nodes = voxels + len(octomap_bytes(points, LEAF)) // 2  # each inner node takes two bytes
+        world = SolidWorld(points, fcl_octree(points, CONSTANTS.leaf), around)
+        voxels = len(np.unique(np.floor(points / CONSTANTS.leaf).astype(np.int64), axis=0))
+        nodes = voxels + len(octomap_bytes(points, CONSTANTS.leaf)) // 2  # each inner node takes two bytes
         size = (points.nbytes + normals.nbytes) // _SINGLE + nodes * _LEAF_NODE
         return _stack_map(scan, points, normals, colors, world, size, begin)
 
@@ -84,12 +106,12 @@ def _stack_map(
     scan: TrialScan, points: Array, normals: Array, colors: Array, world: SolidWorld, size: int, begin: float
 ) -> StackMap:
     """Convert the surface to discs for segmentation and grasps, with the solid world for the arm."""
-    scene = segment(discs(points, normals, colors, VOXEL), scan.T_world_base, cut=False)
+    scene = segment(discs(points, normals, colors, CONSTANTS.voxel), scan.T_world_base, cut=False)
     robot = panda()
 
     def planners(target: Target) -> tuple[GraspSampler, PickPlanner]:
         reach = SolidReach(robot, scene.T_world_base, world, target.rows)
-        observers = points + _OBSERVER_DISTANCE * normals
+        observers = points + CONSTANTS.observer_distance * normals
         sampler = GraspSampler(
             scene, robot, observers=observers, views=scan.views, make_reach=lambda around, whole: reach
         )
@@ -105,17 +127,17 @@ def _cloud(scan: TrialScan) -> Any:
         depth = usable_depth(frame)
         part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(frame.camera.backproject(depth)[depth > 0]))
         part.colors = o3d.utility.Vector3dVector(frame.rgb[depth > 0] / 255.0)
-        part.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(*_NORMALS))
+        part.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(*CONSTANTS.normals))
         part.orient_normals_towards_camera_location(np.zeros(3))
         part.transform(T)
         whole += part
-    cloud = whole.voxel_down_sample(VOXEL)
+    cloud = whole.voxel_down_sample(CONSTANTS.voxel)
     cloud.normalize_normals()
-    cloud, _ = cloud.remove_radius_outlier(_MIN_NEIGHBOURS, 2 * VOXEL)
+    cloud, _ = cloud.remove_radius_outlier(CONSTANTS.min_neighbours, 2 * CONSTANTS.voxel)
     points = np.asarray(cloud.points)
     votes = np.zeros(len(points))
     for frame, T in scan.tracked:
         rows, measured, z = measured_depths(points, usable_depth(frame), frame.camera, T)
-        votes[rows[measured > z + _SEE_THROUGH]] -= 1
-        votes[rows[np.abs(measured - z) <= _SEE_THROUGH]] += 1
+        votes[rows[measured > z + CONSTANTS.see_through]] -= 1
+        votes[rows[np.abs(measured - z) <= CONSTANTS.see_through]] += 1
     return cloud.select_by_index(np.flatnonzero(votes >= 0).tolist())

@@ -36,11 +36,33 @@ from splatbot.sim.wrist import T_PANDA_CAMERA, WristLog
 from splatbot.slam import Slam
 
 _TARGET, _DISTANCE = np.array([0.5, 0.0, 0.05]), 0.6  # [m] point that the camera is aimed at, and the distance to it
-_RINGS = ((45.0, (-130, -80, -40, 0, 40, 80)), (65.0, (80, 40, 0, -40, -80)))  # [deg] elevation, azimuths
-FARTHEST = 0.95  # [m] depth that is used
-_RATE = 4.0  # [Hz]
-_CLICK_STRIDE = 4  # every n-th frame is a candidate for the click
-_POSE_SIGMA = (5e-4, 5e-4)  # [m], [rad] standard deviation of the camera pose by the arm's joints
+
+
+@dataclass(frozen=True)
+class TrialScanConstants:
+    """Constants of the scan of a trial.
+
+    Args:
+        rings: [deg] elevation and azimuths of each ring of views.
+        max_depth: [m] depth that is used.
+        rate: [Hz] frames per second.
+        click_stride: every n-th frame is a candidate for the click.
+        pose_sigma: [m], [rad] standard deviation of the camera pose by the arm's joints.
+    """
+
+    rings: tuple[tuple[float, tuple[int, ...]], tuple[float, tuple[int, ...]]] = (
+        (45.0, (-130, -80, -40, 0, 40, 80)),
+        (65.0, (80, 40, 0, -40, -80)),
+    )
+    max_depth: float = 0.95
+    rate: float = 4.0
+    click_stride: int = 4
+    pose_sigma: tuple[float, float] = (5e-4, 5e-4)
+
+
+CONSTANTS = TrialScanConstants()
+
+
 # Fine Gaussians that stay where depth put them: refinement on images moves means by millimetres, too much for grasps.
 MAPPING = {"stride": 1, "surface_depth_tolerance": 0.01, "means_lr": 0.0, "refine_iterations": 0, "final_iterations": 0}
 _TABLE = RaycastSurface(
@@ -87,7 +109,7 @@ class TrialScan:
 
 def usable_depth(frame: Frame) -> NDArray[np.float32]:
     """Return depth (H, W) [m] without the arm and beyond-range pixels, which become 0."""
-    return np.where(frame.valid & (frame.depth < FARTHEST), frame.depth, 0.0).astype(np.float32)
+    return np.where(frame.valid & (frame.depth < CONSTANTS.max_depth), frame.depth, 0.0).astype(np.float32)
 
 
 def scan_scene(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Config | None = None) -> TrialScan:
@@ -107,7 +129,7 @@ def scan_scene(trial: TrialScene, *, frames: int = 32, width: int = 320, config:
     log = _log(trial, frames, width)
     true = log.ground_truth.T_world_camera
     rng = np.random.default_rng(trial.seed)
-    sigma = np.repeat(_POSE_SIGMA, 3)
+    sigma = np.repeat(CONSTANTS.pose_sigma, 3)
     prior_poses = np.stack([T @ se3_exp(sigma * rng.standard_normal(6)) for T in true])
     mask = SelfMask(log.robot, T_PANDA_CAMERA)
     assert trial.scene.camera is not None
@@ -116,7 +138,7 @@ def scan_scene(trial: TrialScene, *, frames: int = 32, width: int = 320, config:
     )
     shot = tuple(effects(mask(log[k])) for k in range(frames))
     begin = time.perf_counter()
-    slam = Slam(config or Config.model_validate({"mapping": MAPPING, "sensor": {"max_depth": FARTHEST}}))
+    slam = Slam(config or Config.model_validate({"mapping": MAPPING, "sensor": {"max_depth": CONSTANTS.max_depth}}))
     for frame, T in zip(shot, prior_poses, strict=True):
         prior = PosePrior(np.diag(2 * sigma**2), T_world_camera=inverse(prior_poses[0]) @ T)
         slam.process(replace(frame, prior=prior))
@@ -146,7 +168,7 @@ def camera_path(frames: int) -> Array:
     """
     robot = panda()
     near, knots = robot.home, []
-    for steep, turns in _RINGS:
+    for steep, turns in CONSTANTS.rings:
         for turn in turns:
             t, s = np.radians([turn, steep])
             eye = _TARGET + _DISTANCE * np.array([np.cos(t) * np.cos(s), np.sin(t) * np.cos(s), np.sin(s)])
@@ -169,7 +191,9 @@ def _log(trial: TrialScene, frames: int, width: int) -> WristLog:
         shown = surfaces_of(obj, placed=False)
         moving[obj.name] = Moving(shown, partial(_pose_on_path, obj))
     joints = camera_path(frames)
-    return WristLog(panda(), joints, [_TABLE, *still], T_scene_base=np.eye(4), width=width, rate=_RATE, moving=moving)
+    return WristLog(
+        panda(), joints, [_TABLE, *still], T_scene_base=np.eye(4), width=width, rate=CONSTANTS.rate, moving=moving
+    )
 
 
 def _pose_on_path(obj: SceneObject, t: float) -> Array:
@@ -187,7 +211,7 @@ def _click(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Arr
     """Return the central target pixel with depth in the tracked frame with most of them, as a user would click."""
     twin = Twin(trial.scene)
     best: tuple[int, NDArray[np.bool_]] | None = None
-    for k in range(0, len(frames), _CLICK_STRIDE):
+    for k in range(0, len(frames), CONSTANTS.click_stride):
         if not np.isfinite(poses[k]).all():
             continue
         twin.reset(log.joints[k])

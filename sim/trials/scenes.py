@@ -18,13 +18,34 @@ from splatbot.sim.world import OBJECT
 FAMILIES = ("tabletop", "isolated")
 TABLE, OBSTACLE = "table", "obstacle"
 SENSOR = ("depth_noise", "depth_holes:share=0.05")
-_AREA = ((0.36, -0.26), (0.64, 0.26))  # [m] corners of the area with objects
-_SPACING = (0.02, 0.05)  # [m] range of the clearance between objects
-_MASS = (0.1, 0.5)  # [kg]
-_FRICTION = (0.5, 0.9)
-_SETTLE = 1.5  # [s] until all objects are at rest
-_MOVING_EVERY = 5  # every n-th table top has a moving obstacle
-_TRIES = 300
+
+
+@dataclass(frozen=True)
+class SceneConstants:
+    """Constants of random trial scenes.
+
+    Args:
+        area: [m] corners of the area with objects.
+        spacing: [m] range of the clearance between objects.
+        mass: [kg] range of an object's mass.
+        friction: range of an object's friction coefficient.
+        settling_time: [s] time until all objects are at rest.
+        moving_period: every n-th table top has a moving obstacle.
+        max_tries: largest number of random places of an object.
+    """
+
+    area: tuple[tuple[float, float], tuple[float, float]] = ((0.36, -0.26), (0.64, 0.26))
+    spacing: tuple[float, float] = (0.02, 0.05)
+    mass: tuple[float, float] = (0.1, 0.5)
+    friction: tuple[float, float] = (0.5, 0.9)
+    settling_time: float = 1.5
+    moving_period: int = 5
+    max_tries: int = 300
+
+
+CONSTANTS = SceneConstants()
+
+
 _COLORS = (
     (0.85, 0.20, 0.18), (0.20, 0.45, 0.85), (0.95, 0.75, 0.15), (0.25, 0.65, 0.35), (0.60, 0.30, 0.70),
     (0.95, 0.50, 0.15), (0.90, 0.90, 0.88), (0.30, 0.75, 0.75),
@@ -83,7 +104,7 @@ def make_trial(seed: int, family: str = "tabletop") -> TrialScene:
         raise InputError(f"is {family!r}.", field="scenes", hint=f"one of {', '.join(FAMILIES)}")
     rng = np.random.default_rng((FAMILIES.index(family), seed))
     items = [_CONVEX[seed % len(_CONVEX)](rng)] if family == "isolated" else _table_top(rng)
-    moving = family == "tabletop" and seed % _MOVING_EVERY == _MOVING_EVERY - 1
+    moving = family == "tabletop" and seed % CONSTANTS.moving_period == CONSTANTS.moving_period - 1
     placed = _placed(items, rng)
     values = [value for _, value in placed]
     k = int(rng.choice([k for k, (item, _) in enumerate(placed) if item.fits]))
@@ -176,7 +197,7 @@ def _placed(items: list[_TrialObject], rng: np.random.Generator) -> list[tuple[_
     found: list[tuple[_TrialObject, dict[str, Any]]] = []
     colors = rng.permutation(len(_COLORS))
     for k, item in enumerate(items):
-        apart = float(rng.uniform(*_SPACING))
+        apart = float(rng.uniform(*CONSTANTS.spacing))
         at = _free_place(item.radius + apart, taken, rng)
         if at is None:
             continue
@@ -187,8 +208,8 @@ def _placed(items: list[_TrialObject], rng: np.random.Generator) -> list[tuple[_
             "at": [*at.tolist(), item.height + 5e-4],
             "rpy": [0.0, 0.0, float(rng.uniform(-np.pi, np.pi))],
             "movable": True,
-            "mass": float(rng.uniform(*_MASS)),
-            "friction": float(rng.uniform(*_FRICTION)),
+            "mass": float(rng.uniform(*CONSTANTS.mass)),
+            "friction": float(rng.uniform(*CONSTANTS.friction)),
             "color": _COLORS[colors[k % len(_COLORS)]],
         }
         found.append((item, value))
@@ -196,8 +217,8 @@ def _placed(items: list[_TrialObject], rng: np.random.Generator) -> list[tuple[_
 
 
 def _free_place(distance: float, taken: list[tuple[Array, float]], rng: np.random.Generator) -> Array | None:
-    for _ in range(_TRIES):
-        at = rng.uniform(*np.array(_AREA))
+    for _ in range(CONSTANTS.max_tries):
+        at = rng.uniform(*np.array(CONSTANTS.area))
         if all(np.linalg.norm(at - other) > distance + radius for other, radius in taken):
             return at
     return None
@@ -222,7 +243,7 @@ def _settled(scene: Scene) -> Scene:
     assert twin.follower is not None
     q = np.array(twin.data.qpos[twin.follower.qpos])
     still = np.zeros_like(q)
-    for k in range(round(_SETTLE * twin.rate)):
+    for k in range(round(CONSTANTS.settling_time * twin.rate)):
         twin.advance(k / twin.rate, q, still, still, None)
     values = scene.model_dump()
     for item in values["objects"]:

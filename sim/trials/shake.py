@@ -9,17 +9,32 @@ import numpy as np
 from splatbot.planning import WaypointMotion
 from splatbot.protocols import Array, KinematicChain
 
-RATE = 3.0  # [Hz]
-SECONDS = 2.0
-PERIOD = 0.005  # [s]
-SHARE = 0.6  # fraction of the joints' acceleration limits
+
+@dataclass(frozen=True)
+class ShakeConstants:
+    """Constants of the shaking motion.
+
+    Args:
+        rate: [Hz] frequency of the motion.
+        duration: [s] length of the motion.
+        acceleration_share: fraction of the joints' acceleration limits.
+        period: [s] time between the waypoints of the motion.
+    """
+
+    rate: float = 3.0
+    duration: float = 2.0
+    acceleration_share: float = 0.6
+    period: float = 0.005
+
+
+CONSTANTS = ShakeConstants()
 
 
 @dataclass(frozen=True, eq=False)
 class Shake:
     """Sinusoidal motion of every joint about its position, with a smooth start and end.
 
-    Accelerations stay within ``SHARE`` of the joints' limits in the middle, and joints within their ranges.
+    Accelerations stay within the constant share of the joints' limits in the middle, and joints within their ranges.
 
     Args:
         chain: of the arm.
@@ -29,26 +44,26 @@ class Shake:
 
     chain: KinematicChain
     q: Array
-    duration: float = SECONDS
+    duration: float = CONSTANTS.duration
 
     @property
     def amplitude(self) -> Array:
         """Amplitude of each joint (J,) [rad]; signs alternate."""
-        most = SHARE * self.chain.acceleration / (2 * np.pi * RATE) ** 2
+        most = CONSTANTS.acceleration_share * self.chain.acceleration / (2 * np.pi * CONSTANTS.rate) ** 2
         inside = np.minimum(self.q - self.chain.lower, self.chain.upper - self.q)
         return np.asarray(np.minimum(most, np.maximum(inside, 0.0)) * (-1.0) ** np.arange(len(self.q)))
 
     def reference(self, t: float) -> tuple[Array, Array]:
         """Implement :meth:`splatbot.protocols.TimedPath.reference`."""
         x = float(np.clip(t, 0.0, self.duration))
-        w, grow = 2 * np.pi * RATE, np.pi / self.duration
+        w, grow = 2 * np.pi * CONSTANTS.rate, np.pi / self.duration
         swell, turn = np.sin(grow * x) ** 2, np.sin(w * x)
         rate = grow * np.sin(2 * grow * x) * turn + w * swell * np.cos(w * x)
         return self.q + self.amplitude * (swell * turn), self.amplitude * (rate if x == t else 0.0)
 
     def motion(self) -> WaypointMotion:
-        """Return the spline through the positions at every period of ``PERIOD``."""
-        count = round(self.duration / PERIOD)
+        """Return the spline through the positions at every period of ``CONSTANTS.period``."""
+        count = round(self.duration / CONSTANTS.period)
         times = np.linspace(0.0, self.duration, count + 1)
         return WaypointMotion(times, np.array([self.reference(float(t))[0] for t in times]))
 

@@ -26,10 +26,24 @@ from splatbot.planning.problem import Certificate
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.shapes import Capsule
-from splatbot.sim.trials.discrete import RESOLUTION, Free, connect
+from splatbot.sim.trials.discrete import CONSTANTS as DISCRETE
+from splatbot.sim.trials.discrete import Free, connect
 
-SECONDS = 2.0  # [s] time limit of the first path
-_SEEDS = 8  # of inverse kinematics
+
+@dataclass(frozen=True)
+class SolidStackConstants:
+    """Constants of plans on meshes and voxels.
+
+    Args:
+        max_planning_time: [s] time limit of the first path.
+        ik_seeds: seeds of inverse kinematics.
+    """
+
+    max_planning_time: float = 2.0
+    ik_seeds: int = 8
+
+
+CONSTANTS = SolidStackConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +115,7 @@ class SolidReach:
         far = SolidArm(self.robot, self.T, opening, self.world.whole)
         chain = self.robot.chain
         found = solve_ik(
-            self.robot, inverse(self.T) @ T_world_tcp, near=(chain.lower + chain.upper) / 2, seeds=_SEEDS
+            self.robot, inverse(self.T) @ T_world_tcp, near=(chain.lower + chain.upper) / 2, seeds=CONSTANTS.ik_seeds
         ).q
         if not len(found):
             return Reached(None, None, 0.0, 0.0, "no posture reaches it", "no posture reaches")
@@ -184,7 +198,9 @@ class SolidPickPlanner:
         if not arm.free(np.stack([start, goal])).all():
             return None
         chain = self.robot.chain
-        path = connect(arm.free, chain.lower, chain.upper, start, goal, seconds=SECONDS, seed=self.o.seed)
+        path = connect(
+            arm.free, chain.lower, chain.upper, start, goal, seconds=CONSTANTS.max_planning_time, seed=self.o.seed
+        )
         return path if len(path) else None
 
 
@@ -200,11 +216,15 @@ def _segment(path: Array, arm: SolidArm) -> Segment:
     """Sample the waypoints densely, so that corners are hardly rounded; the deviation is not certified."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     parts = [
-        a + np.linspace(0.0, 1.0, max(1, int(np.ceil(length / (4 * RESOLUTION)))), endpoint=False)[:, None] * (b - a)
+        a
+        + np.linspace(0.0, 1.0, max(1, int(np.ceil(length / (4 * DISCRETE.resolution)))), endpoint=False)[:, None]
+        * (b - a)
         for a, b, length in zip(path[:-1], path[1:], steps, strict=True)
     ]
     dense = np.concatenate([*parts, path[-1:]])
-    return Segment(Path(dense, float(steps.sum()), Certificate(False, RESOLUTION, 0.0, 0.0, -1)), arm.spheres, None)
+    return Segment(
+        Path(dense, float(steps.sum()), Certificate(False, DISCRETE.resolution, 0.0, 0.0, -1)), arm.spheres, None
+    )
 
 
 def _capsules(fcl: Any, robot: RobotModel, opening: float) -> list[tuple[int, Array, Any]]:

@@ -24,10 +24,26 @@ from splatbot.robots.panda import panda
 from splatbot.segmentation import SegmentedMap, segment
 from splatbot.sim.trials.scan import TrialScan
 
-LIFT = 0.18  # [m]; success requires 0.15 m
-BUDGET_MS = 28.0  # [ms] of the path search
-_MIN_OBSERVATIONS = 3  # keyframes that must support a Gaussian
-OPTIONS = PickOptions(lift=LIFT, budget_ms=BUDGET_MS, tries=8, grasp=GraspOptions())
+
+@dataclass(frozen=True)
+class StackConstants:
+    """Constants of the stack under trial.
+
+    Args:
+        lift: [m] lift of a pick; success requires 0.15 m.
+        budget_ms: [ms] budget of the path search.
+        min_observations: keyframes that must support a Gaussian.
+    """
+
+    lift: float = 0.18
+    budget_ms: float = 28.0
+    min_observations: int = 3
+
+
+CONSTANTS = StackConstants()
+
+
+OPTIONS = PickOptions(lift=CONSTANTS.lift, budget_ms=CONSTANTS.budget_ms, tries=8, grasp=GraspOptions())
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +92,12 @@ class GaussianStack:
         scene = segment(model, scan.T_world_base, cut=False)
         observers = scan.observers[solid]
         sampler = GraspSampler(
-            scene, panda(), observers=observers, views=scan.views, min_observations=_MIN_OBSERVATIONS, moving=moving
+            scene,
+            panda(),
+            observers=observers,
+            views=scan.views,
+            min_observations=CONSTANTS.min_observations,
+            moving=moving,
         )
         seconds = scan.seconds + time.perf_counter() - begin
         world = model.nbytes + sampler.field.nbytes

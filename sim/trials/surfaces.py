@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from splatbot.errors import InputError
@@ -13,8 +15,21 @@ from splatbot.sim.scene import SceneObject
 from splatbot.sim.solids import BoxGeom, CapsuleGeom, CylinderGeom, EllipsoidGeom, Shape, SphereGeom, pose_at
 from splatbot.sim.wrist import capsule_mesh
 
-_DARK = 0.7  # brightness of the second colour relative to the first
-_PERIOD = 0.03  # [m] of the pattern
+
+@dataclass(frozen=True)
+class SurfaceConstants:
+    """Constants of the pattern of trial surfaces.
+
+    Args:
+        dark: brightness of the second colour relative to the first.
+        period: [m] period of the pattern.
+    """
+
+    dark: float = 0.7
+    period: float = 0.03
+
+
+CONSTANTS = SurfaceConstants()
 
 
 def surfaces_of(obj: SceneObject, *, placed: bool = True, seed: int = 0) -> list[RaycastSurface]:
@@ -24,7 +39,9 @@ def surfaces_of(obj: SceneObject, *, placed: bool = True, seed: int = 0) -> list
         InputError: a shape has no mesh here: planes, hulls and soft bodies.
     """
     r, g, b = obj.color
-    texture = Texture((r, g, b), (_DARK * r, _DARK * g, _DARK * b), _PERIOD, seed=seed)
+    texture = Texture(
+        (r, g, b), (CONSTANTS.dark * r, CONSTANTS.dark * g, CONSTANTS.dark * b), CONSTANTS.period, seed=seed
+    )
     T = pose_at(obj.at, obj.rpy) if placed else np.eye(4)
     found = []
     for shape in obj.shapes:

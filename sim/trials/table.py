@@ -12,7 +12,8 @@ import numpy as np
 from splatbot.sim.compare.agreement import wilson
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.trials.scenes import TrialScene
-from splatbot.sim.trials.shake import RATE, Shake, strength
+from splatbot.sim.trials.shake import CONSTANTS as SHAKE
+from splatbot.sim.trials.shake import Shake, strength
 from splatbot.sim.trials.trial import TrialRow
 
 _MEGA = 1e6
@@ -62,7 +63,7 @@ def physics(trial: TrialScene) -> dict[str, Any]:
         "impratio": float(option.impratio),
         "timestep_ms": 1e3 * twin.timestep,
         "friction": sorted({obj.friction for obj in trial.scene.movable}),
-        "shake_hz": RATE,
+        "shake_hz": SHAKE.rate,
         "shake_m_s2": round(strength(shake, places[:, :3, 3]), 1),
         "held_out_friction": spread.friction,
         "held_out_mass": spread.mass,

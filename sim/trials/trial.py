@@ -31,10 +31,26 @@ from splatbot.sim.twin import Twin
 from splatbot.sim.video import Video
 from splatbot.sim.world import OBJECT
 
-RISE = 0.15  # [m] lift that success requires
-KEPT = 0.12  # [m] height over the start that success requires after shaking
-_TARGET_TOLERANCE = 0.04  # [m] between the centres of the target and the found object
-_CONTACT_EVERY = 5  # control periods between checks for contacts
+
+@dataclass(frozen=True)
+class TrialConstants:
+    """Constants of the success of a pick.
+
+    Args:
+        min_rise: [m] lift that success requires.
+        min_kept_height: [m] height over the start that success requires after shaking.
+        target_tolerance: [m] distance between the centres of the target and the found object.
+        contact_period: [control periods] time between checks for contacts.
+    """
+
+    min_rise: float = 0.15
+    min_kept_height: float = 0.12
+    target_tolerance: float = 0.04
+    contact_period: int = 5
+
+
+CONSTANTS = TrialConstants()
+
 
 Watch = Callable[[Any, float], None]
 
@@ -194,10 +210,10 @@ def attempt(
         except SplatbotError as error:
             shaken = error.message
         kept = _height(twin, trial.target) - before
-    success = bool(result) and rose >= RISE and kept >= KEPT
+    success = bool(result) and rose >= CONSTANTS.min_rise and kept >= CONSTANTS.min_kept_height
     outcome, reason = str(result.outcome), result.reason
     if result and not success:
-        outcome = "dropped" if rose >= RISE else "lost"
+        outcome = "dropped" if rose >= CONSTANTS.min_rise else "lost"
         reason = shaken or f"rose {1e3 * rose:.0f} mm, {1e3 * kept:.0f} mm after it was shaken"
     failure = "" if success else _failure(result, early, mistaken)
     touched = controller.touched(trial.target)
@@ -216,7 +232,7 @@ class _Watched(TwinController):
         self._periods += 1
         if self._watch is not None:
             self._watch(self.twin.data, self._clock)
-        if self._periods % _CONTACT_EVERY == 0:
+        if self._periods % CONSTANTS.contact_period == 0:
             self._contacts.update(self.twin.data, self._clock)
 
     def touched(self, target: str) -> tuple[str, ...]:
@@ -262,7 +278,7 @@ def _mistaken(known: StackMap, target: Target, trial: TrialScene) -> bool:
     found = transform_points(inverse(known.scene.T_world_base), points)
     middle = (found.min(axis=0) + found.max(axis=0))[:2] / 2
     true = next(np.asarray(obj.at) for obj in trial.scene.objects if obj.name == trial.target)
-    return bool(np.linalg.norm(middle - true[:2]) > _TARGET_TOLERANCE)
+    return bool(np.linalg.norm(middle - true[:2]) > CONSTANTS.target_tolerance)
 
 
 def _no_target(error: SplatbotError) -> TwinPickResult:

@@ -11,9 +11,23 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 
-MAX_GOAL_HEIGHT = 0.22  # [m] of the tool above the table
-MIN_CLEARANCE = 5e-3  # [m] true clearance at both ends, so that both are free on every kind of map
-_BATCHES = 20  # of 20,000 configurations that are sampled on a map
+
+@dataclass(frozen=True)
+class ProblemConstants:
+    """Constants of planning problems.
+
+    Args:
+        max_goal_height: [m] height of the tool above the table.
+        min_clearance: [m] true clearance at both ends, so that both are free on every kind of map.
+        batches: [20,000 configurations] configurations that are sampled on a map.
+    """
+
+    max_goal_height: float = 0.22
+    min_clearance: float = 5e-3
+    batches: int = 20
+
+
+CONSTANTS = ProblemConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +45,7 @@ def problems(
     truth: Truth,
     count: int,
     seed: int = 0,
-    clearance: float = MIN_CLEARANCE,
+    clearance: float = CONSTANTS.min_clearance,
 ) -> list[Problem]:
     """Sample ``count`` pairs of configurations with at least ``clearance`` [m] whose straight joint path collides."""
     rng = np.random.default_rng(seed)
@@ -44,7 +58,7 @@ def problems(
         above = tool[:, 2] > 0.0
         low = (
             above
-            & (tool[:, 2] < MAX_GOAL_HEIGHT)
+            & (tool[:, 2] < CONSTANTS.max_goal_height)
             & (tool[:, 0] > 0.2)
             & (tool[:, 0] < 0.9)
             & (np.abs(tool[:, 1]) < 0.8)
@@ -71,12 +85,16 @@ def map_problems(
     """
     rng = np.random.default_rng(seed)
     found: list[Problem] = []
-    for _ in range(_BATCHES):
+    for _ in range(CONSTANTS.batches):
         q = robot.random(20_000, rng)
         q = q[~arm.check(field, q).in_collision]
         tool = robot.tcp(q)[:, :3, 3]
         above = tool[:, 2] > box[0, 2]
-        low = above & (tool[:, 2] < box[0, 2] + MAX_GOAL_HEIGHT) & ((tool > box[0]) & (tool < box[1])).all(axis=1)
+        low = (
+            above
+            & (tool[:, 2] < box[0, 2] + CONSTANTS.max_goal_height)
+            & ((tool > box[0]) & (tool < box[1])).all(axis=1)
+        )
         starts, goals = q[above & ~low], q[low]
         n = min(len(starts), len(goals))
         blocked = arm.certify(field, starts[:n], goals[:n]).in_collision

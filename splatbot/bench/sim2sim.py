@@ -18,7 +18,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_err
 from splatbot.formats.ply import save_ply
 from splatbot.geometry import inverse
 from splatbot.protocols import Array
-from splatbot.results.margin import RADIUS, SHARE
+from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.compare.push import PushCase, PushTask, push_policies
@@ -29,14 +29,35 @@ from splatbot.sim.solids import rpy_of
 from splatbot.sim.twin import Twin
 
 TASKS = ("reach", "push")
-DISTANCE = 0.10  # [m] of a push
-_FIXED = 5  # solids of a table that do not move: its top and the shelf
-_PLACES = ((0.42, -0.42), (0.66, -0.42), (0.42, -0.14), (0.68, -0.14), (0.45, 0.14))  # [m] positions of the objects
-_JITTER = 0.03  # [m]
-_CLEARANCE = 0.01  # [m] true clearance at both ends of a reach
-_MATCH = 0.05  # [m] between the centres of an object and of its mapped counterpart
-_SWEPT = 0.09  # [m] clearance that a push needs
-_SEED_STRIDE = 7919  # between the seeds of tables
+
+
+@dataclass(frozen=True)
+class SimToSimConstants:
+    """Constants of the comparison of twins.
+
+    Args:
+        push_distance: [m] length of a push.
+        fixed_solids: solids of a table that do not move: its top and the shelf.
+        places: [m] positions of the objects.
+        jitter: [m] random shift of the positions.
+        min_clearance: [m] true clearance at both ends of a reach.
+        max_match_distance: [m] distance between the centres of an object and of its mapped counterpart.
+        swept_clearance: [m] clearance that a push needs.
+        seed_stride: difference between the seeds of tables.
+    """
+
+    push_distance: float = 0.10
+    fixed_solids: int = 5
+    places: tuple[tuple[float, float], ...] = ((0.42, -0.42), (0.66, -0.42), (0.42, -0.14), (0.68, -0.14), (0.45, 0.14))
+    jitter: float = 0.03
+    min_clearance: float = 0.01
+    max_match_distance: float = 0.05
+    swept_clearance: float = 0.09
+    seed_stride: int = 7919
+
+
+CONSTANTS = SimToSimConstants()
+
 
 Tell = Callable[[str, float], None]
 
@@ -86,8 +107,8 @@ class MappedTable:
 
     def own_margin(self, field: GaussianCollisionField) -> float:
         """Return the error [m] of the map's surfaces near the arm, measured against its own depth images."""
-        around = [*self.mapped.T_map_scene[:3, 3], RADIUS]
-        return surface_error(field, self.mapped.views(), around=around).share(SHARE)
+        around = [*self.mapped.T_map_scene[:3, 3], MARGIN.radius]
+        return surface_error(field, self.mapped.views(), around=around).share(MARGIN.share)
 
 
 def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, share: None) -> tuple[TrialResults, ...]:
@@ -101,7 +122,7 @@ def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, s
         try:
             for number in range(plan.tables):
                 tell(f"filming and mapping table {number + 1} of {plan.tables}", 0.0)
-                place = map_table(plan, folder / f"map-{number}.ply", plan.seed + _SEED_STRIDE * number)
+                place = map_table(plan, folder / f"map-{number}.ply", plan.seed + CONSTANTS.seed_stride * number)
                 for task in plan.tasks:
                     more = _TRY[task](plan, place, tell)
                     found[task] = join(found[task], more) if task in found else more
@@ -127,21 +148,21 @@ def work_table(seed: int = 0) -> Tabletop:
     """Return the planner's table with its shelf and five objects to push; the seed varies sizes and positions."""
     rng = np.random.default_rng(seed)
     objects: list[Solid] = []
-    for k, place in enumerate(_PLACES):
-        x, y = (np.asarray(place) + rng.uniform(-_JITTER, _JITTER, 2)).tolist()
+    for k, place in enumerate(CONSTANTS.places):
+        x, y = (np.asarray(place) + rng.uniform(-CONSTANTS.jitter, CONSTANTS.jitter, 2)).tolist()
         if k % 2:
             objects.append(Can((x, y, 0.0), float(rng.uniform(0.035, 0.05)), float(rng.uniform(0.08, 0.15))))
         else:
             width, depth, height = rng.uniform([0.06, 0.06, 0.08], [0.10, 0.10, 0.15]).tolist()
             objects.append(Block((x, y, height / 2), (width, depth, height), float(rng.uniform(-1.5, 1.5))))
-    return Tabletop((*tabletop().solids[:_FIXED], *objects))
+    return Tabletop((*tabletop().solids[: CONSTANTS.fixed_solids], *objects))
 
 
 def _reach(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
     robot, field = panda(), GaussianCollisionField(place.mapped.snapshot)
     ideal = GaussianCollisionField(place.table.gaussians(plan.gaussians))
     truth = Truth(place.table, 0.05)
-    wanted = problems(robot, RobotSpheres(robot), ideal, truth, plan.trials, place.seed, _CLEARANCE)
+    wanted = problems(robot, RobotSpheres(robot), ideal, truth, plan.trials, place.seed, CONSTANTS.min_clearance)
     cases = [ReachCase(problem.start, problem.goal, place.seed + k) for k, problem in enumerate(wanted)]
     true = truth_scene(place.table)
     task = ReachTask(
@@ -158,10 +179,10 @@ def _push(plan: SimToSimPlan, place: MappedTable, tell: Tell) -> TrialResults:
     rng = np.random.default_rng(place.seed)
     cases = []
     for k in range(plan.trials):
-        index = _FIXED + k % len(_PLACES)
+        index = CONSTANTS.fixed_solids + k % len(CONSTANTS.places)
         direction = _free_direction(place.table, index, rng)
         match = _mapped_object(mapped, middle_of(place.table.solids[index]))
-        cases.append(PushCase(match, f"thing{index}", direction, DISTANCE, place.seed + k))
+        cases.append(PushCase(match, f"thing{index}", direction, CONSTANTS.push_distance, place.seed + k))
     task = PushTask(cases, map_twin, lambda case: HeldOutTwin(true, draw(Spread(), case.seed)))
     return run_trials(task, push_policies(panda()), seed=plan.seed, on_progress=tell)
 
@@ -172,7 +193,9 @@ _TRY = {"reach": _reach, "push": _push}
 def movable_truth(table: Tabletop) -> Scene:
     """Return the scene of the true shapes, in which the objects on the table are movable."""
     scene = truth_scene(table)
-    objects = [shape.model_copy(update={"movable": k >= _FIXED}) for k, shape in enumerate(scene.objects)]
+    objects = [
+        shape.model_copy(update={"movable": k >= CONSTANTS.fixed_solids}) for k, shape in enumerate(scene.objects)
+    ]
     return make_scene({**scene.model_dump(), "objects": objects})
 
 
@@ -188,7 +211,7 @@ def middle_of(solid: Solid) -> Array:
 def _mapped_object(candidates: Sequence[SceneObject], center: Array) -> SceneObject | None:
     """Return the mapped object at the position of a true one; policies do not know this association."""
     gaps = [float(np.linalg.norm(np.asarray(found.at)[:2] - center[:2])) for found in candidates]
-    return candidates[int(np.argmin(gaps))] if gaps and min(gaps) <= _MATCH else None
+    return candidates[int(np.argmin(gaps))] if gaps and min(gaps) <= CONSTANTS.max_match_distance else None
 
 
 def _free_direction(table: Tabletop, index: int, rng: np.random.Generator) -> Array:
@@ -197,7 +220,7 @@ def _free_direction(table: Tabletop, index: int, rng: np.random.Generator) -> Ar
     middle = middle_of(table.solids[index])
     angles = np.linspace(-np.pi / 2, np.pi / 2, 8) + rng.uniform(0.0, np.pi / 8)  # away from the arm
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    along = np.linspace(-0.12, DISTANCE + 0.05, 12)[:, None]
+    along = np.linspace(-0.12, CONSTANTS.push_distance + 0.05, 12)[:, None]
     clearances = []
     for direction in directions:
         points = np.c_[middle[:2] + along * direction, np.full(len(along), 0.1)]
@@ -205,5 +228,5 @@ def _free_direction(table: Tabletop, index: int, rng: np.random.Generator) -> Ar
             (np.abs(points[:, 1]) < 0.7).all() and (points[:, 0] > 0.28).all() and (points[:, 0] < 0.85).all()
         )
         clearances.append(float(rest.distance(points).min()) if on_table else -1.0)
-    good = np.flatnonzero(np.array(clearances) > _SWEPT)
+    good = np.flatnonzero(np.array(clearances) > CONSTANTS.swept_clearance)
     return np.asarray(directions[rng.choice(good) if len(good) else int(np.argmax(clearances))])

@@ -13,8 +13,21 @@ from splatbot.geometry import rotation_to_quat
 
 Array = NDArray[np.float64]
 
-NORMAL_SIGMA = 1.5e-3  # [m] standard deviation of a Gaussian along its normal
-OVERLAP = 0.55  # a Gaussian's tangential sigma, in spacings of the samples
+
+@dataclass(frozen=True)
+class TabletopConstants:
+    """Constants of Gaussians on a table top.
+
+    Args:
+        normal_sigma: [m] standard deviation of a Gaussian along its normal.
+        overlap: [spacing] tangential standard deviation of a Gaussian.
+    """
+
+    normal_sigma: float = 1.5e-3
+    overlap: float = 0.55
+
+
+CONSTANTS = TabletopConstants()
 
 
 class Solid(Protocol):
@@ -174,7 +187,7 @@ class Tabletop:
         return GaussianModel.from_activated(
             means=points,
             quats=rotation_to_quat(np.stack([along, across, normal], axis=-1)),
-            scales=np.tile([OVERLAP * spacing, OVERLAP * spacing, NORMAL_SIGMA], (n, 1)),
+            scales=np.tile([CONSTANTS.overlap * spacing, CONSTANTS.overlap * spacing, CONSTANTS.normal_sigma], (n, 1)),
             opacities=np.full(n, 0.9),
             colors=np.full((n, 3), 0.5),
         )

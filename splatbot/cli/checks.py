@@ -11,8 +11,23 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import Literal
 
-EGL_TIMEOUT_S = 60.0
-SELF_CHECK_BOUND = 1e-4
+
+@dataclass(frozen=True)
+class CheckConstants:
+    """Constants of checks of the installation.
+
+    Args:
+        egl_timeout: [s] longest time of the check of EGL.
+        self_check_bound: largest error of the kernels' self check.
+    """
+
+    egl_timeout: float = 60.0
+    self_check_bound: float = 1e-4
+
+
+CONSTANTS = CheckConstants()
+
+
 _APT = "apt-get install libegl1 libgl1 libegl-mesa0 libgl1-mesa-dri"
 
 # Alternative distributions, and the feature that needs one of them ("": every feature).
@@ -101,7 +116,7 @@ def check_rasterizer() -> list[Finding]:
     except Exception as problem:  # the doctor reports any error and continues
         return [Finding("fail", "rasterizer", f"{type(problem).__name__}: {problem}", "rebuild: pip install -e .")]
     detail = f"differs from the float64 reference by {error:.1e}"
-    if error > SELF_CHECK_BOUND:
+    if error > CONSTANTS.self_check_bound:
         return [Finding("fail", "rasterizer", detail, "try SPLATBOT_ISA=v2; if that helps, report this processor")]
     return [Finding("ok", "rasterizer", detail)]
 
@@ -139,11 +154,11 @@ def check_egl() -> list[Finding]:
             env={**os.environ, "MUJOCO_GL": "egl"},
             capture_output=True,
             text=True,
-            timeout=EGL_TIMEOUT_S,
+            timeout=CONSTANTS.egl_timeout,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return [Finding("warn", "EGL", f"no picture within {EGL_TIMEOUT_S:.0f} s", f"as root: {_APT}")]
+        return [Finding("warn", "EGL", f"no picture within {CONSTANTS.egl_timeout:.0f} s", f"as root: {_APT}")]
     if answer.returncode == 0 and "rendered" in answer.stdout:
         return [Finding("ok", "EGL", "MuJoCo renders without a display")]
     last = (answer.stderr.strip() or answer.stdout.strip() or f"exit {answer.returncode}").splitlines()[-1]

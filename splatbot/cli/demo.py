@@ -21,8 +21,21 @@ from splatbot.serving import serving
 from splatbot.sim.effects.base import Effects
 from splatbot.sim.effects.depth_noise import DepthNoise
 
-_TABLE_M = 1e-3  # [m] largest height of a ray-cast point on the table
-_TIP_M = 0.005  # [m] radius of the queried fingertip; a camera with 2 mm of noise cannot locate a single point
+
+@dataclass(frozen=True)
+class DemoConstants:
+    """Constants of the demo.
+
+    Args:
+        table_height: [m] largest height of a ray-cast point on the table.
+        tip_radius: [m] radius of the queried fingertip; a camera with 2 mm of noise cannot locate a single point.
+    """
+
+    table_height: float = 1e-3
+    tip_radius: float = 0.005
+
+
+CONSTANTS = DemoConstants()
 
 
 def demo(*, out: Path = Path("runs/demo"), frames: int = 40) -> int:
@@ -81,7 +94,7 @@ def _question(scene: Log) -> _Question:
         raise SplatbotError("has no ground truth.", field=scene.name)
     points = first.camera.backproject(first.depth).astype(np.float64)
     height = transform_points(truth.T_world_camera[0], points)[..., 2]
-    table = (np.abs(height) < _TABLE_M).astype(np.uint8)
+    table = (np.abs(height) < CONSTANTS.table_height).astype(np.uint8)
     inner = cv2.distanceTransform(cv2.copyMakeBorder(table, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0), cv2.DIST_L2, 5)
     row, column = np.unravel_index(np.argmax(inner[1:-1, 1:-1]), table.shape)  # the farthest from any edge
     on_table = points[row, column]
@@ -94,9 +107,9 @@ def _question(scene: Log) -> _Question:
 
 def _tips(places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sample points (P·T, 3) in a fingertip at each of the positions (P, 3)."""
-    steps = np.linspace(-_TIP_M, _TIP_M, 5)
+    steps = np.linspace(-CONSTANTS.tip_radius, CONSTANTS.tip_radius, 5)
     cube = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
-    ball = cube[np.linalg.norm(cube, axis=1) <= _TIP_M * (1 + 1e-9)]
+    ball = cube[np.linalg.norm(cube, axis=1) <= CONSTANTS.tip_radius * (1 + 1e-9)]
     return (places[:, None] + ball).reshape(-1, 3)
 
 

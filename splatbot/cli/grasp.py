@@ -105,13 +105,13 @@ def grasp(
         friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
     )
     arm = load_robot(robot)
-    things = _things(map, base)
-    scene = things.scene
+    objects = _graspable_objects(map, base)
+    scene = objects.scene
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
-    sampler = things.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
+    sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
     sampler.margin = margin_of(margin, map, sampler.field, scene.T_world_base)
-    result = things.with_notes(sampler.sample(found, options))
+    result = objects.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
@@ -125,7 +125,7 @@ def grasp(
     return 0
 
 
-def _things(map_: Path, base: Pose | None) -> GraspableObjects:
+def _graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:
     from splatbot.gaussians import GaussianModel, Snapshot
     from splatbot.robots.graspable_objects import measured_map, run_of, segment_objects
     from splatbot.workspace import find_workspace

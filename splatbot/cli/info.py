@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,8 +11,21 @@ import tyro
 if TYPE_CHECKING:
     from splatbot.logs import Log
 
-_N_SAMPLES = 10  # frames that are decoded to describe a log
-_MAX_SHIFT = 0.004  # share of the width; sensors widen close objects by less
+
+@dataclass(frozen=True)
+class InfoConstants:
+    """Constants of the description of a log.
+
+    Args:
+        samples: frames that are decoded to describe a log.
+        max_shift: [share of width] largest offset of depth and colour; sensors widen close objects by less.
+    """
+
+    samples: int = 10
+    max_shift: float = 0.004
+
+
+CONSTANTS = InfoConstants()
 
 
 def info(
@@ -131,7 +145,7 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
     from splatbot.results.units import NONE, metres, percent
 
     n = len(log)
-    picks = sorted({round(i) for i in np.linspace(0, n - 1, min(n, _N_SAMPLES))})
+    picks = sorted({round(i) for i in np.linspace(0, n - 1, min(n, CONSTANTS.samples))})
     frames = [log[i] for i in picks]
     duration = frames[-1].stamp - frames[0].stamp
     depths = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
@@ -157,4 +171,4 @@ def shift_text(shift: tuple[int, int] | None, width: int) -> str:
     if shift is None:
         return "not known: few frames or edges, or none that depth and colour share clearly"
     text = f"{shift[0]}, {shift[1]} px"
-    return f"{text}: not well registered" if max(map(abs, shift)) > _MAX_SHIFT * width else text
+    return f"{text}: not well registered" if max(map(abs, shift)) > CONSTANTS.max_shift * width else text

@@ -7,13 +7,29 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from splatbot.run import Progress
 
-PLAIN_EVERY_S = 2.0
-_RATE_FRAMES = 10  # number of frames that the shown rate averages
+
+@dataclass(frozen=True)
+class ProgressConstants:
+    """Constants of the shown progress.
+
+    Args:
+        plain_period: [s] time between two lines of an output that is no terminal.
+        rate_frames: number of frames that the shown rate averages.
+    """
+
+    plain_period: float = 2.0
+    rate_frames: int = 10
+
+
+CONSTANTS = ProgressConstants()
+
+
 _COLOURS = {"ok": "green", "degraded": "yellow", "lost": "red"}
 
 
@@ -61,7 +77,7 @@ class PlainLines:
         news = progress.phase != "mapping" or (verdict == "lost") != (self._verdict == "lost")
         self._verdict = verdict
         if news or self._clock() >= self._due or progress.done == progress.total:
-            self._due = self._clock() + PLAIN_EVERY_S
+            self._due = self._clock() + CONSTANTS.plain_period
             print(describe(progress, rate), file=sys.stderr, flush=True)
 
 
@@ -69,7 +85,7 @@ class FrameRate:
     """Frames per second over the latest frames."""
 
     def __init__(self) -> None:
-        self._times: deque[tuple[int, float]] = deque(maxlen=_RATE_FRAMES + 1)
+        self._times: deque[tuple[int, float]] = deque(maxlen=CONSTANTS.rate_frames + 1)
 
     def add(self, progress: Progress) -> float:
         """Return the rate [1/s] including this frame; 0 before the second."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,8 +15,22 @@ from splatbot.errors import InputError
 from splatbot.geometry import quat_to_rotation
 from splatbot.protocols import Array
 
-TOLERANCE = 2e-4  # [m]; a body nearer to an ellipsoid than this may be reported as a collision
-_CHUNK = 200_000  # cells in one query
+
+@dataclass(frozen=True)
+class BodyConstants:
+    """Constants of collision tests between bodies and ellipsoids.
+
+    Args:
+        contact_tolerance: [m] a body nearer to an ellipsoid than this may be reported as a collision.
+        chunk: cells in one query; it bounds memory.
+    """
+
+    contact_tolerance: float = 2e-4
+    chunk: int = 200_000
+
+
+CONSTANTS = BodyConstants()
+
 
 # Splits cells, given as centres (C, 3), sizes as fractions of the body (C,), and body indices (C,).
 _Split = Callable[[Array, Array, NDArray[np.int64]], tuple[Array, Array, NDArray[np.int64]]]
@@ -27,7 +42,7 @@ def capsules_in_collision(
     end: ArrayLike | Tensor,
     radius: ArrayLike | Tensor,
     *,
-    tolerance: float = TOLERANCE,
+    tolerance: float = CONSTANTS.contact_tolerance,
 ) -> NDArray[np.bool_]:
     """Check whether capsules, which are spheres swept along segments, may collide with a Gaussian (P,).
 
@@ -115,8 +130,8 @@ def _search(
     at, part, body = centers, np.ones(len(centers)), np.arange(len(centers))
     while len(at):
         left: list[tuple[Array, Array, NDArray[np.int64]]] = []
-        for k in range(0, len(at), _CHUNK):
-            c, p, b = at[k : k + _CHUNK], part[k : k + _CHUNK], body[k : k + _CHUNK]
+        for k in range(0, len(at), CONSTANTS.chunk):
+            c, p, b = at[k : k + CONSTANTS.chunk], part[k : k + CONSTANTS.chunk], body[k : k + CONSTANTS.chunk]
             c, p, b = c[~hit[b]], p[~hit[b]], b[~hit[b]]
             extent = reach[b] * p
             doubtful = field.in_collision(np.c_[c, own[b] + extent])

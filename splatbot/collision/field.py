@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,8 +27,23 @@ except ImportError as error:
 
 __all__ = ["MIN_OPACITY", "SCALE_FLOOR", "GaussianCollisionField"]
 
-VOXEL, PACKED_VOXEL = 0.02, 0.025  # [m] edge length in the grid of lower bounds
-MAX_VOXELS = 2_000_000  # largest size of that grid, 4 MB; a larger map has larger voxels
+
+@dataclass(frozen=True)
+class FieldConstants:
+    """Constants of the grid of lower bounds.
+
+    Args:
+        voxel: [m] edge length of a voxel.
+        packed_voxel: [m] edge length of a voxel of a packed field.
+        max_voxels: largest size of the grid, 4 MB; a larger map has larger voxels.
+    """
+
+    voxel: float = 0.02
+    packed_voxel: float = 0.025
+    max_voxels: int = 2_000_000
+
+
+CONSTANTS = FieldConstants()
 
 
 class GaussianCollisionField:
@@ -87,8 +103,8 @@ class GaussianCollisionField:
             s.scales,
             s.names,
             n_sigma=self.n_sigma,
-            voxel=PACKED_VOXEL if packed else VOXEL,
-            max_voxels=MAX_VOXELS,
+            voxel=CONSTANTS.packed_voxel if packed else CONSTANTS.voxel,
+            max_voxels=CONSTANTS.max_voxels,
             packed=packed,
         )
 

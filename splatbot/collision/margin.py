@@ -15,8 +15,21 @@ from splatbot.errors import InputError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 
-_POINTS_PER_VIEW = 5000  # largest number of pixels of one view
-_MAX_ERROR = 0.3  # [m]; larger distances between a measured point and the map are clamped
+
+@dataclass(frozen=True)
+class MarginConstants:
+    """Constants of the measured surface error.
+
+    Args:
+        points_per_view: largest number of pixels of one view.
+        max_error: [m] larger distances between a measured point and the map are clamped.
+    """
+
+    points_per_view: int = 5000
+    max_error: float = 0.3
+
+
+CONSTANTS = MarginConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +78,13 @@ def surface_error(
         if depth.shape != (camera.height, camera.width):
             raise InputError(f"is {depth.shape}.", field="depth", hint=f"give ({camera.height}, {camera.width})")
         v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
-        some = np.linspace(0, len(v) - 1, min(len(v), _POINTS_PER_VIEW)).astype(np.int64)
+        some = np.linspace(0, len(v) - 1, min(len(v), CONSTANTS.points_per_view)).astype(np.int64)
         z = depth[v[some], u[some]].astype(np.float64)
         ray = np.stack([(u[some] - camera.cx) / camera.fx, (v[some] - camera.cy) / camera.fy, np.ones(len(some))], 1)
         points = transform_points(T_world_camera, ray * z[:, None])
         if ball is not None:
             points = points[np.linalg.norm(points - ball[:3], axis=1) <= ball[3]]
-        found.append(np.clip(field.clearance(points, cut=_MAX_ERROR).distance, 0.0, _MAX_ERROR))
+        found.append(np.clip(field.clearance(points, cut=CONSTANTS.max_error).distance, 0.0, CONSTANTS.max_error))
     if not sum(map(len, found)):
         raise InputError("have no depth.", field="views", hint="give the depth images that the map was made of")
     return SurfaceError(np.sort(np.concatenate(found)))

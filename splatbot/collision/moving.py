@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,14 +13,31 @@ from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.protocols import Array
 
-CELL = 0.02  # [m] edge length of the cells of the grid
-MIN_GAUSSIANS = 20  # smallest number of seen-through Gaussians around a cell of a dynamic object
-_MIN_SHARE = 0.5  # smallest fraction of seen-through Gaussians around a cell; flying pixels lie next to static surfaces
-PADDING = 0.02  # [m] added to a cell, because only the front of an object is seen, at the times of the frames only
-_SOLID_LOGIT = 4.0  # logit of an opacity of 0.98
+
+@dataclass(frozen=True)
+class MovingRegionConstants:
+    """Constants of the regions of dynamic objects.
+
+    Args:
+        cell: [m] edge length of the cells of the grid.
+        min_gaussians: smallest number of seen-through Gaussians around a cell of a dynamic object.
+        min_share: smallest fraction of seen-through Gaussians around a cell; flying pixels lie next to static surfaces.
+        padding: [m] distance added to a cell, because only the front of an object is seen, at the times of the frames
+            only.
+        solid_logit: logit of an opacity of 0.98.
+    """
+
+    cell: float = 0.02
+    min_gaussians: int = 20
+    min_share: float = 0.5
+    padding: float = 0.02
+    solid_logit: float = 4.0
 
 
-def find_moving(model: GaussianModel, evidence: VisibilityEvidence, *, around: float = PADDING) -> Array:
+CONSTANTS = MovingRegionConstants()
+
+
+def find_moving(model: GaussianModel, evidence: VisibilityEvidence, *, around: float = CONSTANTS.padding) -> Array:
     """Return spheres (V, 4) = (x, y, z, radius) [m, world] that cover the space of dynamic objects; V may be 0.
 
     A Gaussian that was measured, but seen through more often, belongs to a dynamic object or is a flying pixel at an
@@ -43,14 +62,14 @@ def find_moving(model: GaussianModel, evidence: VisibilityEvidence, *, around: f
     passed = evidence.seen_through[measured]
     if not passed.any():
         return np.zeros((0, 4))
-    low = points[passed].min(axis=0) - 2 * CELL
-    shape = tuple((np.floor((points[passed].max(axis=0) - low) / CELL) + 3).astype(np.int64))
+    low = points[passed].min(axis=0) - 2 * CONSTANTS.cell
+    shape = tuple((np.floor((points[passed].max(axis=0) - low) / CONSTANTS.cell) + 3).astype(np.int64))
     passed_count, count = (_histogram(part, low, shape) for part in (points[passed], points))
     nearby = _neighbourhood_sum(passed_count)
-    enough = (nearby >= MIN_GAUSSIANS) & (nearby >= _MIN_SHARE * _neighbourhood_sum(count))
+    enough = (nearby >= CONSTANTS.min_gaussians) & (nearby >= CONSTANTS.min_share * _neighbourhood_sum(count))
     cells = np.argwhere((passed_count > 0) & enough)
-    radius = CELL * np.sqrt(3.0) / 2 + around
-    return np.c_[low + (cells + 0.5) * CELL, np.full(len(cells), radius)]
+    radius = CONSTANTS.cell * np.sqrt(3.0) / 2 + around
+    return np.c_[low + (cells + 0.5) * CONSTANTS.cell, np.full(len(cells), radius)]
 
 
 def with_balls(model: GaussianModel, balls: Array, *, n_sigma: float, observations: int) -> GaussianModel:
@@ -68,7 +87,7 @@ def with_balls(model: GaussianModel, balls: Array, *, n_sigma: float, observatio
         means=centers,
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         log_scales=(radii / n_sigma).log()[:, None].repeat(1, 3),
-        opacity_logits=torch.full((count,), _SOLID_LOGIT),
+        opacity_logits=torch.full((count,), CONSTANTS.solid_logit),
         sh=torch.zeros(count, (degree + 1) ** 2, 3),
         observations=torch.full((count,), observations, dtype=torch.int32),
         anchors=torch.full((count,), -1, dtype=torch.int32),
@@ -78,7 +97,7 @@ def with_balls(model: GaussianModel, balls: Array, *, n_sigma: float, observatio
 
 def _histogram(points: Array, low: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Count the points (P, 3) in each cell of a grid; points outside the grid are ignored."""
-    cells = np.floor((points - low) / CELL).astype(np.int64)
+    cells = np.floor((points - low) / CONSTANTS.cell).astype(np.int64)
     cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
     flat = np.ravel_multi_index(tuple(cells.T), shape)
     return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape)

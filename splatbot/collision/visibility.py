@@ -14,9 +14,22 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 
-# A depth that differs from the Gaussian's by at most TOLERANCE + TOLERANCE_PER_Z2 z² hits it; a larger one passes it.
-# The noise of structured-light cameras grows with z² (Khoshelham & Elberink 2012: sigma = 1.4e-3 z^2).
-TOLERANCE, TOLERANCE_PER_Z2 = 0.01, 0.006  # [m], [1/m]
+
+@dataclass(frozen=True)
+class VisibilityConstants:
+    """Constants of the depth test.
+
+    Args:
+        depth_tolerance: [m] difference from the Gaussian's depth that hits it at any distance; a larger one passes it.
+        depth_tolerance_per_z2: [1/m] growth of the tolerance with z² (Khoshelham, Elberink 2012: sigma = 1.4e-3 z²).
+    """
+
+    depth_tolerance: float = 0.01
+    depth_tolerance_per_z2: float = 0.006
+
+
+CONSTANTS = VisibilityConstants()
+
 
 DepthView = tuple[NDArray[np.float32], Camera, Array]  # depth (H, W) [m], 0 if invalid, camera, T_world_camera (4, 4)
 
@@ -67,7 +80,7 @@ def evidence_at(points: Array, views: Iterable[DepthView]) -> VisibilityEvidence
         if depth.shape != (camera.height, camera.width):
             raise InputError(f"is {depth.shape}.", field="depth", hint=f"give ({camera.height}, {camera.width})")
         rows, measured, z = measured_depths(points, depth, camera, T_world_camera)
-        tolerance = TOLERANCE + TOLERANCE_PER_Z2 * z**2
+        tolerance = CONSTANTS.depth_tolerance + CONSTANTS.depth_tolerance_per_z2 * z**2
         hits[rows[np.abs(measured - z) <= tolerance]] += 1
         passes[rows[measured - z > tolerance]] += 1
     return VisibilityEvidence(hits, passes)

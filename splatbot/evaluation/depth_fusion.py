@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,23 @@ from splatbot.camera import Camera
 from splatbot.geometry import inverse
 from splatbot.protocols import Array
 
-MIN_WEIGHT = 3.0  # measurements of a voxel that the extracted surface requires
-_TRUNCATION = 8.0  # [voxels] truncation distance; Open3D's default
-_BLOCKS = 20_000  # initial capacity [blocks of 16³ voxels]; the hash table grows
+
+@dataclass(frozen=True)
+class FusionConstants:
+    """Constants of fused depth.
+
+    Args:
+        min_weight: measurements of a voxel that the extracted surface requires.
+        truncation: [voxels] truncation distance; Open3D's default.
+        blocks: [blocks of 16³ voxels] initial capacity; the hash table grows.
+    """
+
+    min_weight: float = 3.0
+    truncation: float = 8.0
+    blocks: int = 20_000
+
+
+CONSTANTS = FusionConstants()
 
 
 class DepthFusion:
@@ -27,7 +42,9 @@ class DepthFusion:
 
     def __init__(self, voxel: float, farthest: float) -> None:
         single, kinds = o3d.core.SizeVector((1,)), (o3d.core.float32, o3d.core.float32)
-        self._grid = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, (single, single), voxel, 16, _BLOCKS)
+        self._grid = o3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight"), kinds, (single, single), voxel, 16, CONSTANTS.blocks
+        )
         self._farthest = farthest
 
     def add(self, depth: NDArray[np.float32], camera: Camera, T_world_camera: Array) -> None:
@@ -36,11 +53,11 @@ class DepthFusion:
         image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(np.where(known, depth, 0).astype(np.float32)))
         K, T_camera_world = (o3d.core.Tensor.from_numpy(m) for m in (camera.K, inverse(T_world_camera)))
         blocks = self._grid.compute_unique_block_coordinates(image, K, T_camera_world, 1.0, self._farthest)
-        self._grid.integrate(blocks, image, K, T_camera_world, 1.0, self._farthest, _TRUNCATION)
+        self._grid.integrate(blocks, image, K, T_camera_world, 1.0, self._farthest, CONSTANTS.truncation)
 
     def points(self) -> Array:
-        """Return the surface points (N, 3) [m, world] with at least :data:`MIN_WEIGHT` measurements."""
-        points: Array = self._grid.extract_point_cloud(MIN_WEIGHT).point.positions.numpy().astype(np.float64)
+        """Return the surface points (N, 3) [m, world] with at least ``CONSTANTS.min_weight`` measurements."""
+        points: Array = self._grid.extract_point_cloud(CONSTANTS.min_weight).point.positions.numpy().astype(np.float64)
         return points
 
     def mesh(self) -> Any:
@@ -48,7 +65,7 @@ class DepthFusion:
 
         Vertices whose triangles all have zero area have no normal and are left out.
         """
-        mesh = self._grid.extract_triangle_mesh(MIN_WEIGHT).to_legacy()
+        mesh = self._grid.extract_triangle_mesh(CONSTANTS.min_weight).to_legacy()
         mesh.compute_vertex_normals()
         lengths = np.linalg.norm(np.asarray(mesh.vertex_normals), axis=1)
         mesh.remove_vertices_by_mask(~(lengths > 0.5))

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 
-_FINEST_CELL_M = 0.01
-_COARSENING = 1.25  # factor on the cell size until the number of spheres fits
+
+@dataclass(frozen=True)
+class AttachedConstants:
+    """Constants of the spheres of an attached object.
+
+    Args:
+        finest_cell: [m] smallest cell size that is tried.
+        coarsening: factor on the cell size until the number of spheres fits.
+    """
+
+    finest_cell: float = 0.01
+    coarsening: float = 1.25
+
+
+CONSTANTS = AttachedConstants()
 
 
 def covering_spheres(points: Array, reach: Array, *, max_spheres: int = 100) -> Array:
@@ -27,7 +42,7 @@ def covering_spheres(points: Array, reach: Array, *, max_spheres: int = 100) -> 
     """
     if not len(points) or max_spheres < 1:
         raise InputError("has no points, or max_spheres is below 1.", field="object", hint="name another target")
-    size = _FINEST_CELL_M
+    size = CONSTANTS.finest_cell
     while True:
         cells = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
         _, group = np.unique(cells, axis=0, return_inverse=True)
@@ -35,7 +50,7 @@ def covering_spheres(points: Array, reach: Array, *, max_spheres: int = 100) -> 
         count = int(group.max()) + 1
         if count <= max_spheres:
             break
-        size *= _COARSENING
+        size *= CONSTANTS.coarsening
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, group, points)
     np.maximum.at(high, group, points)

@@ -11,11 +11,6 @@ from splatbot.grasping.antipodal import Pairs
 from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array, HandShape
 
-MAX_PROTRUSION_M = 0.006  # of the target under a pad beyond the planned contact
-PAD_GAP_M = 0.003  # between each pad and the target during the approach
-OPENING_STEP_M = 0.002  # finger openings are rounded up to multiples of it
-MAX_CLEARANCE_M = 0.03  # larger clearances are clipped
-
 
 @dataclass(frozen=True)
 class HandPoseConstants:
@@ -28,6 +23,10 @@ class HandPoseConstants:
         contact_tolerance: [m] maximum distance between a pad and a surface point in contact.
         pad_compliance: [m] depth over which the soft pad distributes its contact.
         tip_margin: [m] minimum distance of a contact from the finger tips.
+        max_protrusion: [m] maximum protrusion of the target under a pad beyond the planned contact.
+        pad_gap: [m] distance between each pad and the target during the approach.
+        opening_step: [m] finger openings are rounded up to multiples of it.
+        max_clearance: [m] larger clearances are clipped.
     """
 
     hands_per_chunk: int = 32
@@ -36,6 +35,10 @@ class HandPoseConstants:
     contact_tolerance: float = 0.003
     pad_compliance: float = 0.001
     tip_margin: float = 0.002
+    max_protrusion: float = 0.006
+    pad_gap: float = 0.003
+    opening_step: float = 0.002
+    max_clearance: float = 0.03
 
 
 CONSTANTS = HandPoseConstants()
@@ -106,7 +109,10 @@ def place_hands(pairs: Pairs, hand: HandShape, *, rolls: int, depths: int, up: A
     steep = -(poses[:, :3, 2] @ up) >= lowest
     poses, pair = poses[steep], pair[steep]
     zero = np.zeros(len(poses))
-    opening = np.minimum(np.ceil((pairs.width[pair] + 2 * PAD_GAP_M) / OPENING_STEP_M) * OPENING_STEP_M, hand.stroke)
+    opening = np.minimum(
+        np.ceil((pairs.width[pair] + 2 * CONSTANTS.pad_gap) / CONSTANTS.opening_step) * CONSTANTS.opening_step,
+        hand.stroke,
+    )
     return Hands(poses, pair, opening, *(zero.copy() for _ in range(4)))
 
 
@@ -190,11 +196,13 @@ def _measured(
     dz = z - reach[2] - hand.tip  # gap to the tips along z
     under = (np.abs(x) < hand.width / 2) & (z < hand.tip) & (z > -hand.palm)
     protrusion = np.where(under & (side < half + 0.02), side - half, -np.inf).max(axis=1)
-    solid = np.where(under & (side < half + MAX_PROTRUSION_M), side + np.minimum(reach[1], MAX_PROTRUSION_M), half).max(
-        axis=1
+    solid = np.where(
+        under & (side < half + CONSTANTS.max_protrusion), side + np.minimum(reach[1], CONSTANTS.max_protrusion), half
+    ).max(axis=1)
+    opening = 2 * (np.maximum(solid, half[:, 0]) + CONSTANTS.pad_gap)
+    opening = np.minimum(
+        np.ceil(opening.astype(np.float64) / CONSTANTS.opening_step) * CONSTANTS.opening_step, hand.stroke
     )
-    opening = 2 * (np.maximum(solid, half[:, 0]) + PAD_GAP_M)
-    opening = np.minimum(np.ceil(opening.astype(np.float64) / OPENING_STEP_M) * OPENING_STEP_M, hand.stroke)
     inner = opening[:, None] / 2
     dy = np.maximum(inner - (side + reach[1]), (side - reach[1]) - inner - hand.thickness)
     finger = np.maximum(np.maximum(dx, dz), np.maximum(dy, -hand.palm - retreat - z - reach[2]))
@@ -202,7 +210,7 @@ def _measured(
         np.maximum(np.abs(x) - reach[0] - hand.palm_size[0] / 2, side - reach[1] - hand.palm_size[1] / 2),
         np.maximum(z - reach[2] + hand.palm, -hand.palm - retreat - z - reach[2]),
     )
-    clearance = np.minimum(np.minimum(finger, palm).min(axis=1), MAX_CLEARANCE_M)
+    clearance = np.minimum(np.minimum(finger, palm).min(axis=1), CONSTANTS.max_clearance)
     return opening, clearance, protrusion, _pad_coverage(x, y, z, half, hand)
 
 

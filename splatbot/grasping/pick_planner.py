@@ -14,7 +14,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.attached import covering_spheres
-from splatbot.grasping.hands import OPENING_STEP_M
+from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.sampler import GraspSampler
@@ -23,10 +23,21 @@ from splatbot.planning import GaussianRRTStar, JointGoal, Path
 from splatbot.planning.cartesian import StraightResult, straight_line
 from splatbot.protocols import Array
 
-_N_SIGMA = 1.0  # standard deviations to which the Gaussians of an attached object are inflated
-# Number of the six axis directions in which the object must surround a stray Gaussian inside of it. The sixth direction
-# may be open, as in a cup.
-_ENCLOSED_SIDES = 5
+
+@dataclass(frozen=True)
+class PickConstants:
+    """Constants of picks.
+
+    Args:
+        attached_sigmas: standard deviations to which the Gaussians of an attached object are inflated.
+        enclosed_sides: axis directions of six in which the object must surround a stray Gaussian; a cup is open in one.
+    """
+
+    attached_sigmas: float = 1.0
+    enclosed_sides: int = 5
+
+
+CONSTANTS = PickConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +155,9 @@ class MapPickPlanner:
         if grasp.q_pregrasp is None:
             return "no posture is known"
         obstacles, avoids_moving = self._obstacles(avoid_moving)
-        opening = min(float(np.ceil(grasp.opening / OPENING_STEP_M - 1e-6)) * OPENING_STEP_M, self.s.hand.stroke)
+        opening = min(
+            float(np.ceil(grasp.opening / HANDS.opening_step - 1e-6)) * HANDS.opening_step, self.s.hand.stroke
+        )
         planner = self._planner(obstacles.whole, opening)
         begin = time.perf_counter()
         plan = planner.plan(start, JointGoal(grasp.q_pregrasp), budget_ms=self.o.budget_ms, seed=self.o.seed)
@@ -215,7 +228,7 @@ def target_spheres(sampler: GraspSampler, target: Target) -> Array:
     """
     surface = sampler.surface(target)
     return covering_spheres(
-        surface.points, np.where(surface.observed, 0.0, surface.spread) + _N_SIGMA * surface.normal_std
+        surface.points, np.where(surface.observed, 0.0, surface.spread) + CONSTANTS.attached_sigmas * surface.normal_std
     )
 
 
@@ -233,7 +246,7 @@ def within(points: Array, spheres: Array) -> NDArray[np.bool_]:
         aligned = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
         sides += (aligned & (between[..., k] > 0)).any(axis=1)
         sides += (aligned & (between[..., k] < 0)).any(axis=1)
-    found[rows] = (sides >= _ENCLOSED_SIDES) | (np.linalg.norm(between, axis=2) <= spheres[:, 3]).any(axis=1)
+    found[rows] = (sides >= CONSTANTS.enclosed_sides) | (np.linalg.norm(between, axis=2) <= spheres[:, 3]).any(axis=1)
     return found
 
 

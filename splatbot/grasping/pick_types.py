@@ -30,7 +30,7 @@ class PickOutcome(StrEnum):
 
     PICKED = "picked"
     NO_GRASP = "no grasp"
-    NO_PLAN = "no way"  # no grasp has a certified plan; the value is part of the HTTP interface
+    NO_PLAN = "no plan"  # no grasp has a certified plan
     NOT_FOLLOWED = "not followed"  # the controller faulted or did not reach the end of the trajectory
     GRIPPER_FAILED = "gripper failed"
     NOTHING_HELD = "nothing held"

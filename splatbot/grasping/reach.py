@@ -11,14 +11,27 @@ import numpy as np
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
-from splatbot.grasping.hands import OPENING_STEP_M
+from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.planning.cartesian import straight_line
 from splatbot.planning.goals import goal_configurations
 from splatbot.planning.problem import PlanStatus, PoseGoal
 from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
 
-_MAX_SOLUTIONS = 4  # IK solutions of a grasp whose approach is tried
-ARM_FULL_SCORE_CLEARANCE_M = 0.03  # clearance of the arm with the score 1
+
+@dataclass(frozen=True)
+class ReachConstants:
+    """Constants of the reachability of grasps.
+
+    Args:
+        max_solutions: IK solutions of a grasp whose approach is tried.
+        full_score_clearance: [m] clearance of the arm with the score 1.
+    """
+
+    max_solutions: int = 4
+    full_score_clearance: float = 0.03
+
+
+CONSTANTS = ReachConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +112,14 @@ class ArmReach:
 
         @cache
         def arm(steps: int) -> RobotSpheres:
-            width = min(steps * OPENING_STEP_M, stroke)
+            width = min(steps * HANDS.opening_step, stroke)
             return RobotSpheres(robot, T_world_base=T_world_base, opening=width, margin=margin)
 
         self._arm = arm
 
     def arm(self, opening: float) -> RobotSpheres:
         """Return the arm's spheres with the fingers opened to ``opening`` [m], rounded up to 2 mm."""
-        return self._arm(int(np.ceil(opening / OPENING_STEP_M - 1e-6)))
+        return self._arm(int(np.ceil(opening / HANDS.opening_step - 1e-6)))
 
     def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
         """Check a grasp; see :class:`ReachabilityCheck`."""
@@ -114,7 +127,7 @@ class ArmReach:
         goals = goal_configurations(
             arm,
             self.around,
-            PoseGoal(T_world_tcp, postures=_MAX_SOLUTIONS),
+            PoseGoal(T_world_tcp, postures=CONSTANTS.max_solutions),
             near=self._near,
             seed=self.seed,
             until=time.perf_counter(),

@@ -11,11 +11,27 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-CELL = 0.002  # [m] size of a cell
-DISC = 0.004  # [m] maximum radius that a point covers
-STEP = 0.006  # [m] minimum height difference of an edge
-_COVERED_STD = 0.5  # standard deviations of a Gaussian that it covers
-_MAX_GAP_CELLS = 5  # gaps between Gaussians up to which the face is closed
+
+@dataclass(frozen=True)
+class ReliefConstants:
+    """Constants of height maps.
+
+    Args:
+        cell: [m] size of a cell.
+        max_disc: [m] maximum radius that a point covers.
+        min_step: [m] minimum height difference of an edge.
+        covered_sigmas: standard deviations of a Gaussian that it covers.
+        max_gap: [cells] gaps between Gaussians up to which the face is closed.
+    """
+
+    cell: float = 0.002
+    max_disc: float = 0.004
+    min_step: float = 0.006
+    covered_sigmas: float = 0.5
+    max_gap: int = 5
+
+
+CONSTANTS = ReliefConstants()
 
 
 def frame_along(direction: Array) -> Array:
@@ -47,20 +63,21 @@ class Relief:
                 the disc has a radius of 4 mm.
             like: height map whose grid is used. If None, the grid covers the points.
         """
+        size, disc = CONSTANTS.cell, CONSTANTS.max_disc
         if like is None:
-            low = flat[:, :2].min(axis=0) - 3 * CELL - DISC
-            shape = tuple(np.ceil((flat[:, :2].max(axis=0) + 3 * CELL + DISC - low) / CELL).astype(int) + 1)
+            low = flat[:, :2].min(axis=0) - 3 * size - disc
+            shape = tuple(np.ceil((flat[:, :2].max(axis=0) + 3 * size + disc - low) / size).astype(int) + 1)
         else:
             shape, low = like.heights.shape, like.low
         heights = np.full(shape, -np.inf)
         if not len(flat):
             return Relief(heights, low)
-        at = np.floor((flat[:, :2] - low) / CELL).astype(int)
-        reach = np.full(len(flat), DISC) if spread is None else np.minimum(_COVERED_STD * spread, DISC)
-        radius = int(DISC / CELL)
+        at = np.floor((flat[:, :2] - low) / size).astype(int)
+        reach = np.full(len(flat), disc) if spread is None else np.minimum(CONSTANTS.covered_sigmas * spread, disc)
+        radius = int(disc / size)
         for i in range(-radius, radius + 1):
             for j in range(-radius, radius + 1):
-                covers = np.hypot(i, j) * CELL <= reach
+                covers = np.hypot(i, j) * size <= reach
                 cell = at[covers] + [i, j]
                 inside = ((cell >= 0) & (cell < shape)).all(axis=1)
                 np.maximum.at(heights, tuple(cell[inside].T), flat[covers, 2][inside])
@@ -68,27 +85,27 @@ class Relief:
 
     def at(self, cells: NDArray[np.int64]) -> Array:
         """Return the coordinates (P, 2) [m] of the centres of cells (P, 2)."""
-        return np.asarray(self.low + (cells + 0.5) * CELL)
+        return np.asarray(self.low + (cells + 0.5) * CONSTANTS.cell)
 
     def inwards(self, flat: Array) -> Array:
         """Return the distance of points (P, 2+) [m] from the boundary of the face (P,) [m]; 0 outside of it.
 
         Small holes are closed first.
         """
-        cell = np.floor((flat[:, :2] - self.low) / CELL).astype(int)
+        cell = np.floor((flat[:, :2] - self.low) / CONSTANTS.cell).astype(int)
         on = np.asarray(((cell >= 0) & (cell < self.heights.shape)).all(axis=1))
         cell = np.where(on[:, None], cell, 0)
         return np.where(on, self._from_rim[cell[:, 0], cell[:, 1]], 0.0)
 
     @cached_property
     def _from_rim(self) -> Array:
-        return np.asarray(cv2.distanceTransform(self._closed, cv2.DIST_L2, 5) * CELL, dtype=np.float64)
+        return np.asarray(cv2.distanceTransform(self._closed, cv2.DIST_L2, 5) * CONSTANTS.cell, dtype=np.float64)
 
     @cached_property
     def _closed(self) -> NDArray[np.uint8]:
         known = np.isfinite(self.heights).astype(np.uint8)
         return np.asarray(
-            cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((_MAX_GAP_CELLS, _MAX_GAP_CELLS), np.uint8)),
+            cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((CONSTANTS.max_gap, CONSTANTS.max_gap), np.uint8)),
             dtype=np.uint8,
         )
 
@@ -101,7 +118,7 @@ class Relief:
         filled, holes = self.heights, (self._closed == 1) & ~np.isfinite(self.heights)
         if holes.any():
             spread = cv2.dilate(
-                np.where(np.isfinite(filled), filled, -1e9), np.ones((_MAX_GAP_CELLS, _MAX_GAP_CELLS), np.uint8)
+                np.where(np.isfinite(filled), filled, -1e9), np.ones((CONSTANTS.max_gap, CONSTANTS.max_gap), np.uint8)
             )
             filled = np.where(holes, spread, filled)
         found, outs, tops, beyonds = [], [], [], []
@@ -111,7 +128,11 @@ class Relief:
         for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             beyond = padded[1 + i : padded.shape[0] - 1 + i, 1 + j : padded.shape[1] - 1 + j]
             with np.errstate(invalid="ignore"):
-                edge = np.isfinite(filled) & (filled > -1e8) & ((filled - beyond > STEP) | ~np.isfinite(beyond))
+                edge = (
+                    np.isfinite(filled)
+                    & (filled > -1e8)
+                    & ((filled - beyond > CONSTANTS.min_step) | ~np.isfinite(beyond))
+                )
             cells = np.argwhere(edge)
             outward = -slope[cells[:, 0], cells[:, 1]]
             length = np.linalg.norm(outward, axis=1, keepdims=True)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from splatbot.grasping.antipodal import Pairs
 from splatbot.grasping.hands import Hands
-from splatbot.grasping.reach import ARM_FULL_SCORE_CLEARANCE_M, Reached
+from splatbot.grasping.reach import CONSTANTS as REACH
+from splatbot.grasping.reach import Reached
 from splatbot.grasping.volume import Volume
 from splatbot.protocols import Array, HandShape
 
@@ -23,7 +24,7 @@ WEIGHTS: Mapping[str, float] = {
     "torque": 4.0,  # remaining friction after the load of the object's weight
     "width": 1.0,  # remaining stroke
     "clear": 4.0,  # whether hand and arm avoid regions where motion was observed; absent without such regions
-    "room": 2.0,  # clearance of the hand along the approach
+    "clearance": 2.0,  # clearance of the hand along the approach
     "seen": 2.0,  # observed fraction of the surface at the contacts
     "certain": 1.0,  # standard deviation of the surface at the contacts
     "upright": 0.5,  # cosine between the approach direction and down
@@ -79,7 +80,7 @@ def hand_terms(
     distance of the nearest contact from the indicated point. The terms are clipped to 0..1::
 
         centre = 1 - a / 5 cm          torque = 1 - load / friction limit, see friction_load
-        width = (stroke - width) / 2 cm    room = clearance / 2 cm
+        width = (stroke - width) / 2 cm    clearance = clearance / 2 cm
         certain = 1 - std / 4 mm       upright = -z · up       near = 1 - b / 5 cm
 
     Args:
@@ -104,7 +105,7 @@ def hand_terms(
         "torque": 1.0
         - friction_load(body.size * CONSTANTS.density * CONSTANTS.load_acceleration, aside, hand, friction),
         "width": (hand.stroke - pairs.width[p]) / CONSTANTS.full_score_stroke,
-        "room": clearance / CONSTANTS.hand_full_score_clearance,
+        "clearance": clearance / CONSTANTS.hand_full_score_clearance,
         "seen": pairs.observed[p],
         "certain": 1.0 - pairs.normal_std[p] / CONSTANTS.zero_score_std,
         "upright": -(hands.T[:, :3, 2] @ up),
@@ -138,7 +139,7 @@ def friction_load(load: float, aside: Array, hand: HandShape, friction: float) -
 def arm_terms(reached: Reached) -> dict[str, float]:
     """Compute the score terms of an arm that reaches the grasp."""
     return {
-        "arm": float(np.clip(reached.clearance / ARM_FULL_SCORE_CLEARANCE_M, 0.0, 1.0)),
+        "arm": float(np.clip(reached.clearance / REACH.full_score_clearance, 0.0, 1.0)),
         "limits": float(np.clip(3 * reached.limits, 0.0, 1.0)),
     }
 

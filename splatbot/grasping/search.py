@@ -15,7 +15,8 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
-from splatbot.grasping.hands import MAX_PROTRUSION_M, Hands, measure_hands, palm_free, place_hands
+from splatbot.grasping.hands import CONSTANTS as HANDS
+from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ReachabilityCheck
@@ -207,7 +208,7 @@ class Search:
                 n_sigma=self.s.n_sigma,
                 friction=self.o.friction,
             )
-        uneven = hands.protrusion > MAX_PROTRUSION_M
+        uneven = hands.protrusion > HANDS.max_protrusion
         free = ~uneven & (hands.clearance > 0.0)
         self.log.drop("hands have something that stands out under a pad", uneven.sum())
         self.log.drop(_IN_TARGET, (~uneven & ~free).sum())

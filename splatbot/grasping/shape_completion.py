@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from splatbot.collision.visibility import DepthView, evidence_at
 from splatbot.geometry import inverse, transform_points
-from splatbot.grasping.relief import CELL, DISC, STEP, Relief, frame_along
-from splatbot.grasping.surface import MAX_POINTS, GraspSurface, measured_surface
+from splatbot.grasping.relief import CONSTANTS as RELIEF
+from splatbot.grasping.relief import Relief, frame_along
+from splatbot.grasping.surface import CONSTANTS as SURFACE
+from splatbot.grasping.surface import GraspSurface, measured_surface
 from splatbot.grasping.volume import winding_numbers
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
@@ -114,9 +116,9 @@ def target_surface(
         backs.append(back)
     points, normals, normal_std = (np.concatenate([part[k] for part in parts]) for k in range(3))
     # Sides reach down to the floor, so downward points of a front face's sides above it are no bottom.
-    standing = np.flatnonzero((normals @ up > -CONSTANTS.same_face_cosine) | (points @ up < floor + STEP))
+    standing = np.flatnonzero((normals @ up > -CONSTANTS.same_face_cosine) | (points @ up < floor + RELIEF.min_step))
     thin = np.unique(np.floor(points[standing] / CONSTANTS.spacing).astype(np.int64), axis=0, return_index=True)[1]
-    every = 1 + len(thin) // MAX_POINTS
+    every = 1 + len(thin) // SURFACE.max_points
     kept = standing[thin[::every]]
     for face, back in zip(faces, backs, strict=True):
         kept = kept[~face.hides(points[kept], back)]
@@ -153,7 +155,7 @@ class _CompletedFace:
         if self.relief is None:
             return np.zeros(len(points), np.bool_)
         flat = points @ self.across.T
-        behind = self.relief.inwards(flat) > CONSTANTS.observed_radius + DISC
+        behind = self.relief.inwards(flat) > CONSTANTS.observed_radius + RELIEF.max_disc
         top = np.percentile(self.flat[:, 2], 95)
         return np.asarray(behind & (flat[:, 2] > back + CONSTANTS.observed_radius) & (flat[:, 2] < top))
 
@@ -348,11 +350,11 @@ def _extruded_sides(
     count = np.array([len(row) for row in rows])
     if not count.sum():
         return none
-    plane = relief.at(at) + out * (CELL / 2)
+    plane = relief.at(at) + out * (RELIEF.cell / 2)
     points = np.c_[np.repeat(plane, count, axis=0), np.concatenate(rows)] @ across
     normals = np.repeat(np.c_[out, np.zeros(len(out))] @ across, count, axis=0)
     if closed:
-        known = np.isfinite(relief.heights) & (relief.heights > floor + STEP)
+        known = np.isfinite(relief.heights) & (relief.heights > floor + RELIEF.min_step)
         cells = np.argwhere(known & ~np.isfinite(below))[::2]
         top = relief.heights[cells[:, 0], cells[:, 1]]
         depth = np.maximum(floor + np.percentile(top, 95) - top, floor) if mirrored and len(cells) else floor

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,13 +24,29 @@ from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapObject, SegmentedMap
 from splatbot.segmentation.faces import find_faces, nearest_of
-from splatbot.segmentation.objects import FEWEST, LARGEST
+from splatbot.segmentation.objects import CONSTANTS as SEGMENTATION
 
-NEAR = 0.02  # [m] maximum distance between an indicated point and a Gaussian of the object
-_MIN_MASK_MAJORITY = 0.6  # of a mask's object pixels that belong to the selected object
-# A mask selects a part of an object if more than this fraction of the object's visible Gaussians is outside of the
-# margin around it. Smaller differences are errors at the boundary of the mask.
-_MASK_MARGIN_M, _MIN_OUTSIDE_FRACTION = 0.01, 0.15
+
+@dataclass(frozen=True)
+class SpatialConstants:
+    """Constants of targets by place.
+
+    Args:
+        max_distance: [m] maximum distance between an indicated point and a Gaussian of the object.
+        min_mask_majority: least fraction of a mask's object pixels that belong to the selected object.
+        mask_margin: [m] margin around a mask; smaller differences are errors at its boundary.
+        min_outside_fraction: a mask selects a part if more than this fraction of the visible object is outside.
+    """
+
+    max_distance: float = 0.02
+    min_mask_majority: float = 0.6
+    mask_margin: float = 0.01
+    min_outside_fraction: float = 0.15
+
+
+CONSTANTS = SpatialConstants()
+
+
 _WITHIN = "the point is inside of the object, not on its surface"
 _TOUCHING = "the object is connected with others in the map; the target is the marked part"
 _UNSEGMENTED = "it is not a segmented object; the target is the marked part of its faces"
@@ -90,11 +108,11 @@ def at_point(scene: SegmentedMap, point: Array, *, backend: str = "place", label
     """
     means = scene.model.means.detach().double().numpy()
     away = [float(np.linalg.norm(means[o.rows] - point, axis=1).min()) for o in scene.objects]
-    if away and min(away) <= NEAR:
+    if away and min(away) <= CONSTANTS.max_distance:
         k = int(np.argmin(away))
         found = scene.objects[k]
         others = [a for i, a in enumerate(away) if i != k]
-        score = 1.0 if not others else float(np.clip((min(others) - away[k]) / NEAR, 0.0, 1.0))
+        score = 1.0 if not others else float(np.clip((min(others) - away[k]) / CONSTANTS.max_distance, 0.0, 1.0))
         return Target(found.rows, point, label or found.name or f"object {k}", backend, score, (), k)
     around = _around(scene, point)
     if around is not None:
@@ -129,15 +147,19 @@ def _around(scene: SegmentedMap, point: Array) -> MapObject | None:
 def _face_at(scene: SegmentedMap, point: Array) -> NDArray[np.int64]:
     """Return the Gaussians of the separate face at a point, such as the spine of a book in a shelf; else no rows."""
     local = transform_points(inverse(scene.T_world_base), point)
-    rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < LARGEST / 2).all(axis=1))
+    rows = np.flatnonzero(scene.solid & (np.abs(scene.points - local) < SEGMENTATION.max_extent / 2).all(axis=1))
     rows = rows[scene.labels[rows] >= -1]
-    if len(rows) < FEWEST:
+    if len(rows) < SEGMENTATION.min_gaussians:
         return rows[:0]
-    faces = find_faces(scene.points[rows], fewest=FEWEST)
+    faces = find_faces(scene.points[rows], fewest=SEGMENTATION.min_gaussians)
     away = np.linalg.norm(scene.points[rows] - local, axis=1)
     k = int(np.argmin(away))
     own = rows[faces.owner == faces.owner[k]]
-    if away[k] > NEAR or faces.owner[k] < 0 or np.ptp(scene.points[own], axis=0).max() > 0.9 * LARGEST:
+    if (
+        away[k] > CONSTANTS.max_distance
+        or faces.owner[k] < 0
+        or np.ptp(scene.points[own], axis=0).max() > 0.9 * SEGMENTATION.max_extent
+    ):
         return rows[:0]
     return own
 
@@ -153,27 +175,29 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
     labels = scene.labels[seeds]
     votes = np.bincount(labels[labels >= 0], minlength=len(scene.objects))
     share = votes / len(seeds)
-    if not len(votes) or share.sum() < _MIN_MASK_MAJORITY / 2:
+    if not len(votes) or share.sum() < CONSTANTS.min_mask_majority / 2:
         rows = scene.grown(seeds)
         if not len(rows):
             raise AffordanceError("shows only supports, no object.", field="mask", hint="mark an object")
         return Target(rows, None, "marked part", "place", 0.5, (_UNSEGMENTED,))
     k = int(np.argmax(votes))
-    if votes[k] < _MIN_MASK_MAJORITY * votes.sum():
+    if votes[k] < CONSTANTS.min_mask_majority * votes.sum():
         names = tuple(o.name or f"object {o.number}" for o in scene.objects if votes[o.number] > 0.2 * votes.sum())
         raise AffordanceError(
             f"shows {len(names)} objects about equally.", field="mask", hint="mark one of them", candidates=names
         )
     found = scene.objects[k]
     label, score = found.name or f"object {k}", float(votes[k] / votes.sum())
-    if exact and votes[k] >= FEWEST:
+    if exact and votes[k] >= SEGMENTATION.min_gaussians:
         shown = _visible(scene, view, np.ones_like(mask))
         shown = shown[scene.labels[shown] == k]
         own, other = seeds[labels == k], np.setdiff1d(shown, seeds)
         outside = (
-            nearest_of(scene.points[own], scene.points[other])[1] > _MASK_MARGIN_M**2 if len(other) else np.zeros(0)
+            nearest_of(scene.points[own], scene.points[other])[1] > CONSTANTS.mask_margin**2
+            if len(other)
+            else np.zeros(0)
         )
-        if outside.sum() > _MIN_OUTSIDE_FRACTION * len(shown) or 2 * len(own) < len(shown):
+        if outside.sum() > CONSTANTS.min_outside_fraction * len(shown) or 2 * len(own) < len(shown):
             rows = _nearer(scene.points, found.rows, own, other)
             return Target(rows, None, f"part of {label}", "place", score, (_TOUCHING,), k)
     return Target(found.rows, None, label, "place", score, (), k)
@@ -197,7 +221,7 @@ def _visible(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_]) -
     u, v = np.rint(c.project(at)).astype(np.int64).T
     inside = (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height)
     rows, at, u, v = rows[inside], at[inside], u[inside], v[inside]
-    return rows[mask[v, u] & (np.abs(depth[v, u] - at[:, 2]) < NEAR)]
+    return rows[mask[v, u] & (np.abs(depth[v, u] - at[:, 2]) < CONSTANTS.max_distance)]
 
 
 def _rectangle(hint: BoxHint) -> NDArray[np.bool_]:

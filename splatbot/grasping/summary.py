@@ -43,7 +43,7 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "approach": grasp.approach,
         "terms": dict(grasp.terms),
         "total": grasp.total,
-        "room_m": grasp.clearance,
+        "clearance_m": grasp.clearance,
         "q": grasp.q.tolist() if grasp.q is not None else None,
         "q_pregrasp": grasp.q_pregrasp.tolist() if grasp.q_pregrasp is not None else None,
         "approach_path": grasp.approach_path.tolist() if grasp.approach_path is not None else None,

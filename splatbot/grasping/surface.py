@@ -14,9 +14,6 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
-MAX_POINTS = 1800  # on a surface; more are subsampled
-SMOOTHING_M = 0.006  # standard deviation [m] of the kernel that averages normals
-
 
 @dataclass(frozen=True)
 class SurfaceConstants:
@@ -27,12 +24,16 @@ class SurfaceConstants:
         smoothing_cosine: minimum cosine between normals that are averaged.
         sharp_cosine: minimum cosine between normals that are averaged where edges stay sharp.
         max_area_ratio: points with a larger area, relative to the median, are strays.
+        max_points: points on a surface; more are subsampled.
+        smoothing: [m] standard deviation of the kernel that averages normals.
     """
 
     min_support: float = 0.2
     smoothing_cosine: float = 0.3
     sharp_cosine: float = 0.8
     max_area_ratio: float = 4.0
+    max_points: int = 1800
+    smoothing: float = 0.006
 
 
 CONSTANTS = SurfaceConstants()
@@ -96,7 +97,9 @@ def measured_surface(
     # Gaussians with few observations are often flying pixels next to a depth edge.
     support = scene.model.observations.numpy()[rows]
     rows = rows[support >= CONSTANTS.min_support * np.percentile(support, 90)] if len(rows) else rows
-    chosen = rows if len(rows) <= MAX_POINTS else np.sort(rng.choice(rows, MAX_POINTS, replace=False))
+    chosen = (
+        rows if len(rows) <= CONSTANTS.max_points else np.sort(rng.choice(rows, CONSTANTS.max_points, replace=False))
+    )
     model = scene.model.select(torch.from_numpy(chosen))
     points = model.means.detach().double().numpy()
     scales = np.sort(model.scales.detach().double().numpy(), axis=1)
@@ -144,10 +147,10 @@ def _smoothed(points: Array, normals: Array, flatness: Array, *, cosine: float) 
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
     weight = np.maximum(square[:, None] + square[None] - 2 * (p @ p.T), 0.0)
-    np.exp(weight * (-0.5 / SMOOTHING_M**2), out=weight)
+    np.exp(weight * (-0.5 / CONSTANTS.smoothing**2), out=weight)
     density = weight.sum(axis=1)
     weight *= n @ n.T > cosine
     weight *= np.maximum(flatness, 0.05).astype(np.float32)
     mean = (weight @ n).astype(np.float64)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    return mean, np.asarray(2 * np.pi * SMOOTHING_M**2 / density, dtype=np.float64)
+    return mean, np.asarray(2 * np.pi * CONSTANTS.smoothing**2 / density, dtype=np.float64)

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField, boxes_in_collision
 from splatbot.geometry import inverse, rotation_to_quat, transform_points
-from splatbot.grasping.hands import MAX_CLEARANCE_M, Hands
+from splatbot.grasping.hands import CONSTANTS as HANDS
+from splatbot.grasping.hands import Hands
 from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
 
-_SAMPLES = 5  # poses along the approach
-_BATCH = 4096  # hands that are evaluated at once
-_TOLERANCE_M = 1e-3  # of box queries, and cut-off of the quick finger test
+
+@dataclass(frozen=True)
+class SweepConstants:
+    """Constants of the swept approach of a hand.
+
+    Args:
+        samples: poses along the approach.
+        batch: hands that are evaluated at once; it bounds memory.
+        box_tolerance: [m] tolerance of box queries, and cut-off of the quick finger test.
+    """
+
+    samples: int = 5
+    batch: int = 4096
+    box_tolerance: float = 1e-3
+
+
+CONSTANTS = SweepConstants()
 
 
 def swept_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, *, retreat: float) -> Array:
@@ -21,12 +38,12 @@ def swept_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisi
     Values are clipped to 3 cm. The continuous path between the poses is certified later for the whole arm, see
     :func:`splatbot.planning.cartesian.straight_line`.
     """
-    return _clearance(robot, hands, field, back=np.linspace(0.0, retreat, _SAMPLES), cut=MAX_CLEARANCE_M)
+    return _clearance(robot, hands, field, back=np.linspace(0.0, retreat, CONSTANTS.samples), cut=HANDS.max_clearance)
 
 
 def finger_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, hand: HandShape) -> Array:
     """Compute the clearance (K,) [m] of the finger spheres at the grasp, clipped to 1 mm; a quick test."""
-    return _clearance(robot, hands, field, back=np.zeros(1), cut=_TOLERANCE_M, ahead=-hand.palm)
+    return _clearance(robot, hands, field, back=np.zeros(1), cut=CONSTANTS.box_tolerance, ahead=-hand.palm)
 
 
 def _clearance(
@@ -46,7 +63,7 @@ def _clearance(
     T_tcp_link = inverse(robot.T_link_tcp)
     clearance = np.full(len(hands), cut)
     alike = (np.flatnonzero(hands.opening == opening) for opening in np.unique(hands.opening))
-    for rows in (some[k : k + _BATCH] for some in alike for k in range(0, len(some), _BATCH)):
+    for rows in (some[k : k + CONSTANTS.batch] for some in alike for k in range(0, len(some), CONSTANTS.batch)):
         spheres = robot.spheres(float(hands.opening[rows[0]]))
         own = spheres.link == len(robot.chain)
         local, radii = transform_points(T_tcp_link, spheres.centers[own]), spheres.radii[own]
@@ -80,5 +97,7 @@ def touches(field: GaussianCollisionField, hands: Hands, hand: HandShape, *, ret
     hit = np.zeros(len(hands), np.bool_)
     for centers, size in boxes:
         world = np.einsum("kij,kj->ki", R, centers) + at
-        hit |= boxes_in_collision(field, world, quats, np.tile(size, (len(hands), 1)), tolerance=_TOLERANCE_M)
+        hit |= boxes_in_collision(
+            field, world, quats, np.tile(size, (len(hands), 1)), tolerance=CONSTANTS.box_tolerance
+        )
     return hit

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatbot.grasping.surface import SMOOTHING_M
+from splatbot.grasping.surface import CONSTANTS as SURFACE
 from splatbot.protocols import Array
 
 
@@ -102,6 +102,6 @@ def _areas(points: Array, normals: Array) -> Array:
     """Estimate the area of each point (M,) [m²] from the kernel density of the points on its side."""
     p, n = (points - points.mean(axis=0)).astype(np.float32), normals.astype(np.float32)
     square = (p**2).sum(axis=1)
-    weight = np.exp(np.maximum(square[:, None] + square - 2 * (p @ p.T), 0.0) * (-0.5 / SMOOTHING_M**2))
+    weight = np.exp(np.maximum(square[:, None] + square - 2 * (p @ p.T), 0.0) * (-0.5 / SURFACE.smoothing**2))
     weight *= n @ n.T > CONSTANTS.same_side_cosine
-    return np.asarray(2 * np.pi * SMOOTHING_M**2 / weight.sum(axis=1), dtype=np.float64)
+    return np.asarray(2 * np.pi * SURFACE.smoothing**2 / weight.sum(axis=1), dtype=np.float64)

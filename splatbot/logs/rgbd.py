@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,26 @@ from splatbot.logs.calibration import Calibration
 from splatbot.logs.images import read_color, read_depth
 from splatbot.logs.undistort import Undistorter
 
-NEAR, FAR = 0.05, 50.0  # [m]; no RGB-D sensor's median depth lies outside
+
+@dataclass(frozen=True)
+class DepthUnitConstants:
+    """Constants of the recognition of depth units.
+
+    Args:
+        min_median: [m] no RGB-D sensor's median depth is smaller.
+        max_median: [m] no RGB-D sensor's median depth is larger.
+        typical_median: [m] median depth of most logs.
+    """
+
+    min_median: float = 0.05
+    max_median: float = 50.0
+    typical_median: float = 1.5
+
+
+CONSTANTS = DepthUnitConstants()
+
+
 _SCALES = (1.0, 100.0, 1000.0, 5000.0, 6553.5, 10000.0)  # units per metre in use
-_TYPICAL = 1.5  # [m]
 
 
 class RgbdReader:
@@ -79,10 +97,10 @@ class RgbdReader:
 
     def _check_unit(self, z: NDArray[np.float32], depth: Path) -> None:
         median = float(np.median(z[z > 0]))
-        if NEAR <= median <= FAR:
+        if CONSTANTS.min_median <= median <= CONSTANTS.max_median:
             return
         units = median * self.calibration.depth_scale
-        likely = min(_SCALES, key=lambda scale: abs(np.log(units / scale / _TYPICAL)))
+        likely = min(_SCALES, key=lambda scale: abs(np.log(units / scale / CONSTANTS.typical_median)))
         raise LogError(
             f"is {self.calibration.depth_scale:g}, which makes the median depth of {depth.name} {median:.4g} m.",
             file=self.calibration.file or depth,

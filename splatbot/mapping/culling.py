@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.mapping.keyframes import Keyframe
 
-_METERS_PER_RADIAN = 0.5  # weight of rotation in the distance of two views
-_LATEST_KEPT = 8  # latest keyframes, which tracking uses
+
+@dataclass(frozen=True)
+class CullingConstants:
+    """Constants of the selection of keyframes to drop.
+
+    Args:
+        meters_per_radian: [m/rad] weight of rotation in the distance of two views.
+        latest_kept: latest keyframes, which tracking uses.
+    """
+
+    meters_per_radian: float = 0.5
+    latest_kept: int = 8
+
+
+CONSTANTS = CullingConstants()
 
 
 def without_redundant(keyframes: Sequence[Keyframe], limit: int) -> list[Keyframe]:
@@ -20,8 +34,8 @@ def without_redundant(keyframes: Sequence[Keyframe], limit: int) -> list[Keyfram
     latest stay because tracking uses them.
     """
     kept = list(keyframes)
-    while len(kept) > max(limit, _LATEST_KEPT + 2):
-        nearest = _distances(kept).min(axis=1)[1:-_LATEST_KEPT]
+    while len(kept) > max(limit, CONSTANTS.latest_kept + 2):
+        nearest = _distances(kept).min(axis=1)[1 : -CONSTANTS.latest_kept]
         del kept[1 + int(np.argmin(nearest))]
     return kept
 
@@ -31,6 +45,6 @@ def _distances(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
     T = np.stack([keyframe.T_world_camera for keyframe in keyframes])
     moved = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
     cosine = 0.5 * (np.einsum("aij,bij->ab", T[:, :3, :3], T[:, :3, :3]) - 1.0)
-    gaps: NDArray[np.float64] = moved + _METERS_PER_RADIAN * np.arccos(np.clip(cosine, -1.0, 1.0))
+    gaps: NDArray[np.float64] = moved + CONSTANTS.meters_per_radian * np.arccos(np.clip(cosine, -1.0, 1.0))
     np.fill_diagonal(gaps, np.inf)
     return gaps

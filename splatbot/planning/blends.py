@@ -9,9 +9,23 @@ from numpy.typing import NDArray
 
 from splatbot.protocols import Array
 
-_BLEND_SAMPLES = 48  # samples of a blend
-_BLEND_CHORDS = 12  # chords that approximate a blend before its speed is planned
-_MIN_LINE_SAMPLES = 24  # samples of the shortest line
+
+@dataclass(frozen=True)
+class BlendConstants:
+    """Constants of blends between straight segments.
+
+    Args:
+        samples: samples of a blend.
+        chords: chords that approximate a blend before its speed is planned.
+        min_line_samples: samples of the shortest line.
+    """
+
+    samples: int = 48
+    chords: int = 12
+    min_line_samples: int = 24
+
+
+CONSTANTS = BlendConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +55,9 @@ class Curve:
         """Return values of s (N,), not decreasing, dense enough to plan speeds; a joint between pieces occurs twice."""
         start = np.concatenate([[0.0], np.cumsum(self.length)])
         even = max(self.total / 256, 1e-9)
-        counts = np.where(self.corner >= 0, _BLEND_SAMPLES, _MIN_LINE_SAMPLES + (self.length / even).astype(np.int64))
+        counts = np.where(
+            self.corner >= 0, CONSTANTS.samples, CONSTANTS.min_line_samples + (self.length / even).astype(np.int64)
+        )
         return np.concatenate([np.linspace(start[i], start[i + 1], int(counts[i])) for i in range(len(self.length))])
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
@@ -98,7 +114,7 @@ def blend_chords(before: Array, at: Array, after: Array, reach: float) -> Array:
             at + reach * np.array([0.2, 0.6, 1.0])[:, None] * last / np.linalg.norm(last),
         ]
     )
-    u = np.linspace(0.0, 1.0, _BLEND_CHORDS + 1)
+    u = np.linspace(0.0, 1.0, CONSTANTS.chords + 1)
     return _bezier(np.broadcast_to(curve, (len(u), *curve.shape)), u)
 
 

@@ -12,16 +12,33 @@ from splatbot.collision.robot import EPS
 from splatbot.errors import InputError
 from splatbot.geometry import so3_exp, so3_log
 from splatbot.planning.causes import collision
-from splatbot.planning.ik import TOLERANCE, HasTool, inverse_kinematics, is_rigid
+from splatbot.planning.ik import CONSTANTS as IK
+from splatbot.planning.ik import HasTool, inverse_kinematics, is_rigid
 from splatbot.planning.problem import Cause, Certificate, GoalError, Path, PlanStatus, StartError
 from splatbot.planning.timing import min_clearance
 from splatbot.protocols import Array
 
-STEP = 0.01  # [m] largest distance between two points of the line
-TURN = 0.05  # [rad] largest rotation between two points
-JUMP = 0.3  # [rad or m] largest step of a joint between two points; a larger one is another branch of the IK
-OFF_LINE = 1e-3  # [m] largest deviation of the tool from the line between two points
-_SUBDIVISIONS = 4  # largest number of times that the points are doubled to keep OFF_LINE
+
+@dataclass(frozen=True)
+class LineConstants:
+    """Constants of straight lines of the tool.
+
+    Args:
+        max_step: [m] largest distance between two points of the line.
+        max_turn: [rad] largest rotation between two points.
+        max_jump: [rad or m] largest step of a joint between two points; a larger one is another branch of the IK.
+        max_deviation: [m] largest deviation of the tool from the line between two points.
+        max_subdivisions: largest number of times that the points are doubled to keep ``max_deviation``.
+    """
+
+    max_step: float = 0.01
+    max_turn: float = 0.05
+    max_jump: float = 0.3
+    max_deviation: float = 1e-3
+    max_subdivisions: int = 4
+
+
+CONSTANTS = LineConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +72,7 @@ def straight_line(
     T_world_end: ArrayLike,
     *,
     eps: float = EPS,
-    off_line: float = OFF_LINE,
+    off_line: float = CONSTANTS.max_deviation,
 ) -> StraightResult:
     """Move the tool on a straight line with a constant axis of rotation.
 
@@ -83,8 +100,10 @@ def straight_line(
     if arm.check(field, q0[None]).in_collision[0]:
         cause = collision(arm, field, q0) if field is not None else None
         return StraightResult(PlanStatus.START_STATE_IN_COLLISION, None, 0.0, 0.0, cause, f"at the start {cause}.")
-    count = max(1, int(np.ceil(max(np.linalg.norm(length) / STEP, np.linalg.norm(turn) / TURN))))
-    for _ in range(_SUBDIVISIONS):
+    count = max(
+        1, int(np.ceil(max(np.linalg.norm(length) / CONSTANTS.max_step, np.linalg.norm(turn) / CONSTANTS.max_turn)))
+    )
+    for _ in range(CONSTANTS.max_subdivisions):
         shares = np.linspace(0.0, 1.0, count + 1)
         q, lost = _joint_path(arm, tool, q0, T_start, length, turn, shares)
         deviation = _deviation(arm, tool, q, T_start, length)
@@ -113,7 +132,7 @@ def _joint_path(
         T[:3, 3] += share * length
         T[:3, :3] = T_start[:3, :3] @ so3_exp(share * turn)
         found, error = inverse_kinematics(arm.native, chain, tool, T[None], q[-1][None])
-        if (error[0] > TOLERANCE).any() or np.abs(found[0] - q[-1]).max() > JUMP:
+        if (error[0] > IK.max_error).any() or np.abs(found[0] - q[-1]).max() > CONSTANTS.max_jump:
             return np.array(q), True
         q.append(found[0])
     return np.array(q), False

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.planning.problem import Cause
 from splatbot.protocols import Array, KinematicChain
 
-SEARCH_DISTANCE = 0.05  # [m] around the arm in which the obstacle is searched
-LIMIT_SLACK = 1e-6  # [rad or m] that a start or goal may exceed a limit; encoders at a hard stop read such values
+
+@dataclass(frozen=True)
+class CauseConstants:
+    """Constants of the causes of infeasible starts and goals.
+
+    Args:
+        search_distance: [m] distance around the arm in which the obstacle is searched.
+        limit_slack: [rad or m] excess of a start or goal over a limit; encoders at a hard stop read such values.
+    """
+
+    search_distance: float = 0.05
+    limit_slack: float = 1e-6
+
+
+CONSTANTS = CauseConstants()
 
 
 def limit_violation(chain: KinematicChain, q: Array) -> Cause | None:
     """Return the joint of ``q`` (J,) that exceeds its limits most, or None if all joints are within their limits."""
     excess = np.maximum(chain.lower - q, q - chain.upper)
     joint = int(np.argmax(excess))
-    return Cause(joint=joint, depth=float(excess[joint])) if excess[joint] > LIMIT_SLACK else None
+    return Cause(joint=joint, depth=float(excess[joint])) if excess[joint] > CONSTANTS.limit_slack else None
 
 
 def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cause:
@@ -24,7 +39,7 @@ def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cau
 
     The cause names no link and no Gaussian if the map is farther than ``SEARCH_DISTANCE``.
     """
-    nearest = arm.clearance(field, q[None], cut=SEARCH_DISTANCE)
+    nearest = arm.clearance(field, q[None], cut=CONSTANTS.search_distance)
     clearance, pair = self_clearance(arm, q)
     if clearance < nearest.distance[0]:
         return Cause(int(pair[0]), int(pair[1]), -1, -clearance)

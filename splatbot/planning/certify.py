@@ -14,17 +14,25 @@ from splatbot.protocols import Array, KinematicChain, TimedPath
 
 
 @dataclass(frozen=True)
-class CertificationLimits:
-    """Tolerances of the certification of a motion."""
+class CertificationConstants:
+    """Tolerances of the certification of a motion.
 
-    eps: float = 2e-5  # [m] resolution of the certificate of a chord
-    share: float = 1e-6  # relative excess over a limit that rounding may cause
-    position: float = 1e-6  # [rad or m] excess over a joint limit
-    rest: float = 1e-6  # [rad/s or m/s] velocity at the ends, and its step between two pieces
-    period: float = 1e-3  # [s] control period in which the acceleration at the ends may begin and end
+    Args:
+        eps: [m] resolution of the certificate of a chord.
+        limit_excess: relative excess over a limit that rounding may cause.
+        position_excess: [rad or m] excess over a joint limit that rounding may cause.
+        rest_velocity: [rad/s or m/s] largest velocity at the ends, and largest step of it between two pieces.
+        rest_period: [s] control period within which the jerk limit bounds the acceleration at the ends.
+    """
+
+    eps: float = 2e-5
+    limit_excess: float = 1e-6
+    position_excess: float = 1e-6
+    rest_velocity: float = 1e-6
+    rest_period: float = 1e-3
 
 
-LIMITS = CertificationLimits()
+CONSTANTS = CertificationConstants()
 
 
 class MotionRefusedError(ControllerError):
@@ -108,21 +116,21 @@ def _check_limits(pieces: CubicPieces, chain: KinematicChain) -> None:
         )
     low, high = pieces.extent()
     outside = np.maximum(chain.lower - low, high - chain.upper)
-    if (outside > LIMITS.position).any():
+    if (outside > CONSTANTS.position_excess).any():
         joint = int(np.argmax(outside))
         text = f"takes {chain.names[joint]} {outside[joint]:.4f} beyond its limit."
         raise MotionRefusedError(text, field="motion", hint="keep the whole curve within the joint limits")
     load = pieces.load(chain)
     for row, kind in enumerate(("velocity", "acceleration", "jerk")):
         share = (load.velocity, load.acceleration, load.jerk)[row]
-        if not share <= 1.0 + LIMITS.share:
+        if not share <= 1.0 + CONSTANTS.limit_excess:
             where = f"{chain.names[load.joint[row]]} at {load.time[row]:.3f} s"
             hint = f"make the motion {load.slowdown:.3f} times as long"
             raise MotionRefusedError(f"needs {share:.3f} times the {kind} limit of {where}.", field="motion", hint=hint)
     v0, v1 = pieces.velocities()
     jumps = np.abs(np.concatenate([v0[:1], v1[:-1] - v0[1:], v1[-1:]]))
     ends = np.abs(pieces.acceleration[[0, -1]])
-    if (jumps > LIMITS.rest).any() or (ends > LIMITS.period * chain.jerk).any():
+    if (jumps > CONSTANTS.rest_velocity).any() or (ends > CONSTANTS.rest_period * chain.jerk).any():
         hint = "begin and end at rest, without a step of the velocity"
         raise MotionRefusedError("does not begin and end at rest, or its velocity jumps.", field="motion", hint=hint)
 
@@ -133,7 +141,7 @@ def _check_free(pieces: CubicPieces, arm: RobotSpheres, field: GaussianCollision
     for part, body in ((chords.curved, grown), (~chords.curved, arm)):
         if not part.any():
             continue
-        edges = body.certify(field, chords.start[part], chords.end[part], eps=LIMITS.eps)
+        edges = body.certify(field, chords.start[part], chords.end[part], eps=CONSTANTS.eps)
         if edges.in_collision.any():
             first = int(np.argmax(edges.in_collision))
             time = float(pieces.time[chords.first[part][first]])

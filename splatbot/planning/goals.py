@@ -11,15 +11,32 @@ from numpy.typing import ArrayLike
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.geometry import so3_exp
 from splatbot.planning.causes import collision, limit_violation
-from splatbot.planning.ik import MAX_STARTS, TOLERANCE, HasTool, inverse_kinematics, is_rigid
+from splatbot.planning.ik import CONSTANTS as IK
+from splatbot.planning.ik import HasTool, inverse_kinematics, is_rigid
 from splatbot.planning.problem import Cause, Goal, GoalError, JointGoal, PlanStatus, PoseGoal
 from splatbot.protocols import Array
 
-_BATCH = 16  # starts between two readings of the clock
-_MIN_STARTS = 128  # smallest number of starts before the search for a first posture may time out
-_MIN_SEPARATION = 0.05  # [rad or m]; postures that differ by less in every joint count as one
-_RANKING_CUT = 0.1  # [m]; postures with more clearance rank equally
-_MAX_CAUSES = 8  # largest number of rejected postures that are examined for the cause
+
+@dataclass(frozen=True)
+class GoalConstants:
+    """Constants of the search for goal postures.
+
+    Args:
+        batch: starts between two readings of the clock.
+        min_starts: smallest number of starts before the search for a first posture may time out.
+        min_separation: [rad or m] postures that differ by less in every joint count as one.
+        ranking_cut: [m] postures with more clearance rank equally.
+        max_causes: largest number of rejected postures that are examined for the cause.
+    """
+
+    batch: int = 16
+    min_starts: int = 128
+    min_separation: float = 0.05
+    ranking_cut: float = 0.1
+    max_causes: int = 8
+
+
+CONSTANTS = GoalConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +101,7 @@ def _free(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Goals:
     free = ~arm.check(field, q).in_collision
     if free.any():
         return Goals(np.ascontiguousarray(q[free]))
-    causes = [collision(arm, field, candidate) for candidate in q[:_MAX_CAUSES]]
+    causes = [collision(arm, field, candidate) for candidate in q[: CONSTANTS.max_causes]]
     least = min(causes, key=lambda cause: cause.depth)
     return Goals(q[:0], PlanStatus.GOAL_IN_COLLISION, least, f"{least}.")
 
@@ -100,28 +117,28 @@ def _postures(
     found: list[Array] = []
     reached, least_error = False, np.array([np.inf, np.inf])
     colliding: list[Array] = []
-    for tried in range(0, MAX_STARTS, _BATCH):
-        starts = rng.uniform(chain.lower, chain.upper, (_BATCH, len(chain)))
-        offsets = rng.uniform(-1.0, 1.0, (_BATCH, 6)) * box
+    for tried in range(0, IK.max_starts, CONSTANTS.batch):
+        starts = rng.uniform(chain.lower, chain.upper, (CONSTANTS.batch, len(chain)))
+        offsets = rng.uniform(-1.0, 1.0, (CONSTANTS.batch, 6)) * box
         if tried == 0:
             starts[0], offsets[0] = near, 0.0
         q, error = _solve(arm, robot.T_link_tcp, T, offsets, starts)
-        converged = (error <= TOLERANCE).all(axis=1)
+        converged = (error <= IK.max_error).all(axis=1)
         if converged.any():
             free = ~arm.check(field, q).in_collision
-            colliding += list(q[converged & ~free][: _MAX_CAUSES - len(colliding)])
+            colliding += list(q[converged & ~free][: CONSTANTS.max_causes - len(colliding)])
             for candidate in q[converged & free]:
-                if all(np.abs(candidate - other).max() > _MIN_SEPARATION for other in found):
+                if all(np.abs(candidate - other).max() > CONSTANTS.min_separation for other in found):
                     found.append(candidate)
             reached = True
         elif not reached:
             nearest = int(np.argmin(error.sum(axis=1)))
             least_error = error[nearest] if error[nearest].sum() < least_error.sum() else least_error
-        if len(found) >= goal.postures or (time.perf_counter() >= until and (found or tried >= _MIN_STARTS)):
+        if len(found) >= goal.postures or (time.perf_counter() >= until and (found or tried >= CONSTANTS.min_starts)):
             break
     if found:
         q = np.array(found[: goal.postures])
-        clearance = np.minimum(arm.clearance(field, q, cut=_RANKING_CUT).distance, _RANKING_CUT)
+        clearance = np.minimum(arm.clearance(field, q, cut=CONSTANTS.ranking_cut).distance, CONSTANTS.ranking_cut)
         return Goals(np.ascontiguousarray(q[np.argsort(-clearance, kind="stable")]))
     if reached:
         return _free(arm, field, np.array(colliding))

@@ -15,9 +15,24 @@ from splatbot._native import inverse_kinematics as _levenberg_marquardt
 from splatbot.errors import InputError
 from splatbot.protocols import Array, KinematicChain
 
-TOLERANCE = 1e-6  # [m] and [rad], largest error of a solution in translation and in rotation
-MAX_STARTS = 512  # largest number of starts before a pose counts as unreachable
-_ITERATIONS = 80  # largest number of Levenberg-Marquardt steps from one start
+
+@dataclass(frozen=True)
+class IKConstants:
+    """Constants of inverse kinematics.
+
+    Args:
+        max_error: [m] and [rad] largest error of a solution in translation and in rotation.
+        max_starts: largest number of starts before a pose counts as unreachable.
+        max_iterations: largest number of Levenberg-Marquardt steps from one start.
+    """
+
+    max_error: float = 1e-6
+    max_starts: int = 512
+    max_iterations: int = 80
+
+
+CONSTANTS = IKConstants()
+
 
 CollisionFilter = Callable[[Array], NDArray[np.bool_]]
 """Maps configurations (K, J) to (K,), True where a configuration is free."""
@@ -91,7 +106,7 @@ def inverse_kinematics(
 
     Returns:
         Configurations (N, J), and the remaining errors (N, 2) of translation [m] and rotation [rad]. A configuration is
-        a solution if both errors are at most :data:`TOLERANCE`.
+        a solution if both errors are at most ``CONSTANTS.max_error``.
     """
     tool = np.asarray(T_link_tcp, dtype=np.float64)
     q, error = _levenberg_marquardt(
@@ -101,7 +116,7 @@ def inverse_kinematics(
         chain.lower,
         chain.upper,
         np.ascontiguousarray(np.clip(starts, chain.lower, chain.upper)),
-        _ITERATIONS,
+        CONSTANTS.max_iterations,
     )
     return q, error
 
@@ -123,7 +138,7 @@ def solve_ik(
     free: CollisionFilter | None = None,
     apart: float = 0.05,
 ) -> IkSolutions:
-    """Return the distinct configurations found that place the tool at ``T_base_tcp`` to :data:`TOLERANCE`.
+    """Return the distinct configurations found that place the tool at ``T_base_tcp`` to ``CONSTANTS.max_error``.
 
     The starts are ``near``, the home posture and uniformly random configurations. While none of them gives a
     free solution, further random starts follow, up to 512 in total. With ``seeds=1`` only ``near`` is solved, so that a
@@ -151,8 +166,8 @@ def solve_ik(
     starts = np.concatenate([fixed, _random(chain, max(0, seeds - len(fixed)), rng)])[:seeds]
     q, tried = _solutions(robot, T, starts), len(starts)
     kept = _distinct(q, posture, apart, free)
-    while seeds > 1 and not len(kept) and tried < MAX_STARTS:
-        starts = _random(chain, min(seeds, MAX_STARTS - tried), rng)
+    while seeds > 1 and not len(kept) and tried < CONSTANTS.max_starts:
+        starts = _random(chain, min(seeds, CONSTANTS.max_starts - tried), rng)
         q, tried = np.concatenate([q, _solutions(robot, T, starts)]), tried + len(starts)
         kept = _distinct(q, posture, apart, free)
     return IkSolutions(kept, tried, len(q))
@@ -176,7 +191,7 @@ def _solutions(robot: ArmWithTool, T: Array, starts: Array) -> Array:
     """Return the configurations (K, J) of the starts (S, J) that converge."""
     targets = np.tile(T, (len(starts), 1, 1))
     q, error = inverse_kinematics(_kinematics(robot.chain), robot.chain, robot.T_link_tcp, targets, starts)
-    return q[(error <= TOLERANCE).all(axis=1)]
+    return q[(error <= CONSTANTS.max_error).all(axis=1)]
 
 
 @lru_cache(maxsize=16)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,11 +27,29 @@ from splatbot.planning.problem import (
 )
 from splatbot.protocols import Array, RobotKinematics
 
-PATH_CLEARANCE_CUT = 0.1  # [m] largest clearance of a certificate
-POSTURES_SHARE = 0.25  # fraction of the budget for further postures once one reaches the pose
-_CLEARANCE_ROUNDS = 6  # bisections of the clearance along a path, which resolve it to 2 %
-_RESERVE = 7e-4  # [s] of the budget that the certificate takes, at most a third of it
-_MIN_EPS = 4e-5  # [m] smallest eps, for a start or goal with hardly any clearance
+
+@dataclass(frozen=True)
+class RRTStarConstants:
+    """Constants of the planner.
+
+    Args:
+        clearance_cut: [m] largest clearance of a certificate.
+        postures_share: fraction of the budget for further postures once one reaches the pose.
+        clearance_rounds: bisections of the clearance along a path, which resolve it to 2 %.
+        certificate_reserve: [s] part of the budget that the certificate takes, at most a third of it.
+        min_eps: [m] smallest eps, for a start or goal with hardly any clearance.
+    """
+
+    clearance_cut: float = 0.1
+    postures_share: float = 0.25
+    clearance_rounds: int = 6
+    certificate_reserve: float = 7e-4
+    min_eps: float = 4e-5
+
+
+CONSTANTS = RRTStarConstants()
+
+
 _STATUS = (None, PlanStatus.PLANNING_FAILED, PlanStatus.TIMED_OUT, PlanStatus.PREEMPTED)  # by native return code
 
 
@@ -74,8 +93,8 @@ class GaussianRRTStar:
         base_in_map: bool = False,
         eps: float = EPS,
     ) -> None:
-        if not _MIN_EPS <= eps < np.inf:
-            raise InputError(f"is {eps}.", field="eps", hint=f"give metres, at least {_MIN_EPS:g}")
+        if not CONSTANTS.min_eps <= eps < np.inf:
+            raise InputError(f"is {eps}.", field="eps", hint=f"give metres, at least {CONSTANTS.min_eps:g}")
         self._field, self.robot, self.margin, self.eps = field, robot, margin, eps
         self.arm = RobotSpheres(
             robot,
@@ -144,7 +163,7 @@ class GaussianRRTStar:
         if failed is not None:
             return failed
         goals = goal_configurations(
-            self.arm, self.field, goal, near=q, seed=seed, until=begin + POSTURES_SHARE * 1e-3 * budget_ms
+            self.arm, self.field, goal, near=q, seed=seed, until=begin + CONSTANTS.postures_share * 1e-3 * budget_ms
         )
         if not len(goals.q):
             return self._failure(goals.status, goals.cause, goals.reason, begin)
@@ -222,7 +241,9 @@ class GaussianRRTStar:
         arm = self.arm.without_pairs
         if arm.certify(field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
             return None
-        return float(path_clearance(arm.native, field.native, waypoints, max(cut, eps), _CLEARANCE_ROUNDS, np.inf))
+        return float(
+            path_clearance(arm.native, field.native, waypoints, max(cut, eps), CONSTANTS.clearance_rounds, np.inf)
+        )
 
     def cancel(self) -> None:
         """End the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""
@@ -261,7 +282,12 @@ class GaussianRRTStar:
             if not self.arm.certify(self.field, waypoints[:-1], waypoints[1:], eps=eps).in_collision.any():
                 left = until - time.perf_counter()
                 clearance = path_clearance(
-                    self.arm.native, self.field.native, waypoints, PATH_CLEARANCE_CUT, _CLEARANCE_ROUNDS, left
+                    self.arm.native,
+                    self.field.native,
+                    waypoints,
+                    CONSTANTS.clearance_cut,
+                    CONSTANTS.clearance_rounds,
+                    left,
                 )
                 return Certificate(True, eps, clearance, self.margin, self.field.map_version)
         return Certificate(False, self._eps, 0.0, self.margin, self.field.map_version)
@@ -294,7 +320,7 @@ class GaussianRRTStar:
     def _prepare(self, ends: Array) -> None:
         """Choose an eps with which edges can leave and reach configurations (K, J) of small clearance."""
         clearance = float(self.arm.native.clearance(self.field.native, ends, 4 * self.eps)[0].min())
-        eps = max(_MIN_EPS, min(self.eps, clearance / 4))
+        eps = max(CONSTANTS.min_eps, min(self.eps, clearance / 4))
         if eps != self._eps:
             self._eps, self._native = eps, self._planner(eps)
 
@@ -344,7 +370,7 @@ class GaussianRRTStar:
 def _for_search(budget_ms: float, spent: float) -> float:
     """Return the part of the budget that is left for the search [s]."""
     budget = 1e-3 * budget_ms
-    return max(1e-4, budget - spent - min(_RESERVE, budget / 3))
+    return max(1e-4, budget - spent - min(CONSTANTS.certificate_reserve, budget / 3))
 
 
 def _check_budget(budget_ms: float, iterations: int | None) -> None:

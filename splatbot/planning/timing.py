@@ -17,15 +17,39 @@ from splatbot.planning.problem import Certificate, Path
 from splatbot.planning.trajectory import JointTrajectory, spline_pieces
 from splatbot.protocols import Array, KinematicChain
 
-MIN_WAYPOINT_STEP = 1e-4  # [rad or m]; waypoints that differ by less in every joint count as one
-TRAJECTORY_CLEARANCE_CUT = 0.05  # [m] largest clearance of the certificate of a trajectory
-_MIN_STEP, _MAX_STEP = 2e-3, 1e-2  # [s] range of the time between knots
-_SAFETY = 1.0005  # factor that keeps the limits although times in messages are rounded to nanoseconds
-_MAX_SHORTENINGS = 8  # largest number of times that colliding blends are shortened
-_MIN_REACH = 4e-3  # [rad or m] smallest reach of a blend; at a corner that needs a smaller one the arm stops
-_REACH_FRACTIONS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # candidates, as fractions of the largest reach
-_MIN_CHORD_EPS = 2e-5  # [m] smallest eps of the certificate of short chords
-_MAX_INTERVAL, _MIN_INTERVAL = 16, 1 / 64  # [spans] range of the intervals of the search for the smallest clearance
+
+@dataclass(frozen=True)
+class TimingConstants:
+    """Constants of timed trajectories and of their certificates.
+
+    Args:
+        min_waypoint_step: [rad or m] waypoints that differ by less in every joint count as one.
+        clearance_cut: [m] largest clearance of the certificate of a trajectory.
+        min_knot_step: [s] shortest time between knots.
+        max_knot_step: [s] longest time between knots.
+        limit_reserve: factor of the duration that keeps the limits although messages round times to nanoseconds.
+        max_shortenings: largest number of times that colliding blends are shortened.
+        min_reach: [rad or m] smallest reach of a blend; at a corner that needs a smaller one the arm stops.
+        reach_fractions: candidates for the reach, as fractions of the largest.
+        min_chord_eps: [m] smallest eps of the certificate of short chords.
+        max_interval: [spans] longest interval of the search for the smallest clearance.
+        min_interval: [spans] shortest interval of that search.
+    """
+
+    min_waypoint_step: float = 1e-4
+    clearance_cut: float = 0.05
+    min_knot_step: float = 2e-3
+    max_knot_step: float = 1e-2
+    limit_reserve: float = 1.0005
+    max_shortenings: int = 8
+    min_reach: float = 4e-3
+    reach_fractions: tuple[float, ...] = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
+    min_chord_eps: float = 2e-5
+    max_interval: int = 16
+    min_interval: float = 1 / 64
+
+
+CONSTANTS = TimingConstants()
 
 
 def time_path(
@@ -63,12 +87,12 @@ def time_path(
         raise InputError(f"is {path.waypoints.shape}.", field="path", hint=f"give finite (N, {len(chain)})")
     waypoints = without_duplicates(path.waypoints)
     if len(waypoints) < 2:
-        rest = _TimedSpline(np.repeat(path.waypoints[:1], 4, axis=0), _MIN_STEP, np.full(4, -1))
+        rest = _TimedSpline(np.repeat(path.waypoints[:1], 4, axis=0), CONSTANTS.min_knot_step, np.full(4, -1))
         free = not arm.check(field, path.waypoints[:1]).in_collision.any()
         return rest.trajectory(chain, path.certificate.eps, arm, field, free)
     checker = _CurveChecker(arm, field, path.certificate.eps)
     reach = checker.max_reach(waypoints)
-    for _ in range(_MAX_SHORTENINGS):
+    for _ in range(CONSTANTS.max_shortenings):
         timed = _timed(waypoints, reach, chain)
         failed = checker.colliding_spans(timed.control)
         if not failed.any():
@@ -84,7 +108,7 @@ def without_duplicates(waypoints: Array) -> Array:
     """Remove waypoints (N, J) that nearly equal their predecessor; both ends are kept."""
     kept = [waypoints[0]]
     for q in waypoints[1:]:
-        if np.abs(q - kept[-1]).max() > MIN_WAYPOINT_STEP:
+        if np.abs(q - kept[-1]).max() > CONSTANTS.min_waypoint_step:
             kept.append(q)
     if len(kept) > 1:
         kept[-1] = waypoints[-1]
@@ -106,7 +130,7 @@ class _TimedSpline:
         uncertified = Certificate(False, eps, 0.0, arm.margin, -1)
         spline = JointTrajectory(chain.names, self.control, self.step, uncertified)
         v, a, j = spline.load(chain)
-        slowdown = max(_SAFETY * max(v, np.sqrt(a), np.cbrt(j)), 1.0)
+        slowdown = max(CONSTANTS.limit_reserve * max(v, np.sqrt(a), np.cbrt(j)), 1.0)
         step = self.step * float(slowdown)
         return JointTrajectory(chain.names, self.control, step, _certificate(eps, arm, field, spline, free))
 
@@ -115,7 +139,7 @@ def _timed(waypoints: Array, reach: Array, chain: KinematicChain) -> _TimedSplin
     """Time the path; the arm comes to rest at corners without a blend."""
     stops = [0, *(i for i in range(1, len(waypoints) - 1) if reach[i] == 0.0), len(waypoints) - 1]
     smooth = float((2.0 * chain.acceleration / chain.jerk).max())  # [s] window of the moving average
-    step = float(np.clip(smooth, _MIN_STEP, _MAX_STEP))
+    step = float(np.clip(smooth, CONSTANTS.min_knot_step, CONSTANTS.max_knot_step))
     wide = int(np.ceil(smooth / step - 1e-9))
     control: list[Array] = []
     corner: list[NDArray[np.int64]] = []
@@ -167,7 +191,7 @@ def _shorten(reach: Array, timed: _TimedSpline, failed: NDArray[np.bool_]) -> bo
             return False
         colliding.add(int(corners[0]))
     for corner in colliding:
-        reach[corner] = 0.5 * reach[corner] if reach[corner] > 2.0 * _MIN_REACH else 0.0
+        reach[corner] = 0.5 * reach[corner] if reach[corner] > 2.0 * CONSTANTS.min_reach else 0.0
     return True
 
 
@@ -177,15 +201,15 @@ class _CurveChecker:
     def __init__(self, arm: RobotSpheres, field: GaussianCollisionField | None, eps: float) -> None:
         self.arm, self.field = arm, field
         self.grown = arm.grown(DEVIATION)
-        self.eps = max(_MIN_CHORD_EPS, min(eps, DEVIATION))
+        self.eps = max(CONSTANTS.min_chord_eps, min(eps, DEVIATION))
 
     def max_reach(self, waypoints: Array) -> Array:
         """Return the largest reach (N,) of a blend at each waypoint whose chords are free; 0 at both ends."""
         edge = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
         reach = np.zeros(len(waypoints))
         inner = range(1, len(waypoints) - 1)
-        tried = [(i, share * 0.49 * min(edge[i - 1], edge[i])) for i in inner for share in _REACH_FRACTIONS]
-        tried = [(i, r) for i, r in tried if r >= _MIN_REACH]
+        tried = [(i, share * 0.49 * min(edge[i - 1], edge[i])) for i in inner for share in CONSTANTS.reach_fractions]
+        tried = [(i, r) for i, r in tried if r >= CONSTANTS.min_reach]
         if not tried:
             return reach
         chords = np.array([blend_chords(waypoints[i - 1], waypoints[i], waypoints[i + 1], r) for i, r in tried])
@@ -217,7 +241,7 @@ def _certificate(
 
 
 def min_clearance(arm: RobotSpheres, field: GaussianCollisionField, control: Array) -> float:
-    """Return a lower bound of the arm's clearance along a spline [m], at most ``TRAJECTORY_CLEARANCE_CUT``.
+    """Return a lower bound of the arm's clearance along a spline [m], at most ``clearance_cut``.
 
     The clearance on an interval is at least that at its midpoint less the largest motion of a sphere from there. The
     search bisects the intervals whose bound is the smallest, until the bound is tight to 2 % and 0.1 mm.
@@ -227,28 +251,28 @@ def min_clearance(arm: RobotSpheres, field: GaussianCollisionField, control: Arr
     path_length = np.concatenate([[0.0], np.cumsum(largest.max(axis=1))])  # of the fastest sphere, up to each knot
     spans = len(control) - 3
     middle, half = (
-        np.arange(0, spans, _MAX_INTERVAL) + _MAX_INTERVAL / 2,
-        np.full(-(-spans // _MAX_INTERVAL), _MAX_INTERVAL / 2),
+        np.arange(0, spans, CONSTANTS.max_interval) + CONSTANTS.max_interval / 2,
+        np.full(-(-spans // CONSTANTS.max_interval), CONSTANTS.max_interval / 2),
     )
     spline = JointTrajectory(arm.robot.chain.names, control, 1.0, Certificate(False, 0.0, 0.0, 0.0, -1))
-    low, best = np.inf, TRAJECTORY_CLEARANCE_CUT
+    low, best = np.inf, CONSTANTS.clearance_cut
     while len(middle):
         at = np.interp(np.stack([middle - half, middle, middle + half]), np.arange(spans + 1), path_length)
         moves = np.maximum(at[2] - at[1], at[1] - at[0])
-        cut = TRAJECTORY_CLEARANCE_CUT + float(
+        cut = CONSTANTS.clearance_cut + float(
             moves.max()
         )  # an interval with this clearance at its midpoint needs no bisection
         clearance = np.minimum(arm.native.clearance(field.native, spline.at(middle).position, cut)[0], cut)
         best = min(best, float(clearance.min()))
-        bound = np.minimum(clearance - moves, TRAJECTORY_CLEARANCE_CUT)
+        bound = np.minimum(clearance - moves, CONSTANTS.clearance_cut)
         open_ = bound < 0.98 * best - 1e-4
         low = min(low, float(bound[~open_].min()) if (~open_).any() else np.inf)
-        if half[0] < _MIN_INTERVAL:
+        if half[0] < CONSTANTS.min_interval:
             low = min(low, float(bound.min()))
             break
         middle, half = middle[open_], half[open_] / 2
         middle, half = np.concatenate([middle - half, middle + half]), np.tile(half, 2)
-    return min(low, TRAJECTORY_CLEARANCE_CUT)
+    return min(low, CONSTANTS.clearance_cut)
 
 
 def _scaled(chain: KinematicChain, velocity: float, acceleration: float) -> KinematicChain:

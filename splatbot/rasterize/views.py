@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -19,12 +20,25 @@ from splatbot.rasterize.rasterization import rasterization
 Mode = Literal["rgb", "depth", "normal", "alpha"]
 MODES: tuple[Mode, ...] = ("rgb", "depth", "normal", "alpha")
 
-# Below this opacity a pixel is more background than map: it has no depth and no normal.
-MIN_ALPHA = 0.5
-# Share of the Gaussians that the default view shows; the rest are mostly floaters.
-VISIBLE_SHARE = 0.9
-_NEAR = 0.05  # [m] nearest a Gaussian may be in the default view
-_ROTATION_TOLERANCE = 1e-3
+
+@dataclass(frozen=True)
+class ViewConstants:
+    """Constants of rendered views.
+
+    Args:
+        min_alpha: below this opacity a pixel is more background than map: it has no depth and no normal.
+        visible_share: fraction of the Gaussians that the default view shows; the rest are mostly floaters.
+        near: [m] nearest that a Gaussian may be in the default view.
+        rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix.
+    """
+
+    min_alpha: float = 0.5
+    visible_share: float = 0.9
+    near: float = 0.05
+    rotation_tolerance: float = 1e-3
+
+
+CONSTANTS = ViewConstants()
 
 
 def render_view(
@@ -58,11 +72,11 @@ def render_view(
         return rgb.clip(0.0, 1.0)
     if mode == "depth":
         depth, alpha = _splat(model, None, camera, T_camera_world, "ED")
-        return np.where(alpha >= MIN_ALPHA, depth[..., 0], np.float32(0))
+        return np.where(alpha >= CONSTANTS.min_alpha, depth[..., 0], np.float32(0))
     if mode == "normal":
         blended, alpha = _splat(model, facing_normals(model, T_camera_world), camera, T_camera_world, "RGB")
         length = np.linalg.norm(blended, axis=-1, keepdims=True)
-        known = (alpha[..., None] >= MIN_ALPHA) & (length > 1e-6)
+        known = (alpha[..., None] >= CONSTANTS.min_alpha) & (length > 1e-6)
         return np.divide(blended, length, out=np.zeros_like(blended), where=known)
     if mode == "alpha":
         return _splat(model, None, camera, T_camera_world, "RGB")[1]
@@ -126,9 +140,13 @@ def default_view(
         means = model.means.detach().to(torch.float64).numpy()
         centre = np.average(means, axis=0, weights=model.opacities.detach().to(torch.float64).numpy())
         x, y, z = (means - centre).T
-        half = np.stack([np.abs(x) * focal / (0.5 * width), np.abs(y) * focal / (0.5 * height), np.full_like(x, _NEAR)])
-        backing = np.quantile(half.max(axis=0) - z, VISIBLE_SHARE, method="higher")  # distance at which each enters
-        T_world_camera[:3, 3] = centre - np.array([0.0, 0.0, max(float(backing), _NEAR)])
+        half = np.stack(
+            [np.abs(x) * focal / (0.5 * width), np.abs(y) * focal / (0.5 * height), np.full_like(x, CONSTANTS.near)]
+        )
+        backing = np.quantile(
+            half.max(axis=0) - z, CONSTANTS.visible_share, method="higher"
+        )  # distance at which each enters
+        T_world_camera[:3, 3] = centre - np.array([0.0, 0.0, max(float(backing), CONSTANTS.near)])
     return camera, T_world_camera
 
 
@@ -211,7 +229,7 @@ def _rigid(T: ArrayLike) -> NDArray[np.float64]:
         raise InputError(f"is {M.shape} or not finite.", field="T_world_camera", hint=hint)
     R = M[:3, :3]
     off = max(float(np.abs(R @ R.T - np.eye(3)).max()), float(np.abs(M[3] - (0, 0, 0, 1)).max()))
-    if off > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+    if off > CONSTANTS.rotation_tolerance or np.linalg.det(R) < 0:
         raise InputError(f"is no rigid transform (off by {off:.2g}).", field="T_world_camera", hint=hint)
     return M
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,8 +20,24 @@ from splatbot.segmentation import SegmentedMap
 
 _HAND, _PREGRASP = np.array([0.15, 0.45, 0.9]), np.array([0.6, 0.75, 0.95])
 _CONTACT, _TARGET = np.array([0.1, 0.9, 0.2]), np.array([0.95, 0.5, 0.1])
-_CAMERA_DISTANCE = 0.5  # [m] from camera to target
-_CROP_RADIUS = 0.6  # [m] of the map around the target that is drawn
+
+
+@dataclass(frozen=True)
+class GraspViewConstants:
+    """Constants of the view of a grasp.
+
+    Args:
+        camera_distance: [m] distance from the camera to the target.
+        crop_radius: [m] radius of the map around the target that is drawn.
+    """
+
+    camera_distance: float = 0.5
+    crop_radius: float = 0.6
+
+
+CONSTANTS = GraspViewConstants()
+
+
 _SIDES = (np.array([-0.8, 0.35, 0.6]), np.array([-0.25, -0.9, 0.45]))  # camera directions in the base frame
 
 
@@ -43,7 +61,7 @@ def grasp_png(
     """
     model = _tinted(scene.model, rows)
     middle = grasp.contacts.mean(axis=0)
-    near = np.linalg.norm(model.means.double().numpy() - middle, axis=1) < _CROP_RADIUS
+    near = np.linalg.norm(model.means.double().numpy() - middle, axis=1) < CONSTANTS.crop_radius
     parts = [model.select(torch.from_numpy(np.flatnonzero(near)))]
     parts.append(_hand(robot, grasp.T_world_pregrasp, grasp.opening, _PREGRASP, 0.2))
     parts.append(_hand(robot, grasp.T_world_tcp, grasp.opening, _HAND, 0.6))
@@ -57,7 +75,7 @@ def grasp_png(
     at = transform_points(inverse(scene.T_world_base), middle)
     views = []
     for side in _SIDES:
-        T = scene.T_world_base @ look_at(at + _CAMERA_DISTANCE * side / np.linalg.norm(side), at)
+        T = scene.T_world_base @ look_at(at + CONSTANTS.camera_distance * side / np.linalg.norm(side), at)
         views.append(render_view(drawn, camera, T, background=(0.09, 0.1, 0.12)))
     return to_png(np.ascontiguousarray(np.concatenate(views, axis=1)), "rgb")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,10 +17,27 @@ from splatbot.rasterize.views import render_view, to_png
 from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
 from splatbot.report.sphere_gaussians import sphere_gaussians
 
-_MAX_POINTS = 40_000
-_CROP_RADIUS = 1.6  # [m] of the map around the base that is shown
-_FRAMES = 80
-_GHOSTS = 5  # postures in the image
+
+@dataclass(frozen=True)
+class PlanPageConstants:
+    """Constants of the page of a plan.
+
+    Args:
+        max_points: largest number of points of the map that are shown.
+        crop_radius: [m] radius of the map around the base that is shown.
+        frames: postures of the animation.
+        ghosts: postures in the image.
+    """
+
+    max_points: int = 40_000
+    crop_radius: float = 1.6
+    frames: int = 80
+    ghosts: int = 5
+
+
+CONSTANTS = PlanPageConstants()
+
+
 _EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # camera of the image, in the base frame [m]
 
 
@@ -34,13 +53,13 @@ def plan_html(
         trajectory: the planned trajectory.
         title: heading.
     """
-    times = np.linspace(0.0, trajectory.duration, _FRAMES)
+    times = np.linspace(0.0, trajectory.duration, CONSTANTS.frames)
     q = trajectory.at(times).position
     T_base_world = inverse(arm.T_world_base)  # the page's up direction is the z axis of the base
     points, colors = _nearby(model, T_base_world)
     centers = transform_points(T_base_world, arm.centers(q).reshape(-1, 3))
     last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])
-    tool = centers.reshape(_FRAMES, -1, 3)[:, last]
+    tool = centers.reshape(CONSTANTS.frames, -1, 3)[:, last]
     clearances = np.minimum(arm.clearance(field, q, cut=0.5).distance, 0.5)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     document = {
@@ -65,13 +84,13 @@ def plan_html(
 
 def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: JointTrajectory, *, width: int = 960) -> bytes:
     """Render the map with the arm at the start (blue), at the end (orange) and in between."""
-    times = np.linspace(0.0, trajectory.duration, _GHOSTS)
+    times = np.linspace(0.0, trajectory.duration, CONSTANTS.ghosts)
     centers = arm.centers(trajectory.at(times).position)
-    share = np.linspace(0.0, 1.0, _GHOSTS)[:, None]
+    share = np.linspace(0.0, 1.0, CONSTANTS.ghosts)[:, None]
     hues = (1 - share) * np.array([0.15, 0.45, 0.9]) + share * np.array([0.95, 0.5, 0.1])
     ghosts = [
-        sphere_gaussians(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, _GHOSTS - 1) else 0.35)
-        for i in range(_GHOSTS)
+        sphere_gaussians(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, CONSTANTS.ghosts - 1) else 0.35)
+        for i in range(CONSTANTS.ghosts)
     ]
     near = _within(model, inverse(arm.T_world_base))
     import torch
@@ -86,13 +105,13 @@ def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: JointTrajector
 def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:
     """Return indices of the Gaussians around the base, or of all Gaussians if none is near."""
     at = transform_points(T_base_world, model.means.double().numpy())
-    rows = np.flatnonzero(np.abs(at).max(axis=1) < _CROP_RADIUS)
+    rows = np.flatnonzero(np.abs(at).max(axis=1) < CONSTANTS.crop_radius)
     return rows if len(rows) else np.arange(len(model))
 
 
 def _nearby(model: GaussianModel, T_base_world: Array) -> tuple[Array, NDArray[np.uint8]]:
     """Return the means (P, 3) around the base, in the base frame, and their colours (P, 3)."""
     rows = _within(model, T_base_world)
-    rows = rows[evenly_spaced(len(rows), _MAX_POINTS)]
+    rows = rows[evenly_spaced(len(rows), CONSTANTS.max_points)]
     means = transform_points(T_base_world, model.means.double().numpy()[rows])
     return means, bytes_of(model.colors.double().numpy()[rows])

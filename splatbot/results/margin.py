@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,21 @@ from splatbot.logs import Log
 from splatbot.results.folder import RunFolder
 from splatbot.results.views import depth_views
 
-RADIUS = 1.0  # [m] around the base
-SHARE = 0.999  # quantile of the surface error
+
+@dataclass(frozen=True)
+class MarginConstants:
+    """Constants of the recommended margin.
+
+    Args:
+        radius: [m] distance around the base in which points count.
+        share: quantile of the surface error.
+    """
+
+    radius: float = 1.0
+    share: float = 0.999
+
+
+CONSTANTS = MarginConstants()
 
 
 def own_margin(run: str | Path, log: Log, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
@@ -33,4 +47,4 @@ def own_margin(run: str | Path, log: Log, field: GaussianCollisionField, T_world
         InputError: no depth was measured there.
     """
     views = depth_views(RunFolder(run), log)
-    return surface_error(field, views, around=[*T_world_base[:3, 3], RADIUS]).share(SHARE)
+    return surface_error(field, views, around=[*T_world_base[:3, 3], CONSTANTS.radius]).share(CONSTANTS.share)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,8 +14,23 @@ from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.tracking.prepare import usable_depth
 
-_MIN_FRAMES = 40  # if the run has that many
-_MAX_FRAMES, _MAX_PIXELS = 40, 640 * 480  # of views that stay in memory
+
+@dataclass(frozen=True)
+class DepthViewConstants:
+    """Constants of the views of a run.
+
+    Args:
+        min_frames: least number of frames, if the run has that many.
+        max_frames_in_memory: largest number of views that stay in memory.
+        max_pixels: [px] largest size of views that stay in memory.
+    """
+
+    min_frames: int = 40
+    max_frames_in_memory: int = 40
+    max_pixels: int = 640 * 480
+
+
+CONSTANTS = DepthViewConstants()
 
 
 def depth_views(run: RunFolder, log: Log) -> Iterator[DepthView]:
@@ -29,7 +45,7 @@ def depth_views(run: RunFolder, log: Log) -> Iterator[DepthView]:
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    return _views(run, log, poses, sorted(poses)[:: max(1, len(poses) // _MIN_FRAMES)])
+    return _views(run, log, poses, sorted(poses)[:: max(1, len(poses) // CONSTANTS.min_frames)])
 
 
 def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
@@ -44,14 +60,14 @@ def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
     """
     poses = run.load_poses()
     indices = sorted(poses)
-    spread = np.linspace(0, len(indices) - 1, min(_MAX_FRAMES, len(indices))).round().astype(int)
+    spread = np.linspace(0, len(indices) - 1, min(CONSTANTS.max_frames_in_memory, len(indices))).round().astype(int)
     return tuple(subsampled(view) for view in _views(run, log, poses, [indices[k] for k in spread]))
 
 
 def subsampled(view: DepthView) -> DepthView:
     """Keep every n-th pixel of both axes so that at most 640 x 480 remain."""
     depth, camera, T = view
-    step = int(np.ceil(np.sqrt(depth.size / _MAX_PIXELS)))
+    step = int(np.ceil(np.sqrt(depth.size / CONSTANTS.max_pixels)))
     if step <= 1:
         return view
     kept = np.ascontiguousarray(depth[::step, ::step])

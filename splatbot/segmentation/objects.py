@@ -21,10 +21,6 @@ from splatbot.segmentation.faces import local_normals, nearest_of, region, split
 from splatbot.segmentation.plane import NEAR, Support, find_support, given_support
 from splatbot.workspace import NamedPlace
 
-MIN_OPACITY = 0.3  # of a Gaussian that represents a surface
-MIN_HEIGHT, MAX_HEIGHT = 0.002, 0.008  # [m] limits of the height above a support below which points are its noise
-FEWEST, LARGEST = 40, 0.35  # minimum number of Gaussians of an object; maximum extent [m]
-
 
 @dataclass(frozen=True)
 class SegmentationConstants:
@@ -43,6 +39,11 @@ class SegmentationConstants:
         min_support_cosine: minimum cosine between the normals of points on a support and its own.
         min_level_fraction: minimum fraction of a support's points with such normals.
         max_name_distance: [m] maximum distance between a named place and its object.
+        min_opacity: least opacity of a Gaussian that represents a surface.
+        min_height: [m] least height above a support below which points are its noise.
+        max_height: [m] largest height above a support below which points are its noise.
+        min_gaussians: minimum number of Gaussians of an object.
+        max_extent: [m] maximum extent of an object.
     """
 
     object_distance: float = 0.012
@@ -57,6 +58,11 @@ class SegmentationConstants:
     min_support_cosine: float = 0.8
     min_level_fraction: float = 0.5
     max_name_distance: float = 0.05
+    min_opacity: float = 0.3
+    min_height: float = 0.002
+    max_height: float = 0.008
+    min_gaussians: int = 40
+    max_extent: float = 0.35
 
 
 CONSTANTS = SegmentationConstants()
@@ -133,11 +139,11 @@ class SegmentedMap:
         low, high = np.percentile(near, [2, 98], axis=0) + np.array([[-CONSTANTS.seed_margin], [CONSTANTS.seed_margin]])
         rows = np.flatnonzero(self.solid & ((self.points > low) & (self.points < high)).all(axis=1))
         rows = rows[self.labels[rows] >= -1]
-        if len(rows) < FEWEST:
+        if len(rows) < CONSTANTS.min_gaussians:
             return rows[:0]
         chosen = np.zeros(len(self.model), np.bool_)
         chosen[seeds] = True
-        return rows[region(self.points[rows], chosen[rows], fewest=FEWEST)]
+        return rows[region(self.points[rows], chosen[rows], fewest=CONSTANTS.min_gaussians)]
 
     @property
     def up(self) -> Array:
@@ -147,7 +153,7 @@ class SegmentedMap:
 
 def solid_rows(model: GaussianModel) -> NDArray[np.bool_]:
     """Return which Gaussians (N,) represent an observed surface: opaque and observed by a keyframe."""
-    return np.asarray((model.opacities.detach().numpy() >= MIN_OPACITY) & (model.observations.numpy() >= 1))
+    return np.asarray((model.opacities.detach().numpy() >= CONSTANTS.min_opacity) & (model.observations.numpy() >= 1))
 
 
 def segment(
@@ -187,7 +193,7 @@ def segment(
         raise InputError(f"is {observers.shape}.", field="observers", hint=f"give ({len(points)}, 3)")
     eyes = None if observers is None else transform_points(inverse(T), observers)
     low, high = np.array([[-2.0] * 3, [2.0] * 3]) if box is None else np.asarray(box, dtype=np.float64)
-    used = np.flatnonzero(solid_rows(model) & ((points >= low - MAX_HEIGHT) & (points <= high)).all(axis=1))
+    used = np.flatnonzero(solid_rows(model) & ((points >= low - CONSTANTS.max_height) & (points <= high)).all(axis=1))
     if not len(used):
         raise InputError(f"has nothing between {low.tolist()} and {high.tolist()}.", field="map", hint="see scene.yaml")
     apart = max(apart, CONSTANTS.spacing_factor * float(model.scales[torch.from_numpy(used)].amax(dim=1).median()))
@@ -240,11 +246,13 @@ def _object_rows(
             supports.append(replace(ledge, inside=np.zeros(0, np.bool_)))
             labels[rows[np.abs(ledge.height(points[rows])) < NEAR]] = -1 - len(supports)
             found += _object_rows(points, eyes, on, apart, deeper - 1, labels, supports, cut)
-        elif cut and eyes is not None and wide > LARGEST:
-            parts = split_at_concave_edges(points[rows], eyes[rows], apart=apart, fewest=FEWEST)
-            found += [rows[some] for some in parts if np.ptp(points[rows[some]], axis=0).max() <= LARGEST]
-        elif len(rows) >= FEWEST and wide <= LARGEST:
-            found += [rows[some] for some in split_at_steps(points[rows], fewest=FEWEST)] if cut else [rows]
+        elif cut and eyes is not None and wide > CONSTANTS.max_extent:
+            parts = split_at_concave_edges(points[rows], eyes[rows], apart=apart, fewest=CONSTANTS.min_gaussians)
+            found += [rows[some] for some in parts if np.ptp(points[rows[some]], axis=0).max() <= CONSTANTS.max_extent]
+        elif len(rows) >= CONSTANTS.min_gaussians and wide <= CONSTANTS.max_extent:
+            found += (
+                [rows[some] for some in split_at_steps(points[rows], fewest=CONSTANTS.min_gaussians)] if cut else [rows]
+            )
     return found
 
 
@@ -274,8 +282,8 @@ def _level(plane: Support, points: Array, left: NDArray[np.bool_]) -> bool:
 def _holds(plane: Support, points: Array) -> bool:
     """Return whether the points above the plane are over its area, as on a shelf, and not next to it."""
     away = plane.height(points)
-    on = points[away > MAX_HEIGHT][:, :2].astype(np.float32)
-    if len(on) < FEWEST:
+    on = points[away > CONSTANTS.max_height][:, :2].astype(np.float32)
+    if len(on) < CONSTANTS.min_gaussians:
         return False
     hull = cv2.convexHull(points[np.abs(away) < NEAR][:, :2].astype(np.float32))
     some = on[:: max(1, len(on) // 200)]
@@ -291,7 +299,7 @@ def above_support(support: Support, points: Array) -> NDArray[np.bool_]:
     height = support.height(points)
     near = np.abs(height[np.abs(height) < NEAR])
     noise = 1.48 * float(np.median(near)) if len(near) else 0.0
-    return np.asarray(height > np.clip(3.0 * noise, MIN_HEIGHT, MAX_HEIGHT))
+    return np.asarray(height > np.clip(3.0 * noise, CONSTANTS.min_height, CONSTANTS.max_height))
 
 
 def _with_faint(

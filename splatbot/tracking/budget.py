@@ -8,11 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-DEADLINE_QUANTILE = 0.95
-"""Quantile of recent durations that a stage is expected to take, to keep the deadline."""
-LOST_QUANTILE = 0.5
-"""The quantile for a lost camera: being late costs it little, and two slow runs would keep it lost."""
-
 
 @dataclass(frozen=True)
 class CostModelParameters:
@@ -24,6 +19,10 @@ class CostModelParameters:
     """Age [frames] at which a run is forgotten. Work that was too slow once is tried again after it."""
     unknown_factor: float = 1.5
     """Factor [1] on the table for work with fewer than two runs. A larger factor starts new stages later."""
+    deadline_quantile: float = 0.95
+    """Quantile [1] of recent durations that a stage is expected to take. A larger one keeps the deadline more often."""
+    lost_quantile: float = 0.5
+    """The quantile [1] for a lost camera. Being late costs it little, and two slow runs would keep it lost."""
 
 
 PARAMETERS = CostModelParameters()
@@ -74,7 +73,7 @@ class CostModel:
         recent.append((self._frame, ms / table_ms(kind, units)))
         del recent[: -PARAMETERS.history]
 
-    def expected_ms(self, kind: str, units: float, quantile: float = DEADLINE_QUANTILE) -> float:
+    def expected_ms(self, kind: str, units: float, quantile: float = PARAMETERS.deadline_quantile) -> float:
         """Return the quantile of the durations [ms] that recent runs would have with this number of units."""
         oldest = self._frame - PARAMETERS.max_age
         ratios = sorted(ratio for frame, ratio in self._runs.get(kind, ()) if frame > oldest)
@@ -100,7 +99,7 @@ class Budget:
     """
 
     def __init__(
-        self, limit_ms: float, costs: CostModel | None, started: float, quantile: float = DEADLINE_QUANTILE
+        self, limit_ms: float, costs: CostModel | None, started: float, quantile: float = PARAMETERS.deadline_quantile
     ) -> None:
         self.limit_ms = limit_ms
         self.ms: dict[str, float] = {}
@@ -111,7 +110,9 @@ class Budget:
         self._counted_ms = 0.0
         if costs is not None:
             costs.begin_frame()
-        self._rest_ms = table_ms("overhead", 1) if costs is None else costs.expected_ms("overhead", 1, LOST_QUANTILE)
+        self._rest_ms = (
+            table_ms("overhead", 1) if costs is None else costs.expected_ms("overhead", 1, PARAMETERS.lost_quantile)
+        )
 
     @property
     def left_ms(self) -> float:

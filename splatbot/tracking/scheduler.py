@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from splatbot.tracking.budget import DEADLINE_QUANTILE, LOST_QUANTILE, Budget, CostModel
+from splatbot.tracking.budget import PARAMETERS as COSTS
+from splatbot.tracking.budget import Budget, CostModel
 from splatbot.tracking.health import verdict_of
 from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis, measure_hypothesis, select_best
 from splatbot.tracking.motion_model import Prediction
@@ -28,7 +29,7 @@ class StageScheduler:
     """
 
     def __init__(self, problem: TrackingProblem, stages: StageSet, costs: CostModel | None) -> None:
-        quantile = LOST_QUANTILE if problem.is_lost else DEADLINE_QUANTILE
+        quantile = COSTS.lost_quantile if problem.is_lost else COSTS.deadline_quantile
         self.budget = Budget(problem.config.budget_ms, costs, problem.prepared.started, quantile)
         self._problem = problem
         self._stages = stages

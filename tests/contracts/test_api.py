@@ -299,7 +299,7 @@ def test_a_plan_is_tried_in_the_twin_of_the_map_it_was_made_in(api: Service, rob
         assert job["result"]["map"] == "default"
         (trial,) = job["result"]["trials"]
         assert any("ellipsoids" in note for note in trial["notes"])
-        touched.append(bool(trial["touches"]))
+        touched.append(bool(trial["contacts"]))
     assert touched == [False, True]
 
 

@@ -109,6 +109,6 @@ def _held_and_free(grasp: dict[str, Any], friction: float = FRICTION) -> None:
     line = (contacts[1] - contacts[0]) / np.linalg.norm(contacts[1] - contacts[0])
     cosines = np.array([-normals[0] @ line, normals[1] @ line])
     assert np.degrees(np.arccos(cosines)).max() < np.degrees(np.arctan(friction))
-    assert grasp["room_m"] > 0.0
+    assert grasp["clearance_m"] > 0.0
     assert grasp["opening_m"] >= grasp["width_m"]
     assert grasp["approach_path"] is not None

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,21 @@ from splatbot.geometry import quat_to_rotation
 from splatbot.logs.shapes import TriangleMesh, box, cylinder, sphere
 from splatbot.protocols import Array
 
-OCTREE_VOXEL = 0.01  # [m]
-_CHUNK = 50  # points per batch against all Gaussians: 60 MB with 100,000 Gaussians
+
+@dataclass(frozen=True)
+class PeerConstants:
+    """Constants of the peers of collision queries.
+
+    Args:
+        octree_voxel: [m] voxel size of the octree.
+        chunk: points per batch against all Gaussians: 60 MB with 100,000 Gaussians.
+    """
+
+    octree_voxel: float = 0.01
+    chunk: int = 50
+
+
+CONSTANTS = PeerConstants()
 
 
 def run_brute_force(results: Results, model: GaussianModel, points: Array, report_progress: ReportProgress) -> None:
@@ -57,7 +71,7 @@ def run_brute_force(results: Results, model: GaussianModel, points: Array, repor
 
 def _torch_squared(means: torch.Tensor, inverse: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     least = []
-    for part in points.split(_CHUNK):
+    for part in points.split(CONSTANTS.chunk):
         x = part[:, None] - means[None]
         least.append(torch.einsum("pni,nij,pnj->pn", x, inverse, x).min(dim=1).values)
     return torch.cat(least)
@@ -111,7 +125,7 @@ def _coal_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> SphereChec
 
 def _coal_octree(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck:
     coal = importlib.import_module("coal")
-    return _coal_spheres(coal, coal.makeOctree(_points_of(scene), OCTREE_VOXEL))
+    return _coal_spheres(coal, coal.makeOctree(_points_of(scene), CONSTANTS.octree_voxel))
 
 
 def mesh_checker(scene: Tabletop) -> SphereCheck:
@@ -150,7 +164,7 @@ def _fcl_mesh(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck
 
 
 def _fcl_octree(vertices: Array, triangles: Array, scene: Tabletop) -> SphereCheck:
-    return _fcl_spheres(importlib.import_module("fcl"), fcl_octree(_points_of(scene), OCTREE_VOXEL))
+    return _fcl_spheres(importlib.import_module("fcl"), fcl_octree(_points_of(scene), CONSTANTS.octree_voxel))
 
 
 def _fcl_spheres(fcl: Any, model: Any) -> SphereCheck:

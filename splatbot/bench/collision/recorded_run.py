@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
@@ -28,8 +29,23 @@ from splatbot.results.folder import RunFolder
 from splatbot.results.scoring import score_views
 from splatbot.robots.in_view import reopen_log
 
-_VOXEL = 0.01  # [m]
-_FARTHEST = 10.0  # [m]
+
+@dataclass(frozen=True)
+class FusedSurfaceConstants:
+    """Constants of the fused surface.
+
+    Args:
+        voxel: [m] voxel size.
+        max_depth: [m] largest depth that is fused.
+    """
+
+    voxel: float = 0.01
+    max_depth: float = 10.0
+
+
+CONSTANTS = FusedSurfaceConstants()
+
+
 _GREY = (0.5, 0.5, 0.5)  # colour of the fused surface, which no result depends on
 
 
@@ -52,7 +68,7 @@ def audit_run(results: Results, run: Path, out: Path, *, points: int, min_observ
     field = GaussianCollisionField(model, min_observations=min_observations)
     rng = np.random.default_rng(0)
     held_out = {row.index for row in folder.load_frames() if row.held_out}
-    clouds, free, fusion = [], [], DepthFusion(_VOXEL, _FARTHEST)
+    clouds, free, fusion = [], [], DepthFusion(CONSTANTS.voxel, CONSTANTS.max_depth)
     each = -(-points // len(poses))
     for index, T in sorted(poses.items()):
         frame = log[index]

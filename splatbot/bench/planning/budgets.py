@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ from splatbot.bench.planning.audit import audit
 from splatbot.bench.planning.mapped_log import add_map, audit_mapped
 from splatbot.bench.planning.peers import run_peers
 from splatbot.bench.planning.recorded_run import plan_in_run
-from splatbot.bench.planning_problems import MIN_CLEARANCE, Problem, problems
+from splatbot.bench.planning_problems import CONSTANTS as PROBLEMS
+from splatbot.bench.planning_problems import Problem, problems
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.timing import threads
@@ -28,11 +30,27 @@ from splatbot.planning import GaussianRRTStar, PlanResult, Replanner
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 
-EXACT_CLEARANCE = 0.01  # [m] up to which the true clearance is exact; above it is a lower bound
-FAST_MS = 28.0  # budget of the path before a change of the map, and of paths on mapped logs
-REPAIR_MS = 9.0
-WIDE_CLEARANCE = 0.03  # [m] true clearance at both ends, which leaves them free on a map with a margin of 2 cm
-SOLVABLE_MS = 100.0  # time in which a changed problem must be solved again to count
+
+@dataclass(frozen=True)
+class BudgetConstants:
+    """Constants of plans under a time budget.
+
+    Args:
+        exact_clearance: [m] true clearance up to which it is exact; above it is a lower bound.
+        fast_ms: [ms] budget of the path before a change of the map, and of paths on mapped logs.
+        repair_ms: [ms] budget of a repair.
+        wide_clearance: [m] true clearance at both ends, which leaves them free on a map with a margin of 2 cm.
+        solvable_ms: [ms] time in which a changed problem must be solved again to count.
+    """
+
+    exact_clearance: float = 0.01
+    fast_ms: float = 28.0
+    repair_ms: float = 9.0
+    wide_clearance: float = 0.03
+    solvable_ms: float = 100.0
+
+
+CONSTANTS = BudgetConstants()
 
 
 def run_planning(settings: PlanningSettings, report_progress: ReportProgress = ignore_progress) -> Results:
@@ -82,15 +100,19 @@ def run_mapped(settings: PlanningSettings, report_progress: ReportProgress = ign
             ideal = GaussianCollisionField(scene.gaussians(settings.gaussians))
             own = add_map(results, mapped)
             # The coarse grid of a quick run bounds clearances too low for the wide one.
-            for clearance in (MIN_CLEARANCE,) if settings.quick else (MIN_CLEARANCE, WIDE_CLEARANCE):
+            for clearance in (
+                (PROBLEMS.min_clearance,) if settings.quick else (PROBLEMS.min_clearance, CONSTANTS.wide_clearance)
+            ):
                 name = f"ends with {1e3 * clearance:g} mm on a mapped noisy log"
                 report_progress(name)
                 wanted = problems(panda(), RobotSpheres(panda()), ideal, truth, settings.problems, clearance=clearance)
-                audit_mapped(results, name, mapped, truth, wanted, own, seeds=settings.seeds, budget_ms=FAST_MS)
+                audit_mapped(
+                    results, name, mapped, truth, wanted, own, seeds=settings.seeds, budget_ms=CONSTANTS.fast_ms
+                )
                 settings.save(results)
         for run in settings.run:
             report_progress(f"planning in {run}")
-            plan_in_run(results, run, problems=settings.run_problems, budget_ms=FAST_MS)
+            plan_in_run(results, run, problems=settings.run_problems, budget_ms=CONSTANTS.fast_ms)
             settings.save(results)
     return results
 
@@ -153,7 +175,7 @@ def add_audit(
     results.add(case, "deepest", 1e3 * max(0.0, -float(clearances.min())), "mm", peer=peer)
     results.add(case, "in self-collision", float(in_self_collision), f"of {len(paths)}", peer=peer)
     if promised is not None:
-        broken = int((clearances < np.minimum(promised, EXACT_CLEARANCE)).sum())
+        broken = int((clearances < np.minimum(promised, CONSTANTS.exact_clearance)).sum())
         results.add(case, "true clearance below the certified one", float(broken), f"of {len(paths)}", peer=peer)
 
 
@@ -168,7 +190,7 @@ def run_changes(settings: PlanningSettings, results: Results, model: GaussianMod
     valid = solvable = 0
     for seed, problem in enumerate(wanted):
         replanner = Replanner(GaussianRRTStar(before, panda()))
-        path = replanner.plan(problem.start, problem.goal, budget_ms=FAST_MS, seed=seed).path
+        path = replanner.plan(problem.start, problem.goal, budget_ms=CONSTANTS.fast_ms, seed=seed).path
         if path is None:
             continue
         update = replanner.update(far)
@@ -176,15 +198,15 @@ def run_changes(settings: PlanningSettings, results: Results, model: GaussianMod
         kept.append(1e3 * update.seconds)
         arm = replanner.planner.arm
         near = changed(far, model, arm.centers(path.at([0.5]))[0, arm.spheres.link >= 6][-1])
-        if not GaussianRRTStar(near, panda()).plan(problem.start, problem.goal, budget_ms=SOLVABLE_MS).path:
+        if not GaussianRRTStar(near, panda()).plan(problem.start, problem.goal, budget_ms=CONSTANTS.solvable_ms).path:
             continue
         solvable += 1
-        update = replanner.update(near, budget_ms=REPAIR_MS)
+        update = replanner.update(near, budget_ms=CONSTANTS.repair_ms)
         if update.result:
             repaired.append(1e3 * (update.seconds - update.result.seconds + update.result.first_seconds))
     results.add(FAR_CHANGE, "paths that stay valid", float(valid), f"of {len(kept)}")
     spread(results, FAR_CHANGE, "certified again", kept, "ms")
-    results.add(NEAR_CHANGE, f"repaired in {REPAIR_MS:g} ms", float(len(repaired)), f"of {solvable}")
+    results.add(NEAR_CHANGE, f"repaired in {CONSTANTS.repair_ms:g} ms", float(len(repaired)), f"of {solvable}")
     if repaired:
         spread(results, NEAR_CHANGE, "time to a new path", repaired, "ms")
 

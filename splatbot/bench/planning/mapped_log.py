@@ -19,7 +19,7 @@ from splatbot.bench.truth import Truth
 from splatbot.collision import GaussianCollisionField, RobotSpheres, surface_error
 from splatbot.planning import GaussianRRTStar, PlanResult, PlanStatus
 from splatbot.protocols import Array
-from splatbot.results.margin import RADIUS, SHARE
+from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.robots.panda import panda
 
 MARGINS = (0.0, 0.005, 0.02)  # [m] in addition to the surface error of the map
@@ -43,14 +43,16 @@ def add_map(results: Results, mapped: FilmedMap) -> float:
     """Add size and errors of the map, and return its surface error [m], which serves as a margin."""
     case = "mapped noisy log"
     field = GaussianCollisionField(mapped.snapshot)
-    own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], RADIUS]).share(SHARE)
+    own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], MARGIN.radius]).share(MARGIN.share)
     drift = mapped.drift()
     results.add(case, "frames", float(len(drift)), "")
     results.add(case, "lost", float(np.isnan(drift).sum()), f"of {len(drift)}")
     results.add(case, "camera position error, median", 1e3 * float(np.nanmedian(drift)), "mm")
     results.add(case, "camera position error, most", 1e3 * float(np.nanmax(drift)), "mm")
     results.add(case, "Gaussians", float(len(field)), "")
-    results.add(case, f"surface error within {RADIUS:g} m against its own depth, {SHARE:.1%}", 1e3 * own, "mm")
+    results.add(
+        case, f"surface error within {MARGIN.radius:g} m against its own depth, {MARGIN.share:.1%}", 1e3 * own, "mm"
+    )
     return own
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +24,34 @@ from splatbot.results.margin import own_margin
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
 from splatbot.tracking.prepare import usable_depth
-from splatbot.workspace import AHEAD, Workspace, find_workspace, fit_workspace
+from splatbot.workspace import CONSTANTS as WORKSPACE
+from splatbot.workspace import Workspace, find_workspace, fit_workspace
 
-_FRAMES = 40  # least number of frames whose depth is compared with the paths
-_PIXEL_STRIDE = 5  # between the compared pixels
+
+@dataclass(frozen=True)
+class RecordedRunConstants:
+    """Constants of paths on recorded logs.
+
+    Args:
+        min_frames: least number of frames whose depth is compared with the paths.
+        pixel_stride: stride between the compared pixels.
+        tried_configurations: number of configurations that are tried.
+        min_free_share: least fraction of free configurations.
+        path_stride: stride between the compared configurations of a path: 1/32 rad.
+    """
+
+    min_frames: int = 40
+    pixel_stride: int = 5
+    tried_configurations: int = 1000
+    min_free_share: float = 0.1
+    path_stride: int = 8
+
+
+CONSTANTS = RecordedRunConstants()
+
+
 _TURNS = (0, *(sign * angle for angle in range(30, 181, 30) for sign in (1, -1)))  # [deg]
-_TRIED, _MIN_FREE = 1000, 0.1  # configurations, and the least share of free ones
 _BOX = ((0.2, -0.5, 0.0), (0.9, 0.5, 0.8))  # [m]
-_PATH_STRIDE = 8  # between the compared configurations of a path: 1/32 rad
 
 
 def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float, seed: int = 0) -> None:
@@ -75,13 +95,13 @@ def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
     """
     T = place.T_world_base
     assert T is not None
-    some = panda().random(_TRIED, np.random.default_rng(0))
+    some = panda().random(CONSTANTS.tried_configurations, np.random.default_rng(0))
     for degrees in _TURNS:
         turn = np.eye(4)
         turn[:3, :3] = so3_exp([0.0, 0.0, np.radians(degrees)])
-        turn[:3, 3] = [AHEAD, 0.0, 0.0] - turn[:3, :3] @ [AHEAD, 0.0, 0.0]
+        turn[:3, 3] = [WORKSPACE.ahead, 0.0, 0.0] - turn[:3, :3] @ [WORKSPACE.ahead, 0.0, 0.0]
         arm = RobotSpheres(panda(), T_world_base=T @ turn)
-        if (~arm.check(field, some).in_collision).mean() > _MIN_FREE:
+        if (~arm.check(field, some).in_collision).mean() > CONSTANTS.min_free_share:
             return place if degrees == 0 else replace(place, T_world_base=T @ turn, box=np.array(_BOX))
     return place
 
@@ -110,18 +130,18 @@ def _measured(folder: RunFolder, log: Log) -> Array:
     config = folder.load_config().tracking
     poses = sorted(folder.load_poses().items())
     parts = []
-    for index, T in poses[:: max(1, len(poses) // _FRAMES)]:
+    for index, T in poses[:: max(1, len(poses) // CONSTANTS.min_frames)]:
         frame = log[index]
         depth = usable_depth(frame, config)
         v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
-        parts.append(lifted(depth, u[::_PIXEL_STRIDE], v[::_PIXEL_STRIDE], frame.camera, T))
+        parts.append(lifted(depth, u[:: CONSTANTS.pixel_stride], v[:: CONSTANTS.pixel_stride], frame.camera, T))
     return np.concatenate(parts)
 
 
 def _clearance(arm: RobotSpheres, path: Array, measured: cKDTree) -> float:
     """Compute the least clearance [m] between the arm along a path and measured points, at most 10 cm."""
     moving = arm.spheres.link > 0
-    centers = arm.centers(configurations(path)[::_PATH_STRIDE])[:, moving]
+    centers = arm.centers(configurations(path)[:: CONSTANTS.path_stride])[:, moving]
     distance, _ = measured.query(centers.reshape(-1, 3), distance_upper_bound=0.1 + float(arm.spheres.radii.max()))
     gap = np.minimum(distance.reshape(len(centers), -1) - arm.spheres.radii[moving], 0.1)
     return float(gap.min())

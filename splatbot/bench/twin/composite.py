@@ -27,10 +27,27 @@ from splatbot.sim.solids import rpy_of
 from splatbot.sim.twin import Twin
 from splatbot.sim.view import TwinView
 
-HELD_OUT = 5  # period [frames] of the frames that are not mapped
-_REACH = 0.35  # of each joint's range, to both sides of home
-_PAPER = 1e-4  # [m]
-_AWAY = 1.5  # [m] of the cameras from the middle of the table
+
+@dataclass(frozen=True)
+class CompositeConstants:
+    """Constants of the twin over pictures.
+
+    Args:
+        held_out_period: [frames] period of the frames that are not mapped.
+        reach: fraction of each joint's range, to both sides of home.
+        paper: [m] standard deviation of the Gaussians across the table top.
+        camera_distance: [m] distance of the cameras from the middle of the table.
+    """
+
+    held_out_period: int = 5
+    reach: float = 0.35
+    paper: float = 1e-4
+    camera_distance: float = 1.5
+
+
+CONSTANTS = CompositeConstants()
+
+
 _CAMERA = {"at": [1.5, -0.9, 0.9], "look_at": [0.35, 0.0, 0.25]}  # the poses are given with each picture
 
 
@@ -58,10 +75,12 @@ def exact_map(poses: int, gaussians: int, *, width: int = 320, seed: int = 0) ->
     """
     table, rng = tabletop(), np.random.default_rng(seed)
     turns, heights = rng.uniform(-2.6, 2.6, poses), rng.uniform(0.15, 1.0, poses)
-    eyes = np.stack([0.45 + _AWAY * np.cos(turns), _AWAY * np.sin(turns), heights], axis=1)
+    eyes = np.stack(
+        [0.45 + CONSTANTS.camera_distance * np.cos(turns), CONSTANTS.camera_distance * np.sin(turns), heights], axis=1
+    )
     views = np.array([look_at(eye, np.array([0.45, 0.0, 0.2])) for eye in eyes])
     model = table.gaussians(gaussians)
-    model.log_scales[:, 2] = np.log(_PAPER)
+    model.log_scales[:, 2] = np.log(CONSTANTS.paper)
     return _compare(table, model, np.eye(4), views, _pinhole(width), rng, None)
 
 
@@ -69,7 +88,7 @@ def filmed_map(poses: int, frames: int, *, width: int = 320, seed: int = 0) -> C
     """Compare pictures of a SLAM map of a noisy film, at the poses of held-out frames."""
     table, rng = tabletop(), np.random.default_rng(seed)
     film = shoot(table, frames, width, seed)
-    held = np.arange(HELD_OUT // 2, frames, HELD_OUT)
+    held = np.arange(CONSTANTS.held_out_period // 2, frames, CONSTANTS.held_out_period)
     kept = [i for i in range(frames) if i not in held]
     mapped: FilmedMap = map_film(Film([film.frames[i] for i in kept], film.T_scene_camera[kept]))
     shown = held[np.linspace(0, len(held) - 1, min(poses, len(held))).astype(int)]
@@ -132,7 +151,7 @@ def _likeness(
 
 def _posture(robot: RobotModel | None, rng: np.random.Generator) -> Array:
     assert robot is not None
-    half = _REACH * 0.5 * (robot.chain.upper - robot.chain.lower)
+    half = CONSTANTS.reach * 0.5 * (robot.chain.upper - robot.chain.lower)
     return np.clip(robot.home + rng.uniform(-half, half), robot.chain.lower, robot.chain.upper)
 
 

@@ -17,7 +17,8 @@ from splatbot.bench.tabletop import tabletop
 from splatbot.bench.twin import TwinSettings
 from splatbot.bench.twin.bounds import EXACT, FILMED, FORCED
 from splatbot.bench.twin.composite import exact_map, filmed_map
-from splatbot.bench.twin.paths import DEPTH, try_paths
+from splatbot.bench.twin.paths import CONSTANTS as PATHS
+from splatbot.bench.twin.paths import try_paths
 from splatbot.errors import NativeError
 from splatbot.protocols import Array
 from splatbot.robots.mjcf import to_mjcf
@@ -152,7 +153,7 @@ def _paths(results: Results, settings: TwinSettings, report_progress: ReportProg
     results.add(case, "certified", trials.certified, "")
     results.add(case, "in contact", trials.in_contact, "", note="of those planned")
     results.add(case, "least clearance", 1e3 * trials.least_clearance, "mm")
-    results.add(case, f"pushed {1e3 * DEPTH:g} mm in", trials.pushed, "")
+    results.add(case, f"pushed {1e3 * PATHS.push_depth:g} mm in", trials.pushed, "")
     results.add(case, "detected as contact", trials.detected, "", note="of those pushed")
     results.add(case, "faster than real time", trials.real_time, "x")
 

@@ -20,13 +20,31 @@ from splatbot.sim.motion import JointMotion, minimum_jerk
 from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.twin import Twin
 
-MARGIN = 0.005  # [m] of the plans; the arm follows them within a millimetre
-DEPTH = 0.01  # [m] that pushed paths go into an obstacle
-_ALONG = 13  # points on a capsule's axis
-_SPARE = 20  # additional problems, because some have no path within the budget
-_DEPARTURES = 12  # configurations at which a pushed path may leave the path
-_FIRST_LINK = 3  # of the checked ones: the clearance of earlier links hardly changes
-_LIMIT_SHARE = 0.6  # of the joints' limits of velocity and acceleration
+
+@dataclass(frozen=True)
+class TwinPathConstants:
+    """Constants of paths that a twin executes.
+
+    Args:
+        margin: [m] margin of the plans; the arm follows them within a millimetre.
+        push_depth: [m] distance that pushed paths go into an obstacle.
+        axis_points: points on a capsule's axis.
+        spare: additional problems, because some have no path within the budget.
+        departures: configurations at which a pushed path may leave the path.
+        first_link: first of the checked links: the clearance of earlier ones hardly changes.
+        limit_share: fraction of the joints' limits of velocity and acceleration.
+    """
+
+    margin: float = 0.005
+    push_depth: float = 0.01
+    axis_points: int = 13
+    spare: int = 20
+    departures: int = 12
+    first_link: int = 3
+    limit_share: float = 0.6
+
+
+CONSTANTS = TwinPathConstants()
 
 
 @dataclass(frozen=True)
@@ -68,13 +86,13 @@ def try_paths(
     """Plan ``count`` problems in a map of the table top, and follow the paths among the true shapes."""
     table, robot = tabletop(), panda()
     field = GaussianCollisionField(table.gaussians(gaussians))
-    planner = GaussianRRTStar(field, robot, margin=MARGIN)
+    planner = GaussianRRTStar(field, robot, margin=CONSTANTS.margin)
     truth = Truth(table)
     twin = Twin(truth_scene(table))
     planned = certified = in_contact = pushed = detected = 0
     least, simulated, spent = np.inf, 0.0, 0.0
     tried = 0
-    for i, problem in enumerate(problems(robot, planner.arm, field, truth, count + _SPARE, seed)):
+    for i, problem in enumerate(problems(robot, planner.arm, field, truth, count + CONSTANTS.spare, seed)):
         if planned == count:
             break
         if planned % 20 == 0:
@@ -89,7 +107,7 @@ def try_paths(
         in_contact += bool(result.contacts)
         least = min(least, result.clearance.value)
         simulated, spent = simulated + result.duration, spent + result.seconds
-        into = push(path.waypoints, robot, table, DEPTH)
+        into = push(path.waypoints, robot, table, CONSTANTS.push_depth)
         if into is not None:
             pushed += 1
             detected += bool(twin.follow(timed(into, robot.chain), until_contact=True).contacts)
@@ -102,8 +120,8 @@ def timed(waypoints: Array, chain: KinematicChain) -> JointMotion:
     """Time a motion along the edges, at rest at each waypoint, within the limits of velocity and acceleration."""
     steps = np.abs(np.diff(waypoints, axis=0))
     # Minimum jerk peaks at 1.875 of the mean velocity and at 5.774 of distance over time squared.
-    slow = (1.875 * steps / (_LIMIT_SHARE * chain.velocity)).max(axis=1)
-    soft = np.sqrt((5.774 * steps / (_LIMIT_SHARE * chain.acceleration)).max(axis=1))
+    slow = (1.875 * steps / (CONSTANTS.limit_share * chain.velocity)).max(axis=1)
+    soft = np.sqrt((5.774 * steps / (CONSTANTS.limit_share * chain.acceleration)).max(axis=1))
     times = np.concatenate([[0.0], np.cumsum(np.maximum(np.maximum(slow, soft), 0.02))])
     t = np.unique(np.concatenate([np.arange(0.0, times[-1], 4e-3), times]))
     q, v, a = (minimum_jerk(t, times, waypoints, order) for order in range(3))
@@ -120,7 +138,7 @@ def arm_clearance(robot: RobotModel, table: Tabletop, q: Array, first: int = 1) 
     for link, shape in _capsules(robot):
         if link < first:
             continue
-        at = np.linspace(shape.start, shape.end, _ALONG)
+        at = np.linspace(shape.start, shape.end, CONSTANTS.axis_points)
         world = np.einsum("cij,pj->cpi", T[:, link, :3, :3], at) + T[:, link, None, :3, 3]
         found.append(table.distance(world.reshape(-1, 3)).reshape(len(q), -1).min(axis=1) - shape.radius)
     return np.asarray(np.min(found, axis=0))
@@ -135,8 +153,8 @@ def push(waypoints: Array, robot: RobotModel, table: Tabletop, depth: float) -> 
     share = np.linspace(0.0, len(waypoints) - 1, 20 * len(waypoints))
     edge = np.minimum(share.astype(int), len(waypoints) - 2)
     q = waypoints[edge] + (share - edge)[:, None] * (waypoints[edge + 1] - waypoints[edge])
-    nearest = np.argsort(arm_clearance(robot, table, q, _FIRST_LINK), kind="stable")
-    for k in nearest[:: max(1, len(nearest) // _DEPARTURES)]:
+    nearest = np.argsort(arm_clearance(robot, table, q, CONSTANTS.first_link), kind="stable")
+    for k in nearest[:: max(1, len(nearest) // CONSTANTS.departures)]:
         out = _deeper(q[k], robot, table, depth)
         if out is not None:
             return np.concatenate([waypoints[: edge[k] + 1], out])
@@ -153,7 +171,7 @@ def _straight_in(start: Array, robot: RobotModel, table: Tabletop, depth: float)
         direction = rng.standard_normal(len(start))
         q = start + far * direction / np.linalg.norm(direction)
         q = q[((q >= robot.chain.lower) & (q <= robot.chain.upper)).all(axis=1)]
-        deep = np.flatnonzero(arm_clearance(robot, table, q, _FIRST_LINK) <= -depth)
+        deep = np.flatnonzero(arm_clearance(robot, table, q, CONSTANTS.first_link) <= -depth)
         if len(deep):
             return np.stack([q[0], q[deep[0]]])
     return None
@@ -163,11 +181,11 @@ def _deeper(start: Array, robot: RobotModel, table: Tabletop, depth: float) -> A
     at = start.copy()
     out = [at.copy()]
     for _ in range(400):
-        clearance = float(arm_clearance(robot, table, at[None], _FIRST_LINK)[0])
+        clearance = float(arm_clearance(robot, table, at[None], CONSTANTS.first_link)[0])
         if clearance <= -depth:
             return np.array(out)
         probes = at + 1e-5 * np.eye(len(at))
-        slope = (arm_clearance(robot, table, probes, _FIRST_LINK) - clearance) / 1e-5
+        slope = (arm_clearance(robot, table, probes, CONSTANTS.first_link) - clearance) / 1e-5
         length = float(np.linalg.norm(slope))
         if length < 1e-3:
             return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import secrets
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,9 +18,24 @@ from splatbot.grasping.vision.views import empty_picture, picture_of, scene_view
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
-LEAST_CONFIDENCE = 0.5
+
+@dataclass(frozen=True)
+class AffordanceConstants:
+    """Constants of the choice among the answers of a vision model.
+
+    Args:
+        min_confidence: least confidence of an answer that is used.
+        single_view_factor: factor on the score of a single view, which no other view confirms.
+    """
+
+    min_confidence: float = 0.5
+    single_view_factor: float = 0.5
+
+
+CONSTANTS = AffordanceConstants()
+
+
 _NAME = re.compile(r"[\w ,.'()/-]{1,80}")  # no quotes and no line breaks, against prompt injection
-_SINGLE_VIEW_FACTOR = 0.5  # on the score of a single view, which no other view confirms
 
 
 class VisionAffordance:
@@ -120,10 +136,10 @@ class VisionAffordance:
                 candidates=tuple(_called(scene, number) for number in votes),
             )
         sure = float(np.mean([answer.confidence for answer, _ in won]))
-        if sure < LEAST_CONFIDENCE:
+        if sure < CONSTANTS.min_confidence:
             raise AffordanceError(f"is not sure ({sure:.2f}) of {name!r}.", field=self.name, hint="point at it")
         self._agrees(name, scene, winner)
-        score = sure * (len(won) / len(views) if len(views) > 1 else _SINGLE_VIEW_FACTOR)
+        score = sure * (len(won) / len(views) if len(views) > 1 else CONSTANTS.single_view_factor)
         point = np.mean([at for _, at in won], axis=0)
         return Target(scene.objects[winner].rows, point, _called(scene, winner), self.name, score, tuple(notes), winner)
 

@@ -111,7 +111,7 @@ inline splatbot::View view_of(const Matrix4& viewmat, const Matrix3& K, int widt
   return view;
 }
 
-// The value that goes by the name, of an argument that takes one of several.
+// Returns the value of that name, for an argument that takes one of several.
 template <class Value, std::size_t N>
 Value choice_of(const char* argument, const std::string& name, const std::pair<const char*, Value> (&choices)[N]) {
   std::string names;
@@ -149,7 +149,7 @@ inline splatbot::Gradients gradients_of(const std::optional<OutAny>& means, cons
           .accumulate = accumulate};
 }
 
-// What result() gives after render(), which runs without the GIL, or (field, row) of the input that is not finite.
+// Returns result() after render(), which runs without the GIL, or (field, row) of an input that is not finite.
 template <class Render, class Result>
 nb::object unless_faulty(Render&& render, Result&& result) {
   std::optional<splatbot::Fault> fault;
@@ -208,7 +208,7 @@ inline nb::dict dict_of(const splatbot::TileInfo& info) {
   return d;
 }
 
-// A Python class of such leftovers with what both kinds of splats tell of them.
+// Defines the Python class of such leftovers, with the methods of both kinds of splats.
 template <class Handle>
 nb::class_<Handle> define_state(nb::module_& m, const char* name, const char* doc, nb::dict (*describe)(const Handle&)) {
   return nb::class_<Handle>(m, name, doc)

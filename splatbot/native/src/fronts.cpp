@@ -4,32 +4,15 @@
 #include <algorithm>
 #include <stdexcept>
 
-#include "splatbot/kernels.hpp"
-#include "splatbot/threads.hpp"
+#include "splats.hpp"
 
 namespace splatbot {
 
 namespace {
 
 // The parts of a finished render that a walk over the tile lists needs.
-BlendArgs finished(const RasterState& const_state) {
-  auto& state = const_cast<RasterState&>(const_state);  // read only: the kernels' structure serves writers as well
-  BlendArgs args{};
-  args.view = state.view;
-  args.columns = state.columns;
-  args.records = state.records.data();
-  args.tile_begin = state.tile_begin.data();
-  args.pairs = state.pairs.data();
-  args.masks = state.masks.data();
-  args.tile_done = state.tile_done.data();
-  args.mask = state.mask.size() == 0 ? nullptr : state.mask.data();
-  args.mask_size = state.mask_size;
-  args.mask_columns = state.mask_columns;
-  return args;
-}
-
-std::size_t pixel_count(const RasterState& state) {
-  return static_cast<std::size_t>(state.view.width) * static_cast<std::size_t>(state.view.height);
+BlendArgs finished(const RasterState& state) {
+  return list_args(const_cast<RasterState&>(state));  // read only: the kernels' structure serves writers as well
 }
 
 // A pixel's tile and its place in it, as the kernels number them.
@@ -47,7 +30,7 @@ Place place_of(const RasterState& state, std::int64_t pixel, std::size_t row) {
 std::vector<Place> by_tile(const RasterState& state, std::span<const std::int64_t> pixels) {
   std::vector<Place> places(pixels.size());
   for (std::size_t i = 0; i < pixels.size(); ++i) {
-    if (pixels[i] < 0 || pixels[i] >= static_cast<std::int64_t>(pixel_count(state))) {
+    if (pixels[i] < 0 || pixels[i] >= static_cast<std::int64_t>(pixels_of(state.view))) {
       throw std::invalid_argument("a pixel lies outside the image");
     }
     places[i] = place_of(state, pixels[i], i);
@@ -65,7 +48,7 @@ std::vector<Place> by_tile(const RasterState& state, std::span<const std::int64_
 }  // namespace
 
 void median_gaussians(const RasterState& state, std::span<std::int32_t> out) {
-  if (out.size() != pixel_count(state)) {
+  if (out.size() != pixels_of(state.view)) {
     throw std::invalid_argument("the output is not (H, W)");
   }
   const Kernels& k = kernels();

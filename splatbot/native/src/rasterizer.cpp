@@ -7,11 +7,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "checks.hpp"
-#include "pull_back.hpp"
-#include "splatbot/kernels.hpp"
-#include "splatbot/stopwatch.hpp"
-#include "splatbot/threads.hpp"
+#include "splats.hpp"
 #include "state_store.hpp"
 
 namespace splatbot {
@@ -41,54 +37,30 @@ std::vector<ChannelPass> plan_passes(int channels, const RasterOptions& options)
 }
 
 ProjectArgs project_args(RasterState& state, const Gaussians& g) {
-  return {.count = state.count,
-          .means = g.means.data(),
-          .quats = g.quats.data(),
-          .scales = g.scales.data(),
-          .covars = g.covars.empty() ? nullptr : g.covars.data(),
-          .opacities = g.opacities.data(),
-          .colors = g.colors.data(),
-          .channels = state.channels,
-          .sh_degree = g.sh_degree,
-          .coefficients = g.coefficients,
-          .view = state.view,
-          .options = state.options,
-          .columns = state.columns,
-          .rows = state.rows,
-          .passes = state.passes.data(),
-          .n_passes = static_cast<int>(state.passes.size()),
-          .records = state.records.data(),
-          .placements = state.placements.data(),
-          .visible = state.visible.data(),
-          .more_channels = state.more_channels.data()};
+  ProjectArgs args{};
+  set_project_args(args, state, g);
+  args.passes = state.passes.data();
+  args.n_passes = static_cast<int>(state.passes.size());
+  args.more_channels = state.more_channels.data();
+  return args;
 }
 
 BlendArgs blend_args(RasterState& state, std::size_t p, const float* background) {
   const std::size_t plane = state.tiles() * kFinalPlanes * kTilePixels;
   const bool first = p == 0;
-  return {.view = state.view,
-          .columns = state.columns,
-          .pass = &state.passes[p],
-          .depth = state.options.depth,
-          .plane_depth = state.options.plane_depth,
-          .write_alphas = first,
-          .transmittance_min = state.options.transmittance_min,
-          .records = state.records.data(),
-          .channels = first ? (state.count == 0 ? nullptr : state.records[0].channels)
-                            : state.more_channels.data() + (p - 1) * state.count * kRecordChannels,
-          .channel_stride = first ? sizeof(Record) / sizeof(float) : kRecordChannels,
-          .tile_begin = state.tile_begin.data(),
-          .pairs = state.pairs.data(),
-          .masks = state.masks.data(),
-          .tile_done = state.tile_done.data(),
-          .final_state = state.final_state.data() + p * plane,
-          .background = background,
-          .mask = state.mask.size() == 0 ? nullptr : state.mask.data(),
-          .mask_size = state.mask_size,
-          .mask_columns = state.mask_columns,
-          .out_colors = nullptr,
-          .out_channels = state.out_channels,
-          .out_alphas = nullptr};
+  BlendArgs args = list_args(state);
+  args.pass = &state.passes[p];
+  args.depth = state.options.depth;
+  args.plane_depth = state.options.plane_depth;
+  args.write_alphas = first;
+  args.transmittance_min = state.options.transmittance_min;
+  args.channels = first ? (state.count == 0 ? nullptr : state.records[0].channels)
+                        : state.more_channels.data() + (p - 1) * state.count * kRecordChannels;
+  args.channel_stride = first ? sizeof(Record) / sizeof(float) : kRecordChannels;
+  args.final_state = state.final_state.data() + p * plane;
+  args.background = background;
+  args.out_channels = state.out_channels;
+  return args;
 }
 
 // The background of a pass's channels, 0 behind depth.
@@ -102,17 +74,11 @@ std::array<float, kRecordChannels> background_of(const ChannelPass& pass, std::s
 }
 
 void prepare(RasterState& state, const Gaussians& g, const View& view, const RasterOptions& options) {
-  state.count = g.count;
-  state.channels = g.channels;
-  state.view = view;
-  state.options = options;
   state.passes = plan_passes(g.channels, options);
-  state.out_channels = g.channels + (options.depth != DepthMode::none ? 1 : 0);
   require(!state.passes.empty(), "nothing to render: no colours and no depth");
-  state.TileLists::resize(g.count, view);
-  state.records.resize(g.count);
+  prepare_splats(state, g, view, options, state.passes.size() * kFinalPlanes);
+  state.out_channels = static_cast<int>(columns_of(state));
   state.more_channels.resize((state.passes.size() - 1) * g.count * kRecordChannels);
-  state.final_state.resize(state.passes.size() * state.tiles() * kFinalPlanes * kTilePixels);
 }
 
 void keep_mask(RasterState& state, const TileMask& mask) {
@@ -127,19 +93,8 @@ void keep_mask(RasterState& state, const TileMask& mask) {
   }
 }
 
-HarmonicsArgs harmonics_args(RasterState& state, const Gaussians& g) {
-  const int depth = state.options.depth != DepthMode::none ? 1 : 0;
-  return {.count = state.count,
-          .means = g.means.data(),
-          .coefficients = g.colors.data(),
-          .degree = g.sh_degree,
-          .held = g.coefficients,
-          .view = state.view,
-          .visible = state.visible.data(),
-          .blocks = state.blocks.data(),
-          .colors = state.count == 0 ? nullptr : state.records[0].channels + depth,
-          .color_stride = sizeof(Record) / sizeof(float)};
-}
+// The record's channel where colours begin.
+int first_color(const RasterState& state) { return state.options.depth != DepthMode::none ? 1 : 0; }
 
 // How many of a pass's channels need their gradients summed.
 int channel_sums(const ChannelPass& pass, const Gradients& out) {
@@ -149,11 +104,6 @@ int channel_sums(const ChannelPass& pass, const Gradients& out) {
   const bool position = !out.means.empty() || !out.camera.empty() || !out.means2d.empty();
   return pass.depth_first && position ? 1 : 0;
 }
-
-struct BackwardScratch {
-  Buffer<float> slots, carried, colors;
-  Buffer<double> camera, center;
-};
 
 void describe_one(const RasterState& state, std::size_t i, const Projections& out) {
   constexpr double kRootHalfLog2e = 0.84932180028801904;  // d of Record in standard deviations
@@ -179,11 +129,6 @@ void describe_one(const RasterState& state, std::size_t i, const Projections& ou
   out.radii[2 * i + 1] = static_cast<std::int32_t>(std::min(1e9, std::ceil(sigmas * sy)));
 }
 
-BackwardScratch& scratch() {
-  static thread_local BackwardScratch instance;
-  return instance;
-}
-
 }  // namespace
 
 std::size_t RasterState::bytes() const noexcept {
@@ -197,7 +142,7 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
                                        RasterStatePtr& result) {
   check_gaussians(g);
   check_view(view);
-  const std::size_t pixels = static_cast<std::size_t>(view.width) * static_cast<std::size_t>(view.height);
+  const std::size_t pixels = pixels_of(view);
   const RasterStatePtr shared = new_state<RasterState>();
   RasterState& state = *shared;
   prepare(state, g, view, options);
@@ -209,26 +154,18 @@ std::optional<Fault> rasterize_forward(const Gaussians& g, const View& view, con
   const Kernels& k = kernels();
   const std::shared_ptr<ThreadPool> pool = thread_pool();
   Stopwatch watch;
-  const ProjectArgs project = project_args(state, g);
-  pool->run(state.blocks.size(), [&](std::size_t b) { k.project(project, b, state.blocks[b]); });
+  const std::optional<Fault> fault = project_splats(state, project_args(state, g), k.gaussians.project);
   state.times = {.project = watch.lap()};
-  if (const std::optional<Fault> fault = find_fault(state.blocks)) {
+  if (fault) {
     return fault;
   }
-  if (g.sh_degree >= 0) {
-    const HarmonicsArgs colors = harmonics_args(state, g);
-    pool->run(state.blocks.size(), [&](std::size_t b) { k.harmonics(colors, b); });
-  }
-  order_by_depth(state, *pool);
-  state.times.order = watch.lap();
-  list_tiles(state, *pool);
-  state.times.list_tiles = watch.lap();
+  list_splats(state, g, first_color(state), watch);
   for (std::size_t p = 0; p < state.passes.size(); ++p) {
     const auto behind = background_of(state.passes[p], background);
     BlendArgs blend = blend_args(state, p, background.empty() ? nullptr : behind.data());
     blend.out_colors = out_colors.data();
     blend.out_alphas = out_alphas.data();
-    pool->run(state.tiles(), [&](std::size_t tile) { k.blend(blend, tile); });
+    pool->run(state.tiles(), [&](std::size_t tile) { k.gaussians.blend(blend, tile); });
   }
   state.times.blend = watch.lap();
   result = shared;
@@ -244,10 +181,7 @@ std::optional<Fault> find_visible(const Gaussians& g, const View& view, const Ra
   RasterOptions depth_alone = options;
   depth_alone.depth = DepthMode::accumulated;
   prepare(state, g, view, depth_alone);
-  const Kernels& k = kernels();
-  const ProjectArgs project = project_args(state, g);
-  thread_pool()->run(state.blocks.size(), [&](std::size_t b) { k.project(project, b, state.blocks[b]); });
-  if (const std::optional<Fault> fault = find_fault(state.blocks)) {
+  if (const std::optional<Fault> fault = project_splats(state, project_args(state, g), kernels().gaussians.project)) {
     return fault;
   }
   for (std::size_t b = 0; b < state.blocks.size(); ++b) {
@@ -262,8 +196,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
   check_gaussians(g);
   // Kernel arguments hold plain pointers for both passes; this one writes to none of the state's arrays.
   auto& state = const_cast<RasterState&>(const_state);
-  const std::size_t pixels =
-      static_cast<std::size_t>(state.view.width) * static_cast<std::size_t>(state.view.height);
+  const std::size_t pixels = pixels_of(state.view);
   require(g.count == state.count && g.channels == state.channels, "the Gaussians are not those of the forward pass");
   require(empty_or(grad_colors, pixels * static_cast<std::size_t>(state.out_channels)), "grad_colors has a wrong size");
   require(empty_or(grad_alphas, pixels), "grad_alphas has a wrong size");
@@ -278,13 +211,7 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
 
   const Kernels& k = kernels();
   const std::shared_ptr<ThreadPool> pool = thread_pool();
-  if (!out.accumulate) {
-    std::fill(out.camera.begin(), out.camera.end(), 0.0);
-    std::fill(out.background.begin(), out.background.end(), 0.0);
-  }
-  if (!out.background.empty() && !grad_colors.empty()) {
-    add_background_gradient(state, state.view, state.final_state.data(), kFinalPlanes, grad_colors, out.background);
-  }
+  BackwardScratch& s = begin_backward(state, g, kFinalPlanes, kSlot, grad_colors, out);
   const bool geometry = !(out.means.empty() && out.quats.empty() && out.scales.empty() && out.covars.empty() &&
                           out.opacities.empty() && out.camera.empty() && out.means2d.empty() &&
                           out.absolute2d.empty());
@@ -293,12 +220,8 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
   }
   const bool harmonics_wanted = wants_harmonics(g, out);
 
-  BackwardScratch& s = scratch();
   const std::size_t passes = state.passes.size();
-  s.slots.resize(state.pairs.size() * kSlot);
   s.carried.resize(passes > 1 ? g.count * kSlot : 0);
-  s.camera.resize(out.camera.empty() ? 0 : state.blocks.size() * kCameraSums);
-  s.colors.resize(harmonics_wanted ? 3 * g.count : 0);
   for (std::size_t p = 0; p < passes; ++p) {
     const auto behind = background_of(state.passes[p], background);
     const int sums = harmonics_wanted ? state.passes[p].count : channel_sums(state.passes[p], out);
@@ -310,40 +233,24 @@ void rasterize_backward(const RasterState& const_state, const Gaussians& g, std:
                                      .absolute = !out.absolute2d.empty(),
                                      .slots = s.slots.data()};
     Stopwatch watch;
-    pool->run(state.tiles(), [&](std::size_t tile) { k.blend_backward(blend, tile); });
+    pool->run(state.tiles(), [&](std::size_t tile) { k.gaussians.blend_backward(blend, tile); });
     state.times.blend_backward = (p == 0 ? 0.0 : state.times.blend_backward) + watch.lap();
-    const ProjectBackwardArgs project = {.forward = project_args(state, g),
-                                         .blocks = state.blocks.data(),
-                                         .slots = s.slots.data(),
-                                         .pass = &state.passes[p],
-                                         .channel_sums = sums,
-                                         .depth_in_pass = state.passes[p].depth_first,
-                                         .carried = passes > 1 ? s.carried.data() : nullptr,
-                                         .first = p == 0,
-                                         .last = p + 1 == passes,
-                                         .accumulate = out.accumulate,
-                                         .accumulate_colors = out.accumulate && g.sh_degree < 0,
-                                         .geometry = geometry,
-                                         .means = pointer(out.means),
-                                         .quats = pointer(out.quats),
-                                         .scales = pointer(out.scales),
-                                         .covars = pointer(out.covars),
-                                         .opacities = pointer(out.opacities),
-                                         .colors = harmonics_wanted ? s.colors.data() : pointer(out.colors),
-                                         .means2d = pointer(out.means2d),
-                                         .absolute2d = pointer(out.absolute2d),
-                                         .camera = out.camera.empty() ? nullptr : s.camera.data()};
-    pool->run(state.blocks.size(), [&](std::size_t b) { k.project_backward(project, b); });
+    ProjectBackwardArgs project{};
+    project.forward = project_args(state, g);
+    set_project_backward_args(project, state, g, s, out);
+    project.pass = &state.passes[p];
+    project.channel_sums = sums;
+    project.depth_in_pass = state.passes[p].depth_first;
+    project.carried = passes > 1 ? s.carried.data() : nullptr;
+    project.first = p == 0;
+    project.last = p + 1 == passes;
+    project.geometry = geometry;
+    project.covars = pointer(out.covars);
+    project.absolute2d = pointer(out.absolute2d);
+    pool->run(state.blocks.size(), [&](std::size_t b) { k.gaussians.project_backward(project, b); });
     state.times.project_backward = (p == 0 ? 0.0 : state.times.project_backward) + watch.lap();
   }
-  CameraGradient camera;
-  camera.add_sums(s.camera.span());
-  if (harmonics_wanted) {
-    pull_back_harmonics(harmonics_args(state, g), state.blocks.size(), s.colors.data(), out, s.center, camera);
-  }
-  if (!out.camera.empty()) {
-    add_camera_gradient(state.view, camera, out.camera);
-  }
+  finish_backward(state, g, first_color(state), s, out);
 }
 
 void describe_projections(const RasterState& state, const Projections& out) {
@@ -383,7 +290,7 @@ std::size_t gaussian_count(const RasterState& state) { return state.count; }
 std::span<const std::uint32_t> visible_ids(const RasterState& state) { return state.ids.span(); }
 
 TileInfo tile_info(const RasterState& state) {
-  return {kTileWidth, kTileHeight, state.columns, state.rows, state.pairs.size(), state.bytes()};
+  return tile_info_of(state, state.bytes());
 }
 
 }  // namespace splatbot

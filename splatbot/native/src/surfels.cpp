@@ -4,22 +4,12 @@
 #include <algorithm>
 #include <cmath>
 
-#include "checks.hpp"
-#include "pull_back.hpp"
-#include "splatbot/kernels.hpp"
-#include "splatbot/threads.hpp"
+#include "splats.hpp"
 #include "state_store.hpp"
 
 namespace splatbot {
 
-struct SurfelState : TileLists {
-  std::size_t count = 0;
-  int channels = 0;
-  View view{};
-  SurfelOptions options;
-  Buffer<SurfelRecord> records;  // (N,), in the order of the map
-  Buffer<float> final_state;     // (tiles, kSurfelPlanes, kTilePixels)
-};
+struct SurfelState : SplatState<SurfelRecord, SurfelOptions> {};  // planes: kSurfelPlanes
 
 namespace {
 
@@ -27,14 +17,6 @@ void check_surfels(const Gaussians& g) {
   check_gaussians(g);
   require(g.channels <= kMaxSurfelChannels, "a surfel has at most 8 channels");
   require(g.covars.empty(), "a surfel has no covariance");
-}
-
-std::size_t pixels_of(const View& view) {
-  return static_cast<std::size_t>(view.width) * static_cast<std::size_t>(view.height);
-}
-
-std::size_t columns_of(const SurfelState& state) {
-  return static_cast<std::size_t>(state.channels) + (state.options.depth != DepthMode::none ? 1U : 0U);
 }
 
 void check_images(const SurfelState& state, const SurfelImages& out) {
@@ -62,67 +44,19 @@ void check_gradients(const SurfelState& state, const Gaussians& g, const SurfelI
 }
 
 SurfelProjectArgs project_args(SurfelState& state, const Gaussians& g) {
-  return {.count = state.count,
-          .means = g.means.data(),
-          .quats = g.quats.data(),
-          .scales = g.scales.data(),
-          .covars = nullptr,
-          .opacities = g.opacities.data(),
-          .colors = g.colors.data(),
-          .channels = state.channels,
-          .sh_degree = g.sh_degree,
-          .coefficients = g.coefficients,
-          .view = state.view,
-          .options = state.options,
-          .columns = state.columns,
-          .rows = state.rows,
-          .records = state.records.data(),
-          .placements = state.placements.data(),
-          .visible = state.visible.data()};
+  SurfelProjectArgs args{};
+  set_project_args(args, state, g);
+  return args;
 }
 
 SurfelBlendArgs blend_args(SurfelState& state, std::span<const float> background) {
-  return {.view = state.view,
-          .options = state.options,
-          .columns = state.columns,
-          .channels = state.channels,
-          .records = state.records.data(),
-          .tile_begin = state.tile_begin.data(),
-          .pairs = state.pairs.data(),
-          .masks = state.masks.data(),
-          .tile_done = state.tile_done.data(),
-          .final_state = state.final_state.data(),
-          .background = background.empty() ? nullptr : background.data(),
-          .colors = nullptr,
-          .alphas = nullptr,
-          .normals = nullptr,
-          .median = nullptr,
-          .distortion = nullptr};
-}
-
-HarmonicsArgs harmonics_args(SurfelState& state, const Gaussians& g) {
-  return {.count = state.count,
-          .means = g.means.data(),
-          .coefficients = g.colors.data(),
-          .degree = g.sh_degree,
-          .held = g.coefficients,
-          .view = state.view,
-          .visible = state.visible.data(),
-          .blocks = state.blocks.data(),
-          .colors = state.count == 0 ? nullptr : state.records[0].channels,
-          .color_stride = sizeof(SurfelRecord) / sizeof(float)};
-}
-
-struct BackwardScratch {
-  Buffer<float> slots;    // (pairs, kSurfelSlot)
-  Buffer<float> colors;   // (N, 3), with harmonics
-  Buffer<double> camera;  // (blocks, kCameraSums)
-  Buffer<double> center;  // (blocks, 3), with harmonics
-};
-
-BackwardScratch& scratch() {
-  static thread_local BackwardScratch instance;
-  return instance;
+  SurfelBlendArgs args{};
+  set_list_args(args, state);
+  args.options = state.options;
+  args.channels = state.channels;
+  args.final_state = state.final_state.data();
+  args.background = pointer(background);
+  return args;
 }
 
 }  // namespace
@@ -134,36 +68,24 @@ std::optional<Fault> surfels_forward(const Gaussians& g, const View& view, const
   check_view(view);
   const SurfelStatePtr shared = new_state<SurfelState>();
   SurfelState& state = *shared;
-  state.count = g.count;
-  state.channels = g.channels;
-  state.view = view;
-  state.options = options;
-  state.TileLists::resize(g.count, view);
-  state.records.resize(g.count);
-  state.final_state.resize(state.tiles() * kSurfelPlanes * kTilePixels);
+  prepare_splats(state, g, view, options, kSurfelPlanes);
   require(empty_or(background, static_cast<std::size_t>(g.channels)), "background is not (channels,)");
   check_images(state, out);
 
   const Kernels& k = kernels();
-  const std::shared_ptr<ThreadPool> pool = thread_pool();
-  const SurfelProjectArgs project = project_args(state, g);
-  pool->run(state.blocks.size(), [&](std::size_t b) { k.surfels.project(project, b, state.blocks[b]); });
-  if (const std::optional<Fault> fault = find_fault(state.blocks)) {
+  Stopwatch watch;
+  if (const std::optional<Fault> fault = project_splats(state, project_args(state, g), k.surfels.project)) {
     return fault;
   }
-  if (g.sh_degree >= 0) {
-    const HarmonicsArgs colors = harmonics_args(state, g);
-    pool->run(state.blocks.size(), [&](std::size_t b) { k.harmonics(colors, b); });
-  }
-  order_by_depth(state, *pool);
-  list_tiles(state, *pool);
+  state.times = {.project = watch.lap()};
+  list_splats(state, g, 0, watch);
   SurfelBlendArgs blend = blend_args(state, background);
   blend.colors = out.colors.data();
   blend.alphas = out.alphas.data();
   blend.normals = out.normals.data();
   blend.median = out.median.data();
   blend.distortion = pointer(out.distortion);
-  pool->run(state.tiles(), [&](std::size_t tile) { k.surfels.blend(blend, tile); });
+  thread_pool()->run(state.tiles(), [&](std::size_t tile) { k.surfels.blend(blend, tile); });
   result = shared;
   return std::nullopt;
 }
@@ -175,13 +97,7 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
   auto& state = const_cast<SurfelState&>(const_state);
   require(g.count == state.count && g.channels == state.channels, "the surfels are not those of the forward pass");
   check_gradients(state, g, grads, out);
-  if (!out.accumulate) {
-    std::fill(out.camera.begin(), out.camera.end(), 0.0);
-    std::fill(out.background.begin(), out.background.end(), 0.0);
-  }
-  if (!out.background.empty() && !grads.colors.empty()) {
-    add_background_gradient(state, state.view, state.final_state.data(), kSurfelPlanes, grads.colors, out.background);
-  }
+  BackwardScratch& s = begin_backward(state, g, kSurfelPlanes, kSurfelSlot, grads.colors, out);
   if (out.means.empty() && out.quats.empty() && out.scales.empty() && out.opacities.empty() && out.camera.empty() &&
       out.colors.empty() && out.means2d.empty()) {
     return;
@@ -189,12 +105,7 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
 
   const Kernels& k = kernels();
   const std::shared_ptr<ThreadPool> pool = thread_pool();
-  BackwardScratch& s = scratch();
-  s.slots.resize(state.pairs.size() * kSurfelSlot);
-  s.camera.resize(out.camera.empty() ? 0 : state.blocks.size() * kCameraSums);
-  const bool harmonics = wants_harmonics(g, out);
-  s.colors.resize(harmonics ? 3 * g.count : 0);
-  const bool sum_channels = !out.colors.empty() || !out.quats.empty() || harmonics;
+  const bool sum_channels = !out.colors.empty() || !out.quats.empty() || wants_harmonics(g, out);
   const SurfelBlendBackwardArgs blend = {.forward = blend_args(state, background),
                                          .colors = pointer(grads.colors),
                                          .alphas = pointer(grads.alphas),
@@ -204,28 +115,12 @@ void surfels_backward(const SurfelState& const_state, const Gaussians& g, std::s
                                          .sum_channels = sum_channels,
                                          .slots = s.slots.data()};
   pool->run(state.tiles(), [&](std::size_t tile) { k.surfels.blend_backward(blend, tile); });
-  const SurfelProjectBackwardArgs project = {.forward = project_args(state, g),
-                                             .blocks = state.blocks.data(),
-                                             .slots = s.slots.data(),
-                                             .sum_channels = sum_channels,
-                                             .accumulate = out.accumulate,
-                                             .accumulate_colors = out.accumulate && g.sh_degree < 0,
-                                             .means = pointer(out.means),
-                                             .quats = pointer(out.quats),
-                                             .scales = pointer(out.scales),
-                                             .opacities = pointer(out.opacities),
-                                             .colors = harmonics ? s.colors.data() : pointer(out.colors),
-                                             .means2d = pointer(out.means2d),
-                                             .camera = out.camera.empty() ? nullptr : s.camera.data()};
+  SurfelProjectBackwardArgs project{};
+  project.forward = project_args(state, g);
+  set_project_backward_args(project, state, g, s, out);
+  project.sum_channels = sum_channels;
   pool->run(state.blocks.size(), [&](std::size_t b) { k.surfels.project_backward(project, b); });
-  CameraGradient camera;
-  camera.add_sums(s.camera.span());
-  if (harmonics) {
-    pull_back_harmonics(harmonics_args(state, g), state.blocks.size(), s.colors.data(), out, s.center, camera);
-  }
-  if (!out.camera.empty()) {
-    add_camera_gradient(state.view, camera, out.camera);
-  }
+  finish_backward(state, g, 0, s, out);
 }
 
 void describe_surfels(const SurfelState& state, const SurfelProjections& out) {
@@ -258,12 +153,8 @@ std::size_t surfel_count(const SurfelState& state) { return state.count; }
 std::span<const std::uint32_t> visible_ids(const SurfelState& state) { return state.ids.span(); }
 
 TileInfo tile_info(const SurfelState& state) {
-  return {kTileWidth,
-          kTileHeight,
-          state.columns,
-          state.rows,
-          state.pairs.size(),
-          state.TileLists::bytes() + state.records.capacity_bytes() + state.final_state.capacity_bytes()};
+  return tile_info_of(state,
+                      state.TileLists::bytes() + state.records.capacity_bytes() + state.final_state.capacity_bytes());
 }
 
 }  // namespace splatbot

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "promises.hpp"
+#include "scene.hpp"
 #include "splatbot/fronts.hpp"
 #include "splatbot/rasterizer.hpp"
 #include "splatbot/threads.hpp"
@@ -18,9 +19,7 @@ namespace {
 
 using namespace splatbot;
 
-struct Cloud {
-  std::vector<float> means, quats, scales, opacities, colors;
-
+struct Cloud : Scene {
   explicit Cloud(std::size_t n) {
     std::mt19937 random(3);
     std::normal_distribution<float> normal;
@@ -38,29 +37,10 @@ struct Cloud {
       colors.insert(colors.end(), {uniform(random), uniform(random), uniform(random)});
     }
   }
-
-  Gaussians gaussians() const {
-    Gaussians g{};
-    g.count = opacities.size();
-    g.channels = 3;
-    g.means = means;
-    g.quats = quats;
-    g.scales = scales;
-    g.opacities = opacities;
-    g.colors = colors;
-    return g;
-  }
 };
 
 View view_through(const Lens& lens, int width, int height) {
-  View view{};
-  view.rotation[0] = view.rotation[4] = view.rotation[8] = 1.0F;
-  view.fx = 30.0F;
-  view.fy = 25.0F;
-  view.cx = 0.5F * static_cast<float>(width);
-  view.cy = 0.4F * static_cast<float>(height);
-  view.width = width;
-  view.height = height;
+  View view = view_of(30.0F, 25.0F, width, height);
   view.lens = lens;
   return view;
 }

@@ -12,6 +12,7 @@
 
 #include "optimize_tests.hpp"
 #include "promises.hpp"
+#include "scene.hpp"
 #include "splatbot/isa.hpp"
 #include "splatbot/rasterizer.hpp"
 #include "splatbot/surfels.hpp"
@@ -21,39 +22,13 @@ namespace {
 
 using namespace splatbot;
 
-void check(bool ok, const std::string& promise) {
-  if (!ok) {
-    std::fprintf(stderr, "broken: %s\n", promise.c_str());
-    std::exit(1);
-  }
-}
-
-struct Scene {
-  int channels;
-  std::vector<float> means, quats, scales, opacities, colors;
-  std::vector<float> covars = {};  // in place of quats and scales, or empty
-  int sh_degree = -1, coefficients = 0;
-
-  Gaussians gaussians() const {
-    return {.count = opacities.size(),
-            .channels = channels,
-            .means = means,
-            .quats = quats,
-            .scales = scales,
-            .covars = covars,
-            .opacities = opacities,
-            .colors = colors,
-            .sh_degree = sh_degree,
-            .coefficients = coefficients};
-  }
-};
-
 // Gaussians in front of, behind and next to the camera, thin, huge, opaque and invisible, with odd quaternions.
 Scene make_scene(std::size_t n, int channels, unsigned seed) {
   std::mt19937 random(seed);
   std::normal_distribution<float> normal;
   std::uniform_real_distribution<float> uniform(0.0F, 1.0F);
-  Scene s{.channels = channels, .means = {}, .quats = {}, .scales = {}, .opacities = {}, .colors = {}};
+  Scene s;
+  s.channels = channels;
   for (std::size_t i = 0; i < n; ++i) {
     const float far_off = i % 11 == 0 ? 1e6F : 1.0F;
     s.means.insert(s.means.end(), {far_off * normal(random), normal(random), 2.0F + 1.5F * normal(random)});
@@ -98,16 +73,7 @@ void use_harmonics(Scene& s, int degree, unsigned seed) {
   }
 }
 
-View make_view(int width, int height) {
-  View view{};
-  view.rotation[0] = view.rotation[4] = view.rotation[8] = 1.0F;
-  view.fx = view.fy = 60.0F;
-  view.cx = 0.5F * static_cast<float>(width);
-  view.cy = 0.4F * static_cast<float>(height);
-  view.width = width;
-  view.height = height;
-  return view;
-}
+View make_view(int width, int height) { return view_of(60.0F, 60.0F, width, height); }
 
 struct Result {
   std::vector<float> image, alphas, means, quats, scales, covars, opacities, colors, means2d, absolute2d;
@@ -146,17 +112,17 @@ Result render(const Scene& scene, const View& view, const RasterOptions& options
     }
   }
   const TileMask mask = {.keep = keep, .size = kMaskSize};
-  check(!rasterize_forward(g, view, options, background, mask, r.image, r.alphas, state),
+  promise(!rasterize_forward(g, view, options, background, mask, r.image, r.alphas, state),
         "finite inputs are no fault");
   for (const float alpha : r.alphas) {
-    check(alpha >= 0.0F && alpha <= 1.0F, "alpha lies in 0..1");
+    promise(alpha >= 0.0F && alpha <= 1.0F, "alpha lies in 0..1");
   }
   std::vector<float> grad_image(r.image.size());
   for (std::size_t i = 0; i < grad_image.size(); ++i) {
     grad_image[i] = static_cast<float>(i % 7) - 3.0F;
   }
   for (const float value : r.image) {
-    check(std::isfinite(value), "the image is finite");
+    promise(std::isfinite(value), "the image is finite");
   }
   const std::vector<float> grad_alphas(pixels, 0.5F);
   r.means.resize(g.means.size());
@@ -183,7 +149,7 @@ Result render(const Scene& scene, const View& view, const RasterOptions& options
   rasterize_backward(*state, g, background, grad_image, grad_alphas, out);
   for (const auto* gradient : {&r.means, &r.quats, &r.scales, &r.covars, &r.opacities, &r.colors, &r.means2d}) {
     for (const float value : *gradient) {
-      check(std::isfinite(value), "gradients are finite");
+      promise(std::isfinite(value), "gradients are finite");
     }
   }
   std::vector<float> means2d(2 * g.count), depths(g.count), conics(3 * g.count), opacities(g.count);
@@ -191,9 +157,9 @@ Result render(const Scene& scene, const View& view, const RasterOptions& options
   describe_projections(*state, {means2d, depths, conics, radii, opacities});
   count_contributions(*state, r.contributions);
   for (const std::int32_t count : r.contributions) {
-    check(count >= 0 && static_cast<std::size_t>(count) <= pixels, "a Gaussian counts in no more pixels than there are");
+    promise(count >= 0 && static_cast<std::size_t>(count) <= pixels, "a Gaussian counts in no more pixels than there are");
   }
-  check(visible_ids(*state).size() <= g.count, "no more Gaussians are seen than there are");
+  promise(visible_ids(*state).size() <= g.count, "no more Gaussians are seen than there are");
   return r;
 }
 
@@ -212,7 +178,7 @@ void run_all(const std::string& isa) {
           const Result want = render(scene, make_view(width, height), options);
           for (const unsigned threads : {2U, 8U}) {
             set_num_threads(threads);
-            check(render(scene, make_view(width, height), options) == want, "threads change no bit");
+            promise(render(scene, make_view(width, height), options) == want, "threads change no bit");
           }
           ++renders;
         }
@@ -239,7 +205,7 @@ void run_variants(const std::string& isa) {
         set_num_threads(1);
         const Result want = render(scene, make_view(70, 45), options, true);
         set_num_threads(3);
-        check(render(scene, make_view(70, 45), options, true) == want, "threads change no bit of any variant");
+        promise(render(scene, make_view(70, 45), options, true) == want, "threads change no bit of any variant");
         ++renders;
       }
     }
@@ -257,7 +223,7 @@ std::vector<float> render_surfels(const Scene& scene, const View& view, const Su
   std::vector<float> distortion(options.distortion ? pixels : 0);
   const std::vector<float> background(static_cast<std::size_t>(scene.channels), 0.25F);
   SurfelStatePtr state;
-  check(!surfels_forward(g, view, options, background, {colors, alphas, normals, median, distortion}, state),
+  promise(!surfels_forward(g, view, options, background, {colors, alphas, normals, median, distortion}, state),
         "finite inputs are no fault");
   std::vector<float> grad_colors(colors.size());
   for (std::size_t i = 0; i < grad_colors.size(); ++i) {
@@ -290,7 +256,7 @@ std::vector<float> render_surfels(const Scene& scene, const View& view, const Su
     all.insert(all.end(), part->begin(), part->end());
   }
   for (const float value : all) {
-    check(std::isfinite(value), "images and gradients of surfels are finite");
+    promise(std::isfinite(value), "images and gradients of surfels are finite");
   }
   return all;
 }
@@ -311,7 +277,7 @@ void run_surfels(const std::string& isa) {
         for (const unsigned threads : {2U, 8U}) {
           set_num_threads(threads);
           const std::vector<float> got = render_surfels(scene, make_view(width, height), options);
-          check(got.size() == want.size() && std::memcmp(got.data(), want.data(), got.size() * sizeof(float)) == 0,
+          promise(got.size() == want.size() && std::memcmp(got.data(), want.data(), got.size() * sizeof(float)) == 0,
                 "threads change no bit of surfels");
         }
         ++renders;
@@ -327,14 +293,14 @@ void check_errors() {
   std::vector<float> image(32 * 16 * 3), alphas(32 * 16);
   RasterStatePtr state;
   const auto fault = rasterize_forward(scene.gaussians(), make_view(32, 16), {}, {}, {}, image, alphas, state);
-  check(fault && fault->field == "scales" && fault->row == 4321, "a NaN is found with its field and row");
+  promise(fault && fault->field == "scales" && fault->row == 4321, "a NaN is found with its field and row");
   bool thrown = false;
   try {
     rasterize_forward(make_scene(5, 3, 1).gaussians(), make_view(33, 16), {}, {}, {}, image, alphas, state);
   } catch (const std::invalid_argument&) {
     thrown = true;
   }
-  check(thrown, "an output of a wrong size is refused");
+  promise(thrown, "an output of a wrong size is refused");
 }
 
 void check_pool() {
@@ -349,11 +315,11 @@ void check_pool() {
   } catch (const std::runtime_error&) {
     thrown = true;
   }
-  check(thrown, "a task's exception reaches the caller");
+  promise(thrown, "a task's exception reaches the caller");
   std::vector<int> done(1000, 0);
   pool.run(done.size(), [&](std::size_t i) { ++done[i]; });
   for (const int count : done) {
-    check(count == 1, "every task runs once, also after an exception");
+    promise(count == 1, "every task runs once, also after an exception");
   }
 }
 

@@ -9,6 +9,7 @@
 #include <random>
 #include <vector>
 
+#include "promises.hpp"
 #include "splatbot/adam.hpp"
 #include "splatbot/isa.hpp"
 #include "splatbot/loss.hpp"
@@ -17,13 +18,6 @@
 namespace {
 
 using namespace splatbot;
-
-void check(bool ok, const char* promise) {
-  if (!ok) {
-    std::fprintf(stderr, "broken: %s\n", promise);
-    std::exit(1);
-  }
-}
 
 struct Images {
   std::vector<float> rendered, target;
@@ -56,11 +50,11 @@ void run_loss(int width, int height, int channels, bool masked, bool inside_only
   std::vector<float> gradient(data.rendered.size()), again(data.rendered.size());
   set_num_threads(1);
   const double value = l1_dssim(images, options, gradient);
-  check(std::isfinite(value) && value >= -1e-6 && value < 1.0, "the loss of images in 0..1 lies in 0..1");
+  promise(std::isfinite(value) && value >= -1e-6 && value < 1.0, "the loss of images in 0..1 lies in 0..1");
   for (const unsigned threads : {2U, 8U}) {
     set_num_threads(threads);
-    check(l1_dssim(images, options, again) == value && again == gradient, "threads change no bit of loss or gradient");
-    check(std::fabs(l1_dssim(images, options, {}) - value) < 1e-6, "the value is the same without a gradient");
+    promise(l1_dssim(images, options, again) == value && again == gradient, "threads change no bit of loss or gradient");
+    promise(std::fabs(l1_dssim(images, options, {}) - value) < 1e-6, "the value is the same without a gradient");
   }
   // Along the gradient the loss falls as the gradient says.
   std::vector<float> moved = data.rendered;
@@ -74,7 +68,7 @@ void run_loss(int width, int height, int channels, bool masked, bool inside_only
   }
   LossImages after = images;
   after.rendered = moved;
-  check(l1_dssim(after, options, {}) <= value, "a step against the gradient does not raise the loss");
+  promise(l1_dssim(after, options, {}) <= value, "a step against the gradient does not raise the loss");
 }
 
 void run_adam(std::size_t rows, std::size_t columns) {
@@ -94,12 +88,12 @@ void run_adam(std::size_t rows, std::size_t columns) {
     chosen[i] = chosen[i] != 0 ? 2 : 0;
   }
   const AdamParameter parameter = {values, first, second, gradient, 0.5};
-  check(adam_step(std::span(&parameter, 1), chosen, steps, {.eps = 1e-12}) == spoilt, "spoilt gradients are counted");
+  promise(adam_step(std::span(&parameter, 1), chosen, steps, {.eps = 1e-12}) == spoilt, "spoilt gradients are counted");
   for (std::size_t i = 0; i < values.size(); ++i) {
     const bool on = chosen[i / columns] == 1;
     const float sign = gradient[i] > 0.0F ? 1.0F : gradient[i] < 0.0F ? -1.0F : 0.0F;
-    check(std::fabs(values[i] - (on ? 1.0F - 0.5F * sign : 1.0F)) < 1e-5F, "Adam's first step is the rate, chosen rows only");
-    check(on || (first[i] == 0.0F && second[i] == 0.0F), "rows that are not chosen keep their moments");
+    promise(std::fabs(values[i] - (on ? 1.0F - 0.5F * sign : 1.0F)) < 1e-5F, "Adam's first step is the rate, chosen rows only");
+    promise(on || (first[i] == 0.0F && second[i] == 0.0F), "rows that are not chosen keep their moments");
   }
 }
 

@@ -6,7 +6,7 @@ transient. A changed meaning needs a higher :data:`FORMAT_VERSION` and a convers
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
@@ -59,8 +59,10 @@ def _dataclass(cls: type) -> SavedType:
     return SavedType(cls, {field.name: field.name for field in fields(cls)})
 
 
-def _fields(*same: str, **renamed: str) -> dict[str, str]:
-    return {name: name for name in same} | renamed
+def _fields(*attributes: str) -> dict[str, str]:
+    """Return attributes by field name: an attribute without underscore, or ``field=attribute``."""
+    pairs = (text.split("=") for text in attributes)
+    return {pair[0].lstrip("_"): pair[-1] for pair in pairs}
 
 
 TYPES: Mapping[str, SavedType] = {
@@ -69,19 +71,19 @@ TYPES: Mapping[str, SavedType] = {
         _fields(
             "config",
             "results",
-            tracker="_tracker",
-            mapper="_mapper",
-            location="_location",
-            image_size="_image_size",
-            localization_only="_localization_only",
-            joint_motion="_joint_motion",
+            "_tracker",
+            "_mapper",
+            "_location",
+            "_image_size",
+            "_localization_only",
+            "_joint_motion",
         ),
         transient=frozenset({"_executor"}),
         create=Slam,
     ),
     "frame_result": _dataclass(FrameResult),
     "graph_location": _dataclass(GraphLocation),
-    "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", last="_last")),
+    "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", "_last")),
     "camera": _dataclass(Camera),
     "gaussians": _dataclass(GaussianModel),
     "keyframe": _dataclass(Keyframe),
@@ -94,53 +96,51 @@ TYPES: Mapping[str, SavedType] = {
             "pending_iterations",
             "version",
             "loops",
-            refiner="_refiner",
-            dynamic_objects="_dynamic_objects",
-            depth_noise="_depth_noise",
-            unmapped_seen="_unmapped_seen",
-            robot_moving="_robot_moving",
-            frozen="_frozen",
-            stamp="_stamp",
-            observed_stamp="_observed_stamp",
+            "_refiner",
+            "_dynamic_objects",
+            "_depth_noise",
+            "_unmapped_seen",
+            "_robot_moving",
+            "_frozen",
+            "_stamp",
+            "_observed_stamp",
         ),
         transient=frozenset({"_lock", "_submitted", "_latest", "_added", "_inserted"}),
         create=Mapper,
     ),
     "loop_closer": SavedType(
         LoopCloser,
-        _fields("config", "graph", "adjacency", "correction", "closed", "rejected", unconfirmed="_unconfirmed"),
+        _fields("config", "graph", "adjacency", "correction", "closed", "rejected", "_unconfirmed"),
         create=LoopCloser,
     ),
     "pose_graph": _dataclass(PoseGraph),
     "edge": _dataclass(Edge),
-    "refiner": SavedType(Refiner, _fields("config", "adam", random="_random", latest_refined="_latest_refined")),
+    "refiner": SavedType(Refiner, _fields("config", "adam", "_random", "_latest_refined")),
     "adam": SavedType(GaussianAdam, _fields("rates", "steps", "skipped", "first", "second")),
-    "dynamic_objects": SavedType(
-        DynamicObjectFilter, _fields(timeout="timeout_s", cells="_cells", since="_since", seen="_seen")
-    ),
+    "dynamic_objects": SavedType(DynamicObjectFilter, _fields("timeout=timeout_s", "_cells", "_since", "_seen")),
     "depth_noise": _dataclass(DepthNoiseModel),
     "tracker": SavedType(
         Tracker,
         _fields(
             "config",
             "motion",
-            lost="_lost",
-            uncertainties="_keyframe_uncertainty",
-            last_covariance="_last_covariance",
-            costs="_costs",
-            place_search="_search",
-            relocalization_candidate="_candidate",
+            "_lost",
+            "uncertainties=_keyframe_uncertainty",
+            "_last_covariance",
+            "_costs",
+            "place_search=_search",
+            "relocalization_candidate=_candidate",
         ),
         transient=frozenset({"_stages"}),
         create=lambda config: Tracker(config.tracking),
     ),
     "motion_model": SavedType(
         ConstantVelocity,
-        _fields(last="_last", twist="_twist", interval="_interval", dead_reckoning="_dead_reckoning"),
+        _fields("_last", "_twist", "_interval", "_dead_reckoning"),
         create=lambda _: ConstantVelocity(),
     ),
-    "stage_costs": SavedType(CostModel, _fields(frame="_frame", runs="_runs"), create=lambda _: CostModel()),
-    "place_search": SavedType(PlaceSearch, _fields(next="_next"), create=lambda _: PlaceSearch()),
+    "stage_costs": SavedType(CostModel, _fields("_frame", "_runs"), create=lambda _: CostModel()),
+    "place_search": SavedType(PlaceSearch, _fields("_next"), create=lambda _: PlaceSearch()),
     "relocalization_candidate": _dataclass(RelocalizationCandidate),
     "uncertainty": _dataclass(Uncertainty),
     "features": _dataclass(Features),
@@ -156,52 +156,55 @@ def type_names() -> Mapping[type, str]:
     return {saved.cls: name for name, saved in TYPES.items()}
 
 
-# Names of version 1 by stable name: the class, and attributes whose field name is not the attribute without underscore.
-_VERSION_1: Mapping[str, tuple[str, Mapping[str, str]]] = {
-    "slam": ("splatbot.slam:Slam", {"_motion": "joint_motion", "_size": "image_size"}),
-    "frame_result": ("splatbot.slam:FrameResult", {}),
-    "joint_motion": ("splatbot.mapping.motion:JointMotion", {"still": "still_speed"}),
-    "camera": ("splatbot.camera:Camera", {}),
-    "gaussians": ("splatbot.gaussians.model:GaussianModel", {}),
-    "keyframe": ("splatbot.mapping.keyframes:Keyframe", {"still": "static_mask"}),
-    "mapper": (
-        "splatbot.mapping.mapper:Mapper",
-        {
-            "owed": "pending_iterations",
-            "_movers": "dynamic_objects",
-            "_noise": "depth_noise",
-            "_revealed": "unmapped_seen",
-            "_held": "robot_moving",
-        },
-    ),
-    "loop_closer": ("splatbot.mapping.loop:LoopCloser", {"_suspected": "unconfirmed"}),
-    "pose_graph": ("splatbot.mapping.posegraph:PoseGraph", {}),
-    "edge": ("splatbot.mapping.posegraph:Edge", {}),
-    "refiner": ("splatbot.mapping.refine:Refiner", {"_latest": "latest_refined"}),
-    "adam": ("splatbot.optimize.adam:GaussianAdam", {}),
-    "dynamic_objects": ("splatbot.mapping.moving:Movers", {"settle": "timeout"}),
-    "depth_noise": ("splatbot.mapping.evidence:DepthNoise", {}),
-    "tracker": (
-        "splatbot.tracking.tracker:Tracker",
-        {
-            "_known": "uncertainties",
-            "_wide": "gicp",
-            "_search": "place_search",
-            "_sighting": "relocalization_candidate",
-        },
-    ),
-    "motion_model": ("splatbot.tracking.predict:ConstantVelocity", {"_reckoned": "dead_reckoning"}),
-    "stage_costs": ("splatbot.tracking.budget:Costs", {}),
-    "gicp": ("splatbot.tracking.wide:WideStage", {}),
-    "place_search": ("splatbot.tracking.recover:KeyframeSearch", {}),
-    "relocalization_candidate": ("splatbot.tracking.recover:Sighting", {}),
-    "uncertainty": ("splatbot.tracking.uncertainty:Uncertainty", {}),
-    "features": ("splatbot.tracking.features:Features", {}),
-    "reference": ("splatbot.tracking.reference:Reference", {}),
-    "reference_points": ("splatbot.tracking.reference:ReferencePoints", {}),
-    # Its mapper takes its place.
-    "mapping_worker": ("splatbot.mapping.worker:MappingWorker", {}),
-}
+# Classes of version 1: stable name, module and class. A mapping worker has become its mapper.
+_VERSION_1_CLASSES = """
+slam                      splatbot.slam:Slam
+frame_result              splatbot.slam:FrameResult
+joint_motion              splatbot.mapping.motion:JointMotion
+camera                    splatbot.camera:Camera
+gaussians                 splatbot.gaussians.model:GaussianModel
+keyframe                  splatbot.mapping.keyframes:Keyframe
+mapper                    splatbot.mapping.mapper:Mapper
+loop_closer               splatbot.mapping.loop:LoopCloser
+pose_graph                splatbot.mapping.posegraph:PoseGraph
+edge                      splatbot.mapping.posegraph:Edge
+refiner                   splatbot.mapping.refine:Refiner
+adam                      splatbot.optimize.adam:GaussianAdam
+dynamic_objects           splatbot.mapping.moving:Movers
+depth_noise               splatbot.mapping.evidence:DepthNoise
+tracker                   splatbot.tracking.tracker:Tracker
+motion_model              splatbot.tracking.predict:ConstantVelocity
+stage_costs               splatbot.tracking.budget:Costs
+gicp                      splatbot.tracking.wide:WideStage
+place_search              splatbot.tracking.recover:KeyframeSearch
+relocalization_candidate  splatbot.tracking.recover:Sighting
+uncertainty               splatbot.tracking.uncertainty:Uncertainty
+features                  splatbot.tracking.features:Features
+reference                 splatbot.tracking.reference:Reference
+reference_points          splatbot.tracking.reference:ReferencePoints
+mapping_worker            splatbot.mapping.worker:MappingWorker
+"""
+
+# Attributes of version 1 whose field name is not the attribute without underscore: stable name, attribute, field.
+_VERSION_1_FIELDS = """
+slam                      _motion     joint_motion
+slam                      _size       image_size
+joint_motion              still       still_speed
+keyframe                  still       static_mask
+mapper                    owed        pending_iterations
+mapper                    _movers     dynamic_objects
+mapper                    _noise      depth_noise
+mapper                    _revealed   unmapped_seen
+mapper                    _held       robot_moving
+loop_closer               _suspected  unconfirmed
+refiner                   _latest     latest_refined
+dynamic_objects           settle      timeout
+tracker                   _known      uncertainties
+tracker                   _wide       gicp
+tracker                   _search     place_search
+tracker                   _sighting   relocalization_candidate
+motion_model              _reckoned   dead_reckoning
+"""
 
 
 def version_1_type(name: str) -> str:
@@ -210,7 +213,7 @@ def version_1_type(name: str) -> str:
     Raises:
         ValueError: Version 1 has no such class.
     """
-    known = {cls: stable for stable, (cls, _) in _VERSION_1.items()}
+    known = {cls: stable for stable, cls in _rows(_VERSION_1_CLASSES)}
     if name not in known:
         raise ValueError(f"{name} is not a class of a saved run")
     return known[name]
@@ -218,7 +221,13 @@ def version_1_type(name: str) -> str:
 
 def version_1_field(type_name: str, attribute: str) -> str:
     """Return the stable field name of an attribute of version 1."""
-    return _VERSION_1[type_name][1].get(attribute, attribute.lstrip("_"))
+    renamed = {(stable, old): field for stable, old, field in _rows(_VERSION_1_FIELDS)}
+    return renamed.get((type_name, attribute), attribute.lstrip("_"))
+
+
+@cache
+def _rows(table: str) -> Sequence[Sequence[str]]:
+    return [line.split() for line in table.strip().splitlines()]
 
 
 def upgrade_version_1(slam: Slam, unused: Mapping[str, Mapping[str, Any]]) -> None:

@@ -11,7 +11,8 @@ import pytest
 from splatbot.bench.planning import BENCHMARK, PlanningSettings
 from splatbot.bench.planning.audit import audit
 from splatbot.bench.planning.peers import add_ratio
-from splatbot.bench.planning_problems import MIN_CLEARANCE, problems
+from splatbot.bench.planning_problems import CONSTANTS as PROBLEMS
+from splatbot.bench.planning_problems import problems
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.truth import Truth
@@ -67,7 +68,7 @@ def test_problems_are_blocked_on_the_straight_line_and_free_at_both_ends() -> No
     assert not arm.check(field, ends).in_collision.any()
     moving = arm.spheres.link > 0
     gap = scene.distance(arm.centers(ends)[:, moving].reshape(-1, 3)).reshape(len(ends), -1) - arm.spheres.radii[moving]
-    assert (gap.min(axis=1) > MIN_CLEARANCE).all()
+    assert (gap.min(axis=1) > PROBLEMS.min_clearance).all()
     assert (panda().tcp(goal)[:, 2, 3] < 0.22).all()
 
 

@@ -10,7 +10,8 @@ import pytest
 from splatbot.bench.film import Film, FilmedMap, map_film, shoot
 from splatbot.bench.planning.audit import STEP, audit, configurations
 from splatbot.bench.planning.mapped_log import true_clearances
-from splatbot.bench.planning_problems import MAX_GOAL_HEIGHT, map_problems
+from splatbot.bench.planning_problems import CONSTANTS as PROBLEMS
+from splatbot.bench.planning_problems import map_problems
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.truth import Truth
 from splatbot.cli import main
@@ -95,7 +96,7 @@ def test_problems_in_a_map_end_within_the_box_and_keep_the_margin() -> None:
     assert not arm.check(field, ends).in_collision.any()
     tool = panda().tcp(np.array([problem.goal for problem in found]))[:, :3, 3]
     assert ((tool > box[0]) & (tool < box[1])).all()
-    assert (tool[:, 2] < MAX_GOAL_HEIGHT).all()
+    assert (tool[:, 2] < PROBLEMS.max_goal_height).all()
     nothing = np.array([[5.0, 5.0, 0.0], [6.0, 6.0, 1.0]])
     assert map_problems(panda(), arm, field, nothing, 1) == []
 

@@ -14,7 +14,8 @@ from splatbot.cli import main
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
-from splatbot.workspace import AHEAD, Workspace
+from splatbot.workspace import CONSTANTS as WORKSPACE
+from splatbot.workspace import Workspace
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +55,9 @@ def test_a_base_inside_an_obstacle_is_turned_about_the_centre_until_it_is_free()
     found = free_place(pile, place)
     assert found.T_world_base is not None
     assert found.box is not None
-    base, middle = found.T_world_base[:3, 3], np.array([AHEAD, 0.0, 0.0])
-    np.testing.assert_allclose(np.linalg.norm(base - middle), AHEAD, atol=1e-12)
-    np.testing.assert_allclose(found.T_world_base @ [AHEAD, 0, 0, 1], [*middle, 1], atol=1e-12)
+    base, middle = found.T_world_base[:3, 3], np.array([WORKSPACE.ahead, 0.0, 0.0])
+    np.testing.assert_allclose(np.linalg.norm(base - middle), WORKSPACE.ahead, atol=1e-12)
+    np.testing.assert_allclose(found.T_world_base @ [WORKSPACE.ahead, 0, 0, 1], [*middle, 1], atol=1e-12)
     assert np.linalg.norm(base) > 0.2
     assert free_place(_pile([5.0, 5.0, 5.0]), place) is place
 

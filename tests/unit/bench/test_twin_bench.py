@@ -10,7 +10,8 @@ import numpy as np
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
 from splatbot.bench.twin.bounds import FORCED, broken_bounds
-from splatbot.bench.twin.paths import DEPTH, arm_clearance, push, timed, truth_scene, try_paths
+from splatbot.bench.twin.paths import CONSTANTS as PATHS
+from splatbot.bench.twin.paths import arm_clearance, push, timed, truth_scene, try_paths
 from splatbot.robots.panda import panda
 from splatbot.sim.twin import Twin
 
@@ -48,9 +49,9 @@ def test_a_timed_path_stays_on_its_edges_and_within_limits(rng: np.random.Genera
 
 def test_a_pushed_path_ends_a_centimetre_deep() -> None:
     home = panda().home
-    into = push(np.stack([home, home + 0.2]), panda(), tabletop(), DEPTH)
+    into = push(np.stack([home, home + 0.2]), panda(), tabletop(), PATHS.push_depth)
     assert into is not None
-    assert float(arm_clearance(panda(), tabletop(), into[-1:])[0]) <= -DEPTH
+    assert float(arm_clearance(panda(), tabletop(), into[-1:])[0]) <= -PATHS.push_depth
     assert float(arm_clearance(panda(), tabletop(), into[:1])[0]) > 0
 
 

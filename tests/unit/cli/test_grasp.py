@@ -28,7 +28,7 @@ def test_ranked_grasps_are_printed_written_and_drawn(run: RunCommand, map_file: 
     out = tmp_path / "out"
     answer = run("grasp", "--map", map_file, *BASE, "--target", "red box", "--wanted", 3, "--out", out)
     assert answer.code == 0, answer.err
-    for word in ("closure", "room", "limits", "red box", "by rules"):
+    for word in ("closure", "clearance", "limits", "red box", "by rules"):
         assert word in answer.out
     found = json.loads((out / "grasp.json").read_text())
     assert found["target"]["backend"] == "rules"

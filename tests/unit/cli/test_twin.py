@@ -23,7 +23,7 @@ def test_the_result_holds_tracking_touches_and_the_ledger_with_costs(run: RunCom
     answer = run("twin", "--scene", "wiping", "--forbid", "backlash", "--json", tmp_path / "r.json")
     assert answer.code == 0  # to wipe is to touch
     values = json.loads((tmp_path / "r.json").read_text())
-    assert {touch["other"] for touch in values["touches"]} >= {"board"}
+    assert {contact["other"] for contact in values["contacts"]} >= {"board"}
     assert values["tracking"]["tcp"] > 1e-3
     effects = {entry["name"]: entry for entry in values["effects"]}
     assert list(effects) == [*PHYSICS, *EFFECTS]

@@ -8,7 +8,8 @@ import pytest
 from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
-from splatbot.grasping.hands import MAX_CLEARANCE_M, Hands
+from splatbot.grasping.hands import CONSTANTS as HANDS
+from splatbot.grasping.hands import Hands
 from splatbot.grasping.sweep import finger_clearance, swept_clearance
 from splatbot.protocols import Array, HandShape
 from splatbot.robots.panda import panda
@@ -67,7 +68,7 @@ def test_the_sweep_has_the_least_room_of_all_its_places() -> None:
     at, back = np.array([0.0, 0.045, -0.05]), np.linspace(0.0, 0.1, 5)
     centers, radii = _spheres()
     places = centers[None] - back[:, None, None] * [0.0, 0.0, 1.0]
-    expected = min(MAX_CLEARANCE_M, (np.linalg.norm(places - at, axis=2) - radii - RADIUS).min())
+    expected = min(HANDS.max_clearance, (np.linalg.norm(places - at, axis=2) - radii - RADIUS).min())
     assert swept_clearance(panda(), _hands(), _ball(at), retreat=0.1)[0] == pytest.approx(expected, abs=1e-4)
 
 

@@ -11,7 +11,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning import Certificate, JointTrajectory, Path, time_path
 from splatbot.planning.blends import rounded
-from splatbot.planning.timing import min_clearance, without_duplicates
+from splatbot.planning.timing import TimingConstants, min_clearance, without_duplicates
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 
@@ -160,7 +160,7 @@ def test_where_no_rounding_is_free_the_arm_stops_at_the_corner(
 ) -> None:
     path = free_paths(arm, field, 1, 4)[0]
     rounded_time = time_path(path, arm, field).duration
-    monkeypatch.setattr("splatbot.planning.timing._MIN_REACH", 1e3)  # no blend is long enough
+    monkeypatch.setattr("splatbot.planning.timing.CONSTANTS", TimingConstants(min_reach=1e3))  # no blend is long enough
     trajectory = time_path(path, arm, field)
     assert trajectory.certificate.certified
     assert trajectory.duration > rounded_time

@@ -14,16 +14,8 @@ from splatbot.camera import Camera
 from splatbot.errors import CameraError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_to_rotation, rotation_to_quat, so3_exp, transform_points
-from splatbot.rasterize.views import (
-    VISIBLE_SHARE,
-    Mode,
-    colorize,
-    default_view,
-    depth_limits,
-    facing_normals,
-    render_view,
-    to_png,
-)
+from splatbot.rasterize.views import CONSTANTS as VIEWS
+from splatbot.rasterize.views import Mode, colorize, default_view, depth_limits, facing_normals, render_view, to_png
 
 CAMERA = Camera(100, 100, 31.5, 23.5, 64, 48)
 
@@ -160,10 +152,10 @@ def test_the_default_view_shows_ninety_percent_and_is_no_farther_than_that_needs
         colors=np.full((2000, 3), 0.5),
     )
     camera, pose = default_view(model, width=320, height=200, fov_deg=fov_deg)
-    assert _visible(model, camera, pose) >= VISIBLE_SHARE
+    assert _visible(model, camera, pose) >= VIEWS.visible_share
     nearer = pose.copy()
     nearer[2, 3] += 0.02
-    assert _visible(model, camera, nearer) < VISIBLE_SHARE
+    assert _visible(model, camera, nearer) < VIEWS.visible_share
     np.testing.assert_allclose(pose[:2, 3], means.mean(axis=0)[:2], atol=1e-4)
 
 

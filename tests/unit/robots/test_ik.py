@@ -11,7 +11,8 @@ from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.geometry import so3_log
-from splatbot.planning.ik import TOLERANCE, solve_ik
+from splatbot.planning.ik import CONSTANTS as IK
+from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
@@ -66,7 +67,7 @@ def test_every_pose_that_the_toolbox_reaches_is_reached(share_near_limits: float
         answer = solve_ik(robot, T, seeds=seeds)
         assert robot.within_limits(answer.q).all()
         for solution in answer.q:
-            assert max(pose_error(ets.fkine(solution).A, T)) <= TOLERANCE
+            assert max(pose_error(ets.fkine(solution).A, T)) <= IK.max_error
         ours.append(len(answer.q) > 0)
         theirs.append(toolbox_reaches(ets, robot, T, starts))
     assert sum(ours) >= sum(theirs)

@@ -17,7 +17,8 @@ import pytest
 
 from splatbot.bench.tabletop import Block, Tabletop
 from splatbot.sim.page import surface_points, twin_html
-from splatbot.sim.recording import RATE, TwinRecording
+from splatbot.sim.recording import CONSTANTS as RECORDING
+from splatbot.sim.recording import TwinRecording
 from splatbot.sim.scene import load_scene, make_scene
 from splatbot.sim.twin import Twin, TwinResult
 
@@ -63,7 +64,7 @@ def test_points_of_a_shape_are_where_a_ray_from_outside_hits_it(shape: dict[str,
 
 def test_the_recording_has_the_contacts_and_clearance_of_the_run() -> None:
     recording, result = recorded()
-    assert len(recording.times) == pytest.approx(RATE * result.duration, abs=1)
+    assert len(recording.times) == pytest.approx(RECORDING.rate * result.duration, abs=1)
     seen: list[np.ndarray] = []
     twin = Twin(load_scene("mug_hanging"))
     twin.follow(watch=lambda data, time: seen.append(data.xpos.copy()) if time in recording.times else None)
@@ -71,7 +72,7 @@ def test_the_recording_has_the_contacts_and_clearance_of_the_run() -> None:
     assert min(recording.clearances) == pytest.approx(result.clearance.value, abs=1e-3)
     in_contact = [t for t, found in zip(recording.times, recording.contacts, strict=True) if found]
     first, last = min(contact.first for contact in result.contacts), max(contact.last for contact in result.contacts)
-    assert first <= in_contact[0] <= first + 2 / RATE + 0.2  # at first fainter than is shown
+    assert first <= in_contact[0] <= first + 2 / RECORDING.rate + 0.2  # at first fainter than is shown
     assert in_contact[-1] <= last
     assert max(force for found in recording.contacts for *_, force in found) <= max(t.force for t in result.contacts)
 
@@ -120,7 +121,7 @@ def browser(tmp_path: Path) -> str:
         ("", "", 0.0),
         ("#t=2.5", "", 2.5),
         ("#t=99", "", 4.0),
-        ("#t=1", 'press("on"); press("on"); press("back");', 1.0 + 1 / RATE),
+        ("#t=1", 'press("on"); press("on"); press("back");', 1.0 + 1 / RECORDING.rate),
         ("", 'press("back");', 4.0),
         ("", 'const s = document.getElementById("time"); s.value = 60; s.dispatchEvent(new Event("input"));', 2.0),
     ],
@@ -130,7 +131,7 @@ def test_a_browser_shows_the_moment_of_the_address(
     browser: str, tmp_path: Path, address: str, clicks: str, time: float
 ) -> None:
     text = _label(browser, tmp_path, address, clicks)
-    assert float(text.split()[0]) == pytest.approx(time, abs=1.5 / RATE)
+    assert float(text.split()[0]) == pytest.approx(time, abs=1.5 / RECORDING.rate)
     assert "of 4.00 s, clearance" in text
 
 

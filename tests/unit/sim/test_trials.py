@@ -21,11 +21,13 @@ from splatbot.sim.scene import SceneObject
 from splatbot.sim.trials.run import FILE, TrialError, TrialsPlan, read_rows, run_trials
 from splatbot.sim.trials.scan import UnseenError, camera_path
 from splatbot.sim.trials.scenes import OBSTACLE, TrialScene, make_trial
-from splatbot.sim.trials.shake import SHARE, Shake
+from splatbot.sim.trials.shake import CONSTANTS as SHAKE
+from splatbot.sim.trials.shake import Shake
 from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.trials.table import physics, summaries, table_rows
-from splatbot.sim.trials.trial import KEPT, RISE, TrialRow, TwinPickResult, run_trial
+from splatbot.sim.trials.trial import CONSTANTS as TRIAL
+from splatbot.sim.trials.trial import TrialRow, TwinPickResult, run_trial
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA
 
@@ -112,8 +114,8 @@ def test_shaking_stays_within_the_limits_and_ends_where_it_began() -> None:
     np.testing.assert_allclose(v[[0, -1]], 0.0, atol=1e-12)
     np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], v[1:-1], atol=1e-3)
     acceleration = np.abs(np.gradient(v, t, axis=0)).max(axis=0)
-    assert (acceleration < 1.1 * SHARE * chain.acceleration).all()
-    assert (acceleration > 0.8 * SHARE * chain.acceleration).all()
+    assert (acceleration < 1.1 * SHAKE.acceleration_share * chain.acceleration).all()
+    assert (acceleration > 0.8 * SHAKE.acceleration_share * chain.acceleration).all()
     assert (np.abs(v).max(axis=0) < chain.velocity).all()
 
 
@@ -209,8 +211,8 @@ def test_one_thing_is_seen_picked_and_shaken_whatever_another_scan_gave_and_ctrl
     (only,) = rows
     assert (only.seed, only.kind, only.stack) == (1, "can", "gaussians")
     assert only.ideal.success, only.ideal.reason
-    assert only.ideal.rose > RISE
-    assert only.ideal.kept > KEPT
+    assert only.ideal.rose > TRIAL.min_rise
+    assert only.ideal.kept > TRIAL.min_kept_height
     obj = make_trial(1, "isolated").scene.movable[0].shapes[0]
     assert obj.kind == "cylinder"
     assert only.width_mm == pytest.approx(2e3 * obj.radius, abs=4.0)  # a scan of 240 pixels

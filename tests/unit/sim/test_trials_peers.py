@@ -13,7 +13,8 @@ from splatbot.gaussians import GaussianModel
 from splatbot.logs.shapes import box
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
-from splatbot.sim.trials.discrete import RESOLUTION, connect, edge_free
+from splatbot.sim.trials.discrete import CONSTANTS as DISCRETE
+from splatbot.sim.trials.discrete import connect, edge_free
 from splatbot.sim.trials.run import TrialsPlan, run_trials
 from splatbot.sim.trials.solid import SolidArm
 
@@ -70,7 +71,7 @@ def test_paths_from_single_configurations_go_around_and_none_is_found_through_a_
     assert all(edge_free(free, a, b) for a, b in pairwise(path))
     length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     shortest = 2 * np.hypot(0.4, 1.0) + 0.4
-    assert shortest - 4 * RESOLUTION < length < 1.3 * shortest
+    assert shortest - 4 * DISCRETE.resolution < length < 1.3 * shortest
     walled = connect(lambda q: np.abs(q[:, 0]) > 0.2, low, high, start, goal, seconds=0.1, seed=1)
     assert len(walled) == 0
 

@@ -12,7 +12,8 @@ from splatbot.config import Config, TrackingConfig, load_config
 from splatbot.logs import open_log
 from splatbot.mapping.mapper import Mapper
 from splatbot.slam import Slam
-from splatbot.tracking.budget import DEADLINE_QUANTILE, LOST_QUANTILE, Budget, CostModel, table_ms
+from splatbot.tracking.budget import PARAMETERS as COSTS
+from splatbot.tracking.budget import Budget, CostModel, table_ms
 from tests.unit.tracking.test_tracker import Run
 
 
@@ -63,7 +64,7 @@ def test_stages_that_were_slow_at_times_are_started_while_lost() -> None:
     costs = CostModel()
     for slowness in (1.0, 8.0, 1.0, 8.0, 1.0):
         costs.record("detect", 500, slowness * table_ms("detect", 500))
-    quantiles = DEADLINE_QUANTILE, LOST_QUANTILE
+    quantiles = COSTS.deadline_quantile, COSTS.lost_quantile
     tracked, lost = (Budget(30.0, costs, time.perf_counter(), quantile) for quantile in quantiles)
     assert not tracked.fits(("detect", 500))
     assert lost.fits(("detect", 500))
@@ -103,7 +104,7 @@ def test_the_slam_reports_its_own_overhead_to_the_tracker(monkeypatch: pytest.Mo
     slam = Slam(config)
     for frame in open_log("synthetic:tabletop?frames=4&width=160&height=120"):
         slam.process(frame)
-    assert slam._tracker._costs.expected_ms("overhead", 1, LOST_QUANTILE) > 1e3 * slow  # type: ignore[union-attr]
+    assert slam._tracker._costs.expected_ms("overhead", 1, COSTS.lost_quantile) > 1e3 * slow  # type: ignore[union-attr]
 
 
 def test_without_time_for_features_the_frame_is_tracked_and_reports_them_as_skipped() -> None:

@@ -200,17 +200,14 @@ struct PlanKernels;   // planning/kernels.hpp
 
 struct Kernels {
   const char* name;
-  void (*project)(const ProjectArgs&, std::size_t block, ProjectedBlock& out);
-  void (*blend)(const BlendArgs&, std::size_t tile);
-  void (*blend_backward)(const BlendBackwardArgs&, std::size_t tile);
-  void (*project_backward)(const ProjectBackwardArgs&, std::size_t block);
+  SplatKernels<ProjectArgs, BlendArgs, BlendBackwardArgs, ProjectBackwardArgs> gaussians;
+  SurfelKernels surfels;
   void (*linearize)(const LinearizeArgs&, LinearizeSums& sums);
   void (*harmonics)(const HarmonicsArgs&, std::size_t block);
   void (*harmonics_backward)(const HarmonicsBackwardArgs&, std::size_t block);
   void (*contributions)(const ContributionArgs&, std::size_t tile);
   void (*medians)(const MedianArgs&, std::size_t tile);
   void (*fronts)(const FrontArgs&, std::size_t tile);
-  SurfelKernels surfels;
   void (*loss)(const LossArgs&, std::size_t tile, float* scratch, LossSums& sums);
   void (*adam)(const AdamGroup&, const AdamBlock&);
   const FieldKernels* field;

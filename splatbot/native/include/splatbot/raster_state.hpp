@@ -115,22 +115,37 @@ struct TileLists {
   std::size_t bytes() const noexcept;
 };
 
-struct RasterState : TileLists {
+// State that a render of either kind of splat keeps.
+template <class SplatRecord, class Options>
+struct SplatState : TileLists {
   std::size_t count = 0;
   int channels = 0;  // input columns
-  int out_channels = 0;
   View view{};
-  RasterOptions options;
-  std::vector<ChannelPass> passes;
+  Options options;
   StageTimes times;
 
-  Buffer<Record> records;       // (N,), in the order of the map
+  Buffer<SplatRecord> records;  // (N,), in the order of the map
+  Buffer<float> final_state;    // (passes, tiles, planes, kTilePixels)
+};
+
+struct RasterState : SplatState<Record, RasterOptions> {
+  int out_channels = 0;
+  std::vector<ChannelPass> passes;
+
   Buffer<float> more_channels;  // (passes - 1, N, kRecordChannels)
-  Buffer<float> final_state;    // (passes, tiles, kFinalPlanes, kTilePixels)
   Buffer<std::uint8_t> mask;    // of square tiles of mask_size pixels; empty: none
   int mask_size = 0, mask_columns = 0;
 
   std::size_t bytes() const noexcept;
+};
+
+// The four passes of either kind of splat, over projection blocks and tiles.
+template <class Project, class Blend, class BlendBackward, class ProjectBackward>
+struct SplatKernels {
+  void (*project)(const Project&, std::size_t block, ProjectedBlock& out);
+  void (*blend)(const Blend&, std::size_t tile);
+  void (*blend_backward)(const BlendBackward&, std::size_t tile);
+  void (*project_backward)(const ProjectBackward&, std::size_t block);
 };
 
 // Depth order and tile lists (order.cpp).

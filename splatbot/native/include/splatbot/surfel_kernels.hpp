@@ -109,11 +109,7 @@ struct SurfelProjectBackwardArgs {
   double* camera;                                                // (blocks, kCameraSums) partial sums, or null
 };
 
-struct SurfelKernels {
-  void (*project)(const SurfelProjectArgs&, std::size_t block, ProjectedBlock& out);
-  void (*blend)(const SurfelBlendArgs&, std::size_t tile);
-  void (*blend_backward)(const SurfelBlendBackwardArgs&, std::size_t tile);
-  void (*project_backward)(const SurfelProjectBackwardArgs&, std::size_t block);
-};
+using SurfelKernels =
+    SplatKernels<SurfelProjectArgs, SurfelBlendArgs, SurfelBlendBackwardArgs, SurfelProjectBackwardArgs>;
 
 }  // namespace splatbot

@@ -209,20 +209,7 @@ void blend_channels(const BlendArgs& args, const TileFrame& frame, std::size_t t
 void blend(const BlendArgs& args, std::size_t tile) {
   TileState state;
   const TileFrame frame = tile_frame(args.view, args.columns, tile);
-  switch (args.pass->count) {  // the channels of a record beyond the pass's are zero
-    case 1:
-      return blend_channels<1>(args, frame, tile, state);
-    case 2:
-    case 3:
-      return blend_channels<3>(args, frame, tile, state);
-    case 4:
-      return blend_channels<4>(args, frame, tile, state);
-    case 5:
-    case 6:
-      return blend_channels<6>(args, frame, tile, state);
-    default:
-      return blend_channels<8>(args, frame, tile, state);
-  }
+  with_channels(args.pass->count, [&](auto channels) { blend_channels<channels>(args, frame, tile, state); });
 }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -177,20 +177,8 @@ void backward_channels(const BlendBackwardArgs& args, const TileFrame& frame, st
 void blend_backward(const BlendBackwardArgs& args, std::size_t tile) {
   TileGradient state;
   const TileFrame frame = tile_frame(args.forward.view, args.forward.columns, tile);
-  switch (args.forward.pass->count) {
-    case 1:
-      return backward_channels<1>(args, frame, tile, state);
-    case 2:
-    case 3:
-      return backward_channels<3>(args, frame, tile, state);
-    case 4:
-      return backward_channels<4>(args, frame, tile, state);
-    case 5:
-    case 6:
-      return backward_channels<6>(args, frame, tile, state);
-    default:
-      return backward_channels<8>(args, frame, tile, state);
-  }
+  with_channels(args.forward.pass->count,
+                [&](auto channels) { backward_channels<channels>(args, frame, tile, state); });
 }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -115,17 +115,22 @@ SB_INLINE void walk(const SolidsView& s, const Split& p, Search& search) {
 }
 
 // Bounds are squared distances to boxes.
-struct NearestSearch {
-  float best;  // certified lower bound of the signed distance so far, or the cut
+struct BoxSearch {
   float slack;
-  Found found = {};
 
-  SB_INLINE float limit() const {
-    const float reach = best + slack;
+  SB_INLINE float limit_at(float distance) const {
+    const float reach = distance + slack;
     return reach > 0.0F ? reach * reach * (1.0F + 1e-5F) : 0.0F;
   }
   SB_INLINE void enter(Place) {}
   SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
+};
+
+struct NearestSearch : BoxSearch {
+  float best;  // certified lower bound of the signed distance so far, or the cut
+  Found found = {};
+
+  SB_INLINE float limit() const { return limit_at(best); }
 
   SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
     alignas(64) float d[W];
@@ -145,19 +150,14 @@ struct NearestSearch {
   }
 };
 
-struct KSearch {
+struct KSearch : BoxSearch {
   int k;
-  float cut, slack;
+  float cut;
   int count = 0;
   Seen seen[kMostNearest];
 
   SB_INLINE float worst() const { return count < k ? cut : seen[count - 1].bound; }
-  SB_INLINE float limit() const {
-    const float reach = worst() + slack;
-    return reach > 0.0F ? reach * reach * (1.0F + 1e-5F) : 0.0F;
-  }
-  SB_INLINE void enter(Place) {}
-  SB_INLINE F bound(const SolidNode& node, const Split& p, int at) const { return box_squared(node, p, at); }
+  SB_INLINE float limit() const { return limit_at(worst()); }
 
   SB_INLINE void leaf(const LeafView& leaf, const Split& p, Found at_leaf) {
     alignas(64) float d[W];
@@ -369,7 +369,7 @@ void field_nearest(const SolidsView& s, const SphereQueries& q, float cut, std::
     const double* center = q.centers + 3 * i;
     const Split p = split(center);
     const float r = radius_of(q, i);
-    NearestSearch search{cut + r, p.slack};
+    NearestSearch search{{p.slack}, cut + r};
     NearestSolid& answer = out[i];
     answer = {static_cast<double>(kInfinity), {0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, -1};
     if (grid_bound(s.grid, p) > cut + r) {
@@ -391,7 +391,7 @@ void field_k_nearest(const SolidsView& s, const SphereQueries& q, int k, float c
     const double* center = q.centers + 3 * i;
     const Split p = split(center);
     const float r = radius_of(q, i);
-    KSearch search{k, cut + r, p.slack, 0, {}};
+    KSearch search{{p.slack}, k, cut + r, 0, {}};
     walk(s, p, search);
     const auto row = i * static_cast<std::size_t>(k);
     for (int j = 0; j < k; ++j) {

@@ -243,25 +243,20 @@ void backward_block(const HarmonicsBackwardArgs& args, const std::uint32_t* visi
   }
 }
 
-template <int Degree>
-struct DegreeConstant {
-  constexpr operator int() const { return Degree; }
-};
-
 // Calls each() with the degree as a constant.
 template <class Each>
 void with_degree(int degree, Each each) {
   switch (degree) {
     case 0:
-      return each(DegreeConstant<0>{});
+      return each(Constant<0>{});
     case 1:
-      return each(DegreeConstant<1>{});
+      return each(Constant<1>{});
     case 2:
-      return each(DegreeConstant<2>{});
+      return each(Constant<2>{});
     case 3:
-      return each(DegreeConstant<3>{});
+      return each(Constant<3>{});
     default:
-      return each(DegreeConstant<4>{});
+      return each(Constant<4>{});
   }
 }
 

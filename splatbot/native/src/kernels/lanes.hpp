@@ -70,11 +70,16 @@ SB_INLINE void each_lanes(const BlockRows& rows, Each each) {
   }
 }
 
-// Calls each(ids, n) for W splats in view of block b at a time. `args` are those of a backward pass.
-template <class Args, class Each>
-SB_INLINE void each_visible(const Args& args, std::size_t b, Each each) {
+// Calls clear(rows) for a block that holds splats out of view, then each(ids, n) for W splats in view at a time. `args`
+// are those of a backward pass.
+template <class Args, class Clear, class Each>
+SB_INLINE void each_visible(const Args& args, std::size_t b, Clear clear, Each each) {
   const ProjectedBlock& block = args.blocks[b];
-  const std::uint32_t* visible = args.forward.visible + b * kProjectBlock;
+  const BlockRows rows = rows_of_block(b, args.forward.count);
+  if (block.visible < rows.end - rows.begin) {
+    clear(args, rows);
+  }
+  const std::uint32_t* visible = args.forward.visible + rows.begin;
   for (std::uint32_t at = 0; at < block.visible; at += W) {
     each(visible + at, block.visible - at < W ? static_cast<int>(block.visible - at) : W);
   }

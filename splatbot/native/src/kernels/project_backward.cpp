@@ -351,17 +351,12 @@ SB_INLINE void collect(const ProjectBackwardArgs& args, const ProjectedBlock& bl
 
 template <Projection P>
 void project_backward_block(const ProjectBackwardArgs& args, std::size_t b) {
-  const ProjectedBlock& block = args.blocks[b];
-  const BlockRows rows = rows_of_block(b, args.forward.count);
-  if (block.visible < rows.end - rows.begin) {
-    zero_rows(args, rows);
-  }
   CameraSums camera_sums;
   const bool of_covar = args.forward.covars != nullptr;
   const CameraLanes cam(args.forward.view);
-  each_visible(args, b, [&](const std::uint32_t* ids, int n) {
+  each_visible(args, b, zero_rows, [&](const std::uint32_t* ids, int n) {
     LaneSums sums;
-    collect(args, block, ids, n, sums);
+    collect(args, args.blocks[b], ids, n, sums);
     if (!args.last || !args.geometry) {
       return;
     }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Front-to-back blending of one tile of surfels, as in blend.cpp.
+#include "entry.hpp"
 #include "surfel.hpp"
-#include "surfel_entry.hpp"
 #include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
@@ -235,13 +235,7 @@ void surfel_blend(const SurfelBlendArgs& args, std::size_t tile) {
   TileState state;
   const TileFrame frame = tile_frame(args.view, args.columns, tile);
   start(frame, state);
-  if (args.channels == 0) {
-    blend_channels<0>(args, frame, tile, state);
-  } else if (args.channels <= 3) {
-    blend_channels<3>(args, frame, tile, state);
-  } else {
-    blend_channels<kMaxSurfelChannels>(args, frame, tile, state);
-  }
+  with_surfel_channels(args.channels, [&](auto channels) { blend_channels<channels>(args, frame, tile, state); });
   write_tile(args, frame, state);
   std::memcpy(args.final_state + tile * kSurfelPlanes * kPlane, state.planes, sizeof(state.planes));
 }

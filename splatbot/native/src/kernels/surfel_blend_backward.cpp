@@ -5,8 +5,8 @@
 // Distortion is 2 sum_i w_i |m_i A_i - B_i| with A_i, B_i the sums of w_j and w_j m_j over j < i. With the signs s_i
 // of its terms fixed, its gradient to w_i is 2 (|m_i A_i - B_i| + sum_{j>i} s_j w_j (m_j - m_i)). That to m_i is 2
 // w_i (s_i A_i - sum_{j>i} s_j w_j). It is of degree 2 in the weights: R counts it twice (Euler).
+#include "entry.hpp"
 #include "surfel.hpp"
-#include "surfel_entry.hpp"
 #include "walk.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
@@ -215,13 +215,8 @@ void surfel_blend_backward(const SurfelBlendBackwardArgs& args, std::size_t tile
   TileGradient state;
   const TileFrame frame = tile_frame(args.forward.view, args.forward.columns, tile);
   load_tile(args, frame, args.forward.final_state + tile * kSurfelPlanes * kPlane, state);
-  if (args.forward.channels == 0) {
-    backward_channels<0>(args, frame, tile, state);
-  } else if (args.forward.channels <= 3) {
-    backward_channels<3>(args, frame, tile, state);
-  } else {
-    backward_channels<kMaxSurfelChannels>(args, frame, tile, state);
-  }
+  with_surfel_channels(args.forward.channels,
+                       [&](auto channels) { backward_channels<channels>(args, frame, tile, state); });
 }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "entry.hpp"
 #include "surfel.hpp"
-#include "surfel_entry.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Propagates the sums of surfel_blend_backward() to the gradients of the inputs, W surfels at once. The projection is
 // computed again: cheaper than keeping it.
+#include "entry.hpp"
 #include "surfel.hpp"
-#include "surfel_entry.hpp"
 
 namespace splatbot::SPLATBOT_KERNELS {
 
@@ -184,16 +184,11 @@ void zero_rows(const SurfelProjectBackwardArgs& args, const BlockRows& rows) {
 }  // namespace
 
 void surfel_project_backward(const SurfelProjectBackwardArgs& args, std::size_t b) {
-  const ProjectedBlock& block = args.blocks[b];
-  const BlockRows rows = rows_of_block(b, args.forward.count);
-  if (block.visible < rows.end - rows.begin) {
-    zero_rows(args, rows);
-  }
   CameraSums camera_sums;
   const CameraLanes cam(args.forward.view);
-  each_visible(args, b, [&](const std::uint32_t* ids, int n) {
+  each_visible(args, b, zero_rows, [&](const std::uint32_t* ids, int n) {
     LaneSums sums;
-    collect(args, block, ids, n, sums);
+    collect(args, args.blocks[b], ids, n, sums);
     GaussianLanes g;
     gather_lanes<3>(args.forward.means, ids, n, g.mean);
     from_origin(cam, g.mean);

@@ -3,7 +3,6 @@
 #include "entry.hpp"
 #include "field_entry.hpp"
 #include "planning_entry.hpp"
-#include "surfel_entry.hpp"
 
 #define SB_TEXT(name) #name
 #define SB_EXPANDED_TEXT(name) SB_TEXT(name)
@@ -18,26 +17,21 @@ const PlanKernels kPlan = {plan_squared_distances, plan_first_at_most, plan_leas
 }  // namespace
 
 extern const Kernels kKernels;
-const Kernels kKernels = {.name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
-                          .project = project,
-                          .blend = blend,
-                          .blend_backward = blend_backward,
-                          .project_backward = project_backward,
-                          .linearize = linearize,
-                          .harmonics = harmonics,
-                          .harmonics_backward = harmonics_backward,
-                          .contributions = contributions,
-                          .medians = medians,
-                          .fronts = fronts,
-                          .surfels = {.project = surfel_project,
-                                      .blend = surfel_blend,
-                                      .blend_backward = surfel_blend_backward,
-                                      .project_backward = surfel_project_backward},
-                          .loss = loss,
-                          .adam = adam,
-                          .field = &kField,
-                          .arm = &kArm,
-                          .plan = &kPlan,
-                          .lanes = SPLATBOT_SIMD / 32};
+const Kernels kKernels = {
+    .name = SB_EXPANDED_TEXT(SPLATBOT_KERNELS),
+    .gaussians = {project, blend, blend_backward, project_backward},
+    .surfels = {surfel_project, surfel_blend, surfel_blend_backward, surfel_project_backward},
+    .linearize = linearize,
+    .harmonics = harmonics,
+    .harmonics_backward = harmonics_backward,
+    .contributions = contributions,
+    .medians = medians,
+    .fronts = fronts,
+    .loss = loss,
+    .adam = adam,
+    .field = &kField,
+    .arm = &kArm,
+    .plan = &kPlan,
+    .lanes = SPLATBOT_SIMD / 32};
 
 }  // namespace splatbot::SPLATBOT_KERNELS

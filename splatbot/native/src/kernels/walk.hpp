@@ -28,6 +28,37 @@ inline void open_pixels(const BlendArgs& args, const TileFrame& frame, float* th
   }
 }
 
+// Calls each() with a constant that is at least a pass's number of channels. Further channels of a record are zero.
+template <class Each>
+SB_INLINE void with_channels(int count, Each each) {
+  switch (count) {
+    case 1:
+      return each(Constant<1>{});
+    case 2:
+    case 3:
+      return each(Constant<3>{});
+    case 4:
+      return each(Constant<4>{});
+    case 5:
+    case 6:
+      return each(Constant<6>{});
+    default:
+      return each(Constant<8>{});
+  }
+}
+
+// The same for surfels, whose records have no channels in addition to their colours.
+template <class Each>
+SB_INLINE void with_surfel_channels(int count, Each each) {
+  if (count == 0) {
+    each(Constant<0>{});
+  } else if (count <= 3) {
+    each(Constant<3>{});
+  } else {
+    each(Constant<kMaxSurfelChannels>{});
+  }
+}
+
 // A bit for each block with an open pixel.
 inline std::uint32_t live_blocks(const float* through, F limit) {
   std::uint32_t live = 0;
@@ -41,9 +72,9 @@ inline std::uint32_t live_blocks(const float* through, F limit) {
   return live;
 }
 
-// Blends a tile's pairs front to back, kChunk at a time, until no pixel is open. load(at, n, live, chunk) fills the
-// chunk with n pairs from `at` on and with the masks of the live blocks that they reach, 0 beyond n. Then blend(chunk,
-// members, at, block, part) blends the pairs that reach a part of a block. Both passes keep the masks.
+// Blends a tile's pairs front to back, kChunk at a time, until no pixel is open. `load_chunk` reads n pairs from `at` on
+// into a chunk, with their masks of live blocks, 0 beyond n. The masks are kept for the backward pass. `blend` takes the
+// members of a chunk that reach a block into one part of it.
 template <class Chunk, class Args, class Load, class Blend>
 SB_INLINE void blend_chunks(const Args& args, std::size_t tile, const float* through, F limit, Load load_chunk,
                             Blend blend) {
@@ -114,16 +145,16 @@ SB_INLINE void each_part_of(std::uint32_t mask, Each each) {
   } while (mask != 0);
 }
 
-// Alpha x d loss / d alpha, from the gradient to the weight and the rest behind it; none where the cap holds alpha, nor
-// in closed pixels.
+// Alpha x d loss / d alpha, from the gradient to the weight and the rest behind it. It is zero where the cap holds
+// alpha and in closed pixels.
 SB_INLINE F pull_back_alpha(const Alpha& a, const Step& step, F along, F rest) {
   const F other = a.alpha * reciprocal(a.left) * rest;
   const M free = step.open & (a.power <= set1(kAlphaMax));
   return zero_unless(free, fms(step.weight, along, other));
 }
 
-// Calls each(lines, id, block) for a tile's Gaussians, front to back, and the blocks they reach of those still in
-// `wanted`, until none is left there.
+// Calls each(lines, id, block) for a tile's Gaussians, front to back, and each block in `wanted` that they reach. It
+// ends when no block is wanted.
 template <class Each>
 SB_INLINE void each_reached(const BlendArgs& args, const TileFrame& frame, std::size_t tile,
                             const std::uint32_t& wanted, Each each) {
