@@ -20,14 +20,17 @@ class Rows:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         number = core_schema.float_schema()
         row = (
-            core_schema.list_schema(number)
+            core_schema.list_schema(number, fail_fast=True)
             if self.columns is None
-            else core_schema.tuple_schema([number] * self.columns)
+            else core_schema.tuple_schema([number] * self.columns, fail_fast=True)
         )
-        return core_schema.no_info_wrap_validator_function(self._read, core_schema.list_schema(row))
+        rows = core_schema.list_schema(row, fail_fast=True)  # one error, not one for each of a million rows
+        return core_schema.with_info_wrap_validator_function(self._read, rows)
 
-    def _read(self, value: Any, listed: Callable[[Any], Any]) -> NDArray[np.float64]:
+    def _read(self, value: Any, listed: Callable[[Any], Any], info: core_schema.ValidationInfo) -> NDArray[np.float64]:
         if isinstance(value, np.ndarray):
+            if info.context is not None and value.size > info.context["values"]:
+                raise PydanticCustomError("array", "has more than {most} values", {"most": info.context["values"]})
             if value.ndim != 2 or (self.columns is not None and value.shape[1] != self.columns):
                 wanted = self.columns if self.columns is not None else "columns"
                 context = {"got": str(value.shape), "wanted": wanted}

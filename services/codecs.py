@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
@@ -15,10 +16,13 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 from pydantic.json_schema import models_json_schema
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from splatbot.client import pack_array
 from splatbot.errors import InputError
+from splatbot.services.bounds import INLINE_BYTES, check_json, check_msgpack
+from splatbot.services.settings import ServiceSettings
 
 JSON = "application/json"
 NPY = "application/x-npy"
@@ -27,33 +31,48 @@ ZIP = "application/zip"
 
 _M = TypeVar("_M", bound=BaseModel)
 _KINDS = "biuf"  # of numpy's dtypes that travel
+_MOST = 2**31  # entries of an array
+_VALUES = 10_000  # of a body, unless its route takes more
 _BODIES: dict[str, type[BaseModel]] = {}
 
 
-def body_of(model: type[_M], *, array: str | None = None) -> Callable[[Request], Coroutine[Any, Any, _M]]:
+def body_of(
+    model: type[_M], *, array: str | None = None, values: Callable[[ServiceSettings], int] = lambda _: _VALUES
+) -> Callable[[Request], Coroutine[Any, Any, _M]]:
     """Return a dependency that reads a ``model`` from a body of any of the three kinds.
+
+    A body with more than ``values`` values is refused before objects are made of it.
 
     Args:
         model: of the body.
         array: the field that a bare npy array fills. If None, npy is refused.
+        values: limit of a body; a list or object counts as four, see :mod:`splatbot.services.bounds`.
     """
     _BODIES[model.__name__] = model
 
-    async def read(request: Request) -> _M:
-        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        body = await request.body()
+    def decode(kind: str, body: bytes, most: int) -> _M:
+        context = {"values": most}
         try:
             if kind == NPY and array is not None:
-                return model.model_validate({array: decode_npy(body)})
+                return model.model_validate({array: decode_npy(body)}, context=context)
             if kind == MSGPACK:
-                return model.model_validate(decode_msgpack(body))
+                check_msgpack(body, most)
+                return model.model_validate(decode_msgpack(body), context=context)
             if kind == JSON:
+                check_json(body, most)
                 return model.model_validate_json(body)
         except ValidationError as error:
-            found = [e | {"loc": ("body", *e["loc"])} for e in error.errors(include_url=False, include_context=False)]
-            raise RequestValidationError(found) from error
+            found = error.errors(include_url=False, include_context=False, include_input=False)
+            raise RequestValidationError([e | {"loc": ("body", *e["loc"])} for e in found]) from error
         taken = ", ".join([JSON, MSGPACK, *([NPY] if array is not None else [])])
         raise HTTPException(415, f"The body is {kind[:80]!r}; taken are {taken}.")
+
+    async def read(request: Request) -> _M:
+        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        body, most = await request.body(), values(request.app.state.runtime.settings)
+        if len(body) <= INLINE_BYTES:
+            return decode(kind, body, most)
+        return await run_in_threadpool(decode, kind, body, most)
 
     return read
 
@@ -181,8 +200,7 @@ def _unpacked(value: dict[str, Any]) -> Any:
     if set(value) != {"dtype", "shape", "data"}:
         return value
     dtype, shape, data = value["dtype"], value["shape"], value["data"]
-    whole = isinstance(shape, list) and all(isinstance(n, int) and n >= 0 for n in shape)
-    if not (isinstance(dtype, str) and isinstance(data, bytes) and whole):
+    if not (isinstance(dtype, str) and len(dtype) <= 20 and isinstance(data, bytes) and isinstance(shape, list)):
         raise InputError("is no array.", field="dtype, shape, data", hint="text, whole numbers, bytes")
     try:
         kind = np.dtype(dtype)
@@ -194,10 +212,9 @@ def _unpacked(value: dict[str, Any]) -> Any:
 def _array(data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], order: Any) -> NDArray[Any]:
     if dtype.kind not in _KINDS or dtype.itemsize > 8 or dtype.subdtype is not None:
         raise InputError(f"is {str(dtype)[:40]}.", field="dtype", hint="send numbers, e.g. <f4 or |u1")
-    count = 1
-    for n in shape:
-        count *= n
-    if len(shape) > 4 or count * dtype.itemsize != len(data):
-        hint = "send as many bytes as the shape has"
-        raise InputError(f"{len(data)} bytes are not {list(shape)[:5]} of {dtype}.", field="shape", hint=hint)
+    whole = len(shape) <= 4 and all(type(n) is int and n >= 0 for n in shape)  # True is no length
+    # Lengths beside a 0 are bounded too: numpy cannot hold an empty array of any shape.
+    if not whole or math.prod(max(n, 1) for n in shape) > _MOST or math.prod(shape) * dtype.itemsize != len(data):
+        hint = "give at most four whole numbers, and as many bytes as they say"
+        raise InputError(f"{len(data)} bytes are not {str(shape)[:60]} of {dtype}.", field="shape", hint=hint)
     return np.frombuffer(data, dtype).reshape(shape, order=order)

@@ -16,7 +16,7 @@ from splatbot.logs.ros_types import definition
 from splatbot.services.bus import Subscription
 from splatbot.services.ros.deliveries import Deliveries
 from splatbot.services.ros.graph import RosGraph
-from splatbot.services.ros.requests import json_object
+from splatbot.services.ros.requests import read_json_object
 from splatbot.services.ros.rosbridge.subscriptions import Send
 from splatbot.services.ros.wire import RosMessage
 
@@ -57,7 +57,7 @@ class FoxgloveSession:
     async def receive(self, text: str | bytes) -> None:
         """Handle a client's message; a wrong message never raises."""
         try:
-            self._do(json_object(text, self._most_bytes))
+            self._do(await read_json_object(text, self._most_bytes))
         except InputError as error:
             await self._status(_ERROR, str(error))
 

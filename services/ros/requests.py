@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat
 from splatbot.robots.robot import RobotModel
+from splatbot.services.bounds import INLINE_BYTES, check_json
+
+_VALUES = 1_000_000  # of one message; an image of 640 x 480 as a list of numbers has 921,600
 
 
 def json_object(text: str | bytes, most_bytes: int) -> dict[str, Any]:
@@ -19,18 +23,27 @@ def json_object(text: str | bytes, most_bytes: int) -> dict[str, Any]:
 
     Raises:
         InputError: it is binary, too long, or no JSON object.
+        TooLargeError: it has too many values or is nested too deep.
     """
     if isinstance(text, bytes):
         raise InputError("is binary.", field="message", hint="send JSON as text")
     if len(text) > most_bytes:
         raise InputError(f"has more than {most_bytes} bytes.", field="message", hint="send less at once")
     try:
+        check_json(text.encode(), _VALUES, "message")
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError("is no JSON.", field="message", hint='send {"op": ...}') from error
     if not isinstance(values, dict):
         raise InputError("is no JSON object.", field="message", hint='send {"op": ...}')
     return values
+
+
+async def read_json_object(text: str | bytes, most_bytes: int) -> dict[str, Any]:
+    """Parse a client's message by :func:`json_object`; a thread parses a long one, so that other clients go on."""
+    if len(text) <= INLINE_BYTES:
+        return json_object(text, most_bytes)
+    return await asyncio.to_thread(json_object, text, most_bytes)
 
 
 def entry(args: Any, path: str) -> Any:

@@ -34,7 +34,11 @@ _ANSWER = {
     "gaussian": [977],
     "gradient": [[0.0, -0.02, 0.0, 0.1, 0.0, 0.05, 0.0]],
 }
-_Body = Annotated[CollisionsRequest, Depends(body_of(CollisionsRequest, array="q"))]
+_VALUES_A_ROW = 20  # its list and up to 15 joints
+_Body = Annotated[
+    CollisionsRequest,
+    Depends(body_of(CollisionsRequest, array="q", values=lambda s: 100 + _VALUES_A_ROW * s.max_configurations)),
+]
 
 
 @router.post(

@@ -19,7 +19,11 @@ _EXAMPLES = {
     "a thicker surface": {"points": [[0.1, 0.0, 0.8]], "n_sigma": 3.0},
 }
 _ANSWER = {"map_version": 12, "n_sigma": 2.0, "distance": [0.4, 31.7], "index": [1042, 977], "inside": [True, False]}
-_Body = Annotated[DistanceRequest, Depends(body_of(DistanceRequest, array="points"))]
+_VALUES_A_POINT = 8  # its list and three numbers
+_Body = Annotated[
+    DistanceRequest,
+    Depends(body_of(DistanceRequest, array="points", values=lambda s: 100 + _VALUES_A_POINT * s.max_points)),
+]
 
 
 @router.post(

@@ -30,7 +30,7 @@ router = APIRouter(prefix="/v1/maps", tags=["views"])
 _PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {}}, "description": "PNG; X-Map-Version and ETag name the state that was drawn"}
 }
-_EXAMPLES = {
+_EXAMPLES: dict[str, Any] = {
     "default view": {"mode": "rgb"},
     "depth at a pose": {
         "mode": "depth",
@@ -40,6 +40,8 @@ _EXAMPLES = {
         "depth_range_m": [0.3, 2.0],
     },
 }
+_MAX_SIDE = 16_384  # [px]
+_Body = Annotated[RenderRequest, Depends(body_of(RenderRequest))]
 
 
 @router.get("/{map_id}/render", response_class=Response, responses=_PNG | problems(404, 413, 422, 503))
@@ -67,11 +69,7 @@ def render_default(
     responses=_PNG | problems(404, 413, 415, 422, 503),
     openapi_extra=request_body(RenderRequest, _EXAMPLES),
 )
-def render(
-    served: ServedAfterFrames,
-    settings: Settings,
-    request: Annotated[RenderRequest, Depends(body_of(RenderRequest))],
-) -> Response:
+def render(served: ServedAfterFrames, settings: Settings, request: _Body) -> Response:
     """Render the map for a given camera and pose."""
     model = served.ready.model
     if request.camera is not None:
@@ -105,11 +103,16 @@ def _png(
 
 
 def check_size(width: int, height: int, settings: ServiceSettings) -> None:
-    """Refuse a view of more pixels than one may cost.
+    """Refuse a view of more pixels than one may cost, or with a longer side than is drawn.
 
     Raises:
         TooLargeError: it is.
     """
+    if max(width, height) > _MAX_SIDE:
+        hint = f"ask for at most {_MAX_SIDE} columns and rows"
+        raise TooLargeError(
+            f"{width}x{height} has a side of more than {_MAX_SIDE} pixels.", field="width, height", hint=hint
+        )
     if width * height > settings.max_pixels:
         raise TooLargeError(
             f"{width}x{height} has more than {settings.max_pixels} pixels.",

@@ -6,7 +6,8 @@ import base64
 import binascii
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ Message = Any
 
 _STRINGS = ("string", "wstring")
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+_MOST_MESSAGES = 100_000  # in each other: an entry `{}` of a list may stand for dozens
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 
 # Types that the JAZZY store lacks: the action of ros-controls/control_msgs as topics of ROS 1's actionlib.
@@ -96,9 +98,9 @@ def build(name: str, values: Mapping[str, Any] | None = None, /, **fields: Any) 
     null is NaN; elsewhere it is a missing field. Times may have ROS 1's `secs` and `nsecs`; `seq` is ignored.
 
     Raises:
-        InputError: a field is unknown, or its value is of another type.
+        InputError: a field is unknown, its value is of another type, or there are more than 100,000 messages in it.
     """
-    return _struct(name, {**(values or {}), **fields}, "")
+    return _struct(name, {**(values or {}), **fields}, "", itertools.count())
 
 
 def to_plain(message: Message) -> dict[str, Any]:
@@ -114,8 +116,10 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _struct(name: str, values: Any, path: str) -> Message:
+def _struct(name: str, values: Any, path: str, built: Iterator[int]) -> Message:
     store = typestore()
+    if next(built) >= _MOST_MESSAGES:
+        raise _wrong(path, f"is one part too many: {_MOST_MESSAGES} make a message", "send less at once")
     if isinstance(values, store.types[name]):
         return values
     if not isinstance(values, Mapping):
@@ -127,14 +131,16 @@ def _struct(name: str, values: Any, path: str) -> Message:
     unknown = sorted(str(key) for key in renamed.keys() - fields.keys())
     if unknown:
         raise _wrong(path, f"{name} has no field {unknown[0]!r}", f"its fields are {', '.join(fields)}")
-    made = {key: _value(kind, renamed.get(key), f"{path}.{key}" if path else key) for key, kind in fields.items()}
+    made = {
+        key: _value(kind, renamed.get(key), f"{path}.{key}" if path else key, built) for key, kind in fields.items()
+    }
     return store.types[name](**made)
 
 
-def _value(kind: Any, value: Any, path: str) -> Any:
+def _value(kind: Any, value: Any, path: str, built: Iterator[int]) -> Any:
     node, what = kind
     if node is Nodetype.NAME:
-        return _struct(what, {} if value is None else value, path)
+        return _struct(what, {} if value is None else value, path, built)
     if node is Nodetype.BASE:
         return _base(what[0], value, path)
     (inner, inner_what), count = what
@@ -147,7 +153,7 @@ def _value(kind: Any, value: Any, path: str) -> Any:
         raise _wrong(path, f"is {_short(value)}", "give a list")
     if node is Nodetype.ARRAY and len(entries) != count:
         raise _wrong(path, f"has {len(entries)} entries", f"give {count}")
-    return [_value((inner, inner_what), entry, f"{path}[{i}]") for i, entry in enumerate(entries)]
+    return [_value((inner, inner_what), entry, f"{path}[{i}]", built) for i, entry in enumerate(entries)]
 
 
 def _base(kind: str, value: Any, path: str) -> Any:

@@ -13,9 +13,10 @@ from typing import Any, cast
 
 from splatbot.errors import InputError, SplatbotError
 from splatbot.logs.ros_types import build, full_name
+from splatbot.services.bounds import INLINE_BYTES
 from splatbot.services.keys import Scope
 from splatbot.services.ros.graph import Handler, RosGraph, Service, resolve
-from splatbot.services.ros.requests import json_object
+from splatbot.services.ros.requests import read_json_object
 from splatbot.services.ros.rosbridge.packing import (
     Fragments,
     check_compression,
@@ -63,6 +64,7 @@ class RosbridgeSession:
         self._calls: set[asyncio.Task[None]] = set()
         self._answers: dict[str, asyncio.Future[dict[str, Any]]] = {}
         self._level = _LEVELS.index("error")
+        self._long = False  # the message in work is not one for the event loop
         self._operations: dict[str, Callable[[dict[str, Any]], Awaitable[None] | None]] = {
             "advertise": self._advertise,
             "unadvertise": self._unadvertise,
@@ -84,7 +86,8 @@ class RosbridgeSession:
         """Handle a client's message; a wrong message never raises."""
         operation: dict[str, Any] = {}
         try:
-            operation = json_object(text, self._most_bytes)
+            operation = await read_json_object(text, self._most_bytes)
+            self._long = len(text) > INLINE_BYTES
             operate = self._operation(operation.get("op"))
             self._check_scope(operation)
             done = operate(operation)
@@ -155,7 +158,7 @@ class RosbridgeSession:
     def _unadvertise(self, operation: dict[str, Any]) -> None:
         self._advertised.pop(resolve(operation.get("topic")), None)
 
-    def _publish(self, operation: dict[str, Any]) -> None:
+    async def _publish(self, operation: dict[str, Any]) -> None:
         topic = resolve(operation.get("topic"))
         kind = self._advertised.get(topic) or self._graph.topics.get(topic)
         if kind is None:
@@ -163,7 +166,7 @@ class RosbridgeSession:
         values = operation.get("msg", {})
         if not isinstance(values, Mapping):
             raise InputError("is no object.", field="msg", hint=f"give the fields of {kind}")
-        message = build(kind, values)
+        message = await asyncio.to_thread(build, kind, values) if self._long else build(kind, values)
         self._graph.publish(topic, message, latched=bool(operation.get("latch")), client=self.number)
 
     async def _fragment(self, operation: dict[str, Any]) -> None:
