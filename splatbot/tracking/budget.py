@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class CostModelParameters:
+class CostModelConstants:
     """Empirical constants of the cost model."""
 
     history: int = 40
@@ -25,7 +25,7 @@ class CostModelParameters:
     """The quantile [1] for a lost camera. Being late costs it little, and two slow runs would keep it lost."""
 
 
-PARAMETERS = CostModelParameters()
+CONSTANTS = CostModelConstants()
 
 # Milliseconds of each kind of work on one idle Zen 4 core: fixed, and per unit. Deterministic mode uses this table
 # alone. With the clock, the table only relates runs of different sizes.
@@ -71,15 +71,15 @@ class CostModel:
         """Record the duration [ms] of a run."""
         recent = self._runs.setdefault(kind, [])
         recent.append((self._frame, ms / table_ms(kind, units)))
-        del recent[: -PARAMETERS.history]
+        del recent[: -CONSTANTS.history]
 
-    def expected_ms(self, kind: str, units: float, quantile: float = PARAMETERS.deadline_quantile) -> float:
+    def expected_ms(self, kind: str, units: float, quantile: float = CONSTANTS.deadline_quantile) -> float:
         """Return the quantile of the durations [ms] that recent runs would have with this number of units."""
-        oldest = self._frame - PARAMETERS.max_age
+        oldest = self._frame - CONSTANTS.max_age
         ratios = sorted(ratio for frame, ratio in self._runs.get(kind, ()) if frame > oldest)
         n = len(ratios)
         if n < 2:
-            return table_ms(kind, units) * min([PARAMETERS.unknown_factor, *ratios])
+            return table_ms(kind, units) * min([CONSTANTS.unknown_factor, *ratios])
         return table_ms(kind, units) * ratios[min(math.ceil(quantile * n), n - 1) - 1]
 
 
@@ -99,7 +99,7 @@ class Budget:
     """
 
     def __init__(
-        self, limit_ms: float, costs: CostModel | None, started: float, quantile: float = PARAMETERS.deadline_quantile
+        self, limit_ms: float, costs: CostModel | None, started: float, quantile: float = CONSTANTS.deadline_quantile
     ) -> None:
         self.limit_ms = limit_ms
         self.ms: dict[str, float] = {}
@@ -111,7 +111,7 @@ class Budget:
         if costs is not None:
             costs.begin_frame()
         self._rest_ms = (
-            table_ms("overhead", 1) if costs is None else costs.expected_ms("overhead", 1, PARAMETERS.lost_quantile)
+            table_ms("overhead", 1) if costs is None else costs.expected_ms("overhead", 1, CONSTANTS.lost_quantile)
         )
 
     @property

@@ -19,7 +19,7 @@ Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class FeatureParameters:
+class FeatureConstants:
     """Empirical constants of detection, matching and PnP."""
 
     min_inliers: int = 20
@@ -51,7 +51,7 @@ class FeatureParameters:
     """Probability [1] that RANSAC finds a sample without outliers."""
 
 
-PARAMETERS = FeatureParameters()
+CONSTANTS = FeatureConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ def detect(
         n_features: largest number of keypoints.
         mask: (H, W), False for pixels to ignore. If None, all pixels are used.
     """
-    p = PARAMETERS
+    p = CONSTANTS
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     usable = None
     if mask is not None:
@@ -142,7 +142,7 @@ def detect(
 
 def _pixels(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the pixels (N, 2) of keypoints and the scales (N,) of their levels."""
-    scales = np.float32(PARAMETERS.scale_factor) ** np.array([k.octave for k in keypoints], dtype=np.float32)
+    scales = np.float32(CONSTANTS.scale_factor) ** np.array([k.octave for k in keypoints], dtype=np.float32)
     # OpenCV scales the coordinates of a level about the centre of the corner pixel, but the level about its corner.
     corners = np.array(cv2.KeyPoint.convert(keypoints), dtype=np.float32).reshape(-1, 2)
     return corners + 0.5 * (scales[:, None] - 1), scales
@@ -159,7 +159,7 @@ def spread(
 
     The strongest keypoints often lie on one textured object. There, a rotation and a translation of the camera cause
     similar motions of pixels, and so does a rolling shutter. Their small common errors become centimetres of the pose.
-    So a tile has at most ``PARAMETERS.crowding`` times its share while other tiles have keypoints left.
+    So a tile has at most ``CONSTANTS.crowding`` times its share while other tiles have keypoints left.
 
     Args:
         pixels: (N, 2).
@@ -168,7 +168,7 @@ def spread(
         width: width of the image [px].
         count: largest number of keypoints.
     """
-    p = PARAMETERS
+    p = CONSTANTS
     across, down = (pixels * (p.tiles / width)).astype(np.intp).T
     tile = down * (p.tiles + 1) + across
     crowd = max(1, int(p.crowding * count / max(len(np.unique(tile)), 1)))
@@ -215,19 +215,19 @@ def match_pose(
         of the search or in one corner of the image. Such inliers indicate a wrong expectation.
     """
     image, world, sigmas = _matches(current, keyframes, camera, expected)
-    if len(image) < PARAMETERS.min_inliers:
+    if len(image) < CONSTANTS.min_inliers:
         return None
     found, r, t, inliers = cv2.solvePnPRansac(
         world,
         image,
         camera.K,
         None,
-        iterationsCount=PARAMETERS.ransac_iterations,
-        reprojectionError=PARAMETERS.max_reprojection,
-        confidence=PARAMETERS.ransac_confidence,
+        iterationsCount=CONSTANTS.ransac_iterations,
+        reprojectionError=CONSTANTS.max_reprojection,
+        confidence=CONSTANTS.ransac_confidence,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not found or inliers is None or len(inliers) < PARAMETERS.min_inliers:
+    if not found or inliers is None or len(inliers) < CONSTANTS.min_inliers:
         return None
     agree = inliers[:, 0]
     r, t = cv2.solvePnPRefineLM(world[agree], image[agree], camera.K, None, r, t)
@@ -267,14 +267,14 @@ def _confirms(found: FeaturePose, camera: Camera, expected: Expectation) -> bool
     shift = camera.project(transform_points(inverse(expected.T_world_camera), found.points)) - found.pixels
     inside = np.percentile(np.linalg.norm(shift, axis=1), 80) < 0.5 * expected.radius
     narrowest = np.sqrt(max(np.linalg.eigvalsh(np.cov(found.pixels.T))[0], 0.0))
-    return bool(inside and narrowest > PARAMETERS.min_spread * camera.width)
+    return bool(inside and narrowest > CONSTANTS.min_spread * camera.width)
 
 
 def _match(
     current: Features, descriptors: NDArray[np.uint8], expected: NDArray[np.float32], radius: float
 ) -> tuple[Index, Index]:
     """Match descriptors (M, 32) expected at pixels (M, 2), and return indices of keypoints and of descriptors."""
-    p = PARAMETERS
+    p = CONSTANTS
     found = _native.match_near(
         expected, descriptors, current.pixels, current.descriptors, radius, p.max_hamming, p.max_ratio
     )

@@ -19,7 +19,7 @@ Cloud = tuple[small_gicp.PointCloud, small_gicp.KdTree]
 
 
 @dataclass(frozen=True)
-class GicpParameters:
+class GicpConstants:
     """Empirical constants of the registration."""
 
     neighbors: int = 10
@@ -32,7 +32,7 @@ class GicpParameters:
     """Share of points [1] with a correspondence below which the clouds do not overlap."""
 
 
-PARAMETERS = GicpParameters()
+CONSTANTS = GicpConstants()
 
 
 class GicpRegistration:
@@ -63,7 +63,7 @@ class GicpRegistration:
             return None
         T_world_keyframe = keyframe.reference.T_world_camera
         T = inverse(T_world_keyframe) @ T_world_camera
-        for max_distance in PARAMETERS.max_distances:
+        for max_distance in CONSTANTS.max_distances:
             found = small_gicp.align(
                 target[0],
                 source[0],
@@ -72,10 +72,10 @@ class GicpRegistration:
                 registration_type="GICP",
                 max_correspondence_distance=max_distance,
                 num_threads=1,
-                max_iterations=PARAMETERS.max_iterations,
+                max_iterations=CONSTANTS.max_iterations,
             )
             T = np.asarray(found.T_target_source, dtype=np.float64)
-        overlaps = found.num_inliers >= PARAMETERS.min_inliers * source[0].size()
+        overlaps = found.num_inliers >= CONSTANTS.min_inliers * source[0].size()
         return T_world_keyframe @ T if overlaps and np.isfinite(T).all() else None
 
     def _keyframe_cloud(self, keyframe: TrackedKeyframe) -> Cloud | None:
@@ -101,9 +101,9 @@ def cloud_of(points: Array) -> Cloud | None:
 
     Return None if there are too few points for a covariance.
     """
-    if len(points) <= PARAMETERS.neighbors:
+    if len(points) <= CONSTANTS.neighbors:
         return None
     cloud = small_gicp.PointCloud(points)
     tree = small_gicp.KdTree(cloud, num_threads=1)
-    small_gicp.estimate_covariances(cloud, tree, num_neighbors=PARAMETERS.neighbors, num_threads=1)
+    small_gicp.estimate_covariances(cloud, tree, num_neighbors=CONSTANTS.neighbors, num_threads=1)
     return cloud, tree

@@ -21,7 +21,7 @@ Verdict = Literal["ok", "degraded", "lost"]
 
 
 @dataclass(frozen=True)
-class HealthParameters:
+class HealthConstants:
     """Empirical thresholds of the verdict."""
 
     saturation: float = 6.0
@@ -41,7 +41,7 @@ class HealthParameters:
     """Share [1] of inliers of each kind from which no other pose is searched for."""
 
 
-PARAMETERS = HealthParameters()
+CONSTANTS = HealthConstants()
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Health:
 def is_explained(health: Health) -> bool:
     """Return True if a pose explains the frame, so that no other pose is searched for."""
     inliers = min(health.photometric_inliers, health.edge_inliers, health.geometric_inliers)
-    return inliers >= PARAMETERS.explained
+    return inliers >= CONSTANTS.explained
 
 
 def measure(
@@ -97,19 +97,19 @@ def measure(
         here.append(found.photometric[seen] * config.sensor.sigma_gray + found.gain * there[-1] + found.offset)
     r_photo, r_depth = np.concatenate(photo), np.concatenate(depth)
     seen, ranged = np.isfinite(r_photo), np.isfinite(r_depth)
-    agree, steep = r_photo[seen] < PARAMETERS.inlier, np.concatenate(slope)[seen].astype(np.float64)
+    agree, steep = r_photo[seen] < CONSTANTS.inlier, np.concatenate(slope)[seen].astype(np.float64)
     return Health(
         overlap=float(seen.mean()) if len(seen) else 0.0,
         photometric_inliers=float(agree.mean()) if len(agree) else 0.0,
         edge_inliers=float(steep @ agree / steep.sum()) if steep.sum() > 0 else 1.0,
-        geometric_inliers=float((r_depth[ranged] < PARAMETERS.inlier).mean()) if ranged.any() else 1.0,
-        score=float(np.mean([_saturated(r_photo), _saturated(r_depth)])) if len(seen) else PARAMETERS.saturation,
+        geometric_inliers=float((r_depth[ranged] < CONSTANTS.inlier).mean()) if ranged.any() else 1.0,
+        score=float(np.mean([_saturated(r_photo), _saturated(r_depth)])) if len(seen) else CONSTANTS.saturation,
         contrast=_contrast(np.concatenate(here), np.concatenate(there)),
     )
 
 
 def _saturated(residuals: NDArray[np.floating[Any]]) -> float:
-    return float(np.fmin(residuals, PARAMETERS.saturation).mean())  # fmin replaces NaN by the saturation
+    return float(np.fmin(residuals, CONSTANTS.saturation).mean())  # fmin replaces NaN by the saturation
 
 
 def _contrast(gray: Array, reference_gray: Array) -> float:
@@ -136,11 +136,11 @@ def verdict_of(
     inliers = float(np.min([health.photometric_inliers, health.geometric_inliers]))
     if not inliers >= config.min_inliers:
         lost.append(f"only {inliers:.0%} of the residuals are inliers")
-    if not health.contrast >= PARAMETERS.min_contrast:
+    if not health.contrast >= CONSTANTS.min_contrast:
         lost.append(f"the image is blank: {health.contrast:.0%} of the reference's contrast")
-    if not health.photometric_inliers >= PARAMETERS.min_photometric:
+    if not health.photometric_inliers >= CONSTANTS.min_photometric:
         doubts.append(f"only {health.photometric_inliers:.0%} of the colours agree")
-    elif not health.edge_inliers >= PARAMETERS.min_edge:
+    elif not health.edge_inliers >= CONSTANTS.min_edge:
         doubts.append(f"only {health.edge_inliers:.0%} of the colours agree where there are edges")
     if not np.isfinite(information).all():
         lost.append("the alignment is not finite")

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class MotionModelParameters:
+class MotionModelConstants:
     """Empirical constants of the constant-velocity model.
 
     The standard deviation of the predicted translation is ``rest + |predicted motion| / 2 + acceleration dt² / 2``,
@@ -31,7 +31,7 @@ class MotionModelParameters:
     """Gap between frames, in previous intervals [1], after which the velocity is no longer used."""
 
 
-PARAMETERS = MotionModelParameters()
+CONSTANTS = MotionModelConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Prediction:
 class ConstantVelocity:
     """Constant-velocity motion model: the last twist continues, in proportion to the time that has passed.
 
-    A lost frame, or a gap of more than ``PARAMETERS.max_gap`` times the last interval, resets the velocity to zero.
+    A lost frame, or a gap of more than ``CONSTANTS.max_gap`` times the last interval, resets the velocity to zero.
     """
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class ConstantVelocity:
         """Predict the pose at a time [s] with its covariance; ``last_covariance`` (6, 6) is that of the last pose."""
         motion = self._motion(stamp)
         dt = max(stamp - self._last[0], 0.0) if self._last is not None else 0.0
-        p = PARAMETERS
+        p = CONSTANTS
         shift = p.rest + 0.5 * float(np.linalg.norm(motion[:3])) + 0.5 * p.acceleration * dt**2
         turn = min(p.rest + 0.5 * float(np.linalg.norm(motion[3:])) + 0.5 * p.angular_acceleration * dt**2, np.pi)
         process_noise = np.diag([shift**2] * 3 + [turn**2] * 3)
@@ -115,7 +115,7 @@ class ConstantVelocity:
         if self._last is None or self._interval <= 0:
             return np.zeros(6)
         ratio = (stamp - self._last[0]) / self._interval
-        return ratio * self._twist if 0 < ratio <= PARAMETERS.max_gap else np.zeros(6)
+        return ratio * self._twist if 0 < ratio <= CONSTANTS.max_gap else np.zeros(6)
 
 
 def _transported(covariance: Array, motion: Array) -> Array:

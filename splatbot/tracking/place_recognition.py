@@ -14,7 +14,7 @@ from splatbot.tracking.features import Features
 
 
 @dataclass(frozen=True)
-class PlaceRecognitionParameters:
+class PlaceRecognitionConstants:
     """Empirical constants of the comparison. It is stricter than feature matching, which geometry verifies."""
 
     max_descriptors: int = 400
@@ -25,7 +25,7 @@ class PlaceRecognitionParameters:
     """Largest ratio [1] of the best to the second best distance (Lowe 2004). A larger one adds ambiguous matches."""
 
 
-PARAMETERS = PlaceRecognitionParameters()
+CONSTANTS = PlaceRecognitionConstants()
 
 
 class HasFeatures(Protocol):
@@ -54,8 +54,8 @@ def likeliest(features: Features, keyframes: Sequence[HasFeatures], count: int) 
 
 def _subset(features: Features) -> NDArray[np.uint8]:
     """Select descriptors (<= 400, 32) at equal steps, because they are sorted by their scales."""
-    step = max(1, len(features) // PARAMETERS.max_descriptors)
-    return np.ascontiguousarray(features.descriptors[::step][: PARAMETERS.max_descriptors])
+    step = max(1, len(features) // CONSTANTS.max_descriptors)
+    return np.ascontiguousarray(features.descriptors[::step][: CONSTANTS.max_descriptors])
 
 
 def _count(queries: NDArray[np.uint8], train: NDArray[np.uint8]) -> int:
@@ -63,6 +63,6 @@ def _count(queries: NDArray[np.uint8], train: NDArray[np.uint8]) -> int:
         return 0
     origins = np.zeros((len(queries), 2), np.float32), np.zeros((len(train), 2), np.float32)
     found = _native.match_near(
-        origins[0], queries, origins[1], train, np.inf, PARAMETERS.max_hamming, PARAMETERS.max_ratio
+        origins[0], queries, origins[1], train, np.inf, CONSTANTS.max_hamming, CONSTANTS.max_ratio
     )
     return int((np.asarray(found) >= 0).sum())

@@ -19,7 +19,7 @@ Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class PrepareParameters:
+class PrepareConstants:
     """Empirical constants of the preparation."""
 
     flying_step: float = 0.03
@@ -35,7 +35,7 @@ class PrepareParameters:
     """σ [px] of the Gaussian that removes the noise of grey. A larger value blurs edges."""
 
 
-PARAMETERS = PrepareParameters()
+CONSTANTS = PrepareConstants()
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     while level.camera.width > config.max_width:
         level = halve(level)
     levels = [Level(smoothed(level.gray), level.depth, level.camera)]
-    while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * PARAMETERS.min_side:
+    while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * CONSTANTS.min_side:
         levels.append(halve(levels[-1]))
     levels[0] = Level(gray_of_one_surface(levels[0], config), levels[0].depth, levels[0].camera)
     return PreparedFrame(frame, depth, tuple(levels), started)
@@ -98,14 +98,14 @@ def gray_of_one_surface(level: Level, config: TrackingConfig) -> Image:
     These pixels are a few percent of the image. Their errors do not average out, and would bias the pose with the
     parallax.
     """
-    p, sensor = PARAMETERS, config.sensor
+    p, sensor = CONSTANTS, config.sensor
     floor, quad = p.jump_sigmas * sensor.sigma_depth_floor, p.jump_sigmas * sensor.sigma_depth_quad
     return np.asarray(_native.gray_of_one_surface(level.depth, level.gray, p.jump_step, floor, quad))
 
 
 def smoothed(gray: Image) -> Image:
     """Smooth grey (H, W) for alignment by a Gaussian."""
-    return np.asarray(cv2.GaussianBlur(gray, (0, 0), PARAMETERS.smoothing), dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), CONSTANTS.smoothing), dtype=np.float32)
 
 
 def valid_depth(depth: Image, near: float, far: float) -> Image:
@@ -114,7 +114,7 @@ def valid_depth(depth: Image, near: float, far: float) -> Image:
     A flying pixel is nearer than one neighbour and farther than the opposite one by more than 3 % of its range. A
     single missing row of neighbours, which registration leaves in upsampled depth, does not invalidate a pixel.
     """
-    return np.asarray(_native.valid_depth(np.ascontiguousarray(depth), near, far, PARAMETERS.flying_step))
+    return np.asarray(_native.valid_depth(np.ascontiguousarray(depth), near, far, CONSTANTS.flying_step))
 
 
 def usable_depth(frame: Frame, config: TrackingConfig) -> Image:

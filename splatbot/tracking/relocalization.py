@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RelocalizationParameters:
+class RelocalizationConstants:
     """Empirical constants of the confirmation. Stricter values cause fewer wrong poses and more lost frames."""
 
     min_inliers: float = 0.45
@@ -29,7 +29,7 @@ class RelocalizationParameters:
     """Largest angular speed [rad/s] of the camera between the two frames."""
 
 
-PARAMETERS = RelocalizationParameters()
+CONSTANTS = RelocalizationConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class RelocalizationCandidate:
     def agrees(self, stamp: float, T_world_camera: Array) -> bool:
         """Return True if a camera can move from this pose to another (4, 4) in the time between them."""
         moved, turned = pose_distance(self.T_world_camera, T_world_camera)
-        dt, p = abs(stamp - self.stamp), PARAMETERS
+        dt, p = abs(stamp - self.stamp), CONSTANTS
         return moved <= p.position_slack + p.max_speed * dt and turned <= p.rotation_slack + p.max_angular_speed * dt
 
 
@@ -72,4 +72,4 @@ def is_confident(pose: ScoredHypothesis) -> bool:
     """Return True if enough residuals of a pose are inliers to relocalize at it."""
     health = pose.health
     inliers = min(health.photometric_inliers, health.geometric_inliers)
-    return pose.verdict != "lost" and inliers >= PARAMETERS.min_inliers
+    return pose.verdict != "lost" and inliers >= CONSTANTS.min_inliers

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from splatbot.tracking.budget import PARAMETERS as COSTS
+from splatbot.tracking.budget import CONSTANTS as COSTS
 from splatbot.tracking.budget import Budget, CostModel
 from splatbot.tracking.health import verdict_of
 from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis, measure_hypothesis, select_best

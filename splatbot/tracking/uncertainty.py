@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class UncertaintyParameters:
+class UncertaintyConstants:
     """Empirical constants of the covariance. Larger values increase it; docs/experiments/tracking.md has the NEES."""
 
     min_information: float = 1e-3
@@ -30,7 +30,7 @@ class UncertaintyParameters:
     path and does not average out."""
 
 
-PARAMETERS = UncertaintyParameters()
+CONSTANTS = UncertaintyConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class Uncertainty:
     @property
     def covariance(self) -> Array:
         """Covariance (6, 6) of the same twist with the error of calibration."""
-        shift = (PARAMETERS.calibration * self.moved) ** 2 / 3
-        turn = (PARAMETERS.calibration * self.turned) ** 2 / 3
+        shift = (CONSTANTS.calibration * self.moved) ** 2 / 3
+        turn = (CONSTANTS.calibration * self.turned) ** 2 / 3
         return self.random + np.diag([shift] * 3 + [turn] * 3)
 
 
@@ -66,13 +66,13 @@ def alignment_covariance(alignment: Alignment) -> Array:
         S = Σ_k g_k g_kᵀ
         Σ = (6/n)² H⁻¹ + f n/(n - 6) C⁻¹ S C⁻¹ + Σ_shift
 
-    The factor n/(n - 6) corrects for few clusters, and f is ``PARAMETERS.cell_correlation``. H⁻¹ replaces the estimate
+    The factor n/(n - 6) corrects for few clusters, and f is ``CONSTANTS.cell_correlation``. H⁻¹ replaces the estimate
     if the cells are too few for it. Σ_shift is a shift of the whole image, expressed as a rotation about each axis. The
     covariance is large but finite in directions without information. It is NaN if H is not finite.
     """
     if not np.isfinite(alignment.information).all():
         return np.full((6, 6), np.nan)
-    p, cells = PARAMETERS, alignment.cells
+    p, cells = CONSTANTS, alignment.cells
     few_clusters = p.cell_correlation * cells / max(cells - 6, 1)
     model_share = min(1.0, (6 / max(cells, 1)) ** 2)
     model = np.linalg.inv(alignment.information + p.min_information * np.eye(6))

@@ -12,7 +12,7 @@ from splatbot.config import Config, TrackingConfig, load_config
 from splatbot.logs import open_log
 from splatbot.mapping.mapper import Mapper
 from splatbot.slam import Slam
-from splatbot.tracking.budget import PARAMETERS as COSTS
+from splatbot.tracking.budget import CONSTANTS as COSTS
 from splatbot.tracking.budget import Budget, CostModel, table_ms
 from tests.unit.tracking.test_tracker import Run
 

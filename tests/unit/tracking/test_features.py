@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatbot import _native
 from splatbot.geometry import inverse, se3_exp, transform_points
-from splatbot.tracking.features import PARAMETERS, Expectation, FeaturePose, Features, detect, match_pose, spread
+from splatbot.tracking.features import CONSTANTS, Expectation, FeaturePose, Features, detect, match_pose, spread
 from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import CAMERA, Array, tabletop
 
@@ -41,7 +41,7 @@ def test_the_pose_between_two_rendered_views_is_found(last: int) -> None:
     moved, turned = pose_distance(truth, found.T_world_camera)
     assert moved < 8e-3
     assert turned < np.radians(0.6)
-    assert len(found.points) == len(found.pixels) >= PARAMETERS.min_inliers
+    assert len(found.points) == len(found.pixels) >= CONSTANTS.min_inliers
     assert found.matches >= len(found.points)
 
 
@@ -82,7 +82,7 @@ def test_there_is_no_pose_from_an_unrelated_image_from_few_matches_or_without_ke
     camera = tabletop(width=WIDTH)[0][0].camera
     blank = detect(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32), CAMERA, 500)
     assert len(blank) == 0
-    few = Features(*(getattr(view(5)[0], field.name)[: PARAMETERS.min_inliers - 1] for field in fields(Features)))
+    few = Features(*(getattr(view(5)[0], field.name)[: CONSTANTS.min_inliers - 1] for field in fields(Features)))
     other = detect(noise_image(0), np.ones((120, 160), np.float32), CAMERA, 500)
     assert len(other) > 100
     for current in (blank, few, other):
