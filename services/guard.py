@@ -52,7 +52,7 @@ class Guard:
             return
         grant = self._access.grant(key, str((scope.get("client") or ("local",))[0]))
         if grant is None:
-            hint = "send Authorization: Bearer KEY"
+            hint = self._access.key_hint
             await _refuse(scope, receive, send, 401, "A valid API key is needed.", hint, {"WWW-Authenticate": "Bearer"})
             return
         scope.setdefault("state", {}).update(client=grant.client, scopes=grant.scopes, has_key=bool(key))

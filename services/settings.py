@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -18,6 +19,11 @@ from pydantic_settings import (
 
 from splatbot.errors import ConfigError
 from splatbot.services.keys import check_hash
+
+_NAMES = {
+    "allowed_hosts": (r"[\w.-]+|[0-9A-Fa-f:]+", "give names without scheme and port, e.g. robot.lan"),
+    "cors_origins": (r"\*|null|[a-z][\w+.-]*://[^/?#\s]*", "give scheme://host or scheme://host:port, without a path"),
+}
 
 Words = Annotated[tuple[str, ...], NoDecode]
 """Several words: a list in YAML, with commas between them in the environment."""
@@ -75,6 +81,15 @@ class ServiceSettings(BaseSettings):
     def _hashed(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for key in value:
             check_hash(key)
+        return value
+
+    @field_validator("allowed_hosts", "cors_origins")
+    @classmethod
+    def _named(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        form, hint = _NAMES[str(info.field_name)]
+        for word in value:
+            if not re.fullmatch(form, word):
+                raise ValueError(f"{word[:80]!r} never matches; {hint}")
         return value
 
     @property
