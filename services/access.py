@@ -57,6 +57,14 @@ class Access:
         """True if every client that can connect has all scopes."""
         return self._settings.insecure_no_auth
 
+    @property
+    def key_hint(self) -> str:
+        """Advice to a client without a valid key."""
+        hint = "send Authorization: Bearer KEY"
+        return hint + (
+            ", with the KEY that the service names at its start; or none, to read" if self._reading_is_open else ""
+        )
+
     def holds_key(self, key: str) -> bool:
         """Return whether a key is known."""
         return known_key(key, self._entries) is not None

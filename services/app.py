@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from anyio.to_thread import current_default_thread_limiter
 from fastapi import Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
@@ -17,6 +18,7 @@ from splatbot.services.guard import Guard
 from splatbot.services.integrations import Integrations
 from splatbot.services.limits import BodyLimit
 from splatbot.services.problems import install_problem_handlers
+from splatbot.services.queues import THREADS, Queues
 from splatbot.services.requests import HEADER, RequestLog
 from splatbot.services.routes import (
     arms,
@@ -55,6 +57,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         lower_priority(settings.niceness)  # this thread starts all those that answer
         switch_quickly()
+        current_default_thread_limiter().total_tokens = THREADS
         await run_in_threadpool(integrations.start)
         await run_in_threadpool(runtime.start)
         yield
@@ -72,6 +75,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     app.state.ros = integrations.ros
     # The last one added is the first to see a request.
     uploads = {"/upload": settings.max_upload_bytes}
+    app.add_middleware(Queues, most_waiting=settings.max_waiting, body_s=settings.body_s)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, larger=uploads)
     app.add_middleware(Guard, settings=settings, access=access)
     if settings.cors_origins:

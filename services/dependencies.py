@@ -7,6 +7,7 @@ import secrets
 from typing import Annotated, Any
 
 from fastapi import Depends, Header, Path, Request, Response
+from starlette.concurrency import run_in_threadpool
 
 from splatbot.services.problems import MEDIA_TYPE
 from splatbot.services.runtime import Runtime
@@ -17,20 +18,21 @@ from splatbot.services.store import MapStore, ServedMap
 _PROCESS = secrets.token_hex(4)
 
 
-def _runtime(request: Request) -> Runtime:
+# Dependencies are coroutines: FastAPI runs functions in the threads of the work, behind which a request would wait.
+async def _runtime(request: Request) -> Runtime:
     runtime: Runtime = request.app.state.runtime
     return runtime
 
 
-def _store(request: Request) -> MapStore:
-    return _runtime(request).store
+async def _store(request: Request) -> MapStore:
+    return (await _runtime(request)).store
 
 
-def _settings(request: Request) -> ServiceSettings:
-    return _runtime(request).settings
+async def _settings(request: Request) -> ServiceSettings:
+    return (await _runtime(request)).settings
 
 
-def _served_map(
+async def _served_map(
     request: Request,
     store: Annotated[MapStore, Depends(_store)],
     map_id: Annotated[str, Path(description="as GET /v1/maps lists it", examples=["default"])],
@@ -40,13 +42,13 @@ def _served_map(
     return served
 
 
-def _map_after_frames(
+async def _map_after_frames(
     request: Request,
     store: Annotated[MapStore, Depends(_store)],
     map_id: Annotated[str, Path(description="as GET /v1/maps lists it", examples=["default"])],
 ) -> ServedMap:
-    store.frames_first.wait()
-    return _served_map(request, store, map_id)
+    await run_in_threadpool(store.frames_first.wait)
+    return await _served_map(request, store, map_id)
 
 
 Service = Annotated[Runtime, Depends(_runtime)]
@@ -98,7 +100,7 @@ def unchanged(request: Request, served: ServedMap, tag: str) -> Response | None:
     return None
 
 
-def idempotency_key(
+async def idempotency_key(
     key: Annotated[
         str | None,
         Header(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Mapping
 from types import MappingProxyType
 from urllib.parse import parse_qsl, urlencode
@@ -14,6 +14,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from splatbot.services.access import Access
 from splatbot.services.codecs import JSON, MSGPACK, NPY, ZIP
 from splatbot.services.problems import problem
+from splatbot.services.queues import URGENT, lasts
 from splatbot.services.settings import ServiceSettings
 
 OPEN = frozenset({"/healthz", "/readyz"})  # for probes: they reveal only versions, and must answer under load
@@ -35,7 +36,7 @@ class Guard:
         self.app = app
         self._settings, self._access = settings, access
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        self._running = {"requests": 0, "streams": 0}
+        self._open: Counter[tuple[str, str]] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request or WebSocket."""
@@ -52,26 +53,39 @@ class Guard:
             return
         grant = self._access.grant(key, str((scope.get("client") or ("local",))[0]))
         if grant is None:
-            hint = "send Authorization: Bearer KEY"
+            hint = self._access.key_hint
             await _refuse(scope, receive, send, 401, "A valid API key is needed.", hint, {"WWW-Authenticate": "Bearer"})
             return
         scope.setdefault("state", {}).update(client=grant.client, scopes=grant.scopes, has_key=bool(key))
+        if scope["path"] in URGENT:
+            await self.app(scope, receive, send)
+            return
         wait = self._wait(grant.client)
         if wait > 0:
             detail = f"More than {self._settings.requests_per_s:g} requests a second."
             header = {"Retry-After": str(int(wait) + 1)}
             await _refuse(scope, receive, send, 429, detail, "ask less often, or for more at once", header)
             return
-        lasts = scope["type"] == "websocket" or scope["path"].endswith("/events")
-        kind, most = ("streams", self._settings.max_streams) if lasts else ("requests", self._settings.max_requests)
-        if self._running[kind] >= most:
-            await _refuse(scope, receive, send, 503, f"{most} {kind} are open.", "try again", {"Retry-After": "1"})
-            return
-        self._running[kind] += 1
+        await self._count(grant.client, scope, receive, send)
+
+    async def _count(self, client: str, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request or WebSocket unless too many are open."""
+        bounds = {("requests", ""): self._settings.max_requests}
+        if lasts(scope):
+            bounds = {
+                ("streams", ""): self._settings.max_streams,
+                ("streams", client): self._settings.max_client_streams,
+            }
+        for counted, most in bounds.items():
+            if self._open[counted] >= most:
+                detail = f"{most} {counted[0]} {'of this client ' if counted[1] else ''}are open."
+                await _refuse(scope, receive, send, 503, detail, "try again", {"Retry-After": "1"})
+                return
+        self._open.update(bounds.keys())
         try:
             await self.app(scope, receive, send)
         finally:
-            self._running[kind] -= 1
+            self._open -= Counter(bounds.keys())
 
     def _foreign(self, scope: Scope) -> tuple[int, str, str] | None:
         """Return status, detail and hint for a request that is malformed or of another site, else None."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections import Counter as Count
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
@@ -47,6 +49,7 @@ class Metrics:
         self._store = store
         r.register(_Present(store, jobs, library))
         self._results = store.bus.subscribe(map_topic("*", RESULT), capacity=_WAITING, latched=False)
+        self._writer = ThreadPoolExecutor(1, "metrics-text")  # its own: metrics do not wait behind work
         self._thread = threading.Thread(target=self._count_frames, name="metrics", daemon=True)
         self._thread.start()
 
@@ -59,8 +62,13 @@ class Metrics:
         self._forget_deleted()
         return generate_latest(self.registry)
 
+    async def text_soon(self) -> bytes:
+        """Return :meth:`text`, which a thread of its own makes."""
+        return await asyncio.get_running_loop().run_in_executor(self._writer, self.text)
+
     def close(self) -> None:
         """Count no more."""
+        self._writer.shutdown(wait=False)
         self._results.close()
         self._thread.join(5)
 

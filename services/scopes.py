@@ -51,7 +51,7 @@ def needed(method: str, path: str) -> Scope:
     return NEEDS.get((method, path), "read" if method in ("GET", "HEAD") else "admin")
 
 
-def check_scope(connection: HTTPConnection) -> None:
+async def check_scope(connection: HTTPConnection) -> None:
     """Check that the client has the scope of the route; a dependency of every route.
 
     Raises:

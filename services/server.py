@@ -6,6 +6,7 @@ import logging
 import signal
 import socket
 from collections.abc import Callable
+from functools import partial
 from types import FrameType
 
 import uvicorn
@@ -13,20 +14,47 @@ from fastapi import FastAPI
 
 from splatbot.errors import InputError
 from splatbot.services.app import create_app
+from splatbot.services.connections import Connections, HttpProtocol, Listener, raise_file_limit
 from splatbot.services.runtime import Runtime, check_exposure
 from splatbot.services.settings import ServiceSettings
 
 _log = logging.getLogger(__name__)
 
 
-class _Server(uvicorn.Server):
-    """Notifies the runtime of the end, so that event streams end before uvicorn waits for them."""
+class Server(uvicorn.Server):
+    """uvicorn's server, which bounds its connections and notifies the runtime of the end.
 
-    def __init__(self, config: uvicorn.Config, runtime: Runtime) -> None:
-        super().__init__(config)
+    Event streams then end before uvicorn waits for them.
+
+    Args:
+        runtime: of the application.
+        app: made by :func:`splatbot.services.app.create_app`.
+        addresses: hosts and ports to listen on.
+
+    Raises:
+        InputError: an address cannot be listened on.
+    """
+
+    def __init__(self, runtime: Runtime, app: FastAPI, addresses: list[tuple[str, int]]) -> None:
+        settings = runtime.settings
+        # Half of the files are for maps, logs and clients of the integrations.
+        files = raise_file_limit(2 * settings.max_connections) // 2
+        self.connections = Connections(
+            min(settings.max_connections, files), min(settings.max_client_connections, files // 2), settings.idle_s
+        )
+        self.listeners = [listen(host, port, self.connections) for host, port in addresses]
         self._runtime = runtime
+        config = server_config(app, settings)
+        config.http = partial(HttpProtocol, connections=self.connections)  # type: ignore[assignment]
+        super().__init__(config)
+
+    async def on_tick(self, counter: int) -> bool:
+        """Close silent connections ten times a second."""
+        self.connections.close_silent()
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the event streams, then everything else."""
         self._runtime.drain()
         await super().shutdown(sockets)
 
@@ -45,17 +73,15 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
     check_exposure(settings)
     if settings.insecure_no_auth:
         _log.warning("insecure_no_auth: every process on this machine may map, move and delete without a key")
-    config = server_config(create_app(runtime), settings)
-    listeners = [listen(settings.host, settings.port)]
-    if settings.ros_port is not None:
-        listeners.append(listen(settings.host, settings.ros_port))
-    host, port = listeners[0].getsockname()[:2]
+    addresses = [(settings.host, port) for port in (settings.port, settings.ros_port) if port is not None]
+    server = Server(runtime, create_app(runtime), addresses)
+    host, port = server.listeners[0].getsockname()[:2]
     scheme = "https" if settings.tls_cert is not None else "http"
     on_start(f"{scheme}://{'[' + host + ']' if ':' in host else host}:{port}")
     # After its graceful end uvicorn raises the signal again for other handlers; here it has no further effect.
     previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        _Server(config, runtime).run(sockets=listeners)
+        server.run(sockets=list(server.listeners))
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
@@ -65,8 +91,6 @@ def server_config(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
     """Configure uvicorn."""
     return uvicorn.Config(
         app,
-        host=settings.host,
-        port=settings.port,
         log_config=None,  # the process' own, see splatbot.services.requests
         access_log=False,  # the application's names the request's id, and no query
         timeout_graceful_shutdown=settings.shutdown_s,
@@ -76,18 +100,17 @@ def server_config(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
         server_header=False,
         proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=list(settings.trusted_proxies),
+        loop="asyncio",  # uvloop does not ask the listener
     )
 
 
-def listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int, connections: Connections) -> Listener:
     """Open a listening socket.
 
     Raises:
         InputError: the address cannot be listened on.
     """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # Named as TCP, else asyncio leaves Nagle's algorithm on and each answer waits 40 ms for the client's ACK.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener = Listener(connections, socket.AF_INET6 if ":" in host else socket.AF_INET)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))

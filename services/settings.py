@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -18,6 +19,11 @@ from pydantic_settings import (
 
 from splatbot.errors import ConfigError
 from splatbot.services.keys import check_hash
+
+_NAMES = {
+    "allowed_hosts": (r"[\w.-]+|[0-9A-Fa-f:]+", "give names without scheme and port, e.g. robot.lan"),
+    "cors_origins": (r"\*|null|[a-z][\w+.-]*://[^/?#\s]*", "give scheme://host or scheme://host:port, without a path"),
+}
 
 Words = Annotated[tuple[str, ...], NoDecode]
 """Several words: a list in YAML, with commas between them in the environment."""
@@ -56,9 +62,15 @@ class ServiceSettings(BaseSettings):
     max_upload_bytes: int = Field(2**30, ge=1024, description="size of an uploaded recording, packed [bytes]")
     max_unpacked_bytes: int = Field(4 * 2**30, ge=1024, description="size of an uploaded recording, unpacked [bytes]")
     max_message_bytes: int = Field(32 * 2**20, ge=1024, description="size of one WebSocket message [bytes]")
-    max_requests: int = Field(64, ge=1, description="requests that are worked on at once; more are answered 503")
+    max_requests: int = Field(128, ge=1, description="requests that are open at once; more are answered 503")
+    max_waiting: int = Field(64, ge=1, description="requests of one kind that may wait; more are answered 503")
     requests_per_s: float = Field(500.0, gt=0, description="of one client in the long run; more are answered 429")
-    max_streams: int = Field(64, ge=1, description="event streams that are open at once")
+    max_streams: int = Field(64, ge=1, description="event streams and WebSockets that are open at once")
+    max_client_streams: int = Field(32, ge=1, description="of one client")
+    max_connections: int = Field(1024, ge=8, description="connections that are open at once")
+    max_client_connections: int = Field(256, ge=4, description="of one address; its oldest idle one makes room")
+    idle_s: float = Field(10.0, gt=0, description="time within which a request's headers must arrive [s]")
+    body_s: float = Field(30.0, gt=0, description="time within which its body must arrive [s]")
     max_jobs: int = Field(16, ge=1, description="jobs that may wait")
     job_workers: int = Field(2, ge=1, description="jobs that run at once")
     shutdown_s: int = Field(6, ge=0, description="how long running requests may take to end after SIGTERM [s]")
@@ -75,6 +87,15 @@ class ServiceSettings(BaseSettings):
     def _hashed(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for key in value:
             check_hash(key)
+        return value
+
+    @field_validator("allowed_hosts", "cors_origins")
+    @classmethod
+    def _named(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        form, hint = _NAMES[str(info.field_name)]
+        for word in value:
+            if not re.fullmatch(form, word):
+                raise ValueError(f"{word[:80]!r} never matches; {hint}")
         return value
 
     @property

@@ -69,7 +69,12 @@ class McapRecorder:
             news = self._news.get(0.0 if self._stopping.is_set() else 0.1)
             if news is not None:
                 self._write(news.topic, news.value)
-            elif self._stopping.is_set():
+                continue
+            try:
+                self._file.flush_due()
+            except OSError as error:
+                self._fail(error)
+            if self._stopping.is_set():
                 return
 
     def _write(self, topic: str, message: RosMessage) -> None:

@@ -16,7 +16,7 @@ router = APIRouter(tags=["health"])
 
 
 @router.get("/healthz", responses=example({"status": "ok", "version": "0.1.0"}), response_model_exclude={"unsaved"})
-def healthz() -> HealthResponse:
+async def healthz() -> HealthResponse:
     """Report that the process answers."""
     return HealthResponse(status="ok", version=splatbot.__version__)
 
@@ -25,7 +25,7 @@ def healthz() -> HealthResponse:
     "/readyz",
     responses=example({"status": "ready", "version": "0.1.0", "unsaved": 0}) | problems(503),
 )
-def readyz(service: Service) -> HealthResponse:
+async def readyz(service: Service) -> HealthResponse:
     """Check that the native module loads, the initial maps have a state, and the service is not ending."""
     try:
         importlib.import_module("splatbot._native")
@@ -47,6 +47,7 @@ def readyz(service: Service) -> HealthResponse:
     response_class=Response,
     responses={200: {"content": {"text/plain": {"example": 'splatbot_map_gaussians{map="default"} 48213.0\n'}}}},
 )
-def metrics(service: Service) -> Response:
+async def metrics(service: Service) -> Response:
     """Return the metrics for Prometheus."""
-    return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+    text = await service.metrics.text_soon()
+    return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -31,7 +31,7 @@ JOB: dict[str, Any] = {
 JobId = Annotated[str, Path(description="as the 202 answer named it", examples=["5f0c2a9b1d3e4f60"])]
 
 
-def _job(service: Service, job_id: JobId) -> Job:
+async def _job(service: Service, job_id: JobId) -> Job:
     """Find the job before a stream begins: afterwards the status 404 can no longer be sent."""
     return service.jobs.get(job_id)
 

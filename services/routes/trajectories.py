@@ -23,7 +23,7 @@ _JOB = JOB | {"kind": "trajectory", "detail": None}
 _MotionId = Annotated[str, Path(description="as the 202 answer named it", examples=["5f0c2a9b1d3e4f60"])]
 
 
-def _motion(service: Service, job_id: _MotionId) -> Job:
+async def _motion(service: Service, job_id: _MotionId) -> Job:
     return service.arms.motions.get(job_id)
 
 

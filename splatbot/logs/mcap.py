@@ -8,10 +8,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 
+from splatbot.atomic import replace, sync
 from splatbot.errors import LogError
 from splatbot.logs.base import Log
+from splatbot.logs.mcap_storage import CheckedStorage, CheckedWriter, recover
 from splatbot.logs.record import Progress
 from splatbot.logs.ros_frames import camera_info_message, image_message, joint_state_message, pose_stamped_message
 from splatbot.logs.ros_types import Message, to_cdr, type_of, typestore
@@ -23,10 +25,11 @@ MASK, JOINTS, TRUTH = "/camera/mask/image_raw", "/joint_states", "/ground_truth/
 class McapFile(AbstractContextManager["McapFile"]):
     """Writer of a recording; the file appears under its name only when it is complete.
 
-    Until then the messages are in the folder `.NAME.partial` next to it, which remains after a crash.
+    Until then the messages are in the folder `.NAME.partial` next to it. After a crash the next recording of that name
+    first recovers its messages into `NAME.recovered-N.mcap`.
 
     Raises:
-        LogError: the file exists, or its folder cannot be written to.
+        LogError: the file exists, another process records into it, or its folder cannot be written to.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -37,8 +40,8 @@ class McapFile(AbstractContextManager["McapFile"]):
         self._topics: dict[tuple[str, str], Any] = {}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.rmtree(self._partial, ignore_errors=True)
-            self._writer = Writer(self._partial, version=9, storage_plugin=StoragePlugin.MCAP)
+            recover(self._partial, self.path)
+            self._writer = CheckedWriter(self._partial, version=9, storage_plugin=StoragePlugin.MCAP)
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except OSError as error:
@@ -54,12 +57,24 @@ class McapFile(AbstractContextManager["McapFile"]):
         if (topic, name) not in self._topics:
             self._topics[topic, name] = self._writer.add_connection(topic, name, typestore=typestore())
         self._writer.write(self._topics[topic, name], nanoseconds, to_cdr(message))
+        self.flush_due()
+
+    def flush_due(self) -> None:
+        """Write the waiting messages to the disk if the last flush was more than a second ago.
+
+        Raises:
+            OSError: the disk is full or not available.
+        """
+        if isinstance(self._writer.storage, CheckedStorage):
+            self._writer.storage.flush_due()
 
     def close(self) -> None:
         """Write the index and give the file its name."""
         self._writer.close()
         (made,) = self._partial.glob("*.mcap")
-        made.replace(self.path)
+        with made.open("r+b") as file:
+            sync(file)
+        replace(made, self.path)
         shutil.rmtree(self._partial)
 
     def __exit__(self, kind: type[BaseException] | None, _error: object, _trace: TracebackType | None) -> None:

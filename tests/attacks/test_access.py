@@ -36,7 +36,7 @@ from splatbot.services.requests import JsonFormatter, TextFormatter
 from splatbot.services.ros.follow import action_topic
 from splatbot.services.runtime import Runtime, check_exposure
 from splatbot.services.scopes import NEEDS
-from splatbot.services.settings import ServiceSettings
+from splatbot.services.settings import ServiceSettings, load_settings
 from splatbot.services.store import MapStore
 from splatbot.services.viewer.scene import close_server, open_server
 from splatbot.services.viewer.viewer import Viewer
@@ -218,6 +218,24 @@ def test_a_key_opens_what_its_scopes_say(keyed: Service, key: str, method: str, 
     keyed.client.delete("/v1/stop", headers={"X-API-Key": MOVE})
 
 
+def test_strangers_are_refused_before_their_body_is_read(home: Service) -> None:
+    head = "Host: localhost\r\nContent-Type: application/msgpack\r\nContent-Length: 10000000\r\n\r\n"
+    for path in ("/v1/maps", "/v1/maps/wall/frames", "/v1/trajectories"):
+        status, _ = _raw(home, f"POST {path} HTTP/1.1\r\n{head}")
+        assert status == 401
+
+
+def test_names_and_origins_that_never_match_are_refused_as_settings() -> None:
+    for field, words in {
+        "allowed_hosts": ("http://robot.lan", "robot.lan:8000", "*"),
+        "cors_origins": ("https://ui.example/", "ui.example", "https://ui.example/page"),
+    }.items():
+        for word in words:
+            with pytest.raises(ConfigError, match="never matches"):
+                load_settings(None, **{field: (word,)})
+    load_settings(allowed_hosts=("robot.lan", "fe80::1"), cors_origins=("*", "null", "app://x", "http://a:1"))
+
+
 def test_a_client_of_the_same_user_finds_the_key(home: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     with Client(home.url) as client:
         client.emergency_stop()
@@ -326,7 +344,9 @@ def test_rosbridge_checks_the_scope_of_the_key(keyed: Service) -> None:
         told = _told(mover)
         assert told["result"] is False
         assert "'map'" in told["values"]
-        _say(mover, op="publish", topic=action_topic("fake", "goal"), msg={})
+        goal = {"topic": action_topic("fake", "goal"), "type": "control_msgs/FollowJointTrajectoryActionGoal"}
+        _say(mover, op="advertise", **goal)
+        _say(mover, op="publish", **goal, msg={})
         _say(mover, op="call_service", id="d", service="/rosapi/nodes")
         assert _told(mover)["id"] == "d"
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 from fastapi import FastAPI
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from splatbot.geometry import pose_from_quat
 from splatbot.service_key import key_file, read_key
 from splatbot.services.app import create_app
 from splatbot.services.runtime import Runtime
-from splatbot.services.server import server_config
+from splatbot.services.server import Server
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
@@ -53,16 +52,14 @@ def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterato
     """Run a real server on a real socket until the block ends."""
     runtime = Runtime(settings, store)
     app = create_app(runtime)
-    config = server_config(app, settings)
-    config.port = 0
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, daemon=True)
+    server = Server(runtime, app, [("127.0.0.1", 0)])
+    thread = threading.Thread(target=server.run, args=(list(server.listeners),), daemon=True)
     thread.start()
     while not server.started:
         assert thread.is_alive(), "the server did not start"
         time.sleep(0.01)
     scheme = "http" if settings.tls_cert is None else "https"
-    url = f"{scheme}://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    url = f"{scheme}://127.0.0.1:{server.listeners[0].getsockname()[1]}"
     trusted = True if settings.tls_cert is None else ssl.create_default_context(cafile=str(settings.tls_cert))
     key = None if settings.api_keys else read_key(key_file())
     headers = {"Authorization": f"Bearer {key}"} if key else {}

@@ -33,7 +33,8 @@ _CALLS = 16  # services that one client may have called without an answer
 _ANSWER_S = 60.0  # [s] that a client may take to serve a call
 _numbers = itertools.count(1)
 _READING = frozenset({"subscribe", "unsubscribe", "fragment", "png", "set_level", "status", "auth", "call_service"})
-_MAPPING = frozenset({"advertise", "unadvertise", "advertise_service", "unadvertise_service", "service_response"})
+_PUBLISHING = frozenset({"advertise", "unadvertise", "publish"})
+_SERVING = frozenset({"advertise_service", "unadvertise_service", "service_response"})
 _COMMANDS = re.compile(r"/\w+_controller/.*|.*/(goal|cancel)")
 
 _log = logging.getLogger(__name__)
@@ -128,7 +129,7 @@ class RosbridgeSession:
         name, scope = operation["op"], cast(Scope, "move")
         if name in _READING:
             scope = "read"
-        elif name in _MAPPING or (name == "publish" and not _COMMANDS.fullmatch(resolve(operation.get("topic")))):
+        elif name in _SERVING or (name in _PUBLISHING and not _COMMANDS.fullmatch(resolve(operation.get("topic")))):
             scope = "map"
         self._require(scope, str(name))
 

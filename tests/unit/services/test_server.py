@@ -8,7 +8,10 @@ import socket
 import pytest
 
 from splatbot.errors import InputError
+from splatbot.services.connections import Connections
 from splatbot.services.server import listen
+
+CONNECTIONS = Connections(8, 8, 10.0)
 
 
 def test_answers_do_not_wait_for_the_clients_acknowledgement() -> None:
@@ -22,7 +25,7 @@ def test_answers_do_not_wait_for_the_clients_acknowledgement() -> None:
             found.set_result(line.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
             writer.close()
 
-        listener = listen("127.0.0.1", 0)
+        listener = listen("127.0.0.1", 0, CONNECTIONS)
         async with await asyncio.start_server(serve, sock=listener):
             _, writer = await asyncio.open_connection(*listener.getsockname())
             value = await asyncio.wait_for(found, 10)
@@ -33,5 +36,5 @@ def test_answers_do_not_wait_for_the_clients_acknowledgement() -> None:
 
 
 def test_a_taken_port_is_named_with_the_way_out() -> None:
-    with listen("127.0.0.1", 0) as taken, pytest.raises(InputError, match="cannot listen"):
-        listen("127.0.0.1", taken.getsockname()[1])
+    with listen("127.0.0.1", 0, CONNECTIONS) as taken, pytest.raises(InputError, match="cannot listen"):
+        listen("127.0.0.1", taken.getsockname()[1], CONNECTIONS)
