@@ -213,7 +213,7 @@ def _array(data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], order: Any
     if dtype.kind not in _KINDS or dtype.itemsize > 8 or dtype.subdtype is not None:
         raise InputError(f"is {str(dtype)[:40]}.", field="dtype", hint="send numbers, e.g. <f4 or |u1")
     whole = len(shape) <= 4 and all(type(n) is int and n >= 0 for n in shape)  # True is no length
-    # Lengths beside a 0 are bounded too: numpy cannot hold an empty array of any shape.
+    # Lengths next to a 0 are bounded too: numpy cannot hold an empty array of any shape.
     if not whole or math.prod(max(n, 1) for n in shape) > _MOST or math.prod(shape) * dtype.itemsize != len(data):
         hint = "give at most four whole numbers, and as many bytes as they say"
         raise InputError(f"{len(data)} bytes are not {str(shape)[:60]} of {dtype}.", field="shape", hint=hint)

@@ -94,7 +94,7 @@ class Connections:
                 _hang_up(connection)
 
     def out_of_files(self) -> None:
-        """Close idle connections because the process has no file descriptors left, and tell it once a minute."""
+        """Close idle connections because the process has no file descriptors left; log this once a minute."""
         self._tell(f"no file descriptors are left at {len(self._open)} connections; idle and new ones are closed")
         for _ in range(_FREED):
             of_client = Counter(known.client for known in self._open.values() if known.idle_since is not None)
@@ -169,7 +169,7 @@ class HttpProtocol(H11Protocol):
     """uvicorn's HTTP/1.1, which notes the begin and the end of requests.
 
     Args:
-        connections: told of them.
+        connections: counts them.
         arguments: of uvicorn's.
     """
 
@@ -178,13 +178,13 @@ class HttpProtocol(H11Protocol):
         self._connections = connections
 
     def handle_events(self) -> None:
-        """Handle what was received; complete headers begin a request."""
+        """Handle received data; complete headers begin a request."""
         super().handle_events()
         if self.cycle is not None and not self.cycle.response_complete:
             self._mark(busy=True)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """Hand the connection over to a WebSocket, whose pings find out a silent client."""
+        """Pass the connection to a WebSocket, whose pings detect a silent client."""
         super().handle_websocket_upgrade(event)
         self._mark(busy=True)
 

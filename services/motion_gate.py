@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.errors import MapNotFoundError, SplatbotError
 from splatbot.planning import CertifiedMotion, MotionRefusedError, certify_motion
-from splatbot.planning.certify import Motion
+from splatbot.planning.certify import JointCurve
 from splatbot.robots.robot import RobotModel
 from splatbot.services.store import MapStore, ServedMap
 
@@ -37,7 +37,7 @@ class MotionRequest:
         margin: clearance to keep [m].
     """
 
-    motion: Motion
+    motion: JointCurve
     robot: str
     map_id: str
     generation: int

@@ -38,15 +38,16 @@ def lasts(scope: Scope) -> bool:
 
 
 def kind_of(path: str) -> str:
-    """Return the kind of work that a path asks for."""
+    """Return the kind of work of a path."""
     return next((kind for kind, pattern in _KINDS.items() if pattern.fullmatch(path)), "others")
 
 
 class Queues:
     """ASGI middleware that lets a few requests of each kind work at once.
 
-    The others wait, and the one too many is answered 503. A request takes its place once its body is there, leaves its
-    queue when its client leaves, and gives its place back before the answer is sent: slow clients hold nothing up.
+    The others wait. A request beyond the queue is answered 503. A request takes its place once its body has arrived,
+    and leaves its queue when its client leaves. It returns its place before the answer is sent, so that slow clients
+    hold no place.
 
     Args:
         most_waiting: requests of one kind that may wait.
@@ -164,7 +165,7 @@ class _Place(AbstractAsyncContextManager["_Place"]):
 
 
 def _again(body: bytes, receive: Receive) -> Receive:
-    """Return a ``receive`` that gives a body that was read before, then what follows it."""
+    """Return a ``receive`` that returns a body that was read before, then the later messages."""
     given = False
 
     async def first() -> Message:

@@ -16,7 +16,7 @@ from splatbot.sim.twin import Twin, TwinResult
 
 
 @dataclass(frozen=True)
-class ReachConstants:
+class ReachTaskConstants:
     """Constants of reaches.
 
     Args:
@@ -30,7 +30,7 @@ class ReachConstants:
     cuts: int = 100
 
 
-CONSTANTS = ReachConstants()
+CONSTANTS = ReachTaskConstants()
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from splatbot.sim.world import World, build_world
 
 
 @dataclass(frozen=True)
-class ViewConstants:
+class PoseViewConstants:
     """Constants of views of maps and twins.
 
     Args:
@@ -44,7 +44,7 @@ class ViewConstants:
     max_range: float = 20.0
 
 
-CONSTANTS = ViewConstants()
+CONSTANTS = PoseViewConstants()
 
 
 Mask = NDArray[np.bool_]

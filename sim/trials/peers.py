@@ -27,7 +27,7 @@ from splatbot.sim.trials.stacks import OPTIONS, StackMap
 
 
 @dataclass(frozen=True)
-class PeerConstants:
+class TrialPeerConstants:
     """Constants of the map representations that are compared.
 
     Args:
@@ -49,7 +49,7 @@ class PeerConstants:
     min_neighbours: int = 3
 
 
-CONSTANTS = PeerConstants()
+CONSTANTS = TrialPeerConstants()
 
 
 _NODE, _LEAF_NODE = 256, 16  # [bytes] of FCL's BVNode<OBBRSS>, as measured, and of OctoMap's OcTreeNode

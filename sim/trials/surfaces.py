@@ -17,7 +17,7 @@ from splatbot.sim.wrist import capsule_mesh
 
 
 @dataclass(frozen=True)
-class SurfaceConstants:
+class SurfaceTwinConstants:
     """Constants of the pattern of trial surfaces.
 
     Args:
@@ -29,7 +29,7 @@ class SurfaceConstants:
     period: float = 0.03
 
 
-CONSTANTS = SurfaceConstants()
+CONSTANTS = SurfaceTwinConstants()
 
 
 def surfaces_of(obj: SceneObject, *, placed: bool = True, seed: int = 0) -> list[RaycastSurface]:

@@ -22,7 +22,7 @@ Message = Any
 
 _STRINGS = ("string", "wstring")
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-_MOST_MESSAGES = 100_000  # in each other: an entry `{}` of a list may stand for dozens
+_MOST_MESSAGES = 100_000  # in each other: an entry `{}` of a list may hold dozens
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 
 # Types that the JAZZY store lacks: the action of ros-controls/control_msgs as topics of ROS 1's actionlib.

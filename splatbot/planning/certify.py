@@ -39,7 +39,7 @@ class MotionRefusedError(ControllerError):
     """A motion is not executed: its curve is not certified where and when it would be."""
 
 
-class Motion(TimedPath, Protocol):
+class JointCurve(TimedPath, Protocol):
     """A curve in joint space over time whose cubic pieces are known."""
 
     def pieces(self) -> CubicPieces:
@@ -59,7 +59,7 @@ class CertifiedMotion:
         map_version: version of the map, -1 without a map.
     """
 
-    motion: Motion
+    motion: JointCurve
     arm: RobotSpheres
     map_version: int
 
@@ -82,7 +82,7 @@ class CertifiedMotion:
         return CertifiedMotion(self.motion, self.arm, field.map_version)
 
 
-def certify_motion(motion: Motion, arm: RobotSpheres, field: GaussianCollisionField | None) -> CertifiedMotion:
+def certify_motion(motion: JointCurve, arm: RobotSpheres, field: GaussianCollisionField | None) -> CertifiedMotion:
     """Certify the curve that will be executed.
 
     1. Positions, velocities, accelerations and jerks keep the limits of the arm (extremes of cubics in closed form).

@@ -22,7 +22,7 @@ MODES: tuple[Mode, ...] = ("rgb", "depth", "normal", "alpha")
 
 
 @dataclass(frozen=True)
-class ViewConstants:
+class RenderViewConstants:
     """Constants of rendered views.
 
     Args:
@@ -38,7 +38,7 @@ class ViewConstants:
     rotation_tolerance: float = 1e-3
 
 
-CONSTANTS = ViewConstants()
+CONSTANTS = RenderViewConstants()
 
 
 def render_view(

@@ -15,7 +15,7 @@ from splatbot.results.views import depth_views
 
 
 @dataclass(frozen=True)
-class MarginConstants:
+class RunMarginConstants:
     """Constants of the recommended margin.
 
     Args:
@@ -27,7 +27,7 @@ class MarginConstants:
     share: float = 0.999
 
 
-CONSTANTS = MarginConstants()
+CONSTANTS = RunMarginConstants()
 
 
 def own_margin(run: str | Path, log: Log, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:

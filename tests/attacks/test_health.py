@@ -204,7 +204,7 @@ def test_streams_of_one_client_are_bounded() -> None:
 
 
 class Probe:
-    """A client that asks /healthz on one connection, and little else."""
+    """A client that requests /healthz on one connection, and little else."""
 
     def __init__(self, url: str) -> None:
         self.line = socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])), timeout=20)

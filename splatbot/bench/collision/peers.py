@@ -25,7 +25,7 @@ from splatbot.protocols import Array
 
 
 @dataclass(frozen=True)
-class PeerConstants:
+class CollisionPeerConstants:
     """Constants of the peers of collision queries.
 
     Args:
@@ -37,7 +37,7 @@ class PeerConstants:
     chunk: int = 50
 
 
-CONSTANTS = PeerConstants()
+CONSTANTS = CollisionPeerConstants()
 
 
 def run_brute_force(results: Results, model: GaussianModel, points: Array, report_progress: ReportProgress) -> None:
