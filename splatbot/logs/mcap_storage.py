@@ -77,7 +77,7 @@ class CheckedStorage(McapWriter):
 class CheckedWriter(Writer):
     """Writer of bags with :class:`CheckedStorage`."""
 
-    STORAGE_PLUGINS: ClassVar = {**Writer.STORAGE_PLUGINS, StoragePlugin.MCAP: CheckedStorage}
+    STORAGE_PLUGINS: ClassVar = {**Writer.STORAGE_PLUGINS, StoragePlugin.MCAP: CheckedStorage}  # type: ignore[misc]
 
 
 def recover(partial: Path, path: Path) -> None:
