@@ -131,11 +131,15 @@ class Bus:
         self._dropped: dict[str, int] = {}
         self._closed = False
 
-    def publish(self, topic: str, value: Any) -> None:
-        """Let ``value`` be the topic's latest, and queue it for the topic's readers."""
+    def publish(self, topic: str, value: Any, *, keep: bool = True) -> None:
+        """Queue ``value`` for the topic's readers, and keep it as the topic's latest."""
         with self._lock:
             number = self._numbers[topic] = self._numbers.get(topic, 0) + 1
-            message = self._latest[topic] = Message(topic, value, number, time.time())
+            message = Message(topic, value, number, time.time())
+            if keep:
+                self._latest[topic] = message
+            else:
+                self._latest.pop(topic, None)
             for reader in self._readers:
                 if reader.wants(topic) and (lost := reader._offer(message)) is not None:
                     self._dropped[lost] = self._dropped.get(lost, 0) + 1
@@ -177,12 +181,19 @@ class Bus:
     def forget(self, prefix: str) -> None:
         """Drop the latest messages of all topics that begin with ``prefix``, e.g. "maps/desk/"."""
         with self._lock:
-            for topic in [topic for topic in self._latest if topic.startswith(prefix)]:
-                del self._latest[topic], self._numbers[topic]
+            for topic in [topic for topic in self._numbers if topic.startswith(prefix)]:
+                self._latest.pop(topic, None)
+                del self._numbers[topic]
             for topic in [topic for topic in self._dropped if topic.startswith(prefix)]:
                 first, _, *rest = topic.split("/")
                 kind = "/".join([first, "*", *rest])
                 self._dropped[kind] = self._dropped.get(kind, 0) + self._dropped.pop(topic)
+
+    def forget_topic(self, topic: str) -> None:
+        """Drop the latest message of one topic."""
+        with self._lock:
+            self._latest.pop(topic, None)
+            self._numbers.pop(topic, None)
 
     @property
     def dropped(self) -> dict[str, int]:

@@ -78,8 +78,12 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
     host, port = server.listeners[0].getsockname()[:2]
     scheme = "https" if settings.tls_cert is not None else "http"
     on_start(f"{scheme}://{'[' + host + ']' if ':' in host else host}:{port}")
-    # After its graceful end uvicorn raises the signal again for other handlers; here it has no further effect.
-    previous = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        """End a server that has not installed its own handlers yet; after its end this has no further effect."""
+        server.should_exit = True
+
+    previous = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         server.run(sockets=list(server.listeners))
     finally:
@@ -123,7 +127,3 @@ def listen(host: str, port: int, connections: Connections) -> Listener:
             hint="give another --host or --port",
         ) from error
     return listener
-
-
-def _ignore(_number: int, _frame: FrameType | None) -> None:
-    """Ignore a signal: the service has already ended."""

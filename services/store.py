@@ -16,7 +16,7 @@ from splatbot.services.bus import Bus
 from splatbot.services.derived import Derived
 from splatbot.services.frames_first import FramesFirst
 from splatbot.services.problems import MapNotReadyError
-from splatbot.services.topics import STATE, TRAJECTORY, map_topic
+from splatbot.services.topics import REMOVED, STATE, TRAJECTORY, map_topic
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 
@@ -177,8 +177,9 @@ class MapStore:
             MapNotFoundError: no map of that name, or it is of another generation.
         """
         with self._lock:
-            self._find(map_id, generation)
+            removed = self._find(map_id, generation)
             del self._maps[map_id]
+            self.bus.publish(map_topic(map_id, REMOVED), removed)
             self.bus.forget(map_topic(map_id, ""))
 
     def get(self, map_id: str, *, generation: int | None = None) -> ServedMap:

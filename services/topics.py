@@ -3,6 +3,7 @@
 | topic | value |
 |---|---|
 | ``maps/{id}/state`` | :class:`splatbot.services.store.ServedMap`: each published state or change of ``state`` |
+| ``maps/{id}/removed`` | :class:`splatbot.services.store.ServedMap`: the map as it was when it was deleted |
 | ``maps/{id}/frame`` | :class:`splatbot.frame.Frame`: the frame that the mapper received |
 | ``maps/{id}/result`` | :class:`splatbot.slam.FrameResult`: odometry, verdict, keyframe, stage timings |
 | ``maps/{id}/trajectory`` | :class:`splatbot.trajectory.Trajectory`: all poses so far, at each published state |
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 STATE = "state"
+REMOVED = "removed"
 FRAME = "frame"
 RESULT = "result"
 TRAJECTORY = "trajectory"

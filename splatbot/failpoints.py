@@ -12,9 +12,14 @@ from pathlib import Path
 
 VARIABLE = "SPLATBOT_FAILPOINT"
 
-_point, _, _rest = os.environ.get(VARIABLE, "").partition(":")
-_left = int(_rest.partition(":")[0] or 0)
-_torn = _rest.endswith(":torn")
+_point, _left, _torn = "", 0, False
+
+
+def arm(choice: str) -> None:
+    """Choose the point at which the process is killed, in the format of the variable."""
+    global _point, _left, _torn
+    _point, _, rest = choice.partition(":")
+    _left, _torn = int(rest.partition(":")[0] or 0), rest.endswith(":torn")
 
 
 def reach(point: str, path: Path | None = None) -> None:
@@ -28,3 +33,6 @@ def reach(point: str, path: Path | None = None) -> None:
     if _torn and path is not None and path.is_file():
         os.truncate(path, path.stat().st_size * 2 // 3)
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+arm(os.environ.get(VARIABLE, ""))

@@ -7,6 +7,7 @@ from typing import Any
 
 from splatbot.frame import Frame
 from splatbot.services.arms import Arms
+from splatbot.services.ros.emergency import EmergencyStopTopic
 from splatbot.services.ros.follow import FollowJointTrajectory
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.grasping import GraspServices
@@ -42,6 +43,8 @@ class RosNode:
         NvbloxServices(self.graph, store)
         GraspServices(self.graph, store, robot=robot)
         self._follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
+        if arms is not None:
+            EmergencyStopTopic(self.graph, arms)
         self._outlets = RosPublishers(store.bus, self.graph)
         self._inlets = RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame)
 

@@ -29,7 +29,7 @@ from splatbot.services.ros.messages import (
     transform_message,
 )
 from splatbot.services.store import ServedMap
-from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState, arm_topic
+from splatbot.services.topics import FRAME, GRASPS, PLAN, REMOVED, RESULT, STATE, TRAJECTORY, JointState, arm_topic
 from splatbot.services.topics import JOINTS as ARM_JOINTS
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
@@ -112,6 +112,8 @@ class RosPublishers:
                 if isinstance(news.value, JointState):
                     prefix = f"/{name}" if what == "arms" else ""
                     self._graph.publish(prefix + JOINTS, joints_message(news.value))
+                elif kind == REMOVED:
+                    self._forget(name)
                 elif kind in self._convert:
                     self._convert[kind](self._prefix(name), news.value)
             except Exception:  # one odd message must not silence the others
@@ -121,6 +123,16 @@ class RosPublishers:
         if self._main is None or map_id == "default":
             self._main = map_id
         return "" if map_id == self._main else f"/maps/{map_id.replace('-', '_')}"
+
+    def _forget(self, map_id: str) -> None:
+        """Remove the topics of a deleted map; if it was the main one, the plain names are free for the next."""
+        prefix = self._prefix(map_id)
+        if prefix:
+            self._graph.remove_topics(f"{prefix}/")
+        else:
+            self._main = None
+            for topic in (POINTS, PATH, MARKERS, PLANNED, GRASP_MARKERS):
+                self._graph.unlatch(topic)
 
     def _publish(self, prefix: str, topic: str, make: Callable[[], Message], *, latched: bool = False) -> None:
         self._graph.publish_later(prefix + topic, TYPES[topic], make, latched=latched)

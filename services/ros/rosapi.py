@@ -39,7 +39,7 @@ class RosApi:
             "message_details": ("MessageDetails", self._message_details),
         }
         for name, (kind, call) in calls.items():
-            graph.serve(f"/rosapi/{name}", Service(f"rosapi_msgs/srv/{kind}", call))
+            graph.serve(f"/rosapi/{name}", Service(f"rosapi_msgs/srv/{kind}", call, quick=True))
 
     def _topics(self, _: Mapping[str, Any]) -> dict[str, Any]:
         topics = self._graph.topics

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.errors import ReaderError
@@ -77,7 +77,7 @@ class CheckedStorage(McapWriter):
 class CheckedWriter(Writer):
     """Writer of bags with :class:`CheckedStorage`."""
 
-    STORAGE_PLUGINS = {**Writer.STORAGE_PLUGINS, StoragePlugin.MCAP: CheckedStorage}  # noqa: RUF012 (as in rosbags)
+    STORAGE_PLUGINS: ClassVar = {**Writer.STORAGE_PLUGINS, StoragePlugin.MCAP: CheckedStorage}  # type: ignore[misc]
 
 
 def recover(partial: Path, path: Path) -> None:

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.atomic import atomic_write
+from splatbot.checksums import NAME as SUMS
+from splatbot.checksums import check_file, read_sums, write_sums
 from splatbot.config import Config, load_config
 from splatbot.errors import FormatError, InputError
 from splatbot.formats.ply import save_ply
@@ -112,24 +114,26 @@ class RunFolder:
         """Write all files but the report. An older report is deleted because it describes another map."""
         self.report.unlink(missing_ok=True)
         self.map_page.unlink(missing_ok=True)
+        (self.path / SUMS).unlink(missing_ok=True)  # a run that is killed from here on has no checksums
         save_ply(model, self.map, bookkeeping=True)  # unobserved Gaussians must stay marked for collision checks
         self._save_trajectory(trajectory)
         lines = [json.dumps(asdict(row)) for row in rows]
         _write_text(self.frames, "\n".join([*lines, ""]))
         _write_text(self.config, config.to_yaml())
         self.save_metrics(metrics)
+        write_sums(self.path, self._files())
 
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write ``metrics.json``."""
-        _write_text(self.metrics, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+        self._replace(self.metrics, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
     def save_report(self, html: str) -> None:
         """Write ``report.html``."""
-        _write_text(self.report, html)
+        self._replace(self.report, html)
 
     def save_map_page(self, html: str) -> None:
         """Write ``map.html``."""
-        _write_text(self.map_page, html)
+        self._replace(self.map_page, html)
 
     def load_config(self) -> Config:
         """Load the configuration of the run; the current environment variables do not change it."""
@@ -204,6 +208,30 @@ class RunFolder:
         full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = np.array(packed)
         return full
 
+    def check(self) -> bool:
+        """Check every file against its checksum; return False if the run has none, as after it was killed.
+
+        Raises:
+            FormatError: a file is missing or altered, or the list of checksums is damaged.
+        """
+        sums = read_sums(self.path)
+        for name in sums or ():
+            check_file(self._require(self.path / name))
+        return sums is not None
+
+    def _files(self) -> list[str]:
+        paths = (self.config, self.trajectory, self.frames, self.metrics, self.map, self.report, self.map_page)
+        return [path.name for path in paths]
+
+    def _replace(self, path: Path, text: str) -> None:
+        """Write a file, and its checksum if the run has checksums; killed in between, the run has none."""
+        listed = self.check()
+        if listed:
+            (self.path / SUMS).unlink()
+        _write_text(path, text)
+        if listed:
+            write_sums(self.path, self._files())
+
     def _was_killed(self) -> bool:
         """Return whether the run neither ended nor was interrupted."""
         return self.metrics.is_file() and not self.load_metrics().get("finished", True)
@@ -217,6 +245,7 @@ class RunFolder:
     def _require(self, path: Path) -> Path:
         if not path.is_file():
             raise FormatError("is missing.", file=path, hint=_NOT_A_RUN)
+        check_file(path)
         return path
 
 

@@ -19,7 +19,8 @@ from splatbot.trajectory import Trajectory
 from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot
 
 BAD = 6  # the frame that is damaged
-FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "map.html", "state"}
+NAMES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "map.html", "state"}
+FILES = NAMES | {"SHA256SUMS"}
 
 
 def truncated_png(log: Path) -> None:

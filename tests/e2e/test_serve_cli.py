@@ -62,6 +62,20 @@ def test_a_map_is_served_until_sigterm_which_ends_cleanly(map_file: Path, by: st
         assert process.wait(20) == 0
 
 
+def test_a_service_that_gets_sigterm_while_it_starts_ends(map_file: Path) -> None:
+    words = (*COMMAND, "--map", str(map_file), "--port", "0")
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        for _ in range(2):  # the address, and the file of the key
+            process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) in (0, -signal.SIGTERM)
+    finally:
+        process.kill()
+        process.communicate()
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [

@@ -34,7 +34,7 @@ DESIGN_NAMES = {
     "frames", "tracked", "lost", "ate_rmse_m", "rpe_trans_rmse_m", "psnr_holdout_db", "depth_l1_m", "gaussians",
     "map_bytes", "peak_rss_bytes", "ms_per_frame", "stages", "effects",
 }  # fmt: skip
-FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html"}
+FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "SHA256SUMS"}
 
 
 @pytest.fixture
@@ -302,6 +302,9 @@ def test_a_lost_pose_file_is_noticed(log: Log, tmp_path: Path) -> None:
     map_log(log, out=tmp_path / "run", slam=oracle(log))
     lines = (tmp_path / "run" / "trajectory.tum").read_text().splitlines(keepends=True)
     (tmp_path / "run" / "trajectory.tum").write_text("".join(lines[:-1]))
+    with pytest.raises(FormatError, match="checksum"):
+        RunFolder(tmp_path / "run").load_poses()
+    (tmp_path / "run" / "SHA256SUMS").unlink()  # as in runs of earlier versions
     with pytest.raises(FormatError, match="15 poses"):
         RunFolder(tmp_path / "run").load_poses()
 

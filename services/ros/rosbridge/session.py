@@ -9,14 +9,17 @@ import json
 import logging
 import re
 from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 from splatbot.errors import InputError, SplatbotError
 from splatbot.logs.ros_types import build, full_name
 from splatbot.services.bounds import INLINE_BYTES
 from splatbot.services.keys import Scope
+from splatbot.services.ros.emergency import EMERGENCY_STOP
 from splatbot.services.ros.graph import Handler, RosGraph, Service, resolve
 from splatbot.services.ros.requests import read_json_object
+from splatbot.services.ros.rosbridge.actions import Actions
 from splatbot.services.ros.rosbridge.packing import (
     Fragments,
     check_compression,
@@ -31,6 +34,7 @@ from splatbot.services.scopes import ScopeError
 _LEVELS = ("none", "error", "warning", "info")
 _CALLS = 16  # services that one client may have called without an answer
 _ANSWER_S = 60.0  # [s] that a client may take to serve a call
+_CALL_THREADS = ThreadPoolExecutor(8, "ros-calls")  # of all clients; other threads pack messages
 _numbers = itertools.count(1)
 _READING = frozenset({"subscribe", "unsubscribe", "fragment", "png", "set_level", "status", "auth", "call_service"})
 _PUBLISHING = frozenset({"advertise", "unadvertise", "publish"})
@@ -58,7 +62,8 @@ class RosbridgeSession:
         self._graph, self._most_bytes, self._scopes = graph, most_bytes, scopes
         self._to_client = send
         self._sending = asyncio.Lock()
-        self._subscriptions = Subscriptions(graph, self._send)
+        self._subscriptions = Subscriptions(graph, self._send, self.number)
+        self._actions = Actions(graph, lambda values: self._send(pack(values, "none")), self.number)
         self._fragments = Fragments(most_bytes)
         self._advertised: dict[str, str] = {}
         self._served: set[str] = set()
@@ -76,6 +81,8 @@ class RosbridgeSession:
             "advertise_service": self._advertise_service,
             "unadvertise_service": self._unadvertise_service,
             "service_response": self._service_response,
+            "send_action_goal": self._actions.send_goal,
+            "cancel_action_goal": self._actions.cancel_goal,
             "fragment": self._fragment,
             "png": self._png,
             "set_level": self._set_level,
@@ -105,6 +112,7 @@ class RosbridgeSession:
     async def close(self) -> None:
         """Forget the client."""
         await self._subscriptions.close()
+        await self._actions.close()
         self._graph.leave(self.number)
         for name in self._served:
             self._graph.withdraw(name, self.number)
@@ -127,8 +135,9 @@ class RosbridgeSession:
             ScopeError: it lacks the scope.
         """
         name, scope = operation["op"], cast(Scope, "move")
-        if name in _READING:
-            scope = "read"
+        topic = operation.get("topic")
+        if name in _READING or (name == "publish" and topic is not None and resolve(topic) == EMERGENCY_STOP):
+            scope = "read"  # a stop adds no danger
         elif name in _SERVING or (name in _PUBLISHING and not _COMMANDS.fullmatch(resolve(operation.get("topic")))):
             scope = "map"
         self._require(scope, str(name))
@@ -154,19 +163,21 @@ class RosbridgeSession:
 
     def _advertise(self, operation: dict[str, Any]) -> None:
         kind = full_name(str(operation.get("type", "")))
-        self._advertised[self._graph.advertise(operation.get("topic"), kind)] = kind  # type: ignore[arg-type]
+        topic = self._graph.advertise(resolve(operation.get("topic")), kind, client=self.number)
+        self._advertised[topic] = kind
 
     def _unadvertise(self, operation: dict[str, Any]) -> None:
-        self._advertised.pop(resolve(operation.get("topic")), None)
+        if self._advertised.pop(resolve(operation.get("topic")), None) is not None:
+            self._graph.unadvertise(resolve(operation.get("topic")), self.number)
 
     async def _publish(self, operation: dict[str, Any]) -> None:
         topic = resolve(operation.get("topic"))
-        kind = self._advertised.get(topic) or self._graph.topics.get(topic)
-        if kind is None:
-            raise InputError(f"{topic} is of no known type.", field="topic", hint="advertise it first")
         values = operation.get("msg", {})
         if not isinstance(values, Mapping):
-            raise InputError("is no object.", field="msg", hint=f"give the fields of {kind}")
+            raise InputError("is no object.", field="msg", hint="give the fields of the message")
+        kind = self._advertised.get(topic) or self._graph.kind_of(topic, values)
+        if kind is None:
+            raise InputError(f"{topic} is of no known type.", field="topic", hint="advertise it first")
         message = await asyncio.to_thread(build, kind, values) if self._long else build(kind, values)
         self._graph.publish(topic, message, latched=bool(operation.get("latch")), client=self.number)
 
@@ -201,7 +212,8 @@ class RosbridgeSession:
             if inspect.iscoroutinefunction(service.call):
                 values = await service.call(args)
             else:
-                values = await asyncio.to_thread(service.call, args)
+                loop = asyncio.get_running_loop()
+                values = await loop.run_in_executor(None if service.quick else _CALL_THREADS, service.call, args)
         except SplatbotError as error:
             await self._respond(operation, str(error), result=False)
         except Exception:

@@ -51,11 +51,12 @@ class Subscriptions:
     Args:
         graph: where the topics are.
         send: sends a message to the client; may wait.
+        client: number of the client.
         most: topics at once.
     """
 
-    def __init__(self, graph: RosGraph, send: Send, most: int = 256) -> None:
-        self._graph, self._send, self._most = graph, send, most
+    def __init__(self, graph: RosGraph, send: Send, client: int, most: int = 256) -> None:
+        self._graph, self._send, self._client, self._most = graph, send, client, most
         self._wishes: dict[str, dict[Any, _SubscribeOptions]] = {}
         self._deliveries: Deliveries[str] = Deliveries(graph)
 
@@ -81,10 +82,10 @@ class Subscriptions:
             known = self._graph.topics.get(topic)
             if known is not None and full_name(str(kind)) != known:
                 raise InputError(f"{topic} is of type {known}.", field="type", hint="subscribe with that type")
-            self._graph.advertise(topic, str(kind))
+            self._graph.advertise(topic, str(kind), client=self._client)
         if topic not in self._wishes and len(self._wishes) >= self._most:
             raise InputError(f"{topic} is one topic too many.", field="topic", hint=f"read at most {self._most}")
-        fresh = topic not in self._wishes
+        fresh = _key(operation) not in self._wishes.get(topic, {})
         self._wishes.setdefault(topic, {})[_key(operation)] = wish
         self._restart(topic, latched=fresh)
 
