@@ -119,9 +119,10 @@ def push(url: str, key: str, until: float, told: Told, frames: list[Frame]) -> N
 
 def measure(seconds: float, clients: int, pause_s: float = 0.5) -> Told:
     """Serve a map that is made of frames every 30 ms, with a number of clients."""
-    told, key = Told(), str(read_key(key_file()))
+    told = Told()
     frames = list(open_log(LOG))
     with tempfile.TemporaryDirectory() as folder, serving("--data", folder, log=Path(folder) / "log.txt") as service:
+        key = str(read_key(key_file()))  # the service made it
         with Client(service.url, key=key) as robot:
             robot.create_map(MAP)
             robot.push(MAP, replace(frames[0], stamp=-1.0))

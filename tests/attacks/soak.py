@@ -51,10 +51,11 @@ def sizes(process: psutil.Process, url: str, key: str) -> tuple[float, ...]:
 
 def soak(seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) [s] and sizes (N, 4) of a run."""
-    key, times, found = str(read_key(key_file())), [], []
+    times, found = [], []
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log.txt"
         with serving("--data", f"{folder}/maps", log=log) as service:
+            key = str(read_key(key_file()))  # the service made it
             process, begin, number = psutil.Process(service.process.pid), time.monotonic(), 0
             while time.monotonic() - begin < seconds:
                 one_round(service.url, key, number)
