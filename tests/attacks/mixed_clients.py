@@ -54,7 +54,7 @@ class Told:
 
 
 def requests(http: httpx.Client) -> list[Any]:
-    """Return the requests of a client that asks one after the other."""
+    """Return the requests of a client, which sends one after the other."""
     points = np.random.default_rng(0).uniform(-1, 1, (100, 3)).tolist()
     under = "/v1/maps/default"
     return [
@@ -69,7 +69,7 @@ def requests(http: httpx.Client) -> list[Any]:
 
 
 def ask(url: str, key: str, until: float, number: int, told: Told, pause_s: float) -> None:
-    """Send requests until a time; a 503 is asked again after its Retry-After, a plan without a path is an answer."""
+    """Send requests until a time; repeat a 503 after its Retry-After; a plan without a path is no error."""
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
         todo, at = requests(http), number
         while time.monotonic() < until:
