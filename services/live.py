@@ -144,7 +144,7 @@ class LiveMapping:
             self._publish()  # without the final refinement: a stop request wants a quick end
 
     def _process(self, frame: Frame) -> FrameResult | None:
-        """Map a frame; if it fails, tell ``on_error`` and return None."""
+        """Map a frame; if it fails, call ``on_error`` and return None."""
         try:
             with self._store.frames_first.mapping():
                 return self._mapper.process(frame)

@@ -133,7 +133,7 @@ def stays_inside(folder: Path) -> None:
 
 
 def check_file(path: Path, max_pixels: int, max_lines: int) -> None:
-    """Check an unpacked file by what it is, not by its name, before it is read.
+    """Check an unpacked file by its real format and size before it is read.
 
     Raises:
         LogError: a file that is named as an image is neither PNG nor JPEG.
@@ -154,7 +154,7 @@ def check_file(path: Path, max_pixels: int, max_lines: int) -> None:
             hint = "send a shorter recording, or raise SPLATBOT_MAX_FRAMES"
             raise TooLargeError(f"{path.name} has more than {most} lines.", field="upload", hint=hint)
     elif path.stat().st_size > _MAX_DOCUMENT:
-        hint = "leave out what is no part of the recording"
+        hint = "leave out files that do not belong to the recording"
         raise TooLargeError(f"{path.name} has more than {_MAX_DOCUMENT} bytes.", field="upload", hint=hint)
 
 

@@ -80,7 +80,7 @@ def associate(a: NDArray[np.float64], b: NDArray[np.float64], max_difference: fl
     The pairing is one to one and greedy by the smallest difference, as in TUM's `associate.py`. Pairs are in the order
     of ``a``.
     """
-    # Of all that are not paired yet, the smallest difference is between neighbours in time.
+    # The smallest difference among all unpaired stamps is always between neighbours in time.
     order = sorted(
         [(stamp, 0, i) for i, stamp in enumerate(a.tolist())] + [(t, 1, j) for j, t in enumerate(b.tolist())]
     )
