@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from splatbot.robots.panda import panda
 from splatbot.robots.robot import Inertial, RobotModel
 from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
 
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 _FORMAT = "splatbot robot 1"
 _BUILT_IN = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140}
 
@@ -26,6 +28,18 @@ def robots_folder() -> Path:
     chosen = os.environ.get("SPLATBOT_ROBOTS")
     data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
     return Path(chosen) if chosen else data / "splatbot" / "robots"
+
+
+def robot_file(name: str) -> Path:
+    """Return the file that an added robot is kept in, which is in :func:`robots_folder`.
+
+    Raises:
+        InputError: the name is that of a built-in robot or cannot be that of a file.
+    """
+    if name in _BUILT_IN or not _NAME.fullmatch(name):
+        hint = "rename the <robot> in the URDF: letters, digits, - _ . after a letter or digit, at most 80"
+        raise InputError(f"{name[:80]!r} is no name of an added robot.", field="name", hint=hint)
+    return robots_folder() / f"{name}.json"
 
 
 def robot_names() -> list[str]:

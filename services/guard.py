@@ -15,6 +15,7 @@ from splatbot.services.access import Access
 from splatbot.services.codecs import JSON, MSGPACK, NPY, ZIP
 from splatbot.services.problems import problem
 from splatbot.services.queues import URGENT, lasts
+from splatbot.services.scopes import listed_scope, scope_error
 from splatbot.services.settings import ServiceSettings
 
 OPEN = frozenset({"/healthz", "/readyz"})  # for probes: they reveal only versions, and must answer under load
@@ -57,6 +58,11 @@ class Guard:
             await _refuse(scope, receive, send, 401, "A valid API key is needed.", hint, {"WWW-Authenticate": "Bearer"})
             return
         scope.setdefault("state", {}).update(client=grant.client, scopes=grant.scopes, has_key=bool(key))
+        need = listed_scope(scope["method"], scope["path"]) if scope["type"] == "http" else None
+        if need is not None and need not in grant.scopes:  # before the body is read
+            error = scope_error(need, bool(key))
+            await _refuse(scope, receive, send, error.http_status, error.message, error.hint or "")
+            return
         if scope["path"] in URGENT:
             await self.app(scope, receive, send)
             return

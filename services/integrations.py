@@ -40,7 +40,7 @@ class Integrations:
         *,
         on_frame: Callable[[Frame], Any],
     ) -> None:
-        self.ros = RosNode(store, arms=arms, on_frame=on_frame)
+        self.ros = RosNode(store, arms=arms, on_frame=on_frame, max_pixels=settings.max_pixels)
         router = settings.zenoh_router
         self._zenoh = ZenohBridge(self.ros.graph, router, domain=settings.ros_domain) if router is not None else None
         self._record = settings.record

@@ -20,6 +20,10 @@ from splatbot.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 
 
+class FrameError(SplatbotError):
+    """A frame made mapping fail; the map goes on without it."""
+
+
 class LiveMapper(Protocol):
     """The part that live mapping uses of :class:`splatbot.slam.Slam`."""
 
@@ -57,6 +61,8 @@ class LiveMapping:
         source: frames in their order: a log, a camera, or the frames that clients push.
         mapper: only the mapping thread touches it once started.
         on_result: called in the mapping thread after each frame.
+        on_error: called in the mapping thread with the index of a frame that cannot be mapped; mapping goes on. If
+            None, such a frame ends it.
         on_end: called in the mapping thread at its end.
     """
 
@@ -68,6 +74,7 @@ class LiveMapping:
         mapper: LiveMapper,
         *,
         on_result: Callable[[FrameResult], None] | None = None,
+        on_error: Callable[[int, SplatbotError], None] | None = None,
         on_end: Callable[[], None] = lambda: None,
     ) -> None:
         self._store = store
@@ -75,6 +82,7 @@ class LiveMapping:
         self._source = source
         self._mapper = mapper
         self._on_result = on_result
+        self._on_error = on_error
         self._on_end = on_end
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name=f"mapping-{served.id}", daemon=True)
@@ -120,8 +128,9 @@ class LiveMapping:
             if self._stop.is_set():
                 break
             self._store.tell(self._served, FRAME, frame)
-            with self._store.frames_first.mapping():
-                result = self._mapper.process(frame)
+            result = self._process(frame)
+            if result is None:
+                continue
             self._store.tell(self._served, RESULT, result)
             if result.keyframe:
                 self._publish()
@@ -133,6 +142,21 @@ class LiveMapping:
             self._publish()
         elif shown >= 0:
             self._publish()  # without the final refinement: a stop request wants a quick end
+
+    def _process(self, frame: Frame) -> FrameResult | None:
+        """Map a frame; if it fails, call ``on_error`` and return None."""
+        try:
+            with self._store.frames_first.mapping():
+                return self._mapper.process(frame)
+        except Exception as error:
+            if self._on_error is None:
+                raise
+            if not isinstance(error, SplatbotError):
+                _log.exception("frame %d of map %s cannot be mapped", frame.index, self._served.id)
+                hint = "push the next frame; the service's log says more"
+                error = FrameError("the frame cannot be mapped; the map is as it was before.", hint=hint)
+            self._on_error(frame.index, error)
+            return None
 
     def _publish(self) -> None:
         served, mapper = self._served, self._mapper

@@ -70,10 +70,15 @@ def _unpacked(settings: ServiceSettings, archive: Path, handle: JobHandle) -> Lo
             handle.report(0.0, f"unpacking, {shown} % done")
 
     home = unpack(
-        archive, folder, max_bytes=settings.max_unpacked_bytes, max_pixels=settings.max_pixels, progress=progress
+        archive,
+        folder,
+        max_bytes=settings.max_unpacked_bytes,
+        max_pixels=settings.max_pixels,
+        max_frames=settings.max_frames,
+        progress=progress,
     )
     archive.unlink()
-    return open_allowed(str(home), [str(folder)])
+    return open_allowed(str(home), [str(folder)], max_frames=settings.max_frames, max_pixels=settings.max_pixels)
 
 
 def _reason(error: Exception) -> str:

@@ -8,10 +8,15 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 
-from splatbot.errors import InputError
+from splatbot.errors import InputError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.services.problems import BusyError
 from splatbot.slam import FrameResult
+
+MAX_STAMP_S = 1e11  # in the year 5138; larger numbers are not seconds
+MAX_PAUSE_S = 86_400.0  # [s] between two frames
+_MAX_INTERVAL_S = 0.1  # [s] largest time in the map between the frames before and after a jump of the clock
+_RESYNC = "if the clock was set, POST /v1/maps/ID/resync first"
 
 
 class StreamEndedError(InputError):
@@ -33,7 +38,10 @@ class PushedFrames:
         self._lock = threading.Lock()
         self._answers: dict[int, Future[FrameResult]] = {}
         self._count = 0
-        self._last = -float("inf")
+        self._last: float | None = None
+        self._interval = _MAX_INTERVAL_S
+        self._offset = 0.0  # [s] from the clock of the frames to the time of the map
+        self._resync = False
         self._size: tuple[int, int] | None = None
         self._ended: str | None = None
 
@@ -43,20 +51,31 @@ class PushedFrames:
         Raises:
             BusyError: as many frames wait as may; this one is dropped.
             StreamEndedError: the stream has ended.
-            InputError: the frame is of another size than those before, or not after them.
+            InputError: the frame is of another size than those before, not after them, or its stamp or intrinsics
+                cannot be right; only this frame is refused.
         """
         with self._lock:
-            if self._ended is not None:
-                raise StreamEndedError(f"the map takes no more frames: {self._ended}.", hint="create another map")
+            self._check_open()
             if len(self._answers) >= self._capacity:
                 raise BusyError(f"{self._capacity} frames wait to be mapped.", hint="send fewer, or smaller ones")
             self._check(frame)
             index, self._count = self._count, self._count + 1
-            self._last = frame.stamp
+            self._size = frame.camera.width, frame.camera.height
+            stamp = self._in_time_of_map(frame.stamp)
             answer: Future[FrameResult] = Future()
             self._answers[index] = answer
-            self._frames.put(replace(frame, index=index))
+            self._frames.put(replace(frame, index=index, stamp=stamp))
         return answer
+
+    def resync(self) -> None:
+        """Accept any stamp of the next frame: its clock was set. In the map, time goes on and never back.
+
+        Raises:
+            StreamEndedError: the stream has ended.
+        """
+        with self._lock:
+            self._check_open()
+            self._resync = True
 
     def end(self, why: str = "its stream has ended") -> None:
         """Take no more; those that wait are still given to the reader."""
@@ -72,6 +91,13 @@ class PushedFrames:
         if waiting is not None and waiting.set_running_or_notify_cancel():
             waiting.set_result(result)
 
+    def refuse(self, index: int, error: SplatbotError) -> None:
+        """Report the error of a frame, which is not in the map, to the request that pushed it."""
+        with self._lock:
+            waiting = self._answers.pop(index, None)
+        if waiting is not None and waiting.set_running_or_notify_cancel():
+            waiting.set_exception(error)
+
     def abandon(self, why: str) -> None:
         """End the stream and fail all waiting requests."""
         self.end(why)
@@ -85,7 +111,12 @@ class PushedFrames:
         while (frame := self._frames.get()) is not None:
             yield frame
 
+    def _check_open(self) -> None:
+        if self._ended is not None:
+            raise StreamEndedError(f"the map takes no more frames: {self._ended}.", hint="create another map")
+
     def _check(self, frame: Frame) -> None:
+        frame.camera.check_plausible()
         size = frame.camera.width, frame.camera.height
         if self._size is not None and size != self._size:
             hint = "push frames of one size to one map"
@@ -94,7 +125,30 @@ class PushedFrames:
                 field="camera",
                 hint=hint,
             )
-        if frame.stamp <= self._last:
-            hint = "push frames in the order of their stamps"
-            raise InputError(f"{frame.stamp} s is not after {self._last} s.", field="stamp", hint=hint)
-        self._size = size
+        if not 0.0 <= frame.stamp <= MAX_STAMP_S:
+            hint = "give seconds since 1970, or since the start"
+            raise InputError(f"{frame.stamp:.6g} s is not within 0..{MAX_STAMP_S:.0e} s.", field="stamp", hint=hint)
+        if self._last is None or self._resync:
+            return
+        stamp = frame.stamp + self._offset
+        if stamp <= self._last:
+            hint = f"push frames in the order of their stamps; {_RESYNC}"
+            before = self._last - self._offset
+            raise InputError(f"{frame.stamp:.6f} s is not after {before:.6f} s.", field="stamp", hint=hint)
+        if stamp - self._last > MAX_PAUSE_S:
+            raise InputError(
+                f"{frame.stamp:.6f} s is more than {MAX_PAUSE_S:.0f} s after the frame before.",
+                field="stamp",
+                hint=_RESYNC,
+            )
+
+    def _in_time_of_map(self, stamp: float) -> float:
+        """Return a stamp in the time of the map, which increases when the clock of the frames is set back."""
+        if self._resync and self._last is not None:
+            self._offset = max(0.0, self._last + self._interval - stamp)
+        self._resync = False
+        stamp += self._offset
+        if self._last is not None:
+            self._interval = min(stamp - self._last, _MAX_INTERVAL_S)
+        self._last = stamp
+        return stamp

@@ -11,29 +11,47 @@ from typing import IO, BinaryIO
 
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log, open_log
+from splatbot.logs.calibration import read_calibration
+from splatbot.logs.image_size import image_size
 from splatbot.logs.index import read_index
 from splatbot.logs.presets import PRESETS
+from splatbot.logs.synthetic import read_options
 from splatbot.services.problems import DISK_ERRORS, TooLargeError
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".txt", ".json", ".yaml"})
 _MAX_FILES = 200_000
 _CHUNK = 1 << 20
+_IMAGES = (".png", ".jpg", ".jpeg")
 _LISTS = ("rgb.txt", "depth.txt", "mask.txt")
-_PNG = b"\x89PNG\r\n\x1a\n"
+_SAMPLES_A_FRAME = 4  # lines of joints and ground truth, which robots report more often than images
+_MAX_URI = 4095
+_COMMENTS = 1000  # lines more
+_LINE_BYTES = 256
+_MAX_DOCUMENT = 1 << 20  # bytes of a JSON or YAML file
 
 
-def open_allowed(uri: str, roots: Sequence[str], *, camera: str | None = None) -> Log:
+def open_allowed(uri: str, roots: Sequence[str], *, camera: str | None = None, max_frames: int, max_pixels: int) -> Log:
     """Open the log that a client names: synthetic, or a folder under one of ``roots`` after resolving links.
 
     Raises:
         InputError: it is elsewhere, whether or not there is something.
         LogError: it cannot be opened.
+        TooLargeError: a synthetic log has more than ``max_frames`` frames, or more than ``max_pixels`` a frame.
     """
     if camera is not None and camera not in PRESETS:
         raise InputError(f"is {camera[:80]!r}.", field="camera", hint=f"presets: {', '.join(PRESETS)}")
     if uri.startswith("synthetic:"):
+        if len(uri) > _MAX_URI:
+            raise InputError(f"has more than {_MAX_URI} characters.", field="log", hint="name fewer effects")
+        options = read_options(uri)
+        _check_pixels((options.width, options.height), max_pixels)
+        if options.frames > max_frames:
+            hint = "ask for fewer, or raise SPLATBOT_MAX_FRAMES"
+            raise TooLargeError(
+                f"has {options.frames} frames, at most {max_frames} are mapped.", field="log", hint=hint
+            )
         return open_log(uri, camera=camera)
-    if "\x00" not in uri and len(uri) < 4096:
+    if "\x00" not in uri and len(uri) <= _MAX_URI:
         for root in (Path(root).resolve() for root in roots):
             folder = (root / uri).resolve()  # an absolute uri is used as it is
             if folder.is_relative_to(root) and folder.is_dir():
@@ -49,6 +67,7 @@ def unpack(
     *,
     max_bytes: int,
     max_pixels: int,
+    max_frames: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
     """Unpack an uploaded zip of a recording into ``folder``; the folder that holds its rgb.txt.
@@ -58,7 +77,9 @@ def unpack(
 
     Raises:
         LogError: it is not a zip, is damaged, holds files of other kinds, or has paths that leave the archive.
-        TooLargeError: it unpacks to more than ``max_bytes``, or an image has more than ``max_pixels``.
+        TooLargeError: it unpacks to more than ``max_bytes``, an image has more than ``max_pixels``, or a list more
+            than ``max_frames`` lines.
+        CameraError: the intrinsics are damaged, or cannot be those of a camera.
         OSError: the disk is full or not available.
     """
     try:
@@ -76,7 +97,7 @@ def unpack(
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with pack.open(member) as source, target.open("xb") as file:
                     left -= _copy(source, file, left, max_bytes, step)
-                check_picture(target, max_pixels)
+                check_file(target, max_pixels, max_frames)
     except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError, EOFError) as error:
         raise LogError("is no zip that can be unpacked.", field="upload", hint="zip the recording's folder") from error
     except FileExistsError as error:
@@ -90,6 +111,7 @@ def unpack(
         hint = "zip a folder in TUM layout: rgb.txt, depth.txt, intrinsics.json and the images"
         raise LogError("holds no rgb.txt.", field="upload", hint=hint)
     stays_inside(homes[0].parent)
+    check_calibration(homes[0].parent, max_pixels)
     return homes[0].parent
 
 
@@ -110,59 +132,58 @@ def stays_inside(folder: Path) -> None:
                 raise LogError("leads out of the recording.", file=path, field=f"line {entry.line}", hint=hint)
 
 
-def check_picture(path: Path, max_pixels: int) -> None:
-    """Refuse an image whose header declares more pixels than the limit.
+def check_file(path: Path, max_pixels: int, max_lines: int) -> None:
+    """Check an unpacked file by its real format and size before it is read.
 
     Raises:
-        TooLargeError: it does.
+        LogError: a file that is named as an image is neither PNG nor JPEG.
+        TooLargeError: an image has too many pixels, a list too many lines, or another text is too long.
     """
-    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        return
-    with path.open("rb") as file:
-        size = picture_size(file.read(1 << 16))
-    if size is not None and size[0] * size[1] > max_pixels:
-        raise _too_many(size, max_pixels)
+    kind = path.suffix.lower()
+    if kind in _IMAGES:
+        with path.open("rb") as file:
+            size = image_size(file)
+        if size is None:
+            raise LogError("is neither PNG nor JPEG.", file=path, field="upload", hint="send images as PNG or JPEG")
+        _check_pixels(size, max_pixels)
+    elif kind == ".txt":
+        most = max_lines if path.name in _LISTS else _SAMPLES_A_FRAME * max_lines
+        with path.open("rb") as file:
+            lines = sum(chunk.count(b"\n") + chunk.count(b"\r") for chunk in iter(lambda: file.read(_CHUNK), b""))
+        if lines > most + _COMMENTS or path.stat().st_size > _LINE_BYTES * (most + _COMMENTS):
+            hint = "send a shorter recording, or raise SPLATBOT_MAX_FRAMES"
+            raise TooLargeError(f"{path.name} has more than {most} lines.", field="upload", hint=hint)
+    elif path.stat().st_size > _MAX_DOCUMENT:
+        hint = "leave out files that do not belong to the recording"
+        raise TooLargeError(f"{path.name} has more than {_MAX_DOCUMENT} bytes.", field="upload", hint=hint)
 
 
-def checked_picture(data: bytes, max_pixels: int, field: str) -> bytes:
+def check_calibration(folder: Path, max_pixels: int) -> None:
+    """Check size and intrinsics in the recording's `intrinsics.json`, if it has one, before anything is allocated.
+
+    Raises:
+        CameraError: the file is damaged, or its values cannot be those of a camera.
+        TooLargeError: images have too many pixels.
+    """
+    path = folder / "intrinsics.json"
+    if path.is_file():
+        camera = read_calibration(path).camera
+        _check_pixels((camera.width, camera.height), max_pixels)
+        camera.check_plausible()
+
+
+def checked_image(data: bytes, max_pixels: int, field: str) -> bytes:
     """Return ``data`` if it is a PNG or JPEG of at most ``max_pixels``.
 
     Raises:
         InputError: it is neither.
         TooLargeError: it has more pixels.
     """
-    size = picture_size(data)
+    size = image_size(data)
     if size is None:
         raise InputError("is neither PNG nor JPEG.", field=field, hint="send an image file, or an array")
-    if size[0] * size[1] > max_pixels:
-        raise _too_many(size, max_pixels)
+    _check_pixels(size, max_pixels)
     return data
-
-
-def picture_size(head: bytes) -> tuple[int, int] | None:
-    """Return width and height from the header of a PNG or JPEG, or None for other data."""
-    if head.startswith(_PNG) and len(head) >= 24:
-        width, height = struct.unpack(">II", head[16:24])
-        return int(width), int(height)
-    if head.startswith(b"\xff\xd8"):
-        return _jpeg_size(head)
-    return None
-
-
-def _jpeg_size(head: bytes) -> tuple[int, int] | None:
-    at = 2
-    while at + 9 <= len(head):
-        if head[at] != 0xFF:
-            return None
-        kind = head[at + 1]
-        if kind == 0xFF:  # fill
-            at += 1
-        elif 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", head[at + 5 : at + 9])
-            return int(width), int(height)
-        else:
-            at += 2 + int.from_bytes(head[at + 2 : at + 4], "big")
-    return None
 
 
 def _inside(member: zipfile.ZipInfo) -> PurePosixPath:
@@ -198,9 +219,10 @@ def _too_large(max_bytes: int) -> TooLargeError:
     )
 
 
-def _too_many(size: tuple[int, int], max_pixels: int) -> TooLargeError:
-    return TooLargeError(
-        f"an image of {size[0]}x{size[1]} has more than {max_pixels} pixels.",
-        field="image",
-        hint="send smaller images, or raise SPLATBOT_MAX_PIXELS",
-    )
+def _check_pixels(size: tuple[int, int], max_pixels: int) -> None:
+    if size[0] * size[1] > max_pixels:
+        raise TooLargeError(
+            f"an image of {size[0]}x{size[1]} has more than {max_pixels} pixels.",
+            field="image",
+            hint="send smaller images, or raise SPLATBOT_MAX_PIXELS",
+        )

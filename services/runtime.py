@@ -118,6 +118,7 @@ class Runtime:
             frames,
             Slam(self.config),
             on_result=frames.answer,
+            on_error=frames.refuse,
             on_end=lambda: self._stream_ended(served.generation, frames),
         )
         with self._lock:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from starlette.requests import HTTPConnection
 
 from splatbot.errors import SplatbotError
@@ -33,6 +35,8 @@ NEEDS: dict[tuple[str, str], Scope] = {
 }
 """Scopes of the routes that are not GET; a test checks that each route is here."""
 
+_FORMS = [(verb, re.compile(re.sub(r"\{\w+\}", "[^/]+", path)), need) for (verb, path), need in NEEDS.items()]
+
 
 class ScopeError(SplatbotError):
     """The client's key lacks a scope."""
@@ -51,6 +55,20 @@ def needed(method: str, path: str) -> Scope:
     return NEEDS.get((method, path), "read" if method in ("GET", "HEAD") else "admin")
 
 
+def scope_error(scope: Scope, has_key: bool) -> SplatbotError:
+    """Return the error of a client without a scope."""
+    if not has_key:
+        hint = "send Authorization: Bearer KEY; `splatbot serve` names the file of the key at its start"
+        return NoKeyError(f"This needs a key with the scope {scope!r}.", hint=hint)
+    hint = f"make another: splatbot serve --new-key --scopes read,{scope}"
+    return ScopeError(f"The key lacks the scope {scope!r}.", hint=hint)
+
+
+def listed_scope(method: str, path: str) -> Scope | None:
+    """Return the scope of the listed route of a path, before the request is routed; None if none is listed."""
+    return next((need for verb, form, need in _FORMS if verb == method and form.fullmatch(path)), None)
+
+
 async def check_scope(connection: HTTPConnection) -> None:
     """Check that the client has the scope of the route; a dependency of every route.
 
@@ -62,10 +80,5 @@ async def check_scope(connection: HTTPConnection) -> None:
     if scope["type"] != "http":
         return  # a session checks each operation
     scope_needed = needed(scope["method"], scope["route"].path)
-    if scope_needed in state.scopes:
-        return
-    if not state.has_key:
-        hint = "send Authorization: Bearer KEY; `splatbot serve` names the file of the key at its start"
-        raise NoKeyError(f"This needs a key with the scope {scope_needed!r}.", hint=hint)
-    hint = f"make another: splatbot serve --new-key --scopes read,{scope_needed}"
-    raise ScopeError(f"The key lacks the scope {scope_needed!r}.", hint=hint)
+    if scope_needed not in state.scopes:
+        raise scope_error(scope_needed, state.has_key)

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import CameraError
 
+_MIN_FIELD_DEG, _MAX_FIELD_DEG = 1.0, 170.0  # field of view of a camera that can be mapped
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -40,6 +42,28 @@ class Camera:
             raise CameraError(
                 f"has {len(self.distortion)} coefficients.", field="distortion", hint="OpenCV's 4, 5 or 8, or none"
             )
+
+    def check_plausible(self) -> None:
+        """Check that the intrinsics can be those of a recorded image.
+
+        Raises:
+            CameraError: the field of view is outside 1..170 degrees, or the principal point is far from the image.
+        """
+        for name, focal, length in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
+            angle = float(np.degrees(2 * np.arctan(0.5 * length / focal)))
+            if not _MIN_FIELD_DEG <= angle <= _MAX_FIELD_DEG:
+                raise CameraError(
+                    f"is {focal:.6g} px for {length} px, a field of view of {angle:.3g} degrees.",
+                    field=name,
+                    hint=f"give pixels; {_MIN_FIELD_DEG:g} to {_MAX_FIELD_DEG:g} degrees are taken",
+                )
+        for name, center, length in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
+            if not -0.5 * length <= center <= 1.5 * length:
+                raise CameraError(
+                    f"is {center:.6g} px, far from the {length} px of the image.",
+                    field=name,
+                    hint="give the principal point in pixels of this image",
+                )
 
     @property
     def K(self) -> NDArray[np.float64]:

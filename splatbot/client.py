@@ -190,6 +190,10 @@ class Client(AbstractContextManager["Client"]):
         answer = self._packed("POST", _map_path(map_id, "frames"), body)
         return _result(TrackedFrame, answer)
 
+    def resync(self, map_id: str) -> None:
+        """Announce that the clock of the frames was set; the next frame may have any stamp."""
+        self.request("POST", _map_path(map_id, "resync"))
+
     def end(self, map_id: str) -> None:
         """End the stream of pushed frames."""
         self.request("POST", _map_path(map_id, "end"))

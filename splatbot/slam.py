@@ -91,6 +91,15 @@ class Slam:
         clock = StageClock()
         prepared = clock.time("prepare", self._prepare, frame)
         self._apply_loop_closure()
+        location = self._location
+        try:
+            return self._map(frame, prepared, hold_out, clock)
+        except Exception:
+            self._location = location  # that of a keyframe which is not in the map
+            raise
+
+    def _map(self, frame: Frame, prepared: PreparedFrame, hold_out: bool, clock: StageClock) -> FrameResult:
+        """Track and map a prepared frame."""
         estimate = clock.time("tracking", self._track, prepared, hold_out)
         observation = self._observation(prepared, estimate, hold_out)
         keyframe = self._mapper.should_insert(observation)

@@ -15,7 +15,7 @@ from splatbot.services.ros.moveit import MoveItServices
 from splatbot.services.ros.nvblox import NvbloxServices
 from splatbot.services.ros.publishers import RosPublishers
 from splatbot.services.ros.rosapi import RosApi
-from splatbot.services.ros.subscribers import RosSubscribers
+from splatbot.services.ros.subscribers import MAX_PIXELS, RosSubscribers
 from splatbot.services.store import MapStore
 
 
@@ -27,6 +27,7 @@ class RosNode:
         arms: executes the motions that clients send. If None, they are refused.
         robot: whose joints /joint_states are, and which plans are made for where a request names none.
         on_frame: called with each frame that clients publish. If None, frames are not mapped.
+        max_pixels: of an image that clients publish.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class RosNode:
         arms: Arms | None = None,
         robot: str = "panda",
         on_frame: Callable[[Frame], Any] | None = None,
+        max_pixels: int = MAX_PIXELS,
     ) -> None:
         self.graph = RosGraph()
         RosApi(self.graph)
@@ -46,7 +48,7 @@ class RosNode:
         if arms is not None:
             EmergencyStopTopic(self.graph, arms)
         self._outlets = RosPublishers(store.bus, self.graph)
-        self._inlets = RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame)
+        self._inlets = RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame, max_pixels=max_pixels)
 
     def start(self) -> None:
         """Begin."""

@@ -12,6 +12,7 @@ from splatbot.collision.esdf import esdf
 from splatbot.errors import InputError
 from splatbot.logs.ros_frames import header
 from splatbot.logs.ros_types import to_plain
+from splatbot.services.problems import TooLargeError
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.moveit import main_map
@@ -56,9 +57,12 @@ class NvbloxServices:
         else:
             means = served.ready.model.means.numpy()
             low, high = (means.min(0) - voxel, means.max(0) + voxel) if len(means) else (np.zeros(3), np.full(3, voxel))
-        if voxel <= 0 or float(np.prod(np.maximum((high - low) / max(voxel, 1e-9), 0))) > _MOST_VOXELS:
-            hint = f"ask for at most {_MOST_VOXELS} voxels"
-            raise InputError(f"needs more voxels of {voxel} m.", field="aabb_size_m", hint=hint)
+        if voxel <= 0 or not (high > low).all():
+            raise InputError(f"is empty, or the voxels of {voxel} m are.", field="aabb_size_m", hint="give lengths > 0")
+        voxels = float(np.prod(np.ceil((high - low) / voxel)))
+        if not voxels <= _MOST_VOXELS:
+            hint = f"at most {_MOST_VOXELS} voxels are answered: ask for a smaller box or larger voxels"
+            raise TooLargeError(f"needs {voxels:.3g} voxels of {voxel:g} m.", field="aabb_size_m", hint=hint)
         grid = esdf(served.field, np.stack([low, high]), voxel, cut=_CUT)
         return {
             "header": to_plain(header(served.ready.stamp, MAP_FRAME)),

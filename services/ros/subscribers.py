@@ -13,10 +13,10 @@ from splatbot.errors import SplatbotError
 from splatbot.frame import Frame
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
-from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of
+from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of, size_of
 from splatbot.logs.undistort import Undistorter
 from splatbot.services.bus import Bus
-from splatbot.services.problems import BusyError
+from splatbot.services.problems import BusyError, TooLargeError
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import joints_of
 from splatbot.services.ros.publishers import FROM_ROS
@@ -24,6 +24,7 @@ from splatbot.services.ros.wire import RosMessage
 from splatbot.services.topics import JOINTS as ROBOT_JOINTS
 from splatbot.services.topics import robot_topic
 
+MAX_PIXELS = 2_100_000  # of an image, unless the settings of the service say otherwise
 _WAITING = 16
 
 _log = logging.getLogger(__name__)
@@ -40,14 +41,21 @@ class RosSubscribers:
         bus: receives the joints.
         robot: whose joints /joint_states are.
         on_frame: called with each frame. If None, images are only forwarded to other clients.
+        max_pixels: of an image.
     """
 
     def __init__(
-        self, graph: RosGraph, bus: Bus, *, robot: str = "panda", on_frame: Callable[[Frame], Any] | None = None
+        self,
+        graph: RosGraph,
+        bus: Bus,
+        *,
+        robot: str = "panda",
+        on_frame: Callable[[Frame], Any] | None = None,
+        max_pixels: int = MAX_PIXELS,
     ) -> None:
         self._bus, self._robot, self._on_frame = bus, robot, on_frame
         self.dropped = 0
-        self._pairs = FramePairs()
+        self._pairs = FramePairs(max_pixels)
         self._news = graph.subscribe(COLOR, DEPTH, INFO, JOINTS, capacity=_WAITING)
         self._thread = threading.Thread(target=self._run, name="ros-inlets", daemon=True)
 
@@ -83,9 +91,14 @@ class RosSubscribers:
 
 
 class FramePairs:
-    """Colour and depth images as they come, paired by time."""
+    """Colour and depth images as they come, paired by time.
 
-    def __init__(self) -> None:
+    Args:
+        max_pixels: of an image; larger ones are refused before anything is decoded or allocated.
+    """
+
+    def __init__(self, max_pixels: int = MAX_PIXELS) -> None:
+        self._max_pixels = max_pixels
         self._camera: Camera | None = None
         self._undistort: Undistorter | None = None
         self._waiting: dict[str, OrderedDict[float, Any]] = {COLOR: OrderedDict(), DEPTH: OrderedDict()}
@@ -96,13 +109,17 @@ class FramePairs:
 
         Raises:
             InputError: the image or the intrinsics make no sense, or do not belong together.
+            TooLargeError: the image has too many pixels.
         """
         if topic == INFO:
             camera = camera_of(message)
+            self._check_size(camera.width, camera.height)
+            camera.check_plausible()
             if self._undistort is None or camera != self._camera:
                 self._undistort = Undistorter(camera) if camera.distortion else None
             self._camera = camera
             return None
+        self._check_size(*size_of(message))
         stamp, other = seconds_of(message.header.stamp), self._waiting[DEPTH if topic == COLOR else COLOR]
         nearest = min(other, key=lambda known: abs(known - stamp), default=None)
         if self._camera is None or nearest is None or abs(nearest - stamp) > MAX_STAMP_DIFFERENCE_S:
@@ -113,6 +130,13 @@ class FramePairs:
         partner = other.pop(nearest)
         color, depth = (message, partner) if topic == COLOR else (partner, message)
         return self._frame(seconds_of(color.header.stamp), color, depth)
+
+    def _check_size(self, width: int, height: int) -> None:
+        if width * height > self._max_pixels:
+            hint = "publish smaller images, or raise SPLATBOT_MAX_PIXELS"
+            raise TooLargeError(
+                f"{width}x{height} has more than {self._max_pixels} pixels.", field="width, height", hint=hint
+            )
 
     def _frame(self, stamp: float, color: Any, depth: Any) -> Frame:
         assert self._camera is not None

@@ -19,7 +19,7 @@ from splatbot.frame import Frame
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import Served, Service, problems
 from splatbot.services.problems import BusyError, TooLargeError
-from splatbot.services.recordings import checked_picture
+from splatbot.services.recordings import checked_image
 from splatbot.services.schemas import CameraIn
 from splatbot.services.schemas import Request as Body
 
@@ -35,7 +35,7 @@ class FrameRequest(Body):
     Arrays are rgb (H, W, 3) uint8 and depth (H, W) float32 [m] or uint16.
     """
 
-    stamp: float = Field(allow_inf_nan=False, description="[s]; later than the frame before")
+    stamp: float = Field(allow_inf_nan=False, description="[s]; later than the frame before, by at most a day")
     camera: CameraIn
     rgb: Any = Field(description="PNG or JPEG, or array")
     depth: Any = Field(description="16-bit PNG, or array; 0 where it is not known")
@@ -113,6 +113,16 @@ def push_frame(request: Request, served: Served, service: Service, query: _Body)
     return answer(request, body)
 
 
+@router.post("/{map_id}/resync", status_code=204, response_class=Response, responses=problems(404, 409))
+def resync_frames(served: Served, service: Service) -> Response:
+    """Accept any stamp of the next frame, because the clock of the camera was set.
+
+    In the map time goes on: if the clock was set back, later stamps are shifted, also in answers and trajectories.
+    """
+    service.stream(served.id).resync()
+    return Response(status_code=204)
+
+
 @router.post("/{map_id}/end", status_code=202, response_class=Response, responses=problems(404, 409))
 def end_frames(served: Served, service: Service) -> Response:
     """End the stream: the map is refined once more, and its state becomes "ended"."""
@@ -138,7 +148,7 @@ def _frame(query: FrameRequest, max_pixels: int) -> Frame:
 def _decoded(value: Any, field: str, flags: int, max_pixels: int) -> NDArray[Any]:
     if isinstance(value, np.ndarray):
         return np.require(value, requirements=["C", "W"])  # arrays of a body are read-only
-    data = checked_picture(value, max_pixels, field)
+    data = checked_image(value, max_pixels, field)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:

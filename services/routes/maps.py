@@ -91,7 +91,14 @@ def create_map(
     known = service.jobs.known(key, request)
     if known is not None:
         return accepted(known)
-    log = open_allowed(query.log, service.settings.log_roots, camera=query.camera)
+    settings = service.settings
+    log = open_allowed(
+        query.log,
+        settings.log_roots,
+        camera=query.camera,
+        max_frames=settings.max_frames,
+        max_pixels=settings.max_pixels,
+    )
     total = check_length(log, service.settings.max_frames, query.max_frames)
     workspace = workspace_of(log.uri, base)
     served = service.store.add(query.id, source=log.name, state="mapping", workspace=workspace, awaited=False)

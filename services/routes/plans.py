@@ -73,6 +73,15 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     planner = GaussianRRTStar(served.field, robot, T_world_base=base, margin=query.margin)
     result = planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed)
     trajectory = time_path(result.unwrap(), planner.arm, served.field, velocity_scale=query.speed)
+    points = len(trajectory.control) - 2 if query.rate is None else trajectory.duration * query.rate
+    most = service.settings.max_configurations
+    if points > most:
+        hint = "give a lower rate or a higher speed, or raise SPLATBOT_MAX_CONFIGURATIONS"
+        raise TooLargeError(
+            f"makes {points:.0f} points of {trajectory.duration:.4g} s, at most {most} points are answered.",
+            field="rate",
+            hint=hint,
+        )
     kept = service.plans.add(served, robot.name, base, result, trajectory)
     service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))

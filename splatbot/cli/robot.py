@@ -60,15 +60,15 @@ def robot(
 
 def _add(path: Path, out: Path | None, tip: str | None, slack: float) -> int:
     from splatbot.robots.cover import uncovered
-    from splatbot.robots.store import robots_folder, save_robot
+    from splatbot.robots.store import robot_file, save_robot
     from splatbot.robots.urdf import read_urdf
 
     reading = read_urdf(path, tip=tip, slack=slack)
     for note in reading.notes:
         print(f"note: {note}")
+    file = out if out is not None else robot_file(reading.robot.name)
     spheres = reading.robot.spheres()
     beyond = uncovered(reading.robot.shapes, spheres, slack / 3)
-    file = out if out is not None else robots_folder() / f"{reading.robot.name}.json"
     save_robot(reading.robot, file)
     inside = beyond <= 1e-9
     state = "all of it is inside" if inside else f"{1e3 * beyond:.2f} mm of it sticks out"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,12 +80,35 @@ def associate(a: NDArray[np.float64], b: NDArray[np.float64], max_difference: fl
     The pairing is one to one and greedy by the smallest difference, as in TUM's `associate.py`. Pairs are in the order
     of ``a``.
     """
-    first, last = np.searchsorted(b, a - max_difference, "left"), np.searchsorted(b, a + max_difference, "right")
-    near = [(abs(a[i] - b[j]), i, j) for i in range(len(a)) for j in range(first[i], last[i])]
+    # The smallest difference among all unpaired stamps is always between neighbours in time.
+    order = sorted(
+        [(stamp, 0, i) for i, stamp in enumerate(a.tolist())] + [(t, 1, j) for j, t in enumerate(b.tolist())]
+    )
+    before, after = list(range(-1, len(order) - 1)), list(range(1, len(order) + 1))
+    heap: list[tuple[float, int, int, int, int]] = []
+
+    def offer(left: int, right: int) -> None:
+        if left < 0 or right >= len(order) or order[left][1] == order[right][1]:
+            return
+        difference = order[right][0] - order[left][0]
+        if difference < max_difference:
+            i, j = (order[k][2] for k in sorted((left, right), key=lambda k: order[k][1]))
+            heapq.heappush(heap, (difference, i, j, left, right))
+
+    for k in range(len(order) - 1):
+        offer(k, k + 1)
     pairs: dict[int, int] = {}
-    taken: set[int] = set()
-    for difference, i, j in sorted(near):
-        if difference < max_difference and i not in pairs and j not in taken:
-            pairs[i] = j
-            taken.add(j)
+    paired = [False] * len(order)
+    while heap:
+        _, i, j, left, right = heapq.heappop(heap)
+        if paired[left] or paired[right]:
+            continue
+        pairs[i] = j
+        paired[left] = paired[right] = True
+        outer_left, outer_right = before[left], after[right]
+        if outer_left >= 0:
+            after[outer_left] = outer_right
+        if outer_right < len(order):
+            before[outer_right] = outer_left
+        offer(outer_left, outer_right)
     return sorted(pairs.items())

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from splatbot.camera import Camera
 from splatbot.errors import CameraError, InputError
 from splatbot.geometry import pose_from_quat, rotation_to_quat
+from splatbot.logs.image_size import image_size
 from splatbot.logs.ros_types import Message, build
 
 COLOR_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8")
@@ -68,6 +69,21 @@ def color_of(message: Message) -> NDArray[np.uint8]:
         raise _encoding(message, COLOR_ENCODINGS)
     pixels = _pixels(message, np.dtype(np.uint8), len(message.encoding) - 1)
     return np.ascontiguousarray(pixels[..., channels[message.encoding]])
+
+
+def size_of(message: Message) -> tuple[int, int]:
+    """Return width and height of a sensor_msgs/Image or CompressedImage; nothing is decoded.
+
+    Raises:
+        InputError: the compressed image is neither PNG nor JPEG.
+    """
+    if not hasattr(message, "format"):
+        return int(message.width), int(message.height)
+    data = np.asarray(message.data, np.uint8)
+    size = image_size((data[_COMPRESSED_DEPTH_HEADER:] if "compressedDepth" in message.format else data).tobytes())
+    if size is None:
+        raise InputError("is neither PNG nor JPEG.", field="data", hint="compress images as PNG or JPEG")
+    return size
 
 
 def depth_of(message: Message) -> NDArray[np.float32]:
@@ -181,9 +197,8 @@ def _pixels(message: Message, dtype: np.dtype[Any], channels: int) -> NDArray[An
             field="data",
             hint="send height * step bytes",
         )
-    padded = np.zeros(height * step, np.uint8)
-    padded[: min(data.size, padded.size)] = data[: padded.size]
-    pixels = np.ascontiguousarray(padded.reshape(height, step)[:, :row]).view(dtype.newbyteorder("<"))
+    rows = np.lib.stride_tricks.as_strided(np.ascontiguousarray(data), (height, row), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(dtype.newbyteorder("<"))
     if message.is_bigendian and dtype.itemsize > 1:
         pixels = pixels.byteswap()
     return np.asarray(pixels, dtype).reshape(height, width, channels)

@@ -158,6 +158,15 @@ class SyntheticLog(LogBase):
         return make_effects(specs, seed=self.options.seed).along(self.ground_truth)
 
 
+def read_options(uri: str) -> SyntheticOptions:
+    """Read the options in the address of a synthetic log; no scene is built.
+
+    Raises:
+        LogError: an option is unknown, or a value out of range.
+    """
+    return _parse(uri, uri.partition("?")[2])
+
+
 def synthetic_uri(scene: str, options: SyntheticOptions) -> str:
     """Return the address of a scene with ``options``; default values are omitted."""
     plain = asdict(SyntheticOptions())

@@ -34,6 +34,7 @@ class TimingConstants:
         min_chord_eps: [m] smallest eps of the certificate of short chords.
         max_interval: [spans] longest interval of the search for the smallest clearance.
         min_interval: [spans] shortest interval of that search.
+        max_duration: [s] longest motion between two stops.
     """
 
     min_waypoint_step: float = 1e-4
@@ -47,6 +48,7 @@ class TimingConstants:
     min_chord_eps: float = 2e-5
     max_interval: int = 16
     min_interval: float = 1 / 64
+    max_duration: float = 300.0
 
 
 CONSTANTS = TimingConstants()
@@ -80,7 +82,8 @@ def time_path(
         A trajectory. ``certificate.certified`` is False only if the path itself collides.
 
     Raises:
-        InputError: a scale is out of range, a limit is 0, or the path has another number of joints.
+        InputError: a scale is out of range or makes the motion last more than 300 s, a limit is 0, or the path has
+            another number of joints.
     """
     chain = _scaled(arm.robot.chain, velocity_scale, acceleration_scale)
     if path.waypoints.ndim != 2 or path.waypoints.shape[1] != len(chain) or not np.isfinite(path.waypoints).all():
@@ -173,6 +176,12 @@ def _sampled(curve: Curve, chain: KinematicChain, step: float) -> tuple[Array, N
     speed = np.sqrt(squared)
     duration = np.where(np.diff(s) > 0, 2.0 * np.diff(s) / np.maximum(speed[:-1] + speed[1:], 1e-12), 0.0)
     time = np.concatenate([[0.0], np.cumsum(duration)])
+    if not time[-1] <= CONSTANTS.max_duration:
+        raise InputError(
+            f"makes the motion last {time[-1]:.3g} s.",
+            field="velocity_scale",
+            hint=f"move faster: a motion lasts at most {CONSTANTS.max_duration:g} s",
+        )
     t = np.append(np.arange(0.0, time[-1], step), time[-1])
     i = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(duration) - 1)
     elapsed = t - time[i]

@@ -5,15 +5,20 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
+import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
 import websockets
+from numpy.typing import NDArray
 
 from splatbot.errors import InputError
+from splatbot.logs.index import associate
+from splatbot.robots.store import robot_file
 from splatbot.services.bounds import check_json, check_msgpack
 from splatbot.services.codecs import decode_msgpack, decode_npy
 from splatbot.services.problems import TooLargeError
@@ -236,3 +241,86 @@ def test_a_view_of_an_impossible_camera_is_answered_or_refused(service: Victim, 
             ),
         ]
     assert all(answer.status_code in (200, 422) for answer in answers), [answer.text for answer in answers]
+
+
+def test_points_of_a_trajectory_are_bounded_by_its_duration_and_rate(service: Victim) -> None:
+    goal = [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+    body = {"goal": goal, "base": {"translation": [5.0, 0, 0]}, "speed": 0.005, "rate": 1000}
+    with service.attacked():
+        answer = service.client.post("/v1/maps/wall/plans", json=body)
+    assert answer.status_code == 413, answer.text
+    assert "10000 points" in answer.json()["detail"]
+    assert service.client.post("/v1/maps/wall/plans", json=body | {"rate": None, "speed": 1}).status_code == 200
+
+
+@pytest.mark.parametrize("speed", [2e-3, 1e-4, 1e-6, 1e-12, 1e-300])
+def test_a_motion_without_end_is_refused_before_its_points_are_made(service: Victim, speed: float) -> None:
+    body = {"goal": [1.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], "base": {"translation": [5.0, 0, 0]}, "speed": speed}
+    with service.attacked():
+        answer = service.client.post("/v1/maps/wall/plans", json=body)
+    assert answer.status_code in (413, 422), answer.text
+
+
+SYNTHETIC = [
+    "width=4096&height=4096",
+    "frames=100001",
+    "frames=1000000000",
+    "width=1000000",
+    "effects=" + "a;" * 100_000,
+]
+
+
+@pytest.mark.parametrize("query", SYNTHETIC)
+def test_synthetic_frames_are_bounded_before_the_scene_is_built(service: Victim, query: str) -> None:
+    with service.attacked():
+        answer = service.client.post("/v1/maps", json={"id": "big", "log": f"synthetic:tabletop?{query}"})
+    assert answer.status_code in (413, 422), answer.text
+
+
+BOXES = [
+    {"use_aabb": True, "aabb_size_m": {"x": 1e9, "y": 1e9, "z": 1e9}},
+    {"use_aabb": True, "aabb_size_m": {"x": 1e300, "y": 1e300, "z": 1e300}},
+    {"use_aabb": True, "aabb_size_m": {"x": 1e12, "y": 1e-12, "z": 1e-12}},
+    {"use_aabb": True, "aabb_size_m": {"x": 1e9, "y": 0, "z": 1}},
+    {"use_aabb": True, "aabb_size_m": {"x": -1e9, "y": -1e9, "z": 1}},
+    {"voxel_size_m": 1e-12},
+    {"voxel_size_m": 1e-300},
+    {"voxel_size_m": -1},
+]
+
+
+@pytest.mark.parametrize("box", BOXES, ids=str)
+def test_voxels_of_a_distance_field_are_bounded_before_they_are_made(service: Victim, box: Any) -> None:
+    call = {"op": "call_service", "id": "e", "service": "/nvblox_node/get_esdf_and_gradient", "args": box}
+
+    async def ask() -> Any:
+        url = service.url.replace("http", "ws") + "/rosbridge"
+        headers = {name: value for name, value in service.client.headers.items() if name == "authorization"}
+        async with websockets.connect(url, max_size=None, additional_headers=headers) as socket:
+            await socket.send(json.dumps(call))
+            return json.loads(await asyncio.wait_for(socket.recv(), 20))
+
+    with service.attacked():
+        answer = asyncio.run(ask())
+    assert not answer["result"]
+    assert "Fix:" in answer["values"]
+
+
+def test_pairing_of_stamps_is_not_quadratic() -> None:
+    a: NDArray[np.float64] = np.arange(50_000, dtype=np.float64) * 1e-8
+    b: NDArray[np.float64] = np.asarray(a + 0.3e-8, np.float64)
+    begin = time.monotonic()
+    pairs = associate(a, b, 0.02)
+    assert time.monotonic() - begin < 10
+    assert pairs == [(i, i) for i in range(50_000)]
+
+
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/tmp/evil", "a/b", "..", ".hidden", "a" * 300, "panda", "new\nline", ""]
+)
+def test_the_name_of_a_robot_leads_nowhere(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "data" / "robots"
+    monkeypatch.setenv("SPLATBOT_ROBOTS", str(folder))
+    with pytest.raises(InputError, match="name"):
+        robot_file(name)
+    assert robot_file("ur5_e-2.1") == folder / "ur5_e-2.1.json"

@@ -61,3 +61,24 @@ def test_compose_builds_that_recipe() -> None:
     context = (ROOT / "docker" / build["context"]).resolve()
     assert context == ROOT
     assert (context / build["dockerfile"]).is_file()
+
+
+def test_the_container_has_no_rights_and_bounds() -> None:
+    service = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))["services"]["splatbot"]
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["read_only"] is True
+    assert all("size=" in mount for mount in service["tmpfs"])
+    assert service["mem_limit"] == service["memswap_limit"]
+    assert 0 < service["pids_limit"] <= 4096
+    assert int(service["stop_grace_period"].removesuffix("s")) > ServiceSettings().shutdown_s
+    assert "privileged" not in service
+    assert "network_mode" not in service
+
+
+def test_uploads_are_unpacked_on_a_volume_that_the_user_may_write() -> None:
+    compose = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))
+    folder = re.findall(r"\bTMPDIR=(\S+)", DOCKERFILE)[0]
+    assert f"uploads:{folder}" in compose["services"]["splatbot"]["volumes"]
+    assert "uploads" in compose["volumes"]
+    assert re.search(rf"install -d -o splatbot .*{folder}$", DOCKERFILE, flags=re.MULTILINE)
