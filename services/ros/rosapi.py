@@ -13,6 +13,8 @@ from splatbot.services.ros.graph import RosGraph, Service, resolve
 
 NODE = "/splatbot"
 
+_NO_PARAMETERS = "this service has no parameters; its settings are in configs/service.yaml"
+
 
 class RosApi:
     """The services of /rosapi on a graph.
@@ -36,6 +38,18 @@ class RosApi:
             "subscribers": ("Subscribers", lambda _: {"subscribers": [NODE]}),
             "get_time": ("GetTime", self._get_time),
             "get_ros_version": ("GetROSVersion", lambda _: {"version": 2, "distro": "jazzy"}),
+            "node_details": ("NodeDetails", self._node_details),
+            "service_node": ("ServiceNode", self._service_node),
+            "service_providers": ("ServiceProviders", self._service_providers),
+            "action_servers": ("GetActionServers", lambda _: {"action_servers": self._actions()}),
+            "action_type": ("ActionType", self._action_type),
+            "interfaces": ("Interfaces", lambda _: {"interfaces": sorted(typestore().fielddefs)}),
+            # There are no parameters; an absent one has the default of the request.
+            "get_param": ("GetParam", self._get_param),
+            "get_param_names": ("GetParamNames", lambda _: {"names": []}),
+            "has_param": ("HasParam", lambda _: {"exists": False}),
+            "set_param": ("SetParam", lambda _: {"successful": False, "reason": _NO_PARAMETERS}),
+            "delete_param": ("DeleteParam", lambda _: {"successful": False, "reason": _NO_PARAMETERS}),
             "message_details": ("MessageDetails", self._message_details),
         }
         for name, (kind, call) in calls.items():
@@ -66,6 +80,31 @@ class RosApi:
 
     def _services_for_type(self, args: Mapping[str, Any]) -> dict[str, Any]:
         return {"services": [name for name, s in self._graph.services.items() if s.type == args.get("type")]}
+
+    def _node_details(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        if args.get("node", NODE) not in (NODE, NODE[1:]):
+            return {"subscribing": [], "publishing": [], "services": []}
+        services = [name for name, service in self._graph.services.items() if not service.client]
+        return {"subscribing": [], "publishing": list(self._graph.topics), "services": services}
+
+    def _service_node(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        return {"node": NODE if resolve(args.get("service")) in self._graph.services else ""}
+
+    def _service_providers(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        known = any(service.type == args.get("service") for service in self._graph.services.values())
+        return {"providers": [NODE] if known else []}
+
+    def _actions(self) -> list[str]:
+        kinds = self._graph.topics
+        return [topic.removesuffix("/goal") for topic, kind in kinds.items() if kind.endswith("ActionGoal")]
+
+    def _action_type(self, args: Mapping[str, Any]) -> dict[str, Any]:
+        kind = self._graph.topics.get(f"{resolve(args.get('action'))}/goal", "")
+        return {"type": kind.replace("/msg/", "/action/").removesuffix("ActionGoal")}
+
+    @staticmethod
+    def _get_param(args: Mapping[str, Any]) -> dict[str, Any]:
+        return {"value": str(args.get("default") or ""), "successful": False, "reason": _NO_PARAMETERS}
 
     @staticmethod
     def _get_time(_: Mapping[str, Any]) -> dict[str, Any]:

@@ -52,8 +52,8 @@ def hear(client: Connection, op: str, timeout_s: float = 10) -> dict[str, Any]:
             return message
 
 
-def call(client: Connection, service: str, **args: Any) -> dict[str, Any]:
-    say(client, op="call_service", id="c", service=service, args=args)
+def call(client: Connection, name: str, /, **args: Any) -> dict[str, Any]:
+    say(client, op="call_service", id="c", service=name, args=args)
     return hear(client, "service_response")
 
 
@@ -209,3 +209,17 @@ def test_an_unknown_action_is_refused(served: Service) -> None:
     with ros(served) as client:
         say(client, op="send_action_goal", id="g", action="/none", action_type="a/B", args={})
         assert hear(client, "action_result")["result"] is False
+
+
+def test_the_rest_of_rosapi_answers(served: Service) -> None:
+    with ros(served) as client:
+        assert ACTION in call(client, "/rosapi/action_servers")["values"]["action_servers"]
+        kind = call(client, "/rosapi/action_type", action=ACTION)["values"]["type"]
+        assert kind == "control_msgs/action/FollowJointTrajectory"
+        assert call(client, "/rosapi/service_node", service="/compute_ik")["values"] == {"node": "/splatbot"}
+        details = call(client, "/rosapi/node_details", node="/splatbot")["values"]
+        assert "/odom" in details["publishing"]
+        assert "/compute_ik" in details["services"]
+        assert call(client, "/rosapi/get_param", name="/a", default="5")["values"]["value"] == "5"
+        for name in ("get_param_names", "has_param", "set_param", "delete_param", "interfaces", "service_providers"):
+            assert call(client, f"/rosapi/{name}")["result"] is True
