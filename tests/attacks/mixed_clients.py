@@ -112,7 +112,7 @@ def push(url: str, key: str, until: float, told: Told, frames: list[Frame]) -> N
             begin = time.monotonic()
             if begin >= until:
                 return
-            pushed = robot.push(MAP, replace(frame, stamp=FRAME_S * number))
+            pushed = robot.push(MAP, replace(frame, stamp=FRAME_S * (number + 1)))
             told.frames.append(sum(pushed.stage_ms.values()))
             time.sleep(max(0.0, begin + FRAME_S - time.monotonic()))
 
@@ -125,7 +125,7 @@ def measure(seconds: float, clients: int, pause_s: float = 0.5) -> Told:
         key = str(read_key(key_file()))  # the service made it
         with Client(service.url, key=key) as robot:
             robot.create_map(MAP)
-            robot.push(MAP, replace(frames[0], stamp=-1.0))
+            robot.push(MAP, replace(frames[0], stamp=0.0))
         until = time.monotonic() + seconds
         threads = [threading.Thread(target=push, args=(service.url, key, until, told, frames))]
         threads += [
