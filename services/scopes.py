@@ -15,6 +15,7 @@ NEEDS: dict[tuple[str, str], Scope] = {
     ("POST", "/v1/maps/{map_id}/upload"): "map",
     ("POST", "/v1/maps/{map_id}/frames"): "map",
     ("POST", "/v1/maps/{map_id}/end"): "map",
+    ("POST", "/v1/maps/{map_id}/resync"): "map",
     ("POST", "/v1/maps/{map_id}/distance"): "read",
     ("POST", "/v1/maps/{map_id}/collisions"): "read",
     ("POST", "/v1/maps/{map_id}/render"): "read",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ParamSpec, TypeVar
@@ -91,24 +91,26 @@ class Slam:
         clock = StageClock()
         prepared = clock.time("prepare", self._prepare, frame)
         self._apply_loop_closure()
-        location = self._location
-        try:
-            return self._map(frame, prepared, hold_out, clock)
-        except Exception:
-            self._location = location  # that of a keyframe which is not in the map
-            raise
-
-    def _map(self, frame: Frame, prepared: PreparedFrame, hold_out: bool, clock: StageClock) -> FrameResult:
-        """Track and map a prepared frame."""
         estimate = clock.time("tracking", self._track, prepared, hold_out)
         observation = self._observation(prepared, estimate, hold_out)
         keyframe = self._mapper.should_insert(observation)
-        if keyframe:
-            self._location = self._mapper.submit(observation)
-        else:
-            self._mapper.observe(observation)
-        self._executor.run()
+        with self._location_restored_on_error():
+            if keyframe:
+                self._location = self._mapper.submit(observation)
+            else:
+                self._mapper.observe(observation)
+            self._executor.run()
         return self._record(frame, estimate, keyframe, clock)
+
+    @contextmanager
+    def _location_restored_on_error(self) -> Iterator[None]:
+        """Restore the location after an error, which removes the keyframe from the map."""
+        location = self._location
+        try:
+            yield
+        except Exception:
+            self._location = location
+            raise
 
     def finish(self, stop: Stop = never) -> None:
         """Close the last loop and run the final refinement at the end of a stream, or until ``stop`` returns True."""
