@@ -44,20 +44,12 @@ nb::tuple edges(const Arm& arm, const Configurations& from, const Configurations
   if (from.shape(0) != to.shape(0)) {
     throw nb::value_error("the edges' ends differ in number");
   }
-  const std::size_t n = from.shape(0);
-  std::vector<std::int32_t> verdict(n), checked(n);
-  std::vector<float> at(n);
+  std::vector<ArmEdge> out(from.shape(0));
   {
     nb::gil_scoped_release release;
-    std::vector<ArmEdge> out(n);
     ask(std::span<ArmEdge>(out));
-    for (std::size_t i = 0; i < n; ++i) {
-      verdict[i] = out[i].verdict;
-      at[i] = out[i].at;
-      checked[i] = out[i].checked;
-    }
   }
-  return nb::make_tuple(owned(std::move(verdict), {n}), owned(std::move(at), {n}), owned(std::move(checked), {n}));
+  return nb::make_tuple(column(out, &ArmEdge::verdict), column(out, &ArmEdge::at), column(out, &ArmEdge::checked));
 }
 
 }  // namespace
@@ -137,26 +129,14 @@ void define_arm(nb::module_& m) {
           "clearance",
           [](const Arm& self, const CollisionField& field, Configurations q, double cut) {
             check(self, q);
-            const std::size_t n = q.shape(0);
-            std::vector<double> distance(n), normal(3 * n), center(3 * n);
-            std::vector<std::int32_t> sphere(n), id(n);
+            std::vector<ArmClearance> out(q.shape(0));
             {
               nb::gil_scoped_release release;
-              std::vector<ArmClearance> out(n);
               self.clearance(field, span_of(q), cut, out);
-              for (std::size_t i = 0; i < n; ++i) {
-                distance[i] = out[i].distance;
-                sphere[i] = out[i].sphere;
-                id[i] = out[i].id;
-                for (std::size_t k = 0; k < 3; ++k) {
-                  normal[3 * i + k] = out[i].normal[k];
-                  center[3 * i + k] = out[i].center[k];
-                }
-              }
             }
-            return nb::make_tuple(owned(std::move(distance), {n}), owned(std::move(normal), {n, 3}),
-                                  owned(std::move(center), {n, 3}), owned(std::move(sphere), {n}),
-                                  owned(std::move(id), {n}));
+            return nb::make_tuple(column(out, &ArmClearance::distance), column(out, &ArmClearance::normal),
+                                  column(out, &ArmClearance::center), column(out, &ArmClearance::sphere),
+                                  column(out, &ArmClearance::id));
           },
           "field"_a, "q"_a.noconvert(), "cut"_a,
           "Clearance (C), its gradient at the sphere (C, 3), the sphere's centre (C, 3), sphere and id");

@@ -6,6 +6,8 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
+#include <algorithm>
+#include <cstddef>
 #include <cstdint>
 #include <initializer_list>
 #include <memory>
@@ -192,6 +194,26 @@ nb::ndarray<nb::numpy, T> filled(std::initializer_list<std::size_t> shape, Fill&
     fill(std::span<T>(values));
   }
   return owned(std::move(values), shape);
+}
+
+// One number of each row, (R,).
+template <class Row, class T>
+nb::ndarray<nb::numpy, T> column(const std::vector<Row>& rows, T Row::* number) {
+  return filled<T>({rows.size()}, [&](std::span<T> out) {
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+      out[i] = rows[i].*number;
+    }
+  });
+}
+
+// N numbers of each row, (R, N).
+template <class Row, class T, std::size_t N>
+nb::ndarray<nb::numpy, T> column(const std::vector<Row>& rows, T (Row::*numbers)[N]) {
+  return filled<T>({rows.size(), N}, [&](std::span<T> out) {
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+      std::copy_n(rows[i].*numbers, N, out.begin() + static_cast<std::ptrdiff_t>(N * i));
+    }
+  });
 }
 
 inline nb::ndarray<nb::numpy, std::int64_t> indices_of(std::span<const std::uint32_t> ids) {

@@ -44,23 +44,13 @@ splatbot::SphereQueries queries_of(const Points& centers, const Radii& radii) {
 nb::tuple nearest(const CollisionField& field, const Points& centers, const Radii& radii, float cut) {
   const std::size_t n = centers.shape(0);
   const auto queries = queries_of(centers, radii);
-  std::vector<double> distance(n), normal(3 * n), point(3 * n);
-  std::vector<std::int32_t> id(n);
+  std::vector<NearestSolid> found(n);
   {
     nb::gil_scoped_release release;
-    std::vector<NearestSolid> found(n);
     field.nearest(queries, n, cut, found);
-    for (std::size_t i = 0; i < n; ++i) {
-      distance[i] = found[i].distance;
-      id[i] = found[i].id;
-      for (std::size_t k = 0; k < 3; ++k) {
-        normal[3 * i + k] = found[i].normal[k];
-        point[3 * i + k] = found[i].point[k];
-      }
-    }
   }
-  return nb::make_tuple(owned(std::move(distance), {n}), owned(std::move(normal), {n, 3}),
-                        owned(std::move(point), {n, 3}), owned(std::move(id), {n}));
+  return nb::make_tuple(column(found, &NearestSolid::distance), column(found, &NearestSolid::normal),
+                        column(found, &NearestSolid::point), column(found, &NearestSolid::id));
 }
 
 }  // namespace

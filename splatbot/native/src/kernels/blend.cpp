@@ -182,18 +182,14 @@ void blend_channels(const BlendArgs& args, const TileFrame& frame, std::size_t t
   start(args, frame, C, state);
   const bool depth = args.pass->depth_first;
   const bool expected = depth && args.depth == DepthMode::expected;
-  if (depth && args.plane_depth) {
-    constexpr int kRoom = C < kRecordChannels ? C : 1;  // such a pass leaves two channels to the slopes
-    if (expected) {
-      blend_lists<kRoom, Extras{true, true}>(args, frame, tile, state);
+  with_flag(expected, [&](auto weights) {
+    if (depth && args.plane_depth) {
+      constexpr int kRoom = C < kRecordChannels ? C : 1;  // such a pass leaves two channels to the slopes
+      blend_lists<kRoom, Extras{true, weights}>(args, frame, tile, state);
     } else {
-      blend_lists<kRoom, Extras{true, false}>(args, frame, tile, state);
+      blend_lists<C, Extras{false, weights}>(args, frame, tile, state);
     }
-  } else if (expected) {
-    blend_lists<C, Extras{false, true}>(args, frame, tile, state);
-  } else {
-    blend_lists<C, Extras{false, false}>(args, frame, tile, state);
-  }
+  });
   float* saved = args.final_state + tile * kFinalSize;
   std::memcpy(saved, state.transmittance, sizeof(state.transmittance));
   std::memcpy(saved + kPlane, state.channels, C * sizeof(state.channels[0]));

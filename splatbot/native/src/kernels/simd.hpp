@@ -396,10 +396,10 @@ SB_INLINE F log2(F a) {
   return fma(s, fma(p, s2, set1(2.8853901F)), to_float(exponent));
 }
 
-// A number as a type: an argument that may be a template's.
-template <int N>
+// A number or a flag as a type: an argument that may be a template's.
+template <auto N>
 struct Constant {
-  constexpr operator int() const { return N; }
+  constexpr operator decltype(N)() const { return N; }
 };
 
 // Sum over lanes, from the first to the last.

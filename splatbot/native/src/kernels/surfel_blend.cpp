@@ -220,22 +220,16 @@ void write_tile(const SurfelBlendArgs& args, const TileFrame& frame, const TileS
   }
 }
 
-template <int C>
-void blend_channels(const SurfelBlendArgs& args, const TileFrame& frame, std::size_t tile, TileState& state) {
-  if (args.options.distortion) {
-    blend_lists<C, true>(args, frame, tile, state);
-  } else {
-    blend_lists<C, false>(args, frame, tile, state);
-  }
-}
-
 }  // namespace
 
 void surfel_blend(const SurfelBlendArgs& args, std::size_t tile) {
   TileState state;
   const TileFrame frame = tile_frame(args.view, args.columns, tile);
   start(frame, state);
-  with_surfel_channels(args.channels, [&](auto channels) { blend_channels<channels>(args, frame, tile, state); });
+  with_surfel_channels(args.channels, [&](auto channels) {
+    with_flag(args.options.distortion,
+              [&](auto distort) { blend_lists<channels, distort>(args, frame, tile, state); });
+  });
   write_tile(args, frame, state);
   std::memcpy(args.final_state + tile * kSurfelPlanes * kPlane, state.planes, sizeof(state.planes));
 }

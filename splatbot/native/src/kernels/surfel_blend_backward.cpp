@@ -189,34 +189,18 @@ void backward_lists(const SurfelBlendBackwardArgs& args, const TileFrame& frame,
   });
 }
 
-template <int C, bool Distort>
-void backward_sums(const SurfelBlendBackwardArgs& args, const TileFrame& frame, std::size_t tile,
-                   TileGradient& state) {
-  if (args.sum_channels) {
-    backward_lists<C, Distort, true>(args, frame, tile, state);
-  } else {
-    backward_lists<C, Distort, false>(args, frame, tile, state);
-  }
-}
-
-template <int C>
-void backward_channels(const SurfelBlendBackwardArgs& args, const TileFrame& frame, std::size_t tile,
-                       TileGradient& state) {
-  if (args.forward.options.distortion && args.distortion != nullptr) {
-    backward_sums<C, true>(args, frame, tile, state);
-  } else {
-    backward_sums<C, false>(args, frame, tile, state);
-  }
-}
-
 }  // namespace
 
 void surfel_blend_backward(const SurfelBlendBackwardArgs& args, std::size_t tile) {
   TileGradient state;
   const TileFrame frame = tile_frame(args.forward.view, args.forward.columns, tile);
   load_tile(args, frame, args.forward.final_state + tile * kSurfelPlanes * kPlane, state);
-  with_surfel_channels(args.forward.channels,
-                       [&](auto channels) { backward_channels<channels>(args, frame, tile, state); });
+  with_surfel_channels(args.forward.channels, [&](auto channels) {
+    with_flag(args.forward.options.distortion && args.distortion != nullptr, [&](auto distort) {
+      with_flag(args.sum_channels,
+                [&](auto sum) { backward_lists<channels, distort, sum>(args, frame, tile, state); });
+    });
+  });
 }
 
 }  // namespace splatbot::SPLATBOT_KERNELS

@@ -47,7 +47,17 @@ SB_INLINE void with_channels(int count, Each each) {
   }
 }
 
-// The same for surfels, whose records have no channels in addition to their colours.
+// Calls each() with a constant that equals a flag.
+template <class Each>
+SB_INLINE void with_flag(bool flag, Each each) {
+  if (flag) {
+    each(Constant<true>{});
+  } else {
+    each(Constant<false>{});
+  }
+}
+
+// The same as with_channels() for surfels, whose records have no channels in addition to their colours.
 template <class Each>
 SB_INLINE void with_surfel_channels(int count, Each each) {
   if (count == 0) {
