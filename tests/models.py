@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
 
@@ -15,4 +16,16 @@ def random_model(n: int, rng: np.random.Generator, *, least: float = 0.01) -> Ga
         scales=rng.uniform(least, 0.1, (n, 3)),
         opacities=rng.uniform(0.1, 0.9, n),
         colors=rng.uniform(0, 1, (n, 3)),
+    )
+
+
+def uniform_model(means: NDArray[np.float64]) -> GaussianModel:
+    """Return grey spheres of 0.1 m with opacity 0.9 at the given means (N, 3) [m]."""
+    n = len(means)
+    return GaussianModel.from_activated(
+        means=means,
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        scales=np.full((n, 3), 0.1),
+        opacities=np.full(n, 0.9),
+        colors=np.full((n, 3), 0.5),
     )

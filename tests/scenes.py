@@ -13,6 +13,10 @@ from splatbot.rasterize import Gaussians, Viewpoints, rasterization, rasterizati
 from splatbot.rasterize.native import native
 from splatbot.rasterize.reference import Projector
 
+FORWARD_BOUND = 1e-5
+"""Largest absolute difference of colours, depth and alpha from the float64 reference."""
+GRADIENT_BOUND = 1e-4
+"""Largest relative L2 difference [1] of gradients from the float64 reference."""
 NAMES = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks", "backgrounds")
 
 

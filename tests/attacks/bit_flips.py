@@ -5,7 +5,6 @@ Run `python -m tests.attacks.bit_flips --count 2000`. Each damage must be detect
 
 from __future__ import annotations
 
-import argparse
 import logging
 import shutil
 import sys
@@ -25,6 +24,7 @@ from splatbot.services.library import MapLibrary
 from splatbot.services.store import MapStore
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
+from tests.attacks.command_line import exit_code, seeded_parser
 from tests.attacks.crash_points import LOG
 from tests.contracts.conftest import wall
 
@@ -139,15 +139,10 @@ def run(count: int, seed: int = 0) -> Tally:
 
 def main() -> int:
     """Run and print the counts."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    given = seeded_parser(__doc__, 2000).parse_args()
     tally = run(given.count, given.seed)
     print(f"detected and reported: {sum(tally.detected.values())} of {given.count}; {dict(tally.detected)}")
-    for line in tally.missed[:20]:
-        print("  missed", line)
-    return 1 if tally.missed else 0
+    return exit_code(tally.missed)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ again), a third of recordings, a third of mapping. In half of them the file that
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import shutil
@@ -30,6 +29,8 @@ from splatbot.services.library import MapLibrary
 from splatbot.services.store import MapStore
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
+from tests.attacks.command_line import exit_code, seeded_parser
+from tests.models import uniform_model
 
 State = tuple[str, int] | None
 STATES: list[State] = [None, ("a", 1), ("a", 2), ("a", 5), None, ("b", 1), ("b", 2), ("b", 9)]
@@ -79,14 +80,7 @@ def _child(work: Callable[[int], None], choice: str = "") -> tuple[bool, bytes]:
 def _snapshot(state: tuple[str, int]) -> Snapshot:
     n = 50 + 10 * state[1] + ord(state[0])
     means = np.random.default_rng([ord(state[0]), state[1]]).normal(size=(n, 3))
-    model = GaussianModel.from_activated(
-        means=means,
-        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        scales=np.full((n, 3), 0.1),
-        opacities=np.full(n, 0.9),
-        colors=np.full((n, 3), 0.5),
-    )
-    return Snapshot(model, state[1])
+    return Snapshot(uniform_model(means), state[1])
 
 
 def _serve(folder: Path, ack: int) -> None:
@@ -232,17 +226,13 @@ def run(count: int, seed: int = 0, kinds: tuple[str, ...] = ("serve", "record", 
 
 def main() -> int:
     """Run and print the counts."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
+    parser = seeded_parser(__doc__, 500)
     parser.add_argument("--kinds", default="serve,record,map")
     given = parser.parse_args()
     tally = run(given.count, given.seed, tuple(given.kinds.split(",")))
     print(f"killed {dict(tally.killed)}, ended before {dict(tally.ended)}")
     print(f"neither old nor new state: {len(tally.wrong)}; slowest recovery {tally.slowest_s:.2f} s")
-    for line in tally.wrong[:20]:
-        print(" ", line)
-    return 1 if tally.wrong else 0
+    return exit_code(tally.wrong)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ have a closed form.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -31,6 +30,7 @@ from splatbot.services.ros.follow import FollowJointTrajectory
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
+from tests.attacks.command_line import exit_code, seeded_parser
 
 PERIOD = 1e-3  # [s] of the check
 N_SIGMA = 2.0  # of the collision field
@@ -209,16 +209,11 @@ def run(count: int, seed: int = 0, *, show: Callable[[int], None] = lambda done:
 
 def main() -> int:
     """Run and print the counts."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=100_000)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    given = seeded_parser(__doc__, 100_000).parse_args()
     tally = run(given.count, given.seed, show=lambda done: print(f"\r{done}", end="", file=sys.stderr, flush=True))
     print(f"\nexecuted {dict(tally.executed)}\nrefused {dict(tally.refused)}")
     print(f"executed and rejected by the check: {len(tally.wrong)}; refused without a reason: {tally.unexplained}")
-    for line in tally.wrong[:20]:
-        print(" ", line)
-    return 1 if tally.wrong or tally.unexplained else 0
+    return exit_code(tally.wrong) or int(tally.unexplained > 0)
 
 
 if __name__ == "__main__":

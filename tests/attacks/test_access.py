@@ -37,26 +37,21 @@ from splatbot.services.ros.follow import action_topic
 from splatbot.services.runtime import Runtime, check_exposure
 from splatbot.services.scopes import NEEDS
 from splatbot.services.settings import ServiceSettings, load_settings
-from splatbot.services.store import MapStore
 from splatbot.services.viewer.scene import close_server, open_server
 from splatbot.services.viewer.viewer import Viewer
-from tests.contracts.conftest import Service, running, wall
+from tests.contracts.conftest import Service, running, wall, wall_store
 
 EVIL = "https://evil.example"
 READ, MAP, MOVE, USUAL = (new_key() for _ in range(4))
 JSON = {"Content-Type": "application/json"}
 
 
-def _store() -> MapStore:
-    store = MapStore()
-    store.add("wall", source="wall.ply", state="static", snapshot=wall())
-    return store
-
-
 @pytest.fixture(scope="module")
 def home() -> Iterator[Service]:
     """A service on loopback without configured keys."""
-    with running(ServiceSettings(cors_origins=("https://ui.example",), allowed_hosts=("robot.lan",)), _store()) as it:
+    with running(
+        ServiceSettings(cors_origins=("https://ui.example",), allowed_hosts=("robot.lan",)), wall_store()
+    ) as it:
         yield it
 
 
@@ -64,7 +59,7 @@ def home() -> Iterator[Service]:
 def keyed() -> Iterator[Service]:
     """A service with a key for each of some scopes."""
     entries = (hash_key(READ, ("read",)), hash_key(MAP, ("read", "map")), hash_key(MOVE, ("read", "move")))
-    with running(ServiceSettings(api_keys=(*entries, hash_key(USUAL))), _store()) as it:
+    with running(ServiceSettings(api_keys=(*entries, hash_key(USUAL))), wall_store()) as it:
         yield it
 
 
@@ -105,7 +100,7 @@ def test_names_of_this_machine_and_allowed_ones_are_served(home: Service) -> Non
 
 def test_a_service_that_others_reach_takes_addresses_and_names_that_are_listed() -> None:
     settings = ServiceSettings(host="0.0.0.0", api_keys=(hash_key(USUAL),), allowed_hosts=("robot.lan",))
-    app = create_app(Runtime(settings, _store()))
+    app = create_app(Runtime(settings, wall_store()))
 
     async def ask(name: str) -> int:
         transport = httpx.ASGITransport(app)
@@ -175,7 +170,7 @@ def test_a_page_of_another_site_or_of_a_rebound_name_opens_no_websocket(home: Se
 
 
 def test_every_route_has_its_scope() -> None:
-    app = create_app(Runtime(ServiceSettings(), _store()))
+    app = create_app(Runtime(ServiceSettings(), wall_store()))
     document = app.openapi()
     routes = {(m.upper(), path) for path, item in document["paths"].items() for m in item}
     assert {(m, path) for m, path in routes if m not in ("GET", "HEAD")} == set(NEEDS)
@@ -276,7 +271,7 @@ def test_the_file_of_the_key_is_private_and_made_once(tmp_path: Path) -> None:
 def test_insecure_no_auth_opens_loopback_alone_and_still_refuses_pages() -> None:
     settings = ServiceSettings(insecure_no_auth=True)
     check_exposure(settings)
-    with running(settings, _store()) as service, _stranger(service) as stranger:
+    with running(settings, wall_store()) as service, _stranger(service) as stranger:
         assert stranger.delete("/v1/maps/wall", headers={"Origin": EVIL}).status_code == 403
         assert stranger.delete("/v1/maps/wall", headers={"Host": "evil.example"}).status_code == 421
         assert stranger.delete("/v1/maps/wall").status_code == 204
@@ -376,7 +371,7 @@ def test_foxglove_clients_only_read(keyed: Service) -> None:
 
 @pytest.fixture(scope="module")
 def viewer() -> Iterator[Viewer]:
-    it = Viewer(_store(), Access(ServiceSettings()), port=0)
+    it = Viewer(wall_store(), Access(ServiceSettings()), port=0)
     it.start()
     yield it
     it.stop()
@@ -434,7 +429,7 @@ def test_a_server_that_only_draws_a_page_serves_nobody() -> None:
 
 
 def test_a_viewer_of_a_service_without_keys_is_open_to_this_machine_alone() -> None:
-    viewer = Viewer(_store(), Access(ServiceSettings(insecure_no_auth=True)), port=0)
+    viewer = Viewer(wall_store(), Access(ServiceSettings(insecure_no_auth=True)), port=0)
     viewer.start()
     try:
         url = f"http://127.0.0.1:{viewer.port}/"

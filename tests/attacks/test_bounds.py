@@ -13,7 +13,6 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-import websockets
 from numpy.typing import NDArray
 
 from splatbot.errors import InputError
@@ -198,9 +197,7 @@ MESSAGES = {
 @pytest.mark.parametrize("name", MESSAGES)
 def test_a_message_of_millions_of_values_is_refused_before_objects_are_made(service: Victim, name: str) -> None:
     async def ask() -> str:
-        url = service.url.replace("http", "ws") + "/rosbridge"
-        headers = {name: value for name, value in service.client.headers.items() if name == "authorization"}
-        async with websockets.connect(url, max_size=None, additional_headers=headers) as socket:
+        async with service.rosbridge() as socket:
             advertise = {"op": "advertise", "topic": "/markers", "type": "visualization_msgs/msg/MarkerArray"}
             await socket.send(json.dumps(advertise))
             await socket.send(MESSAGES[name])
@@ -294,9 +291,7 @@ def test_voxels_of_a_distance_field_are_bounded_before_they_are_made(service: Vi
     call = {"op": "call_service", "id": "e", "service": "/nvblox_node/get_esdf_and_gradient", "args": box}
 
     async def ask() -> Any:
-        url = service.url.replace("http", "ws") + "/rosbridge"
-        headers = {name: value for name, value in service.client.headers.items() if name == "authorization"}
-        async with websockets.connect(url, max_size=None, additional_headers=headers) as socket:
+        async with service.rosbridge() as socket:
             await socket.send(json.dumps(call))
             return json.loads(await asyncio.wait_for(socket.recv(), 20))
 

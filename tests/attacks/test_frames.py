@@ -17,7 +17,6 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
-import websockets
 
 from splatbot.client import Client, ServiceError
 from splatbot.errors import InputError
@@ -295,9 +294,7 @@ ROS = {
 @pytest.mark.parametrize("name", ROS)
 def test_one_message_costs_little_memory(service: Victim, name: str) -> None:
     async def send() -> None:
-        url = service.url.replace("http", "ws") + "/rosbridge"
-        headers = {name: value for name, value in service.client.headers.items() if name == "authorization"}
-        async with websockets.connect(url, max_size=None, additional_headers=headers) as socket:
+        async with service.rosbridge() as socket:
             for topic, kind, message in ROS[name]:
                 await socket.send(json.dumps({"op": "advertise", "topic": topic, "type": kind}))
                 await socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))

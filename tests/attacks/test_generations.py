@@ -15,6 +15,7 @@ from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from tests.contracts.conftest import Service, running, wall
+from tests.waiting import until
 
 LONG = "synthetic:tabletop?frames=400&width=160&height=120"
 
@@ -23,14 +24,6 @@ LONG = "synthetic:tabletop?frames=400&width=160&height=120"
 def kept(tmp_path: Path) -> Iterator[Service]:
     with running(ServiceSettings(data_dir=tmp_path / "maps", save_every_s=0.05)) as service:
         yield service
-
-
-def until(true: object, seconds: float = 60.0) -> None:
-    assert callable(true)
-    deadline = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_an_old_recording_never_fills_a_new_map_of_the_same_name(kept: Service) -> None:

@@ -20,6 +20,7 @@ from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running, wall
+from tests.waiting import until
 
 ACTION = "/fake_controller/follow_joint_trajectory"
 STRING = "std_msgs/msg/String"
@@ -59,13 +60,6 @@ def call(client: Connection, name: str, /, **args: Any) -> dict[str, Any]:
 
 def topics(service: Service) -> set[str]:
     return set(service.app.state.ros.graph.topics)
-
-
-def until(found: Any, timeout_s: float = 10) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not found():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_one_client_cannot_take_all_topics_and_services(served: Service) -> None:

@@ -28,6 +28,7 @@ from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running, wall
 from tests.e2e.test_serve_cli import refused, serving
+from tests.waiting import until
 
 
 def save(folder: Path, *versions: int) -> None:
@@ -166,13 +167,13 @@ def test_a_full_disk_is_told_and_stops_nothing(small_disk: Path, monkeypatch: py
     monkeypatch.setattr(tempfile, "tempdir", str(small_disk))
     with running(ServiceSettings(data_dir=small_disk / "maps", save_every_s=0.1)) as service:
         service.store.add("desk", source="log", state="mapping", snapshot=wall(1))
-        _until(lambda: (small_disk / "maps" / "desk" / "v1").is_dir())
+        until(lambda: (small_disk / "maps" / "desk" / "v1").is_dir())
         filler = small_disk / "filler"
         with filler.open("wb", buffering=0) as file, suppress(OSError):
             while file.write(bytes(4096)):
                 pass
         service.store.publish("desk", wall(2))
-        _until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
+        until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
         assert service.client.get("/readyz").status_code == 200
         assert _metric(service, "splatbot_maps_unsaved ") == 1
         assert _metric(service, "splatbot_map_save_failures_total ") >= 1
@@ -185,30 +186,30 @@ def test_a_full_disk_is_told_and_stops_nothing(small_disk: Path, monkeypatch: py
         assert service.client.get("/v1/maps/shelf").status_code == 404
         assert service.client.get("/v1/maps/desk/splats.ply").status_code == 507
         filler.unlink()
-        _until(lambda: service.client.get("/readyz").json().get("unsaved") == 0)
+        until(lambda: service.client.get("/readyz").json().get("unsaved") == 0)
         assert (small_disk / "maps" / "desk" / "v2").is_dir()
 
 
 def test_a_read_only_disk_is_told_and_a_map_that_cannot_be_deleted_stays(small_disk: Path) -> None:
     with running(ServiceSettings(data_dir=small_disk / "maps", save_every_s=0.1)) as service:
         service.store.add("desk", source="log", state="mapping", snapshot=wall(1))
-        _until(lambda: (small_disk / "maps" / "desk" / "v1").is_dir())
+        until(lambda: (small_disk / "maps" / "desk" / "v1").is_dir())
         subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
         told = service.client.delete("/v1/maps/desk")
         assert told.status_code == 507
         assert "cannot be deleted (Read-only file system)" in told.json()["detail"]
         assert service.client.get("/v1/maps/desk").status_code == 200
         service.store.publish("desk", wall(2))
-        _until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
+        until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
 
 
 def test_a_disk_that_vanishes_is_told_and_nothing_is_written_beneath_it(small_disk: Path) -> None:
     with running(ServiceSettings(data_dir=small_disk, save_every_s=0.1)) as service:
         service.store.add("desk", source="log", state="mapping", snapshot=wall(1))
-        _until(lambda: (small_disk / "desk" / "v1").is_dir())
+        until(lambda: (small_disk / "desk" / "v1").is_dir())
         subprocess.run(["umount", "-l", small_disk], check=True)
         service.store.publish("desk", wall(2))
-        _until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
+        until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
         assert list(small_disk.iterdir()) == []
         assert service.client.get("/v1/maps/desk").json()["map_version"] == 2
 
@@ -229,7 +230,7 @@ def test_deleted_maps_leave_no_threads_descriptors_or_metric_series(tmp_path: Pa
         _make_and_delete(service, 5)
         before = _held(service)
         _make_and_delete(service, 40)
-        _until(lambda: _held(service)[0] <= before[0])
+        until(lambda: _held(service)[0] <= before[0])
         assert _held(service)[1:] == before[1:]
 
 
@@ -241,7 +242,7 @@ def test_sigterm_ends_within_eight_seconds_while_a_big_upload_is_unpacked(tmp_pa
             headers = {"content-type": "application/zip"}
             sent = client.post("/v1/maps/desk/upload", content=_zip(3_500_000_000), headers=headers)
             job = sent.json()["id"]
-            _until(lambda: "unpacking" in (client.get(f"/v1/jobs/{job}").json()["detail"] or ""))
+            until(lambda: "unpacking" in (client.get(f"/v1/jobs/{job}").json()["detail"] or ""))
             start = time.monotonic()
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
@@ -254,7 +255,7 @@ def test_deleting_a_map_ends_the_unpacking_of_its_upload() -> None:
     with running(ServiceSettings()) as service:
         headers = {"content-type": "application/zip"}
         job = service.client.post("/v1/maps/desk/upload", content=_zip(1_500_000_000), headers=headers).json()["id"]
-        _until(lambda: "unpacking" in (service.client.get(f"/v1/jobs/{job}").json()["detail"] or ""))
+        until(lambda: "unpacking" in (service.client.get(f"/v1/jobs/{job}").json()["detail"] or ""))
         assert service.client.delete("/v1/maps/desk").status_code == 204
         assert service.client.get(f"/v1/jobs/{job}").json()["state"] == "cancelled"
 
@@ -288,11 +289,3 @@ def _held(service: Service) -> tuple[int, int, int]:
 def _metric(service: Service, name: str) -> float:
     lines = service.client.get("/metrics").text.splitlines()
     return float(next(line for line in lines if line.startswith(name)).split()[-1])
-
-
-def _until(true: object, seconds: float = 30.0) -> None:
-    assert callable(true)
-    deadline = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)

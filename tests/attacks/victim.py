@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import websockets
 
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
@@ -36,6 +37,12 @@ class Victim:
         """Return memory of the process [MB]: "VmRSS" now, "VmHWM" at its peak."""
         lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
         return next(int(line.split()[1]) for line in lines if line.startswith(kind)) / 1024
+
+    def rosbridge(self) -> websockets.connect:
+        """Connect to rosbridge with the client's key; messages may have any size."""
+        url = self.url.replace("http", "ws") + "/rosbridge"
+        headers = {name: value for name, value in self.client.headers.items() if name == "authorization"}
+        return websockets.connect(url, max_size=None, additional_headers=headers)
 
     @contextmanager
     def attacked(self, *, memory: float = MEMORY, seconds: float = SECONDS) -> Iterator[None]:

@@ -85,6 +85,13 @@ def wall(version: int = 1, *, z: float = 1.0) -> Snapshot:
     return Snapshot(model, version)
 
 
+def wall_store() -> MapStore:
+    """Return a store with the map "wall"."""
+    store = MapStore()
+    store.add("wall", source="wall.ply", state="static", snapshot=wall())
+    return store
+
+
 def table_with_box() -> Snapshot:
     """Build a table top at z = 0, z up, and a box of 4 x 6 x 8 cm on it at (0.5, 0, 0)."""
     size = np.array([0.04, 0.06, 0.08])

@@ -34,21 +34,14 @@ from splatbot.services.codecs import encode_npy
 from splatbot.services.keys import hash_key, known_key, new_key
 from splatbot.services.runtime import check_exposure
 from splatbot.services.settings import ServiceSettings, load_settings
-from splatbot.services.store import MapStore
-from tests.contracts.conftest import Service, running, wall
+from tests.contracts.conftest import Service, running, wall_store
 
 KEYS = (new_key(), new_key())
 
 
-def _store() -> MapStore:
-    store = MapStore()
-    store.add("wall", source="wall.ply", state="static", snapshot=wall())
-    return store
-
-
 @pytest.fixture(scope="module")
 def locked() -> Iterator[Service]:
-    with running(ServiceSettings(api_keys=tuple(hash_key(key) for key in KEYS)), _store()) as service:
+    with running(ServiceSettings(api_keys=tuple(hash_key(key) for key in KEYS)), wall_store()) as service:
         yield service
 
 
@@ -57,7 +50,7 @@ def open_() -> Iterator[Service]:
     settings = ServiceSettings(
         max_upload_bytes=2_000_000, max_unpacked_bytes=3_000_000, max_body_bytes=300_000, requests_per_s=1e6
     )
-    with running(settings, _store()) as service:
+    with running(settings, wall_store()) as service:
         yield service
 
 
@@ -136,7 +129,7 @@ def test_a_service_with_a_certificate_speaks_https_to_those_who_trust_it_alone(t
     subprocess.run(make, check=True, capture_output=True)
     settings = ServiceSettings(tls_cert=cert, tls_key=key)
     check_exposure(settings)
-    with running(settings, _store()) as service:
+    with running(settings, wall_store()) as service:
         trusting = ssl.create_default_context(cafile=str(cert))
         with Client(service.url, tls=trusting) as client:
             assert client.maps()[0]["id"] == "wall"
@@ -157,9 +150,9 @@ def test_keys_come_from_the_environment_separated_by_commas(monkeypatch: pytest.
 
 def test_pages_of_other_origins_may_not_ask_unless_they_are_named() -> None:
     asked = {"Origin": "https://evil.example", "Access-Control-Request-Method": "POST"}
-    with running(ServiceSettings(), _store()) as service:
+    with running(ServiceSettings(), wall_store()) as service:
         assert "access-control-allow-origin" not in service.client.options("/v1/maps", headers=asked).headers
-    with running(ServiceSettings(cors_origins=("https://ui.example",)), _store()) as service:
+    with running(ServiceSettings(cors_origins=("https://ui.example",)), wall_store()) as service:
         assert "access-control-allow-origin" not in service.client.get("/v1/maps", headers=asked).headers
         named = service.client.get("/v1/maps", headers={"Origin": "https://ui.example"})
         assert named.headers["access-control-allow-origin"] == "https://ui.example"
@@ -167,7 +160,7 @@ def test_pages_of_other_origins_may_not_ask_unless_they_are_named() -> None:
 
 def test_a_hasty_client_is_told_when_to_come_again_and_others_are_served() -> None:
     hashes = tuple(hash_key(key) for key in KEYS)
-    with running(ServiceSettings(requests_per_s=5, api_keys=hashes), _store()) as service:
+    with running(ServiceSettings(requests_per_s=5, api_keys=hashes), wall_store()) as service:
         hasty = [service.client.get("/v1/maps", headers={"X-API-Key": KEYS[0]}) for _ in range(30)]
         refused = [response for response in hasty if response.status_code == 429]
         assert 10 <= len(refused) <= 20
@@ -176,7 +169,7 @@ def test_a_hasty_client_is_told_when_to_come_again_and_others_are_served() -> No
 
 
 def test_one_request_too_many_at_once_is_503_and_the_probes_still_answer() -> None:
-    with running(ServiceSettings(max_requests=1), _store()) as service:
+    with running(ServiceSettings(max_requests=1), wall_store()) as service:
         gate, entered = threading.Event(), threading.Event()
 
         def slow() -> None:

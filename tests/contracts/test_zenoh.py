@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from splatbot.services.ros.publishers import POINTS
 from splatbot.services.ros.zenoh_bridge import ZenohBridge
 from splatbot.services.store import MapStore
 from tests.contracts.conftest import wall
+from tests.waiting import until
 
 zenoh = pytest.importorskip("zenoh")
 
@@ -56,13 +57,6 @@ def node(router: tuple[str, Any], frames: list[Frame]) -> Iterator[RosNode]:
     yield node
     bridge.stop()
     node.stop()
-
-
-def until(found: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not found():
-        assert time.monotonic() < deadline, "nothing came"
-        time.sleep(0.02)
 
 
 def test_the_cloud_arrives_under_its_key_with_number_and_time_also_late(router: tuple[str, Any], node: RosNode) -> None:

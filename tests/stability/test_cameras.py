@@ -20,10 +20,18 @@ from splatbot.rasterize.reference_cameras import (
     pinhole_points,
     unscented_projector,
 )
-from tests.scenes import NAMES, Scene, compare, hard_scene, one_gaussian, pinhole, two_roundings
+from tests.scenes import (
+    FORWARD_BOUND,
+    GRADIENT_BOUND,
+    NAMES,
+    Scene,
+    compare,
+    hard_scene,
+    one_gaussian,
+    pinhole,
+    two_roundings,
+)
 
-FORWARD_BOUND = 1e-5
-GRADIENT_BOUND = 1e-4
 NEAR = 0.01
 
 

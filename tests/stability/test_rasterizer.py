@@ -7,10 +7,7 @@ import torch
 from torch import Tensor
 
 from splatbot.errors import InputError
-from tests.scenes import NAMES, Scene, compare, hard_scene, one_gaussian, pinhole
-
-FORWARD_BOUND = 1e-5
-GRADIENT_BOUND = 1e-4
+from tests.scenes import FORWARD_BOUND, GRADIENT_BOUND, NAMES, Scene, compare, hard_scene, one_gaussian, pinhole
 
 
 def assert_within_bounds(

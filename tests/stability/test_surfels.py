@@ -8,11 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import Scene, hard_scene, one_gaussian
+from tests.scenes import FORWARD_BOUND, GRADIENT_BOUND, Scene, hard_scene, one_gaussian
 from tests.surfels import NAMES, RENDERED, compare_surfels, hard_surfels, loss, reference, render
-
-FORWARD_BOUND = 1e-5
-GRADIENT_BOUND = 1e-4
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 

@@ -19,14 +19,12 @@ from splatbot.robots.panda import panda
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
+def results(folder: Path) -> Results:
     """One quick run with peers, for all tests."""
-    folder = tmp_path_factory.mktemp("bench")
-    return BENCHMARK.run(CollisionSettings(out=folder, peers=True, quick=True)), folder
+    return BENCHMARK.run(CollisionSettings(out=folder, peers=True, quick=True))
 
 
-def test_speed_and_memory_are_measured_at_every_size(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_speed_and_memory_are_measured_at_every_size(results: Results) -> None:
     for count in CollisionSettings.quick_values["counts"]:
         for threads in ("1 thread", "2 threads"):
             for metric in ("build", "memory", "configurations", "exact clearance in the clutter"):
@@ -35,8 +33,7 @@ def test_speed_and_memory_are_measured_at_every_size(run: tuple[Results, Path]) 
                 assert found > 0
 
 
-def test_no_configuration_or_certified_edge_is_called_free_wrongly(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_no_configuration_or_certified_edge_is_called_free_wrongly(results: Results) -> None:
     cases = [row for row in results.rows if row.metric == "false free, count" and "(default)" in row.case]
     assert len(cases) >= 3
     assert all(row.value == 0 for row in cases)
@@ -45,8 +42,7 @@ def test_no_configuration_or_certified_edge_is_called_free_wrongly(run: tuple[Re
     assert all(row.value == 0 for row in certified)
 
 
-def test_gates_give_back_what_floaters_block(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_gates_give_back_what_floaters_block(results: Results) -> None:
     clean, none, all_three = (
         results.find(f"gate: {label}", "reported free")
         for label in ("clean map", "1 % floaters, none", "1 % floaters, all three")
@@ -57,8 +53,7 @@ def test_gates_give_back_what_floaters_block(run: tuple[Results, Path]) -> None:
     assert none < all_three <= clean
 
 
-def test_brute_force_agrees(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_brute_force_agrees(results: Results) -> None:
     differences = [row.value for row in results.rows if row.metric == "verdicts that differ from float64's"]
     assert differences == [0.0]
     own = [row for row in results.rows if row.metric.startswith("largest relative") and row.peer is None]
@@ -66,8 +61,7 @@ def test_brute_force_agrees(run: tuple[Results, Path]) -> None:
     assert own[0].value < 1e-5
 
 
-def test_files_hold_the_rows(run: tuple[Results, Path]) -> None:
-    results, folder = run
+def test_files_hold_the_rows(results: Results, folder: Path) -> None:
     written = json.loads((folder / "collision.json").read_text())
     assert len(written["rows"]) == len(results.rows)
     with (folder / "collision.csv").open() as file:

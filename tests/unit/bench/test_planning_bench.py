@@ -22,14 +22,12 @@ from splatbot.robots.panda import panda
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
+def results(folder: Path) -> Results:
     """One quick run with peers, for all tests."""
-    folder = tmp_path_factory.mktemp("bench")
-    return BENCHMARK.run(PlanningSettings(out=folder, peers=True, quick=True)), folder
+    return BENCHMARK.run(PlanningSettings(out=folder, peers=True, quick=True))
 
 
-def test_every_problem_is_solved_and_no_path_is_in_collision(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_every_problem_is_solved_and_no_path_is_in_collision(results: Results) -> None:
     for budget in PlanningSettings.quick_values["budgets"]:
         case = f"budget {budget:g} ms"
         assert results.find(case, "solved") == 6
@@ -42,16 +40,14 @@ def test_every_problem_is_solved_and_no_path_is_in_collision(run: tuple[Results,
             assert results.find(case, metric) == 0, metric
 
 
-def test_peers_are_measured_or_reported_as_absent(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_peers_are_measured_or_reported_as_absent(results: Results) -> None:
     told = {row.peer for row in results.rows if row.peer is not None}
     assert "VAMP" in told
     assert any(name.startswith("OMPL") for name in told)
     assert all(row.value is not None or row.note for row in results.rows)
 
 
-def test_files_are_written(run: tuple[Results, Path]) -> None:
-    results, folder = run
+def test_files_are_written(results: Results, folder: Path) -> None:
     found = json.loads((folder / "planning.json").read_text())
     assert len(found["rows"]) == len(results.rows)
     assert {path.name for path in folder.iterdir()} >= {"planning.csv", "planning-cost.png", "planning-cost.svg"}

@@ -17,10 +17,9 @@ from splatbot.cli import main
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path]:
+def results(folder: Path) -> Results:
     """One quick run with peers, for all tests."""
-    folder = tmp_path_factory.mktemp("bench")
-    return BENCHMARK.run(RasterSettings(out=folder, peers=True, quick=True)), folder
+    return BENCHMARK.run(RasterSettings(out=folder, peers=True, quick=True))
 
 
 def figures(results: Results, case: str, peer: str | None = None) -> dict[str, Any]:
@@ -28,8 +27,7 @@ def figures(results: Results, case: str, peer: str | None = None) -> dict[str, A
     return {row.metric: row.value for row in results.rows if row.case == case and row.peer == peer}
 
 
-def test_every_scene_size_and_number_of_threads_is_measured(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_every_scene_size_and_number_of_threads_is_measured(results: Results) -> None:
     for scene in scenes_of(RasterSettings(quick=True)):
         for threads in ("1 thread", "2 threads"):
             found = figures(results, f"{scene.name} 32x24, {threads}")
@@ -37,8 +35,7 @@ def test_every_scene_size_and_number_of_threads_is_measured(run: tuple[Results, 
                 assert found[metric] > 0.0
 
 
-def test_files_hold_the_rows_and_the_machine(run: tuple[Results, Path]) -> None:
-    results, folder = run
+def test_files_hold_the_rows_and_the_machine(results: Results, folder: Path) -> None:
     written = json.loads((folder / "raster.json").read_text())
     assert set(written) == {"machine", "rows"}
     assert len(written["rows"]) == len(results.rows)
@@ -51,8 +48,7 @@ def test_files_hold_the_rows_and_the_machine(run: tuple[Results, Path]) -> None:
         assert b"<svg" in (folder / f"{name}.svg").read_bytes()
 
 
-def test_ratios_are_those_of_the_measured_times(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_ratios_are_those_of_the_measured_times(results: Results) -> None:
     compared = 0
     for row in results.rows:
         if row.metric.endswith(", ratio to splatbot") and row.value is not None:
@@ -65,8 +61,7 @@ def test_ratios_are_those_of_the_measured_times(run: tuple[Results, Path]) -> No
     assert compared >= 8  # two peers, two scenes, two passes
 
 
-def test_the_share_of_the_peak_follows_from_pairs_time_and_peak(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_the_share_of_the_peak_follows_from_pairs_time_and_peak(results: Results) -> None:
     isa = results.machine["isa"]
     found = figures(results, "surface 32x24, 2 threads")
     peak = results.machine["fma_peak_gflops"][isa]["2"]
@@ -76,8 +71,7 @@ def test_the_share_of_the_peak_follows_from_pairs_time_and_peak(run: tuple[Resul
         assert 0.0 < gflops < peak
 
 
-def test_peers_show_the_same_image_and_gradients(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_peers_show_the_same_image_and_gradients(results: Results) -> None:
     for case in ("surface 32x24, 1 thread, RGB", "random 500 32x24, 1 thread, RGB"):
         for peer in ("torch", "scalar C++"):
             found = figures(results, case, peer)
@@ -85,23 +79,20 @@ def test_peers_show_the_same_image_and_gradients(run: tuple[Results, Path]) -> N
             assert found["gradients, largest relative difference"] < 1e-3
 
 
-def test_an_absent_peer_is_said_to_be_absent(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_an_absent_peer_is_said_to_be_absent(results: Results) -> None:
     notes = {row.peer: row.note for row in results.rows if row.metric == "implementation"}
     assert set(notes) == {"torch", "scalar C++", "gsplat torch reference"}
     assert all(notes.values())
 
 
-def test_every_effect_has_a_line_with_figures_or_a_reason(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_every_effect_has_a_line_with_figures_or_a_reason(results: Results) -> None:
     for effect in all_effects():
         rows = results.select(f"effect on surface 32x24: {effect.name}")
         assert rows
         assert all(row.value is not None or row.note for row in rows)
 
 
-def test_an_instruction_set_is_compared_with_float64(run: tuple[Results, Path]) -> None:
-    results, _ = run
+def test_an_instruction_set_is_compared_with_float64(results: Results) -> None:
     for name in results.machine["fma_peak_gflops"]:
         assert figures(results, f"sweep instruction set: {name}")["largest error"] < 1e-5
 

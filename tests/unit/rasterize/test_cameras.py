@@ -30,10 +30,17 @@ from splatbot.rasterize.reference_cameras import (
     pinhole_points,
     unscented_projector,
 )
-from tests.scenes import Scene, compare, hard_scene, one_gaussian, relative_l2, two_roundings
+from tests.scenes import (
+    FORWARD_BOUND,
+    GRADIENT_BOUND,
+    Scene,
+    compare,
+    hard_scene,
+    one_gaussian,
+    relative_l2,
+    two_roundings,
+)
 
-FORWARD_BOUND = 1e-5
-GRADIENT_BOUND = 1e-4
 PINHOLE = (-0.28, 0.09, -0.01, 0.02, 0.01, 0.001, 1e-3, -2e-3, 1e-3, -5e-4, 8e-4, 3e-4)  # k1..k6, p1, p2, s1..s4
 FISHEYE = (0.05, -0.02, 0.004, -0.001)
 ROLLING = [name for name in RollingShutterType.__members__ if name != "GLOBAL"]

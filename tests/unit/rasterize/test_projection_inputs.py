@@ -13,10 +13,7 @@ from torch import Tensor
 from splatbot.errors import InputError
 from splatbot.rasterize import rasterization
 from splatbot.rasterize.harmonics import harmonics_basis
-from tests.scenes import Scene, compare, hard_scene, one_gaussian, relative_l2
-
-FORWARD_BOUND = 1e-5
-GRADIENT_BOUND = 1e-4
+from tests.scenes import FORWARD_BOUND, GRADIENT_BOUND, Scene, compare, hard_scene, one_gaussian, relative_l2
 
 
 def with_harmonics(scene: Scene, coefficients: int, seed: int = 0) -> Scene:

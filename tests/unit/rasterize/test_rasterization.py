@@ -11,10 +11,16 @@ from torch import Tensor
 from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.rasterize import rasterization
-from tests.scenes import NAMES, assert_alone_equal_together, compare, hard_scene, one_gaussian, relative_l2
-
-FORWARD_BOUND = 1e-5
-GRADIENT_BOUND = 1e-4
+from tests.scenes import (
+    FORWARD_BOUND,
+    GRADIENT_BOUND,
+    NAMES,
+    assert_alone_equal_together,
+    compare,
+    hard_scene,
+    one_gaussian,
+    relative_l2,
+)
 
 
 @pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])

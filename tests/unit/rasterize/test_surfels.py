@@ -14,11 +14,8 @@ from splatbot.errors import InputError
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.rasterize import rasterization_2dgs
 from splatbot.rasterize.native import native
-from tests.scenes import Scene, assert_alone_equal_together, one_gaussian, relative_l2
+from tests.scenes import FORWARD_BOUND, GRADIENT_BOUND, Scene, assert_alone_equal_together, one_gaussian, relative_l2
 from tests.surfels import NAMES, RENDERED, arguments, compare_surfels, hard_surfels, loss, reference, render, wall
-
-FORWARD_BOUND = 1e-5
-GRADIENT_BOUND = 1e-4
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread", "default_kernels")
 

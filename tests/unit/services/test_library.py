@@ -11,22 +11,17 @@ import numpy as np
 import pytest
 
 from splatbot.errors import InputError
-from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.gaussians import Snapshot
 from splatbot.services.library import MapLibrary, SaveError, check_id
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
+from tests.models import uniform_model
 
 
 def _served(version: int, n: int = 5) -> ServedMap:
     means = np.arange(3 * n, dtype=np.float64).reshape(n, 3)
-    model = GaussianModel.from_activated(
-        means=means,
-        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        scales=np.full((n, 3), 0.1),
-        opacities=np.full(n, 0.9),
-        colors=np.full((n, 3), 0.5),
-    )
+    model = uniform_model(means)
     trajectory = Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
     return ServedMap("desk", "desk log", "ended", None, Snapshot(model, version, 1.5), trajectory, Workspace(np.eye(4)))
 
