@@ -23,17 +23,17 @@ _MOVING = ("revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class DefaultLimits:
-    """Limits that a URDF lacks: always those of acceleration and jerk, often that of velocity.
-
-    Args:
-        velocity: [rad/s or m/s] limit of velocity.
-        acceleration_per_velocity: [1/s] ratio of the limits.
-        jerk_per_velocity: [1/s²] ratio of the limits.
-    """
+    """Limits that a URDF lacks: always those of acceleration and jerk, often that of velocity."""
 
     velocity: float = 1.0
+    """Limit [rad/s or m/s] of the velocity of a joint without one. A larger one makes motions faster than the arm may
+    bear."""
     acceleration_per_velocity: float = 5.0
+    """Ratio [1/s] of the limits of acceleration and velocity. The joint reaches its velocity within a fifth of a
+    second."""
     jerk_per_velocity: float = 50.0
+    """Ratio [1/s²] of the limits of jerk and velocity. The joint reaches its acceleration within a tenth of a
+    second."""
 
 
 CONSTANTS = DefaultLimits()

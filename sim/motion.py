@@ -21,6 +21,8 @@ from splatbot.sim.scene import Scene
 from splatbot.sim.solids import rotation_of
 
 _RATE = 250.0  # [Hz] at which moves are sampled; between samples a motion is a cubic
+MINIMUM_JERK_PEAK = 15 / 8
+"""Ratio [1] of the peak to the mean speed of a minimum-jerk motion: 30 u² (1 - u)² at u = 1/2."""
 
 
 class Samples(Protocol):

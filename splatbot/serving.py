@@ -17,15 +17,12 @@ from splatbot.errors import SplatbotError
 
 @dataclass(frozen=True)
 class ServingConstants:
-    """Constants of a service process.
-
-    Args:
-        start_timeout: [s] longest time to start; the service imports torch first.
-        end_timeout: [s] longest time to end.
-    """
+    """Constants of a service process."""
 
     start_timeout: float = 120.0
+    """Longest time [s] to start. The service imports torch first."""
     end_timeout: float = 20.0
+    """Longest time [s] to end, after which the process is killed."""
 
 
 CONSTANTS = ServingConstants()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.rasterize.views import depth_limits
-from splatbot.report.images import colour_png, depth_png, difference_png
+from splatbot.report.images import CaptionedView, colour_png, comparison, depth_png
 from splatbot.report.parts import details, document, image, note, pictures, section, table, tiles
 from splatbot.results.units import NONE, count, decibels, metres, number, percent
 from splatbot.sim.compare.agreement import Interval
@@ -21,7 +21,6 @@ from splatbot.sim.compare.trials import KIND as SIM_TO_SIM
 from splatbot.sim.compare.trials import TrialResults
 from splatbot.sim.compare.views import SeenView, ViewAgreement
 
-_GAIN = 3.0  # of difference images
 _STOPPED = '<section class="banner warn"><b>Interrupted</b>; these are the results until then.</section>\n'
 
 
@@ -177,18 +176,14 @@ def _tiles(found: LogComparison) -> list[tuple[str, str]]:
 
 
 def _view(view: ViewAgreement, seen: SeenView) -> str:
-    span = depth_limits(seen.depth)
-    images = [
-        (colour_png(seen.rgb), f"frame {view.index}, recorded{' (held out)' if view.held_out else ''}"),
-        (colour_png(seen.twin_rgb), f"twin, {decibels(view.psnr_db)}"),
-        (difference_png(seen.rgb, seen.twin_rgb, gain=_GAIN), f"difference, times {_GAIN:g}"),
-        (depth_png(seen.depth, span), f"recorded depth, {span[0]:.2f} to {span[1]:.2f} m"),
-        (depth_png(seen.twin_depth, span), f"twin's depth, median error {metres(view.depth_median_m)}"),
-        (
-            depth_png(_as_large(seen.shape_depth, seen.depth), span),
-            f"collision geometry, mean error {metres(view.physics_l1_m)}",
-        ),
-    ]
+    name = f"frame {view.index}, recorded{' (held out)' if view.held_out else ''}"
+    recorded = CaptionedView(seen.rgb, seen.depth, name, "recorded depth")
+    error = f"twin's depth, median error {metres(view.depth_median_m)}"
+    images = comparison(
+        recorded, CaptionedView(seen.twin_rgb, seen.twin_depth, f"twin, {decibels(view.psnr_db)}", error)
+    )
+    shapes = depth_png(_as_large(seen.shape_depth, seen.depth), depth_limits(seen.depth))
+    images.append((shapes, f"collision geometry, mean error {metres(view.physics_l1_m)}"))
     if seen.above is not None and seen.twin_above is not None:
         text = f"above the support: both white, only recorded red, only twin blue; IoU {number(view.iou, 3)}"
         images.append((colour_png(silhouettes(seen.above, seen.twin_above)), text))

@@ -13,7 +13,7 @@ from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 from splatbot.sim.compare.recorded import ArmRecord, pose_gap
 from splatbot.sim.contact_monitor import ContactEvent
-from splatbot.sim.motion import JointMotion, minimum_jerk, motion_from_samples
+from splatbot.sim.motion import MINIMUM_JERK_PEAK, JointMotion, minimum_jerk, motion_from_samples
 from splatbot.sim.twin import Twin
 
 BY_IK = "joints by IK, not recorded"
@@ -22,21 +22,19 @@ RECORDED = "recorded joints"
 
 @dataclass(frozen=True)
 class ReplayConstants:
-    """Constants of the replay of a log.
-
-    Args:
-        static_spacing: [s] time between frames from which the log is one of separate static poses.
-        rate: [Hz] samples per second of the motion between rests.
-        peak: peak over mean speed of a minimum-jerk motion.
-        speed_share: fraction of the joints' speed limits.
-        dwell: [s] time at rest at each pose until the tool pose is read.
-    """
+    """Constants of the replay of a log."""
 
     static_spacing: float = 0.5
+    """Median time [s] between frames from which the log is one of static poses. A shorter one makes a slow video stop
+    at every frame."""
     rate: float = 250.0
-    peak: float = 1.875
+    """Rate [Hz] of the samples of the motion between rests. A higher one follows the quintic more closely and takes
+    more memory."""
     speed_share: float = 0.9
+    """Largest speed [1] as a share of the joints' limits. A larger one replays faster, with larger tracking errors."""
     dwell: float = 0.1
+    """Time [s] at rest at each pose until the tool pose is read. The controller settles in it; a shorter one measures
+    its lag."""
 
 
 CONSTANTS = ReplayConstants()
@@ -186,7 +184,7 @@ def _motion(knots: Knots, robot: RobotModel) -> tuple[JointMotion, Array, float]
         slower = max(1.0, float(speed.max()))
         ends = slower * (knots.stamps - knots.stamps[0])
         return motion_from_samples(ends, knots.q), ends, slower
-    least = (CONSTANTS.peak * np.abs(np.diff(knots.q, axis=0)) / (CONSTANTS.speed_share * robot.chain.velocity)).max(
+    least = (MINIMUM_JERK_PEAK * np.abs(np.diff(knots.q, axis=0)) / (CONSTANTS.speed_share * robot.chain.velocity)).max(
         axis=1
     ) + CONSTANTS.dwell
     slower = float(np.maximum(least / spans, 1.0).max())

@@ -27,21 +27,19 @@ from splatbot.sim.world import World, build_world
 
 @dataclass(frozen=True)
 class PoseViewConstants:
-    """Constants of views of maps and twins.
-
-    Args:
-        min_height: [m] height over the support plane; lower points are sensor noise of the plane.
-        min_opacity: least opacity of Gaussians that count as surface.
-        below_support: [m] depth of the map below the support plane that the twin keeps.
-        rays: rays across an image of the collision geometry.
-        max_range: [m] length of the rays.
-    """
+    """Constants of views of maps and twins."""
 
     min_height: float = 0.01
+    """Height [m] over the support plane below which points are noise of the plane. A larger one cuts flat objects."""
     min_opacity: float = 0.3
+    """Smallest opacity [1] of Gaussians that count as surface. A larger one loses parts that few frames show."""
     below_support: float = 0.05
+    """Depth [m] of the map below the support plane that the twin keeps. A larger one adds legs and floor to the
+    physics."""
     rays: int = 160
+    """Number of rays [1] across an image of the collision geometry. More of them take quadratically longer."""
     max_range: float = 20.0
+    """Length [m] of the rays. Geometry farther away is missing in the image."""
 
 
 CONSTANTS = PoseViewConstants()

@@ -12,23 +12,20 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True)
 class EllipsoidConstants:
-    """Constants of collision ellipsoids of a map.
-
-    Args:
-        reach: [m] distance from the base; reach of an arm of this size.
-        tangent_sigmas: [sigma] half-axis in the surface: wide enough to close gaps.
-        normal_sigmas: [sigma] half-axis across it: thin enough not to lift resting objects.
-        min_axis: [m] shortest half-axis.
-        min_cell: [m] smallest cell size.
-        growth: factor between tried cell sizes.
-    """
+    """Constants of collision ellipsoids of a map."""
 
     reach: float = 0.9
+    """Distance [m] from the base within which cells have the smallest size: the reach of an arm of this size."""
     tangent_sigmas: float = 2.2
+    """Half-axis [σ] in the surface. A smaller one leaves gaps between ellipsoids, through which objects fall."""
     normal_sigmas: float = 1.0
+    """Half-axis [σ] across the surface. A larger one lifts objects that rest on it."""
     min_axis: float = 1e-3
+    """Shortest half-axis [m]. Cells whose Gaussians lie in a plane have none of their own."""
     min_cell: float = 0.005
+    """Smallest size [m] of a cell. A smaller one gives finer shapes as far as the limit of their number permits."""
     growth: float = 1.15
+    """Ratio [1] between tried cell sizes. A smaller one comes closer to the limit, in more passes."""
 
 
 CONSTANTS = EllipsoidConstants()

@@ -14,17 +14,16 @@ from splatbot.robots.robot import RobotModel
 
 @dataclass(frozen=True)
 class ProblemConstants:
-    """Constants of planning problems.
-
-    Args:
-        max_goal_height: [m] height of the tool above the table.
-        min_clearance: [m] true clearance at both ends, so that both are free on every kind of map.
-        batches: [20,000 configurations] configurations that are sampled on a map.
-    """
+    """Constants of planning problems."""
 
     max_goal_height: float = 0.22
+    """Largest height [m] of the tool above the table. A larger one poses easier problems, above the objects."""
     min_clearance: float = 5e-3
+    """True clearance [m] at both ends, so that both are free on every kind of map. A smaller one poses ends that a
+    coarse map blocks."""
     batches: int = 20
+    """Number of batches [1] of 20,000 configurations that are sampled on a map. More of them find more ends in
+    cluttered maps."""
 
 
 CONSTANTS = ProblemConstants()

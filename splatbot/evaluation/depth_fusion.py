@@ -16,17 +16,15 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True)
 class FusionConstants:
-    """Constants of fused depth.
-
-    Args:
-        min_weight: measurements of a voxel that the extracted surface requires.
-        truncation: [voxels] truncation distance; Open3D's default.
-        blocks: [blocks of 16³ voxels] initial capacity; the hash table grows.
-    """
+    """Constants of fused depth."""
 
     min_weight: float = 3.0
+    """Number of measurements [1] of a voxel that the extracted surface requires. A smaller one keeps noise of single
+    frames."""
     truncation: float = 8.0
+    """Truncation distance [voxels], Open3D's default. A larger one thickens thin parts."""
     blocks: int = 20_000
+    """Initial capacity [blocks of 16³ voxels]. The hash table grows beyond it."""
 
 
 CONSTANTS = FusionConstants()

@@ -14,31 +14,32 @@ from splatbot.protocols import Array, HandShape
 
 @dataclass(frozen=True)
 class HandPoseConstants:
-    """Constants of hand placement and of the collision tests against the target.
-
-    Args:
-        hands_per_chunk: number of hands that are evaluated at once; it bounds memory.
-        quick_points: number of surface points of the quick palm test.
-        completion_tolerance: [m] error of completed points, by which they are shrunk.
-        contact_tolerance: [m] maximum distance between a pad and a surface point in contact.
-        pad_compliance: [m] depth over which the soft pad distributes its contact.
-        tip_margin: [m] minimum distance of a contact from the finger tips.
-        max_protrusion: [m] maximum protrusion of the target under a pad beyond the planned contact.
-        pad_gap: [m] distance between each pad and the target during the approach.
-        opening_step: [m] finger openings are rounded up to multiples of it.
-        max_clearance: [m] larger clearances are clipped.
-    """
+    """Constants of hand placement and of the collision tests against the target."""
 
     hands_per_chunk: int = 32
+    """Number of hands [1] that are evaluated at once. It bounds memory and has no effect on the result."""
     quick_points: int = 250
+    """Number of surface points [1] of the quick test of the palm. Fewer of them pass more hands to the exact test."""
     completion_tolerance: float = 0.003
+    """Error [m] of completed points, by which they are shrunk. A larger one accepts grasps closer to an unobserved
+    side."""
     contact_tolerance: float = 0.003
+    """Largest distance [m] between a pad and a surface point in contact. A larger one reports more of the pad as
+    covered."""
     pad_compliance: float = 0.001
+    """Depth [m] over which the soft pad distributes its contact. A smaller one concentrates it on the highest point."""
     tip_margin: float = 0.002
+    """Smallest distance [m] of a contact from the finger tips. A larger one moves hands closer to the object."""
     max_protrusion: float = 0.006
+    """Largest height [m] of the target under a pad above the planned contact. A larger one opens the hand
+    wider."""
     pad_gap: float = 0.003
+    """Distance [m] between each pad and the target during the approach. A larger one needs a wider opening."""
     opening_step: float = 0.002
+    """Step [m] to whose multiples finger openings are rounded up. A larger one opens the hand wider than the target
+    needs."""
     max_clearance: float = 0.03
+    """Clearance [m] above which larger values are clipped, since they do not make a grasp better."""
 
 
 CONSTANTS = HandPoseConstants()

@@ -60,19 +60,18 @@ _SYNONYMS = {"gray": "grey", "violet": "purple", "magenta": "pink", "turquoise":
 
 @dataclass(frozen=True)
 class QueryConstants:
-    """Constants of scores of language queries.
-
-    Args:
-        color_scale: [CIELAB] distance at which the colour score falls to exp(-1/2).
-        shape_scale: [m] excess fit error at which the shape score falls to exp(-1).
-        min_score: minimum score of a match.
-        tie_ratio: ratio of the second score to the best above which the query is ambiguous.
-    """
+    """Constants of scores of language queries."""
 
     color_scale: float = 28.0
+    """CIELAB distance [1] at which the colour score falls to exp(-1/2). A larger one accepts more distant shades."""
     shape_scale: float = 2.5e-3
+    """Excess error [m] of a fit at which the shape score falls to exp(-1). A larger one tells shapes apart less
+    strictly."""
     min_score: float = 0.3
+    """Smallest score [1] of a match. A larger one refuses more queries as unknown."""
     tie_ratio: float = 0.75
+    """Ratio [1] of the second score to the best above which a query is ambiguous. A larger one decides more close
+    cases."""
 
 
 CONSTANTS = QueryConstants()

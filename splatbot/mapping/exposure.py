@@ -17,34 +17,34 @@ Image = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ExposureConstants:
-    """Constants of the exposure correction.
-
-    Args:
-        block_size: [px] side of the blocks whose mean colors are compared. Single pixels differ by blur and noise.
-        least_blocks: with fewer blocks, the exposure counts as unchanged.
-        opaque_alpha: the map's color is valid where it covers more.
-        depth_share: [share of depth] up to this difference, map and image show the same surface.
-        black, white: [0..255] values below or above are clipped.
-        fit_iterations: iterations of the robust fit.
-        fit_scale: [0..1] a residual of this size has half the weight.
-        offset_prior: weight of the prior that draws the offset to 0. A uniform gray determines only the gain.
-        least_gain, most_gain: a fit outside these limits is implausible.
-        correction_threshold: [0..1] smaller differences remain. Automatic exposure changes by up to 0.16 between
-            keyframes of recorded logs. Corrections of such differences would accumulate the map's own errors.
-    """
+    """Constants of the exposure correction."""
 
     block_size: int = 16
+    """Side [px] of the blocks whose mean colors are compared. Single pixels differ by blur and noise."""
     least_blocks: int = 20
+    """Number of blocks [1] below which the exposure counts as unchanged."""
     opaque_alpha: float = 0.9
+    """Alpha [1] of the map above which its color is valid. A smaller one compares with the map's background."""
     depth_share: float = 0.05
+    """Relative difference of depth [1] up to which map and image show the same surface. A larger one compares colors of
+    different surfaces."""
     black: int = 2
+    """Value [0..255] below which a channel is clipped."""
     white: int = 253
+    """Value [0..255] above which a channel is clipped."""
     fit_iterations: int = 10
+    """Number of iterations [1] of the robust fit."""
     fit_scale: float = 0.02
+    """Residual [0..1] that has half the weight. A larger one lets surfaces that changed bias the fit."""
     offset_prior: float = 1e-3
+    """Relative weight [1] of the prior that draws the offset to 0. A uniform gray determines only the gain."""
     least_gain: float = 0.1
+    """Gain [1] below which a fit is implausible; the exposure then counts as unchanged."""
     most_gain: float = 10.0
+    """Gain [1] above which a fit is implausible; the exposure then counts as unchanged."""
     correction_threshold: float = 0.2
+    """Change of black or white [0..1] up to which differences remain. Automatic exposure changes by up to 0.16 between
+    keyframes of recorded logs. Corrections of such differences would accumulate the map's own errors."""
 
 
 CONSTANTS = ExposureConstants()

@@ -29,39 +29,39 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LoopConstants:
-    """Constants of loop closing.
-
-    Args:
-        neighbor_hops: edges of the pose graph, or difference of keyframe numbers, within which a keyframe is a
-            neighbor of the odometry and not a revisited place.
-        near_translation, near_rotation: [m], [rad] a keyframe this near is a loop candidate, even with
-            another appearance.
-        appearance_candidates: loop candidates by appearance that are verified for each keyframe.
-        unknown_sigma: [m], [rad] standard deviation of a motion that the images could not measure.
-        drift_sigma: [m/m], [rad/rad] standard deviation of the odometry error, relative to the motion. Errors of lens
-            and depth calibration add up over the path.
-        open_translation, open_rotation: [m], [rad] a loop that the optimized graph leaves open by more is wrong.
-        tracking_translation, tracking_rotation: [m], [rad] up to this difference, the images confirm the tracked
-            motion between two keyframes. Beyond it, other keyframes biased tracking.
-        drift_offset: [m], [rad] drift that a loop may correct for a path of any length.
-        same_translation, same_rotation: [m], [rad] two loops that imply corrections this near confirm each other.
-        unconfirmed_kept: loops that wait for a confirming one.
-    """
+    """Constants of loop closing."""
 
     neighbor_hops: int = 10
+    """Number of edges of the pose graph [1], or difference of keyframe numbers, within which a keyframe is a neighbor
+    of the odometry and not a revisited place."""
     near_translation: float = 0.25
+    """Distance [m] below which a keyframe is a loop candidate, even with another appearance."""
     near_rotation: float = 0.35
+    """Angle [rad] below which such a keyframe is a loop candidate."""
     appearance_candidates: int = 2
+    """Number of loop candidates [1] by appearance that are verified for each keyframe. Each takes an alignment."""
     unknown_sigma: float = 0.5
+    """Standard deviation [m], [rad] of a motion that the images could not measure."""
     drift_sigma: float = 5e-3
+    """Standard deviation [m/m], [rad/rad] of the odometry error, relative to the motion. Errors of lens and depth
+    calibration add up over the path."""
     open_translation: float = 1e-2
+    """Distance [m] by which the optimized graph leaves a wrong loop open. A smaller one rejects inaccurate loops."""
     open_rotation: float = 2e-2
+    """Angle [rad] by which the optimized graph leaves a wrong loop open."""
     tracking_translation: float = 5e-3
+    """Distance [m] up to which the images confirm the tracked motion between two keyframes. Beyond it, other keyframes
+    biased tracking."""
     tracking_rotation: float = 5e-3
+    """Angle [rad] of the same confirmation."""
     drift_offset: float = 0.05
+    """Drift [m], [rad] that a loop may correct for a path of any length."""
     same_translation: float = 0.02
+    """Distance [m] between the corrections that two loops imply, below which they confirm each other."""
     same_rotation: float = 0.02
+    """Angle [rad] between the corrections of loops that confirm each other."""
     unconfirmed_kept: int = 4
+    """Number of loops [1] that wait for a confirming one. More of them confirm loops that are farther apart in time."""
 
 
 CONSTANTS = LoopConstants()

@@ -10,9 +10,8 @@ from importlib import metadata
 from typing import Any
 
 from splatbot.config import Config
-from splatbot.rasterize.views import depth_limits
 from splatbot.report.figures import error_plot, gaussians_plot, stages_plot, trajectory_plot
-from splatbot.report.images import colour_png, depth_png, difference_png
+from splatbot.report.images import CaptionedView, comparison
 from splatbot.report.parts import details, document, image, note, pictures, section, table, tiles
 from splatbot.results.folder import FrameRow
 from splatbot.results.scoring import ShownView, TrajectoryScore, ViewScores
@@ -20,7 +19,6 @@ from splatbot.results.units import count, decibels, megabytes, metres, milliseco
 from splatbot.trajectory import Trajectory
 
 _PACKAGES = ("splatbot", "torch", "numpy", "opencv-contrib-python-headless", "open3d")
-_GAIN = 3.0  # of difference images: errors of a third of the range are white
 
 
 def report_html(
@@ -110,15 +108,14 @@ def _verdicts(rows: Sequence[FrameRow]) -> str:
 
 
 def _view(view: ShownView) -> str:
-    span = depth_limits(view.depth)
-    images = [
-        (colour_png(view.rgb), f"frame {view.score.index}"),
-        (colour_png(view.rendered_rgb), f"map, {decibels(view.score.psnr_db)}"),
-        (difference_png(view.rgb, view.rendered_rgb, gain=_GAIN), f"difference, times {_GAIN:g}"),
-        (depth_png(view.depth, span), f"sensor depth, {span[0]:.2f} to {span[1]:.2f} m"),
-        (depth_png(view.rendered_depth, span), f"map depth, median error {metres(view.score.depth_median_m)}"),
-    ]
-    return pictures(images)
+    score = view.score
+    seen = CaptionedView(view.rgb, view.depth, f"frame {score.index}", "sensor depth")
+    error = f"map depth, median error {metres(score.depth_median_m)}"
+    return pictures(
+        comparison(
+            seen, CaptionedView(view.rendered_rgb, view.rendered_depth, f"map, {decibels(score.psnr_db)}", error)
+        )
+    )
 
 
 def _views_note(metrics: Mapping[str, Any], views: ViewScores) -> str:

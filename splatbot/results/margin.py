@@ -16,15 +16,14 @@ from splatbot.results.views import depth_views
 
 @dataclass(frozen=True)
 class RunMarginConstants:
-    """Constants of the recommended margin.
-
-    Args:
-        radius: [m] distance around the base in which points count.
-        share: quantile of the surface error.
-    """
+    """Constants of the recommended margin."""
 
     radius: float = 1.0
+    """Distance [m] around the base in which points count. A larger one includes distant surfaces, whose error is
+    larger."""
     share: float = 0.999
+    """Quantile [1] of the surface error that the margin covers. A larger one gives a larger margin, which outliers
+    determine."""
 
 
 CONSTANTS = RunMarginConstants()

@@ -13,23 +13,24 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True)
 class FitConstants:
-    """Constants of primitive fits.
-
-    Args:
-        hull_error_ratio: a hull is used only if every primitive's error exceeds this multiple of the hull's error.
-        hull_noise: [m] noise that is added to that multiple, since a hull follows the noise and lacks unobserved sides.
-        foot_fraction: lower part of a hull's height whose points are projected to the floor.
-        max_unobserved_cap: maximum height of a ball above its points as a fraction of the radius.
-        trim: [%] points outside of a box or cylinder on each side.
-        max_floor_gap: [m] maximum distance between a cluster and the floor that it stands on.
-    """
+    """Constants of primitive fits."""
 
     hull_error_ratio: float = 1.3
+    """Ratio [1] to a hull's error that every primitive's error must exceed for the hull to be used. A larger one
+    prefers primitives."""
     hull_noise: float = 3e-3
+    """Noise [m] that is added to that multiple, since a hull follows the noise and lacks unobserved sides."""
     foot_fraction: float = 0.3
+    """Lower part [1] of a hull's height whose points are projected to the floor. A larger one widens the foot of
+    tapered objects."""
     max_unobserved_cap: float = 0.25
+    """Largest height [1] of a ball above its points, as a share of the radius. A larger one fits balls to domes."""
     trim: float = 1.0
+    """Share [%] of points outside of a box or cylinder on each side. A larger one shrinks shapes, a smaller one follows
+    outliers."""
     max_floor_gap: float = 0.03
+    """Largest distance [m] between a cluster and the floor that it stands on. A larger one extends objects that
+    hang."""
 
 
 CONSTANTS = FitConstants()

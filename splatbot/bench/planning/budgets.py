@@ -33,21 +33,19 @@ from splatbot.robots.panda import panda
 
 @dataclass(frozen=True)
 class BudgetConstants:
-    """Constants of plans under a time budget.
-
-    Args:
-        exact_clearance: [m] true clearance up to which it is exact; above it is a lower bound.
-        fast_ms: [ms] budget of the path before a change of the map, and of paths on mapped logs.
-        repair_ms: [ms] budget of a repair.
-        wide_clearance: [m] true clearance at both ends, which leaves them free on a map with a margin of 2 cm.
-        solvable_ms: [ms] time in which a changed problem must be solved again to count.
-    """
+    """Constants of plans under a time budget."""
 
     exact_clearance: float = 0.01
+    """True clearance [m] up to which it is exact; above it is a lower bound, and is compared with this value."""
     fast_ms: float = 28.0
+    """Budget [ms] of the path before a change of the map, and of paths on mapped logs. A larger one solves more
+    problems, with shorter paths."""
     repair_ms: float = 9.0
+    """Budget [ms] of a repair. A larger one repairs more paths."""
     wide_clearance: float = 0.03
+    """True clearance [m] at both ends, which leaves them free on a map with a margin of 2 cm."""
     solvable_ms: float = 100.0
+    """Time [ms] in which a changed problem must be solved again to count. A larger one counts harder problems."""
 
 
 CONSTANTS = BudgetConstants()

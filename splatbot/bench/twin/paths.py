@@ -16,32 +16,32 @@ from splatbot.protocols import Array, KinematicChain
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.shapes import Capsule
-from splatbot.sim.motion import JointMotion, minimum_jerk
+from splatbot.sim.motion import MINIMUM_JERK_PEAK, JointMotion, minimum_jerk
 from splatbot.sim.scene import Scene, make_scene
 from splatbot.sim.twin import Twin
 
 
 @dataclass(frozen=True)
 class TwinPathConstants:
-    """Constants of paths that a twin executes.
-
-    Args:
-        margin: [m] margin of the plans; the arm follows them within a millimetre.
-        push_depth: [m] distance that pushed paths go into an obstacle.
-        axis_points: points on a capsule's axis.
-        spare: additional problems, because some have no path within the budget.
-        departures: configurations at which a pushed path may leave the path.
-        first_link: first of the checked links: the clearance of earlier ones hardly changes.
-        limit_share: fraction of the joints' limits of velocity and acceleration.
-    """
+    """Constants of paths that a twin executes."""
 
     margin: float = 0.005
+    """Margin [m] of the plans. It covers the millimetre by which the arm leaves its path; a larger one leaves more
+    problems unsolved."""
     push_depth: float = 0.01
+    """Depth [m] of a pushed path in an obstacle. A larger one leaves fewer places from which it can be reached."""
     axis_points: int = 13
+    """Number of points [1] on a capsule's axis. More of them find the clearance of long links more exactly, in
+    proportional time."""
     spare: int = 20
+    """Number of additional problems [1], because some have no path within the budget."""
     departures: int = 12
+    """Number of configurations [1] at which a pushed path may leave the path. More of them push more paths, and take
+    longer."""
     first_link: int = 3
+    """Index [1] of the first link whose clearance is checked. Paths hardly change that of earlier links."""
     limit_share: float = 0.6
+    """Share [1] of the joints' limits of velocity and acceleration. A larger one leaves the controller less reserve."""
 
 
 CONSTANTS = TwinPathConstants()
@@ -119,8 +119,8 @@ def try_paths(
 def timed(waypoints: Array, chain: KinematicChain) -> JointMotion:
     """Time a motion along the edges, at rest at each waypoint, within the limits of velocity and acceleration."""
     steps = np.abs(np.diff(waypoints, axis=0))
-    # Minimum jerk peaks at 1.875 of the mean velocity and at 5.774 of distance over time squared.
-    slow = (1.875 * steps / (CONSTANTS.limit_share * chain.velocity)).max(axis=1)
+    # The acceleration of minimum jerk peaks at 5.774 of distance over time squared.
+    slow = (MINIMUM_JERK_PEAK * steps / (CONSTANTS.limit_share * chain.velocity)).max(axis=1)
     soft = np.sqrt((5.774 * steps / (CONSTANTS.limit_share * chain.acceleration)).max(axis=1))
     times = np.concatenate([[0.0], np.cumsum(np.maximum(np.maximum(slow, soft), 0.02))])
     t = np.unique(np.concatenate([np.arange(0.0, times[-1], 4e-3), times]))
