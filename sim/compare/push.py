@@ -20,35 +20,34 @@ from splatbot.sim.world import OBJECT
 
 @dataclass(frozen=True)
 class PushConstants:
-    """Constants of pushes.
-
-    Args:
-        goal_radius: [m] distance from the goal within which the task succeeds.
-        upright_cosine: an object that leans by more than 0.5 rad has tipped over.
-        tip: [m] distance from the tool frame to the finger tips.
-        tilt: [rad] tilt of the tool from straight down, so that the fingers and not the hand make contact.
-        min_height: [m] height of the tool over the table.
-        run_up: [m] distance before contact.
-        start_height: [m] height of the start over the table.
-        approach: [s] time of the approach.
-        descent: [s] time of the descent.
-        rest: [s] time at rest.
-        max_postures: postures above the object that are tried.
-        rate: [Hz] samples per second; between them a motion is a cubic.
-    """
+    """Constants of pushes."""
 
     goal_radius: float = 0.03
+    """Distance [m] from the goal within which the task succeeds."""
     upright_cosine: float = float(np.cos(0.5))
+    """Cosine [1] of the angle from the vertical beyond which an object has tipped over: 0.5 rad."""
     tip: float = 0.01
+    """Distance [m] from the tool frame to the finger tips. A wrong one ends the push short of the goal or beyond it."""
     tilt: float = np.pi / 4
+    """Tilt [rad] of the tool from straight down. With a smaller one the hand makes contact instead of the fingers."""
     min_height: float = 0.03
+    """Smallest height [m] of the tool over the table. A smaller one scrapes along it."""
     run_up: float = 0.05
+    """Distance [m] before contact. The arm reaches its speed within it."""
     start_height: float = 0.25
+    """Height [m] of the start over the table, above all objects."""
     approach: float = 2.0
+    """Time [s] from the home posture to the start."""
     descent: float = 1.0
+    """Time [s] of the descent behind the object."""
     rest: float = 0.5
+    """Time [s] at rest after the push, in which the object comes to rest, too."""
     max_postures: int = 8
+    """Number of postures [1] above the object that are tried. More of them find a path where the first is near its
+    limits, and take longer."""
     rate: float = 50.0
+    """Rate [Hz] of the samples of the motion. Between them it is a cubic; a smaller one leaves the straight line by
+    more."""
 
 
 CONSTANTS = PushConstants()

@@ -17,17 +17,15 @@ from splatbot.sim.twin import Twin, TwinResult
 
 @dataclass(frozen=True)
 class ReachTaskConstants:
-    """Constants of reaches.
-
-    Args:
-        goal_tolerance: [rad] largest error of every joint.
-        budget_ms: [ms] ample: iterations end a search, not time, so equal calls give equal paths.
-        cuts: shortcut attempts.
-    """
+    """Constants of reaches."""
 
     goal_tolerance: float = 0.02
+    """Largest error [rad] of every joint at the goal. A smaller one counts the lag of the controller as a failure."""
     budget_ms: float = 10_000.0
+    """Budget [ms] of a search. It is ample: iterations end a search, not time, so that equal calls give equal paths."""
     cuts: int = 100
+    """Number of random cuts [1] that are tried to shorten a path. More of them give shorter paths that pass obstacles
+    more closely."""
 
 
 CONSTANTS = ReachTaskConstants()

@@ -12,19 +12,17 @@ from splatbot.protocols import Array, KinematicChain
 
 @dataclass(frozen=True)
 class ShakeConstants:
-    """Constants of the shaking motion.
-
-    Args:
-        rate: [Hz] frequency of the motion.
-        duration: [s] length of the motion.
-        acceleration_share: fraction of the joints' acceleration limits.
-        period: [s] time between the waypoints of the motion.
-    """
+    """Constants of the shaking motion."""
 
     rate: float = 3.0
+    """Frequency [Hz] of the motion. A higher one has smaller amplitudes at the same acceleration."""
     duration: float = 2.0
+    """Length [s] of the motion. A longer one lets an object that slips fall."""
     acceleration_share: float = 0.6
+    """Amplitude of the acceleration [1] as a share of the joints' limits. A larger one pulls harder on the held object
+    and leaves the controller less reserve."""
     period: float = 0.005
+    """Time [s] between the waypoints of the motion. A longer one flattens the peaks of the sinusoid."""
 
 
 CONSTANTS = ShakeConstants()

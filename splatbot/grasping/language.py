@@ -65,7 +65,7 @@ class QueryConstants:
     color_scale: float = 28.0
     """CIELAB distance [1] at which the colour score falls to exp(-1/2). A larger one accepts more distant shades."""
     shape_scale: float = 2.5e-3
-    """Excess error [m] of a fit at which the shape score falls to exp(-1). A larger one tells shapes apart less
+    """Excess error [m] of a fit at which the shape score falls to exp(-1). A larger one separates similar shapes less
     strictly."""
     min_score: float = 0.3
     """Smallest score [1] of a match. A larger one refuses more queries as unknown."""

@@ -17,23 +17,22 @@ from splatbot.segmentation import SegmentedMap
 
 @dataclass(frozen=True)
 class SurfaceConstants:
-    """Constants of the observed surface.
-
-    Args:
-        min_support: minimum observations of a Gaussian as a fraction of the 90th percentile.
-        smoothing_cosine: minimum cosine between normals that are averaged.
-        sharp_cosine: minimum cosine between normals that are averaged where edges stay sharp.
-        max_area_ratio: points with a larger area, relative to the median, are strays.
-        max_points: points on a surface; more are subsampled.
-        smoothing: [m] standard deviation of the kernel that averages normals.
-    """
+    """Constants of the observed surface."""
 
     min_support: float = 0.2
+    """Smallest number of observations [1] of a Gaussian, as a share of the 90th percentile. A larger one removes more
+    floaters, and sides that few frames show."""
     smoothing_cosine: float = 0.3
+    """Smallest cosine [1] between normals that are averaged. A larger one keeps more noise."""
     sharp_cosine: float = 0.8
+    """Smallest cosine [1] between normals that are averaged where edges stay sharp. A smaller one rounds them."""
     max_area_ratio: float = 4.0
+    """Ratio [1] to the median area above which a point is a stray. A larger one keeps isolated points."""
     max_points: int = 1800
+    """Largest number of points [1] on a surface; more are subsampled. Smoothing takes quadratically longer with more of
+    them."""
     smoothing: float = 0.006
+    """Standard deviation [m] of the kernel that averages normals. A larger one flattens small objects."""
 
 
 CONSTANTS = SurfaceConstants()

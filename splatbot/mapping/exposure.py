@@ -22,7 +22,8 @@ class ExposureConstants:
     block_size: int = 16
     """Side [px] of the blocks whose mean colors are compared. Single pixels differ by blur and noise."""
     least_blocks: int = 20
-    """Number of blocks [1] below which the exposure counts as unchanged."""
+    """Number of blocks [1] below which the exposure counts as unchanged. A smaller one lets noise of a few blocks
+    determine it."""
     opaque_alpha: float = 0.9
     """Alpha [1] of the map above which its color is valid. A smaller one compares with the map's background."""
     depth_share: float = 0.05

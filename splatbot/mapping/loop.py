@@ -32,8 +32,8 @@ class LoopConstants:
     """Constants of loop closing."""
 
     neighbor_hops: int = 10
-    """Number of edges of the pose graph [1], or difference of keyframe numbers, within which a keyframe is a neighbor
-    of the odometry and not a revisited place."""
+    """Number of edges of the pose graph [1], or difference of keyframe numbers. A keyframe within it is a neighbor of
+    the odometry and not a revisited place."""
     near_translation: float = 0.25
     """Distance [m] below which a keyframe is a loop candidate, even with another appearance."""
     near_rotation: float = 0.35

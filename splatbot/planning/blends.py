@@ -12,17 +12,16 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True)
 class BlendConstants:
-    """Constants of blends between straight segments.
-
-    Args:
-        samples: samples of a blend.
-        chords: chords that approximate a blend before its speed is planned.
-        min_line_samples: samples of the shortest line.
-    """
+    """Constants of blends between straight segments."""
 
     samples: int = 48
+    """Number of samples [1] of a blend. More of them hold the limits of the joints between samples more closely, and
+    take longer."""
     chords: int = 12
+    """Number of chords [1] that approximate a blend before its speed is planned. More of them follow the curve more
+    closely."""
     min_line_samples: int = 24
+    """Number of samples [1] of the shortest line; longer lines have more."""
 
 
 CONSTANTS = BlendConstants()

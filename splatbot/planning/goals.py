@@ -19,21 +19,22 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True)
 class GoalConstants:
-    """Constants of the search for goal postures.
-
-    Args:
-        batch: starts between two readings of the clock.
-        min_starts: smallest number of starts before the search for a first posture may time out.
-        min_separation: [rad or m] postures that differ by less in every joint count as one.
-        ranking_cut: [m] postures with more clearance rank equally.
-        max_causes: largest number of rejected postures that are examined for the cause.
-    """
+    """Constants of the search for goal postures."""
 
     batch: int = 16
+    """Number of starts [1] between two readings of the clock. A larger one exceeds the budget by more, a smaller one
+    uses the vector units less."""
     min_starts: int = 128
+    """Smallest number of starts [1] before the search for a first posture may time out. A larger one finds rare
+    postures and may exceed a short budget."""
     min_separation: float = 0.05
+    """Largest difference [rad or m] of every joint of two postures that count as one. A larger one returns fewer
+    postures."""
     ranking_cut: float = 0.1
+    """Clearance [m] above which postures rank equally. A larger one takes longer to compute."""
     max_causes: int = 8
+    """Largest number of rejected postures [1] that are examined for the cause of a failure. The one with the least
+    penetration is reported."""
 
 
 CONSTANTS = GoalConstants()

@@ -14,27 +14,29 @@ from splatbot.segmentation.faces import local_normals, nearest_of
 
 @dataclass(frozen=True)
 class ConcaveEdgeConstants:
-    """Constants of the segmentation at concave edges.
-
-    Args:
-        plane_candidates: number of points whose tangent planes are scored.
-        max_inlier_sample: maximum number of points on which inliers are counted.
-        max_planes: maximum number of planes.
-        min_plane_fraction: minimum fraction of the points that are inliers of a plane.
-        inlier_distance: [m] maximum distance of an inlier from its plane.
-        inlier_cosine: minimum cosine between the normal at a point and that of its plane.
-        max_concave_offset: [m] faces of one object lie at most this far in front of each other.
-        min_contact_points: minimum number of points of a face near another face that it meets.
-    """
+    """Constants of the segmentation at concave edges."""
 
     plane_candidates: int = 150
+    """Number of points [1] whose tangent planes are scored. Fewer of them miss small faces, more of them take
+    proportionally longer."""
     max_inlier_sample: int = 4000
+    """Largest number of points [1] on which inliers are counted. It bounds the time for large clusters; fewer points
+    make the choice between planes of similar size random."""
     max_planes: int = 16
+    """Largest number of planes [1]. It bounds the time for clusters of many faces."""
     min_plane_fraction: float = 0.01
+    """Smallest share [1] of the points that are inliers of a plane. A smaller one splits curved surfaces."""
     inlier_distance: float = 0.008
+    """Largest distance [m] of an inlier from its plane. A larger one merges parallel faces, a smaller one splits noisy
+    ones."""
     inlier_cosine: float = 0.8
+    """Smallest cosine [1] between the normal at a point and that of its plane."""
     max_concave_offset: float = 0.006
+    """Largest distance [m] by which faces of one object lie in front of each other. A larger one merges objects that
+    touch."""
     min_contact_points: int = 5
+    """Smallest number of points [1] of a face near another face that it meets. A larger one separates faces that share
+    only a short edge."""
 
 
 CONSTANTS = ConcaveEdgeConstants()

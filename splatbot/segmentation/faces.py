@@ -13,31 +13,32 @@ from splatbot.protocols import Array
 
 @dataclass(frozen=True)
 class FaceConstants:
-    """Constants of smooth faces.
-
-    Args:
-        neighbour_radius: [m] maximum distance of a neighbour.
-        max_neighbours: maximum number of neighbours of a point.
-        min_neighbours: median number of neighbours, with the point itself, from which normals are reliable.
-        min_coherence: minimum length of the mean normal around a point of a face.
-        parallel_cosine: minimum cosine between normals of one face.
-        level_cosine: minimum cosine between the normal of a horizontal face and z.
-        max_step: [m] maximum distance between neighbours of one face along their normal.
-        min_contact_pairs: minimum number of pairs of neighbours between two faces that meet.
-        min_seed_fraction: a face is selected if more than this fraction of its points are seeds.
-        min_part_fraction: minimum fraction of all points that a separate part has.
-    """
+    """Constants of smooth faces."""
 
     neighbour_radius: float = 0.012
+    """Largest distance [m] of a neighbour. A smaller one breaks faces of coarse maps, a larger one links faces across a
+    gap."""
     max_neighbours: int = 24
+    """Largest number of neighbours [1] of a point. It bounds time and memory."""
     min_neighbours: int = 6
+    """Median number of neighbours [1], with the point itself, from which normals are reliable. Coarser maps are not
+    split at steps."""
     min_coherence: float = 0.9
+    """Smallest length [1] of the mean normal around a point of a face. A larger one excludes more points near edges."""
     parallel_cosine: float = 0.8
+    """Smallest cosine [1] between normals of one face. A larger one splits curved faces."""
     level_cosine: float = 0.8
+    """Smallest cosine [1] between the normal of a horizontal face and z."""
     max_step: float = 0.006
+    """Largest distance [m] between neighbours of one face along their normal. A larger one merges objects that lie on
+    each other."""
     min_contact_pairs: int = 5
+    """Smallest number of pairs of neighbours [1] between two faces that meet."""
     min_seed_fraction: float = 0.5
+    """Share [1] of the points of a face that must be seeds for it to be selected. A larger one selects fewer faces
+    around a hint."""
     min_part_fraction: float = 0.02
+    """Smallest share [1] of all points that a separate part has. A smaller one splits off noise."""
 
 
 CONSTANTS = FaceConstants()

@@ -24,45 +24,50 @@ from splatbot.workspace import NamedPlace
 
 @dataclass(frozen=True)
 class SegmentationConstants:
-    """Constants of the segmentation into objects.
-
-    Args:
-        object_distance: [m] minimum distance between objects.
-        min_support_extent: [m] minimum extent of a cluster that may contain a support.
-        min_support_fraction: minimum fraction of a cluster's points that are on its support.
-        max_support_planes: maximum number of planes of a cluster that are tried as supports.
-        max_nested_supports: maximum depth of supports on supports.
-        spacing_factor: minimum object distance relative to the median size of the Gaussians, for coarse maps.
-        seed_margin: [m] margin around seeds in which faces are searched.
-        stray_distance: [m] faint Gaussians within this distance of an object belong to it.
-        min_over_fraction: minimum fraction of the points above a support that are over its area.
-        min_support_cosine: minimum cosine between the normals of points on a support and its own.
-        min_level_fraction: minimum fraction of a support's points with such normals.
-        max_name_distance: [m] maximum distance between a named place and its object.
-        min_opacity: least opacity of a Gaussian that represents a surface.
-        min_height: [m] least height above a support below which points are its noise.
-        max_height: [m] largest height above a support below which points are its noise.
-        min_gaussians: minimum number of Gaussians of an object.
-        max_extent: [m] maximum extent of an object.
-    """
+    """Constants of the segmentation into objects."""
 
     object_distance: float = 0.012
+    """Smallest distance [m] between objects. A larger one merges objects that stand close to each other, a smaller one
+    splits objects at gaps of the map."""
     min_support_extent: float = 0.15
+    """Smallest extent [m] of a cluster that may contain a support, such as a book with objects on it."""
     min_support_fraction: float = 0.1
+    """Smallest share [1] of a cluster's points that are on its support."""
     max_support_planes: int = 3
+    """Largest number of planes [1] of a cluster that are tried as supports."""
     max_nested_supports: int = 1
+    """Largest depth [1] of supports on supports."""
     spacing_factor: float = 2.2
+    """Smallest distance [1] between objects relative to the median size of the Gaussians, for coarse maps. A smaller
+    one splits objects into single Gaussians."""
     seed_margin: float = 0.05
+    """Margin [m] around seeds in which faces are searched."""
     stray_distance: float = 0.006
+    """Distance [m] from an object within which faint Gaussians belong to it. A larger one adds shadows on the
+    support."""
     min_over_fraction: float = 0.7
+    """Smallest share [1] of the points above a support that are over its area. A smaller one takes leaning objects for
+    supports."""
     min_support_cosine: float = 0.8
+    """Smallest cosine [1] between the normals of points on a support and its own."""
     min_level_fraction: float = 0.5
+    """Smallest share [1] of a support's points with such normals. A smaller one takes the points of a curved object for
+    a support."""
     max_name_distance: float = 0.05
+    """Largest distance [m] between a named place and its object. A larger one names a neighbour if the object is
+    missing."""
     min_opacity: float = 0.3
+    """Smallest opacity [1] of a Gaussian that represents a surface."""
     min_height: float = 0.002
+    """Smallest height [m] above a support below which points are its noise. The height is three standard deviations of
+    the noise within these limits."""
     max_height: float = 0.008
+    """Largest height [m] above a support below which points are its noise. A larger one loses flat objects in noisy
+    maps."""
     min_gaussians: int = 40
+    """Smallest number of Gaussians [1] of an object."""
     max_extent: float = 0.35
+    """Largest extent [m] of an object. A larger cluster is split, and parts that are larger are left out."""
 
 
 CONSTANTS = SegmentationConstants()

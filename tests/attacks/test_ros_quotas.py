@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from websockets.sync.connection import Connection
 
 from splatbot.geometry import pose_from_quat
 from splatbot.services.arms import known_robot
-from splatbot.services.ros.graph import CLIENT_RETAINED_BYTES, CLIENT_SERVICES, CLIENT_TOPICS
+from splatbot.services.ros.graph import CLIENT_RETAINED_BYTES, CLIENT_SERVICES, CLIENT_TOPICS, RosGraph
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
@@ -113,17 +114,22 @@ def test_only_latched_messages_are_kept_and_no_more_than_a_client_may(served: Se
         assert graph.latched("/b") is not None
 
 
+def _published(graph: RosGraph, name: str) -> bool:
+    """Return whether the points of a map are published, as the default map or under its name."""
+    return bool(graph.latched("/map/points") or graph.latched(f"/maps/{name}/map/points"))
+
+
 def test_topics_of_deleted_maps_go(served: Service) -> None:
     graph = served.app.state.ros.graph
     served.store.remove("default")
     for number in range(40):
         name = f"m{number}"
         served.store.add(name, source="x", state="static", snapshot=wall())
-        until(lambda name=name: graph.latched("/map/points") or graph.latched(f"/maps/{name}/map/points"))
+        until(partial(_published, graph, name))
         served.store.remove(name)
         until(lambda: not any(topic.startswith("/maps/") for topic in topics(served)))
     served.store.add("last", source="x", state="static", snapshot=wall())
-    until(lambda: graph.latched("/map/points") or graph.latched("/maps/last/map/points"))
+    until(partial(_published, graph, "last"))
 
 
 def test_a_second_subscription_of_a_connection_gets_the_latched_message(served: Service) -> None:

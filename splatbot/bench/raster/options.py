@@ -77,7 +77,7 @@ def run_effects(results: Results, scene: SplatScene, size: tuple[int, int], *, r
 
 def plain_arguments(scene: SplatScene, size: tuple[int, int]) -> Arguments:
     """Return arguments of ``rasterization`` without options, with gradients of all five tensors."""
-    leaves = {name: t.detach().clone().requires_grad_() for name, t in scene.named().items()}
+    leaves = {name: t.detach().clone().requires_grad_() for name, t in scene.gaussians.items()}
     return leaves | scene.view(*size)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatbot.bench.native import bench_native
-from splatbot.bench.raster.scenes import NAMES, SplatScene
+from splatbot.bench.raster.scenes import SplatScene
 
 TILE = 16  # [px]
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, MAX_SIGMAS, EPS2D, FOV_MARGIN = 1.0 / 255.0, 0.99, 1e-4, 3.33, 0.3, 0.3
@@ -71,7 +71,7 @@ def scalar_render(scene: SplatScene, width: int, height: int, grad: Tensor | Non
         "conics": torch.zeros(n, 3),
     }
     K = scene.intrinsics(width, height)[0]
-    tensors = [t.contiguous() for t in (*scene.tensors(), scene.viewmat)]
+    tensors = [t.contiguous() for t in (*scene.gaussians.values(), scene.viewmat)]
     bench_native().scalar_baseline(*tensors, K, width, height, image, alpha, grad, *gradients.values())
     return PeerRender(image, alpha, gradients if grad is not None else {})
 
@@ -94,7 +94,7 @@ def torch_render(
     project: Callable[..., Projection] | None = None,
 ) -> PeerRender:
     """Render by float32 operations of torch, and differentiate each tile at once, which bounds the memory."""
-    leaves = [t.detach().clone().requires_grad_(grad is not None) for t in scene.tensors()]
+    leaves = [t.detach().clone().requires_grad_(grad is not None) for t in scene.gaussians.values()]
     means, quats, scales, opacities, colors = leaves
     with torch.set_grad_enabled(grad is not None):
         found = (project or _project)(scene, means, quats, scales, width, height)
@@ -115,7 +115,7 @@ def torch_render(
         return PeerRender(image, alpha, {})
     torch.autograd.backward([mean2d, conic], [_grad(cut[0]), _grad(cut[1])])
     gradients = [_grad(t) for t in (means, quats, scales)] + [_grad(cut[2]), _grad(cut[3])]
-    return PeerRender(image, alpha, dict(zip(NAMES, gradients, strict=True)))
+    return PeerRender(image, alpha, dict(zip(scene.gaussians, gradients, strict=True)))
 
 
 def gsplat_render(scene: SplatScene, width: int, height: int, grad: Tensor | None) -> PeerRender:

@@ -16,39 +16,28 @@ from splatbot.geometry import inverse
 from splatbot.rasterize.views import default_view
 
 MAP_WIDTH, MAP_HEIGHT = 320, 240  # [px] grid that the surface map is back-projected from
-NAMES = ("means", "quats", "scales", "opacities", "colors")
 BOX_DISTANCE = 2.5  # [m] from the camera to the centre of the random scenes
 
 
 @dataclass(frozen=True)
 class SplatScene:
-    """Gaussians in the camera frame, and the camera's field of view.
+    """Gaussians and a camera.
 
     Args:
-        means: (N, 3) [m]; quats: (N, 4) wxyz; scales: (N, 3) [m]; opacities: (N,); colors: (N, 3).
+        name: of the scene, in results.
+        gaussians: the tensors by the argument names of ``rasterization``: means (N, 3) [m, world], quats (N, 4) wxyz,
+            scales (N, 3) [m], opacities (N,), colors (N, 3), in this order.
         viewmat: (4, 4) world to camera.
         fov: horizontal field of view [rad].
     """
 
     name: str
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
+    gaussians: dict[str, Tensor]
     viewmat: Tensor
     fov: float
 
     def __len__(self) -> int:
-        return len(self.means)
-
-    def tensors(self) -> tuple[Tensor, ...]:
-        """Return means, quats, scales, opacities, colours."""
-        return self.means, self.quats, self.scales, self.opacities, self.colors
-
-    def named(self) -> dict[str, Tensor]:
-        """Return the tensors by the argument names of ``rasterization``."""
-        return dict(zip(NAMES, self.tensors(), strict=True))
+        return len(self.gaussians["means"])
 
     def intrinsics(self, width: int, height: int) -> Tensor:
         """Return intrinsics (1, 3, 3) [px] with the principal point at the centre."""
@@ -61,8 +50,7 @@ class SplatScene:
 
     def select(self, index: Tensor, name: str) -> SplatScene:
         """Select some of the Gaussians."""
-        means, quats, scales, opacities, colors = (t[index] for t in self.tensors())
-        return replace(self, name=name, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+        return replace(self, name=name, gaussians={key: t[index] for key, t in self.gaussians.items()})
 
 
 def surface_map(width: int = MAP_WIDTH, height: int = MAP_HEIGHT, *, sigma_px: float = 1.0) -> SplatScene:
@@ -83,11 +71,13 @@ def surface_map(width: int = MAP_WIDTH, height: int = MAP_HEIGHT, *, sigma_px: f
     n = width * height
     return SplatScene(
         name="surface",
-        means=torch.stack([x * z, y * z, z], -1).reshape(n, 3).contiguous(),
-        quats=torch.randn(n, 4, generator=generator),
-        scales=(sigma_px * z / focal).reshape(n, 1).expand(n, 3).contiguous(),
-        opacities=torch.full((n,), 0.7),
-        colors=torch.rand(n, 3, generator=generator),
+        gaussians={
+            "means": torch.stack([x * z, y * z, z], -1).reshape(n, 3).contiguous(),
+            "quats": torch.randn(n, 4, generator=generator),
+            "scales": (sigma_px * z / focal).reshape(n, 1).expand(n, 3).contiguous(),
+            "opacities": torch.full((n,), 0.7),
+            "colors": torch.rand(n, 3, generator=generator),
+        },
         viewmat=torch.eye(4),
         fov=2.0 * math.atan(0.5 * width / focal),
     )
@@ -105,11 +95,13 @@ def random_box(n: int, *, shrink: float = 1.0) -> SplatScene:
     viewmat[2, 3] = BOX_DISTANCE
     return SplatScene(
         name=f"random {_thousands(n)}",
-        means=2.0 * torch.rand(n, 3, generator=g) - 1.0,
-        quats=torch.randn(n, 4, generator=g),
-        scales=shrink * (1e-4 + (0.02 - 1e-4) * torch.rand(n, 3, generator=g)),
-        opacities=torch.rand(n, generator=g),
-        colors=torch.rand(n, 3, generator=g),
+        gaussians={
+            "means": 2.0 * torch.rand(n, 3, generator=g) - 1.0,
+            "quats": torch.randn(n, 4, generator=g),
+            "scales": shrink * (1e-4 + (0.02 - 1e-4) * torch.rand(n, 3, generator=g)),
+            "opacities": torch.rand(n, generator=g),
+            "colors": torch.rand(n, 3, generator=g),
+        },
         viewmat=viewmat,
         fov=math.radians(60.0),
     )
@@ -125,11 +117,13 @@ def from_file(path: Path) -> SplatScene:
     camera, T_world_camera = default_view(model)
     return SplatScene(
         name=path.stem,
-        means=model.means,
-        quats=model.quats,
-        scales=model.log_scales.exp(),
-        opacities=model.opacities.contiguous(),
-        colors=model.colors.contiguous(),
+        gaussians={
+            "means": model.means,
+            "quats": model.quats,
+            "scales": model.log_scales.exp(),
+            "opacities": model.opacities.contiguous(),
+            "colors": model.colors.contiguous(),
+        },
         viewmat=torch.from_numpy(inverse(T_world_camera).astype(np.float32)),
         fov=2.0 * math.atan(0.5 * camera.width / camera.fx),
     )

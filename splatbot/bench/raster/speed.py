@@ -119,9 +119,10 @@ class Passes:
     def __init__(self, scene: SplatScene, size: tuple[int, int], render_mode: str = "RGB+ED") -> None:
         view = scene.view(*size) | {"render_mode": render_mode}
         self._pose = view["viewmats"].clone().requires_grad_()
-        self._plain: dict[str, Any] = scene.named() | view
-        self._leaves = {name: t.detach().clone().requires_grad_() for name, t in scene.named().items()}
-        self.round = bool((scene.scales == scene.scales[:, :1]).all())
+        self._plain: dict[str, Any] = scene.gaussians | view
+        self._leaves = {name: t.detach().clone().requires_grad_() for name, t in scene.gaussians.items()}
+        scales = scene.gaussians["scales"]
+        self.round = bool((scales == scales[:, :1]).all())
         channels = 4 if "D" in render_mode else 3
         generator = torch.Generator().manual_seed(1)
         self.upstream = torch.randn(1, size[1], size[0], channels, generator=generator)

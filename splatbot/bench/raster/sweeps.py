@@ -60,7 +60,7 @@ def _settings(scene: SplatScene, size: tuple[int, int]) -> Iterator[Setting]:
     plain = _detached(scene, size)
     for clip in (0.0, 0.5, 1.0, 2.0, 4.0):
         yield Setting("radius_clip", clip, plain | {"radius_clip": clip}, exact=clip == 0.0, default=clip == 0.0)
-    weight = scene.opacities * scene.scales.amax(-1) ** 2
+    weight = scene.gaussians["opacities"] * scene.gaussians["scales"].amax(-1) ** 2
     order = torch.argsort(weight, descending=True)
     for percent in (100, 80, 60, 40, 20):
         index = order[: max(1, len(order) * percent // 100)].sort().values
@@ -105,7 +105,7 @@ def _reference_case(*, quick: bool) -> tuple[dict[str, Any], Tensor, Tensor]:
     """Return arguments, their image in float64, and a mask of the pixels that rounding cannot flip."""
     scene = random_box(200 if quick else 2000, shrink=3.0)
     size = (24, 16) if quick else (96, 64)
-    means, quats, scales, opacities, colors = (t.detach().double() for t in scene.tensors())
+    means, quats, scales, opacities, colors = (t.detach().double() for t in scene.gaussians.values())
     exact, _, meta = rasterization_reference(
         Gaussians(means, quats, scales, opacities, colors),
         Viewpoints(scene.viewmat[None].double(), scene.intrinsics(*size).double(), *size),

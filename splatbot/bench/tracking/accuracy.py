@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.machine import describe_machine
@@ -31,10 +30,9 @@ from splatbot.config import Config, load_config
 from splatbot.evaluation import absolute_error, nees, relative_error
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
+from splatbot.protocols import Array
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.geometry import so3_exp, so3_log
@@ -16,11 +15,6 @@ from tests.unit.collision.oracle import gaussians
 
 START = np.array([0.0, -0.3, 0.0, -2.2, 0.0, 2.0, np.pi / 4])
 ARM = RobotSpheres(panda(), opening=0.0)
-
-
-@pytest.fixture(scope="module")
-def field() -> GaussianCollisionField:
-    return GaussianCollisionField(tabletop().gaussians(10_000))
 
 
 def test_the_tool_goes_straight_and_turns_evenly(field: GaussianCollisionField) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from splatbot._native import fastest_speeds
-from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning import Certificate, JointTrajectory, Path, time_path
@@ -16,16 +15,6 @@ from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 
 CHAIN = panda().chain
-
-
-@pytest.fixture(scope="module")
-def field() -> GaussianCollisionField:
-    return GaussianCollisionField(tabletop().gaussians(10_000))
-
-
-@pytest.fixture(scope="module")
-def arm() -> RobotSpheres:
-    return RobotSpheres(panda())
 
 
 def path_of(waypoints: Array) -> Path:
