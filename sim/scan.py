@@ -22,27 +22,26 @@ from splatbot.tracking.prepare import normals_of
 
 @dataclass(frozen=True)
 class ScanConstants:
-    """Constants of maps from rendered views.
-
-    Args:
-        spacing: [m] distance between discs.
-        distance: [m] distance of the camera from the centre of the objects.
-        elevations: [rad] elevations of the camera over the support, alternating.
-        max_range: [m] range of the camera.
-        tangential_sigma: [spacing] standard deviation of a disc in its plane.
-        thickness: [m] thickness of a disc.
-        base_radius: [m] radius around the robot's base, whose stand is not mapped.
-        min_cosine: least cosine between surface normal and ray; grazing measurements are inaccurate.
-    """
+    """Constants of maps from rendered views."""
 
     spacing: float = 4e-3
+    """Distance [m] between discs. A smaller one gives more Gaussians and finer edges."""
     distance: float = 0.65
+    """Distance [m] of the camera from the centre of the objects."""
     elevations: tuple[float, float] = (np.radians(60.0), np.radians(30.0))
+    """Elevations [rad] of the camera over the support, alternating. Steep views show the tops, flat ones the sides."""
     max_range: float = 3.0
+    """Range [m] of the camera. Surfaces farther away are missing in the map."""
     tangential_sigma: float = 0.55
+    """Standard deviation [spacing] of a disc in its plane. A smaller one leaves gaps between discs, a larger one
+    extends objects over their edges."""
     thickness: float = 1e-3
+    """Thickness [m] of a disc."""
     base_radius: float = 0.2
+    """Radius [m] around the robot's base, whose stand is not mapped. A larger one removes the support next to it."""
     min_cosine: float = 0.2
+    """Smallest cosine [1] between surface normal and ray. A smaller one keeps grazing measurements, which are
+    inaccurate."""
 
 
 CONSTANTS = ScanConstants()

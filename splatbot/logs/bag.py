@@ -18,7 +18,7 @@ from rosbags.interfaces import Connection
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import LogBase
+from splatbot.logs.base import StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
 from splatbot.logs.joints import interpolate_joints
@@ -52,7 +52,7 @@ class _Entry:
     nth: int
 
 
-class BagLog(LogBase):
+class BagLog(StampedLog):
     """RGB-D frames of a recording of ROS topics; each depth image is paired with the colour image nearest in time.
 
     Colour images without depth within 0.02 s are skipped and counted in ``unpaired``. If recorded, joint positions are
@@ -84,6 +84,7 @@ class BagLog(LogBase):
         self._color, self._depth = self._image_topics()
         self._index = self._scan()
         self._pairs = self._pair()
+        self.stamps = [color.stamp for color, _ in self._pairs]
         self.unpaired = len(self._index[self._color]) - len(self._pairs)
         found = find_calibration(camera).camera if camera is not None else self._recorded_camera()
         self._undistort = Undistorter(found) if found.distortion else None
@@ -94,11 +95,6 @@ class BagLog(LogBase):
         """Camera of the delivered frames: undistorted."""
         return self._camera
 
-    @property
-    def stamps(self) -> list[float]:
-        """Times of the frames [s]."""
-        return [color.stamp for color, _ in self._pairs]
-
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """Poses T_world_camera of /ground_truth/pose, or None without that topic."""
@@ -107,9 +103,6 @@ class BagLog(LogBase):
         messages = list(self._all(TRUTH))
         poses = self._checked(TRUTH, lambda: np.stack([pose_of(m.pose) for m in messages]))
         return Trajectory(np.array([seconds_of(m.header.stamp) for m in messages]), poses)
-
-    def __len__(self) -> int:
-        return len(self._pairs)
 
     def _decode(self, index: int) -> Frame:
         color, depth = self._pairs[index]

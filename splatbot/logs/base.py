@@ -85,3 +85,13 @@ class LogBase:
     def read(self, index: int) -> Frame:
         """Decode frame ``index``; see :class:`Log`."""
         return self._decode(range(len(self))[index])
+
+
+class StampedLog(LogBase):
+    """A log that knows the stamps of its frames before it decodes them."""
+
+    stamps: list[float]
+    """Times of the frames [s]."""
+
+    def __len__(self) -> int:
+        return len(self.stamps)

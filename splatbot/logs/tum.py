@@ -13,7 +13,7 @@ import numpy as np
 from splatbot.camera import Camera
 from splatbot.errors import CameraError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import LogBase
+from splatbot.logs.base import StampedLog
 from splatbot.logs.calibration import Calibration, read_calibration
 from splatbot.logs.effects import read_account
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, IndexEntry, associate, read_index
@@ -30,7 +30,7 @@ _SYNCHRONIZED_S = 1e-3  # maximum difference of stamps between synchronized stre
 _log = logging.getLogger(__name__)
 
 
-class TumLog(LogBase):
+class TumLog(StampedLog):
     """A recording in TUM layout; frames are the colour images, each with the depth image nearest in time.
 
     ``missing`` defines the treatment of a colour image without a depth image within 0.02 s:
@@ -66,6 +66,7 @@ class TumLog(LogBase):
             missing = "error" if lockstep else "skip"
         kept = [i for i in range(len(colors)) if i in pairs or missing == "error"]
         self._frames: list[tuple[IndexEntry, IndexEntry | None]] = [(colors[i], pairs.get(i)) for i in kept]
+        self.stamps = [color.stamp for color, _ in self._frames]
         self._masks = find_masks(self.folder)
         self._joints = find_joints(self.folder)
         self._effects, blanks_depth = read_account(self.folder)
@@ -82,11 +83,6 @@ class TumLog(LogBase):
         """The account in `effects.json`, which `splatbot simulate` writes; empty for a real sensor."""
         return self._effects
 
-    @property
-    def stamps(self) -> list[float]:
-        """Times of the frames [s]."""
-        return [color.stamp for color, _ in self._frames]
-
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """Poses of groundtruth.txt as recorded, T_world_camera; None where there is no such file.
@@ -96,9 +92,6 @@ class TumLog(LogBase):
         """
         path = self.folder / "groundtruth.txt"
         return Trajectory.load(path) if path.exists() else None
-
-    def __len__(self) -> int:
-        return len(self._frames)
 
     def _decode(self, index: int) -> Frame:
         color, depth = self._frames[index]
