@@ -8,6 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.paths import check_camera
+from splatbot.cli.tables import print_table
+from splatbot.errors import InputError
+from splatbot.layouts import is_map, log_kind, map_file
+
 if TYPE_CHECKING:
     from splatbot.logs import Log
 
@@ -53,19 +58,15 @@ def info(
             scene.yaml next to the map.
         up: with --fit-plane, roughly upwards in the first camera: 0 -1 0 if it looked ahead, 0 0 -1 straight down.
     """
-    from splatbot.cli.tables import print_table
-
-    place = Path(path)
-    if (place / "map.ply").is_file():
-        place = place / "map.ply"
-    if place.is_file():
+    if is_map(path):
+        place = map_file(path)
         print_table(describe_map(place), title=str(place))
         if fit_plane:
             print_table(fit_scene(place, up), title=str(place.parent / "scene.yaml"))
         return 0
+    log_kind(path)
+    check_camera(camera)
     if fit_plane:
-        from splatbot.errors import InputError
-
         raise InputError("needs a map.", field="--fit-plane", hint="map the log first: splatbot map LOG")
     from splatbot.logs import open_log
 
