@@ -120,6 +120,13 @@ class Slam:
         else:
             self._executor.finish(stop)
 
+    @property
+    def iterations_left(self) -> int:
+        """Number of iterations that :meth:`finish` runs: the pending ones and the final refinement."""
+        if self._localization_only:
+            return 0
+        return self._mapper.pending_iterations + self.config.mapping.final_iterations
+
     def localise_only(self) -> None:
         """Localize all further frames in the map, which does not change; the next frame may be anywhere in it.
 

@@ -78,6 +78,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `splatbot info ... | head` is no error; Python must not flush to the dead pipe again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        from splatbot.cli.paths import system_error
+
+        sentence = system_error(error)
+        if sentence is None:
+            raise
+        if debug:
+            traceback.print_exc()
+        print(f"error: {sentence}", file=sys.stderr)
+        return 1
 
 
 def _print_warning(

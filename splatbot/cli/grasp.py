@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import Pose, base_pose, margin_of
+from splatbot.errors import InputError
+from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,14 +85,15 @@ def grasp(
         seed: seed of the search.
         out: folder to write to; by default runs/grasp.
     """
-    from splatbot.errors import InputError
-
     places = {"--target": target, "--pixel": pixel, "--point": point, "--box": box, "--mask": mask, "--tag": tag}
     given = [flag for flag, value in places.items() if value is not None]
     if len(given) != 1:
         raise InputError(f"are {len(given)}.", field=", ".join(places), hint="give one of them")
     if vlm and target is None:
         raise InputError("needs a name.", field="--vlm", hint="give --target too")
+    map_file(map)
+    check_file(mask, "--mask")
+    check_output(out)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
@@ -131,7 +135,7 @@ def _graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:
     from splatbot.workspace import find_workspace
 
     T = base_pose(base, map_)
-    model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
+    model = GaussianModel.load(map_file(map_))
     measured = measured_map(Snapshot(model, map_version=0), run_of(map_))
     return segment_objects(measured, T, find_workspace(map_), as_known=base is None)
 
@@ -170,8 +174,6 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
     import cv2
     import numpy as np
 
-    from splatbot.errors import InputError
-
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if picture is None:
         raise InputError("cannot be read.", file=path, field="--mask", hint="give a PNG of the size of the image")
@@ -181,7 +183,6 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
 def _view(map_: Path, index: int) -> ObservedView:
     from dataclasses import replace
 
-    from splatbot.errors import InputError
     from splatbot.grasping.affordance import ObservedView
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
@@ -201,7 +202,7 @@ def _view(map_: Path, index: int) -> ObservedView:
 def _print(result: GraspResult, folder: Path) -> None:
     from rich.table import Table
 
-    from splatbot.cli.tables import print_table, wide_console
+    from splatbot.cli.tables import print_columns, print_table
 
     target = result.target
     seconds = sum(result.seconds.values())
@@ -219,5 +220,5 @@ def _print(result: GraspResult, folder: Path) -> None:
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *(f"{g.terms[name]:.2f}" for name in terms))
-    wide_console().print(table)
+    print_columns(table)
     print("width, opens and clearance in mm; the best value of a term is 1")

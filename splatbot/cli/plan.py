@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from splatbot.cli.paths import check_output
 from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_of
+from splatbot.errors import InputError
+from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,6 +31,7 @@ def plan(
     base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
     margin: Annotated[str, tyro.conf.arg(metavar="M|auto")] = "0",
     n_sigma: float = 2.0,
+    speed: float = 0.2,
     budget_ms: float = 100.0,
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
@@ -53,16 +57,20 @@ def plan(
         margin: clearance [m] to the map. With "auto" and a run folder, it is the error of the map's surfaces near the
             base, measured against the depth images of the run.
         n_sigma: surface of a Gaussian, in standard deviations.
+        speed: fraction of the limits of velocity and acceleration, as MoveIt's scaling factors; 1 is as fast as the
+            robot can.
         budget_ms: time budget of the planner [ms].
         seed: seed of the search.
         out: folder to write to; by default runs/plan.
     """
-    from splatbot.errors import InputError
-
     if (goal is None) == (goal_pose is None):
         raise InputError("must be given, one of the two.", field="--goal, --goal-pose", hint="give joints or a pose")
+    if not 0.0 < speed <= 1.0:
+        raise InputError(f"is {speed:g}.", field="--speed", hint="give a fraction of the limits, above 0, at most 1")
+    file = map_file(map)
+    check_output(out)
 
-    from splatbot.atomic import atomic_write
+    from splatbot.atomic import replace_files, write_bytes, write_text
     from splatbot.collision import GaussianCollisionField
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal, time_path
@@ -70,7 +78,6 @@ def plan(
     from splatbot.robots.store import load_robot
 
     arm = load_robot(robot)
-    file = map / "map.ply" if map.is_dir() else map
     model = GaussianModel.load(file)
     field = GaussianCollisionField(model, n_sigma)
     T_world_base = base_pose(base, map)
@@ -82,9 +89,8 @@ def plan(
     )
     result = planner.plan(_joints(start, arm, "--start"), wanted, budget_ms=budget_ms, seed=seed)
     path = result.unwrap()
-    trajectory = time_path(path, planner.arm, field)
+    trajectory = time_path(path, planner.arm, field, velocity_scale=speed, acceleration_scale=speed)
     folder = out if out is not None else Path("runs") / "plan"
-    folder.mkdir(parents=True, exist_ok=True)
     title = f"{arm.name} in {map.resolve().name}"
     texts = {
         "plan.json": json.dumps(_summary(result, trajectory), indent=2),
@@ -92,19 +98,14 @@ def plan(
         "trajectory.csv": trajectory.to_csv(),
         "plan.html": plan_html(model, planner.arm, field, trajectory, title=title),
     }
-    for name, text in texts.items():
-        with atomic_write(folder / name) as handle:
-            handle.write(text.encode())
-    with atomic_write(folder / "plan.png") as handle:
-        handle.write(plan_png(model, planner.arm, trajectory))
+    writers = {name: write_text(text) for name, text in texts.items()}
+    replace_files(folder, writers | {"plan.png": write_bytes(plan_png(model, planner.arm, trajectory))})
     _print(result, trajectory, folder)
     return 0
 
 
 def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
     import numpy as np
-
-    from splatbot.errors import InputError
 
     if words == ("home",):
         return np.asarray(robot.home)

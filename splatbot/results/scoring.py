@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -142,10 +142,19 @@ class ViewScores:
         }
 
 
-def score_views(log: Log, model: GaussianModel, poses: Mapping[int, NDArray[np.float64]]) -> ViewScores:
+def score_views(
+    log: Log,
+    model: GaussianModel,
+    poses: Mapping[int, NDArray[np.float64]],
+    on_view: Callable[[int], None] | None = None,
+) -> ViewScores:
     """Render the map at ``poses`` (T_world_camera (4, 4) by position in the log) and compare with the frames there.
 
     Frames are read again one by one, so memory does not grow with the log.
+
+    Args:
+        log, model, poses: recording, map and poses.
+        on_view: called with the number of scored views before each view.
 
     Raises:
         LogError: a frame can no longer be read.
@@ -153,7 +162,9 @@ def score_views(log: Log, model: GaussianModel, poses: Mapping[int, NDArray[np.f
     result = ViewScores()
     indices = sorted(poses)
     chosen = {indices[round(i)] for i in np.linspace(0, len(indices) - 1, min(N_SHOWN, len(indices)))}
-    for index in indices:
+    for number, index in enumerate(indices):
+        if on_view is not None:
+            on_view(number)
         view = _score_view(log, model, index, poses[index])
         result.scores.append(view.score)
         if index in chosen:

@@ -141,6 +141,7 @@ def map_log(
             )
         loop.run(interrupts)
         if not loop.slam.results:
+            folder.remove_if_new()
             raise loop.crash or loop.error or loop.first_bad or KeyboardInterrupt()
         ended = outcome()
         ended.finished = True

@@ -69,7 +69,12 @@ class RunOutcome:
         self.loop.progress("scoring")
         poses = {r.index: r.T_world_camera for r in self.loop.slam.results if r.T_world_camera is not None}
         held_out = {i: poses[i] for i in sorted(self.loop.held_out) if i in poses}
-        self.views = score_views(self.loop.source.log, self.model, held_out)
+        self.views = score_views(
+            self.loop.source.log,
+            self.model,
+            held_out,
+            lambda number: self.loop.progress("scoring", step=number, steps=len(held_out)),
+        )
         folder.save_metrics(self.metrics())
         self.loop.progress("reporting")
         map_page = self._save_map_page(folder)

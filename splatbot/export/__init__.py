@@ -1,0 +1,1 @@
+"""Export of a map in the formats of other programs."""
