@@ -82,6 +82,7 @@ class RunFolder:
         self.map = self.path / "map.ply"
         self.report = self.path / "report.html"
         self.map_page = self.path / "map.html"
+        self.audit = self.path / "audit.json"
 
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
@@ -111,9 +112,10 @@ class RunFolder:
         model: GaussianModel,
         metrics: Mapping[str, Any],
     ) -> None:
-        """Write all files but the report. An older report is deleted because it describes another map."""
+        """Write all files but report and audit. Older ones are deleted because they describe another map."""
         self.report.unlink(missing_ok=True)
         self.map_page.unlink(missing_ok=True)
+        self.audit.unlink(missing_ok=True)
         (self.path / SUMS).unlink(missing_ok=True)  # a run that is killed from here on has no checksums
         save_ply(model, self.map, bookkeeping=True)  # unobserved Gaussians must stay marked for collision checks
         self._save_trajectory(trajectory)
@@ -126,6 +128,10 @@ class RunFolder:
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write ``metrics.json``."""
         self._replace(self.metrics, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+
+    def save_audit(self, summary: Mapping[str, Any]) -> None:
+        """Write ``audit.json``."""
+        self._replace(self.audit, json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def save_report(self, html: str) -> None:
         """Write ``report.html``."""
@@ -220,7 +226,8 @@ class RunFolder:
         return sums is not None
 
     def _files(self) -> list[str]:
-        paths = (self.config, self.trajectory, self.frames, self.metrics, self.map, self.report, self.map_page)
+        paths = [self.config, self.trajectory, self.frames, self.metrics, self.map]
+        paths += [self.report, self.map_page, self.audit]
         return [path.name for path in paths]
 
     def _replace(self, path: Path, text: str) -> None:
