@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import cv2
@@ -28,12 +29,15 @@ class UnknownConstants:
     Args:
         suspect_views: number of views whose pixels of a voxel lack depth that make it suspect.
         suspect_share: least share of the pixels of a voxel without depth in such a view.
-        largest_radius: [px] a voxel that covers more pixels is too near to the camera to be observed.
+        radii: [px] half the sides of the squares of pixels that are tested; a voxel that covers more is too near to the
+            camera to be observed.
+        scattered: [px] groups of so few pixels without depth are noise, and take the least depth around them.
     """
 
     suspect_views: int = 2
     suspect_share: float = 0.1
-    largest_radius: int = 64
+    radii: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 17, 20, 24, 29, 35, 42, 50, 60)
+    scattered: int = 3
 
 
 CONSTANTS = UnknownConstants()
@@ -98,7 +102,8 @@ def find_unknown(aabb: ArrayLike, voxel: float, views: Iterable[DepthView]) -> U
 
     A voxel is empty if one view has depth at all pixels onto which its sphere may project, and all of it lies behind
     the sphere. The test of a single pixel would see past a rod that is thinner than the voxel. The pixels are those of
-    a square of 3, 5, 9, ... pixels around the centre, the smallest that covers the sphere, which is conservative.
+    the smallest square around the centre that covers the image of the sphere, which is conservative. Up to three
+    adjacent pixels without depth are noise of the sensor and take the least depth around them.
 
     Args:
         aabb: (2, 3) = (low, high), corners of the box [m, world].
@@ -138,11 +143,10 @@ def _observed(centers: Array, radius: float, view: DepthView) -> tuple[NDArray[n
     u = np.rint(camera.fx * p[:, 0] / np.maximum(z, 1e-6) + camera.cx)
     v = np.rint(camera.fy * p[:, 1] / np.maximum(z, 1e-6) + camera.cy)
     seen = (z > 2 * radius) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    known = np.isfinite(depth) & (depth > 0)
-    measured = np.where(known, depth, np.float32(0))
+    measured = _without_scattered_holes(depth)
+    known = measured > 0
     holes = (~known).astype(np.float32)
-    smaller, width = 0, 1
-    while width <= CONSTANTS.largest_radius:
+    for smaller, width in pairwise((0, *CONSTANTS.radii)):
         chosen = np.flatnonzero(seen & (reach > smaller) & (reach <= width))
         if len(chosen):
             row, column = v[chosen].astype(np.int64), u[chosen].astype(np.int64)
@@ -153,5 +157,17 @@ def _observed(centers: Array, radius: float, view: DepthView) -> tuple[NDArray[n
             empty[chosen] = nearest > z[chosen] + radius
             hidden = (farthest > 0) & (farthest < z[chosen] - radius)
             lacks_depth[chosen] = (share >= CONSTANTS.suspect_share) & ~hidden
-        smaller, width = width, 2 * width
     return empty, lacks_depth
+
+
+def _without_scattered_holes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return depth (H, W) [m], 0 where missing, with small groups of missing pixels filled by the least around them."""
+    known = np.isfinite(depth) & (depth > 0)
+    _, label, stats, _ = cv2.connectedComponentsWithStats((~known).astype(np.uint8), connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] <= CONSTANTS.scattered
+    small[0] = False  # the pixels with depth
+    around = np.where(known, depth, np.float32(np.inf)).astype(np.float32)
+    for _ in range(CONSTANTS.scattered):
+        around = np.where(known, around, cv2.erode(around, np.ones((3, 3), np.uint8)))
+    filled = np.where(small[label], around, np.where(known, depth, np.float32(0)))
+    return np.asarray(np.where(np.isfinite(filled), filled, 0.0), dtype=np.float32)
