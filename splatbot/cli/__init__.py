@@ -22,6 +22,7 @@ class _Command(NamedTuple):
 COMMANDS = {
     "map": _Command("splatbot.cli.map", "map_log_command", "Turn an RGB-D log into a Gaussian map and a run folder."),
     "eval": _Command("splatbot.cli.eval", "eval_run", "Score a run again: trajectory error and held-out views."),
+    "audit": _Command("splatbot.cli.audit", "audit", "Check a map against measured depth: missed surface, false hits."),
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
     "info": _Command("splatbot.cli.info", "info", "Describe a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),

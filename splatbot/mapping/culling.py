@@ -35,12 +35,12 @@ def without_redundant(keyframes: Sequence[Keyframe], limit: int) -> list[Keyfram
     """
     kept = list(keyframes)
     while len(kept) > max(limit, CONSTANTS.latest_kept + 2):
-        nearest = _distances(kept).min(axis=1)[1 : -CONSTANTS.latest_kept]
+        nearest = view_distances(kept).min(axis=1)[1 : -CONSTANTS.latest_kept]
         del kept[1 + int(np.argmin(nearest))]
     return kept
 
 
-def _distances(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
+def view_distances(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
     """Compute the distances (K, K) [m] between views, with a radian as half a meter; the diagonal is infinite."""
     T = np.stack([keyframe.T_world_camera for keyframe in keyframes])
     moved = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)

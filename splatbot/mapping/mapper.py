@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.mapping.completion import missing_gaussians
 from splatbot.mapping.culling import without_redundant
 from splatbot.mapping.densify import PositionGradients, split
 from splatbot.mapping.depth_fusion import (
@@ -324,10 +325,14 @@ class Mapper:
     def finish(self, stop: Stop = never) -> None:
         """Refine over all keyframes at the end of a log, and densify where the loss gradients are large.
 
+        Confirmed depth that the map misses becomes Gaussians before, so that refinement adapts them, and after, because
+        refinement may move or remove Gaussians that depth supports.
+
         Args:
             stop: called before each iteration. Once it returns True, no iteration and no densification follows.
         """
         self.refine(self.pending_iterations, stop)
+        self._complete()
         final, gradients = self.config.mapping.final_iterations, PositionGradients(len(self.model))
         first = int(final * CONSTANTS.densify_after)
         self._refiner.refine_all(self.model, self.keyframes, first, gradients, stop)
@@ -335,6 +340,7 @@ class Mapper:
             self._densify(gradients)
             self._refiner.refine_all(self.model, self.keyframes, final - first, stop=stop)
         self._prune()
+        self._complete()
         self.version += 1
 
     # --- implementation ---
@@ -433,6 +439,14 @@ class Mapper:
             new.uncertainty = initial_uncertainty(new, keyframe.T_world_camera, self._depth_noise)
         self.model = GaussianModel.concatenate([self.model, measured, guessed])
         self._refiner.adam.extend(self.model)
+
+    def _complete(self) -> None:
+        if self._frozen or not len(self.model):
+            return
+        missing = missing_gaussians(self.model, self.keyframes, self.config.mapping, self._depth_noise)
+        self.model = GaussianModel.concatenate([self.model, missing])
+        self._refiner.adam.extend(self.model)
+        self._prune()
 
     def _densify(self, gradients: PositionGradients) -> None:
         free = self.config.mapping.max_gaussians - len(self.model)

@@ -82,6 +82,7 @@ class RunFolder:
         self.map = self.path / "map.ply"
         self.report = self.path / "report.html"
         self.map_page = self.path / "map.html"
+        self.audit = self.path / "audit.json"
         self.is_new = False
 
     @classmethod
@@ -113,7 +114,7 @@ class RunFolder:
         model: GaussianModel,
         metrics: Mapping[str, Any],
     ) -> None:
-        """Write all files but the report. An older report is deleted because it describes another map.
+        """Write all files but report and audit. Older ones are deleted because they describe another map.
 
         The files are replaced once all are written: a full disk leaves those of the last save as they were.
         """
@@ -128,7 +129,8 @@ class RunFolder:
                 self.config.name: write_text(config.to_yaml()),
                 self.metrics.name: write_text(_metrics_text(metrics)),
             },
-            remove=(self.report.name, self.map_page.name, SUMS),  # a run that is killed from here on has no checksums
+            # a run that is killed from here on has no checksums
+            remove=(self.report.name, self.map_page.name, self.audit.name, SUMS),
         )
         write_sums(self.path, self._files())
 
@@ -140,6 +142,10 @@ class RunFolder:
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write ``metrics.json``."""
         self._replace(self.metrics, _metrics_text(metrics))
+
+    def save_audit(self, summary: Mapping[str, Any]) -> None:
+        """Write ``audit.json``."""
+        self._replace(self.audit, json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def save_report(self, html: str) -> None:
         """Write ``report.html``."""
@@ -234,7 +240,8 @@ class RunFolder:
         return sums is not None
 
     def _files(self) -> list[str]:
-        paths = (self.config, self.trajectory, self.frames, self.metrics, self.map, self.report, self.map_page)
+        paths = [self.config, self.trajectory, self.frames, self.metrics, self.map]
+        paths += [self.report, self.map_page, self.audit]
         return [path.name for path in paths]
 
     def _replace(self, path: Path, text: str) -> None:

@@ -12,6 +12,7 @@ from splatbot import __version__
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
 from splatbot.report import report_html
+from splatbot.results.audit import RunAudit, audit_metrics, audit_run
 from splatbot.results.folder import FrameRow, RunFolder
 from splatbot.results.metrics import without_nan
 from splatbot.results.scoring import TrajectoryScore, ViewScores, score_views, trajectory_metrics
@@ -42,6 +43,7 @@ class RunOutcome:
     finished: bool = False
     localised_in: str | None = None
     map_page: MapPage | None = None
+    audit: RunAudit | None = None
 
     def save(self, folder: RunFolder) -> None:
         """Save the results, then score and report; a signal after the end of the mapping skips both."""
@@ -75,7 +77,10 @@ class RunOutcome:
             held_out,
             lambda number: self.loop.progress("scoring", step=number, steps=len(held_out)),
         )
+        self.audit = audit_run(folder, self.loop.source.log) if poses else None
         folder.save_metrics(self.metrics())
+        if self.audit is not None:
+            folder.save_audit(self.audit.summary())
         self.loop.progress("reporting")
         map_page = self._save_map_page(folder)
         folder.save_report(
@@ -87,6 +92,7 @@ class RunOutcome:
                 track=self.track,
                 views=self.views,
                 map_page=map_page,
+                audit=self.audit,
             )
         )
 
@@ -108,6 +114,7 @@ class RunOutcome:
             **self.costs,
             **trajectory_metrics(self.track),
             **self.views.metrics(),
+            **audit_metrics(self.audit),
             "gaussians": len(self.model),
             "map_bytes": self.model.nbytes,
             "paced": self.loop.source.pace,
