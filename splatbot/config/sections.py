@@ -22,7 +22,16 @@ class SensorConfig(_Section):
     """
 
     PUBLIC: ClassVar[frozenset[str]] = frozenset(
-        {"min_depth", "max_depth", "sigma_gray", "sigma_depth_floor", "sigma_depth_quad"}
+        {
+            "min_depth",
+            "max_depth",
+            "sigma_gray",
+            "sigma_depth_floor",
+            "sigma_depth_quad",
+            "readout",
+            "depth_delay",
+            "exposure",
+        }
     )
 
     min_depth: float = Field(default=0.2, gt=0, description="smaller depth is ignored, such as that of a gripper [m]")
@@ -30,6 +39,17 @@ class SensorConfig(_Section):
     sigma_gray: float = Field(default=0.02, gt=0, description="standard deviation of a grey value in 0..1")
     sigma_depth_floor: float = Field(default=1e-3, gt=0, description="constant part of the depth's σ [m]")
     sigma_depth_quad: float = Field(default=2e-3, ge=0, description="part of the depth's σ that grows with z² [1/m]")
+    readout: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.2,
+        description="rolling shutter: time from the first row of an image to the last, whose middle is the stamp; 0 is "
+        "a global shutter [s]",
+    )
+    depth_delay: float = Field(
+        default=0.0, ge=-0.2, le=0.2, description="time by which the depth image is later than the colour image [s]"
+    )
+    exposure: float = Field(default=0.0, ge=0, le=0.2, description="exposure time of colour: motion blur [s]")
     depth_sigma_scale: float = Field(
         default=10.0,
         ge=1,
