@@ -25,7 +25,7 @@ from splatbot.tracking.scheduler import StageScheduler
 from splatbot.tracking.stage import TrackingProblem
 from splatbot.tracking.stages import StageSet
 from splatbot.tracking.uncertainty import Uncertainty, world_uncertainty
-from splatbot.tracking.velocity import CameraVelocity
+from splatbot.tracking.velocity import CameraVelocity, twist_of_rows
 
 __all__ = ["PoseEstimate", "TrackedKeyframe", "Tracker", "order_by_distance", "pose_distance"]
 
@@ -159,10 +159,14 @@ class Tracker:
     ) -> ScoredHypothesis:
         """Rectify the frame by the velocity that its pose implies, and align it again, until its rows stay in place."""
         readout, depth = self.config.sensor.readout, typical_depth(problem.prepared)
+        if not readout:
+            return best
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
             frame = prepared.recorded
-            twist = self._velocity.at(frame.stamp, best.T_world_camera)
+            expected = self._velocity.at(frame.stamp, best.T_world_camera)
+            sigma, alignment = self._velocity.sigma(frame.stamp), best.hypothesis.alignment
+            twist = twist_of_rows(alignment, prepared.twist, expected, sigma, readout)
             moved = row_displacement(twist - prepared.twist, depth, frame.camera, readout)
             if best.verdict == "lost" or moved < _MAX_ROW_DISPLACEMENT:
                 break
