@@ -35,7 +35,7 @@ class RollingShutter(CameraMotionEffect, cost="two warps of depth and one of col
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Warp the frame line by line."""
-        T_now_line = motion_of_lines(self.path, frame.stamp, self.readout, frame.camera.height, effect=self.name)
+        T_now_line = motion_of_lines(self.known_path(), frame.stamp, self.readout, frame.camera.height)
         depth, camera = frame.depth, frame.camera
         at = grid(*depth.shape)
         for _ in range(2):  # the second iteration uses the depth at the position that the first one found

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import InputError
 from splatbot.geometry import Array, inverse, se3_exp, se3_log
 from splatbot.trajectory import Trajectory
 
@@ -15,26 +14,14 @@ _KEY_POSES = 33  # exact poses among the lines of an image; at 200 °/s, the oth
 _SURFACE_TOLERANCE = 0.02  # relative difference of depth between neighbouring pixels of one surface
 
 
-def motion_during(path: Trajectory | None, stamp: float, seconds: float, *, effect: str) -> list[Array]:
-    """Return T_now_then (4, 4) of the times ``seconds / 2`` before and after ``stamp`` [s].
-
-    Raises:
-        InputError: the path is not known.
-    """
-    if path is None:
-        raise InputError("does not know how the camera moves.", field=effect, hint="give it the path: along()")
+def motion_during(path: Trajectory, stamp: float, seconds: float) -> list[Array]:
+    """Return T_now_then (4, 4) of the times ``seconds / 2`` before and after ``stamp`` [s]."""
     now = inverse(pose_at(path, stamp))
     return [now @ pose_at(path, stamp + side * seconds / 2) for side in (-1, 1)]
 
 
-def motion_of_lines(path: Trajectory | None, stamp: float, readout: float, lines: int, *, effect: str) -> Array:
-    """Return T_now_line (lines, 4, 4) of the time of each line, the first one ``readout / 2`` [s] before ``stamp``.
-
-    Raises:
-        InputError: the path is not known.
-    """
-    if path is None:
-        raise InputError("does not know how the camera moves.", field=effect, hint="give it the path: along()")
+def motion_of_lines(path: Trajectory, stamp: float, readout: float, lines: int) -> Array:
+    """Return T_now_line (lines, 4, 4) of the time of each line, the first one ``readout / 2`` [s] before ``stamp``."""
     now, shares = inverse(pose_at(path, stamp)), np.linspace(-0.5, 0.5, _KEY_POSES)
     keys = np.array([now @ pose_at(path, stamp + share * readout) for share in shares]).reshape(_KEY_POSES, 16)
     at = np.linspace(-0.5, 0.5, lines)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -85,7 +85,9 @@ class BagLog(LogBase):
         self._index = self._scan()
         self._pairs = self._pair()
         self.unpaired = len(self._index[self._color]) - len(self._pairs)
-        found = find_calibration(camera).camera if camera is not None else self._recorded_camera()
+        given = find_calibration(camera) if camera is not None else None
+        self._sensor = {} if given is None else given.sensor
+        found = self._recorded_camera() if given is None else given.camera
         self._undistort = Undistorter(found) if found.distortion else None
         self._camera = self._undistort.camera if self._undistort else found
 
@@ -93,6 +95,11 @@ class BagLog(LogBase):
     def camera(self) -> Camera:
         """Camera of the delivered frames: undistorted."""
         return self._camera
+
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """Calibrated values of the sensor in the camera file that replaces the recorded intrinsics."""
+        return self._sensor
 
     @property
     def stamps(self) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
 from splatbot.camera import Camera
@@ -46,6 +46,11 @@ class Log(Protocol):
         """Records of the simulated sensor effects that are applied to the frames; empty for a real sensor."""
         ...
 
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """Calibrated values of the section `sensor` of the configuration; empty if none is known."""
+        ...
+
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
@@ -69,6 +74,11 @@ class LogBase:
     def effects(self) -> list[dict[str, Any]]:
         """Empty list; see :class:`Log`."""
         return []
+
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """Empty mapping; see :class:`Log`."""
+        return {}
 
     def __len__(self) -> int:
         raise NotImplementedError

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +59,11 @@ class ReplicaLog(LogBase):
         lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
         poses = [_parse_pose(path, i, line) for i, line in enumerate(lines, 1) if line.strip()]
         return Trajectory(np.arange(len(poses)) / _RATE, np.array(poses).reshape(-1, 4, 4))
+
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """Calibrated values of the sensor in the camera file."""
+        return self._reader.calibration.sensor
 
     def __len__(self) -> int:
         return len(self._colors)

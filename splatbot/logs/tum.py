@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -81,6 +82,11 @@ class TumLog(LogBase):
     def effects(self) -> list[dict[str, Any]]:
         """The account in `effects.json`, which `splatbot simulate` writes; empty for a real sensor."""
         return self._effects
+
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """Calibrated values of the sensor in the camera file."""
+        return self._reader.calibration.sensor
 
     @property
     def stamps(self) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from splatbot.camera import Camera
@@ -38,6 +38,11 @@ class MaskedLog(LogBase):
     def effects(self) -> list[dict[str, Any]]:
         """As of the log."""
         return self._log.effects
+
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """As of the log."""
+        return self._log.sensor
 
     def __len__(self) -> int:
         return len(self._log)
