@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +70,7 @@ class Pair:
 def match_pairs(views: Sequence[View], camera: Camera) -> list[Pair]:
     """Match the features of views that are ``CONSTANTS.steps`` apart, with initial poses by PnP between neighbours."""
     chain: list[Array | None] = []  # T_next_previous
-    for a, b in zip(views, views[1:], strict=False):
+    for a, b in pairwise(views):
         pose = match_pose(b.features, [(a.features, np.eye(4))], camera)
         close = 0 < b.stamp - a.stamp <= CONSTANTS.max_gap
         chain.append(inverse(pose.T_world_camera) if pose is not None and close else None)

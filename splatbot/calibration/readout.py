@@ -64,7 +64,7 @@ def estimate_rows(views: Sequence[View], pairs: Sequence[Pair], camera: Camera) 
 
         π( exp(-s'_j r ξ') T exp(s_j r ξ) (z_j + b) a_j )
 
-    The twists ξ and ξ' follow from the poses between neighbours. Gauss-Newton with the weights of Student's t solves for
+    The twists ξ and ξ' follow from the poses between neighbours. Gauss-Newton with weights of Student's t solves for
     r and b after the Schur complement of the pose T of each pair. The covariance is cluster-robust (Liang and Zeger
     1986), with the pairs of a first view as clusters. Only the difference of two velocities distorts a pair, so that a
     camera at constant velocity does not tell r. Only the parallax of points at different depths tells b, as the scale
@@ -112,9 +112,7 @@ class _Reduced:
         return -np.linalg.solve(self.H_pose, self.g_pose + self.H_pose_shared @ shared_step)
 
 
-def _reduced(
-    pair: Pair, twists: Mapping[int, Array], shared: Array, camera: Camera, pixel_sigma: float
-) -> _Reduced:
+def _reduced(pair: Pair, twists: Mapping[int, Array], shared: Array, camera: Camera, pixel_sigma: float) -> _Reduced:
     """Linearise the reprojection residuals of a pair at its pose, the readout time and the bias."""
     readout, bias = shared
     xi, xi2, T, nu = twists[pair.first], twists[pair.second], pair.T_second_first, CONSTANTS.nu

@@ -55,7 +55,7 @@ class SensorConfig(_Section):
     )
     depth_to_color: tuple[float, float, float, float, float, float] = Field(
         default=(0.0,) * 6,
-        description="T_color_depth of depth that is not registered to colour: translation [m] and rotation vector [rad]",
+        description="T_color_depth if depth is not registered to colour: translation [m] and rotation vector [rad]",
     )
     depth_scale: float = Field(default=1.0, gt=0, description="factor on the measured depth")
     depth_bias: float = Field(default=0.0, description="added to the measured depth, after the factor [m]")

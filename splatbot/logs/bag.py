@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from rosbags.interfaces import Connection
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import LogBase
+from splatbot.logs.base import MILLIMETRES, LogBase
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
 from splatbot.logs.joints import interpolate_joints
@@ -85,9 +85,10 @@ class BagLog(LogBase):
         self._index = self._scan()
         self._pairs = self._pair()
         self.unpaired = len(self._index[self._color]) - len(self._pairs)
-        given = find_calibration(camera) if camera is not None else None
-        self._sensor = {} if given is None else given.sensor
-        found = self._recorded_camera() if given is None else given.camera
+        self._calibration = (
+            find_calibration(camera) if camera is not None else Calibration(self._recorded_camera(), MILLIMETRES)
+        )
+        found = self._calibration.camera
         self._undistort = Undistorter(found) if found.distortion else None
         self._camera = self._undistort.camera if self._undistort else found
 
@@ -97,9 +98,9 @@ class BagLog(LogBase):
         return self._camera
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
-        """Calibrated values of the sensor in the camera file that replaces the recorded intrinsics."""
-        return self._sensor
+    def calibration(self) -> Calibration:
+        """The given calibration, or the recorded intrinsics."""
+        return self._calibration
 
     @property
     def stamps(self) -> list[float]:

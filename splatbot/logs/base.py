@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, Protocol
+from collections.abc import Iterator
+from typing import Any, Protocol, cast
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
+from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
+
+MILLIMETRES = 1000.0  # [units/m] of integer depth images without a unit of their own
 
 
 class Log(Protocol):
@@ -47,8 +50,8 @@ class Log(Protocol):
         ...
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
-        """Calibrated values of the section `sensor` of the configuration; empty if none is known."""
+    def calibration(self) -> Calibration:
+        """Calibration of the recorded images, with the sensor's values of the configuration if they are known."""
         ...
 
     def __len__(self) -> int: ...
@@ -76,9 +79,9 @@ class LogBase:
         return []
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
-        """Empty mapping; see :class:`Log`."""
-        return {}
+    def calibration(self) -> Calibration:
+        """The camera of the delivered frames, and millimetres; see :class:`Log`."""
+        return Calibration(cast(Log, self).camera, MILLIMETRES)
 
     def __len__(self) -> int:
         raise NotImplementedError

@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from splatbot.atomic import atomic_write
 from splatbot.camera import Camera
 from splatbot.config import SensorConfig
 from splatbot.errors import CameraError
@@ -63,6 +64,22 @@ def read_calibration(path: str | Path) -> Calibration:
         path, values, scale_key="depth_scale", distortion=tuple(number(path, named, key) for key in named)
     )
     return replace(calibration, sensor=_sensor(path, values.get("sensor", {})))
+
+
+def save_calibration(calibration: Calibration, path: str | Path) -> None:
+    """Write a calibration that :func:`read_calibration` reads.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    c = calibration.camera
+    values: dict[str, Any] = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "width": c.width, "height": c.height}
+    values["depth_scale"] = calibration.depth_scale
+    if c.distortion:
+        values["distortion"] = list(c.distortion)
+    values["sensor"] = dict(calibration.sensor)
+    with atomic_write(Path(path)) as file:
+        file.write(json.dumps(values, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def make_calibration(

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -61,9 +59,9 @@ class ReplicaLog(LogBase):
         return Trajectory(np.arange(len(poses)) / _RATE, np.array(poses).reshape(-1, 4, 4))
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
-        """Calibrated values of the sensor in the camera file."""
-        return self._reader.calibration.sensor
+    def calibration(self) -> Calibration:
+        """Calibration of the recorded images."""
+        return self._reader.calibration
 
     def __len__(self) -> int:
         return len(self._colors)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -84,9 +83,9 @@ class TumLog(LogBase):
         return self._effects
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
-        """Calibrated values of the sensor in the camera file."""
-        return self._reader.calibration.sensor
+    def calibration(self) -> Calibration:
+        """Calibration of the recorded images."""
+        return self._reader.calibration
 
     @property
     def stamps(self) -> list[float]:

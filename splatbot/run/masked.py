@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.logs.base import LogBase
+from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
 
 
@@ -40,9 +41,9 @@ class MaskedLog(LogBase):
         return self._log.effects
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
+    def calibration(self) -> Calibration:
         """As of the log."""
-        return self._log.sensor
+        return self._log.calibration
 
     def __len__(self) -> int:
         return len(self._log)

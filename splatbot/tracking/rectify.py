@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +15,7 @@ from splatbot.config import SensorConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.logs.base import Log, LogBase
+from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -81,9 +81,9 @@ class RectifiedLog(LogBase):
         return self._log.effects
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
+    def calibration(self) -> Calibration:
         """As of the log."""
-        return self._log.sensor
+        return self._log.calibration
 
     def __len__(self) -> int:
         return len(self._log)

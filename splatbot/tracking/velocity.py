@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,7 @@ class CameraVelocity:
         """
         poses = [*self._poses, *([] if T_world_camera is None else [(stamp, T_world_camera)])][-3:]
         times, twists = [], []
-        for (t0, T0), (t1, T1) in zip(poses, poses[1:], strict=False):
+        for (t0, T0), (t1, T1) in pairwise(poses):
             if 0 < t1 - t0 <= CONSTANTS.max_gap:
                 times.append(0.5 * (t0 + t1))
                 twists.append(se3_log(inverse(T0) @ T1) / (t1 - t0))
@@ -100,9 +101,9 @@ def twist_of_rows(alignment: Alignment, used: Array, prior: Array, sigma: Array,
         sigma: (6,) standard deviations of the prior.
         readout: time from the first row to the last [s].
     """
-    bands = len(alignment.band_g)
+    bands = len(alignment.band_gradient)
     s = ((np.arange(bands) + 0.5) / max(bands, 1) - 0.5) * readout
-    H, g, information = alignment.band_H, alignment.band_g, np.diag(1 / sigma**2)
+    H, g, information = alignment.band_information, alignment.band_gradient, np.diag(1 / sigma**2)
     H0, H1, H2 = (np.einsum("b,bij->ij", s**k, H) for k in range(3))
     A = np.block([[H0 + _DAMPING * np.eye(6), -H1], [-H1, H2 + information]])
     b = np.concatenate([-g.sum(0), s @ g + information @ (prior - used)])
