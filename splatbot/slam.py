@@ -92,6 +92,7 @@ class Slam:
         prepared = clock.time("prepare", self._prepare, frame)
         self._apply_loop_closure()
         estimate = clock.time("tracking", self._track, prepared, hold_out)
+        prepared = estimate.prepared or prepared
         observation = self._observation(prepared, estimate, hold_out)
         keyframe = self._mapper.should_insert(observation)
         with self._location_restored_on_error():
@@ -224,7 +225,7 @@ class Slam:
                 field="image size",
                 hint="map recordings of different sizes separately",
             )
-        return prepare(frame, self.config.tracking)
+        return prepare(frame, self.config.tracking, self._tracker.expected_twist(frame.stamp))
 
     def _apply_loop_closure(self) -> None:
         if self._mapper.has_loop:

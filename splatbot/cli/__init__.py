@@ -45,7 +45,18 @@ COMMANDS = {
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and print how to fix it."),
 }
 
-_GROUPS = {"bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks."}
+CALIBRATIONS = {
+    "sensor": _Command(
+        "splatbot.cli.calibrate",
+        "calibrate_sensor_command",
+        "Estimate readout, delays, registration and bias of an RGB-D sensor from a log.",
+    ),
+}
+
+_GROUPS = {
+    "bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks.",
+    "calibrate": "Calibrate a camera from a log; `splatbot calibrate --help` lists what.",
+}
 
 _DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers queries of a robot.
 
@@ -108,8 +119,10 @@ def _dispatch(words: list[str]) -> Any:
     import tyro
 
     if words and words[0] in COMMANDS:
-        return _run(words[0], words[1:])
+        return _run(words[0], COMMANDS[words[0]], words[1:])
     group = words[0] if words and words[0] in _GROUPS else ""
+    if group == "calibrate" and len(words) > 1 and words[1] in CALIBRATIONS:
+        return _run(f"calibrate {words[1]}", CALIBRATIONS[words[1]], words[2:])
     if group and len(words) > 1 and words[1] in _summaries(group):
         from splatbot.cli.bench import run_benchmark
 
@@ -123,10 +136,9 @@ def _dispatch(words: list[str]) -> Any:
     )
 
 
-def _run(name: str, words: list[str]) -> Any:
+def _run(name: str, command: _Command, words: list[str]) -> Any:
     import tyro
 
-    command = COMMANDS[name]
     function = getattr(importlib.import_module(command.module), command.function)
     return tyro.cli(
         function,
@@ -148,6 +160,8 @@ def _summaries(group: str) -> dict[str, str]:
         from splatbot.bench.benchmark import BENCHMARKS
 
         return {name: entry.summary for name, entry in BENCHMARKS.items()}
+    if group == "calibrate":
+        return {name: command.summary for name, command in CALIBRATIONS.items()}
     return {name: command.summary for name, command in COMMANDS.items()} | _GROUPS
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_serializer, model_validator
@@ -22,7 +23,19 @@ class SensorConfig(_Section):
     """
 
     PUBLIC: ClassVar[frozenset[str]] = frozenset(
-        {"min_depth", "max_depth", "sigma_gray", "sigma_depth_floor", "sigma_depth_quad"}
+        {
+            "min_depth",
+            "max_depth",
+            "sigma_gray",
+            "sigma_depth_floor",
+            "sigma_depth_quad",
+            "readout",
+            "depth_delay",
+            "exposure",
+            "depth_to_color",
+            "depth_scale",
+            "depth_bias",
+        }
     )
 
     min_depth: float = Field(default=0.2, gt=0, description="smaller depth is ignored, such as that of a gripper [m]")
@@ -30,6 +43,23 @@ class SensorConfig(_Section):
     sigma_gray: float = Field(default=0.02, gt=0, description="standard deviation of a grey value in 0..1")
     sigma_depth_floor: float = Field(default=1e-3, gt=0, description="constant part of the depth's σ [m]")
     sigma_depth_quad: float = Field(default=2e-3, ge=0, description="part of the depth's σ that grows with z² [1/m]")
+    readout: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.2,
+        description="rolling shutter: time from the first row of an image to the last, whose middle is the stamp; 0 is "
+        "a global shutter [s]",
+    )
+    depth_delay: float = Field(
+        default=0.0, ge=-0.2, le=0.2, description="time by which the depth image is later than the colour image [s]"
+    )
+    depth_to_color: tuple[float, float, float, float, float, float] = Field(
+        default=(0.0,) * 6,
+        description="T_color_depth if depth is not registered to colour: translation [m] and rotation vector [rad]",
+    )
+    depth_scale: float = Field(default=1.0, gt=0, description="factor on the measured depth")
+    depth_bias: float = Field(default=0.0, description="added to the measured depth, after the factor [m]")
+    exposure: float = Field(default=0.0, ge=0, le=0.2, description="exposure time of colour: motion blur [s]")
     depth_sigma_scale: float = Field(
         default=10.0,
         ge=1,
@@ -265,6 +295,15 @@ class Config(_Section):
             self.__dict__["tracking"] = self.tracking.model_copy()
             self.tracking.__dict__["sensor"] = self.sensor
         return self
+
+    def with_sensor(self, values: Mapping[str, Any]) -> Config:
+        """Return the configuration with the values of a calibrated sensor for all keys that are not set.
+
+        Raises:
+            ValidationError: a key is unknown, or a value is out of range.
+        """
+        given = self.sensor.model_dump(include=self.sensor.model_fields_set)
+        return self.model_copy(update={"sensor": SensorConfig(**{**values, **given})})._share_sensor()
 
     def to_yaml(self) -> str:
         """Return the configuration in force as YAML that :func:`splatbot.config.load_config` reads back."""

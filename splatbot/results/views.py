@@ -13,6 +13,7 @@ from splatbot.logs import Log
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.tracking.prepare import usable_depth
+from splatbot.tracking.rectify import RectifiedLog
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ def _spread(indices: Sequence[int]) -> list[int]:
 
 def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequence[int]) -> Iterator[DepthView]:
     config = run.load_config().tracking
+    rectified = RectifiedLog(log, config.sensor, run.load_trajectory())
     for index in indices:
-        frame = log[index]
+        frame = rectified[index]
         yield usable_depth(frame, config), frame.camera, poses[index]

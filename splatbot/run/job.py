@@ -96,6 +96,8 @@ def map_log(
         config, slam = localise.config, localise.slam
         slam.localise_only()
     config = config or (slam.config if slam else Config())
+    if slam is None:
+        config = config.with_sensor(log.calibration.sensor)
     realtime = realtime or rate is not None
     if rate is not None and not 0 < rate < 1e4:
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")

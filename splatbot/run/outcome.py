@@ -18,6 +18,7 @@ from splatbot.results.metrics import without_nan
 from splatbot.results.scoring import TrajectoryScore, ViewScores, score_views, trajectory_metrics
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.loop import FrameLoop
+from splatbot.tracking.rectify import RectifiedLog
 from splatbot.trajectory import Trajectory
 
 MapPage = Callable[[GaussianModel, Trajectory], str]
@@ -71,8 +72,9 @@ class RunOutcome:
         self.loop.progress("scoring")
         poses = {r.index: r.T_world_camera for r in self.loop.slam.results if r.T_world_camera is not None}
         held_out = {i: poses[i] for i in sorted(self.loop.held_out) if i in poses}
+        log = RectifiedLog(self.loop.source.log, self.loop.config.sensor, self.trajectory)
         self.views = score_views(
-            self.loop.source.log,
+            log,
             self.model,
             held_out,
             lambda number: self.loop.progress("scoring", step=number, steps=len(held_out)),

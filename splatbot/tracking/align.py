@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,8 @@ class Alignment:
         spread: (6, 6) sum of g gᵀ over the image cells, where g is the gradient of the residuals in one cell.
         cells: number of image cells with residuals.
         focal: focal length [px] of the finest level.
+        band_information: (B, 6, 6) Gauss-Newton matrices of the residuals in B bands of image rows, top to bottom.
+        band_gradient: (B, 6) their gradients.
     """
 
     T_world_camera: Array
@@ -43,6 +45,8 @@ class Alignment:
     spread: Array
     cells: int
     focal: float
+    band_information: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    band_gradient: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     @classmethod
     def unconstrained(cls, T_world_camera: Array) -> Alignment:
@@ -157,7 +161,7 @@ def align(
     if features is not None and camera is not None:
         matches = (features.points, features.pixels, features.sigmas, _intrinsics(camera))
     scale = config.sensor.depth_sigma_scale if photometric else 1.0
-    T_camera_world, information, curvature, spread, cells, *_ = _native.align(
+    T_camera_world, information, curvature, spread, cells, _, _, band_information, band_gradient = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
         matches,
@@ -169,7 +173,10 @@ def align(
         finest,
         config.dense_share if photometric else 0.0,
     )
-    return Alignment(inverse(T_camera_world), information, curvature, spread, cells, levels[finest].camera.fx)
+    focal = levels[finest].camera.fx
+    return Alignment(
+        inverse(T_camera_world), information, curvature, spread, cells, focal, band_information, band_gradient
+    )
 
 
 def _level_arrays(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float, float, float]]:

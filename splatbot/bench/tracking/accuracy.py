@@ -93,7 +93,7 @@ def run_tracking(settings: TrackingSettings, report_progress: ReportProgress = i
     logs = [open_log(address, camera=settings.camera) for address in settings.addresses]
     results = Results(describe_machine((1,), peak_ms=20))
     for name, log in zip(distinct([log.name for log in logs]), logs, strict=True):
-        for contender in contenders(settings, config):
+        for contender in contenders(settings, config.with_sensor(log.calibration.sensor)):
             report_progress(f"{name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
             add_rows(results, log, contender, run_log(log, contender.make(), settings.max_frames), name)
     if settings.stress:

@@ -88,13 +88,16 @@ class CellSums {
     return ratio * n / (n - 6);
   }
 
-  // The number of cells that have residuals, and Σ g gᵀ over them.
+  // The number of cells that have residuals, Σ g gᵀ over them, and the normal equations of each row of cells.
   void report(AlignResult& result) const {
     Matrix6 spread = Matrix6::Zero();
     for (int c = 0; c < kCount; ++c) {
       if (!used_[c]) continue;
       ++result.cells;
       spread += g_[c] * g_[c].transpose();
+      const int band = c / kAlignCellColumns;
+      Eigen::Map<Matrix6>(&result.band_H[36 * band]) += H_[c];
+      Eigen::Map<Vector6>(&result.band_g[6 * band]) += g_[c];
     }
     result.spread = array_from<6>(spread);
   }
