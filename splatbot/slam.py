@@ -18,6 +18,7 @@ from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
 from splatbot.mapping.executor import Executor, InlineExecutor, ThreadExecutor
 from splatbot.mapping.joint_motion import JointMotionMonitor
+from splatbot.mapping.keyframe_choice import FrameQuality
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.observation import GraphLocation, Observation
@@ -76,6 +77,7 @@ class Slam:
         self._tracker = Tracker(self.config.tracking)
         self._mapper = Mapper(self.config)
         self._location = GraphLocation()
+        self._quality = FrameQuality()
         self._joint_motion = JointMotionMonitor(self.config.mapping.still_joint_speed)
         self._image_size: tuple[int, int] | None = None
         self._localization_only = False
@@ -245,9 +247,10 @@ class Slam:
         if estimate.verdict != "lost" and not hold_out:
             self._location = self._mapper.locate(estimate.T_world_camera, self._location)
         features = self._tracker.keypoints(prepared, estimate)
-        return Observation(
+        observation = Observation(
             prepared, estimate.T_world_camera, features, self._location, estimate.verdict, held_out=hold_out
         )
+        return replace(observation, is_poor=self._quality.is_poor(observation))
 
     def _record(self, frame: Frame, estimate: PoseEstimate, keyframe: bool, clock: StageClock) -> FrameResult:
         """Append the result of a frame, and report the time outside the stages to the tracker's budget."""

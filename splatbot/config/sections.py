@@ -208,6 +208,12 @@ class MappingConfig(_Section):
     keyframe_rotation: float = Field(
         default=0.07, gt=0, description="rotation to every keyframe from which a frame is a new keyframe [rad]"
     )
+    keyframe_patience: float = Field(
+        default=2.0,
+        ge=1,
+        description="factor on both limits for a blurred, fast or degraded frame, which waits for a better one; 1 "
+        "takes any frame",
+    )
     max_keyframes: int = Field(
         default=300, ge=10, description="hard cap on keyframes, 3 MB each; the most redundant are dropped: memory"
     )
@@ -277,6 +283,20 @@ class LoopsConfig(_Section):
     )
 
 
+class BundleConfig(_Section):
+    """Bundle adjustment: joint poses of the keyframes that see the same features."""
+
+    enabled: bool = Field(default=True, description="adjust the poses of keyframes to each other")
+    window: int = Field(
+        default=8, ge=2, description="latest keyframes that move if the new one revisits none: accuracy for time"
+    )
+    pairs: int = Field(
+        default=10, ge=1, description="earlier keyframes that each new one is matched with: accuracy for time"
+    )
+    min_translation: float = Field(default=0.002, gt=0, description="smaller corrections do not move the map [m]")
+    min_rotation: float = Field(default=0.001, gt=0, description="smaller corrections do not move the map [rad]")
+
+
 class Config(_Section):
     """All settings of a run.
 
@@ -287,6 +307,7 @@ class Config(_Section):
     tracking: TrackingConfig = Field(default_factory=lambda: TrackingConfig())
     mapping: MappingConfig = Field(default_factory=lambda: MappingConfig())
     loops: LoopsConfig = Field(default_factory=LoopsConfig)
+    bundle: BundleConfig = Field(default_factory=BundleConfig)
     seed: int = Field(default=0, description="seed of every random choice")
 
     @model_validator(mode="after")

@@ -130,11 +130,17 @@ def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
     return min(1.0, float(np.median(bend)) / (CONSTANTS.median_of_absolute * np.sqrt(1.5)))
 
 
-def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[HasPose], config: MappingConfig) -> bool:
-    """Return whether a view is new: its translation or rotation from every keyframe exceeds the configured limit."""
+def is_keyframe(
+    T_world_camera: NDArray[np.float64], keyframes: Sequence[HasPose], config: MappingConfig, patience: float = 1.0
+) -> bool:
+    """Return whether a view is new: its translation or rotation from every keyframe exceeds the configured limit.
+
+    Args:
+        patience: factor on both limits.
+    """
     for keyframe in reversed(keyframes):
         moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)
-        if moved < config.keyframe_translation and turned < config.keyframe_rotation:
+        if moved < patience * config.keyframe_translation and turned < patience * config.keyframe_rotation:
             return False
     return True
 

@@ -10,12 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_multiply, rotation_to_quat
+from splatbot.mapping.covisibility import covisible_candidates, match_keyframes, relative_pose
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.observation import GraphLocation, Observation
-from splatbot.mapping.posegraph import Adjacency, Edge, PoseGraph, max_residual, within_hops
+from splatbot.mapping.posegraph import Adjacency, Edge, PoseGraph, max_residual, orthonormal, within_hops
 from splatbot.tracking.align import align
 from splatbot.tracking.features import match_pose
 from splatbot.tracking.health import measure
@@ -150,8 +152,11 @@ class LoopCloser:
         self.adjacency = self.graph.adjacency()
 
     def apply_correction(self, correction: Mapping[int, Array]) -> None:
-        """Move the poses of the graph after the keyframes were moved."""
-        self.graph.poses = {number: correction[number] @ T for number, T in self.graph.poses.items()}
+        """Move the poses of the graph after the keyframes were moved.
+
+        The rotations stay exact: the rounding errors of many corrections would otherwise grow exponentially.
+        """
+        self.graph.poses = {number: orthonormal(correction[number] @ T) for number, T in self.graph.poses.items()}
         self.correction = None
 
     def state(self) -> dict[str, Any]:
@@ -173,7 +178,10 @@ class LoopCloser:
             self.correction[keyframe.number] = self.correction[reference.number]
         prepared = observation.prepared
         odometry = self._odometry_edge(reference, keyframe, prepared)
-        self.graph.edges.append(odometry)
+        covisible = self._covisible_edges(keyframe, others, prepared.frame.camera)
+        if covisible:
+            odometry = replace(odometry, covisible=True)
+        self.graph.edges += [odometry, *covisible]
         edge = None if others[-1] is reference else self._covisibility_edge(others[-1], keyframe, prepared)
         if edge is not None:
             self.graph.edges.append(edge)
@@ -184,6 +192,40 @@ class LoopCloser:
         self._unconfirmed = [*self._unconfirmed[-CONSTANTS.unconfirmed_kept :], *loops]
         if confirmed:
             self._close(confirmed)
+        if self.correction is None and covisible:
+            self._adjust(keyframe.number)
+
+    def _covisible_edges(self, keyframe: Keyframe, others: Sequence[Keyframe], camera: Camera) -> list[Edge]:
+        """Return the motions from covisible keyframes, measured from matched features."""
+        if not self.config.bundle.enabled:
+            return []
+        edges = []
+        for other in covisible_candidates(keyframe, others, self.config.bundle.pairs):
+            matches = match_keyframes(other, keyframe, camera)
+            if matches is None:
+                continue
+            T_tracked = inverse(other.T_world_camera) @ keyframe.T_world_camera
+            found = relative_pose(matches, T_tracked, camera, self.config.sensor)
+            if found is not None:
+                T = found.T_first_second
+                edges.append(Edge(other.number, keyframe.number, T, found.covariance + _drift(T), covisible=True))
+        return edges
+
+    def _adjust(self, number: int) -> None:
+        """Adjust the poses of the latest keyframes to all pairs that see the same features.
+
+        If the new keyframe is connected to one outside the window, all keyframes move: a revisited place corrects the
+        whole path since the last visit.
+        """
+        window = sorted(self.graph.poses)[-self.config.bundle.window :]
+        first = window[0]
+        revisits = any(edge.second == number and edge.first < first for edge in self.graph.edges)
+        poses = self.graph.optimize(None if revisits else set(window) - {min(self.graph.poses)})
+        moved = {k: orthonormal(T @ inverse(self.graph.poses[k])) for k, T in poses.items()}
+        distances = [pose_distance(self.graph.poses[k], T) for k, T in poses.items()]
+        limits = self.config.bundle
+        if any(m >= limits.min_translation or t >= limits.min_rotation for m, t in distances):
+            self.correction = {k: moved.get(k, np.eye(4)) for k in self.graph.poses}
 
     def _odometry_edge(self, reference: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> Edge:
         """Return the motion from the reference keyframe: as tracked, or as measured where other keyframes biased it."""
@@ -274,14 +316,14 @@ class LoopCloser:
             return
         poses = self.graph.optimize()
         moved, turned = max_residual(edge.residual(poses) for edge in loops)
-        sigma = max(_mahalanobis(edge, poses) for edge in self.graph.edges if not edge.loop)
+        sigma = max((_mahalanobis(edge, poses) for edge in self.graph.edges if not (edge.loop or edge.covisible)), default=0.0)
         is_open = moved > CONSTANTS.open_translation or turned > CONSTANTS.open_rotation
         if is_open or sigma > limits.max_edge_sigma:
             self.graph.edges = [edge for edge in self.graph.edges if all(edge is not loop for loop in loops)]
             self.rejected += len(loops)
             return
         self.closed += 1
-        self.correction = {number: poses[number] @ inverse(T) for number, T in self.graph.poses.items()}
+        self.correction = {k: orthonormal(poses[k] @ inverse(T)) for k, T in self.graph.poses.items()}
 
     def _measure(self, other: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> MeasuredMotion | None:
         """Align the frame of a keyframe to one other keyframe; return None if the alignment does not converge."""
@@ -358,7 +400,7 @@ def move_gaussians(model: GaussianModel, correction: Mapping[int, Array]) -> Gau
 
 def move_keyframe(keyframe: Keyframe, correction: Mapping[int, Array]) -> Keyframe:
     """Return a keyframe and its reference at the corrected pose."""
-    T = correction[keyframe.number] @ keyframe.T_world_camera
+    T = orthonormal(correction[keyframe.number] @ keyframe.T_world_camera)
     return replace(keyframe, T_world_camera=T, reference=replace(keyframe.reference, T_world_camera=T))
 
 

@@ -177,9 +177,10 @@ class Mapper:
         waiting = self._waiting()
         if len(waiting) >= CONSTANTS.backlog or self.loops.correction is not None:
             return False
-        if observation.location.revisits or (self._unmapped_seen and not waiting):
+        if not observation.is_poor and (observation.location.revisits or (self._unmapped_seen and not waiting)):
             return True
-        return is_keyframe(observation.T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
+        patience = self.config.mapping.keyframe_patience if observation.is_poor else 1.0
+        return is_keyframe(observation.T_world_camera, [*self.keyframes, *waiting], self.config.mapping, patience)
 
     def submit(self, observation: Observation) -> GraphLocation:
         """Queue a frame as the next keyframe; return its own location in the pose graph."""
