@@ -201,6 +201,4 @@ def _sigma(depth: Array, sensor: SensorConfig) -> Array:
 
 def _with_depth(features: Features) -> Features:
     known = np.flatnonzero(np.isfinite(features.points[:, 2]) & (features.points[:, 2] > 0))
-    return Features(
-        features.pixels[known], features.descriptors[known], features.points[known], features.scales[known]
-    )
+    return Features(features.pixels[known], features.descriptors[known], features.points[known], features.scales[known])

@@ -316,7 +316,9 @@ class LoopCloser:
             return
         poses = self.graph.optimize()
         moved, turned = max_residual(edge.residual(poses) for edge in loops)
-        sigma = max((_mahalanobis(edge, poses) for edge in self.graph.edges if not (edge.loop or edge.covisible)), default=0.0)
+        sigma = max(
+            (_mahalanobis(edge, poses) for edge in self.graph.edges if not (edge.loop or edge.covisible)), default=0.0
+        )
         is_open = moved > CONSTANTS.open_translation or turned > CONSTANTS.open_rotation
         if is_open or sigma > limits.max_edge_sigma:
             self.graph.edges = [edge for edge in self.graph.edges if all(edge is not loop for loop in loops)]

@@ -261,7 +261,7 @@ def ransac_pose(world: Array, image: Array, camera: Camera, max_reprojection: fl
 
 def match_features(current: Features, descriptors: NDArray[np.uint8]) -> tuple[Index, Index]:
     """Match descriptors (M, 32) with all keypoints of an image, and return indices of keypoints and of descriptors."""
-    return _match(current, descriptors, np.zeros((len(descriptors), 2), np.float32), np.inf)
+    return match(current, descriptors, np.zeros((len(descriptors), 2), np.float32), np.inf)
 
 
 def _matches(
