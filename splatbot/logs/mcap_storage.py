@@ -1,4 +1,4 @@
-"""MCAP storage with checksums, which are checked before a recording is read, and the recovery of a recording whose process was killed."""
+"""MCAP storage with checksums, their check before a recording is read, and the recovery of a killed recording."""
 
 from __future__ import annotations
 
