@@ -144,7 +144,7 @@ class Listener(socket.socket):
                 if error.errno not in _NO_FILES:
                     raise
                 if self._connections.out_of_files():
-                    raise BlockingIOError from error  # asyncio asks again once those are closed
+                    raise BlockingIOError from error  # asyncio accepts again once those are closed
                 self._refuse_one()
                 continue
             connection = Connection(self.family, self.type, self.proto, fileno=fd)

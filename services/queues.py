@@ -48,7 +48,7 @@ class Queues:
 
     The others wait. A request beyond the queue is answered 503. A request takes its place once its body has arrived,
     and leaves its queue when its client leaves. It returns its place before the answer is sent, so that slow clients
-    hold no place; an export returns it afterwards, for its file is on the disk until then.
+    hold no place. An export returns it afterwards: until then its file is on the disk.
 
     Args:
         most_waiting: requests of one kind that may wait.

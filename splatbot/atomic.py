@@ -84,10 +84,10 @@ def _about(target: Path, draft: Path, error: OSError) -> OSError:
     return OSError(error.errno, error.strerror, str(target))
 
 
-def sync(file: BinaryIO) -> None:
-    """Flush an open file to the disk."""
+def sync(file: BinaryIO, *, flushed: int = 0) -> None:
+    """Flush an open file to the disk; ``flushed`` bytes at its begin were flushed earlier."""
     file.flush()
-    failpoints.reach("fsync", Path(file.name))
+    failpoints.reach("fsync", Path(file.name), flushed)
     os.fsync(file.fileno())
 
 

@@ -235,6 +235,11 @@ class RosGraph:
         with self._lock:
             return client == 0 or client in self._clients
 
+    def has_clients(self, topic: str) -> bool:
+        """Return whether a client uses a topic."""
+        with self._lock:
+            return bool(self._users.get(topic, set()) - {0})
+
     def on_leave(self, call: Callable[[int], None]) -> None:
         """Register a function that is called with the number of each client that leaves."""
         with self._lock:

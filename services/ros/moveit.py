@@ -166,7 +166,7 @@ class MoveItServices:
                 raise InputError("is not supported.", field=path, hint="leave it empty")
 
     def _check_tool(self, request: Any, path: str) -> None:
-        """Check that a link is the tool, whose poses are all that can be asked for.
+        """Check that a link is the tool: goals are poses of the tool.
 
         Raises:
             InputError: it is another link.
@@ -197,7 +197,7 @@ class MoveItServices:
             return JointGoal(np.stack([_joint_goal(goal, robot) for goal in goals]))
         if unsupported := kinds - {"position_constraints", "orientation_constraints"}:
             hint = "give joints, or a position and an orientation of the tool"
-            raise InputError("are not supported beside others.", field=max(unsupported), hint=hint)
+            raise InputError("are not supported together with others.", field=max(unsupported), hint=hint)
         if len(goals) > 1:
             raise InputError("are several poses.", field="goal_constraints", hint="give one pose")
         return self._pose_goal(goals[0], base)

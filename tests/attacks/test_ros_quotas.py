@@ -222,6 +222,9 @@ def test_the_rest_of_rosapi_answers(served: Service) -> None:
         details = call(client, "/rosapi/node_details", node="/splatbot")["values"]
         assert "/odom" in details["publishing"]
         assert "/compute_ik" in details["services"]
+        for part in ("goal", "feedback", "result"):
+            found = call(client, f"/rosapi/action_{part}_details", type=kind)["values"]["typedefs"]
+            assert found[0]["type"] == f"control_msgs/msg/FollowJointTrajectory{part.capitalize()}"
         assert call(client, "/rosapi/get_param", name="/a", default="5")["values"]["value"] == "5"
         for name in ("get_param_names", "has_param", "set_param", "delete_param", "interfaces", "service_providers"):
             assert call(client, f"/rosapi/{name}")["result"] is True
