@@ -28,7 +28,9 @@ from splatbot.services.routes import (
     grasps,
     health,
     jobs,
+    landing,
     maps,
+    objects,
     picks,
     plans,
     render,
@@ -87,6 +89,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     install_problem_handlers(app)
     describe_bodies(app)
     for group in (
+        landing,
         health,
         maps,
         frames,
@@ -96,6 +99,7 @@ def create_app(runtime: Runtime) -> FastAPI:
         views,
         plans,
         grasps,
+        objects,
         picks,
         arms,
         trajectories,

@@ -32,6 +32,8 @@ COMMANDS = {
         "splatbot.cli.plan", "plan", "Plan a path of an arm among the Gaussians of a map, with pictures of it."
     ),
     "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked object in a map."),
+    "objects": _Command("splatbot.cli.objects", "objects", "List the supports and objects of a map with their sizes."),
+    "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),
     "pick": _Command("splatbot.cli.pick", "pick", "Pick a named object in the twin: scan, grasp, plan, lift, check."),
