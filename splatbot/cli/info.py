@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.doubts import camera_doubts
 from splatbot.cli.paths import check_camera
 from splatbot.cli.tables import print_table
 from splatbot.errors import InputError
@@ -136,6 +137,7 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
         ("valid depth", percent(depths.size / sum(frame.depth.size for frame in frames))),
         ("shift of depth onto colour", shift_text(depth_offset(frames), c.width)),
         ("reference poses", f"{len(truth)}, path {metres(length)}" if truth is not None else "none"),
+        *(("question", doubt) for doubt in camera_doubts(c)),
         *(("simulated effect", f"{effect['name']} ({effect['why']})") for effect in log.effects),
     ]
 
