@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import shutil
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -45,6 +47,8 @@ COMMANDS = {
     ),
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and print how to fix it."),
 }
+
+_HELP_COLUMNS = 120  # widest text of a help
 
 _GROUPS = {"bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks."}
 
@@ -139,8 +143,20 @@ def _run(name: str, words: list[str]) -> Any:
 
 
 def description(documented: object) -> str:
-    """Return the docstring of a command up to its "Args:"; tyro alone would drop the examples."""
-    return inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
+    """Return the docstring of a command up to its "Args:", wrapped to the terminal; tyro would drop the examples.
+
+    Examples stay whole, so that they can be copied. Tyro joins lines that begin with a letter, hence the indentation.
+    """
+    text = inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
+    width = min(shutil.get_terminal_size().columns, _HELP_COLUMNS) - 2
+    paragraphs = []
+    for paragraph in text.split("\n\n"):
+        lines = paragraph.splitlines()
+        plain = not any(line.startswith(" ") for line in lines)
+        paragraphs.append(
+            textwrap.fill(" ".join(lines), width, subsequent_indent=" ", break_on_hyphens=False) if plain else paragraph
+        )
+    return "\n\n".join(paragraphs)
 
 
 def _summaries(group: str) -> dict[str, str]:

@@ -78,7 +78,12 @@ def test_a_command_fits_the_terminal(run_folder: Path, tmp_path: Path, name: str
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_help_of_a_command_fits_the_terminal(name: str) -> None:
-    _assert_sound(at_a_terminal(name, "--help", columns=80), 80)
+    shown = at_a_terminal(name, "--help", columns=80)
+    assert shown.code == 0
+    lines = [line.rstrip() for line in shown.text.splitlines()]
+    # examples stay whole, to be copied; tyro does not wrap the usage
+    explained = [line for line in lines if not line.startswith(("    ", "usage:"))]
+    assert max(map(len, explained)) <= 80, max(explained, key=len)
 
 
 @pytest.mark.parametrize("name", ["simulate", "record", "export"])
