@@ -27,8 +27,8 @@ class UpDirectionConstants:
         max_roll: [deg] largest roll of the camera without a doubt.
         max_pitch: [deg] largest pitch below the horizon without a doubt; beyond it, the plane may be a wall.
         cell: [m] side of the cells in which a plane is occupied.
-        min_height: [m] least height of things above the plane.
-        max_height: [m] largest height of things above the plane.
+        min_height: [m] least height of objects above the plane.
+        max_height: [m] largest height of objects above the plane.
         min_standing: least number of points on the plane's area that stand on it, relative to the plane's points.
         rival: least surplus of points that stand on another plane, relative to the chosen one, for a doubt.
         max_beneath: largest number of points beneath the plane's area, relative to those that stand on it.
@@ -74,7 +74,8 @@ def estimate_workspace(
 
     Without ``up``, planes are fitted for cameras that look ahead, obliquely down and straight down. Planes that the
     camera would see from below are dropped. The estimate is doubtful if the remaining ones disagree, if nothing stands
-    on the plane, if points are beneath it, or if the camera is rolled or looks straight down, where a wall looks alike.
+    on the plane, or if points are beneath it. It is also doubtful if the camera is rolled or looks straight down, where
+    a wall looks alike.
 
     Args:
         model: a map whose world frame is its first camera.
@@ -93,12 +94,12 @@ def estimate_workspace(
     doubts = [*_doubts_of_view(found), *_doubts_of_support(found, points)]
     if others:
         angles = ", ".join(f"{_angle(found, other):.0f}°" for other in others)
-        doubts.append(f"other planes with things on them are turned by {angles}")
+        doubts.append(f"other planes with objects on them are turned by {angles}")
     return WorkspaceEstimate(found, "estimated", tuple(doubts), tuple(others))
 
 
 def _candidates(model: GaussianModel, seed: int) -> list[Workspace]:
-    """Return different planes that can be supports, that with most things on it first; weak rivals are left out."""
+    """Return different planes that can be supports, that with most points on it first; weak rivals are left out."""
     points = model.means.double().numpy()
     found: list[tuple[int, Workspace]] = []
     failure: InputError | None = None

@@ -6,6 +6,7 @@ import fcntl
 import os
 import pty
 import re
+import select
 import signal
 import struct
 import sys
@@ -55,6 +56,7 @@ def at_a_terminal(
     *words: str,
     columns: int,
     interrupt_at: str | None = None,
+    interrupt_after_s: float | None = None,
     resize_at: tuple[str, int] | None = None,
     environment: Mapping[str, str] | None = None,
     cwd: Path | None = None,
@@ -65,6 +67,7 @@ def at_a_terminal(
         words: of the command.
         columns: width of the terminal.
         interrupt_at: press Ctrl-C once this text is shown.
+        interrupt_after_s: press Ctrl-C after this time [s].
         resize_at: text at which the terminal gets another width.
         environment: additional variables.
         cwd: working directory.
@@ -83,6 +86,11 @@ def at_a_terminal(
     shown, started = b"", time.monotonic()
     try:
         while time.monotonic() - started < _TIMEOUT_S:
+            if interrupt_after_s is not None and time.monotonic() - started > interrupt_after_s:
+                os.write(terminal, b"\x03")
+                interrupt_after_s = None
+            if not select.select([terminal], [], [], 0.2)[0]:
+                continue
             try:
                 piece = os.read(terminal, 4096)
             except OSError:  # Linux reports EIO when the child has closed its side

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import shutil
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -33,6 +35,8 @@ COMMANDS = {
         "splatbot.cli.plan", "plan", "Plan a path of an arm among the Gaussians of a map, with pictures of it."
     ),
     "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked object in a map."),
+    "objects": _Command("splatbot.cli.objects", "objects", "List the supports and objects of a map with their sizes."),
+    "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),
     "pick": _Command("splatbot.cli.pick", "pick", "Pick a named object in the twin: scan, grasp, plan, lift, check."),
@@ -57,6 +61,8 @@ _GROUPS = {
     "bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks.",
     "calibrate": "Calibrate a camera from a log; `splatbot calibrate --help` lists what.",
 }
+
+_HELP_COLUMNS = 120  # widest text of a help
 
 _DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers queries of a robot.
 
@@ -150,8 +156,20 @@ def _run(name: str, command: _Command, words: list[str]) -> Any:
 
 
 def description(documented: object) -> str:
-    """Return the docstring of a command up to its "Args:"; tyro alone would drop the examples."""
-    return inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
+    """Return the docstring of a command up to its "Args:", wrapped to the terminal; tyro would drop the examples.
+
+    Examples stay whole, so that they can be copied. Tyro joins lines that begin with a letter, hence the indentation.
+    """
+    text = inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
+    width = min(shutil.get_terminal_size().columns, _HELP_COLUMNS) - 2
+    paragraphs = []
+    for paragraph in text.split("\n\n"):
+        lines = paragraph.splitlines()
+        plain = not any(line.startswith(" ") for line in lines)
+        paragraphs.append(
+            textwrap.fill(" ".join(lines), width, subsequent_indent=" ", break_on_hyphens=False) if plain else paragraph
+        )
+    return "\n\n".join(paragraphs)
 
 
 def _summaries(group: str) -> dict[str, str]:

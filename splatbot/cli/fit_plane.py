@@ -1,4 +1,4 @@
-"""`splatbot info --fit-plane`: the support plane and a robot's base, decided, estimated or asked for."""
+"""`splatbot info --fit-plane`: the support plane and a robot's base, decided or estimated."""
 
 from __future__ import annotations
 

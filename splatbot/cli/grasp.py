@@ -10,7 +10,7 @@ import tyro
 
 from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import Pose, base_pose, margin_of
-from splatbot.errors import InputError
+from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from splatbot.grasping.affordance import Hint, ObservedView
     from splatbot.grasping.types import GraspResult
     from splatbot.robots.graspable_objects import GraspableObjects
+    from splatbot.robots.robot import RobotModel
 
 
 def grasp(
@@ -45,6 +46,7 @@ def grasp(
     n_sigma: float = 1.0,
     min_observations: int = 1,
     seed: int = 0,
+    verbose: bool = False,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
     """Find grasps of an object in a map, best first, with each term of their scores.
@@ -83,6 +85,7 @@ def grasp(
         n_sigma: surface of a Gaussian, in standard deviations; smaller than for planning, because the hand comes close.
         min_observations: least number of keyframes that support a Gaussian; others are ignored.
         seed: seed of the search.
+        verbose: without a grasp, print the counts of each reason.
         out: folder to write to; by default runs/grasp.
     """
     places = {"--target": target, "--pixel": pixel, "--point": point, "--box": box, "--mask": mask, "--tag": tag}
@@ -97,6 +100,7 @@ def grasp(
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
+    from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.spatial import SpatialAffordance
@@ -109,7 +113,7 @@ def grasp(
         friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
     )
     arm = load_robot(robot)
-    objects = _graspable_objects(map, base)
+    objects = graspable_objects(map, base)
     scene = objects.scene
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
@@ -124,12 +128,27 @@ def grasp(
     if shown is not None:
         with atomic_write(folder / "grasp.png") as handle:
             handle.write(grasp_png(scene, found.rows, arm, shown))
+    if not result.grasps and not verbose:
+        reason, change = first_change(result, scene, stroke_of(arm))
+        why = " ".join(note for note in found.notes if note.startswith("took "))
+        raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
     _print(result, folder)
     return 0
 
 
-def _graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:
+def stroke_of(arm: RobotModel) -> float:
+    """Return the widest opening of a robot's hand [m], 0 without a hand."""
+    return 2 * arm.gripper.stroke if arm.gripper is not None else 0.0
+
+
+def graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:
+    """Segment the objects of a run's map or of a map file.
+
+    Raises:
+        InputError: the base is not known.
+        FormatError: the map or its run is damaged.
+    """
     from splatbot.gaussians import GaussianModel, Snapshot
     from splatbot.robots.graspable_objects import measured_map, run_of, segment_objects
     from splatbot.workspace import find_workspace
@@ -215,10 +234,10 @@ def _print(result: GraspResult, folder: Path) -> None:
     print_table(rows, title="grasps")
     terms = list(result.grasps[0].terms)
     table = Table()
-    for name in ("", "total", "approach", "width", "opens", "clearance", *terms):
+    for name in ("", "total", "approach", "width, mm", "opens, mm", "clearance, mm", *terms):
         table.add_column(name, justify="left" if name == "approach" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *(f"{g.terms[name]:.2f}" for name in terms))
     print_columns(table)
-    print("width, opens and clearance in mm; the best value of a term is 1")
+    print("the best total and the best value of a term is 1")

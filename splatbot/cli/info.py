@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.doubts import camera_doubts
 from splatbot.cli.paths import check_camera
 from splatbot.cli.tables import print_table
 from splatbot.errors import InputError
@@ -56,8 +57,8 @@ def info(
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         fit_plane: estimate the plane of the table or floor and propose a base of a robot. They are written to
             scene.yaml next to the map, with the picture scene.png. A doubtful estimate is not written.
-        up: with --fit-plane, upwards in the first camera (x right, y down, z ahead): 0 -1 0 if it looked ahead, 0 0 -1
-            straight down. It replaces an existing estimate. By default the log's accelerometer decides, if there is
+        up: with --fit-plane, upwards in the first camera (x right, y down, z ahead), as 0 -1 0 for a camera that looked
+            ahead and 0 0 -1 for one that looked straight down. It replaces an existing estimate. By default the log's accelerometer decides, if there is
             one, else the planes of the map.
     """
     from splatbot.cli.fit_plane import fit_plane as fit_plane_command
@@ -136,6 +137,7 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
         ("valid depth", percent(depths.size / sum(frame.depth.size for frame in frames))),
         ("shift of depth onto colour", shift_text(depth_offset(frames), c.width)),
         ("reference poses", f"{len(truth)}, path {metres(length)}" if truth is not None else "none"),
+        *(("question", doubt) for doubt in camera_doubts(c)),
         *(("simulated effect", f"{effect['name']} ({effect['why']})") for effect in log.effects),
     ]
 

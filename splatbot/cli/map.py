@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatbot.cli.doubts import camera_doubts, run_doubts
 from splatbot.cli.paths import check_camera, check_file, check_output, check_state
 from splatbot.errors import InputError
 from splatbot.layouts import MAP_NAME, log_kind
@@ -108,6 +109,9 @@ def map_log_command(
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
         robot = robot or saved.place.robot
     recording = without_robot(open_log(log, camera=camera), robot)
+    if not quiet:
+        for doubt in camera_doubts(recording.camera):
+            print(f"question: {doubt}", file=sys.stderr)
     folder = out if out is not None else Path("runs") / f"{_slug(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     with progress_display(quiet=quiet) as on_progress:
         result = map_log(
@@ -218,6 +222,11 @@ def _pace(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return [("paced", f"{metrics['late']} frames late, {metrics['dropped']} dropped")]
 
 
+def _mishaps(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    counts = [f"{metrics[name]} {name}" for name in ("lost", "degraded") if metrics[name]]
+    return [("of them", ", ".join(counts))] if counts else []
+
+
 def _print_summary(result: RunResult) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, decibels, megabytes, metres, milliseconds
@@ -226,12 +235,14 @@ def _print_summary(result: RunResult) -> None:
     ms = m["ms_per_frame"]
     rows = [
         ("frames tracked", f"{m['tracked']} of {m['frames']}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
+        *_mishaps(m),
         *_pace(m),
         ("ATE RMSE", metres(m["ate_rmse_m"])),
         ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
         ("depth error, median", metres(m["depth_median_m"])),
         ("Gaussians", f"{count(m['gaussians'])}, {megabytes(m['map_bytes'])}"),
         ("time per frame", f"{milliseconds(ms['p50'])} (p95 {milliseconds(ms['p95'])})"),
+        *(("question", doubt) for doubt in run_doubts(m)),
         ("report", str(result.folder / "report.html")),
     ]
     title = "interrupted; saved" if m["interrupted"] else "stopped early; saved" if m["error"] else "mapped"

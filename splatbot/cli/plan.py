@@ -177,6 +177,8 @@ def _plan(
 def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
     import numpy as np
 
+    from splatbot.planning.goals import suspect_degrees
+
     if words == ("home",):
         return np.asarray(robot.home)
     try:
@@ -185,6 +187,7 @@ def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.
         raise InputError(f"is {' '.join(words)}.", field=flag, hint='give numbers, or "home"') from error
     if len(values) != len(robot) or not np.isfinite(values).all():
         raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
+    suspect_degrees(values, robot.chain, flag)
     return values
 
 

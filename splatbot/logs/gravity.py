@@ -38,11 +38,11 @@ CONSTANTS = GravityConstants()
 
 
 def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] | None:
-    """Return the upward unit vector in the world of a trajectory, or None if the log cannot tell.
+    """Return the upward unit vector in the world of a trajectory, or None if the log does not determine it.
 
-    The axes of the accelerometer on the camera are not recorded. Of the 24 rotations by right angles, the one is chosen
-    for which gravity has the same direction in the world at all poses. If the motion does not tell them apart, the
-    answer is None.
+    The axes of the accelerometer on the camera are not recorded. The function chooses the rotation by right angles for
+    which gravity has the same direction in the world at all poses. If the motion does not distinguish the 24 rotations,
+    the answer is None.
 
     Args:
         uri: folder of the log.

@@ -1,1 +1,0 @@
-"""Export of a map in the formats of other programs."""
