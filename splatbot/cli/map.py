@@ -44,9 +44,9 @@ def map_log_command(
 ) -> int:
     """Turn an RGB-D log into a map of Gaussians.
 
-    Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml, report.html and map.html.
-    Ctrl-C saves the current map; so does a frame that cannot be read. Every 30 s, and after the last frame, the whole
-    state is saved too (RUN/state), for --resume and --localise.
+    Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml, audit.json, report.html and
+    map.html. Ctrl-C saves the current map; so does a frame that cannot be read. Every 30 s, and after the last frame,
+    the whole state is saved too (RUN/state), for --resume and --localise.
 
     Examples:
         splatbot map recordings/desk

@@ -62,12 +62,12 @@ def plan(
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
             `splatbot info --fit-plane`).
-        margin: clearance [m] to the map. "auto", the default in a run folder, is the error of the map's surfaces in the
-            region of the motion, audited against the depth of the run (see `splatbot audit`). A map file has no
-            depth, and its default is 0.
+        margin: clearance [m] to the map. "auto" is the error of the map's surfaces in the region of the motion, audited
+            against the depth of the run (see `splatbot audit`). It is the default in a run folder; the default of a map
+            file is 0.
         confidence: share of the confirmed surface that the margin "auto" covers, 0..1.
-        unknown: space that no frame of the run saw to be empty. It is free, or "occupied"; or "cautious", an obstacle
-            only where two frames looked and measured no depth, as at dark, thin, shiny or transparent objects.
+        unknown: space that no frame of the run saw to be empty is free, or "occupied". With "cautious" it is occupied
+            only where two frames looked and measured no depth, as at dark, shiny or transparent objects.
         n_sigma: surface of a Gaussian, in standard deviations.
         speed: fraction of the limits of velocity and acceleration, as MoveIt's scaling factors; 1 is as fast as the
             robot can.
@@ -253,7 +253,7 @@ def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, An
 
 def _margin_text(covers: dict[str, Any]) -> str:
     if covers["margin_from"] != "audit":
-        return {"user": "as given", "none": "none: errors of the map are not covered"}[covers["margin_from"]]
+        return {"user": "as given", "none": "0, so that errors of the map are not covered"}[covers["margin_from"]]
     return (
         f"covers {100 * covers['confidence']:g} % of {covers['region_points']} measured points, "
         f"error {1e3 * covers['region_error_m']:.1f} mm"

@@ -29,8 +29,8 @@ class UnknownConstants:
     Args:
         suspect_views: number of views whose pixels of a voxel lack depth that make it suspect.
         suspect_share: least share of the pixels of a voxel without depth in such a view.
-        radii: [px] half the sides of the squares of pixels that are tested; a voxel that covers more is too near to the
-            camera to be observed.
+        radii: [px] half the sides of the squares of pixels that are tested. A voxel that covers more pixels is too
+            close to the camera.
         scattered: [px] groups of so few pixels without depth are noise, and take the least depth around them.
     """
 
@@ -100,8 +100,8 @@ class UnknownSpace:
 def find_unknown(aabb: ArrayLike, voxel: float, views: Iterable[DepthView]) -> UnknownSpace:
     """Find the voxels of a box that no view has observed to be empty.
 
-    A voxel is empty if one view has depth at all pixels onto which its sphere may project, and all of it lies behind
-    the sphere. The test of a single pixel would see past a rod that is thinner than the voxel. The pixels are those of
+    A voxel is empty if one view has depth at all pixels onto which its sphere may project, all of it behind the
+    sphere. The test of a single pixel would see past a rod that is thinner than the voxel. The pixels are those of
     the smallest square around the centre that covers the image of the sphere, which is conservative. Up to three
     adjacent pixels without depth are noise of the sensor and take the least depth around them.
 

@@ -326,8 +326,8 @@ class Mapper:
     def finish(self, stop: Stop = never) -> None:
         """Refine over all keyframes at the end of a log, and densify where the loss gradients are large.
 
-        Confirmed depth that the map misses becomes Gaussians before, so that refinement adapts them, and after, because
-        refinement may move or remove Gaussians that depth supports.
+        Confirmed depth that the map misses becomes Gaussians before and after. Refinement adapts the first ones; it may
+        move or remove Gaussians that depth supports.
 
         Args:
             stop: called before each iteration. Once it returns True, no iteration and no densification follows.

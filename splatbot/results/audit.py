@@ -29,7 +29,7 @@ class ObjectAudit:
     """Audit of the surface points nearest to one object of the map.
 
     Args:
-        name: name of the object in ``scene.yaml``, or "object" and its number, "support" or "rest".
+        name: name of the object in ``scene.yaml``, or "object" or "support" and its number, or "rest".
         points: number of confirmed points.
         missed_share: share of them that is farther than 1 cm from the field.
         worst: largest distance [m].
@@ -153,7 +153,7 @@ def _by_object(near: SurfaceAudit, model: GaussianModel, run: RunFolder) -> tupl
     found = []
     for label in np.unique(labels):
         distance = near.distance[labels == label]
-        name = names[int(label)] if label >= 0 else "rest" if label == -1 else "support"
+        name = names[int(label)] if label >= 0 else "rest" if label == -1 else f"support {-2 - int(label)}"
         missed = float((distance > AUDIT.missed_distance).mean())
         found.append(ObjectAudit(name, len(distance), missed, float(distance.max())))
     return tuple(sorted(found, key=lambda part: -part.missed_share))

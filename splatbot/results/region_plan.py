@@ -102,6 +102,6 @@ def plan_in_region(
 
 
 def _around(arm: RobotSpheres, q: Array, error: AuditedError, confidence: float) -> AuditedError:
-    """Return the points near the arm; all points if too few are near to show one beyond the confidence."""
+    """Return the points near the arm; if too few are there for the confidence, return all points."""
     near = error.near(arm.centers(np.atleast_2d(q)).reshape(-1, 3), MARGIN.region)
     return near if len(near) * (1.0 - confidence) >= 1.0 else error
