@@ -303,7 +303,10 @@ class Config(_Section):
             ValidationError: a key is unknown, or a value is out of range.
         """
         given = self.sensor.model_dump(include=self.sensor.model_fields_set)
-        return self.model_copy(update={"sensor": SensorConfig(**{**values, **given})})._share_sensor()
+        sensor = SensorConfig(**{**values, **given})
+        tracking = self.tracking.model_copy()
+        tracking.__dict__["sensor"] = sensor
+        return self.model_copy(update={"sensor": sensor, "tracking": tracking})
 
     def to_yaml(self) -> str:
         """Return the configuration in force as YAML that :func:`splatbot.config.load_config` reads back."""
