@@ -65,7 +65,7 @@ class DepthTiming:
 def estimate_depth_timing(frames: Sequence[Frame], twists: Mapping[int, Array]) -> DepthTiming:
     """Estimate shift and delay of depth from frames and the twists (6,) [m/s, rad/s] of some of them.
 
-    Depth that is τ seconds late is displaced by the image velocity c of its edges, so that a shift of
+    Depth that is τ seconds late is displaced by τ c_k, where c_k is the image velocity of its edges. A shift of
     d_k = (right, down) - τ c_k aligns the depth of frame k. The estimate maximises the sum over all frames of the
     correlation of depth edges, shifted by d_k, with the gradient magnitude of colour. A jackknife over blocks of
     frames gives the covariance (Efron and Stein 1981).

@@ -54,7 +54,7 @@ CALIBRATIONS = {
 
 _GROUPS = {
     "bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks.",
-    "calibrate": "Calibrate a camera from a log; `splatbot calibrate --help` lists what.",
+    "calibrate": "Calibrate a sensor from a log; `splatbot calibrate --help` lists the calibrations.",
 }
 
 _DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers queries of a robot.

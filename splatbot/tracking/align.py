@@ -160,8 +160,8 @@ def align(
         features: matches of features. If None, no reprojection residuals are used.
         camera: camera of the features' pixels.
         prior: Gaussian prior of the pose. If None, the pose is not constrained by one.
-        blur: (6,) motion β (translation [m], rotation [rad]) by which blur may displace what the image shows, one
-            standard deviation. The variance of a residual with the Jacobian J becomes σ² + (J β)².
+        blur: (6,) standard deviation β (translation [m], rotation [rad]) of the motion by which a blurred image may be
+            displaced. The variance of a residual with the Jacobian J becomes σ² + (J β)².
     """
     matches = None
     if features is not None and camera is not None:

@@ -35,8 +35,8 @@ CONSTANTS = RectifyConstants()
 def rectify(frame: Frame, twist: Array, sensor: SensorConfig) -> Frame:
     """Return the images that a global shutter takes at the stamp of a frame, with depth registered to colour.
 
-    A point X that a row sees s seconds after the stamp is exp(s ξ) X in the camera at the stamp, for the constant
-    twist ξ of the camera (Hedborg et al. 2012). The depth image is resampled first; it defines the displacement of
+    A row sees a point X s seconds after the stamp. In the camera at the stamp it is exp(s ξ) X, with the constant twist
+    ξ of the camera (Hedborg et al. 2012). The depth image is resampled first; it defines the displacement of
     colour. Nothing is resampled that the sensor and the twist do not displace.
 
     Args:

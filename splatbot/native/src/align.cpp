@@ -230,8 +230,8 @@ using Jacobian = Eigen::Matrix<double, 2, 6, Eigen::RowMajor>;
 
 constexpr double kMatchNu = 4.0;  // degrees of freedom of the Student-t noise of matches
 
-// Scale residual and Jacobian of a match in a blurred image along its displacement b = J β [σ], so that its variance there
-// becomes 1 + |b|²: both are multiplied by I - (1 - 1/√(1 + |b|²)) b bᵀ / |b|².
+// Scale residual and Jacobian of a match in a blurred image along its displacement b = J β [σ]. Their variance there is
+// 1 + |b|², so both are multiplied by I - (1 - 1/√(1 + |b|²)) b bᵀ / |b|².
 void whiten(const Eigen::Map<const Vector6>& blur, Jacobian& J, Eigen::Vector2d& r) {
   const Eigen::Vector2d b = J * blur;
   const double length2 = b.squaredNorm();

@@ -8,7 +8,7 @@ from splatbot.tracking.align import align
 from splatbot.tracking.hypothesis import Hypothesis
 from splatbot.tracking.stage import EFFORT_SHARES, StageCost, TrackingProblem, TrackingStage
 
-# Displacement of what a blurred image shows, one standard deviation, over the length of the blur: that of a uniform
+# Standard deviation of the displacement of a blurred corner over the length of the blur: that of a uniform
 # distribution. Corners that are visible at one end of the blur alone lie that far from its middle.
 _BLUR_SHARE = 1 / 12**0.5
 
