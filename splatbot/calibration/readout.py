@@ -65,8 +65,8 @@ class RowModel:
 def estimate_rows(views: Sequence[View], pairs: Sequence[Pair], camera: Camera) -> RowModel:
     """Estimate readout time and bias together with the poses of all pairs; the poses of ``pairs`` are updated.
 
-    A feature j of the first view of a pair has the depth z_j, the row time s_j r and the ray a_j. In the second view its
-    pixel is::
+    A feature j of the first view of a pair has the depth z_j, the row time s_j r and the ray a_j. In the second view
+    its pixel is::
 
         π( exp(-s'_j r ξ') T exp(s_j r ξ) (z_j + b) a_j )
 
