@@ -1,4 +1,4 @@
-"""Estimated quantity of a calibration with its uncertainty, or the reason why a log does not tell it."""
+"""Estimated quantity of a calibration with its uncertainty, or the reason why a log does not determine it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Estimate:
         value: estimate.
         sigma: its standard deviation.
         unit: unit of both.
-        refusal: reason why the log does not tell the quantity. If empty, it does.
+        refusal: reason why the log does not determine the quantity. Empty if it does.
     """
 
     value: float
@@ -30,7 +30,7 @@ class Estimate:
             sigma: its standard deviation; NaN is too large.
             unit: unit of both.
             largest_sigma: largest standard deviation of a useful estimate.
-            need: what a log must show for it.
+            need: motion that a log must contain for it.
         """
         if sigma <= largest_sigma:
             return cls(value, sigma, unit)

@@ -30,10 +30,15 @@ class ReadoutConstants:
     """Standard deviation [s] that more frames do not reduce, of the motion model within a frame."""
     bias_floor: float = 1e-3
     """Standard deviation [m] that more frames do not reduce, of the calibration of the lens."""
-    largest_readout_sigma: float = 2e-3
-    """Standard deviation [s] above which the readout time is refused: rows off by 4 px at 120 °/s."""
-    largest_bias_sigma: float = 4e-3
+    largest_readout_sigma: float = 3e-3
+    """Standard deviation [s] above which the readout time is refused: a tenth of that of a Kinect."""
+    largest_bias_sigma: float = 5e-3
     """Standard deviation [m] above which the bias is refused."""
+    largest_bias: float = 0.1
+    """Bias [m] that no depth camera has. A larger one shows that something else distorts the images."""
+    min_parallax: float = 0.05
+    """Translation between two views over their distance to the scene [1], reached by a tenth of the pairs. Noise of
+    the features replaces smaller parallax."""
 
 
 CONSTANTS = ReadoutConstants()
@@ -60,14 +65,15 @@ class RowModel:
 def estimate_rows(views: Sequence[View], pairs: Sequence[Pair], camera: Camera) -> RowModel:
     """Estimate readout time and bias together with the poses of all pairs; the poses of ``pairs`` are updated.
 
-    A feature j of the first view of a pair, with depth z_j, row time s_j r and ray a_j, is seen in the second view at::
+    A feature j of the first view of a pair has the depth z_j, the row time s_j r and the ray a_j. In the second view
+    its pixel is::
 
         π( exp(-s'_j r ξ') T exp(s_j r ξ) (z_j + b) a_j )
 
     The twists ξ and ξ' follow from the poses between neighbours. Gauss-Newton with weights of Student's t solves for
     r and b after the Schur complement of the pose T of each pair. The covariance is cluster-robust (Liang and Zeger
     1986), with the pairs of a first view as clusters. Only the difference of two velocities distorts a pair, so that a
-    camera at constant velocity does not tell r. Only the parallax of points at different depths tells b, as the scale
+    constant velocity does not determine r. Only the parallax of points at different depths determines b, as the scale
     of T is free.
     """
     p, shared = CONSTANTS, np.zeros(2)
@@ -80,21 +86,28 @@ def estimate_rows(views: Sequence[View], pairs: Sequence[Pair], camera: Camera) 
             H, g = clusters.get(pair.first, (np.zeros((2, 2)), np.zeros(2)))
             clusters[pair.first] = (H + system.H, g + system.g)
         A = sum((H for H, _ in clusters.values()), _WEAK_INFORMATION)
-        step = -np.linalg.solve(A, sum((g for _, g in clusters.values()), np.zeros(2)))
+        step: Array = -np.linalg.solve(A, sum((g for _, g in clusters.values()), np.zeros(2)))
         shared = shared + step
         for pair, system in zip(usable, systems, strict=True):
             pair.T_second_first = updated(pair.T_second_first, system.pose_step(step))
-    covariance = _sandwich(list(clusters.values()))
-    sigmas = np.sqrt(np.diag(covariance) + np.array([p.readout_floor, p.bias_floor]) ** 2)
+    sigmas = np.sqrt(np.diag(_sandwich(list(clusters.values()))) + np.array([p.readout_floor, p.bias_floor]) ** 2)
     if len(clusters) < p.min_pairs:
         sigmas = np.full(2, np.inf)
-    readout = Estimate.limited(
-        float(shared[0]), float(sigmas[0]), "s", p.largest_readout_sigma, "turn the camera to and fro over texture"
+    if not _has_parallax(pairs) or abs(shared[1]) > p.largest_bias:
+        sigmas[1] = np.inf
+    (readout, bias), (readout_sigma, bias_sigma) = shared.tolist(), sigmas.tolist()
+    to_and_fro, sideways = "turn the camera to and fro over texture", "move the camera sideways past near and far"
+    return RowModel(
+        Estimate.limited(readout, readout_sigma, "s", p.largest_readout_sigma, to_and_fro),
+        Estimate.limited(bias, bias_sigma, "m", p.largest_bias_sigma, sideways),
+        twists,
     )
-    bias = Estimate.limited(
-        float(shared[1]), float(sigmas[1]), "m", p.largest_bias_sigma, "move the camera sideways past near and far"
-    )
-    return RowModel(readout, bias, twists)
+
+
+def _has_parallax(pairs: Sequence[Pair]) -> bool:
+    """Return whether the translation between pairs is large enough to measure depths by colour."""
+    moved = [np.linalg.norm(pair.T_second_first[:3, 3]) / np.median(pair.points[:, 2]) for pair in pairs]
+    return bool(moved) and float(np.percentile(moved, 90)) >= CONSTANTS.min_parallax
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +126,7 @@ class _Reduced:
 
 
 def _reduced(pair: Pair, twists: Mapping[int, Array], shared: Array, camera: Camera, pixel_sigma: float) -> _Reduced:
-    """Linearise the reprojection residuals of a pair at its pose, the readout time and the bias."""
+    """Compute the linearised reprojection residuals of a pair at its pose, the readout time and the bias."""
     readout, bias = shared
     xi, xi2, T, nu = twists[pair.first], twists[pair.second], pair.T_second_first, CONSTANTS.nu
     s = pair.pixels_first[:, 1] / (camera.height - 1) - 0.5
@@ -166,9 +179,9 @@ def _along(D: Array, directions: Array) -> Array:
 def _sandwich(clusters: Sequence[tuple[Array, Array]]) -> Array:
     """Return the covariance (2, 2) from H and g of each cluster: cluster-robust, plus that of the noise model.
 
-    The second term exceeds the first only where residuals tell little, as in a log at rest.
+    The second term exceeds the first only where residuals determine little, as in a log at rest.
     """
     n = len(clusters)
-    A = np.linalg.inv(sum((H for H, _ in clusters), _WEAK_INFORMATION))
+    A: Array = np.linalg.inv(sum((H for H, _ in clusters), _WEAK_INFORMATION))
     S = sum((np.outer(g, g) for _, g in clusters), np.zeros((2, 2)))
     return np.asarray(A @ S @ A * n / max(n - 2, 1) + A)

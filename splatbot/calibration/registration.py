@@ -32,10 +32,12 @@ class DepthTimingConstants:
     """Blocks of consecutive frames of the jackknife [1]."""
     min_edges: int = 2000
     """Edge pixels [1] of all frames."""
-    shift_floor: float = 0.3
+    shift_floor: float = 0.4
     """Standard deviation [px] that more frames do not reduce: depth sensors widen near objects."""
     delay_floor: float = 3e-4
     """Standard deviation [s] that more frames do not reduce, of the velocities."""
+    min_travel: float = 0.25
+    """Path of the image over the log [share of width]. The edges of a single view favour one side of objects."""
     largest_shift_sigma: float = 1.0
     """Standard deviation [px] above which the shift is refused."""
     largest_delay_sigma: float = 3e-3
@@ -63,7 +65,7 @@ class DepthTiming:
 def estimate_depth_timing(frames: Sequence[Frame], twists: Mapping[int, Array]) -> DepthTiming:
     """Estimate shift and delay of depth from frames and the twists (6,) [m/s, rad/s] of some of them.
 
-    Depth that is τ seconds late is displaced by the image velocity c of its edges, so that a shift of
+    Depth that is τ seconds late is displaced by τ c_k, where c_k is the image velocity of its edges. A shift of
     d_k = (right, down) - τ c_k aligns the depth of frame k. The estimate maximises the sum over all frames of the
     correlation of depth edges, shifted by d_k, with the gradient magnitude of colour. A jackknife over blocks of
     frames gives the covariance (Efron and Stein 1981).
@@ -79,14 +81,18 @@ def estimate_depth_timing(frames: Sequence[Frame], twists: Mapping[int, Array]) 
     if edges < p.min_edges or any(volume.ndim == 1 for volume in volumes):
         refused = [Estimate(0.0, np.inf, unit, f"too few depth edges: {need}") for unit in ("px", "px", "s")]
         return DepthTiming(*refused)
-    total = np.sum(volumes, axis=0)
+    total: Array = sum(volumes, np.zeros(1))
     best = _peak(total, frames[0])
     others = np.array([_peak(total - volume, frames[0]) for volume in volumes])
     spread = (p.blocks - 1) / p.blocks * ((others - others.mean(0)) ** 2).sum(0)
     sigma = np.sqrt(spread + np.array([p.delay_floor, p.shift_floor, p.shift_floor]) ** 2)
     sigma = np.where(_is_at_border(best, frames[0]), np.inf, sigma)
-    if _velocity_spread(frames, twists, chosen) * p.largest_delay_sigma < p.shift_floor:
+    velocities = np.array([image_velocity(frames[k], twists[k]) for k in chosen])
+    if velocities.std(0).max() * p.largest_delay_sigma < p.shift_floor:
         sigma[0] = np.inf
+    gaps = np.diff([frame.stamp for frame in frames])
+    if np.linalg.norm(velocities, axis=1).sum() * float(np.median(gaps)) < p.min_travel * frames[0].camera.width:
+        sigma[:] = np.inf
     return DepthTiming(
         Estimate.limited(float(best[2]), float(sigma[2]), "px", p.largest_shift_sigma, need),
         Estimate.limited(float(best[1]), float(sigma[1]), "px", p.largest_shift_sigma, need),
@@ -147,8 +153,3 @@ def _peak(volume: Array, frame: Frame) -> Array:
 def _is_at_border(peak: Array, frame: Frame) -> Array:
     limits = np.array([CONSTANTS.delay_range, *[_shift_radius(frame)] * 2])
     return np.asarray(np.abs(peak) > 0.95 * limits)
-
-
-def _velocity_spread(frames: Sequence[Frame], twists: Mapping[int, Array], chosen: Sequence[int]) -> float:
-    """Return the standard deviation [px/s] of the image velocity over the frames."""
-    return float(np.std([image_velocity(frames[k], twists[k]) for k in chosen], axis=0).max())

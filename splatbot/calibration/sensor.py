@@ -61,8 +61,8 @@ class SensorCalibration:
     camera: Camera
 
     @property
-    def told(self) -> dict[str, Estimate]:
-        """Quantities that the log tells."""
+    def known(self) -> dict[str, Estimate]:
+        """Quantities that the log determines."""
         return {name: estimate for name, estimate in self.estimates.items() if not estimate.refusal}
 
     @property
@@ -72,18 +72,18 @@ class SensorCalibration:
         return {name: getattr(self, name) for name in names}
 
     def section(self) -> dict[str, Any]:
-        """Return the section `sensor` of the configuration with the quantities that the log tells.
+        """Return the section `sensor` of the configuration with the quantities that the log determines.
 
         The shift of depth becomes a rotation of the depth camera, which displaces all pixels near the image centre
         alike.
         """
-        told, values = self.told, dict[str, Any]()
+        known, values = self.known, dict[str, Any]()
         for name in ("readout", "depth_delay", "depth_bias"):
-            if name in told:
-                value = told[name].value
+            if name in known:
+                value = known[name].value
                 values[name] = max(value, 0.0) if name == "readout" else value
-        if "right" in told and "down" in told:
-            down, right = told["down"].value / self.camera.fy, told["right"].value / self.camera.fx
+        if "right" in known and "down" in known:
+            down, right = known["down"].value / self.camera.fy, known["right"].value / self.camera.fx
             values["depth_to_color"] = [0.0, 0.0, 0.0, -down, right, 0.0]
         return values
 

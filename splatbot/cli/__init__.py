@@ -59,7 +59,7 @@ CALIBRATIONS = {
 
 _GROUPS = {
     "bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks.",
-    "calibrate": "Calibrate a camera from a log; `splatbot calibrate --help` lists what.",
+    "calibrate": "Calibrate a sensor from a log; `splatbot calibrate --help` lists the calibrations.",
 }
 
 _HELP_COLUMNS = 120  # widest text of a help

@@ -27,7 +27,7 @@ def calibrate_sensor_command(
     - depth_bias: constant error of the distance
 
     The log shows texture and objects before a background, while the camera turns to and fro and moves sideways. A
-    quantity that the log does not tell is refused with its reason. The scale of depth needs a known length, and is not
+    quantity that the log does not determine is refused with its reason. The scale of depth needs a known length, and is not
     estimated.
 
     Examples:
@@ -50,10 +50,13 @@ def calibrate_sensor_command(
     found = calibrate_sensor(recording)
     if not quiet:
         print_table([(name, _row(e)) for name, e in found.estimates.items()], title=f"{recording.name}: sensor")
-    if not found.told:
+    if not found.known:
         refusals = "; ".join(f"{name}: {e.refusal}" for name, e in found.estimates.items())
         raise InputError(
-            f"tells nothing about the sensor ({refusals}).", file=log, field="motion", hint="record a moving camera"
+            f"does not determine any quantity of the sensor ({refusals}).",
+            file=log,
+            field="motion",
+            hint="record a moving camera",
         )
     if out is not None:
         calibration = recording.calibration

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_serializer, model_validator
@@ -316,15 +315,6 @@ class Config(_Section):
             self.__dict__["tracking"] = self.tracking.model_copy()
             self.tracking.__dict__["sensor"] = self.sensor
         return self
-
-    def with_sensor(self, values: Mapping[str, Any]) -> Config:
-        """Return the configuration with the values of a calibrated sensor for all keys that are not set.
-
-        Raises:
-            ValidationError: a key is unknown, or a value is out of range.
-        """
-        given = self.sensor.model_dump(include=self.sensor.model_fields_set)
-        return self.model_copy(update={"sensor": SensorConfig(**{**values, **given})})._share_sensor()
 
     def to_yaml(self) -> str:
         """Return the configuration in force as YAML that :func:`splatbot.config.load_config` reads back."""

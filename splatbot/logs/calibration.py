@@ -9,11 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from splatbot.atomic import atomic_write
 from splatbot.camera import Camera
-from splatbot.config import SensorConfig
 from splatbot.errors import CameraError
 
 
@@ -63,7 +60,10 @@ def read_calibration(path: str | Path) -> Calibration:
     calibration = make_calibration(
         path, values, scale_key="depth_scale", distortion=tuple(number(path, named, key) for key in named)
     )
-    return replace(calibration, sensor=_sensor(path, values.get("sensor", {})))
+    sensor = values.get("sensor", {})
+    if not isinstance(sensor, dict):
+        raise CameraError("is no JSON object.", file=path, field="sensor", hint='write {"readout": 0.03, ...}')
+    return replace(calibration, sensor=sensor)
 
 
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
@@ -102,21 +102,6 @@ def make_calibration(
     except CameraError as error:
         raise CameraError(error.message, file=path, field=error.field, hint=error.hint) from error
     return Calibration(camera, scale, str(path))
-
-
-def _sensor(path: str | Path, values: Any) -> dict[str, Any]:
-    """Check the values of a sensor by the configuration that they belong to."""
-    if not isinstance(values, dict):
-        raise CameraError("is no JSON object.", file=path, field="sensor", hint='write {"readout": 0.03, ...}')
-    try:
-        SensorConfig(**values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(["sensor", *map(str, first["loc"])])
-        raise CameraError(
-            f"{first['msg']}.", file=path, field=key, hint="`splatbot map --dump-config` prints all keys"
-        ) from error
-    return values
 
 
 def read_object(path: str | Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from splatbot.config import Config
+from splatbot.config import Config, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
 from splatbot.results.folder import RunFolder
@@ -97,7 +97,7 @@ def map_log(
         slam.localise_only()
     config = config or (slam.config if slam else Config())
     if slam is None:
-        config = config.with_sensor(log.calibration.sensor)
+        config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
     realtime = realtime or rate is not None
     if rate is not None and not 0 < rate < 1e4:
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 # so their total weight is that of this number.
 _CALIBRATED_PIXELS = 4800
 
+_SHARP = np.zeros(6)
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -72,7 +74,7 @@ class SoftPrior:
 
 
 def settings_of(
-    config: TrackingConfig, *, photometric: bool, gate: float, depth_sigma_scale: float = 1.0
+    config: TrackingConfig, *, photometric: bool, gate: float, depth_sigma_scale: float = 1.0, blur: Array = _SHARP
 ) -> _native.AlignSettings:
     """Return the noise model of the native kernels; ``depth_sigma_scale`` multiplies the σ of depth."""
     sensor = config.sensor
@@ -83,6 +85,7 @@ def settings_of(
         sigma_depth_floor=depth_sigma_scale * sensor.sigma_depth_floor,
         sigma_depth_quad=depth_sigma_scale * sensor.sigma_depth_quad,
         gate=gate,
+        blur=blur.tolist(),
     )
 
 
@@ -122,6 +125,7 @@ def align(
     features: FeaturePose | None = None,
     camera: Camera | None = None,
     prior: SoftPrior | None = None,
+    blur: Array = _SHARP,
 ) -> Alignment:
     """Align a frame to references from the coarsest level to the finest.
 
@@ -156,6 +160,8 @@ def align(
         features: matches of features. If None, no reprojection residuals are used.
         camera: camera of the features' pixels.
         prior: Gaussian prior of the pose. If None, the pose is not constrained by one.
+        blur: (6,) standard deviation β (translation [m], rotation [rad]) of the motion by which a blurred image may be
+            displaced. The variance of a residual with the Jacobian J becomes σ² + (J β)².
     """
     matches = None
     if features is not None and camera is not None:
@@ -167,7 +173,7 @@ def align(
         matches,
         None if prior is None else (inverse(prior.T_world_camera), prior.information),
         inverse(T_world_camera),
-        settings_of(config, photometric=photometric, gate=gate, depth_sigma_scale=scale),
+        settings_of(config, photometric=photometric, gate=gate, depth_sigma_scale=scale, blur=blur),
         config.dense_weight * _CALIBRATED_PIXELS / config.n_pixels,
         config.iterations,
         finest,

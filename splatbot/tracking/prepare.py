@@ -75,7 +75,7 @@ class PreparedFrame:
 
 
 def prepare(recorded: Frame, config: TrackingConfig, twist: NDArray[np.float64] = _AT_REST) -> PreparedFrame:
-    """Rectify a frame, and compute its pyramid, whose finest level is at most ``config.max_width`` pixels wide.
+    """Compute the pyramid of the rectified frame, whose finest level is at most ``config.max_width`` pixels wide.
 
     It has ``config.n_levels`` levels, or fewer if the next would be smaller than 12 pixels. The finest level determines
     the pose, and has no grey along occluding edges.

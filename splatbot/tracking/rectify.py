@@ -35,8 +35,8 @@ CONSTANTS = RectifyConstants()
 def rectify(frame: Frame, twist: Array, sensor: SensorConfig) -> Frame:
     """Return the images that a global shutter takes at the stamp of a frame, with depth registered to colour.
 
-    A point X that a row sees s seconds after the stamp is exp(s ξ) X in the camera at the stamp, for the constant
-    twist ξ of the camera (Hedborg et al. 2012). The depth image is resampled first; it defines the displacement of
+    A row sees a point X s seconds after the stamp. In the camera at the stamp it is exp(s ξ) X, with the constant twist
+    ξ of the camera (Hedborg et al. 2012). The depth image is resampled first; it defines the displacement of
     colour. Nothing is resampled that the sensor and the twist do not displace.
 
     Args:
@@ -55,10 +55,10 @@ def rectify(frame: Frame, twist: Array, sensor: SensorConfig) -> Frame:
         depth = np.asarray(_native.rectify_depth(depth, intrinsics, *timing, se3_exp(T_color_depth)))
     if not (moves and sensor.readout):
         return frame if depth is frame.depth else replace(frame, depth=depth)
-    at = np.asarray(_native.rectify_map(depth, intrinsics, velocity, sensor.readout, 0.0))
-    rgb = cv2.remap(frame.rgb, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    u, v = np.moveaxis(_native.rectify_map(depth, intrinsics, velocity, sensor.readout, 0.0), -1, 0)
+    rgb = cv2.remap(frame.rgb, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     mask = np.ones(depth.shape, np.uint8) if frame.mask is None else frame.mask.astype(np.uint8)
-    seen = cv2.remap(mask, at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    seen = cv2.remap(mask, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
     return replace(frame, rgb=np.asarray(rgb, np.uint8), depth=np.where(seen, depth, np.float32(0)), mask=seen)
 
 

@@ -157,7 +157,7 @@ class Tracker:
     def _rectify_again(
         self, best: ScoredHypothesis, problem: TrackingProblem, scheduler: StageScheduler
     ) -> ScoredHypothesis:
-        """Rectify the frame by the velocity that its pose implies, and align it again, until its rows stay in place."""
+        """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
         readout, depth = self.config.sensor.readout, typical_depth(problem.prepared)
         if not readout:
             return best

@@ -87,8 +87,8 @@ class CameraVelocity:
 def twist_of_rows(alignment: Alignment, used: Array, prior: Array, sigma: Array, readout: float) -> Array:
     """Estimate the twist (6,) of the camera during a frame from its residuals and a prior.
 
-    The residuals of a rectified image depend on the pose and on the error of its twist. A point that a row sees s
-    seconds after the stamp moves by δ - s η for a left increment δ of T_camera_world and a correction η of the twist.
+    The residuals of a rectified image depend on the pose and on the error of its twist. A left
+    increment δ of T_camera_world and a correction η of the twist move a point by δ - s η, s seconds after the stamp.
     With the normal equations (H_b, g_b) of bands of rows at times s_b and the information Λ of the prior, η solves::
 
         [Σ H_b        -Σ s_b H_b     ] [δ]   [-Σ g_b                  ]

@@ -26,7 +26,7 @@ from splatbot.bench.tracking import (
 )
 from splatbot.bench.tracking.peers import Odometry, tracking_peers
 from splatbot.bench.tracking.stress import run_stress
-from splatbot.config import Config, load_config
+from splatbot.config import Config, load_config, with_sensor
 from splatbot.evaluation import absolute_error, nees, relative_error
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
@@ -93,7 +93,8 @@ def run_tracking(settings: TrackingSettings, report_progress: ReportProgress = i
     logs = [open_log(address, camera=settings.camera) for address in settings.addresses]
     results = Results(describe_machine((1,), peak_ms=20))
     for name, log in zip(distinct([log.name for log in logs]), logs, strict=True):
-        for contender in contenders(settings, config.with_sensor(log.calibration.sensor)):
+        calibrated = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
+        for contender in contenders(settings, calibrated):
             report_progress(f"{name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
             add_rows(results, log, contender, run_log(log, contender.make(), settings.max_frames), name)
     if settings.stress:

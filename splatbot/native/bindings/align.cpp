@@ -67,15 +67,16 @@ void define_align(nb::module_& m) {
       .def(
           "__init__",
           [](splatbot::AlignSettings* self, bool photometric, bool geometric, double sigma_gray,
-             double sigma_depth_floor, double sigma_depth_quad, double gate) {
+             double sigma_depth_floor, double sigma_depth_quad, double gate, const std::array<double, 6>& blur) {
             new (self) splatbot::AlignSettings{.use_photometric = photometric,
                                                .use_geometric = geometric,
                                                .sigma_gray = sigma_gray,
                                                .sigma_depth_floor = sigma_depth_floor,
                                                .sigma_depth_quad = sigma_depth_quad,
-                                               .gate = gate};
+                                               .gate = gate,
+                                               .blur = blur};
           },
-          "photometric"_a, "geometric"_a, "sigma_gray"_a, "sigma_depth_floor"_a, "sigma_depth_quad"_a, "gate"_a);
+          "photometric"_a, "geometric"_a, "sigma_gray"_a, "sigma_depth_floor"_a, "sigma_depth_quad"_a, "gate"_a, "blur"_a = std::array<double, 6>{});
   m.def(
       "linearize_alignment",
       [](Image gray, Image depth, Intrinsics intrinsics, Rows3 points, Rows3 normals, Vector gray_reference,

@@ -23,8 +23,8 @@ constexpr double kRectifyTolerance = 0.75;  // [px]
 void rectify_depth(const DepthImage& depth, const Pinhole& camera, const RowMotion& motion,
                    std::span<const double, 16> T_color_depth, std::span<float> out);
 
-// out (H, W, 2): the pixel (u, v) of the rolling-shutter image at which each pixel of the image at the stamp is seen.
-// depth is that of the stamp; a pixel without depth takes that of the last one in its row, or moves as if infinitely far.
+// out (H, W, 2): the pixel (u, v) of the rolling-shutter image that shows each pixel of the image at the stamp. The
+// depth is that of the stamp. A pixel without depth takes that of the last one in its row, or moves as if very far.
 void rectify_map(const DepthImage& depth, const Pinhole& camera, const RowMotion& motion, std::span<float> out);
 
 }  // namespace splatbot
