@@ -236,6 +236,7 @@ class Slam:
     def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
         keyframes = self._mapper.keyframes
         if keyframes:
+            self._tracker.variance_scale = self._mapper.inconsistency
             return self._tracker.track(prepared, keyframes)
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")

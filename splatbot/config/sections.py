@@ -207,11 +207,8 @@ class MappingConfig(_Section):
     keyframe_rotation: float = Field(
         default=0.07, gt=0, description="rotation to every keyframe from which a frame is a new keyframe [rad]"
     )
-    keyframe_patience: float = Field(
-        default=2.0,
-        ge=1,
-        description="factor on both limits for a blurred, fast or degraded frame, which waits for a better one; 1 "
-        "takes any frame",
+    replace_poor: bool = Field(
+        default=True, description="a blurred or degraded keyframe is replaced by a better view of the same place"
     )
     max_keyframes: int = Field(
         default=300, ge=10, description="hard cap on keyframes, 3 MB each; the most redundant are dropped: memory"
@@ -283,14 +280,16 @@ class LoopsConfig(_Section):
 
 
 class BundleConfig(_Section):
-    """Bundle adjustment: joint poses of the keyframes that see the same features."""
+    """Bundle adjustment: joint poses of the keyframes that see the same place. It needs ``loops.enabled``."""
+
+    PUBLIC: ClassVar[frozenset[str]] = frozenset({"enabled"})
 
     enabled: bool = Field(default=True, description="adjust the poses of keyframes to each other")
     window: int = Field(
         default=8, ge=2, description="latest keyframes that move if the new one revisits none: accuracy for time"
     )
     pairs: int = Field(
-        default=10, ge=1, description="earlier keyframes that each new one is matched with: accuracy for time"
+        default=6, ge=1, description="earlier keyframes that each new one is matched with: accuracy for time"
     )
     min_translation: float = Field(default=0.002, gt=0, description="smaller corrections do not move the map [m]")
     min_rotation: float = Field(default=0.001, gt=0, description="smaller corrections do not move the map [rad]")

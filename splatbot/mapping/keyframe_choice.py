@@ -10,9 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.mapping.observation import Observation
-from splatbot.tracking.nearby_keyframes import pose_distance
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -22,45 +19,30 @@ class KeyframeChoiceConstants:
     Args:
         recent: frames whose sharpness is compared.
         blurred: sharpness below this share of the median of the recent frames is blurred.
-        max_rate: [rad/s] a frame that turns faster is poor: rolling shutter and blur distort it.
-        max_gap: [s] frames farther apart say nothing about the rate within a frame.
     """
 
     recent: int = 15
     blurred: float = 0.7
-    max_rate: float = 1.0
-    max_gap: float = 0.2
 
 
 CONSTANTS = KeyframeChoiceConstants()
 
 
 class FrameQuality:
-    """Judges each frame as a keyframe by its verdict, its sharpness and its angular rate.
+    """Judges each frame as a keyframe by its verdict and its sharpness.
 
     The tracking thread calls :meth:`is_poor` once per frame, in order.
     """
 
     def __init__(self) -> None:
         self._recent: deque[float] = deque(maxlen=CONSTANTS.recent)
-        self._last: tuple[float, Array] | None = None
 
     def is_poor(self, observation: Observation) -> bool:
-        """Return whether a better frame of the same place is likely to come; a lost frame is poor."""
-        p, last = CONSTANTS, self._last
-        if observation.verdict == "lost":
-            self._last = None
-            return True
-        self._last = observation.stamp, observation.T_world_camera
+        """Return whether a better frame of the same place is likely to come."""
         sharpness = sharpness_of(observation.prepared.levels[0].gray)
         typical = float(np.median(self._recent)) if self._recent else sharpness
         self._recent.append(sharpness)
-        if observation.verdict == "degraded" or sharpness < p.blurred * typical:
-            return True
-        if last is None or not 0 < observation.stamp - last[0] <= p.max_gap:
-            return False
-        turned = pose_distance(last[1], observation.T_world_camera)[1]
-        return turned / (observation.stamp - last[0]) > p.max_rate
+        return observation.verdict != "ok" or sharpness < CONSTANTS.blurred * typical
 
 
 def sharpness_of(gray: NDArray[np.float32]) -> float:

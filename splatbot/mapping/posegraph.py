@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.geometry import inverse, se3_log
+from splatbot.tracking.nearby_keyframes import pose_distance
 
 Array = NDArray[np.float64]
 Adjacency = Mapping[int, tuple[int, ...]]
 
 _CAUCHY_SIGMA = 1.0  # scale of the Cauchy loss of loop edges [σ]
 _COVISIBLE_CAUCHY_SIGMA = 3.0  # the same of covisible pairs; six residuals of 1 σ have the norm 2.4
+_DRIFT_SIGMA = 5e-3  # standard deviation of the odometry error, relative to the motion [m/m], [rad/rad]
 # Least covariance of an edge: standard deviations of 1 mm and 0.5 mrad, however small the residuals of its alignment.
 _LEAST_COVARIANCE = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
 
@@ -151,6 +153,15 @@ def max_residual(residuals: Iterable[Array]) -> tuple[float, float]:
     return moved, max((float(np.linalg.norm(r[3:])) for r in found), default=0.0)
 
 
+def drift_covariance(T: Array) -> Array:
+    """Compute the covariance (6, 6) of the odometry error, which grows with the motion (4, 4).
+
+    σ_t = s (‖t‖ + θ · 1 m) and σ_ω = s θ, with s = 0.5 %: errors of lens and depth calibration add up over the path.
+    """
+    moved, turned = pose_distance(np.eye(4), T)
+    return np.diag([(_DRIFT_SIGMA * (moved + turned)) ** 2] * 3 + [(_DRIFT_SIGMA * turned) ** 2] * 3)
+
+
 def _noise_model(covariance: Array) -> gtsam.noiseModel.Base:
     """Convert a covariance (6, 6); GTSAM's twists begin with the rotation."""
     order = [3, 4, 5, 0, 1, 2]
@@ -158,7 +169,7 @@ def _noise_model(covariance: Array) -> gtsam.noiseModel.Base:
 
 
 def orthonormal(T: Array) -> Array:
-    """Return the nearest pose with an exact rotation, by polar decomposition."""
+    """Return the nearest pose (4, 4) with an exact rotation, by polar decomposition."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = U @ Vt, T[:3, 3]

@@ -217,51 +217,27 @@ def match_pose(
     image, world, sigmas = _matches(current, keyframes, camera, expected)
     if len(image) < CONSTANTS.min_inliers:
         return None
-    found = ransac_pose(world, image, camera, CONSTANTS.max_reprojection)
-    if found is None or len(found[1]) < CONSTANTS.min_inliers:
-        return None
-    T_world_camera, agree = found
-    pose = FeaturePose(T_world_camera, world[agree], image[agree], sigmas[agree], len(image))
-    return pose if expected is None or _confirms(pose, camera, expected) else None
-
-
-def ransac_pose(world: Array, image: Array, camera: Camera, max_reprojection: float) -> tuple[Array, Index] | None:
-    """Estimate a pose from matches with outliers by P3P in RANSAC, and refine it by Levenberg-Marquardt.
-
-    Args:
-        world: (M, 3) [m] points.
-        image: (M, 2) [px] their pixels.
-        camera: camera of the pixels.
-        max_reprojection: largest reprojection error [px] of an inlier.
-
-    Returns:
-        T_world_camera (4, 4) and the indices of the inliers, or None if no pose is found or it is not finite.
-    """
-    if len(image) < 4:
-        return None
     found, r, t, inliers = cv2.solvePnPRansac(
         world,
         image,
         camera.K,
         None,
         iterationsCount=CONSTANTS.ransac_iterations,
-        reprojectionError=max_reprojection,
+        reprojectionError=CONSTANTS.max_reprojection,
         confidence=CONSTANTS.ransac_confidence,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not found or inliers is None or len(inliers) < 4:
+    if not found or inliers is None or len(inliers) < CONSTANTS.min_inliers:
         return None
-    agree = inliers[:, 0].astype(np.intp)
+    agree = inliers[:, 0]
     r, t = cv2.solvePnPRefineLM(world[agree], image[agree], camera.K, None, r, t)
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3] = cv2.Rodrigues(r)[0]
     T_camera_world[:3, 3] = t[:, 0]
-    return (inverse(T_camera_world), agree) if np.isfinite(T_camera_world).all() else None
-
-
-def match_features(current: Features, descriptors: NDArray[np.uint8]) -> tuple[Index, Index]:
-    """Match descriptors (M, 32) with all keypoints of an image, and return indices of keypoints and of descriptors."""
-    return match(current, descriptors, np.zeros((len(descriptors), 2), np.float32), np.inf)
+    if not np.isfinite(T_camera_world).all():
+        return None
+    pose = FeaturePose(inverse(T_camera_world), world[agree], image[agree], sigmas[agree], len(image))
+    return pose if expected is None or _confirms(pose, camera, expected) else None
 
 
 def _matches(

@@ -51,6 +51,8 @@ class Tracker:
         self._velocity = CameraVelocity()
         self._lost = False
         self._keyframe_uncertainty: WeakKeyDictionary[Features, Uncertainty] = WeakKeyDictionary()
+        self.variance_scale = 1.0
+        """Factor on the covariance of poses against keyframes: how much the keyframes contradict each other."""
         self._last_covariance: Array = np.zeros((6, 6))  # of the last pose against its keyframes
         self._costs = None if config.deterministic else CostModel()
         self._stages = StageSet.create()
@@ -191,7 +193,7 @@ class Tracker:
         """Compute the uncertainty of a pose in the world from its own and that of its keyframes."""
         exact, known = Uncertainty(), self._keyframe_uncertainty
         keyframes = [(k.reference.T_world_camera, known.get(k.features, exact)) for k in pose.hypothesis.keyframes]
-        return world_uncertainty(pose.T_world_camera, pose.covariance, keyframes)
+        return world_uncertainty(pose.T_world_camera, self.variance_scale * pose.covariance, keyframes)
 
     def _confirm_relocalization(self, stamp: float, pose: ScoredHypothesis) -> ScoredHypothesis:
         """Accept a pose found while lost only if it agrees with that of the previous frame."""
