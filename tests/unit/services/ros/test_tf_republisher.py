@@ -74,6 +74,12 @@ def test_topics_and_frames_are_bounded(graph: RosGraph, monkeypatch: pytest.Monk
         ask(graph, target_frame=name)
     with pytest.raises(InputError, match="2 already"):
         ask(graph, target_frame="c")
-    for wrong in ({"source_frames": ["a"] * 4}, {"source_frames": []}, {"target_frame": ""}, {"rate": "fast"}):
+    requests: list[dict[str, Any]] = [
+        {"source_frames": ["a"] * 4},
+        {"source_frames": []},
+        {"target_frame": ""},
+        {"rate": "fast"},
+    ]
+    for wrong in requests:
         with pytest.raises(InputError):
             ask(graph, **wrong)
