@@ -57,9 +57,9 @@ def info(
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         fit_plane: estimate the plane of the table or floor and propose a base of a robot. They are written to
             scene.yaml next to the map, with the picture scene.png. A doubtful estimate is not written.
-        up: with --fit-plane, upwards in the first camera (x right, y down, z ahead), as 0 -1 0 for a camera that looked
-            ahead and 0 0 -1 for one that looked straight down. It replaces an existing estimate. By default the log's accelerometer decides, if there is
-            one, else the planes of the map.
+        up: with --fit-plane, upwards in the first camera (x right, y down, z ahead). It is 0 -1 0 for a camera that
+            looked ahead, and 0 0 -1 for one that looked straight down. It replaces an existing estimate. By default
+            the log's accelerometer decides, if there is one, else the planes of the map.
     """
     from splatbot.cli.fit_plane import fit_plane as fit_plane_command
 
