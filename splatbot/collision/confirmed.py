@@ -66,7 +66,9 @@ class ConfirmedSpace:
         return ConfirmedSpace(*kept, self.free, self.proposed)
 
 
-def find_confirmed(views: Sequence[DepthView], *, floor: float, quad: float) -> ConfirmedSpace:
+def find_confirmed(
+    views: Sequence[DepthView], *, floor: float, quad: float, agreeing_views: int = CONSTANTS.agreeing_views
+) -> ConfirmedSpace:
     """Find confirmed space by comparing points of every view with all other views.
 
     A pixel of a view proposes a surface point. It is confirmed if two other views measure the same depth there within
@@ -78,6 +80,7 @@ def find_confirmed(views: Sequence[DepthView], *, floor: float, quad: float) -> 
         views: depth (H, W) [m], 0 or NaN where invalid, camera, and T_world_camera (4, 4) of each view.
         floor: constant part of the standard deviation σ of depth [m].
         quad: part of σ that grows with z² [1/m].
+        agreeing_views: number of other views that confirm a surface point.
 
     Raises:
         InputError: the size of a depth image differs from its camera's.
@@ -100,7 +103,8 @@ def find_confirmed(views: Sequence[DepthView], *, floor: float, quad: float) -> 
         )
     surface, free, z, owner = (np.concatenate(parts) for parts in (surfaces, frees, depths, owners))
     pixel = np.concatenate(pixels)
-    solid = _agreed(surface, z, owner, views, floor, quad)
+    agreeing, clear = _agreeing(surface, owner, views, floor, quad)
+    solid = clear & (agreeing >= agreeing_views)
     empty = _passed(free, owner, views)
     return ConfirmedSpace(surface[solid], z[solid], owner[solid], pixel[solid], free[empty], len(surface))
 
@@ -126,9 +130,10 @@ def _lifted(column: NDArray[np.int64], row: NDArray[np.int64], z: Array, camera:
     return transform_points(T, ray * z[:, None])
 
 
-def _agreed(
-    points: Array, z: Array, owner: NDArray[np.int64], views: Sequence[DepthView], floor: float, quad: float
-) -> NDArray[np.bool_]:
+def _agreeing(
+    points: Array, owner: NDArray[np.int64], views: Sequence[DepthView], floor: float, quad: float
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Return how many other views measure each point (P,), and whether hardly any sees through it (P,)."""
     agreeing, passing, measuring = (np.zeros(len(points), np.int32) for _ in range(3))
     for number, view in enumerate(views):
         rows, measured, own = measured_depths(points, *view)
@@ -137,7 +142,7 @@ def _agreed(
         agreeing[rows[np.abs(measured - own) <= CONSTANTS.agreement_sigma * (floor + quad * own**2)]] += 1
         passing[rows[measured - own > passing_distance(own)]] += 1
         measuring[rows] += 1
-    return (agreeing >= CONSTANTS.agreeing_views) & (passing <= CONSTANTS.through_share * measuring)
+    return agreeing, passing <= CONSTANTS.through_share * measuring
 
 
 def _passed(points: Array, owner: NDArray[np.int64], views: Sequence[DepthView]) -> NDArray[np.bool_]:

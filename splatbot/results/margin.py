@@ -29,6 +29,9 @@ class RunMarginConstants:
     confidence: float = 0.999
     """Quantile [1] of the surface error that the margin covers. A larger one gives a larger margin, which outliers
     determine."""
+    agreeing_views: int = 1
+    """Number of other frames [1] that confirm a surface point. The audit requires two; a margin must also cover surface
+    that only two frames saw."""
     region: float = 0.2
     """Distance [m] of the arm's sphere centers within which points belong to the region of a motion. A larger one
     averages over more surface."""
@@ -85,15 +88,21 @@ def audited_error(run: str | Path, log: Log, field: GaussianCollisionField) -> A
     Raises:
         FormatError: the folder is damaged.
         LogError: the log is damaged.
-        InputError: no surface point is confirmed, as in a run of fewer than three frames.
+        InputError: no surface point is confirmed, as in a run of a single frame.
     """
     folder = RunFolder(run)
     sensor = folder.load_config().sensor
     _, views = raw_views(folder, log)
-    audit = audit_surfaces(field, find_confirmed(views, floor=sensor.sigma_depth_floor, quad=sensor.sigma_depth_quad))
+    space = find_confirmed(
+        views,
+        floor=sensor.sigma_depth_floor,
+        quad=sensor.sigma_depth_quad,
+        agreeing_views=CONSTANTS.agreeing_views,
+    )
+    audit = audit_surfaces(field, space)
     if not len(audit.distance):
         raise InputError(
-            "has no surface point that three frames measured.",
+            "has no surface point that two frames measured.",
             file=run,
             field="margin",
             hint="give the margin in metres",

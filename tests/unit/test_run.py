@@ -34,7 +34,16 @@ DESIGN_NAMES = {
     "frames", "tracked", "lost", "ate_rmse_m", "rpe_trans_rmse_m", "psnr_holdout_db", "depth_l1_m", "gaussians",
     "map_bytes", "peak_rss_bytes", "ms_per_frame", "stages", "effects",
 }  # fmt: skip
-FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "SHA256SUMS"}
+FILES = {
+    "config.yaml",
+    "trajectory.tum",
+    "frames.jsonl",
+    "metrics.json",
+    "map.ply",
+    "audit.json",
+    "report.html",
+    "SHA256SUMS",
+}
 
 
 @pytest.fixture
