@@ -86,8 +86,9 @@ def estimate_rows(views: Sequence[View], pairs: Sequence[Pair], camera: Camera) 
             H, g = clusters.get(pair.first, (np.zeros((2, 2)), np.zeros(2)))
             clusters[pair.first] = (H + system.H, g + system.g)
         A = sum((H for H, _ in clusters.values()), _WEAK_INFORMATION)
-        step: Array = -np.linalg.solve(A, sum((g for _, g in clusters.values()), np.zeros(2)))
-        shared = shared + step
+        gradient = sum((g for _, g in clusters.values()), np.zeros(2))
+        step = np.asarray(-np.linalg.solve(A, gradient), dtype=np.float64)
+        shared = np.asarray(shared + step, dtype=np.float64)
         for pair, system in zip(usable, systems, strict=True):
             pair.T_second_first = updated(pair.T_second_first, system.pose_step(step))
     sigmas = np.sqrt(np.diag(_sandwich(list(clusters.values()))) + np.array([p.readout_floor, p.bias_floor]) ** 2)
@@ -182,6 +183,6 @@ def _sandwich(clusters: Sequence[tuple[Array, Array]]) -> Array:
     The second term exceeds the first only where residuals determine little, as in a log at rest.
     """
     n = len(clusters)
-    A: Array = np.linalg.inv(sum((H for H, _ in clusters), _WEAK_INFORMATION))
+    A = np.asarray(np.linalg.inv(sum((H for H, _ in clusters), _WEAK_INFORMATION)), dtype=np.float64)
     S = sum((np.outer(g, g) for _, g in clusters), np.zeros((2, 2)))
-    return np.asarray(A @ S @ A * n / max(n - 2, 1) + A)
+    return np.asarray(A @ S @ A * n / max(n - 2, 1) + A, dtype=np.float64)

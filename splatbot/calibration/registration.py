@@ -81,7 +81,7 @@ def estimate_depth_timing(frames: Sequence[Frame], twists: Mapping[int, Array]) 
     if edges < p.min_edges or any(volume.ndim == 1 for volume in volumes):
         refused = [Estimate(0.0, np.inf, unit, f"too few depth edges: {need}") for unit in ("px", "px", "s")]
         return DepthTiming(*refused)
-    total: Array = sum(volumes, np.zeros(1))
+    total = np.asarray(sum(volumes, np.zeros(1)), dtype=np.float64)
     best = _peak(total, frames[0])
     others = np.array([_peak(total - volume, frames[0]) for volume in volumes])
     spread = (p.blocks - 1) / p.blocks * ((others - others.mean(0)) ** 2).sum(0)

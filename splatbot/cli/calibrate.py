@@ -27,8 +27,8 @@ def calibrate_sensor_command(
     - depth_bias: constant error of the distance
 
     The log shows texture and objects before a background, while the camera turns to and fro and moves sideways. A
-    quantity that the log does not determine is refused with its reason. The scale of depth needs a known length, and is not
-    estimated.
+    quantity that the log does not determine is refused with its reason. The scale of depth is not estimated, because it
+    needs a known length.
 
     Examples:
         splatbot calibrate sensor recordings/shake --out camera.json

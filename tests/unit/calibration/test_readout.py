@@ -1,4 +1,4 @@
-"""Readout time and bias: recovered from exact projections with noise, and refused where features do not determine them."""
+"""Readout time and bias: recovered from projections with noise, refused where features do not determine them."""
 
 from __future__ import annotations
 
