@@ -128,8 +128,8 @@ def contenders(settings: TrackingSettings, config: Config) -> Iterator[Contender
     for budget in settings.budgets:
         limited = _with_budget(config, budget)
         yield Contender(None, f"{budget:g} ms", "", lambda limited=limited: SlamOdometry(limited))  # type: ignore[misc]
-    for change, *setting in ABLATIONS if settings.ablation else ():
-        changed = _with_value(_with_budget(config, settings.budgets[0]), *setting)
+    for change, section, key, value in ABLATIONS if settings.ablation else ():
+        changed = _with_value(_with_budget(config, settings.budgets[0]), section, key, value)
         name = f"{settings.budgets[0]:g} ms {change}"
         yield Contender(None, name, "", lambda changed=changed: SlamOdometry(changed))  # type: ignore[misc]
     for peer in tracking_peers() if not settings.no_peers else ():
