@@ -208,7 +208,7 @@ class MappingConfig(_Section):
         default=0.07, gt=0, description="rotation to every keyframe from which a frame is a new keyframe [rad]"
     )
     replace_poor: bool = Field(
-        default=True, description="a blurred or degraded keyframe is replaced by a better view of the same place"
+        default=False, description="a blurred or degraded keyframe is replaced by a better view of the same place"
     )
     max_keyframes: int = Field(
         default=300, ge=10, description="hard cap on keyframes, 3 MB each; the most redundant are dropped: memory"

@@ -36,10 +36,10 @@ from splatbot.protocols import Array
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
 
-# Parts that an ablation switches off: name, section and key of the setting.
+# Changes of an ablation: name, section, key and value of the setting.
 ABLATIONS = (
-    ("bundle adjustment", "bundle", "enabled"),
-    ("replaced keyframes", "mapping", "replace_poor"),
+    ("without bundle adjustment", "bundle", "enabled", False),
+    ("with replaced keyframes", "mapping", "replace_poor", True),
 )
 
 
@@ -123,14 +123,14 @@ def distinct(names: Sequence[str]) -> list[str]:
 
 
 def contenders(settings: TrackingSettings, config: Config) -> Iterator[Contender]:
-    """Yield splatbot with each budget, then without each of its parts if that is asked for, then its peers."""
+    """Yield splatbot with each budget, then the changes of an ablation if that is asked for, then its peers."""
     for budget in settings.budgets:
         limited = _with_budget(config, budget)
         yield Contender(None, f"{budget:g} ms", "", lambda limited=limited: SlamOdometry(limited))  # type: ignore[misc]
-    for part, section, key in ABLATIONS if settings.ablation else ():
-        without = _with_value(_with_budget(config, settings.budgets[0]), section, key, False)
-        setting = f"{settings.budgets[0]:g} ms without {part}"
-        yield Contender(None, setting, "", lambda without=without: SlamOdometry(without))  # type: ignore[misc]
+    for change, section, key, value in ABLATIONS if settings.ablation else ():
+        changed = _with_value(_with_budget(config, settings.budgets[0]), section, key, value)
+        name = f"{settings.budgets[0]:g} ms {change}"
+        yield Contender(None, name, "", lambda changed=changed: SlamOdometry(changed))  # type: ignore[misc]
     for peer in tracking_peers() if not settings.no_peers else ():
         yield Contender(peer.name, "", peer.note, peer.make)
 

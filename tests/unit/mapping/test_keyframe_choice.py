@@ -38,7 +38,7 @@ def test_a_blurred_and_a_degraded_frame_among_sharp_ones_are_poor() -> None:
 
 
 def test_a_sharp_view_replaces_a_poor_keyframe_of_the_same_place_but_never_the_first_one() -> None:
-    mapper = Mapper(small_config())
+    mapper = Mapper(small_config(mapping__replace_poor=True))
     poor, sharp = replace(observed(3), is_poor=True), observed(3)
     for observation in (replace(observed(0), is_poor=True), poor):
         mapper.submit(observation)
