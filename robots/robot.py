@@ -54,6 +54,8 @@ class GripperGeometry:
         shapes: shapes of one finger in its own frame; their ``link`` is ignored.
         speed: speed of each finger [m/s].
         force: force between the fingers [N].
+        covering: spheres of one finger in its own frame; their ``link`` is ignored. If None, they are generated from
+            the shapes.
     """
 
     T_link_finger: Array
@@ -61,6 +63,7 @@ class GripperGeometry:
     shapes: tuple[Shape, ...]
     speed: float = 0.2
     force: float = 70.0
+    covering: LinkSpheres | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,7 @@ class RobotModel:
         allowed: pairs of links that may touch, in addition to neighbours and links whose spheres overlap at home.
         covering: spheres of the links. If None, they are generated from the shapes.
         pairs: (M, 2) links that may not touch. If None, they are derived from the spheres.
+        hand_shape: boxes around the gripper. If None, they are measured on the shapes.
 
     Raises:
         InputError: joints, home and shapes are inconsistent.
@@ -95,6 +99,7 @@ class RobotModel:
     allowed: tuple[tuple[int, int], ...] = ()
     covering: LinkSpheres | None = field(default=None, repr=False)
     pairs: NDArray[np.int32] | None = field(default=None, repr=False)
+    hand_shape: HandShape | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.home) != len(self.joints):
@@ -185,6 +190,8 @@ class RobotModel:
     @cached_property
     def hand(self) -> HandShape | None:
         """Boxes around the shapes of the gripper, whose fingers open along the tool's y axis; None without one."""
+        if self.hand_shape is not None:
+            return self.hand_shape
         if self.gripper is None or not self.gripper.shapes:
             return None
         T_tcp_link = inverse(self.T_link_tcp)
@@ -258,6 +265,8 @@ class RobotModel:
 
     @cached_property
     def _finger_spheres(self) -> LinkSpheres:
+        if self.gripper is not None and self.gripper.covering is not None:
+            return self.gripper.covering
         return _covered(self.gripper.shapes if self.gripper else (), self.slack / 2)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import HasHand
-from splatbot.robots.cover import uncovered
+from splatbot.robots.containment import uncovered
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from splatbot.collision import RobotSpheres
 from splatbot.errors import FormatError, InputError
 from splatbot.protocols import Array
-from splatbot.robots.cover import uncovered
+from splatbot.robots.containment import uncovered
 from splatbot.robots.store import load_robot, read_robot, robot_names, save_robot
 from splatbot.robots.urdf import read_urdf
 
