@@ -58,7 +58,7 @@ _HAND = HandShape(
     pad=-0.0037,
     pad_width=0.0,
     palm=0.0374,
-    palm_size=(0.0632, 0.208),
+    palm_size=(0.0634, 0.208),
 )
 # Links that may not touch. Neighbours always do, and so do their spheres.
 PAIRS = tuple((a, b) for a in range(8) for b in range(a + 2, 8))
