@@ -49,7 +49,9 @@ def open_pieces(triangles: Array, centers: Array, radii: Array, size: float = CO
         some = waiting.pop()
         for k in range(0, len(some), CONSTANTS.chunk):
             pieces = some[k : k + CONSTANTS.chunk]
-            pieces = pieces[~(beyond(pieces, centers, radii) <= 0).any(axis=1)]
+            corners, rows = np.unique(pieces.reshape(-1, 3), axis=0, return_inverse=True)
+            inside = np.stack([np.linalg.norm(corners - c, axis=1) <= r for c, r in zip(centers, radii, strict=True)])
+            pieces = pieces[~inside[:, rows.reshape(-1, 3)].all(axis=2).any(axis=0)]
             edges = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
             small = edges.max(axis=1) <= size
             left.append(pieces[small])

@@ -54,11 +54,11 @@ _HAND = HandShape(
     stroke=0.08,
     width=0.025,
     thickness=0.0265,
-    tip=0.009,
+    tip=0.0088999,
     pad=-0.0037,
     pad_width=0.0,
     palm=0.0374,
-    palm_size=(0.0632, 0.208),
+    palm_size=(0.0634, 0.208),
 )
 # Links that may not touch. Neighbours always do, and so do their spheres.
 PAIRS = tuple((a, b) for a in range(8) for b in range(a + 2, 8))
@@ -135,7 +135,7 @@ def _arm_shapes() -> list[Capsule]:
 
 def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
     """Return a capsule in the body of the hand."""
-    start, end = (T_link_hand @ np.array([0.0, y, 0.036, 1.0]) for y in (-0.066, 0.066))
+    start, end = (T_link_hand @ np.array([0.0, y, 0.036, 1.0]) for y in (-0.064, 0.064))
     return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.025)]
 
 

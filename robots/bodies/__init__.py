@@ -13,7 +13,7 @@ from splatbot.errors import FormatError, InputError
 from splatbot.protocols import Array, LinkSpheres
 from splatbot.robots.containment import open_pieces, slack_of
 from splatbot.robots.cover import cover_solids
-from splatbot.robots.maker_meshes import SOURCES, ReportProgress, Source
+from splatbot.robots.maker_meshes import ReportProgress, Source
 
 
 @dataclass(frozen=True, eq=False)
