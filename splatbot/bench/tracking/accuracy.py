@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 
 # Changes of an ablation: name, section, key and value of the setting.
 ABLATIONS = (
-    ("without bundle adjustment", "bundle", "enabled", False),
+    ("with bundle adjustment", "bundle", "enabled", True),
     ("with replaced keyframes", "mapping", "replace_poor", True),
 )
 
