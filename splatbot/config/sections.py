@@ -284,7 +284,7 @@ class BundleConfig(_Section):
 
     PUBLIC: ClassVar[frozenset[str]] = frozenset({"enabled"})
 
-    enabled: bool = Field(default=True, description="adjust the poses of keyframes to each other")
+    enabled: bool = Field(default=False, description="adjust the poses of keyframes to each other")
     window: int = Field(
         default=8, ge=2, description="latest keyframes that move if the new one revisits none: accuracy for time"
     )

@@ -212,6 +212,10 @@ class LoopCloser:
             measured = self._measure(other, keyframe, prepared)
             if measured is not None and self._is_reliable(measured) and measured.matches > 0:
                 T = measured.T_keyframe_camera
+                moved, turned = pose_distance(inverse(other.T_world_camera) @ keyframe.T_world_camera, T)
+                if max(moved, turned) > CONSTANTS.drift_offset:  # repeated texture, or a loop to be confirmed
+                    self.rejected += 1
+                    continue
                 edges.append(
                     Edge(other.number, keyframe.number, T, measured.covariance + drift_covariance(T), covisible=True)
                 )

@@ -38,7 +38,7 @@ from splatbot.trajectory import Trajectory
 
 # Changes of an ablation: name, section, key and value of the setting.
 ABLATIONS = (
-    ("without bundle adjustment", "bundle", "enabled", False),
+    ("with bundle adjustment", "bundle", "enabled", True),
     ("with replaced keyframes", "mapping", "replace_poor", True),
 )
 
