@@ -115,7 +115,7 @@ def image_velocity(frame: Frame, twist: Array) -> Array:
 
 def _delays() -> Array:
     count = round(CONSTANTS.delay_range / CONSTANTS.delay_step)
-    return CONSTANTS.delay_step * np.arange(-count, count + 1)
+    return np.asarray(CONSTANTS.delay_step * np.arange(-count, count + 1), dtype=np.float64)
 
 
 def _shift_radius(frame: Frame) -> int:
