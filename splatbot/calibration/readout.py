@@ -123,7 +123,9 @@ class _Reduced:
 
     def pose_step(self, shared_step: Array) -> Array:
         """Return the left increment (6,) of the pose that belongs to a step (2,) of readout time and bias."""
-        return -np.linalg.solve(self.H_pose, self.g_pose + self.H_pose_shared @ shared_step)
+        return np.asarray(
+            -np.linalg.solve(self.H_pose, self.g_pose + self.H_pose_shared @ shared_step), dtype=np.float64
+        )
 
 
 def _reduced(pair: Pair, twists: Mapping[int, Array], shared: Array, camera: Camera, pixel_sigma: float) -> _Reduced:

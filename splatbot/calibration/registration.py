@@ -103,19 +103,19 @@ def estimate_depth_timing(frames: Sequence[Frame], twists: Mapping[int, Array]) 
 def image_velocity(frame: Frame, twist: Array) -> Array:
     """Return the mean velocity (2,) [px/s] of the depth pixels of a frame by the twist (6,) of the camera."""
     depth = frame.depth[::8, ::8].astype(np.float64)
-    v, u = np.indices(depth.shape) * 8
-    z, u, v = depth[depth > 0], u[depth > 0], v[depth > 0]
-    if not len(z):
+    rows, columns = np.nonzero(depth)
+    if not len(rows):
         return np.zeros(2)
+    z, u, v = depth[rows, columns], 8.0 * columns, 8.0 * rows
     c = frame.camera
     points = np.stack([(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z], axis=1)
     later = points - 1e-3 * (twist[:3] + np.cross(twist[3:], points))
-    return np.asarray((c.project(later) - c.project(points)).mean(0) / 1e-3)
+    return np.asarray((c.project(later) - c.project(points)).mean(0) / 1e-3, dtype=np.float64)
 
 
 def _delays() -> Array:
     count = round(CONSTANTS.delay_range / CONSTANTS.delay_step)
-    return CONSTANTS.delay_step * np.arange(-count, count + 1)
+    return np.asarray(CONSTANTS.delay_step * np.arange(-count, count + 1), dtype=np.float64)
 
 
 def _shift_radius(frame: Frame) -> int:

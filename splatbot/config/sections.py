@@ -29,11 +29,6 @@ class SensorConfig(_Section):
             "sigma_depth_floor",
             "sigma_depth_quad",
             "readout",
-            "depth_delay",
-            "exposure",
-            "depth_to_color",
-            "depth_scale",
-            "depth_bias",
         }
     )
 
