@@ -52,7 +52,7 @@ class LoopConstants:
         drift_offset: [m], [rad] drift that a loop may correct for a path of any length.
         same_translation, same_rotation: [m], [rad] two loops that imply corrections this near confirm each other.
         unconfirmed_kept: loops that wait for a confirming one.
-        ratios_kept: latest keyframes whose pairs tell how consistent the images are.
+        ratios_kept: latest keyframes whose pairs measure the consistency of images.
     """
 
     neighbor_hops: int = 10
