@@ -46,8 +46,8 @@ class Adjustment:
 def adjust(graph: PoseGraph, number: int, config: BundleConfig) -> Adjustment:
     """Adjust the poses of the latest keyframes to all pairs that see the same place.
 
-    Each edge of the graph holds the alignment of a pair in condensed form: the motion that minimizes the reprojection,
-    photometric and depth residuals of the two images, and its covariance. So the problem has six unknowns for each
+    Each edge of the graph holds the alignment of a pair in condensed form: a motion and its covariance.
+    The motion minimizes the reprojection, photometric and depth residuals of the two images. So the problem has six unknowns for each
     keyframe and no landmarks, as in BundleFusion (Dai et al. 2017) and DVO-SLAM (Kerl et al. 2013). Keyframes before
     the window are fixed. If the new keyframe sees a place from before the window, all keyframes but the first move.
 
@@ -73,7 +73,7 @@ def variance_ratio(edge: Edge, poses: dict[int, Array]) -> float:
     """Compute rᵀ Σ⁻¹ r / 6 of an edge, with the covariance Σ of its alignment alone, without the drift of a path.
 
     Its mean is the squared Birge ratio (Birge 1932). It exceeds 1 if images contradict each other by more than their
-    residuals tell: by a rolling shutter, blur, or depth of another instant.
+    residuals show: by a rolling shutter, blur, or depth of another instant.
     """
     covariance = edge.covariance - drift_covariance(edge.T_first_second) + CONSTANTS.least_sigma**2 * np.eye(6)
     residual = edge.residual(poses)

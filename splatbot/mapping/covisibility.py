@@ -29,7 +29,7 @@ CONSTANTS = CovisibilityConstants()
 
 
 def covisible_candidates(keyframe: Keyframe, others: Sequence[Keyframe], count: int) -> list[Keyframe]:
-    """Return at most ``count`` keyframes that may see what ``keyframe`` sees, the nearest first.
+    """Return at most ``count`` keyframes that may see the place of ``keyframe``, the nearest first.
 
     Half of them are the nearest. The rest are distributed evenly from the oldest to the latest one in range: pairs far
     apart in time hold a chain of keyframes together.

@@ -68,7 +68,7 @@ class LoopConstants:
     unconfirmed_kept: int = 4
     """Number of loops [1] that wait for a confirming one. More of them confirm loops that are farther apart in time."""
     ratios_kept: int = 10
-    """Number of latest keyframes [1] whose pairs tell how consistent the images are. More of them react more slowly."""
+    """Number of latest keyframes [1] whose pairs measure the consistency of images. More of them react more slowly."""
 
 
 CONSTANTS = LoopConstants()
