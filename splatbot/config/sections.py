@@ -281,7 +281,7 @@ class BundleConfig(_Section):
 
     enabled: bool = Field(default=False, description="adjust the poses of keyframes to each other")
     window: int = Field(
-        default=8, ge=2, description="latest keyframes that move if the new one revisits none: accuracy for time"
+        default=8, ge=2, description="latest keyframes that move without a revisited place: accuracy for time"
     )
     pairs: int = Field(
         default=6, ge=1, description="earlier keyframes that each new one is matched with: accuracy for time"

@@ -36,7 +36,7 @@ class TrackingSettings(Settings):
     NEES / 6 is 1 for consistent covariances; it includes the error of the reference.
 
     --ablation also runs splatbot with bundle adjustment, and with replaced keyframes, with the first budget.
-    "Jumps reported as ok" counts frames with the verdict "ok" whose motion since the last frame is off by more than
+    "Jumps reported as ok" counts frames with the verdict "ok" whose motion since the last frame is wrong by more than
     three sigma.
 
     --stress runs hard synthetic logs with exact ground truth: flat walls, a corridor, pure rotation, jumps, depth

@@ -123,7 +123,7 @@ def distinct(names: Sequence[str]) -> list[str]:
 
 
 def contenders(settings: TrackingSettings, config: Config) -> Iterator[Contender]:
-    """Yield splatbot with each budget, then the changes of an ablation if that is asked for, then its peers."""
+    """Yield splatbot with each budget, then the changes of an ablation if requested, then its peers."""
     for budget in settings.budgets:
         limited = _with_budget(config, budget)
         yield Contender(None, f"{budget:g} ms", "", lambda limited=limited: SlamOdometry(limited))  # type: ignore[misc]
@@ -187,7 +187,7 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Tracking
 
 
 def jumps_reported_ok(truth: Trajectory, tracked: Trajectory, covariances: Array, accepted: NDArray[np.bool_]) -> float:
-    """Compute the share of frames reported as ok whose motion since the last frame is off by more than three sigma.
+    """Compute the share of frames reported as ok whose motion since the last frame is wrong by more than three sigma.
 
     Sigma is √(trace of the translation's covariance), of the one of the two frames where it is larger.
 
