@@ -135,8 +135,8 @@ def _arm_shapes() -> list[Capsule]:
 
 def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
     """Return a capsule in the body of the hand."""
-    start, end = (T_link_hand @ np.array([0.0, y, 0.036, 1.0]) for y in (-0.064, 0.064))
-    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.025)]
+    start, end = (T_link_hand @ np.array([0.0, y, 0.04, 1.0]) for y in (-0.064, 0.064))
+    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.022)]
 
 
 def _dh(a: float, d: float, alpha: float) -> Array:

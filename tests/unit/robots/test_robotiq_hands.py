@@ -64,6 +64,6 @@ def test_its_spheres_cover_its_shapes_and_home_is_free_of_itself(robot: RobotMod
     from splatbot.collision import RobotSpheres
 
     links = robot.spheres(0.0)
-    assert uncovered(robot.shapes, links, 0.004) < 1e-6
+    assert uncovered(robot.shapes, links) <= 0
     assert not RobotSpheres(robot).check(None, robot.home[None]).in_collision[0]
     assert len(robot.self_collision_pairs) >= 15

@@ -60,8 +60,8 @@ SB_INLINE std::uint32_t meeting(const ArmView& arm, const Placed& placed, int a,
   return lanes & bits(squared_between(placed.at[a], placed.at[b]) <= reach * reach);
 }
 
-// Calls visit(group, group, lanes) for each two groups of a pair of links that may meet in some lanes, which visit
-// returns less those that need no more.
+// Calls visit(group, group, lanes) for each two groups of a pair of links that may meet. visit returns the lanes in
+// which the pair is still tested.
 template <class Visit>
 SB_INLINE void meeting_groups(const ArmView& arm, const Pose* link, Placed& placed, int pair, F more,
                               std::uint32_t lanes, Visit&& visit) {
@@ -385,7 +385,8 @@ class Certifier {
     return found;
   }
 
-  // Whether spheres of group g are not yet known to be free all along one stretch; they are noted in `left`.
+  // Adds the spheres of group g that are not yet known to be free along one stretch to `left`; returns whether there are
+  // any.
   bool in_stretch(int g, const Twist& twist, int head, int lane, float half, Stretch& left) {
     bool found = false;
     Twist own;
@@ -418,8 +419,8 @@ class Certifier {
     return found;
   }
 
-  // How far balls move at most from the middle of a stretch: v h + a h² / 2, and 2 um for the rounding of the speed and
-  // of where in float32 the middle is.
+  // Bounds the motion of balls from the middle of a stretch: v h + a h² / 2. 2 um cover the rounding of the speed and
+  // of the middle in float32.
   static F motion(F speed, F bend, F half) {
     return fma(speed * set1(1.0F + 1e-5F), half, set1(0.5F) * bend * half * half) + set1(2e-6F);
   }

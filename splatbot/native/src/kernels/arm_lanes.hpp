@@ -94,7 +94,7 @@ SB_INLINE void place(const Pose& pose, float x, float y, float z, F (&at)[3]) {
   }
 }
 
-// Centres of the balls around groups and links, and of the spheres of those groups that were asked for.
+// Centres of the balls around groups and links, and of the spheres of the placed groups.
 struct Placed {
   alignas(64) float at[kMostBalls][3][W];
   alignas(64) float ball[kMostJoints + 1][3][W];
