@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +58,6 @@ def test_probes_are_in_the_box_and_a_scan_repeats() -> None:
 
 
 @pytest.mark.parametrize("values", [{"scans": 0}, {"views": 2}])
-def test_settings_that_confirm_nothing_are_refused(values: dict[str, int], tmp_path: Path) -> None:
+def test_settings_that_confirm_nothing_are_refused(values: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--scans, --views"):
         BENCHMARK.run(ThinSettings(out=tmp_path, **values))

@@ -15,6 +15,7 @@ from splatbot.collision.visibility import DepthView
 from splatbot.errors import InputError
 from splatbot.geometry import transform_points
 from splatbot.logs import open_log
+from splatbot.logs.synthetic import SyntheticLog
 from splatbot.protocols import Array
 from tests.unit.collision.oracle import gaussians
 
@@ -56,6 +57,7 @@ def _audit(balls: Array, space: ConfirmedSpace | None = None) -> SurfaceAudit:
 
 def _true_distance(points: Array) -> Array:
     log = open_log("synthetic:tabletop?frames=1")
+    assert isinstance(log, SyntheticLog)
     shapes = o3d.t.geometry.RaycastingScene()
     for surface in log.scene.surfaces:
         shapes.add_triangles(
