@@ -84,7 +84,7 @@ def read_shapes(path: Path, link: int, scale: float = 1.0) -> list[Shape]:
         InputError: the file cannot be read.
     """
     try:
-        loaded = trimesh.load_scene(path, process=False).to_geometry()
+        loaded = trimesh.load_scene(path, process=False).to_mesh()
     except (ImportError, ValueError, OSError) as error:
         raise InputError(f"cannot be read ({error}).", file=path, hint="pip install pycollada for .dae") from error
     mesh = trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces, process=True)

@@ -46,7 +46,7 @@ def test_no_point_of_a_million_on_the_meshes_is_outside_by_another_reader(arm: t
     source, body = arm
     files = [(part, file) for part, files in source.parts.items() for file in files]
     for number, (part, file) in enumerate(files):
-        mesh = trimesh.load_scene(source.path(file)).to_geometry()
+        mesh = trimesh.load_scene(source.path(file)).to_mesh()
         points, _ = trimesh.sample.sample_surface(mesh, 1_000_000 // len(files) + 1, seed=number)
         spheres = body.parts[part]
         gap = np.min([np.linalg.norm(points - s[:3], axis=1) - s[3] for s in spheres], axis=0)
