@@ -22,8 +22,8 @@ struct SphereGroups {
 SphereGroups group_spheres(std::span<const std::int32_t> link, std::span<const double> centers,
                            std::span<const double> radii, std::size_t joints);
 
-// Writes the middle of a ball that encloses the spheres `own` and returns its radius. Shrinking steps towards the
-// farthest sphere converge to the smallest ball (Badoiu and Clarkson 2003).
+// Writes the middle of a ball that encloses the spheres `own` and returns its radius. Ever shorter steps towards the
+// farthest sphere approach the smallest ball (Badoiu and Clarkson 2003).
 double enclosing_ball(std::span<const std::int32_t> own, std::span<const double> centers, std::span<const double> radii,
                       double* middle);
 

@@ -21,8 +21,8 @@ struct ArmJoint {
   std::int32_t prismatic;
 };
 
-// An arm as the kernels see it, on two levels. Small spheres decide. Balls around groups of neighbouring spheres of a
-// link spare most tests. The balls are numbered after the spheres: that of group g is spheres + g. Spheres and groups
+// An arm as the kernels see it, on two levels. Small spheres decide. Balls around groups of neighbouring spheres spare
+// most of the tests. The balls are numbered after the spheres: that of group g is spheres + g. Spheres and groups
 // are sorted by link; link 0 is the base, link k moves with joint k - 1.
 struct ArmView {
   int joints, spheres, groups, first_group;  // groups before the first are not tested against the map

@@ -60,8 +60,8 @@ SB_INLINE std::uint32_t meeting(const ArmView& arm, const Placed& placed, int a,
   return lanes & bits(squared_between(placed.at[a], placed.at[b]) <= reach * reach);
 }
 
-// Calls visit(group, group, lanes) for groups of a pair of links that may meet. It returns the lanes in which the pair
-// is still tested.
+// Calls visit(group, group, lanes) for each two groups of a pair of links that may meet. It returns the lanes that
+// remain.
 template <class Visit>
 SB_INLINE void meeting_groups(const ArmView& arm, const Pose* link, Placed& placed, int pair, F more,
                               std::uint32_t lanes, Visit&& visit) {
