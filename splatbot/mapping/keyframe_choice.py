@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -35,13 +34,13 @@ class FrameQuality:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[float] = deque(maxlen=CONSTANTS.recent)
+        self._recent: list[float] = []
 
     def is_poor(self, observation: Observation) -> bool:
         """Return whether a better frame of the same place is likely to come."""
         sharpness = sharpness_of(observation.prepared.levels[0].gray)
         typical = float(np.median(self._recent)) if self._recent else sharpness
-        self._recent.append(sharpness)
+        self._recent = [*self._recent, sharpness][-CONSTANTS.recent :]
         return observation.verdict != "ok" or sharpness < CONSTANTS.blurred * typical
 
 

@@ -80,7 +80,8 @@ class FrameLoop:
             if self.saver is not None:
                 with interrupts.noted():
                     self.progress("saving")
-                self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
+                with interrupts.noted():  # before the last refinement: a resumed run goes on as if it had not ended
+                    self.saver.save(self)
             if through:
                 with interrupts.noted():
                     self.progress("refining")

@@ -72,9 +72,18 @@ class Saver:
 
         Raises:
             OSError: the disk is full or not available.
+            KeyboardInterrupt: the progress callback raised it. The save is complete.
         """
         if self._last is None:
             return
+        interrupts: list[KeyboardInterrupt] = []
+
+        def report(step: int, steps: int) -> None:
+            try:
+                loop.progress("saving", step=step, steps=steps)
+            except KeyboardInterrupt as interrupt:
+                interrupts.append(interrupt)
+
         place = LogPlace(
             name=self._log.name,
             uri=self._log.uri,
@@ -91,8 +100,10 @@ class Saver:
             loop_state(loop),
             place,
             loop.config,
-            lambda step, steps: loop.progress("saving", step=step, steps=steps),
+            report,
         )
+        if interrupts:
+            raise interrupts[0]
 
     @property
     def cost(self) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -39,15 +38,15 @@ class CameraVelocity:
     """Twist of the camera at a time under constant acceleration, by the poses of the last three frames."""
 
     def __init__(self) -> None:
-        self._poses: deque[tuple[float, Array]] = deque(maxlen=3)
+        self._poses: list[tuple[float, Array]] = []
 
     def update(self, stamp: float, T_world_camera: Array) -> None:
         """Append the pose (4, 4) of a frame at a time [s]."""
-        self._poses.append((stamp, T_world_camera))
+        self._poses = [*self._poses, (stamp, T_world_camera)][-3:]
 
     def move(self, T_new_old: Array) -> None:
         """Move the last poses with a correction (4, 4) of the map."""
-        self._poses = deque(((stamp, T_new_old @ T) for stamp, T in self._poses), maxlen=3)
+        self._poses = [(stamp, T_new_old @ T) for stamp, T in self._poses]
 
     def forget(self) -> None:
         """Discard the poses, after a lost frame."""
