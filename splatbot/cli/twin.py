@@ -12,6 +12,7 @@ import tyro
 
 from splatbot.cli.drawing import draw_offscreen
 from splatbot.cli.paths import check_file, check_output
+from splatbot.errors import InputError
 from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
@@ -69,6 +70,10 @@ def twin(
     if list_:
         _print_lists()
         return 0
+    if (scene is None) == (map is None):
+        raise InputError(
+            "needs either a scene or a map.", field="--scene", hint="splatbot twin --list names the scenes"
+        )
     if map is not None:
         map_file(map)
     check_file(trajectory, "--trajectory")
@@ -100,14 +105,9 @@ def twin(
 
 
 def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
-    from splatbot.errors import InputError
     from splatbot.sim.maps.placed import placed_scene
     from splatbot.sim.scene import load_scene, make_scene
 
-    if (name is None) == (map is None):
-        raise InputError(
-            "needs either a scene or a map.", field="--scene", hint="splatbot twin --list names the scenes"
-        )
     values: dict[str, Any] = {}
     if map is not None:
         values = placed_scene(map)
