@@ -39,8 +39,8 @@ def robot(
     Args:
         action: the action.
         name: a robot's name; for add, the URDF file.
-        out: the file to write. add: the robot. mjcf: the model, else it is printed. fit: the body, NAME.json by
-            default. info --check-meshes: the picture, NAME-body.png by default.
+        out: the file of the robot (add), the model (mjcf), the body (fit) or the picture (info --check-meshes). By
+            default a model is printed, a body is NAME.json, and a picture NAME-body.png.
         tip: add: the link at the arm's end; by default that with most moving joints before it.
         slack: largest distance of the spheres beyond the geometry [m]; for add 0.02, for fit 0.011 by default.
         check_meshes: info: prove that the spheres contain the meshes of the maker, which a package must provide.
