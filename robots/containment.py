@@ -133,7 +133,7 @@ def slack_of(shapes: Sequence[Shape], centers: Array, radii: Array) -> Slack:
     distance = distance_of(shapes, points)
     order = np.argsort(distance)
     share = np.cumsum(weights[order]) / weights.sum()
-    median, most99 = (float(distance[order][min(np.searchsorted(share, f), len(order) - 1)]) for f in (0.5, 0.99))
+    median, most99 = (float(distance[order][min(int(np.searchsorted(share, f)), len(order) - 1)]) for f in (0.5, 0.99))
     return Slack(median, most99, float(distance.max()))
 
 

@@ -77,4 +77,4 @@ def draw_body(body: Body, source: Source, path: Path) -> None:
 def _fill(axis: object, triangles: Array) -> None:
     from matplotlib.collections import PolyCollection
 
-    axis.add_collection(PolyCollection(triangles, facecolor=(0.35, 0.35, 0.35), edgecolor="none"))  # type: ignore[attr-defined]
+    axis.add_collection(PolyCollection(list(triangles), facecolor=(0.35, 0.35, 0.35), edgecolor="none"))  # type: ignore[attr-defined]
