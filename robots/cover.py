@@ -209,7 +209,7 @@ def _spread(points: Array, lacking: Array, fit: FitConstants) -> Array:
 def _completed(
     triangles: Array, centers: Array, radii: Array, inner: float, growth: float, fit: FitConstants
 ) -> tuple[Array, Array]:
-    """Enclose the pieces that are left: by spheres of radius ``inner`` on those that lack more than ``growth``.
+    """Cover the pieces that are left: by spheres of radius ``inner`` on those that lack more than ``growth``.
 
     Other pieces make the sphere grow that needs to grow least.
     """
