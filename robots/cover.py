@@ -34,20 +34,21 @@ class FitConstants:
         seed: of the samples.
     """
 
-    points: int = 1200
-    candidates: int = 6000
+    points: int = 600
+    candidates: int = 3000
     deepest: float = 0.05
-    rounds: int = 4
+    rounds: int = 3
     size: float = 1e-3
     growth: float = 1e-3
     added: int = 150
     apart: float = 4e-3
-    seconds: float = 20.0
-    gap: float = 0.04
+    seconds: float = 3.0
+    gap: float = 0.1
     seed: int = 0
 
 
-CONSTANTS = FitConstants()
+QUICK = FitConstants()  # of robots that users add: seconds a link
+FINE = FitConstants(points=1200, candidates=6000, rounds=5, seconds=20.0, gap=0.04)  # of shipped bodies: minutes
 
 
 def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
@@ -91,49 +92,52 @@ def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
     return middle + at[:, None] * shape.along(), np.full(count, radius)
 
 
-def cover_solids(shapes: Sequence[Shape], slack: float) -> tuple[Array, Array]:
+def cover_solids(shapes: Sequence[Shape], slack: float, fit: FitConstants = QUICK) -> tuple[Array, Array]:
     """Cover boxes and meshes of one link by the fewest spheres found, and prove that they contain every triangle.
 
     Candidates are spheres inscribed in a closed shape and enlarged by ``slack``, and spheres of radius ``slack`` on the
-    surface. Either kind extends at most ``slack`` beyond the shapes. A minimum set cover of surface points selects from
-    them (integer programming by HiGHS). Where the proof fails, points are added. Finally the radii grow to contain the
-    pieces that are left; see :func:`splatbot.robots.containment.open_pieces`.
+    surface. A minimum set cover of surface points selects from them (integer programming by HiGHS). Where the proof
+    fails, points are added. Finally radii grow by at most ``fit.growth``, and small spheres are added, to contain the
+    pieces that are left; see :func:`splatbot.robots.containment.open_pieces`. Candidates are smaller by the growth, so
+    that no sphere extends farther than ``slack`` beyond the shapes.
 
     Returns:
         centres (S, 3) [m, link frame] and radii (S,) [m].
     """
-    rng = np.random.default_rng(CONSTANTS.seed)
+    rng = np.random.default_rng(fit.seed)
+    growth = min(fit.growth, slack / 4)
+    inner = slack - growth
     triangles = np.concatenate([shape.triangles() for shape in shapes])
-    centers, radii = _candidates(shapes, triangles, slack, rng)
-    points = np.concatenate([_sampled(triangles, CONSTANTS.points, rng)[0], *_corners(shapes)])
-    for turn in range(CONSTANTS.rounds):
-        missed = ~_contains(centers, radii, points).any(axis=0)
+    centers, radii = _candidates(shapes, triangles, inner, fit, rng)
+    points = np.concatenate([_sampled(triangles, fit.points, rng)[0], *_corners(shapes, fit)])
+    for turn in range(fit.rounds):
+        missed = ~_contains(centers, radii, points, fit).any(axis=0)
         centers = np.concatenate([centers, points[missed]])
-        radii = np.concatenate([radii, np.full(missed.sum(), slack)])
-        chosen = _fewest(_contains(centers, radii, points))
-        left = open_pieces(triangles, centers[chosen], radii[chosen], CONSTANTS.size * (2 if turn == 0 else 1))
+        radii = np.concatenate([radii, np.full(missed.sum(), inner)])
+        chosen = _fewest(_contains(centers, radii, points, fit), fit)
+        left = open_pieces(triangles, centers[chosen], radii[chosen], fit.size * (2 if turn == 0 else 1))
         if not len(left):
             break
         lacking = beyond(left, centers[chosen], radii[chosen]).min(axis=1)
-        if lacking.max() <= CONSTANTS.growth:
+        if lacking.max() <= growth:
             break
-        points = np.concatenate([points, _spread(left.mean(axis=1), lacking)])
-    return _grown(triangles, centers[chosen], radii[chosen])
+        points = np.concatenate([points, _spread(left.mean(axis=1), lacking, fit)])
+    return _completed(triangles, centers[chosen], radii[chosen], inner, growth, fit)
 
 
 def _candidates(
-    shapes: Sequence[Shape], triangles: Array, slack: float, rng: np.random.Generator
+    shapes: Sequence[Shape], triangles: Array, slack: float, fit: FitConstants, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return spheres (C, 3), (C,) that extend at most the slack beyond the shapes."""
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    anywhere = rng.uniform(low, high, (CONSTANTS.candidates, 3))
-    at, normals = _sampled(triangles, CONSTANTS.candidates // 3, rng)
-    below = at - rng.uniform(slack / 4, CONSTANTS.deepest, (len(at), 1)) * normals
+    anywhere = rng.uniform(low, high, (fit.candidates, 3))
+    at, normals = _sampled(triangles, fit.candidates // 3, rng)
+    below = at - rng.uniform(slack / 4, fit.deepest, (len(at), 1)) * normals
     towards = at + rng.uniform(0.05, 0.6, (len(at), 1)) * ((low + high) / 2 - at)
     inner = np.concatenate([anywhere, below, towards])
     depth = depth_of(shapes, inner)
     inner, depth = inner[depth > 0], depth[depth > 0]
-    on, _ = _sampled(triangles, CONSTANTS.candidates // 30, rng)
+    on, _ = _sampled(triangles, fit.candidates // 30, rng)
     return np.concatenate([inner, on]), np.concatenate([depth, np.zeros(len(on))]) + slack
 
 
@@ -148,20 +152,18 @@ def _sampled(triangles: Array, count: int, rng: np.random.Generator) -> tuple[Ar
     return a + u * (b - a) + v * (c - a), normals[rows] / area[rows, None]
 
 
-def _corners(shapes: Sequence[Shape]) -> list[Array]:
+def _corners(shapes: Sequence[Shape], fit: FitConstants) -> list[Array]:
     """Return the corners of shapes of few triangles; they are the hardest points to contain."""
     meshes = [shape.triangles() for shape in shapes]
-    return [np.unique(t.reshape(-1, 3), axis=0) for t in meshes if len(t) <= CONSTANTS.points // 2]
+    return [np.unique(t.reshape(-1, 3), axis=0) for t in meshes if len(t) <= fit.points // 2]
 
 
-def _contains(centers: Array, radii: Array, points: Array) -> NDArray[np.bool_]:
+def _contains(centers: Array, radii: Array, points: Array, fit: FitConstants) -> NDArray[np.bool_]:
     """Return which spheres contain which points with a margin, (C, P)."""
-    return np.stack(
-        [np.linalg.norm(points - c, axis=1) <= r - CONSTANTS.size for c, r in zip(centers, radii, strict=True)]
-    )
+    return np.stack([np.linalg.norm(points - c, axis=1) <= r - fit.size for c, r in zip(centers, radii, strict=True)])
 
 
-def _fewest(contains: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _fewest(contains: NDArray[np.bool_], fit: FitConstants) -> NDArray[np.int64]:
     """Select few rows of (C, P) that contain every column."""
     greedy = _greedy(contains)
     _, columns = np.unique(np.packbits(contains, axis=0), axis=1, return_index=True)
@@ -171,7 +173,7 @@ def _fewest(contains: NDArray[np.bool_]) -> NDArray[np.int64]:
         constraints=LinearConstraint(matrix, 1, np.inf),
         integrality=np.ones(len(contains)),
         bounds=Bounds(0, 1),
-        options={"time_limit": CONSTANTS.seconds, "mip_rel_gap": CONSTANTS.gap},
+        options={"time_limit": fit.seconds, "mip_rel_gap": fit.gap},
     )
     if answer.x is None:
         return greedy
@@ -195,21 +197,31 @@ def _greedy(contains: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array(chosen, dtype=np.int64)
 
 
-def _spread(points: Array, lacking: Array) -> Array:
+def _spread(points: Array, lacking: Array, fit: FitConstants) -> Array:
     """Return the points that lack most, apart from each other."""
     found = np.zeros((0, 3))
-    for point in points[np.argsort(-lacking)][: 40 * CONSTANTS.added]:
-        if len(found) < CONSTANTS.added and (np.linalg.norm(found - point, axis=1) > CONSTANTS.apart).all():
+    for point in points[np.argsort(-lacking)][: 40 * fit.added]:
+        if len(found) < fit.added and (np.linalg.norm(found - point, axis=1) > fit.apart).all():
             found = np.concatenate([found, point[None]])
     return found
 
 
-def _grown(triangles: Array, centers: Array, radii: Array) -> tuple[Array, Array]:
-    """Grow radii until every piece of a triangle lies in one sphere: in that which needs to grow least."""
-    radii = radii.copy()
-    left = open_pieces(triangles, centers, radii, CONSTANTS.size)
+def _completed(
+    triangles: Array, centers: Array, radii: Array, inner: float, growth: float, fit: FitConstants
+) -> tuple[Array, Array]:
+    """Cover the pieces that are left: by spheres of radius ``inner`` on those that lack more than ``growth``.
+
+    Other pieces make the sphere grow that needs to grow least.
+    """
+    left = open_pieces(triangles, centers, radii, fit.size)
+    lacking = beyond(left, centers, radii).min(axis=1)
+    while len(lacking) and lacking.max() > growth:
+        middle = left[int(lacking.argmax())].mean(axis=0)
+        centers, radii = np.concatenate([centers, middle[None]]), np.append(radii, inner)
+        np.minimum(lacking, beyond(left, middle[None], radii[-1:])[:, 0], out=lacking)
+    grown = radii.copy()
     for k in range(0, len(left), 20_000):
         missing = beyond(left[k : k + 20_000], centers, radii)
         nearest = missing.argmin(axis=1)
-        np.maximum.at(radii, nearest, radii[nearest] + missing[np.arange(len(nearest)), nearest] + NANOMETRE)
-    return centers, radii
+        np.maximum.at(grown, nearest, radii[nearest] + missing[np.arange(len(nearest)), nearest] + NANOMETRE)
+    return centers, grown

@@ -84,9 +84,15 @@ def read_shapes(path: Path, link: int, scale: float = 1.0) -> list[Shape]:
         InputError: the file cannot be read.
     """
     try:
-        loaded = trimesh.load_scene(path, process=False).to_mesh()
+        pieces = trimesh.load_scene(path, process=False).dump()
     except (ImportError, ValueError, OSError) as error:
-        raise InputError(f"cannot be read ({error}).", file=path, hint="pip install pycollada for .dae") from error
+        raise InputError(
+            f"cannot be read ({error}).", field=path.name, hint="pip install pycollada for .dae"
+        ) from error
+    meshes = [piece for piece in pieces if isinstance(piece, trimesh.Trimesh)]
+    loaded = trimesh.util.concatenate(meshes)
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise InputError("holds no triangles.", field=path.name, hint="give an STL, OBJ or Collada file")
     mesh = trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces, process=True)
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if mesh.is_watertight:

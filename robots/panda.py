@@ -93,11 +93,11 @@ def panda() -> RobotModel:
             0.04,
             (Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.0413), 0.0125),),
             covering=body.on("finger", 0),
+            hand=_HAND,
         ),
         slack=body.slack,
         covering=joined(*arm_spheres(), body.on("hand", 7, T_link_hand)),
         pairs=np.array(PAIRS, dtype=np.int32),
-        hand_shape=_HAND,
     )
 
 

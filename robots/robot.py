@@ -56,6 +56,7 @@ class GripperGeometry:
         force: force between the fingers [N].
         covering: spheres of one finger in its own frame; their ``link`` is ignored. If None, they are generated from
             the shapes.
+        hand: boxes around fingers and palm. If None, they are measured on the shapes of gripper and last link.
     """
 
     T_link_finger: Array
@@ -64,6 +65,7 @@ class GripperGeometry:
     speed: float = 0.2
     force: float = 70.0
     covering: LinkSpheres | None = field(default=None, repr=False)
+    hand: HandShape | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,6 @@ class RobotModel:
         allowed: pairs of links that may touch, in addition to neighbours and links whose spheres overlap at home.
         covering: spheres of the links. If None, they are generated from the shapes.
         pairs: (M, 2) links that may not touch. If None, they are derived from the spheres.
-        hand_shape: boxes around the gripper. If None, they are measured on the shapes.
 
     Raises:
         InputError: joints, home and shapes are inconsistent.
@@ -99,7 +100,6 @@ class RobotModel:
     allowed: tuple[tuple[int, int], ...] = ()
     covering: LinkSpheres | None = field(default=None, repr=False)
     pairs: NDArray[np.int32] | None = field(default=None, repr=False)
-    hand_shape: HandShape | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.home) != len(self.joints):
@@ -190,10 +190,10 @@ class RobotModel:
     @cached_property
     def hand(self) -> HandShape | None:
         """Boxes around the shapes of the gripper, whose fingers open along the tool's y axis; None without one."""
-        if self.hand_shape is not None:
-            return self.hand_shape
         if self.gripper is None or not self.gripper.shapes:
             return None
+        if self.gripper.hand is not None:
+            return self.gripper.hand
         T_tcp_link = inverse(self.T_link_tcp)
         T_tcp_finger = T_tcp_link @ self.gripper.T_link_finger[0]
         finger = np.concatenate([shape.surface(CONSTANTS.spacing) for shape in self.gripper.shapes])

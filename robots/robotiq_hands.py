@@ -87,7 +87,6 @@ def _with_hand(
         name=name,
         shapes=(*own, *flange, *hand),
         covering=joined(*arm_spheres(), cover(hand, COVER.slack)),
-        hand_shape=None,
         T_link_tcp=T_link_flange @ _along_z(tcp),
         gripper=GripperGeometry(
             np.stack([T_link_flange @ _along_z(root) @ turn for turn in (np.eye(4), turned)]),

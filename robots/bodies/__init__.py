@@ -12,7 +12,7 @@ from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError, InputError
 from splatbot.protocols import Array, LinkSpheres
 from splatbot.robots.containment import open_pieces, slack_of
-from splatbot.robots.cover import cover_solids
+from splatbot.robots.cover import FINE, cover_solids
 from splatbot.robots.maker_meshes import ReportProgress, Source
 
 
@@ -80,7 +80,7 @@ def fit_body(source: Source, slack: float, report_progress: ReportProgress) -> B
     parts = {}
     for part in source.parts:
         shapes = source.shapes(part)
-        centers, radii = cover_solids(shapes, slack)
+        centers, radii = cover_solids(shapes, slack, FINE)
         spheres = np.c_[np.round(centers, 5), np.ceil((radii + 1e-5) * 1e5) / 1e5]
         triangles = np.concatenate([shape.triangles() for shape in shapes])
         if len(open_pieces(triangles, spheres[:, :3], spheres[:, 3])):

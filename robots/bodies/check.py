@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from splatbot.protocols import Array
 from splatbot.robots.bodies import Body
 from splatbot.robots.containment import Slack, slack_of, uncovered_by_link
 from splatbot.robots.maker_meshes import Source
@@ -45,7 +44,7 @@ def check_body(body: Body, source: Source) -> list[PartCheck]:
 
 
 def draw_body(body: Body, source: Source, path: Path) -> None:
-    """Write a picture: each part's mesh from two sides, with the outlines of its spheres [mm].
+    """Write a picture: the corners of each part's meshes from two sides, with the outlines of its spheres [mm].
 
     Raises:
         InputError: the meshes are not installed.
@@ -57,10 +56,10 @@ def draw_body(body: Body, source: Source, path: Path) -> None:
     figure = Figure(figsize=(2.2 * len(body.parts), 5), layout="constrained")
     axes = figure.subplots(2, len(body.parts), squeeze=False)
     for column, (part, spheres) in enumerate(body.parts.items()):
-        triangles = 1e3 * np.concatenate([shape.triangles() for shape in source.shapes(part)])
+        corners = 1e3 * np.concatenate([shape.triangles().reshape(-1, 3) for shape in source.shapes(part)])
         for row, (across, name) in enumerate(((0, "x"), (1, "y"))):
             axis = axes[row, column]
-            _fill(axis, triangles[:, :, [across, 2]])
+            axis.plot(corners[:, across], corners[:, 2], ",", color="0.35")
             outlines = [Circle((1e3 * s[across], 1e3 * s[2]), 1e3 * s[3]) for s in spheres]
             axis.add_collection(
                 PatchCollection(outlines, facecolor=(0.1, 0.4, 0.8, 0.06), edgecolor=(0.1, 0.4, 0.8, 0.6))
@@ -72,9 +71,3 @@ def draw_body(body: Body, source: Source, path: Path) -> None:
             axis.set_title(f"{part}: {len(spheres)}" if row == 0 else "", fontsize=8)
         axes[0, 0].set_ylabel("z [mm]", fontsize=7)
     figure.savefig(path, dpi=110)
-
-
-def _fill(axis: object, triangles: Array) -> None:
-    from matplotlib.collections import PolyCollection
-
-    axis.add_collection(PolyCollection(triangles, facecolor=(0.35, 0.35, 0.35), edgecolor="none"))  # type: ignore[attr-defined, arg-type]

@@ -27,7 +27,7 @@ def test_every_point_of_the_surface_is_covered_and_none_reaches_beyond_the_slack
 ) -> None:
     spheres = cover([shape], slack)
     assert uncovered([shape], spheres) <= 0
-    assert (spheres.radii - np.maximum(shape.depth(spheres.centers), 0) <= slack + 0.002).all()
+    assert (spheres.radii - np.maximum(shape.depth(spheres.centers), 0) <= slack + 1e-6).all()
     assert len(spheres) < 120
 
 
