@@ -196,7 +196,7 @@ class Decoder:
         saved = TYPES[name]
         if saved.create is not None:
             return saved.create(self._config)
-        value = object.__new__(saved.cls)
+        value: Any = object.__new__(saved.cls)
         self._set(value, name, saved.defaults())
         return value
 
