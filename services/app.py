@@ -14,7 +14,6 @@ import splatbot
 from splatbot.priority import lower_priority, switch_quickly
 from splatbot.services.access import Access
 from splatbot.services.codecs import describe_bodies
-from splatbot.services.docs import add_docs
 from splatbot.services.guard import Guard
 from splatbot.services.integrations import Integrations
 from splatbot.services.limits import BodyLimit
@@ -29,9 +28,7 @@ from splatbot.services.routes import (
     grasps,
     health,
     jobs,
-    landing,
     maps,
-    objects,
     picks,
     plans,
     render,
@@ -71,8 +68,6 @@ def create_app(runtime: Runtime) -> FastAPI:
         title="splatbot",
         version=splatbot.__version__,
         description=_DESCRIPTION,
-        docs_url=None,
-        redoc_url=None,
         lifespan=lifespan,
         dependencies=[Depends(check_scope)],
     )
@@ -91,9 +86,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     app.add_middleware(RequestLog, counter=runtime.metrics)
     install_problem_handlers(app)
     describe_bodies(app)
-    add_docs(app)
     for group in (
-        landing,
         health,
         maps,
         frames,
@@ -103,7 +96,6 @@ def create_app(runtime: Runtime) -> FastAPI:
         views,
         plans,
         grasps,
-        objects,
         picks,
         arms,
         trajectories,

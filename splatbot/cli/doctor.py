@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 
 
@@ -18,7 +17,7 @@ def doctor() -> int:
     """
     from splatbot.cli.checks import all_checks
 
-    colours = {"ok": "32", "warn": "33", "fail": "31"} if sys.stdout.isatty() and not os.environ.get("NO_COLOR") else {}
+    colours = {"ok": "32", "warn": "33", "fail": "31"} if sys.stdout.isatty() else {}
     broken = False
     for check in all_checks():
         for finding in check():

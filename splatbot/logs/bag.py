@@ -18,12 +18,11 @@ from rosbags.interfaces import Connection
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import MILLIMETRES, StampedLog
+from splatbot.logs.base import StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
 from splatbot.logs.joints import interpolate_joints
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS, MASK, TRUTH
-from splatbot.logs.mcap_storage import check_checksums
 from splatbot.logs.presets import find_calibration
 from splatbot.logs.ros_frames import (
     COLOR_ENCODINGS,
@@ -87,10 +86,7 @@ class BagLog(StampedLog):
         self._pairs = self._pair()
         self.stamps = [color.stamp for color, _ in self._pairs]
         self.unpaired = len(self._index[self._color]) - len(self._pairs)
-        self._calibration = (
-            find_calibration(camera) if camera is not None else Calibration(self._recorded_camera(), MILLIMETRES)
-        )
-        found = self._calibration.camera
+        found = find_calibration(camera).camera if camera is not None else self._recorded_camera()
         self._undistort = Undistorter(found) if found.distortion else None
         self._camera = self._undistort.camera if self._undistort else found
 
@@ -98,11 +94,6 @@ class BagLog(StampedLog):
     def camera(self) -> Camera:
         """Camera of the delivered frames: undistorted."""
         return self._camera
-
-    @property
-    def calibration(self) -> Calibration:
-        """The given calibration, or the recorded intrinsics."""
-        return self._calibration
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
@@ -166,8 +157,6 @@ class BagLog(StampedLog):
     def _open(self) -> AnyReader:
         if not self.path.exists():
             raise LogError("does not exist.", file=self.path, field="log", hint="check the path")
-        if self.path.is_file() and self.path.suffix == ".mcap":
-            check_checksums(self.path)
         try:
             reader = AnyReader([self.path], default_typestore=typestore())
             reader.open()

@@ -31,7 +31,7 @@ GOAL = [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 
 
 @dataclass
-class LoadTimes:
+class Told:
     """Measurements of one run.
 
     Args:
@@ -68,7 +68,7 @@ def requests(http: httpx.Client) -> list[Any]:
     ]
 
 
-def ask(url: str, key: str, until: float, number: int, times: LoadTimes, pause_s: float) -> None:
+def ask(url: str, key: str, until: float, number: int, told: Told, pause_s: float) -> None:
     """Send requests until a time; repeat a 503 after its Retry-After; a plan without a path is no error."""
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
         todo, at = requests(http), number
@@ -77,20 +77,20 @@ def ask(url: str, key: str, until: float, number: int, times: LoadTimes, pause_s
             try:
                 response = todo[at % len(todo)]()
             except httpx.HTTPError as error:
-                times.statuses[type(error).__name__] += 1
+                told.statuses[type(error).__name__] += 1
                 continue
-            times.seconds.append(time.perf_counter() - begin)
+            told.seconds.append(time.perf_counter() - begin)
             if response.status_code == 503:
-                times.statuses["503, asked again"] += 1
+                told.statuses["503, asked again"] += 1
                 time.sleep(float(response.headers["retry-after"]))
                 continue
             if not response.is_success and not (response.status_code == 422 and "code" in response.json()):
-                times.statuses[str(response.status_code)] += 1
+                told.statuses[str(response.status_code)] += 1
             at += 1
             time.sleep(pause_s)
 
 
-def listen(url: str, key: str, until: float, times: LoadTimes) -> None:
+def listen(url: str, key: str, until: float, told: Told) -> None:
     """Read the odometry over rosbridge until a time."""
     with connect(f"{url.replace('http', 'ws')}/rosbridge?api_key={key}", max_size=None) as socket:
         socket.send(json.dumps({"op": "subscribe", "topic": "/odom"}))
@@ -100,11 +100,11 @@ def listen(url: str, key: str, until: float, times: LoadTimes) -> None:
             except TimeoutError:
                 continue
             except Exception as error:
-                times.statuses[f"rosbridge: {type(error).__name__}"] += 1
+                told.statuses[f"rosbridge: {type(error).__name__}"] += 1
                 return
 
 
-def push(url: str, key: str, until: float, times: LoadTimes, frames: list[Frame]) -> None:
+def push(url: str, key: str, until: float, told: Told, frames: list[Frame]) -> None:
     """Push frames to and fro until a time, one each FRAME_S or as soon as the one before is mapped."""
     there_and_back = itertools.cycle([*frames, *frames[-2:0:-1]])
     with Client(url, key=key) as robot:
@@ -113,13 +113,13 @@ def push(url: str, key: str, until: float, times: LoadTimes, frames: list[Frame]
             if begin >= until:
                 return
             pushed = robot.push(MAP, replace(frame, stamp=FRAME_S * (number + 1)))
-            times.frames.append(sum(pushed.stage_ms.values()))
+            told.frames.append(sum(pushed.stage_ms.values()))
             time.sleep(max(0.0, begin + FRAME_S - time.monotonic()))
 
 
-def measure(seconds: float, clients: int, pause_s: float = 0.5) -> LoadTimes:
+def measure(seconds: float, clients: int, pause_s: float = 0.5) -> Told:
     """Serve a map that is made of frames every 30 ms, with a number of clients."""
-    times = LoadTimes()
+    told = Told()
     frames = list(open_log(LOG))
     with tempfile.TemporaryDirectory() as folder, serving("--data", folder, log=Path(folder) / "log.txt") as service:
         key = str(read_key(key_file()))  # the service made it
@@ -127,18 +127,18 @@ def measure(seconds: float, clients: int, pause_s: float = 0.5) -> LoadTimes:
             robot.create_map(MAP)
             robot.push(MAP, replace(frames[0], stamp=0.0))
         until = time.monotonic() + seconds
-        threads = [threading.Thread(target=push, args=(service.url, key, until, times, frames))]
+        threads = [threading.Thread(target=push, args=(service.url, key, until, told, frames))]
         threads += [
-            threading.Thread(target=listen, args=(service.url, key, until, times))
+            threading.Thread(target=listen, args=(service.url, key, until, told))
             if number % 10 == 9
-            else threading.Thread(target=ask, args=(service.url, key, until, number, times, pause_s))
+            else threading.Thread(target=ask, args=(service.url, key, until, number, told, pause_s))
             for number in range(clients)
         ]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join(seconds + 60)
-    return times
+    return told
 
 
 def main() -> None:
@@ -148,12 +148,12 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--pause", type=float, default=0.5, help="of a client between two requests [s]")
     given = parser.parse_args()
-    alone, times = measure(min(given.seconds, 20.0), 0), measure(given.seconds, given.clients, given.pause)
-    again = times.statuses.pop("503, asked again", 0)
-    print(f"{len(times.seconds)} answers, {again} asked again after 503, errors: {dict(times.statuses) or 0}")
-    print(f"answers: p50 {1e3 * times.p(0.5):.0f} ms, p99 {1e3 * times.p(0.99):.0f} ms")
+    alone, told = measure(min(given.seconds, 20.0), 0), measure(given.seconds, given.clients, given.pause)
+    again = told.statuses.pop("503, asked again", 0)
+    print(f"{len(told.seconds)} answers, {again} asked again after 503, errors: {dict(told.statuses) or 0}")
+    print(f"answers: p50 {1e3 * told.p(0.5):.0f} ms, p99 {1e3 * told.p(0.99):.0f} ms")
     print(f"frames: p95 {alone.frame_p95():.0f} ms of {len(alone.frames)} alone, ", end="")
-    print(f"{times.frame_p95():.0f} ms of {len(times.frames)} with clients")
+    print(f"{told.frame_p95():.0f} ms of {len(told.frames)} with clients")
 
 
 if __name__ == "__main__":

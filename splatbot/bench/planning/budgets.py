@@ -110,9 +110,7 @@ def run_mapped(settings: PlanningSettings, report_progress: ReportProgress = ign
                 settings.save(results)
         for run in settings.run:
             report_progress(f"planning in {run}")
-            plan_in_run(
-                results, run, problems=settings.run_problems, budget_ms=CONSTANTS.fast_ms, margins=settings.margins
-            )
+            plan_in_run(results, run, problems=settings.run_problems, budget_ms=CONSTANTS.fast_ms)
             settings.save(results)
     return results
 

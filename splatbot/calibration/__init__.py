@@ -1,1 +1,0 @@
-"""Calibration of cameras and sensors from logs."""
