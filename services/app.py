@@ -14,6 +14,7 @@ import splatbot
 from splatbot.priority import lower_priority, switch_quickly
 from splatbot.services.access import Access
 from splatbot.services.codecs import describe_bodies
+from splatbot.services.docs import add_docs
 from splatbot.services.guard import Guard
 from splatbot.services.integrations import Integrations
 from splatbot.services.limits import BodyLimit
@@ -68,6 +69,8 @@ def create_app(runtime: Runtime) -> FastAPI:
         title="splatbot",
         version=splatbot.__version__,
         description=_DESCRIPTION,
+        docs_url=None,
+        redoc_url=None,
         lifespan=lifespan,
         dependencies=[Depends(check_scope)],
     )
@@ -86,6 +89,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     app.add_middleware(RequestLog, counter=runtime.metrics)
     install_problem_handlers(app)
     describe_bodies(app)
+    add_docs(app)
     for group in (
         health,
         maps,

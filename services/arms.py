@@ -126,6 +126,7 @@ class Arms:
         self._arms: dict[str, Arm] = {}
         self._lock = threading.Lock()
         self._stop: EmergencyStop | None = None
+        self._last_stop: EmergencyStop | None = None
         self.leases = Leases()
         self.motions = Jobs(self._bus, workers=max(1, len(self._makers)), capacity=len(self._makers))
 
@@ -171,6 +172,7 @@ class Arms:
     def stop_all(self, by: str) -> EmergencyStop:
         """Stop every arm within one control period and refuse motions until :meth:`reset`. This never waits."""
         stop = self._stop = EmergencyStop(by, time.time())
+        self._last_stop = stop
         _log.warning("emergency stop by %s", by)
         return stop
 
@@ -199,13 +201,14 @@ class Arms:
             return known  # a repeated request: the arm must not move twice
         arm = self.get(name)
         self.leases.check(lease, name)
+        last_stop = self._last_stop
         self._check_running()
         if not arm.lock.acquire(blocking=False):
             raise ControllerError("is moving.", field=f"arm {name}", hint="stop it, or wait until it has arrived")
         try:
             motion = self._gate.certify(request, arm.robot)
             arm.ready().send(motion)
-            work = partial(self._follow, arm, request, motion, lease)
+            work = partial(self._follow, arm, request, motion, lease, last_stop)
             abandoned = partial(self._abandon, arm)
             return self.motions.submit("trajectory", work, key=key, request=content, abandoned=abandoned)[0]
         except BaseException:
@@ -233,15 +236,22 @@ class Arms:
             raise MotionRefusedError(f"An emergency stop by {stop.by} is in force.", field="stop", hint=hint)
 
     def _follow(
-        self, arm: Arm, request: MotionRequest, motion: CertifiedMotion, lease: str, handle: JobHandle
+        self,
+        arm: Arm,
+        request: MotionRequest,
+        motion: CertifiedMotion,
+        lease: str,
+        last_stop: EmergencyStop | None,
+        handle: JobHandle,
     ) -> dict[str, Any]:
+        """Follow a motion that was sent after ``last_stop``; a later stop counts although it was reset since."""
         controller = arm.ready()
         published_at, largest = 0.0, 0.0
         begin, steps, reason = time.perf_counter(), 0, ""
         try:
             with MotionWatch(self._gate, request, motion, lambda: steps * controller.period) as watch:
                 while True:
-                    reason = reason or self._reason_to_stop(watch, lease)
+                    reason = reason or self._reason_to_stop(watch, lease, last_stop)
                     if reason or handle.cancelled.is_set():
                         controller.stop()
                     feedback = arm.feedback = controller.step()
@@ -269,8 +279,8 @@ class Arms:
             raise ControllerError(f"{feedback.fault}.", field=f"arm {arm.name}", hint="plan from where it is")
         return {"seconds": feedback.time, "largest_error": largest, "position": feedback.position.tolist()}
 
-    def _reason_to_stop(self, watch: MotionWatch, lease: str) -> str:
-        if (stop := self._stop) is not None:
+    def _reason_to_stop(self, watch: MotionWatch, lease: str, last_stop: EmergencyStop | None) -> str:
+        if (stop := self._last_stop) is not None and stop is not last_stop:
             return f"emergency stop by {stop.by}"
         if not self.leases.holds(lease):
             return "its lease ended; the owner is gone or another owner preempted it"

@@ -50,10 +50,11 @@ class Connections:
         most: connections at once.
         most_of_client: connections of one address.
         idle_s: time within which a request's headers must arrive [s].
+        unread_s: time without progress after which the system ends a connection whose client does not read [s].
     """
 
-    def __init__(self, most: int, most_of_client: int, idle_s: float) -> None:
-        self.most, self.most_of_client, self.idle_s = most, most_of_client, idle_s
+    def __init__(self, most: int, most_of_client: int, idle_s: float, unread_s: float) -> None:
+        self.most, self.most_of_client, self.idle_s, self.unread_s = most, most_of_client, idle_s, unread_s
         self._open: dict[int, Connection] = {}
         self._told = -_LOG_EVERY_S
 
@@ -93,14 +94,15 @@ class Connections:
             if connection.idle_since is not None and connection.idle_since < before:
                 _hang_up(connection)
 
-    def out_of_files(self) -> None:
-        """Close idle connections because the process has no file descriptors left; log this once a minute."""
+    def out_of_files(self) -> bool:
+        """Close idle connections because the process has no file descriptors left; return whether there was one."""
         self._tell(f"no file descriptors are left at {len(self._open)} connections; idle and new ones are closed")
-        for _ in range(_FREED):
+        for number in range(_FREED):
             of_client = Counter(known.client for known in self._open.values() if known.idle_since is not None)
             if not of_client:
-                return
+                return number > 0
             self._close_idle(of_client.most_common(1)[0][0])
+        return True
 
     def _close_idle(self, client: str) -> bool:
         idle = [known for known in self._open.values() if known.client == client and known.idle_since is not None]
@@ -119,7 +121,8 @@ class Connections:
 class Listener(socket.socket):
     """Listening socket that counts its connections and keeps a file descriptor for the case that none is left.
 
-    asyncio answers EMFILE by 2,048 log lines and as many retries; here the connection is closed instead.
+    asyncio answers EMFILE by 2,048 log lines and as many retries; here idle connections make room, and without one
+    the new connection is closed.
 
     Args:
         connections: counts them.
@@ -140,9 +143,14 @@ class Listener(socket.socket):
             except OSError as error:
                 if error.errno not in _NO_FILES:
                     raise
+                if self._connections.out_of_files():
+                    raise BlockingIOError from error  # asyncio accepts again once those are closed
                 self._refuse_one()
                 continue
             connection = Connection(self.family, self.type, self.proto, fileno=fd)
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
+                unread_ms = round(1e3 * self._connections.unread_s)
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, unread_ms)
             if self._connections.add(connection, str(address[0])):
                 return connection, address
             connection.close()
@@ -156,7 +164,6 @@ class Listener(socket.socket):
 
     def _refuse_one(self) -> None:
         """Close the oldest waiting connection, for which the kept file descriptor is freed."""
-        self._connections.out_of_files()
         os.close(self._reserve)
         self._reserve = -1
         try:

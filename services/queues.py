@@ -16,7 +16,7 @@ from splatbot.services.problems import problem
 URGENT = frozenset({"/healthz", "/readyz", "/metrics", "/v1/stop"})
 """Paths that are answered on the event loop, or in a thread of their own."""
 
-AT_ONCE = {"motions": 4, "plans": 4, "views": 4, "queries": 8, "frames": 8, "uploads": 4, "others": 8}
+AT_ONCE = {"motions": 4, "plans": 4, "views": 4, "exports": 4, "queries": 8, "frames": 8, "uploads": 4, "others": 8}
 """Requests of each kind that are worked on at once."""
 
 THREADS = sum(AT_ONCE.values()) + 24
@@ -25,7 +25,8 @@ THREADS = sum(AT_ONCE.values()) + 24
 _KINDS = {
     "motions": re.compile(r"/v1/(trajectories|arms|leases)(/.*)?"),
     "plans": re.compile(r".*/(plans|grasps)|/v1/ik"),
-    "views": re.compile(r".*/(render|views|splats\.ply)"),
+    "views": re.compile(r".*/(render|views)"),
+    "exports": re.compile(r".*/splats\..*"),
     "queries": re.compile(r".*/(distance|collisions)"),
     "frames": re.compile(r".*/frames"),
     "uploads": re.compile(r".*/upload"),
@@ -47,7 +48,7 @@ class Queues:
 
     The others wait. A request beyond the queue is answered 503. A request takes its place once its body has arrived,
     and leaves its queue when its client leaves. It returns its place before the answer is sent, so that slow clients
-    hold no place.
+    hold no place. An export returns it afterwards: until then its file is on the disk.
 
     Args:
         most_waiting: requests of one kind that may wait.
@@ -88,7 +89,7 @@ class Queues:
         async with _Place(self._places[kind]) as place:
 
             async def freeing_send(message: Message) -> None:
-                if message["type"] == "http.response.start":
+                if message["type"] == "http.response.start" and kind != "exports":
                     place.leave()
                 await send(message)
 

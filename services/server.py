@@ -40,7 +40,10 @@ class Server(uvicorn.Server):
         # Half of the files are for maps, logs and clients of the integrations.
         files = raise_file_limit(2 * settings.max_connections) // 2
         self.connections = Connections(
-            min(settings.max_connections, files), min(settings.max_client_connections, files // 2), settings.idle_s
+            min(settings.max_connections, files),
+            min(settings.max_client_connections, files // 2),
+            settings.idle_s,
+            settings.body_s,
         )
         self.listeners = [listen(host, port, self.connections) for host, port in addresses]
         self._runtime = runtime

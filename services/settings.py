@@ -70,7 +70,9 @@ class ServiceSettings(BaseSettings):
     max_connections: int = Field(1024, ge=8, description="connections that are open at once")
     max_client_connections: int = Field(256, ge=4, description="of one address; its oldest idle one makes room")
     idle_s: float = Field(10.0, gt=0, description="time within which a request's headers must arrive [s]")
-    body_s: float = Field(30.0, gt=0, description="time within which its body must arrive [s]")
+    body_s: float = Field(
+        30.0, gt=0, description="time within which its body must arrive, and a client must read on [s]"
+    )
     max_jobs: int = Field(16, ge=1, description="jobs that may wait")
     job_workers: int = Field(2, ge=1, description="jobs that run at once")
     shutdown_s: int = Field(6, ge=0, description="how long running requests may take to end after SIGTERM [s]")

@@ -29,10 +29,10 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
         draft.unlink(missing_ok=True)
 
 
-def sync(file: BinaryIO) -> None:
-    """Flush an open file to the disk."""
+def sync(file: BinaryIO, *, flushed: int = 0) -> None:
+    """Flush an open file to the disk; ``flushed`` bytes at its begin were flushed earlier."""
     file.flush()
-    failpoints.reach("fsync", Path(file.name))
+    failpoints.reach("fsync", Path(file.name), flushed)
     os.fsync(file.fileno())
 
 

@@ -22,8 +22,14 @@ def arm(choice: str) -> None:
     _left, _torn = int(rest.partition(":")[0] or 0), rest.endswith(":torn")
 
 
-def reach(point: str, path: Path | None = None) -> None:
-    """End the process with SIGKILL if this is the chosen point; ``path`` is the file that is not flushed yet."""
+def reach(point: str, path: Path | None = None, flushed: int = 0) -> None:
+    """End the process with SIGKILL if this is the chosen point.
+
+    Args:
+        point: kind of point.
+        path: file that is not flushed yet.
+        flushed: bytes at its begin that were flushed earlier, which a power failure leaves.
+    """
     global _left
     if point != _point and _point != "any":
         return
@@ -31,7 +37,7 @@ def reach(point: str, path: Path | None = None) -> None:
     if _left != 0:
         return
     if _torn and path is not None and path.is_file():
-        os.truncate(path, path.stat().st_size * 2 // 3)
+        os.truncate(path, flushed + (path.stat().st_size - flushed) * 2 // 3)
     os.kill(os.getpid(), signal.SIGKILL)
 
 

@@ -17,6 +17,7 @@ from splatbot.protocols import Feedback
 from splatbot.services.arms import Arm, Arms
 from splatbot.services.bus import Message as News
 from splatbot.services.jobs import ENDED, Job
+from splatbot.services.leases import LeaseError
 from splatbot.services.motion_gate import MotionRequest
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import waypoints_of
@@ -69,6 +70,7 @@ class FollowJointTrajectory:
         self._graph, self._arms, self._store = graph, arms, store
         self._lock = threading.Lock()
         self._goals: dict[str, tuple[str, Message]] = {}
+        self._leases_lock = threading.Lock()  # its own: a client that leaves must not wait for a certification
         self._leases: dict[tuple[str, int], str] = {}
         graph.on_leave(self._release)
         topics = []
@@ -133,15 +135,22 @@ class FollowJointTrajectory:
         return MotionRequest(WaypointMotion(times, q), arm.robot.name, served.id, served.generation)
 
     def _lease(self, arm: str, client: int) -> str:
-        """Return the lease of a client's connection, taken at its first goal."""
-        held = self._leases.get((arm, client))
-        if held is None or not self._arms.leases.holds(held):
-            held = self._leases[arm, client] = self._arms.lease(arm, f"ROS client {client}", seconds=None).id
-        return held
+        """Return the lease of a client's connection, taken at its first goal.
+
+        Raises:
+            LeaseError: another owner holds it, or the client has left.
+        """
+        with self._leases_lock:
+            if not self._graph.connected(client):
+                raise LeaseError("has left.", field="client", hint="stay connected while the arm moves")
+            held = self._leases.get((arm, client))
+            if held is None or not self._arms.leases.holds(held):
+                held = self._leases[arm, client] = self._arms.lease(arm, f"ROS client {client}", seconds=None).id
+            return held
 
     def _release(self, client: int) -> None:
         """End the leases of a client that leaves; its arm stops."""
-        with self._lock:
+        with self._leases_lock:
             for arm, owner in [key for key in self._leases if key[1] == client]:
                 self._arms.leases.release(self._leases.pop((arm, owner)))
 

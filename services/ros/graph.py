@@ -62,6 +62,7 @@ class RosGraph:
         self._retained: dict[str, tuple[int, int]] = {}
         self._commands: dict[str, tuple[tuple[str, ...], Command]] = {}
         self._services: dict[str, Service] = {}
+        self._clients: set[int] = set()
         self._on_leave: list[Callable[[int], None]] = []
 
     def advertise(self, topic: str, name: str, *, client: int = 0) -> str:
@@ -224,6 +225,21 @@ class RosGraph:
             if found is not None and found.client == client:
                 del self._services[resolve(name)]
 
+    def join(self, client: int) -> None:
+        """Note that a client is connected, until it leaves."""
+        with self._lock:
+            self._clients.add(client)
+
+    def connected(self, client: int) -> bool:
+        """Return whether a client is connected; 0 is the service itself."""
+        with self._lock:
+            return client == 0 or client in self._clients
+
+    def has_clients(self, topic: str) -> bool:
+        """Return whether a client uses a topic."""
+        with self._lock:
+            return bool(self._users.get(topic, set()) - {0})
+
     def on_leave(self, call: Callable[[int], None]) -> None:
         """Register a function that is called with the number of each client that leaves."""
         with self._lock:
@@ -232,6 +248,7 @@ class RosGraph:
     def leave(self, client: int) -> None:
         """Forget a client whose connection has ended, and the topics that only it used."""
         with self._lock:
+            self._clients.discard(client)
             calls = list(self._on_leave)
             for topic in [topic for topic, users in self._users.items() if client in users]:
                 self._leave_topic(topic, client)

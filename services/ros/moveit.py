@@ -35,7 +35,16 @@ _IGNORED_IN_PLANS = (
     "start_state.attached_collision_objects",
     "start_state.multi_dof_joint_state.joint_names",
 )
-_IGNORED_IN_IK = ("constraints", "pose_stamped_vector", "ik_link_names")
+_IGNORED_IN_IK = (
+    "constraints",
+    "pose_stamped_vector",
+    "ik_link_names",
+    "robot_state.attached_collision_objects",
+    "robot_state.multi_dof_joint_state.joint_names",
+)
+_GOALS = ("joint_constraints", "position_constraints", "orientation_constraints", "visibility_constraints")
+_SHAPES = {1: (0, 2), 3: (0, 1)}  # types of shape_msgs/SolidPrimitive by the number of their dimensions: sphere, box
+_IGNORED_IN_STATES = _IGNORED_IN_IK[-2:]
 
 
 class MoveItServices:
@@ -93,6 +102,7 @@ class MoveItServices:
         def work() -> dict[str, Any]:
             request = entry(args, "ik_request")
             self._check_supported(request, _IGNORED_IN_IK)
+            self._check_tool(request, "ik_link_name")
             served, robot, base = self._place()
             near = joints(request, "robot_state.joint_state", robot)
             wanted = pose(request, "pose_stamped.pose")
@@ -117,7 +127,7 @@ class MoveItServices:
         Raises:
             SplatbotError: the request makes no sense, or there is no map: this service has no error code.
         """
-        self._check_supported(args, ("constraints",))
+        self._check_supported(args, ("constraints", *_IGNORED_IN_STATES))
         served, robot, base = self._place()
         q = joints(args, "robot_state.joint_state", robot)[None]
         arm = RobotSpheres(robot, T_world_base=base)
@@ -153,6 +163,17 @@ class MoveItServices:
             if has_content(entry(request, path)):
                 raise InputError("is not supported.", field=path, hint="leave it empty")
 
+    def _check_tool(self, request: Any, path: str) -> None:
+        """Check that a link is the tool: goals are poses of the tool.
+
+        Raises:
+            InputError: it is another link.
+        """
+        link, tools = entry(request, path) or "tcp", ("tcp", f"{self._name}_tcp", f"{self._name}_hand_tcp")
+        if link not in tools:
+            hint = f"leave it empty, or name the tool: {tools[-1]}"
+            raise InputError(f"{str(link)[:80]!r} is not supported.", field=path.rpartition(".")[2], hint=hint)
+
     def _place(self) -> tuple[ServedMap, RobotModel, NDArray[np.float64]]:
         return robot_place(self._store, self._name)
 
@@ -169,16 +190,26 @@ class MoveItServices:
         goals = entries(request, "goal_constraints")
         if not goals:
             raise InputError("are missing.", field="goal_constraints", hint="give joint_constraints, or a pose")
-        if entries(goals[0], "joint_constraints"):
+        kinds = {kind for goal in goals for kind in _GOALS if entries(goal, kind)}
+        if kinds == {"joint_constraints"}:
             return JointGoal(np.stack([_joint_goal(goal, robot) for goal in goals]))
+        if unsupported := kinds - {"position_constraints", "orientation_constraints"}:
+            hint = "give joints, or a position and an orientation of the tool"
+            raise InputError("are not supported together with others.", field=max(unsupported), hint=hint)
+        if len(goals) > 1:
+            raise InputError("are several poses.", field="goal_constraints", hint="give one pose")
         return self._pose_goal(goals[0], base)
 
     def _pose_goal(self, goal: Any, base: NDArray[np.float64]) -> PoseGoal:
-        at, turn = (next(iter(entries(goal, f"{kind}_constraints")), None) for kind in ("position", "orientation"))
-        region = next(iter(entries(at, "constraint_region.primitive_poses")), None)
+        at, turn = (_at_most_one(goal, f"{kind}_constraints") for kind in ("position", "orientation"))
+        for constraint in (at, turn):
+            self._check_tool(constraint, "link_name")
+        region = _at_most_one(at, "constraint_region.primitive_poses")
         if region is None:
             raise InputError("has no region.", field="position_constraints", hint="give a primitive and its pose")
-        size = entry(next(iter(entries(at, "constraint_region.primitives")), None), "dimensions") or [0.0]
+        if entries(at, "constraint_region.meshes"):
+            raise InputError("are not supported.", field="constraint_region.meshes", hint="give a box or a sphere")
+        half = _half_edges(_at_most_one(at, "constraint_region.primitives"))
         centre = vector(region, "position") + vector(at, "target_point_offset")
         if turn is None:
             T, tolerance = pose({"p": {"position": {}, "orientation": {"w": 1.0}}}, "p"), np.full(3, np.pi)
@@ -188,7 +219,6 @@ class MoveItServices:
         T[:3, 3] = centre
         if self._in_base(at, "header.frame_id"):
             T = base @ T
-        half = np.resize(np.asarray(size, np.float64), 3) * (0.5 if len(size) == 3 else 1.0)  # a box's edges; a radius
         return PoseGoal(T, position=half, angle=tolerance)
 
 
@@ -232,12 +262,41 @@ def robot_place(store: MapStore, robot: str) -> tuple[ServedMap, RobotModel, NDA
 
 
 def _joint_goal(goal: Any, robot: RobotModel) -> NDArray[np.float64]:
-    named = {str(entry(c, "joint_name")): number(c, "position") for c in entries(goal, "joint_constraints")}
+    constraints = entries(goal, "joint_constraints")
+    named = {str(entry(c, "joint_name")): number(c, "position") for c in constraints}
+    unknown = sorted(named.keys() - set(robot.chain.names))
+    if unknown or len(named) < len(constraints):
+        text = f"name {', '.join(unknown)[:200]}" if unknown else "name a joint twice"
+        raise InputError(f"{text}.", field="joint_constraints", hint=f"name {', '.join(robot.chain.names)} once")
     missing = [name for name in robot.chain.names if name not in named]
     if missing:
         hint = "constrain every joint"
         raise InputError(f"lack {', '.join(missing)}.", field="joint_constraints", hint=hint)
     return np.array([named[name] for name in robot.chain.names])
+
+
+def _at_most_one(args: Any, path: str) -> Any:
+    """Return the only entry of a list, None if it is empty.
+
+    Raises:
+        InputError: there are several, of which all but one would be ignored.
+    """
+    found = entries(args, path)
+    if len(found) > 1:
+        raise InputError("are several.", field=path, hint="give one")
+    return found[0] if found else None
+
+
+def _half_edges(primitive: Any) -> NDArray[np.float64]:
+    """Return the half edges (3,) [m] of a box, or of the largest cube in a sphere; zeros without a primitive.
+
+    Raises:
+        InputError: it is neither.
+    """
+    size = [number({"size": value}, "size") for value in entries(primitive, "dimensions")] or [0.0]
+    if len(size) not in (1, 3) or min(size) < 0.0 or entry(primitive, "type") not in (None, *_SHAPES[len(size)]):
+        raise InputError("is neither a box nor a sphere.", field="constraint_region.primitives", hint="give one")
+    return np.full(3, size[0] / np.sqrt(3.0)) if len(size) == 1 else 0.5 * np.array(size)
 
 
 def coded(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:

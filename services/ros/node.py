@@ -16,6 +16,7 @@ from splatbot.services.ros.nvblox import NvbloxServices
 from splatbot.services.ros.publishers import RosPublishers
 from splatbot.services.ros.rosapi import RosApi
 from splatbot.services.ros.subscribers import MAX_PIXELS, RosSubscribers
+from splatbot.services.ros.tf_republisher import TfRepublisher
 from splatbot.services.store import MapStore
 
 
@@ -47,11 +48,13 @@ class RosNode:
         self._follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
         if arms is not None:
             EmergencyStopTopic(self.graph, arms)
+        self._tf = TfRepublisher(self.graph)
         self._outlets = RosPublishers(store.bus, self.graph)
         self._inlets = RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame, max_pixels=max_pixels)
 
     def start(self) -> None:
         """Begin."""
+        self._tf.start()
         self._outlets.start()
         self._inlets.start()
         if self._follow is not None:
@@ -59,6 +62,7 @@ class RosNode:
 
     def stop(self) -> None:
         """End."""
+        self._tf.stop()
         self._outlets.stop()
         self._inlets.stop()
         if self._follow is not None:

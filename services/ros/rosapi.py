@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, cast
 
 from rosbags.interfaces import Nodetype
@@ -25,7 +26,7 @@ class RosApi:
 
     def __init__(self, graph: RosGraph) -> None:
         self._graph = graph
-        calls = {
+        calls: dict[str, tuple[str, Callable[[Mapping[str, Any]], dict[str, Any]]]] = {
             "topics": ("Topics", self._topics),
             "topics_and_raw_types": ("TopicsAndRawTypes", self._topics_and_raw_types),
             "topic_type": ("TopicType", self._topic_type),
@@ -52,6 +53,8 @@ class RosApi:
             "delete_param": ("DeleteParam", lambda _: {"successful": False, "reason": _NO_PARAMETERS}),
             "message_details": ("MessageDetails", self._message_details),
         }
+        for part in ("Goal", "Feedback", "Result"):
+            calls[f"action_{part.lower()}_details"] = f"Action{part}Details", partial(self._action_details, part)
         for name, (kind, call) in calls.items():
             graph.serve(f"/rosapi/{name}", Service(f"rosapi_msgs/srv/{kind}", call, quick=True))
 
@@ -111,6 +114,10 @@ class RosApi:
         sec, nanosec = divmod(time.time_ns(), 10**9)
         # Clients of ROS 1 read secs and nsecs, those of ROS 2 sec and nanosec.
         return {"time": {"sec": sec, "nanosec": nanosec, "secs": sec, "nsecs": nanosec}}
+
+    @classmethod
+    def _action_details(cls, part: str, args: Mapping[str, Any]) -> dict[str, Any]:
+        return cls._message_details({"type": str(args.get("type", "")).replace("/action/", "/msg/") + part})
 
     @staticmethod
     def _message_details(args: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from splatbot.logs.calibration import Calibration
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
 from splatbot.logs.joints import interpolate_joints
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS, MASK, TRUTH
+from splatbot.logs.mcap_storage import check_checksums
 from splatbot.logs.presets import find_calibration
 from splatbot.logs.ros_frames import (
     COLOR_ENCODINGS,
@@ -157,6 +158,8 @@ class BagLog(StampedLog):
     def _open(self) -> AnyReader:
         if not self.path.exists():
             raise LogError("does not exist.", file=self.path, field="log", hint="check the path")
+        if self.path.is_file() and self.path.suffix == ".mcap":
+            check_checksums(self.path)
         try:
             reader = AnyReader([self.path], default_typestore=typestore())
             reader.open()

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from splatbot.atomic import replace, sync
 from splatbot.errors import LogError
 from splatbot.logs.base import Log
-from splatbot.logs.mcap_storage import CheckedStorage, CheckedWriter, recover
+from splatbot.logs.mcap_storage import CheckedStorage, CheckedWriter, recover, write_checksums
 from splatbot.logs.record import Progress
 from splatbot.logs.ros_frames import camera_info_message, image_message, joint_state_message, pose_stamped_message
 from splatbot.logs.ros_types import Message, to_cdr, type_of, typestore
@@ -73,6 +73,7 @@ class McapFile(AbstractContextManager["McapFile"]):
         self._writer.close()
         (made,) = self._partial.glob("*.mcap")
         with made.open("r+b") as file:
+            write_checksums(file)
             sync(file)
         replace(made, self.path)
         shutil.rmtree(self._partial)

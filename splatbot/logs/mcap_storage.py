@@ -1,4 +1,4 @@
-"""MCAP storage with checksums, and the recovery of a recording whose process was killed."""
+"""MCAP storage with checksums, their check before a recording is read, and the recovery of a killed recording."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ from splatbot.errors import LogError
 
 FLUSH_S = 1.0  # [s] longest time that a message waits for the disk
 _MAGIC = b"\x89MCAP0\r\n"
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+_DATA_END_FORM, _FOOTER_FORM = struct.Struct("<BQI"), struct.Struct("<BQQQI")  # their last fields are checksums
+_PART = 1 << 24  # bytes that are read at once
 _CRC_AT = 33  # offset of the checksum in a chunk's record [bytes]
 
 _log = logging.getLogger(__name__)
@@ -72,6 +74,72 @@ class CheckedStorage(McapWriter):
         """Flush the file to the disk."""
         sync(self.bio)
         self._flushed = time.monotonic()
+
+
+def write_checksums(file: BinaryIO) -> None:
+    """Write the checksums of the data and of the summary into a closed recording, which the writer leaves at 0.
+
+    MCAP specification, records DataEnd and Footer.
+    """
+    end, summary = _find_summary(file)
+    for at, checksum in (
+        (summary - 4, _checksum(file, 0, summary - _DATA_END_FORM.size)),
+        (end - 4, _checksum(file, summary, end - 4)),
+    ):
+        file.seek(at)
+        file.write(struct.pack("<I", checksum))
+
+
+def check_checksums(path: Path) -> None:
+    """Check the checksums of the data and of the summary of a recording that has both.
+
+    Raises:
+        LogError: the file is damaged.
+    """
+    hint = "copy the recording again, or repair it (`mcap recover`)"
+    with path.open("rb") as file:
+        try:
+            end, summary = _find_summary(file)
+        except (ValueError, OSError, struct.error) as error:
+            size = file.seek(0, os.SEEK_END)
+            if _bytes_at(file, max(0, size - len(_MAGIC) - 4), 4) == bytes(4):
+                return  # a recording without checksums
+            raise LogError("is damaged: its footer is wrong.", file=path, field="log", hint=hint) from error
+        known = [struct.unpack("<I", _bytes_at(file, at, 4))[0] for at in (summary - 4, end - 4)]
+        if not any(known):
+            return
+        found = _checksum(file, 0, summary - _DATA_END_FORM.size), _checksum(file, summary, end - 4)
+    for name, a, b in zip(("data", "summary"), known, found, strict=True):
+        if a != b:
+            raise LogError(f"is damaged: the checksum of its {name} differs.", file=path, field="log", hint=hint)
+
+
+def _find_summary(file: BinaryIO) -> tuple[int, int]:
+    """Return the offsets of the end of the footer and of the summary, which follows the end of the data.
+
+    Raises:
+        ValueError: there is no summary, or it is not where the footer says.
+    """
+    end = file.seek(0, os.SEEK_END) - len(_MAGIC)
+    kind, _, summary, _, _ = _FOOTER_FORM.unpack(_bytes_at(file, end - _FOOTER_FORM.size, _FOOTER_FORM.size))
+    data_end = _DATA_END_FORM.unpack(_bytes_at(file, summary - _DATA_END_FORM.size, _DATA_END_FORM.size))
+    if kind != _FOOTER or data_end[:2] != (_DATA_END, 4):
+        raise ValueError("no summary")
+    return end, summary
+
+
+def _bytes_at(file: BinaryIO, at: int, size: int) -> bytes:
+    file.seek(at)
+    return file.read(size)
+
+
+def _checksum(file: BinaryIO, start: int, stop: int) -> int:
+    """Return the CRC-32 of a range of a file."""
+    file.seek(start)
+    value = 0
+    for at in range(start, stop, _PART):
+        value = crc32(file.read(min(_PART, stop - at)), value)
+    return value
 
 
 class CheckedWriter(Writer):
@@ -133,6 +201,7 @@ def _recover(partial: Path, target: Path) -> int:
     if count:
         made = folder / f"{folder.name}.mcap"
         with made.open("r+b") as written:
+            write_checksums(written)
             sync(written)
         replace(made, target)
     return count

@@ -25,11 +25,13 @@ _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _MOST_MESSAGES = 100_000  # in each other: an entry `{}` of a list may hold dozens
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 
-# Types that the JAZZY store lacks: the action of ros-controls/control_msgs as topics of ROS 1's actionlib.
+# Types that the JAZZY store lacks: the action of ros-controls/control_msgs as topics of ROS 1's actionlib, and the
+# message of RobotWebTools/tf2_web_republisher.
 _JOINT_TOLERANCE = "string name\nfloat64 position\nfloat64 velocity\nfloat64 acceleration\n"
 _FOLLOW = "control_msgs/msg/FollowJointTrajectory"
 _STATUS = "std_msgs/Header header\nactionlib_msgs/GoalStatus status\n"
 _MORE = {
+    "tf2_web_republisher/msg/TFArray": "geometry_msgs/TransformStamped[] transforms\n",
     "control_msgs/msg/JointTolerance": _JOINT_TOLERANCE,
     f"{_FOLLOW}Goal": (
         "trajectory_msgs/JointTrajectory trajectory\ncontrol_msgs/JointTolerance[] path_tolerance\n"

@@ -1,4 +1,4 @@
-"""Bit flips, zeroed blocks and truncations in every stored file of a data folder and of a run.
+"""Bit flips, zeroed blocks and truncations in every stored file of a data folder and of a run, and in recordings.
 
 Run `python -m tests.attacks.bit_flips --count 2000`. Each damage must be detected and reported with the file's name.
 """
@@ -10,6 +10,7 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +19,8 @@ import numpy as np
 from splatbot.checksums import NAME as SUMS
 from splatbot.cli import main as splatbot
 from splatbot.errors import SplatbotError
+from splatbot.logs import open_log
+from splatbot.logs.mcap import record_mcap
 from splatbot.results.folder import RunFolder
 from splatbot.run.state import SavedRun
 from splatbot.services.library import MapLibrary
@@ -42,7 +45,7 @@ class Tally:
     missed: list[str] = field(default_factory=list)
 
 
-class _Told(logging.Handler):
+class _Warnings(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.text = ""
@@ -88,15 +91,15 @@ def damage(path: Path, rng: np.random.Generator) -> str:
 
 def _data_reports(folder: Path, name: str) -> bool:
     """Return whether the damage is logged and whole states only are served."""
-    told, store = _Told(), MapStore()
-    logging.getLogger("splatbot").addHandler(told)
+    warnings, store = _Warnings(), MapStore()
+    logging.getLogger("splatbot").addHandler(warnings)
     try:
         MapLibrary(folder).load_all(store)
     finally:
-        logging.getLogger("splatbot").removeHandler(told)
+        logging.getLogger("splatbot").removeHandler(warnings)
     served = store.get("desk")
     right = np.array_equal(served.ready.model.means, wall(z=float(served.map_version)).model.means)
-    return name in told.text and right and served.map_version == (2 if name == "current" else 1)
+    return name in warnings.text and right and served.map_version == (2 if name == "current" else 1)
 
 
 def _run_reports(folder: Path, path: Path) -> bool:
@@ -109,6 +112,17 @@ def _run_reports(folder: Path, path: Path) -> bool:
     return False
 
 
+def _recording_reports(path: Path) -> bool:
+    """Return whether reading the recording is an error that names its file."""
+    try:
+        log = open_log(str(path))
+        for number in range(len(log)):
+            _ = log[number]
+    except SplatbotError as error:
+        return error.file is not None and Path(error.file).name == path.name
+    return False
+
+
 def run(count: int, seed: int = 0) -> Tally:
     """Write damage into random files ``count`` times."""
     rng, tally = np.random.default_rng(seed), Tally()
@@ -117,17 +131,22 @@ def run(count: int, seed: int = 0) -> Tally:
         home, copy = Path(made), Path(made) / "copy"
         make_data(home / "data")
         make_run(home / "run")
+        record_mcap(open_log(LOG), home / "recordings" / "log.mcap")
         states = [home / "data" / "desk" / "v2" / p.name for p in (home / "data" / "desk" / "v2").iterdir()]
         data = [*states, home / "data" / "desk" / "current"]
         kept = [path for path in (home / "run").rglob("*") if path.is_file()]
+        recordings = [home / "recordings" / "log.mcap"]
+        kinds: list[tuple[str, list[Path], Callable[[Path], bool]]] = [
+            ("data", data, lambda path: _data_reports(copy, path.name)),
+            ("run", kept, lambda path: _run_reports(copy, path)),
+            ("recordings", recordings, _recording_reports),
+        ]
         for number in range(count):
-            of_data = number % 2 == 0
-            files = data if of_data else kept
-            source = home / ("data" if of_data else "run")
-            path = copy / files[number // 2 % len(files)].relative_to(source)
-            shutil.copytree(source, copy)
+            source, files, reports = kinds[number % len(kinds)]
+            path = copy / files[number // len(kinds) % len(files)].relative_to(home / source)
+            shutil.copytree(home / source, copy)
             how = damage(path, rng)
-            found = _data_reports(copy, path.name) if of_data else _run_reports(copy, path)
+            found = reports(path)
             shutil.rmtree(copy)
             if found:
                 tally.detected[path.name] += 1

@@ -31,7 +31,7 @@ GOAL = [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 
 
 @dataclass
-class Told:
+class LoadTimes:
     """Measurements of one run.
 
     Args:
@@ -68,7 +68,7 @@ def requests(http: httpx.Client) -> list[Any]:
     ]
 
 
-def ask(url: str, key: str, until: float, number: int, told: Told, pause_s: float) -> None:
+def ask(url: str, key: str, until: float, number: int, times: LoadTimes, pause_s: float) -> None:
     """Send requests until a time; repeat a 503 after its Retry-After; a plan without a path is no error."""
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
         todo, at = requests(http), number
@@ -77,20 +77,20 @@ def ask(url: str, key: str, until: float, number: int, told: Told, pause_s: floa
             try:
                 response = todo[at % len(todo)]()
             except httpx.HTTPError as error:
-                told.statuses[type(error).__name__] += 1
+                times.statuses[type(error).__name__] += 1
                 continue
-            told.seconds.append(time.perf_counter() - begin)
+            times.seconds.append(time.perf_counter() - begin)
             if response.status_code == 503:
-                told.statuses["503, asked again"] += 1
+                times.statuses["503, asked again"] += 1
                 time.sleep(float(response.headers["retry-after"]))
                 continue
             if not response.is_success and not (response.status_code == 422 and "code" in response.json()):
-                told.statuses[str(response.status_code)] += 1
+                times.statuses[str(response.status_code)] += 1
             at += 1
             time.sleep(pause_s)
 
 
-def listen(url: str, key: str, until: float, told: Told) -> None:
+def listen(url: str, key: str, until: float, times: LoadTimes) -> None:
     """Read the odometry over rosbridge until a time."""
     with connect(f"{url.replace('http', 'ws')}/rosbridge?api_key={key}", max_size=None) as socket:
         socket.send(json.dumps({"op": "subscribe", "topic": "/odom"}))
@@ -100,11 +100,11 @@ def listen(url: str, key: str, until: float, told: Told) -> None:
             except TimeoutError:
                 continue
             except Exception as error:
-                told.statuses[f"rosbridge: {type(error).__name__}"] += 1
+                times.statuses[f"rosbridge: {type(error).__name__}"] += 1
                 return
 
 
-def push(url: str, key: str, until: float, told: Told, frames: list[Frame]) -> None:
+def push(url: str, key: str, until: float, times: LoadTimes, frames: list[Frame]) -> None:
     """Push frames to and fro until a time, one each FRAME_S or as soon as the one before is mapped."""
     there_and_back = itertools.cycle([*frames, *frames[-2:0:-1]])
     with Client(url, key=key) as robot:
@@ -113,13 +113,13 @@ def push(url: str, key: str, until: float, told: Told, frames: list[Frame]) -> N
             if begin >= until:
                 return
             pushed = robot.push(MAP, replace(frame, stamp=FRAME_S * (number + 1)))
-            told.frames.append(sum(pushed.stage_ms.values()))
+            times.frames.append(sum(pushed.stage_ms.values()))
             time.sleep(max(0.0, begin + FRAME_S - time.monotonic()))
 
 
-def measure(seconds: float, clients: int, pause_s: float = 0.5) -> Told:
+def measure(seconds: float, clients: int, pause_s: float = 0.5) -> LoadTimes:
     """Serve a map that is made of frames every 30 ms, with a number of clients."""
-    told = Told()
+    times = LoadTimes()
     frames = list(open_log(LOG))
     with tempfile.TemporaryDirectory() as folder, serving("--data", folder, log=Path(folder) / "log.txt") as service:
         key = str(read_key(key_file()))  # the service made it
@@ -127,18 +127,18 @@ def measure(seconds: float, clients: int, pause_s: float = 0.5) -> Told:
             robot.create_map(MAP)
             robot.push(MAP, replace(frames[0], stamp=0.0))
         until = time.monotonic() + seconds
-        threads = [threading.Thread(target=push, args=(service.url, key, until, told, frames))]
+        threads = [threading.Thread(target=push, args=(service.url, key, until, times, frames))]
         threads += [
-            threading.Thread(target=listen, args=(service.url, key, until, told))
+            threading.Thread(target=listen, args=(service.url, key, until, times))
             if number % 10 == 9
-            else threading.Thread(target=ask, args=(service.url, key, until, number, told, pause_s))
+            else threading.Thread(target=ask, args=(service.url, key, until, number, times, pause_s))
             for number in range(clients)
         ]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join(seconds + 60)
-    return told
+    return times
 
 
 def main() -> None:
@@ -148,12 +148,12 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--pause", type=float, default=0.5, help="of a client between two requests [s]")
     given = parser.parse_args()
-    alone, told = measure(min(given.seconds, 20.0), 0), measure(given.seconds, given.clients, given.pause)
-    again = told.statuses.pop("503, asked again", 0)
-    print(f"{len(told.seconds)} answers, {again} asked again after 503, errors: {dict(told.statuses) or 0}")
-    print(f"answers: p50 {1e3 * told.p(0.5):.0f} ms, p99 {1e3 * told.p(0.99):.0f} ms")
+    alone, times = measure(min(given.seconds, 20.0), 0), measure(given.seconds, given.clients, given.pause)
+    again = times.statuses.pop("503, asked again", 0)
+    print(f"{len(times.seconds)} answers, {again} asked again after 503, errors: {dict(times.statuses) or 0}")
+    print(f"answers: p50 {1e3 * times.p(0.5):.0f} ms, p99 {1e3 * times.p(0.99):.0f} ms")
     print(f"frames: p95 {alone.frame_p95():.0f} ms of {len(alone.frames)} alone, ", end="")
-    print(f"{told.frame_p95():.0f} ms of {len(told.frames)} with clients")
+    print(f"{times.frame_p95():.0f} ms of {len(times.frames)} with clients")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ have a closed form.
 from __future__ import annotations
 
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -180,12 +181,21 @@ SPOILED: dict[str, Callable[[World, np.random.Generator], MotionRequest]] = {
 }
 
 
-def run(count: int, seed: int = 0, *, show: Callable[[int], None] = lambda done: None) -> Tally:
-    """Send ``count`` random motions through the gate, half of them spoiled, and check those that it lets through."""
+def run(count: int, seed: int = 0, *, cpu_s: float = np.inf, show: Callable[[int], None] = lambda done: None) -> Tally:
+    """Send ``count`` random motions through the gate, half of them spoiled, and check those that it lets through.
+
+    Args:
+        count: motions.
+        seed: of the random numbers.
+        cpu_s: processor time after which no further motion is sent [s].
+        show: called with the number of motions so far.
+    """
     rng, tally = np.random.default_rng(seed), Tally()
     world = World(rng)
     for k in range(count):
         if k % 100 == 0:
+            if time.process_time() > cpu_s:
+                break
             world.arms.close(0.0)
             world = World(rng)
             show(k)
@@ -209,9 +219,17 @@ def run(count: int, seed: int = 0, *, show: Callable[[int], None] = lambda done:
 
 def main() -> int:
     """Run and print the counts."""
-    given = seeded_parser(__doc__, 100_000).parse_args()
-    tally = run(given.count, given.seed, show=lambda done: print(f"\r{done}", end="", file=sys.stderr, flush=True))
-    print(f"\nexecuted {dict(tally.executed)}\nrefused {dict(tally.refused)}")
+    parser = seeded_parser(__doc__, 100_000)
+    parser.add_argument("--cpu-minutes", type=float, default=np.inf, help="processor time after which the run ends")
+    given = parser.parse_args()
+
+    def show(done: int) -> None:
+        print(f"\r{done}", end="", file=sys.stderr, flush=True)
+
+    tally = run(given.count, given.seed, cpu_s=60 * given.cpu_minutes, show=show)
+    sent = sum(tally.executed.values()) + sum(tally.refused.values())
+    print(f"\n{sent} motions, {time.process_time() / 60:.1f} min of one core")
+    print(f"executed {dict(tally.executed)}\nrefused {dict(tally.refused)}")
     print(f"executed and rejected by the check: {len(tally.wrong)}; refused without a reason: {tally.unexplained}")
     return exit_code(tally.wrong) or int(tally.unexplained > 0)
 

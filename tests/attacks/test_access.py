@@ -557,3 +557,35 @@ def test_a_service_tells_the_file_of_its_key_and_writes_the_key_to_no_pipe(tmp_p
         assert key not in out + err
         assert ("service-key" in out) is not warned
         assert ("insecure_no_auth" in err) is warned
+
+
+# ------------------------------------------------------------------ the page of the routes
+
+
+def test_the_docs_run_scripts_of_the_service_alone(home: Service) -> None:
+    page = home.client.get("/docs")
+    assert "default-src 'self'" in page.headers["content-security-policy"]
+    assert "unsafe" not in page.headers["content-security-policy"].replace("style-src 'self' 'unsafe-inline'", "")
+    sources = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+    assert len(sources) == 4
+    for source in sources:
+        assert source.startswith("/docs/"), source
+        assert home.client.get(source).status_code == 200
+    assert home.client.get("/docs/assets/../../etc/passwd").status_code == 404
+    assert home.client.get("/docs/assets/%2e%2e/core.py").status_code == 404
+    assert home.client.get("/redoc").status_code == 404
+
+
+def test_methods_of_a_client_s_own_make_no_metric_series(home: Service) -> None:
+    def series() -> int:
+        return len(home.client.get("/metrics").text.splitlines())
+
+    for number in range(2):
+        home.client.request(f"ODD{number}", "/v1/maps")
+        home.client.request(f"ODD{number}", f"/nowhere{number}")
+    series()  # a request of /metrics has its own series from the next one on
+    before = series()
+    for number in range(20):
+        home.client.request(f"STRANGE{number}", "/v1/maps")
+        home.client.request(f"STRANGE{number}", f"/nowhere{number}")
+    assert series() == before

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import resource
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.services.queues import AT_ONCE
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
@@ -273,3 +275,33 @@ def test_health_is_quick_while_50_plans_are_asked_for(process: tuple[str, Path])
     print(f"{len(seconds)} probes, p50 {np.median(seconds):.4f} s, p99 {np.quantile(seconds, 0.99):.4f} s")
     assert set(statuses) == {200}
     assert np.quantile(seconds, 0.99) < 0.1
+
+
+def test_a_client_that_does_not_read_is_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    maps, n = store(), 200_000
+    big = GaussianModel.from_activated(
+        means=np.random.default_rng(0).normal(size=(n, 3)),
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        scales=np.full((n, 3), 0.01),
+        opacities=np.full(n, 0.9),
+        colors=np.full((n, 3), 0.5),
+    )
+    maps.add("big", source="big.ply", state="static", snapshot=Snapshot(big, 1))
+    with running(ServiceSettings(body_s=1.0), maps) as service:
+        lines = [raw(service, "GET /v1/maps/big/splats.ply HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") for _ in range(8)]
+        deadline = time.monotonic() + 120
+        while answered(service, "splats") < len(lines):
+            assert len(list(tmp_path.glob("splatbot-export-*"))) <= AT_ONCE["exports"]
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        for line in lines:
+            line.close()
+    assert list(tmp_path.glob("splatbot-export-*")) == []
+
+
+def answered(service: Service, route: str) -> int:
+    """Return the number of requests of a route that have ended."""
+    lines = service.client.get("/metrics").text.splitlines()
+    counts = [line for line in lines if line.startswith("splatbot_request_seconds_count") and route in line]
+    return sum(int(float(line.split()[-1])) for line in counts)

@@ -162,6 +162,16 @@ def test_an_emergency_stop_acts_at_once_and_lasts_until_it_is_reset(arms: Servic
         assert client.wait(lease.send(again)["id"], under="/v1/trajectories")["state"] == "succeeded"
 
 
+def test_an_emergency_stop_acts_although_it_is_reset_before_the_next_period(arms: Service, client: Client) -> None:
+    made = plan(client, 1.5, speed=0.05)
+    with client.lease() as lease:
+        motion = lease.send(made)
+        arms.runtime.arms.stop_all("a client")
+        arms.runtime.arms.reset()
+        ended = client.wait(motion["id"], under="/v1/trajectories", timeout_s=5)
+    assert (ended["state"], "emergency stop" in ended["detail"]) == ("failed", True)
+
+
 def test_of_many_clients_that_want_one_arm_at_once_one_gets_it(arms: Service) -> None:
     taken: list[str] = []
     barrier = threading.Barrier(8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from websockets.sync.connection import Connection
 
 from splatbot.geometry import pose_from_quat
 from splatbot.services.arms import known_robot
+from splatbot.services.motion_gate import MotionGate
 from splatbot.services.ros.graph import CLIENT_RETAINED_BYTES, CLIENT_SERVICES, CLIENT_TOPICS, RosGraph
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
@@ -220,6 +222,51 @@ def test_the_rest_of_rosapi_answers(served: Service) -> None:
         details = call(client, "/rosapi/node_details", node="/splatbot")["values"]
         assert "/odom" in details["publishing"]
         assert "/compute_ik" in details["services"]
+        for part in ("goal", "feedback", "result"):
+            found = call(client, f"/rosapi/action_{part}_details", type=kind)["values"]["typedefs"]
+            assert found[0]["type"] == f"control_msgs/msg/FollowJointTrajectory{part.capitalize()}"
         assert call(client, "/rosapi/get_param", name="/a", default="5")["values"]["value"] == "5"
         for name in ("get_param_names", "has_param", "set_param", "delete_param", "interfaces", "service_providers"):
             assert call(client, f"/rosapi/{name}")["result"] is True
+
+
+def test_a_client_that_leaves_before_its_goal_is_taken_moves_nothing_and_keeps_no_lease(served: Service) -> None:
+    home = served.client.get("/v1/arms/fake").json()["position"]
+    for number in range(10):
+        with ros(served) as client:
+            send_goal(client, f"g{number}", goal(0.5, 20))
+        time.sleep(0.05)
+    arms = served.runtime.arms
+    until(lambda: not arms.get("fake").busy and arms.leases.of("fake") is None, 5)
+    time.sleep(0.3)
+    assert arms.leases.of("fake") is None
+    np.testing.assert_allclose(served.client.get("/v1/arms/fake").json()["position"], home, atol=0.02)
+
+
+def test_the_event_loop_does_not_wait_for_a_certification_when_its_client_leaves(
+    served: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, gate = threading.Event(), threading.Event()
+    certify = MotionGate.certify
+
+    def slow(self: MotionGate, *args: Any) -> Any:
+        begun.set()
+        gate.wait(20)
+        return certify(self, *args)
+
+    monkeypatch.setattr(MotionGate, "certify", slow)
+    with ros(served) as client:
+        send_goal(client, "g", goal(0.5, 20))
+        assert begun.wait(10)
+    try:
+        assert served.client.get("/healthz", timeout=5).status_code == 200
+    finally:
+        gate.set()
+    until(lambda: not served.runtime.arms.get("fake").busy, 5)
+
+
+def test_one_client_cannot_subscribe_to_a_topic_without_end(served: Service) -> None:
+    with ros(served) as client:
+        for number in range(65):
+            say(client, op="subscribe", id=f"s{number}", topic="/odom")
+        assert "one subscription too many" in hear(client, "status")["msg"]

@@ -60,6 +60,7 @@ class RosbridgeSession:
     def __init__(self, graph: RosGraph, send: Send, *, most_bytes: int, scopes: frozenset[Scope] = frozenset()) -> None:
         self.number = next(_numbers)
         self._graph, self._most_bytes, self._scopes = graph, most_bytes, scopes
+        graph.join(self.number)
         self._to_client = send
         self._sending = asyncio.Lock()
         self._subscriptions = Subscriptions(graph, self._send, self.number)

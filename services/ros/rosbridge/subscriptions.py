@@ -27,6 +27,7 @@ Send = Callable[[str | bytes], Awaitable[None]]
 
 _UNTHROTTLED = 16  # messages that may wait where the client names no queue
 _LONGEST_QUEUE = 1000
+_MOST_OF_TOPIC = 64  # subscriptions that one client may have of one topic
 _STRONGEST: tuple[Compression, ...] = ("cbor-raw", "cbor", "png", "none")
 
 _log = logging.getLogger(__name__)
@@ -85,6 +86,9 @@ class Subscriptions:
             self._graph.advertise(topic, str(kind), client=self._client)
         if topic not in self._wishes and len(self._wishes) >= self._most:
             raise InputError(f"{topic} is one topic too many.", field="topic", hint=f"read at most {self._most}")
+        if len(self._wishes.get(topic, {})) >= _MOST_OF_TOPIC and _key(operation) not in self._wishes[topic]:
+            hint = f"read it at most {_MOST_OF_TOPIC} times, or unsubscribe"
+            raise InputError(f"{topic} has one subscription too many.", field="id", hint=hint)
         fresh = _key(operation) not in self._wishes.get(topic, {})
         self._wishes.setdefault(topic, {})[_key(operation)] = wish
         self._restart(topic, latched=fresh)
@@ -149,7 +153,7 @@ class Subscriptions:
 
 
 def _key(operation: dict[str, Any]) -> str:
-    return str(operation.get("id"))
+    return str(operation.get("id"))[:256]
 
 
 def _number(operation: dict[str, Any], key: str) -> float:

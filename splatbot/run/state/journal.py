@@ -36,6 +36,7 @@ class Journal:
     _entries: dict[int, tuple[object, int, Entry]] = field(default_factory=dict)
     _used: set[int] = field(default_factory=set)
     _end: int = 0
+    _flushed: int = 0
 
     @property
     def path(self) -> Path:
@@ -47,7 +48,7 @@ class Journal:
         live = sum(self._entries[key][2][1] for key in self._used if key in self._entries)
         if self._end and live < (1.0 - _UNUSED_SHARE) * self._end:
             self._entries.clear()
-            self.number, self._end = self.number + 1, 0
+            self.number, self._end, self._flushed = self.number + 1, 0, 0
         self._used = set()
 
     def put(self, owner: object, array: Array) -> Entry:
@@ -70,7 +71,8 @@ class Journal:
         """Flush the appended arrays to the disk; needed before a state file refers to them."""
         if self._end:
             with self.path.open("r+b") as file:
-                sync(file)
+                sync(file, flushed=self._flushed)
+            self._flushed = self._end
             sync_folder(self.folder)
 
     def finish(self) -> None:

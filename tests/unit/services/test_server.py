@@ -11,7 +11,7 @@ from splatbot.errors import InputError
 from splatbot.services.connections import Connections
 from splatbot.services.server import listen
 
-CONNECTIONS = Connections(8, 8, 10.0)
+CONNECTIONS = Connections(8, 8, 10.0, 30.0)
 
 
 def test_answers_do_not_wait_for_the_clients_acknowledgement() -> None:

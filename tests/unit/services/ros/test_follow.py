@@ -45,6 +45,8 @@ class Scene:
         self.store.add("desk", source="a", state="static", snapshot=Snapshot(ball, 1), workspace=workspace)
         self.arms = Arms(self.store, {"fake": lambda robot: FakeController(robot.home, period=0.005)})
         self.action = FollowJointTrajectory(self.graph, self.arms, self.store)
+        for client in (1, 2):  # as the WebSocket of each does
+            self.graph.join(client)
         self.action.start()
         self.results = self.read("result")
         self.feedback = self.read("feedback")

@@ -154,6 +154,44 @@ def test_parts_of_a_planning_request_that_are_not_supported_are_refused_by_name(
     assert not response["trajectory"]
 
 
+_AT = {"primitives": [{"type": 2, "dimensions": [0.01]}], "primitive_poses": [_pose(np.eye(4))]}
+_POSE = {"position_constraints": [{"constraint_region": _AT}]}
+
+
+@pytest.mark.parametrize(
+    ("goals", "name"),
+    [
+        ([{"position_constraints": [{"link_name": "panda_link5", "constraint_region": _AT}]}], "link_name"),
+        ([_POSE | {"orientation_constraints": [{"link_name": "panda_link5"}]}], "link_name"),
+        ([{"position_constraints": [{"constraint_region": _AT}] * 2}], "position_constraints"),
+        ([_joint_goal(GOAL) | _POSE], "joint_constraints"),
+        ([_joint_goal(GOAL) | {"visibility_constraints": [{"target_radius": 1.0}]}], "visibility_constraints"),
+        ([_POSE, _POSE], "goal_constraints"),
+        ([_joint_goal(GOAL), _POSE], "joint_constraints"),
+        ([{"position_constraints": [{"constraint_region": _AT | {"meshes": [{}]}}]}], "meshes"),
+        ([{"position_constraints": [{"constraint_region": _AT | {"primitives": [{"type": 3}]}}]}], "primitives"),
+        ([{"joint_constraints": [{"joint_name": "elbow", "position": 0.0}]}], "elbow"),
+        ([{"joint_constraints": 2 * _joint_goal(GOAL)["joint_constraints"]}], "twice"),
+    ],
+)
+def test_goals_that_would_be_heeded_in_part_are_refused_by_name(goals: list[Any], name: str) -> None:
+    graph, _ = _graph(_ball((3.0, 0.0, 0.0)))
+    response = _plan(graph, {}, goal_constraints=goals)
+    assert response["error_code"]["val"] == -16
+    assert name in response["error_code"]["message"]
+
+
+@pytest.mark.parametrize(
+    "more", [{"ik_link_name": "panda_link5"}, {"robot_state": {"attached_collision_objects": [{"link_name": "hand"}]}}]
+)
+def test_parts_of_ik_requests_that_are_not_supported_are_refused_by_name(more: dict[str, Any]) -> None:
+    graph, _ = _graph(_ball((3.0, 0.0, 0.0)))
+    request = {"pose_stamped": {"pose": _pose(PANDA.tcp(np.array(GOAL)))}} | more
+    answer = _call(graph, IK_SERVICE, ik_request=request)
+    assert answer["error_code"]["val"] == -16
+    assert next(iter(more)) in answer["error_code"]["message"]
+
+
 def test_empty_parts_and_the_scales_of_a_planning_request_are_heeded() -> None:
     graph, _ = _graph(_ball((3.0, 0.0, 0.0)))
     empty = {"path_constraints": {"name": "", "joint_constraints": []}, "group_name": "panda_arm"}
