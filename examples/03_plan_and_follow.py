@@ -19,7 +19,7 @@ certificate = path.certificate
 print(f"path of {len(path.waypoints)} waypoints, {path.cost:.2f} rad, certified: {certificate.certified}")
 print(f"certified clearance: {1e3 * certificate.clearance:.1f} mm beyond a margin of {1e3 * certificate.margin:.0f} mm")
 
-trajectory = time_path(path, planner.arm, field)
+trajectory = time_path(path, planner.arm, field, velocity_scale=0.2, acceleration_scale=0.2)
 print(f"trajectory of {trajectory.duration:.2f} s, certified: {trajectory.certificate.certified}")
 
 controller = FakeController(robot.home, lag=0.005)

@@ -15,7 +15,7 @@ with serving("--data", "maps", log=Path("service.log")) as service, Client(servi
     print(f"map desk has {client.map('desk')['gaussians']} Gaussians")
 
     found = client.distance("desk", [[0.0, 0.0, 0.5], [0.0, 0.0, 30.0]])
-    sigmas = ", ".join(f"{distance:.1f}" for distance in found.distance)
+    sigmas = ", ".join(f"{distance:.1f}" for distance in found.distance_sigma)
     print(f"nearest Gaussians: {sigmas} sigma away, map version {found.map_version}")
 
     plan = client.plan("desk", goal=GOAL)

@@ -1,113 +1,227 @@
-"""Spheres that cover the collision geometry of links, and a check of the cover."""
+"""Spheres that contain the geometry of links: fitted to points of its surface, then grown until the proof succeeds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import csr_matrix
 
 from splatbot.errors import InputError
 from splatbot.protocols import Array, LinkSpheres
-from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
+from splatbot.robots.containment import NANOMETRE, beyond, open_pieces
+from splatbot.robots.shapes import Capsule, Shape, depth_of
+
+
+@dataclass(frozen=True)
+class FitConstants:
+    """Constants of the fit of spheres.
+
+    Args:
+        points: points of the surface that the selected spheres must contain; more are added where the proof fails.
+        candidates: spheres to select from, a third of them in the volume and the others below the surface.
+        deepest: [m] largest depth of a candidate that is placed below the surface.
+        rounds: selections at most.
+        size: [m] edge of the pieces in the proof; every selected sphere contains its points with this margin.
+        growth: [m] growth of a radius that ends the selection.
+        added: points that are added in a round, at most.
+        apart: [m] distance between added points.
+        seconds: [s] time limit of a selection; the greedy one is taken if it is smaller.
+        gap: relative gap to the fewest spheres at which a selection ends.
+        seed: of the samples.
+    """
+
+    points: int = 600
+    candidates: int = 3000
+    deepest: float = 0.05
+    rounds: int = 3
+    size: float = 1e-3
+    growth: float = 1e-3
+    added: int = 150
+    apart: float = 4e-3
+    seconds: float = 3.0
+    gap: float = 0.1
+    seed: int = 0
+
+
+QUICK = FitConstants()  # of robots that users add: seconds a link
+FINE = FitConstants(points=1200, candidates=6000, rounds=5, seconds=20.0, gap=0.04)  # of shipped bodies: minutes
 
 
 def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
-    """Cover every shape with spheres that extend at most ``slack`` [m] beyond it.
+    """Cover the shapes of each link with spheres that extend about ``slack`` [m] beyond them.
 
     The spheres of a capsule of radius R have the radius r = R + slack. Their distance along the segment is at most
-    2 sqrt(r² - R²), so that their union contains the capsule. For boxes and meshes see :func:`cover_solid`.
+    2 sqrt(r² - R²), so that their union contains the capsule. For boxes and meshes see :func:`cover_solids`.
+
+    Raises:
+        InputError: the slack is not above 0.
     """
-    found = [(shape.link, *cover_shape(shape, slack)) for shape in shapes]
-    link = np.concatenate([np.full(len(radii), link, np.int32) for link, _, radii in found])
-    order = np.argsort(link, kind="stable")
-    centers = np.concatenate([c for _, c, _ in found])
-    radii = np.concatenate([r for _, _, r in found])
-    return LinkSpheres(link[order], np.ascontiguousarray(centers[order]), radii[order])
-
-
-def cover_shape(shape: Shape, slack: float) -> tuple[Array, Array]:
-    """Return the centres (S, 3) [m, link frame] and radii (S,) [m] of the spheres of one shape."""
     if not slack > 0:
         raise InputError(f"is {slack}.", field="slack", hint="give metres above 0, as 0.01")
-    if isinstance(shape, Capsule):
-        return _cover_capsule(shape, slack)
-    if isinstance(shape, (Box, Mesh)):
-        return cover_solid(shape, slack)
-    raise InputError(
-        f"cannot be covered: {type(shape).__name__}.", field="shape", hint="give capsules, boxes or meshes"
+    found: list[tuple[int, Array, Array]] = []
+    for link in sorted({shape.link for shape in shapes}):
+        own = [shape for shape in shapes if shape.link == link]
+        found += [(link, *_cover_capsule(shape, slack)) for shape in own if isinstance(shape, Capsule)]
+        if solids := [shape for shape in own if not isinstance(shape, Capsule)]:
+            found.append((link, *cover_solids(solids, slack)))
+    return LinkSpheres(
+        np.concatenate([np.full(len(radii), link, np.int32) for link, _, radii in found]),
+        np.concatenate([centers for _, centers, _ in found]),
+        np.concatenate([radii for _, _, radii in found]),
     )
 
 
 def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
-    """Place spheres a chord apart; the outer ones lie a slack inside the ends and contain the tips of the caps."""
-    radius = shape.radius + slack
-    half_chord = np.sqrt(radius**2 - shape.radius**2)
+    """Place spheres a chord apart; the outer ones lie inside the ends and contain the tips of the caps.
+
+    They contain the mesh of the capsule too, whose corners lie outside by 2 % of its radius.
+    """
+    outer = 1.02 * shape.radius
+    radius = max(shape.radius + slack, outer + slack / 2)
+    half_chord = np.sqrt(radius**2 - outer**2)
     middle = (np.asarray(shape.start) + np.asarray(shape.end)) / 2
-    inner = shape.length - 2 * slack
+    inner = shape.length - 2 * (radius - outer)
     if inner <= 0:
-        return middle[None], np.array([shape.radius + shape.length / 2])
+        return middle[None], np.array([outer + shape.length / 2])
     count = int(np.ceil(inner / (2 * half_chord))) + 1
     at = np.linspace(-inner / 2, inner / 2, count)
     return middle + at[:, None] * shape.along(), np.full(count, radius)
 
 
-def cover_solid(shape: Box | Mesh, slack: float) -> tuple[Array, Array]:
-    """Cover a solid greedily: the candidate that covers most uncovered surface points is next.
+def cover_solids(shapes: Sequence[Shape], slack: float, fit: FitConstants = QUICK) -> tuple[Array, Array]:
+    """Cover boxes and meshes of one link by the fewest spheres found, and prove that they contain every triangle.
 
-    Candidates are the inscribed spheres at the points of a grid, enlarged by the slack. Spheres of radius ``slack`` on
-    the surface cover the remaining points. A surface point represents a neighbourhood of a quarter of the slack, which
-    follows from the sampling. Every radius is reduced by this amount in the test.
+    Candidates are spheres inscribed in a closed shape and enlarged by ``slack``, and spheres of radius ``slack`` on the
+    surface. A minimum set cover of surface points selects from them (integer programming by HiGHS). Where the proof
+    fails, points are added. Finally radii grow by at most ``fit.growth``, and small spheres are added, to contain the
+    pieces that are left; see :func:`splatbot.robots.containment.open_pieces`. Candidates are smaller by the growth, so
+    that no sphere extends farther than ``slack`` beyond the shapes.
+
+    Returns:
+        centres (S, 3) [m, link frame] and radii (S,) [m].
     """
-    spacing = slack / 8
-    left = _thinned(shape.surface(spacing), spacing / 2)
-    grid = _grid(left.min(axis=0), left.max(axis=0), slack)
-    depth = shape.depth(grid)
-    centers, radii = grid[depth > 0], depth[depth > 0] + slack
-    found: list[tuple[Array, float]] = []
-    few = left[:: max(1, len(left) // 3000)]
-    covers = np.stack(
-        [np.linalg.norm(few - c, axis=1) <= r - 2 * spacing for c, r in zip(centers, radii, strict=True)]
-        or [np.zeros(len(few), bool)]
+    rng = np.random.default_rng(fit.seed)
+    growth = min(fit.growth, slack / 4)
+    inner = slack - growth
+    triangles = np.concatenate([shape.triangles() for shape in shapes])
+    centers, radii = _candidates(shapes, triangles, inner, fit, rng)
+    points = np.concatenate([_sampled(triangles, fit.points, rng)[0], *_corners(shapes, fit)])
+    for turn in range(fit.rounds):
+        missed = ~_contains(centers, radii, points, fit).any(axis=0)
+        centers = np.concatenate([centers, points[missed]])
+        radii = np.concatenate([radii, np.full(missed.sum(), inner)])
+        chosen = _fewest(_contains(centers, radii, points, fit), fit)
+        left = open_pieces(triangles, centers[chosen], radii[chosen], fit.size * (2 if turn == 0 else 1))
+        if not len(left):
+            break
+        lacking = beyond(left, centers[chosen], radii[chosen]).min(axis=1)
+        if lacking.max() <= growth:
+            break
+        points = np.concatenate([points, _spread(left.mean(axis=1), lacking, fit)])
+    return _completed(triangles, centers[chosen], radii[chosen], inner, growth, fit)
+
+
+def _candidates(
+    shapes: Sequence[Shape], triangles: Array, slack: float, fit: FitConstants, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return spheres (C, 3), (C,) that extend at most the slack beyond the shapes."""
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    anywhere = rng.uniform(low, high, (fit.candidates, 3))
+    at, normals = _sampled(triangles, fit.candidates // 3, rng)
+    below = at - rng.uniform(slack / 4, fit.deepest, (len(at), 1)) * normals
+    towards = at + rng.uniform(0.05, 0.6, (len(at), 1)) * ((low + high) / 2 - at)
+    inner = np.concatenate([anywhere, below, towards])
+    depth = depth_of(shapes, inner)
+    inner, depth = inner[depth > 0], depth[depth > 0]
+    on, _ = _sampled(triangles, fit.candidates // 30, rng)
+    return np.concatenate([inner, on]), np.concatenate([depth, np.zeros(len(on))]) + slack
+
+
+def _sampled(triangles: Array, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Sample points (count, 3) uniformly on triangles, and their normals."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    rows = rng.choice(len(triangles), count, p=area / area.sum())
+    u, v = rng.random((2, count))
+    u, v = np.where(u + v > 1, 1 - u, u)[:, None], np.where(u + v > 1, 1 - v, v)[:, None]
+    a, b, c = (triangles[rows, k] for k in range(3))
+    return a + u * (b - a) + v * (c - a), normals[rows] / area[rows, None]
+
+
+def _corners(shapes: Sequence[Shape], fit: FitConstants) -> list[Array]:
+    """Return the corners of shapes of few triangles; they are the hardest points to contain."""
+    meshes = [shape.triangles() for shape in shapes]
+    return [np.unique(t.reshape(-1, 3), axis=0) for t in meshes if len(t) <= fit.points // 2]
+
+
+def _contains(centers: Array, radii: Array, points: Array, fit: FitConstants) -> NDArray[np.bool_]:
+    """Return which spheres contain which points with a margin, (C, P)."""
+    return np.stack([np.linalg.norm(points - c, axis=1) <= r - fit.size for c, r in zip(centers, radii, strict=True)])
+
+
+def _fewest(contains: NDArray[np.bool_], fit: FitConstants) -> NDArray[np.int64]:
+    """Select few rows of (C, P) that contain every column."""
+    greedy = _greedy(contains)
+    _, columns = np.unique(np.packbits(contains, axis=0), axis=1, return_index=True)
+    matrix = csr_matrix(contains[:, columns].T.astype(np.float64))
+    answer = milp(
+        np.ones(len(contains)),
+        constraints=LinearConstraint(matrix, 1, np.inf),
+        integrality=np.ones(len(contains)),
+        bounds=Bounds(0, 1),
+        options={"time_limit": fit.seconds, "mip_rel_gap": fit.gap},
     )
-    while (gains := covers.sum(axis=1)).max() > 0:
+    if answer.x is None:
+        return greedy
+    chosen = np.flatnonzero(answer.x > 0.5)
+    good = len(chosen) < len(greedy) and bool(contains[chosen].any(axis=0).all())
+    return chosen if good else greedy
+
+
+def _greedy(contains: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Take the row that contains most of the columns that are left, then drop rows that others make superfluous."""
+    left, chosen = contains.copy(), []
+    while (gains := left.sum(axis=1)).max() > 0:
         best = int(gains.argmax())
-        found.append((centers[best], float(radii[best])))
-        covers &= ~covers[best]
-    for center, radius in found:
-        left = left[np.linalg.norm(left - center, axis=1) > radius - 2 * spacing]
-    while len(left):
-        found.append((left[0], slack))
-        left = left[np.linalg.norm(left - left[0], axis=1) > slack - 2 * spacing]
-    return np.array([center for center, _ in found]), np.array([radius for _, radius in found])
+        chosen.append(best)
+        left[:, left[best].copy()] = False
+    times = contains[chosen].sum(axis=0)
+    for row in sorted(chosen, key=lambda r: int(contains[r].sum())):
+        if (times[contains[row]] > 1).all():
+            times -= contains[row]
+            chosen.remove(row)
+    return np.array(chosen, dtype=np.int64)
 
 
-def _thinned(points: Array, cell: float) -> Array:
-    """Keep the first point of each cell [m] of a grid."""
-    at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    size = at.max(axis=0) + 1
-    _, first = np.unique((at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2], return_index=True)
-    return points[np.sort(first)]
+def _spread(points: Array, lacking: Array, fit: FitConstants) -> Array:
+    """Return the points that lack most, apart from each other."""
+    found = np.zeros((0, 3))
+    for point in points[np.argsort(-lacking)][: 40 * fit.added]:
+        if len(found) < fit.added and (np.linalg.norm(found - point, axis=1) > fit.apart).all():
+            found = np.concatenate([found, point[None]])
+    return found
 
 
-def _grid(low: Array, high: Array, slack: float) -> Array:
-    """Return grid points (P, 3) with a step of the slack, or a sixteenth of the longest side if that is larger."""
-    step = max(slack, float((high - low).max()) / 16)
-    lines = [np.linspace(low[k], high[k], int((high[k] - low[k]) / step) + 3)[1:-1] for k in range(3)]
-    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+def _completed(
+    triangles: Array, centers: Array, radii: Array, inner: float, growth: float, fit: FitConstants
+) -> tuple[Array, Array]:
+    """Cover the pieces that are left: by spheres of radius ``inner`` on those that lack more than ``growth``.
 
-
-def uncovered(shapes: Sequence[Shape], spheres: LinkSpheres, spacing: float) -> float:
-    """Return the largest distance [m] of a surface point of the shapes from the spheres.
-
-    The sampling makes it too small by at most ``spacing`` [m]. A negative value is the smallest depth of any point in
-    the spheres.
+    Other pieces make the sphere grow that needs to grow least.
     """
-    worst = -np.inf
-    for shape in shapes:
-        own = spheres.link == shape.link
-        points = shape.surface(spacing)
-        distance = np.full(len(points), np.inf)
-        for center, radius in zip(spheres.centers[own], spheres.radii[own], strict=True):
-            distance = np.minimum(distance, np.linalg.norm(points - center, axis=1) - radius)
-        worst = max(worst, float(distance.max()))
-    return worst
+    left = open_pieces(triangles, centers, radii, fit.size)
+    lacking = beyond(left, centers, radii).min(axis=1)
+    while len(lacking) and lacking.max() > growth:
+        middle = left[int(lacking.argmax())].mean(axis=0)
+        centers, radii = np.concatenate([centers, middle[None]]), np.append(radii, inner)
+        np.minimum(lacking, beyond(left, middle[None], radii[-1:])[:, 0], out=lacking)
+    grown = radii.copy()
+    for k in range(0, len(left), 20_000):
+        missing = beyond(left[k : k + 20_000], centers, radii)
+        nearest = missing.argmin(axis=1)
+        np.maximum.at(grown, nearest, radii[nearest] + missing[np.arange(len(nearest)), nearest] + NANOMETRE)
+    return centers, grown

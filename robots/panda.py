@@ -1,8 +1,9 @@
-"""Franka Emika Panda with its hand: published kinematics and limits, estimated inertias, coarse collision shapes.
+"""Franka Emika Panda with its hand: published kinematics and limits, estimated inertias, certified body.
 
 DH parameters and limits come from Franka's documentation (robot and interface specifications). Inertias are those of
-Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019). Capsules follow Franka's coarse
-self-collision model.
+Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019). The spheres contain Franka's visual and
+collision meshes; see :mod:`splatbot.robots.bodies`. The capsules of the twin follow Franka's coarse self-collision
+model.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from functools import cache
 
 import numpy as np
 
-from splatbot.protocols import Array
+from splatbot.protocols import Array, HandShape, LinkSpheres
+from splatbot.robots.bodies import joined, load_body
 from splatbot.robots.joints import Joint
 from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
 from splatbot.robots.shapes import Capsule
@@ -47,6 +49,20 @@ _INERTIALS = (
     (1.495522, (0.0102, -0.0021, 0.0972), (0.0192, 0.0184, 0.0068, -0.0004, -0.0012, -0.0007)),
 )
 
+# Around the meshes of hand and fingers; the pads are those of the twin's fingers.
+_HAND = HandShape(
+    stroke=0.08,
+    width=0.025,
+    thickness=0.0265,
+    tip=0.0088999,
+    pad=-0.0037,
+    pad_width=0.0,
+    palm=0.0374,
+    palm_size=(0.0634, 0.208),
+)
+# Links that may not touch. Neighbours always do, and so do their spheres.
+PAIRS = tuple((a, b) for a in range(8) for b in range(a + 2, 8))
+
 
 @cache
 def panda() -> RobotModel:
@@ -64,7 +80,7 @@ def panda() -> RobotModel:
         )
         for k in range(7)
     )
-    T_link_hand = _turned(_HAND_YAW, _FLANGE)
+    T_link_hand, body = _turned(_HAND_YAW, _FLANGE), load_body("panda")
     return RobotModel(
         name="panda",
         joints=joints,
@@ -76,29 +92,51 @@ def panda() -> RobotModel:
             np.stack([T_link_hand @ _turned(yaw, _FINGERS) for yaw in (0.0, np.pi)]),
             0.04,
             (Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.0413), 0.0125),),
+            covering=body.on("finger", 0),
+            hand=_HAND,
         ),
+        slack=body.slack,
+        covering=joined(*arm_spheres(), body.on("hand", 7, T_link_hand)),
+        pairs=np.array(PAIRS, dtype=np.int32),
     )
 
 
+def arm_spheres() -> list[LinkSpheres]:
+    """Return the spheres of the arm without a hand, a link each."""
+    body = load_body("panda")
+    return [body.on(f"link{k}", k) for k in range(8)]
+
+
 def _arm_shapes() -> list[Capsule]:
+    """Return capsules for the twin. They lie in the meshes of their links, and so in the certified body."""
     return [
-        Capsule(0, (-0.09, 0.0, 0.06), (-0.06, 0.0, 0.06), 0.06),
-        Capsule(1, (0.0, 0.0, -0.333), (0.0, 0.0, -0.05), 0.06),
-        Capsule(2, (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
-        Capsule(3, (0.0, 0.0, -0.22), (0.0, 0.0, -0.07), 0.06),
-        Capsule(4, (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06),
-        Capsule(5, (0.0, 0.0, -0.31), (0.0, 0.0, -0.21), 0.06),
-        Capsule(5, (0.0, 0.08, -0.20), (0.0, 0.08, -0.06), 0.025),
-        Capsule(6, (0.0, 0.0, -0.07), (0.0, 0.0, 0.01), 0.05),
-        Capsule(7, (0.0, 0.0, -0.06), (0.0, 0.0, 0.08), 0.04),
-        Capsule(7, (0.0424, 0.0424, 0.077), (0.0424, 0.0424, 0.087), 0.03),
+        Capsule(0, (-0.034, -0.004, 0.072), (0.004, 0.003, 0.063), 0.058),
+        Capsule(0, (-0.095, -0.001, 0.035), (-0.019, -0.045, 0.037), 0.034),
+        Capsule(1, (-0.001, -0.051, -0.01), (-0.004, -0.002, -0.138), 0.050),
+        Capsule(1, (0.01, -0.019, -0.133), (-0.006, -0.084, 0.002), 0.043),
+        Capsule(1, (-0.01, -0.015, -0.05), (0.005, -0.029, 0.004), 0.041),
+        Capsule(2, (-0.002, -0.114, 0.019), (-0.001, 0.004, 0.038), 0.050),
+        Capsule(2, (-0.011, -0.148, 0.008), (-0.006, 0.006, 0.08), 0.042),
+        Capsule(3, (0.025, 0.008, -0.061), (0.086, 0.047, -0.003), 0.048),
+        Capsule(3, (0.074, 0.059, 0.0), (0.012, 0.016, -0.074), 0.046),
+        Capsule(3, (0.033, 0.018, -0.024), (-0.008, -0.008, -0.079), 0.040),
+        Capsule(4, (-0.065, 0.074, 0.014), (-0.017, 0.012, 0.044), 0.049),
+        Capsule(4, (-0.005, 0.005, 0.047), (-0.05, 0.042, 0.016), 0.051),
+        Capsule(4, (-0.082, 0.056, -0.002), (-0.037, 0.056, 0.02), 0.045),
+        Capsule(5, (0.002, 0.061, -0.025), (-0.002, 0.007, -0.208), 0.047),
+        Capsule(5, (-0.009, 0.04, -0.172), (-0.004, 0.085, 0.005), 0.039),
+        Capsule(5, (-0.016, 0.033, -0.013), (-0.016, -0.015, -0.223), 0.030),
+        Capsule(6, (0.081, 0.007, 0.001), (-0.005, -0.008, 0.015), 0.037),
+        Capsule(6, (0.088, 0.035, 0.0), (0.038, -0.01, 0.01), 0.039),
+        Capsule(7, (-0.019, -0.017, 0.081), (0.036, 0.024, 0.079), 0.022),
+        Capsule(7, (-0.01, 0.017, 0.077), (0.02, 0.042, 0.079), 0.021),
     ]
 
 
 def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
-    """Return a capsule around the body of the hand, 63 x 204 x 66 mm, round at its ends."""
-    start, end = (T_link_hand @ np.array([0.0, y, 0.0345, 1.0]) for y in (-0.0705, 0.0705))
-    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.0315)]
+    """Return a capsule in the body of the hand."""
+    start, end = (T_link_hand @ np.array([0.0, y, 0.04, 1.0]) for y in (-0.064, 0.064))
+    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.022)]
 
 
 def _dh(a: float, d: float, alpha: float) -> Array:

@@ -54,6 +54,9 @@ class GripperGeometry:
         shapes: shapes of one finger in its own frame; their ``link`` is ignored.
         speed: speed of each finger [m/s].
         force: force between the fingers [N].
+        covering: spheres of one finger in its own frame; their ``link`` is ignored. If None, they are generated from
+            the shapes.
+        hand: boxes around fingers and palm. If None, they are measured on the shapes of gripper and last link.
     """
 
     T_link_finger: Array
@@ -61,6 +64,8 @@ class GripperGeometry:
     shapes: tuple[Shape, ...]
     speed: float = 0.2
     force: float = 70.0
+    covering: LinkSpheres | None = field(default=None, repr=False)
+    hand: HandShape | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +192,8 @@ class RobotModel:
         """Boxes around the shapes of the gripper, whose fingers open along the tool's y axis; None without one."""
         if self.gripper is None or not self.gripper.shapes:
             return None
+        if self.gripper.hand is not None:
+            return self.gripper.hand
         T_tcp_link = inverse(self.T_link_tcp)
         T_tcp_finger = T_tcp_link @ self.gripper.T_link_finger[0]
         finger = np.concatenate([shape.surface(CONSTANTS.spacing) for shape in self.gripper.shapes])
@@ -258,6 +265,8 @@ class RobotModel:
 
     @cached_property
     def _finger_spheres(self) -> LinkSpheres:
+        if self.gripper is not None and self.gripper.covering is not None:
+            return self.gripper.covering
         return _covered(self.gripper.shapes if self.gripper else (), self.slack / 2)
 
 

@@ -15,7 +15,10 @@ from functools import cache
 import numpy as np
 
 from splatbot.protocols import Array
-from splatbot.robots.panda import panda
+from splatbot.robots.bodies import joined
+from splatbot.robots.cover import cover
+from splatbot.robots.panda import arm_spheres, panda
+from splatbot.robots.robot import CONSTANTS as COVER
 from splatbot.robots.robot import GripperGeometry, RobotModel
 from splatbot.robots.shapes import Capsule
 
@@ -78,10 +81,12 @@ def _with_hand(
     own = tuple(shape for shape in arm.shapes if shape.link < 7)
     flange = tuple(shape for shape in arm.shapes if shape.link == 7)[:2]
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    hand = tuple(Capsule(7, _at(*a), _at(*b), radius) for a, b, radius in body)
     return replace(
         arm,
         name=name,
-        shapes=(*own, *flange, *(Capsule(7, _at(*a), _at(*b), radius) for a, b, radius in body)),
+        shapes=(*own, *flange, *hand),
+        covering=joined(*arm_spheres(), cover(hand, COVER.slack)),
         T_link_tcp=T_link_flange @ _along_z(tcp),
         gripper=GripperGeometry(
             np.stack([T_link_flange @ _along_z(root) @ turn for turn in (np.eye(4), turned)]),
@@ -89,6 +94,7 @@ def _with_hand(
             tuple(Capsule(0, *along) for along in finger),
             speed=0.15,
             force=force,
+            covering=cover([Capsule(0, *along) for along in finger], COVER.slack / 2),
         ),
     )
 

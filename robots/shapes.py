@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +13,8 @@ from numpy.typing import NDArray
 
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
+
+_AROUND = 24  # corners of the rings of a capsule's mesh
 
 
 class Shape(Protocol):
@@ -23,6 +27,14 @@ class Shape(Protocol):
 
     def surface(self, spacing: float) -> Array:
         """Sample points (P, 3) of the surface in the link frame, at a distance of about ``spacing`` [m] or less."""
+        ...
+
+    def triangles(self) -> Array:
+        """Return triangles (T, 3, 3) [m, link frame] that contain every point of the surface, or enclose it."""
+        ...
+
+    def depth(self, points: Array) -> Array:
+        """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface; negative outside."""
         ...
 
 
@@ -63,6 +75,30 @@ class Capsule:
             rings += [end + self.radius * np.cos(angle) * ring + out, start + self.radius * np.cos(angle) * ring - out]
         return np.concatenate(rings)
 
+    def triangles(self) -> Array:
+        """Return a mesh whose corners lie outside by at most 2 % of the radius, so that it encloses the capsule."""
+        axis, turn = self.along(), 2 * np.pi * np.arange(_AROUND) / _AROUND
+        side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        side /= np.linalg.norm(side)
+        ring = np.outer(np.cos(turn), side) + np.outer(np.sin(turn), np.cross(axis, side))
+        rise = np.linspace(-np.pi / 2, np.pi / 2, _AROUND // 2 + 2)
+        rise = np.sort(np.r_[rise, 0.0])  # the equator twice: one ring for each end
+        wide = self.radius / np.cos(np.pi / _AROUND) ** 2
+        ends = np.where(np.arange(len(rise)) < len(rise) // 2, 0, 1)
+        at = np.array([self.start, self.end])[ends]
+        rings = at[:, None] + wide * (np.cos(rise)[:, None, None] * ring + np.sin(rise)[:, None, None] * axis)
+        quads = np.stack(
+            [rings[:-1], np.roll(rings[:-1], -1, axis=1), np.roll(rings[1:], -1, axis=1), rings[1:]], axis=2
+        )
+        quads = quads.reshape(-1, 4, 3)
+        return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+    def depth(self, points: Array) -> Array:
+        """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface; negative outside."""
+        start, line = np.asarray(self.start), np.subtract(self.end, self.start)
+        along = np.clip((points - start) @ line / max(float(line @ line), 1e-30), 0.0, 1.0)
+        return np.asarray(self.radius - np.linalg.norm(points - start - along[:, None] * line, axis=1))
+
 
 @dataclass(frozen=True, eq=False)
 class Box:
@@ -86,6 +122,14 @@ class Box:
                 faces.append(face)
         return transform_points(self.T_link_box, np.concatenate(faces))
 
+    def triangles(self) -> Array:
+        """Return the twelve triangles (12, 3, 3) [m, link frame]."""
+        half = np.asarray(self.size) / 2
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+        quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        rows = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+        return transform_points(self.T_link_box, corners)[rows]
+
     def depth(self, points: Array) -> Array:
         """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface; negative outside."""
         local = transform_points(inverse(self.T_link_box), points)
@@ -94,23 +138,41 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A closed triangle mesh: vertices (V, 3) [m, link frame] and triangles (T, 3)."""
+    """A triangle mesh: vertices (V, 3) [m, link frame] and rows of its faces (T, 3).
+
+    Args:
+        link: index of the link; 0 is the base.
+        vertices: (V, 3) [m, link frame].
+        faces: (T, 3) rows of vertices; those of a closed mesh are counter-clockwise from outside.
+        closed: whether the mesh bounds a volume. No point is inside an open one.
+    """
 
     link: int
     vertices: Array = field(repr=False)
-    triangles: NDArray[np.int64] = field(repr=False)
+    faces: NDArray[np.int64] = field(repr=False)
+    closed: bool = True
+
+    @cached_property
+    def _scene(self) -> o3d.t.geometry.RaycastingScene:
+        scene = o3d.t.geometry.RaycastingScene()
+        vertices, faces = self.vertices.astype(np.float32), self.faces.astype(np.uint32)
+        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces))
+        return scene
+
+    def triangles(self) -> Array:
+        """Return the triangles (T, 3, 3) [m, link frame]."""
+        return np.asarray(self.vertices[self.faces], dtype=np.float64)
 
     def depth(self, points: Array) -> Array:
         """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface; negative outside."""
-        scene = o3d.t.geometry.RaycastingScene()
-        vertices, triangles = self.vertices.astype(np.float32), self.triangles.astype(np.uint32)
-        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
         queries = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
-        return np.asarray(-scene.compute_signed_distance(queries, nsamples=5).numpy(), dtype=np.float64)
+        if not self.closed:
+            return np.asarray(-self._scene.compute_distance(queries).numpy(), dtype=np.float64)
+        return np.asarray(-self._scene.compute_signed_distance(queries, nsamples=5).numpy(), dtype=np.float64)
 
     def surface(self, spacing: float) -> Array:
         """Sample barycentric grids on the triangles."""
-        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         edge = np.max(
             [np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)], axis=0
         )
@@ -124,3 +186,16 @@ class Mesh:
             grid = corners[0] + u[:, None] * (corners[1] - corners[0]) + v[:, None] * (corners[2] - corners[0])
             points.append(grid.reshape(-1, 3))
         return np.concatenate(points)
+
+
+def depth_of(shapes: Sequence[Shape], points: Array) -> Array:
+    """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface of the shapes of one link.
+
+    It is negative outside of all shapes: minus the distance from the nearest.
+    """
+    return np.asarray(np.max([shape.depth(points) for shape in shapes], axis=0))
+
+
+def distance_of(shapes: Sequence[Shape], points: Array) -> Array:
+    """Compute the distance (P,) [m] of points (P, 3) [m, link frame] from the shapes of one link; 0 inside."""
+    return np.maximum(-depth_of(shapes, points), 0.0)

@@ -29,7 +29,9 @@ from splatbot.services.routes import (
     grasps,
     health,
     jobs,
+    landing,
     maps,
+    objects,
     picks,
     plans,
     render,
@@ -91,6 +93,7 @@ def create_app(runtime: Runtime) -> FastAPI:
     describe_bodies(app)
     add_docs(app)
     for group in (
+        landing,
         health,
         maps,
         frames,
@@ -100,6 +103,7 @@ def create_app(runtime: Runtime) -> FastAPI:
         views,
         plans,
         grasps,
+        objects,
         picks,
         arms,
         trajectories,

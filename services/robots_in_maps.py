@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
+from splatbot.planning.goals import suspect_degrees
 from splatbot.robots.graspable_objects import GraspableObjects, measured_map, segment_objects
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
@@ -62,4 +63,5 @@ def joints_of(model: RobotModel, values: list[float], field: str) -> NDArray[np.
     if q.shape != (len(model),) or not np.isfinite(q).all():
         hint = f"{model.name} has {len(model)} joints"
         raise InputError(f"has {len(values)} values.", field=field, hint=hint)
+    suspect_degrees(q, model.chain, field)
     return q

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat
+from splatbot.planning.timing import DEFAULT_SPEED
 from splatbot.services.arrays import Configurations, Points
 
 Vector3 = tuple[float, float, float]
@@ -187,7 +188,10 @@ class PlanRequest(Request):
     margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="room to keep to the map [m]")
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    speed: Annotated[float, Field(gt=0, le=1)] = Field(1.0, description="share of the joints' limits of velocity")
+    speed: Annotated[float, Field(gt=0, le=1)] = Field(
+        DEFAULT_SPEED,
+        description="fraction of the joints' limits of velocity and acceleration; 1 is as fast as the arm can",
+    )
     rate: Annotated[float, Field(ge=1, le=1000)] | None = Field(
         None, description="of the trajectory's points [Hz]; by default its knots, which give the same curve again"
     )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,8 +26,62 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
             yield file
             sync(file)
         replace(draft, target)
+    except OSError as error:
+        raise _about(target, draft, error) from error
     finally:
-        draft.unlink(missing_ok=True)
+        with suppress(OSError):  # a mount that has vanished
+            draft.unlink(missing_ok=True)
+
+
+def replace_files(
+    folder: str | Path, writers: Mapping[str, Callable[[Path], None]], *, remove: Sequence[str] = ()
+) -> None:
+    """Write several files, then replace those of ``folder`` in this order.
+
+    An error while they are written, as of a full disk, leaves every file of ``folder`` as it was.
+
+    Args:
+        folder: it is created if it does not exist.
+        writers: function that writes the file at a path, by the file's name.
+        remove: files that describe the earlier ones; they are removed before the first is replaced.
+    """
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    draft = target / f".{secrets.token_hex(4)}.draft"
+    try:
+        draft.mkdir()
+        for name, write in writers.items():
+            write(draft / name)
+        for name in remove:
+            (target / name).unlink(missing_ok=True)
+        for name in writers:
+            replace(draft / name, target / name)
+    except OSError as error:
+        raise _about(target, draft, error) from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def write_text(text: str) -> Callable[[Path], None]:
+    """Return a writer of a text for :func:`replace_files`."""
+    return write_bytes(text.encode())
+
+
+def write_bytes(data: bytes) -> Callable[[Path], None]:
+    """Return a writer of bytes for :func:`replace_files`."""
+
+    def write(path: Path) -> None:
+        with atomic_write(path) as file:
+            file.write(data)
+
+    return write
+
+
+def _about(target: Path, draft: Path, error: OSError) -> OSError:
+    """Return an error that names the caller's file; errors that name another file are returned as they are."""
+    if error.errno is None or not (error.filename is None or str(error.filename).startswith(str(draft))):
+        return error
+    return OSError(error.errno, error.strerror, str(target))
 
 
 def sync(file: BinaryIO, *, flushed: int = 0) -> None:
@@ -64,3 +119,5 @@ def sweep_drafts(folder: Path) -> None:
     for draft in folder.glob(".*.tmp"):
         if draft.is_file():
             draft.unlink(missing_ok=True)
+    for draft in folder.glob(".*.draft"):
+        shutil.rmtree(draft, ignore_errors=True)

@@ -53,16 +53,19 @@ class ServiceError(SplatbotError):
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """Mahalanobis distances of P points to the map.
+    """Distances of P points to the map.
 
     Args:
-        distance: (P,) float32, in standard deviations of the nearest Gaussian; infinity in an empty map.
+        distance_sigma: (P,) float32, in standard deviations of the nearest Gaussian; infinity in an empty map.
+        distance_m: (P,) float32, signed distance to the surface at 2 standard deviations [m]; infinity beyond 1 m, and
+            if another ``n_sigma`` was queried.
         index: (P,) row of that Gaussian; -1 in an empty map.
         inside: (P,) bool, whether the distance is below ``n_sigma``.
         map_version: version of the map that answered.
     """
 
-    distance: NDArray[np.float32]
+    distance_sigma: NDArray[np.float32]
+    distance_m: NDArray[np.float32]
     index: NDArray[np.int64]
     inside: NDArray[np.bool_]
     map_version: int
@@ -199,7 +202,7 @@ class Client(AbstractContextManager["Client"]):
         self.request("POST", _map_path(map_id, "end"))
 
     def distance(self, map_id: str, points: ArrayLike, *, n_sigma: float = 2.0) -> Distances:
-        """Query the Mahalanobis distance of points (P, 3) [m] to the map."""
+        """Query the distances of points (P, 3) [m] to the map, in standard deviations and in metres."""
         body = {"points": np.asarray(points, dtype=np.float64).reshape(-1, 3), "n_sigma": n_sigma}
         answer = self._packed("POST", _map_path(map_id, "distance"), body)
         return _result(Distances, answer)

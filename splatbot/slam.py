@@ -18,6 +18,7 @@ from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
 from splatbot.mapping.executor import Executor, InlineExecutor, ThreadExecutor
 from splatbot.mapping.joint_motion import JointMotionMonitor
+from splatbot.mapping.keyframe_choice import FrameQuality
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.observation import GraphLocation, Observation
@@ -76,6 +77,7 @@ class Slam:
         self._tracker = Tracker(self.config.tracking)
         self._mapper = Mapper(self.config)
         self._location = GraphLocation()
+        self._quality = FrameQuality()
         self._joint_motion = JointMotionMonitor(self.config.mapping.still_joint_speed)
         self._image_size: tuple[int, int] | None = None
         self._localization_only = False
@@ -92,6 +94,7 @@ class Slam:
         prepared = clock.time("prepare", self._prepare, frame)
         self._apply_loop_closure()
         estimate = clock.time("tracking", self._track, prepared, hold_out)
+        prepared = estimate.prepared or prepared
         observation = self._observation(prepared, estimate, hold_out)
         keyframe = self._mapper.should_insert(observation)
         with self._location_restored_on_error():
@@ -119,6 +122,13 @@ class Slam:
             self._executor.close()
         else:
             self._executor.finish(stop)
+
+    @property
+    def iterations_left(self) -> int:
+        """Number of iterations that :meth:`finish` runs: the pending ones and the final refinement."""
+        if self._localization_only:
+            return 0
+        return self._mapper.pending_iterations + self.config.mapping.final_iterations
 
     def localise_only(self) -> None:
         """Localize all further frames in the map, which does not change; the next frame may be anywhere in it.
@@ -217,7 +227,7 @@ class Slam:
                 field="image size",
                 hint="map recordings of different sizes separately",
             )
-        return prepare(frame, self.config.tracking)
+        return prepare(frame, self.config.tracking, self._tracker.expected_twist(frame.stamp))
 
     def _apply_loop_closure(self) -> None:
         if self._mapper.has_loop:
@@ -226,6 +236,7 @@ class Slam:
     def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
         keyframes = self._mapper.keyframes
         if keyframes:
+            self._tracker.variance_scale = self._mapper.inconsistency
             return self._tracker.track(prepared, keyframes)
         if hold_out:
             return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
@@ -237,9 +248,10 @@ class Slam:
         if estimate.verdict != "lost" and not hold_out:
             self._location = self._mapper.locate(estimate.T_world_camera, self._location)
         features = self._tracker.keypoints(prepared, estimate)
-        return Observation(
+        observation = Observation(
             prepared, estimate.T_world_camera, features, self._location, estimate.verdict, held_out=hold_out
         )
+        return replace(observation, is_poor=self._quality.is_poor(observation))
 
     def _record(self, frame: Frame, estimate: PoseEstimate, keyframe: bool, clock: StageClock) -> FrameResult:
         """Append the result of a frame, and report the time outside the stages to the tracker's budget."""

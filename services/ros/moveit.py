@@ -14,6 +14,7 @@ from splatbot.errors import InputError, MapNotFoundError, SplatbotError
 from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal, time_path
 from splatbot.planning.ik import solve_ik
+from splatbot.planning.timing import DEFAULT_SPEED
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
 from splatbot.services.ros.graph import RosGraph, Service
@@ -82,8 +83,9 @@ class MoveItServices:
             budget = min(1e3 * number(request, "allowed_planning_time") or _BUDGET_MS, _LONGEST_MS)
             planner = GaussianRRTStar(served.field, robot, T_world_base=base)
             path = planner.plan(start, goal, budget_ms=budget).unwrap()
-            speed = number(request, "max_velocity_scaling_factor") or 1.0
-            acceleration = number(request, "max_acceleration_scaling_factor") or 1.0
+            # 0 means "not set" in MoveIt, whose own default is 0.1
+            speed = number(request, "max_velocity_scaling_factor") or DEFAULT_SPEED
+            acceleration = number(request, "max_acceleration_scaling_factor") or DEFAULT_SPEED
             trajectory = time_path(
                 path, planner.arm, served.field, velocity_scale=speed, acceleration_scale=acceleration
             )

@@ -18,7 +18,15 @@ _EXAMPLES = {
     "two points": {"points": [[0.1, 0.0, 0.8], [0.1, 0.0, 0.3]]},
     "a thicker surface": {"points": [[0.1, 0.0, 0.8]], "n_sigma": 3.0},
 }
-_ANSWER = {"map_version": 12, "n_sigma": 2.0, "distance": [0.4, 31.7], "index": [1042, 977], "inside": [True, False]}
+_ANSWER = {
+    "map_version": 12,
+    "n_sigma": 2.0,
+    "distance_sigma": [0.4, 31.7],
+    "distance_m": [-0.003, 0.216],
+    "index": [1042, 977],
+    "inside": [True, False],
+}
+_CUT = 1.0  # [m] farther distances are infinite, which saves most of their time
 _VALUES_A_POINT = 8  # its list and three numbers
 _Body = Annotated[
     DistanceRequest,
@@ -29,13 +37,15 @@ _Body = Annotated[
 @router.post(
     "/{map_id}/distance",
     response_class=Response,
-    responses=answers(_ANSWER, npy="distance (P,) float32") | problems(404, 413, 415, 422, 503),
+    responses=answers(_ANSWER, npy="distance_sigma (P,) float32") | problems(404, 413, 415, 422, 503),
     openapi_extra=request_body(DistanceRequest, _EXAMPLES, npy="points (P, 3)"),
 )
 def distance(request: Request, served: ServedAfterFrames, settings: Settings, query: _Body) -> Response:
-    """Return each point's Mahalanobis distance to the nearest Gaussian, that Gaussian's row, and a verdict.
+    """Return each point's distance to the map in standard deviations and in metres, the Gaussian, and a verdict.
 
-    In an empty map the distance is null (infinity in npy and msgpack) and the index -1.
+    `distance_sigma` is the Mahalanobis distance to the Gaussian `index`. `distance_m` is the signed distance to the
+    surface at `n_sigma` standard deviations. It is null beyond 1 m, and for another `n_sigma` than that of motions, 2.
+    In an empty map both are null (infinity in npy and msgpack) and the index is -1.
     """
     if len(query.points) > settings.max_points:
         raise TooLargeError(
@@ -43,12 +53,18 @@ def distance(request: Request, served: ServedAfterFrames, settings: Settings, qu
             field="points",
             hint="split the request, or raise SPLATBOT_MAX_POINTS",
         )
-    found = served.field.mahalanobis(query.points.reshape(-1, 3))
+    points = query.points.reshape(-1, 3)
+    found = served.field.mahalanobis(points)
+    metres = np.full(len(points), np.inf, np.float32)
+    if query.n_sigma == served.field.n_sigma:
+        metres = served.field.clearance(points, cut=_CUT).distance.astype(np.float32)
+        metres[metres >= _CUT] = np.inf
     body = {
         "map_version": found.map_version,
         "n_sigma": query.n_sigma,
-        "distance": found.distance,
+        "distance_sigma": found.distance,
+        "distance_m": metres,
         "index": found.index,
         "inside": found.distance.astype(np.float64) <= query.n_sigma,
     }
-    return answer(request, body, array="distance")
+    return answer(request, body, array="distance_sigma")

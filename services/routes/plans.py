@@ -72,7 +72,9 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     )
     planner = GaussianRRTStar(served.field, robot, T_world_base=base, margin=query.margin)
     result = planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed)
-    trajectory = time_path(result.unwrap(), planner.arm, served.field, velocity_scale=query.speed)
+    trajectory = time_path(
+        result.unwrap(), planner.arm, served.field, velocity_scale=query.speed, acceleration_scale=query.speed
+    )
     points = len(trajectory.control) - 2 if query.rate is None else trajectory.duration * query.rate
     most = service.settings.max_configurations
     if points > most:

@@ -21,6 +21,16 @@ from splatbot.services.access import Access
 Check = Callable[[ServerConnection, Request], Response | None]
 
 _PAGE = '<!doctype html><meta name="referrer" content="no-referrer"><meta http-equiv="refresh" content="0;url=/">'
+_ASK = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="referrer" content="no-referrer">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>splatbot viewer</title>
+<style>:root { color-scheme: light dark } body { font: 16px/1.5 system-ui, sans-serif; max-width: 30rem;
+margin: 20vh auto; padding: 0 1rem } input, button { font: inherit; padding: .4rem .6rem; width: 100%;
+box-sizing: border-box; margin: .3rem 0 }</style>
+<h1>splatbot viewer</h1><p>The map is shown to clients with the key of the service. It is in the file that the service
+names at its start, by default <code>~/.local/state/splatbot/service-key</code>.</p>
+<form method="get" action="/"><label>Key
+<input type="password" name="key" autocomplete="off" autofocus required></label>
+<button>Open the viewer</button></form><p>The address <code>/?key=KEY</code> opens it at once.</p>NOTE"""
 _opening = threading.Lock()
 
 
@@ -44,7 +54,7 @@ class Door:
         self._ticket = secrets.token_urlsafe(32)
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the refusal of a connection, the answer to its key, or None to let it pass."""
+        """Return a refusal, the form for the key, the answer to a key, or None to let the connection pass."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or not self._access.host_allowed(hosts[0]):
             return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, "This is no name of the viewer: use localhost.\n")
@@ -55,11 +65,9 @@ class Door:
             return None
         key = parse_qs(urlsplit(request.path).query).get("key", [""])[0]
         if not self._access.holds_key(key):
-            return connection.respond(HTTPStatus.UNAUTHORIZED, "Open /?key=KEY with the key of the service.\n")
-        response = connection.respond(HTTPStatus.OK, _PAGE)
-        del response.headers["Content-Type"]
-        response.headers["Content-Type"] = "text/html; charset=utf-8"
-        response.headers["Cache-Control"] = "no-store"
+            note = '<p role="alert">This key is not the one of the service.</p>' if key else ""
+            return _html(connection.respond(HTTPStatus.UNAUTHORIZED, _ASK.replace("NOTE", note)))
+        response = _html(connection.respond(HTTPStatus.OK, _PAGE))
         response.headers["Set-Cookie"] = f"{cookie}={self._ticket}; Path=/; HttpOnly; SameSite=Strict"
         return response
 
@@ -72,6 +80,14 @@ class Door:
             if found is not None and secrets.compare_digest(found.value.encode(), self._ticket.encode()):
                 return True
         return False
+
+
+def _html(response: Response) -> Response:
+    """Return the response as a page that no browser keeps."""
+    del response.headers["Content-Type"]
+    response.headers["Content-Type"] = "text/html; charset=utf-8"
+    response.headers["Cache-Control"] = "no-store"
+    return response
 
 
 @contextmanager

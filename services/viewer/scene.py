@@ -34,12 +34,14 @@ class ViewerSceneConstants:
     Args:
         max_frusta: largest number of shown cameras.
         frustum: [m] size of a camera.
+        frustum_line: [px] width of its lines.
         full_clearance: [m] an arm with at least this clearance is green.
         path_points: points of a shown path.
     """
 
     max_frusta: int = 60
     frustum: float = 0.04
+    frustum_line: float = 1.5
     full_clearance: float = 0.1
     path_points: int = 60
 
@@ -190,6 +192,8 @@ class ViewerScene:
             float(fov),
             aspect,
             scale=CONSTANTS.frustum,
+            thickness=CONSTANTS.frustum_line,
+            thickness_units="screen",  # viser's default is 2 cm, half of the frustum
             color=color,
             wxyz=rotation_to_quat(T[:3, :3]),
             position=T[:3, 3],

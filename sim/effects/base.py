@@ -119,6 +119,16 @@ class CameraMotionEffect(SensorEffect):
         """Return the effect for a camera that moves along ``path``."""
         return replace(self, path=path)
 
+    def known_path(self) -> Trajectory:
+        """Return the camera path.
+
+        Raises:
+            InputError: it is not known.
+        """
+        if self.path is None:
+            raise InputError("does not know how the camera moves.", field=self.name, hint="give it the path: along()")
+        return self.path
+
 
 class Effects:
     """Effects in the order in which they act on a frame; without effects, frames pass unchanged.

@@ -39,7 +39,7 @@ class MotionBlur(CameraMotionEffect, cost="one warp for each pixel of blur, at m
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Smear the colours of the frame."""
-        ends = motion_during(self.path, frame.stamp, self.exposure, effect=self.name)
+        ends = motion_during(self.known_path(), frame.stamp, self.exposure)
         flows = [flow(frame.camera, frame.depth, T_now_then) for T_now_then in ends]
         longest = float(np.abs(flows[0]).max() + np.abs(flows[1]).max())
         if longest < _MIN_BLUR_PX:

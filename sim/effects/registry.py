@@ -12,6 +12,7 @@ from splatbot.sim.effects.base import Effects, SensorEffect, settings
 EFFECTS = (
     "motion_blur",
     "rolling_shutter",
+    "depth_camera",
     "lens_distortion",
     "exposure",
     "white_balance",

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
-from splatbot.geometry import Array, inverse
+from splatbot.geometry import Array
 from splatbot.sim.effects.base import CameraMotionEffect, setting
-from splatbot.sim.effects.warping import color_at, depth_at, flow, grid, motion_during
+from splatbot.sim.effects.warping import color_at, depth_at, flow, grid, motion_of_lines
 
 
 @dataclass(frozen=True)
@@ -35,27 +35,21 @@ class RollingShutter(CameraMotionEffect, cost="two warps of depth and one of col
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """Warp the frame line by line."""
-        ends = motion_during(self.path, frame.stamp, self.readout, effect=self.name)
+        T_now_line = motion_of_lines(self.known_path(), frame.stamp, self.readout, frame.camera.height)
         depth, camera = frame.depth, frame.camera
         at = grid(*depth.shape)
         for _ in range(2):  # the second iteration uses the depth at the position that the first one found
-            at = grid(*depth.shape) + _by_line([flow(camera, depth_at(depth, at), T) for T in ends])
+            at = grid(*depth.shape) + flow(camera, depth_at(depth, at), T_now_line)
         seen = depth_at(depth, at)
-        depth_then = seen + _by_line([_depth_change(camera, seen, at, T) for T in ends])
+        depth_then = seen + _depth_change(camera, seen, at, T_now_line)
         return replace(frame, rgb=color_at(frame.rgb, at), depth=np.where(seen > 0, np.maximum(depth_then, 0), 0))
 
 
-def _by_line(ends: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Interpolate values (H, W[, K]) of the first and last line's readout times to that of each line."""
-    first, last = ends
-    share = np.linspace(-1.0, 1.0, len(first), dtype=np.float32).reshape(-1, *[1] * (first.ndim - 1))
-    return np.where(share < 0, -share * first, share * last)
-
-
 def _depth_change(
-    camera: Camera, depth: NDArray[np.float32], at: NDArray[np.float32], T_now_then: Array
+    camera: Camera, depth: NDArray[np.float32], at: NDArray[np.float32], T_now_line: Array
 ) -> NDArray[np.float32]:
-    """Compute the change of depth (H, W) [m] from now to then of points at pixels (H, W, 2) of the view now."""
-    R, t = inverse(T_now_then)[2, :3], inverse(T_now_then)[2, 3]
+    """Compute the change of depth (H, W) [m] from now to each line (H, 4, 4) of points at pixels (H, W, 2) now."""
+    R = T_now_line[:, :3, 2].T[..., None]  # third row of the inverse rotation of each line
+    t = -np.einsum("hi,hi->h", T_now_line[:, :3, 2], T_now_line[:, :3, 3])[:, None]
     x, y = (at[..., 0] - camera.cx) / camera.fx, (at[..., 1] - camera.cy) / camera.fy
     return np.asarray(depth * (R[0] * x + R[1] * y + R[2] - 1.0) + t, dtype=np.float32)

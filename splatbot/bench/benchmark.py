@@ -37,6 +37,7 @@ BENCHMARKS = {
     "raster": Entry("splatbot.bench.raster", "Measure the rasterizer: speed, and error against time."),
     "tracking": Entry("splatbot.bench.tracking", "Measure tracking: error against time, compared with other trackers."),
     "collision": Entry("splatbot.bench.collision", "Measure the collision field: queries per second, errors."),
+    "thin": Entry("splatbot.bench.thin", "Measure missed probes on thin, transparent and black objects."),
     "planning": Entry("splatbot.bench.planning", "Measure the planner: paths over time budgets, checked exactly."),
     "grasping": Entry("splatbot.bench.grasping", "Measure grasping: candidates per second, errors of the contacts."),
     "service": Entry("splatbot.bench.service", "Measure the service: mapping under queries, and the cost of HTTP."),

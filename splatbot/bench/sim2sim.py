@@ -108,7 +108,7 @@ class MappedTable:
     def own_margin(self, field: GaussianCollisionField) -> float:
         """Return the error [m] of the map's surfaces near the arm, measured against its own depth images."""
         around = [*self.mapped.T_map_scene[:3, 3], MARGIN.radius]
-        return surface_error(field, self.mapped.views(), around=around).share(MARGIN.share)
+        return surface_error(field, self.mapped.views(), around=around).share(MARGIN.confidence)
 
 
 def run_sim_to_sim(plan: SimToSimPlan, folder: Path, tell: Tell = lambda what, share: None) -> tuple[TrialResults, ...]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import shutil
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -22,6 +24,7 @@ class _Command(NamedTuple):
 COMMANDS = {
     "map": _Command("splatbot.cli.map", "map_log_command", "Turn an RGB-D log into a Gaussian map and a run folder."),
     "eval": _Command("splatbot.cli.eval", "eval_run", "Score a run again: trajectory error and held-out views."),
+    "audit": _Command("splatbot.cli.audit", "audit", "Check a map against measured depth: missed surface, false hits."),
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
     "info": _Command("splatbot.cli.info", "info", "Describe a map, a log or a run."),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
@@ -32,6 +35,8 @@ COMMANDS = {
         "splatbot.cli.plan", "plan", "Plan a path of an arm among the Gaussians of a map, with pictures of it."
     ),
     "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked object in a map."),
+    "objects": _Command("splatbot.cli.objects", "objects", "List the supports and objects of a map with their sizes."),
+    "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),
     "pick": _Command("splatbot.cli.pick", "pick", "Pick a named object in the twin: scan, grasp, plan, lift, check."),
@@ -44,7 +49,20 @@ COMMANDS = {
     "doctor": _Command("splatbot.cli.doctor", "doctor", "Check this installation and print how to fix it."),
 }
 
-_GROUPS = {"bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks."}
+CALIBRATIONS = {
+    "sensor": _Command(
+        "splatbot.cli.calibrate",
+        "calibrate_sensor_command",
+        "Estimate readout, delays, registration and bias of an RGB-D sensor from a log.",
+    ),
+}
+
+_GROUPS = {
+    "bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks.",
+    "calibrate": "Calibrate a sensor from a log; `splatbot calibrate --help` lists the calibrations.",
+}
+
+_HELP_COLUMNS = 120  # widest text of a help
 
 _DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers queries of a robot.
 
@@ -78,6 +96,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `splatbot info ... | head` is no error; Python must not flush to the dead pipe again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        from splatbot.cli.paths import system_error
+
+        sentence = system_error(error)
+        if sentence is None:
+            raise
+        if debug:
+            traceback.print_exc()
+        print(f"error: {sentence}", file=sys.stderr)
+        return 1
 
 
 def _print_warning(
@@ -97,8 +125,10 @@ def _dispatch(words: list[str]) -> Any:
     import tyro
 
     if words and words[0] in COMMANDS:
-        return _run(words[0], words[1:])
+        return _run(words[0], COMMANDS[words[0]], words[1:])
     group = words[0] if words and words[0] in _GROUPS else ""
+    if group == "calibrate" and len(words) > 1 and words[1] in CALIBRATIONS:
+        return _run(f"calibrate {words[1]}", CALIBRATIONS[words[1]], words[2:])
     if group and len(words) > 1 and words[1] in _summaries(group):
         from splatbot.cli.bench import run_benchmark
 
@@ -112,10 +142,9 @@ def _dispatch(words: list[str]) -> Any:
     )
 
 
-def _run(name: str, words: list[str]) -> Any:
+def _run(name: str, command: _Command, words: list[str]) -> Any:
     import tyro
 
-    command = COMMANDS[name]
     function = getattr(importlib.import_module(command.module), command.function)
     return tyro.cli(
         function,
@@ -127,8 +156,20 @@ def _run(name: str, words: list[str]) -> Any:
 
 
 def description(documented: object) -> str:
-    """Return the docstring of a command up to its "Args:"; tyro alone would drop the examples."""
-    return inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
+    """Return the docstring of a command up to its "Args:", wrapped to the terminal; tyro would drop the examples.
+
+    Examples stay whole, so that they can be copied. Tyro joins lines that begin with a letter, hence the indentation.
+    """
+    text = inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
+    width = min(shutil.get_terminal_size().columns, _HELP_COLUMNS) - 2
+    paragraphs = []
+    for paragraph in text.split("\n\n"):
+        lines = paragraph.splitlines()
+        plain = not any(line.startswith(" ") for line in lines)
+        paragraphs.append(
+            textwrap.fill(" ".join(lines), width, subsequent_indent=" ", break_on_hyphens=False) if plain else paragraph
+        )
+    return "\n\n".join(paragraphs)
 
 
 def _summaries(group: str) -> dict[str, str]:
@@ -137,6 +178,8 @@ def _summaries(group: str) -> dict[str, str]:
         from splatbot.bench.benchmark import BENCHMARKS
 
         return {name: entry.summary for name, entry in BENCHMARKS.items()}
+    if group == "calibrate":
+        return {name: command.summary for name, command in CALIBRATIONS.items()}
     return {name: command.summary for name, command in COMMANDS.items()} | _GROUPS
 
 

@@ -7,11 +7,12 @@ from typing import Any
 
 import tyro
 from rich.console import Console
+from rich.table import Table as RichTable
 
 from splatbot.bench.benchmark import load_benchmark
 from splatbot.cli import description
 from splatbot.cli.drawing import draw_offscreen
-from splatbot.cli.tables import wide_console
+from splatbot.cli.tables import print_columns, wide_console
 
 _BUSY_LOAD = 0.5  # load average above which other programs slow the measurement down
 
@@ -33,7 +34,10 @@ def run_benchmark(name: str, words: Sequence[str]) -> int:
     _print_machine(console, results.machine)
     for table in benchmark.tables:
         for part in table.render(results.rows):
-            console.print(part)
+            if isinstance(part, RichTable):
+                print_columns(part, console)
+            else:
+                console.print(part)
     console.print(f"written to {settings.folder}")
     violations = benchmark.violations(results) if not settings.quick else []
     for violation in violations:

@@ -117,7 +117,7 @@ def _judge(question: _Question, answer: Distances) -> int:
     """Print each answer next to the truth; return the number of contradictions."""
     wrong = 0
     touched = answer.inside.reshape(len(question.places), -1)
-    nearest = answer.distance.reshape(touched.shape).min(axis=1)
+    nearest = answer.distance_sigma.reshape(touched.shape).min(axis=1)
     rows = zip(question.names, question.places, question.occupied, touched.sum(axis=1), nearest, strict=True)
     for name, place, occupied, inside, distance in rows:
         at = ", ".join(f"{x:+.3f}" for x in place)

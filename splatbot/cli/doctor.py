@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
@@ -17,7 +18,7 @@ def doctor() -> int:
     """
     from splatbot.cli.checks import all_checks
 
-    colours = {"ok": "32", "warn": "33", "fail": "31"} if sys.stdout.isatty() else {}
+    colours = {"ok": "32", "warn": "33", "fail": "31"} if sys.stdout.isatty() and not os.environ.get("NO_COLOR") else {}
     broken = False
     for check in all_checks():
         for finding in check():

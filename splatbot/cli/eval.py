@@ -8,6 +8,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from splatbot.cli.paths import check_camera, check_file, check_run
+from splatbot.layouts import log_kind
+
 
 def eval_run(
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
@@ -34,6 +37,12 @@ def eval_run(
         ground_truth: TUM trajectory to compare with instead of the log's own.
         as_json: print JSON instead of a table.
     """
+    check_run(run)
+    if log is not None:
+        log_kind(log)
+    check_camera(camera)
+    check_file(ground_truth, "--ground-truth")
+
     from splatbot.results.folder import RunFolder
     from splatbot.results.rescore import rescore
     from splatbot.robots.in_view import reopen_log

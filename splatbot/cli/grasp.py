@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import Pose, base_pose, margin_of
+from splatbot.errors import InputError, SplatbotError
+from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from splatbot.grasping.affordance import Hint, ObservedView
     from splatbot.grasping.types import GraspResult
     from splatbot.robots.graspable_objects import GraspableObjects
+    from splatbot.robots.robot import RobotModel
 
 
 def grasp(
@@ -42,6 +46,7 @@ def grasp(
     n_sigma: float = 1.0,
     min_observations: int = 1,
     seed: int = 0,
+    verbose: bool = False,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
     """Find grasps of an object in a map, best first, with each term of their scores.
@@ -80,19 +85,22 @@ def grasp(
         n_sigma: surface of a Gaussian, in standard deviations; smaller than for planning, because the hand comes close.
         min_observations: least number of keyframes that support a Gaussian; others are ignored.
         seed: seed of the search.
+        verbose: without a grasp, print the counts of each reason.
         out: folder to write to; by default runs/grasp.
     """
-    from splatbot.errors import InputError
-
     places = {"--target": target, "--pixel": pixel, "--point": point, "--box": box, "--mask": mask, "--tag": tag}
     given = [flag for flag, value in places.items() if value is not None]
     if len(given) != 1:
         raise InputError(f"are {len(given)}.", field=", ".join(places), hint="give one of them")
     if vlm and target is None:
         raise InputError("needs a name.", field="--vlm", hint="give --target too")
+    map_file(map)
+    check_file(mask, "--mask")
+    check_output(out)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
+    from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.spatial import SpatialAffordance
@@ -105,7 +113,7 @@ def grasp(
         friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
     )
     arm = load_robot(robot)
-    objects = _graspable_objects(map, base)
+    objects = graspable_objects(map, base)
     scene = objects.scene
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
@@ -120,18 +128,33 @@ def grasp(
     if shown is not None:
         with atomic_write(folder / "grasp.png") as handle:
             handle.write(grasp_png(scene, found.rows, arm, shown))
+    if not result.grasps and not verbose:
+        reason, change = first_change(result, scene, stroke_of(arm))
+        why = " ".join(note for note in found.notes if note.startswith("took "))
+        raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
     _print(result, folder)
     return 0
 
 
-def _graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:
+def stroke_of(arm: RobotModel) -> float:
+    """Return the widest opening of a robot's hand [m], 0 without a hand."""
+    return 2 * arm.gripper.stroke if arm.gripper is not None else 0.0
+
+
+def graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:
+    """Segment the objects of a run's map or of a map file.
+
+    Raises:
+        InputError: the base is not known.
+        FormatError: the map or its run is damaged.
+    """
     from splatbot.gaussians import GaussianModel, Snapshot
     from splatbot.robots.graspable_objects import measured_map, run_of, segment_objects
     from splatbot.workspace import find_workspace
 
     T = base_pose(base, map_)
-    model = GaussianModel.load(map_ / "map.ply" if map_.is_dir() else map_)
+    model = GaussianModel.load(map_file(map_))
     measured = measured_map(Snapshot(model, map_version=0), run_of(map_))
     return segment_objects(measured, T, find_workspace(map_), as_known=base is None)
 
@@ -170,8 +193,6 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
     import cv2
     import numpy as np
 
-    from splatbot.errors import InputError
-
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if picture is None:
         raise InputError("cannot be read.", file=path, field="--mask", hint="give a PNG of the size of the image")
@@ -181,7 +202,6 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
 def _view(map_: Path, index: int) -> ObservedView:
     from dataclasses import replace
 
-    from splatbot.errors import InputError
     from splatbot.grasping.affordance import ObservedView
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
@@ -201,7 +221,7 @@ def _view(map_: Path, index: int) -> ObservedView:
 def _print(result: GraspResult, folder: Path) -> None:
     from rich.table import Table
 
-    from splatbot.cli.tables import print_table, wide_console
+    from splatbot.cli.tables import print_columns, print_table
 
     target = result.target
     seconds = sum(result.seconds.values())
@@ -214,10 +234,10 @@ def _print(result: GraspResult, folder: Path) -> None:
     print_table(rows, title="grasps")
     terms = list(result.grasps[0].terms)
     table = Table()
-    for name in ("", "total", "approach", "width", "opens", "clearance", *terms):
+    for name in ("", "total", "approach", "width, mm", "opens, mm", "clearance, mm", *terms):
         table.add_column(name, justify="left" if name == "approach" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *(f"{g.terms[name]:.2f}" for name in terms))
-    wide_console().print(table)
-    print("width, opens and clearance in mm; the best value of a term is 1")
+    print_columns(table)
+    print("the best total and the best value of a term is 1")

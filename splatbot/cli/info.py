@@ -8,6 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.doubts import camera_doubts
+from splatbot.cli.paths import check_camera
+from splatbot.cli.tables import print_table
+from splatbot.errors import InputError
+from splatbot.layouts import is_map, log_kind, map_file
+
 if TYPE_CHECKING:
     from splatbot.logs import Log
 
@@ -33,7 +39,7 @@ def info(
     /,
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     fit_plane: bool = False,
-    up: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y Z")] = (0.0, -1.0, 0.0),
+    up: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
 ) -> int:
     """Describe a map, a log or a run.
 
@@ -49,59 +55,28 @@ def info(
     Args:
         path: a map file, a folder in TUM or Replica layout, synthetic:SCENE, or a run folder (its map).
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
-        fit_plane: estimate the plane of the table or floor and propose a base of a robot. They are written to a new
-            scene.yaml next to the map.
-        up: with --fit-plane, roughly upwards in the first camera: 0 -1 0 if it looked ahead, 0 0 -1 straight down.
+        fit_plane: estimate the plane of the table or floor and propose a base of a robot. They are written to
+            scene.yaml next to the map, with the picture scene.png. A doubtful estimate is not written.
+        up: with --fit-plane, upwards in the first camera (x right, y down, z ahead). It is 0 -1 0 for a camera that
+            looked ahead, and 0 0 -1 for one that looked straight down. It replaces an existing estimate. By default
+            the log's accelerometer decides, if there is one, else the planes of the map.
     """
-    from splatbot.cli.tables import print_table
+    from splatbot.cli.fit_plane import fit_plane as fit_plane_command
 
-    place = Path(path)
-    if (place / "map.ply").is_file():
-        place = place / "map.ply"
-    if place.is_file():
+    if up is not None and not fit_plane:
+        raise InputError("goes with --fit-plane.", field="--up", hint="give both")
+    if is_map(path):
+        place = map_file(path)
         print_table(describe_map(place), title=str(place))
-        if fit_plane:
-            print_table(fit_scene(place, up), title=str(place.parent / "scene.yaml"))
-        return 0
+        return fit_plane_command(place, up) if fit_plane else 0
+    log_kind(path)
+    check_camera(camera)
     if fit_plane:
-        from splatbot.errors import InputError
-
         raise InputError("needs a map.", field="--fit-plane", hint="map the log first: splatbot map LOG")
     from splatbot.logs import open_log
 
     print_table(describe_log(open_log(path, camera=camera)), title=path)
     return 0
-
-
-def fit_scene(path: Path, up: tuple[float, float, float]) -> list[tuple[str, str]]:
-    """Describe the workspace next to a map file; estimate and write it if the file does not exist.
-
-    Raises:
-        InputError: the map has no upward surface.
-        FormatError: the map or a scene.yaml is damaged.
-    """
-    import numpy as np
-
-    from splatbot.gaussians import GaussianModel
-    from splatbot.workspace import NAME, find_workspace, fit_workspace
-
-    known = find_workspace(path)
-    found = fit_workspace(GaussianModel.load(path), up=up) if known is None else known
-    if known is None:
-        found.save(path.parent / NAME)
-
-    def text(values: np.ndarray | None) -> str:
-        return "not known" if values is None else " ".join(f"{x:.3f}" for x in np.ravel(values))
-
-    T = found.T_world_base
-    return [
-        ("from", "estimated, written" if known is None else "the file"),
-        ("gravity", text(found.gravity)),
-        ("support plane n, d", text(found.support_plane)),
-        ("base at [m]", text(None if T is None else T[:3, 3])),
-        ("base's x, z", text(None if T is None else T[:3, [0, 2]].T)),
-        ("workspace, from the base [m]", text(found.box)),
-    ]
 
 
 def describe_map(path: Path) -> list[tuple[str, str]]:
@@ -162,6 +137,7 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
         ("valid depth", percent(depths.size / sum(frame.depth.size for frame in frames))),
         ("shift of depth onto colour", shift_text(depth_offset(frames), c.width)),
         ("reference poses", f"{len(truth)}, path {metres(length)}" if truth is not None else "none"),
+        *(("question", doubt) for doubt in camera_doubts(c)),
         *(("simulated effect", f"{effect['name']} ({effect['why']})") for effect in log.effects),
     ]
 

@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatbot.cli.doubts import camera_doubts, run_doubts
+from splatbot.cli.paths import check_camera, check_file, check_output, check_state
+from splatbot.errors import InputError
+from splatbot.layouts import MAP_NAME, log_kind
+
 if TYPE_CHECKING:
     from splatbot.run import RunResult
     from splatbot.run.state import SavedRun
@@ -32,15 +37,16 @@ def map_log_command(
     save_every: Annotated[float, tyro.conf.arg(metavar="S")] = 30.0,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     localise: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
+    overwrite: bool = False,
     robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     dump_config: bool = False,
     quiet: bool = False,
 ) -> int:
     """Turn an RGB-D log into a map of Gaussians.
 
-    Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml, report.html and map.html.
-    Ctrl-C saves the current map; so does a frame that cannot be read. Every 30 s, and after the last frame, the whole
-    state is saved too (RUN/state), for --resume and --localise.
+    Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml, audit.json, report.html and
+    map.html. Ctrl-C saves the current map; so does a frame that cannot be read. Every 30 s, and after the last frame,
+    the whole state is saved too (RUN/state), for --resume and --localise.
 
     Examples:
         splatbot map recordings/desk
@@ -71,27 +77,26 @@ def map_log_command(
             if the log has moved.
         localise: localise the frames in the map of this run instead of building one. The first pose is
             arbitrary, and is accepted when the second agrees.
+        overwrite: replace the run that --out holds.
         robot: mask this robot in the frames, by the log's joints.txt and the T_link_camera of its scene.yaml.
         dump_config: print the configuration in force and leave.
         quiet: no progress and no summary, only errors.
     """
+    check_file(config, "--config")
+    if (resume or localise) and (config or overrides or budget_ms is not None):
+        hint = "leave --config, --set and --budget-ms out, or map the log again"
+        raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
+    if not dump_config:
+        _check(log, out, resume, localise, max_frames=max_frames, overwrite=overwrite)
+        check_camera(camera)
+
     from splatbot.config import load_config
-    from splatbot.errors import InputError
 
     given = _parse_overrides(overrides) | ({} if budget_ms is None else {"tracking.budget_ms": budget_ms})
     settings = load_config(config, overrides=given)
     if dump_config:
         print(settings.to_yaml(), end="")
         return 0
-    if resume is not None and localise is not None:
-        raise InputError("excludes --resume.", field="--localise", hint="give the one or the other")
-    if (resume or localise) and (config or given):
-        hint = "leave --config, --set and --budget-ms out, or map the log again"
-        raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
-    if not log and resume is None:
-        raise InputError("is missing.", field="LOG", hint="name a recording: splatbot map LOG")
-    if max_frames is not None and max_frames < 1:
-        raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
 
     from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display
@@ -104,6 +109,9 @@ def map_log_command(
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
         robot = robot or saved.place.robot
     recording = without_robot(open_log(log, camera=camera), robot)
+    if not quiet:
+        for doubt in camera_doubts(recording.camera):
+            print(f"question: {doubt}", file=sys.stderr)
     folder = out if out is not None else Path("runs") / f"{_slug(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     with progress_display(quiet=quiet) as on_progress:
         result = map_log(
@@ -128,6 +136,41 @@ def map_log_command(
     if result.error is not None:
         print(f"error: {result.error}", file=sys.stderr)
     return result.exit_code
+
+
+def _check(
+    log: str,
+    out: Path | None,
+    resume: Path | None,
+    localise: Path | None,
+    *,
+    max_frames: int | None,
+    overwrite: bool,
+) -> None:
+    """Refuse wrong paths before the libraries load."""
+    if resume is not None and localise is not None:
+        raise InputError("excludes --resume.", field="--localise", hint="give the one or the other")
+    if not log and resume is None:
+        raise InputError("is missing.", field="LOG", hint="name a recording: splatbot map LOG")
+    if max_frames is not None and max_frames < 1:
+        raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
+    for saved in (resume, localise):
+        if saved is not None:
+            check_state(saved)
+    if log:
+        log_kind(log)
+    if resume is None or (out is not None and out.resolve() != resume.resolve()):
+        check_output(out or Path("runs"))
+        _check_overwrite(out, overwrite=overwrite)
+
+
+def _check_overwrite(out: Path | None, *, overwrite: bool) -> None:
+    if out is None or overwrite:
+        return
+    found = [name for name in (MAP_NAME, "metrics.json", "trajectory.tum", "state") if (out / name).exists()]
+    if found:
+        hint = f"give another folder, --overwrite to replace it, or --resume {out} to continue it"
+        raise InputError(f"holds a run already ({', '.join(found)}).", file=out, field="--out", hint=hint)
 
 
 def _saved_run(resume: Path | None, localise: Path | None) -> SavedRun | None:
@@ -179,6 +222,11 @@ def _pace(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return [("paced", f"{metrics['late']} frames late, {metrics['dropped']} dropped")]
 
 
+def _mishaps(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    counts = [f"{metrics[name]} {name}" for name in ("lost", "degraded") if metrics[name]]
+    return [("of them", ", ".join(counts))] if counts else []
+
+
 def _print_summary(result: RunResult) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, decibels, megabytes, metres, milliseconds
@@ -187,12 +235,14 @@ def _print_summary(result: RunResult) -> None:
     ms = m["ms_per_frame"]
     rows = [
         ("frames tracked", f"{m['tracked']} of {m['frames']}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
+        *_mishaps(m),
         *_pace(m),
         ("ATE RMSE", metres(m["ate_rmse_m"])),
         ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
         ("depth error, median", metres(m["depth_median_m"])),
         ("Gaussians", f"{count(m['gaussians'])}, {megabytes(m['map_bytes'])}"),
         ("time per frame", f"{milliseconds(ms['p50'])} (p95 {milliseconds(ms['p95'])})"),
+        *(("question", doubt) for doubt in run_doubts(m)),
         ("report", str(result.folder / "report.html")),
     ]
     title = "interrupted; saved" if m["interrupted"] else "stopped early; saved" if m["error"] else "mapped"

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.paths import check_output
+
 if TYPE_CHECKING:
     from splatbot.sim.picking import TwinPick
 
@@ -52,6 +54,8 @@ def pick(
         seed: seed of sensor noise and search.
         out: folder to write to; by default runs/pick.
     """
+    check_output(out)
+
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
     from splatbot.grasping.options import GraspOptions

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from splatbot.collision import GaussianCollisionField
+    from splatbot.results.folder import RunFolder
 
 Pose = tuple[float, float, float, float, float, float, float]
 
@@ -55,18 +56,39 @@ def margin_of(text: str, map_: Path, field: GaussianCollisionField, T_world_base
     Raises:
         InputError: it is neither, or the map is no run folder.
     """
+    if text == "auto":
+        from splatbot.results.margin import own_margin
+        from splatbot.robots.in_view import reopen_log
+
+        run = run_folder(map_, "--margin auto")
+        return own_margin(map_, reopen_log(run), field, T_world_base)
+    return margin_value(text)
+
+
+def run_folder(map_: Path, flag: str) -> RunFolder:
+    """Return the run folder that a flag requires.
+
+    Raises:
+        InputError: the map is a file.
+    """
+    from splatbot.errors import InputError
+    from splatbot.results.folder import RunFolder
+
+    if not map_.is_dir():
+        raise InputError("needs a run folder.", field=flag, hint="give the folder that `splatbot map` wrote")
+    return RunFolder(map_)
+
+
+def margin_value(text: str) -> float:
+    """Parse a margin [m].
+
+    Raises:
+        InputError: it is no number, or below 0.
+    """
     import math
 
     from splatbot.errors import InputError
 
-    if text == "auto":
-        if not map_.is_dir():
-            raise InputError("needs a run folder.", field="--margin auto", hint="give metres, or the folder of the run")
-        from splatbot.results.folder import RunFolder
-        from splatbot.results.margin import own_margin
-        from splatbot.robots.in_view import reopen_log
-
-        return own_margin(map_, reopen_log(RunFolder(map_)), field, T_world_base)
     try:
         value = float(text)
     except ValueError:

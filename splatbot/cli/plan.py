@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_of
+from splatbot.cli.paths import check_output
+from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_value, run_folder
+from splatbot.errors import InputError
+from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.planning import JointTrajectory, PlanResult
+    from splatbot.collision import GaussianCollisionField
+    from splatbot.collision.unknown import UnknownPolicy
+    from splatbot.gaussians import GaussianModel
+    from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult
+    from splatbot.results.region_plan import RegionPlan
     from splatbot.robots.robot import RobotModel
 
 
@@ -26,8 +35,11 @@ def plan(
     goal_pose: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
     robot: str = "panda",
     base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
-    margin: Annotated[str, tyro.conf.arg(metavar="M|auto")] = "0",
+    margin: Annotated[str | None, tyro.conf.arg(metavar="M|auto")] = None,
+    confidence: float = 0.999,
+    unknown: Literal["free", "cautious", "occupied"] = "free",
     n_sigma: float = 2.0,
+    speed: float = 0.2,
     budget_ms: float = 100.0,
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
@@ -50,61 +62,122 @@ def plan(
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
             `splatbot info --fit-plane`).
-        margin: clearance [m] to the map. With "auto" and a run folder, it is the error of the map's surfaces near the
-            base, measured against the depth images of the run.
+        margin: clearance [m] to the map. "auto" is the error of the map's surfaces in the region of the motion, audited
+            against the depth of the run (see `splatbot audit`). It is the default in a run folder; the default of a map
+            file is 0.
+        confidence: share of the confirmed surface that the margin "auto" covers, 0..1.
+        unknown: space that no frame of the run saw to be empty is free, or "occupied". With "cautious" it is occupied
+            only where two frames looked and measured no depth, as at dark, shiny or transparent objects.
         n_sigma: surface of a Gaussian, in standard deviations.
+        speed: fraction of the limits of velocity and acceleration, as MoveIt's scaling factors; 1 is as fast as the
+            robot can.
         budget_ms: time budget of the planner [ms].
         seed: seed of the search.
         out: folder to write to; by default runs/plan.
     """
-    from splatbot.errors import InputError
-
     if (goal is None) == (goal_pose is None):
         raise InputError("must be given, one of the two.", field="--goal, --goal-pose", hint="give joints or a pose")
+    if not 0.0 < speed <= 1.0:
+        raise InputError(f"is {speed:g}.", field="--speed", hint="give a fraction of the limits, above 0, at most 1")
+    file = map_file(map)
+    check_output(out)
 
-    from splatbot.atomic import atomic_write
+    import numpy as np
+
+    from splatbot.atomic import replace_files, write_bytes, write_text
     from splatbot.collision import GaussianCollisionField
     from splatbot.gaussians import GaussianModel
-    from splatbot.planning import GaussianRRTStar, PoseGoal, time_path
+    from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.report.plan_page import plan_html, plan_png
     from splatbot.robots.store import load_robot
 
     arm = load_robot(robot)
-    file = map / "map.ply" if map.is_dir() else map
     model = GaussianModel.load(file)
-    field = GaussianCollisionField(model, n_sigma)
     T_world_base = base_pose(base, map)
-    planner = GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=margin_of(margin, map, field, T_world_base))
+    here = _joints(start, arm, "--start")
     wanted: Any = (
         PoseGoal(T_world_base @ checked_pose(goal_pose, "--goal-pose"))
         if goal_pose is not None
         else _joints(goal or (), arm, "--goal")
     )
-    result = planner.plan(_joints(start, arm, "--start"), wanted, budget_ms=budget_ms, seed=seed)
-    path = result.unwrap()
-    trajectory = time_path(path, planner.arm, field)
+    solids = _unknown_solids(map, unknown, arm, T_world_base, here)
+    field = GaussianCollisionField(GaussianModel.concatenate([model, solids]) if len(solids) else model, n_sigma)
+    found = _plan(
+        map,
+        GaussianCollisionField(model, n_sigma),
+        lambda keep: GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=keep),
+        lambda planner: planner.plan(here, wanted, budget_ms=budget_ms, seed=seed),
+        here if goal_pose is not None else np.stack([here, wanted]),
+        margin="auto" if margin is None and map.is_dir() else margin or "0",
+        confidence=confidence,
+        speed=speed,
+    )
+    result, trajectory = found.result, found.trajectory
+    result.unwrap()
+    assert trajectory is not None
+    covers = _covers(found, model, n_sigma, unknown, confidence)
     folder = out if out is not None else Path("runs") / "plan"
-    folder.mkdir(parents=True, exist_ok=True)
     title = f"{arm.name} in {map.resolve().name}"
     texts = {
-        "plan.json": json.dumps(_summary(result, trajectory), indent=2),
+        "plan.json": json.dumps(_summary(result, trajectory) | {"covers": covers}, indent=2),
         "trajectory.json": trajectory.to_json(),
         "trajectory.csv": trajectory.to_csv(),
-        "plan.html": plan_html(model, planner.arm, field, trajectory, title=title),
+        "plan.html": plan_html(model, found.planner.arm, field, trajectory, title=title),
     }
-    for name, text in texts.items():
-        with atomic_write(folder / name) as handle:
-            handle.write(text.encode())
-    with atomic_write(folder / "plan.png") as handle:
-        handle.write(plan_png(model, planner.arm, trajectory))
-    _print(result, trajectory, folder)
+    writers = {name: write_text(text) for name, text in texts.items()}
+    replace_files(folder, writers | {"plan.png": write_bytes(plan_png(model, found.planner.arm, trajectory))})
+    _print(result, trajectory, covers, folder)
     return 0
+
+
+def _unknown_solids(
+    map_: Path, policy: UnknownPolicy, arm: RobotModel, T_world_base: NDArray[np.float64], here: NDArray[np.float64]
+) -> GaussianModel:
+    """Return the unknown space of a run as Gaussians; none if it counts as free."""
+    from splatbot.collision import RobotSpheres
+    from splatbot.gaussians import GaussianModel
+    from splatbot.results.unknown import obstacles, unknown_in_reach
+    from splatbot.robots.in_view import reopen_log
+
+    if policy == "free":
+        return GaussianModel.empty()
+    run = run_folder(map_, "--unknown")
+    spheres = RobotSpheres(arm, T_world_base=T_world_base)
+    return obstacles(unknown_in_reach(run, reopen_log(run), spheres), policy, spheres, here)
+
+
+def _plan(
+    map_: Path,
+    of_map: GaussianCollisionField,
+    make_planner: Callable[[float], GaussianRRTStar],
+    plan_once: Callable[[GaussianRRTStar], PlanResult],
+    ends: NDArray[np.float64],
+    *,
+    margin: str,
+    confidence: float,
+    speed: float,
+) -> RegionPlan:
+    """Plan with a given margin, or with the audited margin of the region."""
+    from splatbot.planning import time_path
+    from splatbot.results.margin import audited_error
+    from splatbot.results.region_plan import RegionPlan, plan_in_region
+    from splatbot.robots.in_view import reopen_log
+
+    if margin == "auto":
+        error = audited_error(map_, reopen_log(run_folder(map_, "--margin auto")), of_map)
+        return plan_in_region(make_planner, plan_once, ends, error, confidence=confidence, speed=speed)
+    planner = make_planner(margin_value(margin))
+    result = plan_once(planner)
+    if result.path is None:
+        return RegionPlan(planner, result, None, points=None, error=None)
+    timed = time_path(result.path, planner.arm, planner.field, velocity_scale=speed, acceleration_scale=speed)
+    return RegionPlan(planner, result, timed, points=None, error=None)
 
 
 def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
     import numpy as np
 
-    from splatbot.errors import InputError
+    from splatbot.planning.goals import suspect_degrees
 
     if words == ("home",):
         return np.asarray(robot.home)
@@ -114,6 +187,7 @@ def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.
         raise InputError(f"is {' '.join(words)}.", field=flag, hint='give numbers, or "home"') from error
     if len(values) != len(robot) or not np.isfinite(values).all():
         raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
+    suspect_degrees(values, robot.chain, flag)
     return values
 
 
@@ -135,7 +209,30 @@ def _summary(result: PlanResult, trajectory: JointTrajectory) -> dict[str, Any]:
     }
 
 
-def _print(result: PlanResult, trajectory: JointTrajectory, folder: Path) -> None:
+def _covers(found: RegionPlan, model: GaussianModel, n_sigma: float, unknown: str, confidence: float) -> dict[str, Any]:
+    """Describe the scope of the certificate: obstacles, unknown space, and the origin of the margin."""
+    audited = found.points is not None
+    return {
+        "map_gaussians": len(model),
+        "n_sigma": n_sigma,
+        "self_collision": True,
+        "unknown_space": unknown,
+        "margin_m": found.planner.margin,
+        "margin_from": "audit" if audited else "user" if found.planner.margin > 0 else "none",
+        "confidence": confidence if audited else None,
+        "region_points": found.points,
+        "region_error_m": found.error,
+    }
+
+
+_UNKNOWN = {
+    "free": "not covered: counts as free",
+    "cautious": "covered where two frames looked and measured no depth",
+    "occupied": "covered: counts as occupied",
+}
+
+
+def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, Any], folder: Path) -> None:
     from splatbot.cli.tables import print_table
 
     assert result.path is not None
@@ -146,6 +243,18 @@ def _print(result: PlanResult, trajectory: JointTrajectory, folder: Path) -> Non
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
         ("clearance along the path", f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm"),
+        ("covers", f"the map at {covers['n_sigma']:g} sigma, and self-collision"),
+        ("unknown space", _UNKNOWN[covers["unknown_space"]]),
+        ("margin", _margin_text(covers)),
         ("written to", str(folder)),
     ]
     print_table(rows, title="planned")
+
+
+def _margin_text(covers: dict[str, Any]) -> str:
+    if covers["margin_from"] != "audit":
+        return {"user": "as given", "none": "0, so that errors of the map are not covered"}[covers["margin_from"]]
+    return (
+        f"covers {100 * covers['confidence']:g} % of {covers['region_points']} measured points, "
+        f"error {1e3 * covers['region_error_m']:.1f} mm"
+    )

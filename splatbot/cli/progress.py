@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from splatbot.run import Progress
@@ -21,10 +21,14 @@ class ProgressConstants:
     Args:
         plain_period: [s] time between two lines of an output that is no terminal.
         rate_frames: number of frames that the shown rate averages.
+        bar_width: [characters] width of the bar.
+        wide_columns: [characters] width of the terminal from which all numbers are shown.
     """
 
     plain_period: float = 2.0
     rate_frames: int = 10
+    bar_width: int = 12
+    wide_columns: int = 110
 
 
 CONSTANTS = ProgressConstants()
@@ -67,18 +71,22 @@ class PlainLines:
         self._due = 0.0
         self._rate = FrameRate()
         self._verdict = "ok"
+        self._phase = ""
 
     def __call__(self, progress: Progress) -> None:
         """Show the progress of the run, if it is due."""
-        rate = self._rate.add(progress)
-        if progress.skipped:
-            print(f"skipped: {progress.skipped}", file=sys.stderr, flush=True)
+        if progress.phase == "mapping":
+            self._rate.add(progress)
+        for notice in notices(progress):
+            print(notice, file=sys.stderr, flush=True)
         verdict = progress.result.verdict if progress.result else self._verdict
-        news = progress.phase != "mapping" or (verdict == "lost") != (self._verdict == "lost")
-        self._verdict = verdict
-        if news or self._clock() >= self._due or progress.done == progress.total:
+        new_phase = progress.phase != self._phase and progress.phase != "mapping"
+        news = new_phase or (verdict == "lost") != (self._verdict == "lost")
+        self._verdict, self._phase = verdict, progress.phase
+        last = progress.phase == "mapping" and progress.done == progress.total
+        if news or last or self._clock() >= self._due:
             self._due = self._clock() + CONSTANTS.plain_period
-            print(describe(progress, rate), file=sys.stderr, flush=True)
+            print(describe(progress, self._rate.value), file=sys.stderr, flush=True)
 
 
 class FrameRate:
@@ -87,18 +95,30 @@ class FrameRate:
     def __init__(self) -> None:
         self._times: deque[tuple[int, float]] = deque(maxlen=CONSTANTS.rate_frames + 1)
 
-    def add(self, progress: Progress) -> float:
-        """Return the rate [1/s] including this frame; 0 before the second."""
+    def add(self, progress: Progress) -> None:
+        """Count a frame."""
         self._times.append((progress.done, progress.elapsed_s))
+
+    @property
+    def value(self) -> float:
+        """The rate [1/s]; 0 before the second frame."""
+        if len(self._times) < 2:
+            return 0.0
         frames = self._times[-1][0] - self._times[0][0]
         seconds = self._times[-1][1] - self._times[0][1]
         return frames / seconds if seconds > 0 else 0.0
 
 
+def notices(progress: Progress) -> list[str]:
+    """Return the lines that stay: a frame that was skipped, a problem that did not end the run."""
+    skipped = [f"skipped: {progress.skipped}"] if progress.skipped else []
+    return skipped + ([f"warning: {progress.warning}"] if progress.warning else [])
+
+
 def describe(progress: Progress, rate: float) -> str:
     """Return one line on the progress of the run."""
     if progress.phase != "mapping":
-        return f"{progress.phase} ..."
+        return f"{progress.phase} {progress.step}/{progress.steps}" if progress.steps else f"{progress.phase} ..."
     verdict = progress.result.verdict if progress.result else "skipped"
     counts = mishaps(progress)
     return (
@@ -120,33 +140,53 @@ def _live() -> Iterator[Callable[[Progress], None]]:
     from rich.progress import Progress as Bars
 
     bars = Bars(
-        TextColumn("[bold]{task.fields[phase]}"),
-        BarColumn(bar_width=24),
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=CONSTANTS.bar_width),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[numbers]}"),
+        TextColumn("{task.fields[numbers]}", table_column=_one_line()),
         TextColumn("[{task.fields[colour]}]{task.fields[verdict]}"),
-        TimeRemainingColumn(),
+        TimeRemainingColumn(compact=True),
         console=Console(stderr=True),
         transient=True,
     )
     rate = FrameRate()
     with bars:
-        task = bars.add_task("", total=None, phase="reading", numbers="", verdict="", colour="white")
+        task = bars.add_task("reading", total=None, numbers="", verdict="", colour="white")
 
         def show(progress: Progress) -> None:
-            if progress.skipped:
-                bars.console.print(f"skipped: {progress.skipped}", style="yellow", markup=False)
-            fps = rate.add(progress)
-            verdict = progress.result.verdict if progress.result else ""
+            for notice in notices(progress):
+                bars.console.print(notice, style="yellow", markup=False)
+            mapping = progress.phase == "mapping"
+            if mapping:
+                rate.add(progress)
+            total, done = (progress.total, progress.done) if mapping else (progress.steps or None, progress.step)
+            if bars.tasks[task].description != progress.phase:
+                bars.reset(task)  # the time left is that of this phase
+                bars.tasks[task].total = total  # reset and update take None as "as before"
+            verdict = progress.result.verdict if progress.result and mapping else ""
             bars.update(
                 task,
-                total=progress.total,
-                completed=progress.done,
-                phase=progress.phase,
-                numbers=f"{fps:.1f} fps  {progress.gaussians:,} Gaussians  {progress.keyframes} keyframes"
-                + (f"  {mishaps(progress)}" if mishaps(progress) else ""),
+                description=progress.phase,
+                total=total,
+                completed=done,
+                numbers=_numbers(progress, rate.value, bars.console.width) if mapping else "",
                 verdict=verdict,
                 colour=_COLOURS.get(verdict, "white"),
             )
 
         yield show
+
+
+def _one_line() -> Any:
+    from rich.table import Column
+
+    return Column(no_wrap=True, overflow="ignore")
+
+
+def _numbers(progress: Progress, fps: float, columns: int) -> str:
+    """Return the numbers of the mapping that fit next to the bar; the terminal may change its width."""
+    counts = mishaps(progress)
+    if columns < CONSTANTS.wide_columns:
+        return f"{fps:.1f} fps" + (f"  {counts}" if counts else f"  {progress.gaussians:,} Gaussians")
+    numbers = f"{fps:.1f} fps  {progress.gaussians:,} Gaussians  {progress.keyframes} keyframes"
+    return numbers + (f"  {counts}" if counts else "")

@@ -7,6 +7,10 @@ from typing import Annotated
 
 import tyro
 
+from splatbot.cli.paths import check_camera, check_output
+from splatbot.errors import InputError
+from splatbot.layouts import log_kind
+
 
 def record(
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
@@ -28,6 +32,12 @@ def record(
         out: the file to write; must not exist.
         camera: intrinsics instead of the log's own, as for `splatbot map`.
     """
+    log_kind(log)
+    check_camera(camera)
+    check_output(out, folder=False)
+    if out.exists():
+        raise InputError("exists already.", file=out, field="--out", hint="choose another name")
+
     from splatbot.logs import open_log
     from splatbot.logs.mcap import record_mcap
 

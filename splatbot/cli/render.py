@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatbot.cli.paths import check_file, check_output
+from splatbot.layouts import map_file
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -47,7 +50,9 @@ def render(
         fov: horizontal field of view [deg].
     """
     width, height = _parse_size(size)
-    file, path = _find_map(map_), trajectory or _own_trajectory(map_, index)
+    file, path = map_file(map_), trajectory or _own_trajectory(map_, index)
+    check_file(trajectory, "--trajectory")
+    check_output(out, folder=False)
 
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel
@@ -62,10 +67,6 @@ def render(
         image.write(to_png(view, mode))
     print(target)
     return 0
-
-
-def _find_map(path: Path) -> Path:
-    return path / "map.ply" if path.is_dir() else path
 
 
 def _own_trajectory(path: Path, index: int | None) -> Path | None:

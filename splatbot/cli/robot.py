@@ -3,36 +3,47 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+if TYPE_CHECKING:
+    from splatbot.robots.maker_meshes import Source
+
 
 def robot(
-    action: Annotated[Literal["add", "list", "info", "mjcf"], tyro.conf.Positional, tyro.conf.arg(metavar="ACTION")],
+    action: Annotated[
+        Literal["add", "list", "info", "fit", "mjcf"], tyro.conf.Positional, tyro.conf.arg(metavar="ACTION")
+    ],
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME|PATH")] = "panda",
     /,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     tip: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None,
     slack: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None,
+    check_meshes: bool = False,
 ) -> int:
     """Add a robot arm, or describe a stored one.
 
     The action `add` reads a URDF, covers its collision geometry with spheres, checks the cover, and stores it under its
     name. The action `list` prints the names of the robots. The action `info` prints joints, limits and spheres. The
-    action `mjcf` writes a MuJoCo model.
+    action `fit` fits the certified body of a shipped arm to the meshes of its maker. The action `mjcf` writes a MuJoCo
+    model.
 
     Examples:
         splatbot robot add ur5.urdf --tip tool0
         splatbot robot info panda
+        splatbot robot info panda --check-meshes --out panda-body.png
+        splatbot robot fit panda --slack 0.011 --out panda.json
         splatbot robot mjcf panda --out panda.xml
 
     Args:
         action: the action.
         name: a robot's name; for add, the URDF file.
-        out: add: a file to keep the robot in; mjcf: the file to write (else it is printed).
+        out: the file to write; mjcf prints without one. info --check-meshes draws NAME-body.png by default, and fit
+            writes NAME.json.
         tip: add: the link at the arm's end; by default that with most moving joints before it.
-        slack: add: largest distance of the spheres beyond the geometry [m]; 0.02 by default.
+        slack: largest distance of the spheres beyond the geometry [m]; for add 0.02, for fit 0.011 by default.
+        check_meshes: info: prove that the spheres contain the meshes of the maker, which a package must provide.
     """
     if action == "add":
         return _add(Path(name), out, tip, 0.02 if slack is None else slack)
@@ -41,12 +52,14 @@ def robot(
 
         print("\n".join(robot_names()))
         return 0
+    if action == "fit":
+        return _fit(name, out, 0.011 if slack is None else slack)
     from splatbot.robots.store import load_robot
 
     model = load_robot(name)
     if action == "info":
         _info(name)
-        return 0
+        return _check_meshes(name, out) if check_meshes else 0
     from splatbot.robots.mjcf import to_mjcf
 
     text = to_mjcf(model)
@@ -58,8 +71,54 @@ def robot(
     return 0
 
 
+def _source(name: str) -> Source:
+    from splatbot.errors import InputError
+    from splatbot.robots.maker_meshes import SOURCES
+
+    if name not in SOURCES:
+        raise InputError(f"has no known meshes: {name!r}.", field="robot", hint=f"arms: {', '.join(SOURCES)}")
+    return SOURCES[name]
+
+
+def _fit(name: str, out: Path | None, slack: float) -> int:
+    from splatbot.robots.bodies import fit_body, save_body
+
+    file = out if out is not None else Path(f"{name}.json")
+    save_body(fit_body(_source(name), slack, print), file)
+    print(f"written to {file}")
+    return 0
+
+
+def _check_meshes(name: str, out: Path | None) -> int:
+    """Print containment and slack of each part; return 1 if a part is not contained."""
+    from splatbot.cli.tables import print_table
+    from splatbot.robots.bodies import load_body
+    from splatbot.robots.bodies.check import check_body, draw_body
+
+    source = _source(name)
+    body = load_body(name)
+    parts = check_body(body, source)
+    print_table(
+        [
+            (
+                p.part,
+                f"{p.spheres} spheres, largest uncovered distance {1e3 * p.uncovered:.2f} mm, slack "
+                f"{1e3 * p.slack.median:.1f} mm (median), {1e3 * p.slack.most99:.1f} mm (99 %)",
+            )
+            for p in parts
+        ],
+        title=f"{source.package} {source.version()} ({source.origin}, {source.licence})",
+    )
+    if body.source["sha256"] != source.digest():
+        print("note: the body was fitted to other meshes than those that are installed")
+    picture = out if out is not None else Path(f"{name}-body.png")
+    draw_body(body, source, picture)
+    print(f"picture: {picture}")
+    return 0 if max(p.uncovered for p in parts) <= 0 else 1
+
+
 def _add(path: Path, out: Path | None, tip: str | None, slack: float) -> int:
-    from splatbot.robots.cover import uncovered
+    from splatbot.robots.containment import uncovered
     from splatbot.robots.store import robot_file, save_robot
     from splatbot.robots.urdf import read_urdf
 
@@ -68,7 +127,7 @@ def _add(path: Path, out: Path | None, tip: str | None, slack: float) -> int:
         print(f"note: {note}")
     file = out if out is not None else robot_file(reading.robot.name)
     spheres = reading.robot.spheres()
-    beyond = uncovered(reading.robot.shapes, spheres, slack / 3)
+    beyond = uncovered(reading.robot.shapes, spheres)
     save_robot(reading.robot, file)
     inside = beyond <= 1e-9
     state = "all of it is inside" if inside else f"{1e3 * beyond:.2f} mm of it sticks out"

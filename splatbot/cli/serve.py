@@ -7,6 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatbot.cli.paths import check_camera, check_file, check_output
+from splatbot.errors import InputError
+from splatbot.layouts import log_kind, map_file
+
 if TYPE_CHECKING:
     from splatbot.logs import Log
     from splatbot.protocols import FrameSource
@@ -65,12 +69,20 @@ def serve(
         scopes: scopes of the new key, separated by commas: read, map, move (these by default) and admin, which may
             preempt the owner of a moving arm.
     """
-    from splatbot.errors import InputError
-
     if new_key:
         return _print_new_key(scopes)
     if scopes is not None:
         raise InputError("is for a new key.", field="--scopes", hint="give --new-key, too")
+    if map is not None:
+        map_file(map)
+    if log is not None:
+        log_kind(log)
+        check_camera(camera)
+    check_file(config, "--config")
+    check_file(service_config, "--service-config")
+    check_output(data, "--data")
+    check_output(record, "--record", folder=False)
+
     from splatbot.config import load_config
     from splatbot.logs import open_log
     from splatbot.robots.cameras import is_camera, open_camera
@@ -108,7 +120,7 @@ def _add_map(runtime: Runtime, map_: Path) -> None:
     from splatbot.robots.graspable_objects import run_of
     from splatbot.workspace import find_workspace
 
-    path = map_ / "map.ply" if map_.is_dir() else map_
+    path = map_file(map_)
     snapshot = Snapshot(GaussianModel.load(path), map_version=1)
     runtime.store.add(
         MAP_ID,
@@ -131,7 +143,6 @@ def _follow(runtime: Runtime, source: Log | FrameSource) -> None:
 
 
 def _print_new_key(words: str | None) -> int:
-    from splatbot.errors import InputError
     from splatbot.services.keys import check_scopes, hash_key, new_key
 
     try:

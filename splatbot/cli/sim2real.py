@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from splatbot.cli.paths import check_output, check_run
+from splatbot.errors import InputError
+from splatbot.layouts import log_kind
+
 if TYPE_CHECKING:
     from splatbot.bench.sim2sim import SimToSimPlan
 
@@ -61,11 +65,16 @@ def sim2real(
         json: path of the JSON file of the log, or without a log of the held-out twin.
         quiet: print only errors.
     """
-    from splatbot.cli.progress import shares
-    from splatbot.errors import InputError
-
     if (log is None) != (map is None) or (log is None and not held_out):
         raise InputError("are needed, both.", field="LOG, --map", hint="splatbot sim2real LOG --map RUN, or --held-out")
+    if log is not None and map is not None:
+        log_kind(log)
+        check_run(map)
+    check_output(out)
+    check_output(json, "--json", folder=False)
+
+    from splatbot.cli.progress import shares
+
     folder = out if out is not None else Path("runs") / "sim2real"
     interrupted = False
     with shares(quiet) as tell:
@@ -101,7 +110,6 @@ def _compare_log(
 
 def _plan(task: tuple[str, ...], tables: int, trials: int, seed: int, quick: bool) -> SimToSimPlan:
     from splatbot.bench.sim2sim import TASKS, SimToSimPlan
-    from splatbot.errors import InputError
 
     unknown = [name for name in task if name not in TASKS]
     if unknown:
@@ -118,7 +126,7 @@ def _compare_twins(plan: SimToSimPlan, folder: Path, json: Path | None, tell: Te
     from rich.table import Table
 
     from splatbot.bench.sim2sim import run_sim_to_sim
-    from splatbot.cli.tables import wide_console
+    from splatbot.cli.tables import print_columns, wide_console
     from splatbot.sim.compare.page import (
         POLICY_HEAD,
         PROMISE_HEAD,
@@ -145,7 +153,7 @@ def _compare_twins(plan: SimToSimPlan, folder: Path, json: Path | None, tell: Te
                 table = Table(*head, title=title)
                 for row in rows:
                     table.add_row(*row)
-                console.print(table)
+                print_columns(table, console)
     return interrupted
 
 

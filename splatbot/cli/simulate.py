@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.paths import check_output
+from splatbot.errors import InputError
+
 if TYPE_CHECKING:
-    from splatbot.frame import Frame
     from splatbot.logs.synthetic import SyntheticLog, SyntheticOptions
 
 _PLAIN_EVERY_S = 2.0
@@ -62,8 +64,6 @@ def simulate(
         list_: print the scenes, trajectories and effects and leave.
         quiet: no progress, no summary, only errors.
     """
-    from splatbot.errors import InputError
-
     if list_:
         _print_lists()
         return 0
@@ -72,6 +72,9 @@ def simulate(
     if out is None:
         raise InputError("is missing.", field="--out", hint="name the folder to write: --out DIR")
     width, height = _parse_size(size)
+    check_output(out)
+    if (out / "rgb.txt").exists():
+        raise InputError("holds a recording already.", file=out, field="--out", hint="choose another folder")
 
     from splatbot.logs.synthetic import SyntheticLog, SyntheticOptions, synthetic_uri
 
@@ -84,8 +87,6 @@ def simulate(
 
 
 def _parse_size(text: str) -> tuple[int, int]:
-    from splatbot.errors import InputError
-
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise InputError(f"is {text!r}.", field="--size", hint="write WIDTHxHEIGHT, as in 640x480")
@@ -97,18 +98,15 @@ def _record(log: SyntheticLog, out: Path, *, quiet: bool) -> None:
     from splatbot.logs.effects import write_account
     from splatbot.logs.record import record
 
-    def frames() -> Iterator[Frame]:
-        def account() -> None:
-            write_account(out, uri=log.uri, effects=log.effects, blanks_depth=log.blanks_depth)
+    def account() -> None:
+        write_account(out, uri=log.uri, effects=log.effects, blanks_depth=log.blanks_depth)
 
-        account()  # before the first frame, so that an interrupted recording is also marked as synthetic
-        try:
-            yield from log
-        finally:
-            account()
-
-    with _progress(len(log), quiet=quiet) as show:
-        record(frames(), out, ground_truth=log.ground_truth, progress=show)
+    account()  # before the first frame, so that an interrupted recording is also marked as synthetic
+    try:
+        with _progress(len(log), quiet=quiet) as show:
+            record(log, out, ground_truth=log.ground_truth, progress=show)
+    finally:
+        account()
     for name, path in log.objects().items():
         save_trajectory(path, out / "objects" / f"{name}.tum", pose_name="T_world_object")
 

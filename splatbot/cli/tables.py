@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 _FILE_WIDTH = 160  # [characters] without a terminal
 
 
 def print_table(rows: Sequence[tuple[str, str]], *, title: str | None = None) -> None:
-    """Print names and values in two columns, plain enough to be piped."""
+    """Print names and values in two columns, plain enough to be piped; a terminal gets values wrapped to its width."""
     if title:
         print(title)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
-        print(f"  {name:<{width}}  {value}")
+        first, *rest = _wrapped(value, width + 4)
+        print(f"  {name:<{width}}  {first}")
+        for line in rest:
+            print(f"  {'':<{width}}  {line}")
+
+
+def _wrapped(value: str, indent: int) -> list[str]:
+    """Return the lines of a value; paths and other long words are not broken, so that they can be copied."""
+    if not sys.stdout.isatty():
+        return [value]
+    room = max(shutil.get_terminal_size().columns - indent, 20)
+    return textwrap.wrap(value, room, break_long_words=False, break_on_hyphens=False) or [""]
 
 
 def wide_console() -> Console:
@@ -26,3 +40,31 @@ def wide_console() -> Console:
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
+
+
+def print_columns(table: Table, console: Console | None = None) -> None:
+    """Print a table; one that is wider than the console becomes a record of names and values for each row."""
+    console = console or wide_console()
+    if _natural_width(table) <= console.width:
+        console.print(table)
+        return
+    if table.title:
+        console.print(f"[italic]{table.title}[/italic]")
+    names = [str(column.header) for column in table.columns]
+    cells = [list(column.cells) for column in table.columns]
+    for number in range(table.row_count):
+        values = [str(column[number]) for column in cells]
+        console.print(f"[bold]{' '.join(part for part in (names[0], values[0]) if part)}[/bold]")
+        width = max((len(name) for name in names[1:]), default=0)
+        for name, value in zip(names[1:], values[1:], strict=True):
+            if value:
+                console.print(f"  {name:<{width}}  {value}")
+
+
+def _natural_width(table: Table) -> int:
+    """Return the width [characters] at which no cell wraps; rich measures the table as it would squeeze it."""
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    wide = Console(width=10_000)
+    return Measurement.get(wide, wide.options, table).maximum

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from splatbot.cli.paths import check_output
+
 
 def trials(
     *,
@@ -54,6 +56,8 @@ def trials(
         out: folder to write to; by default runs/trials.
         quiet: print only errors.
     """
+    check_output(out)
+
     import json
 
     from splatbot.atomic import atomic_write
@@ -86,13 +90,13 @@ def _print(values: Mapping[str, object], folder: Path) -> None:
 
     from rich.table import Table
 
-    from splatbot.cli.tables import wide_console
+    from splatbot.cli.tables import print_columns
     from splatbot.sim.trials.table import HEAD, table_rows
 
     table = Table(*HEAD, title=f"picks, {values['scenes']}")
     for row in table_rows(cast(list[dict[str, Any]], values["stacks"])):
         table.add_row(*row)
-    wide_console().print(table)
+    print_columns(table)
     for name, value in cast(dict[str, Any], values["physics"]).items():
         print(f"{name}: {value}")
     print(f"written to {folder}")

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from splatbot.cli.drawing import draw_offscreen
+from splatbot.cli.paths import check_file, check_output
+from splatbot.errors import InputError
+from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
     from splatbot.sim.ledger import LedgerEntry
@@ -67,6 +70,16 @@ def twin(
     if list_:
         _print_lists()
         return 0
+    if (scene is None) == (map is None):
+        raise InputError(
+            "needs either a scene or a map.", field="--scene", hint="splatbot twin --list names the scenes"
+        )
+    if map is not None:
+        map_file(map)
+    check_file(trajectory, "--trajectory")
+    for flag, path in (("--json", json), ("--video", video), ("--html", html)):
+        check_output(path, flag, folder=False)
+
     from splatbot.sim.ledger import ledger
     from splatbot.sim.motion import load_motion
     from splatbot.sim.recording import TwinRecording
@@ -92,14 +105,9 @@ def twin(
 
 
 def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
-    from splatbot.errors import InputError
     from splatbot.sim.maps.placed import placed_scene
     from splatbot.sim.scene import load_scene, make_scene
 
-    if (name is None) == (map is None):
-        raise InputError(
-            "needs either a scene or a map.", field="--scene", hint="splatbot twin --list names the scenes"
-        )
     values: dict[str, Any] = {}
     if map is not None:
         values = placed_scene(map)
@@ -185,6 +193,8 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
     from rich.console import Console
     from rich.table import Table
 
+    from splatbot.cli.tables import print_columns
+
     console = Console(width=None if sys.stdout.isatty() else 140)
     console.print(
         f"{result.scene}: {result.duration:.2f} s in {result.steps} steps of {1e3 * result.timestep:g} ms, "
@@ -214,7 +224,7 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
         cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
         if entry.on or entry.observable or entry.by != "scene":  # leaves out effects that no sensor names
             table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
-    console.print(table)
+    print_columns(table, console)
     for path in written:
         console.print(f"written to {path}")
 

@@ -9,6 +9,9 @@ from typing import Annotated
 
 import tyro
 
+from splatbot.cli.paths import check_output
+from splatbot.layouts import map_file
+
 
 def view(
     map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|RUN")],
@@ -33,6 +36,9 @@ def view(
         robot: the arm to show, if a scene.yaml next to the map defines its base.
         html: write one self-contained page, and exit.
     """
+    file = map_file(map)
+    check_output(html, "--html", folder=False)
+
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel, Snapshot
     from splatbot.service_key import key_file
@@ -45,7 +51,6 @@ def view(
     from splatbot.trajectory import Trajectory
     from splatbot.workspace import find_workspace
 
-    file = map / "map.ply" if map.is_dir() else map
     model, workspace = GaussianModel.load(file), find_workspace(map)
     path = file.with_name("trajectory.tum")
     trajectory = Trajectory.load(path) if path.exists() else None

@@ -9,7 +9,7 @@ from splatbot.collision.moving import find_moving
 from splatbot.collision.probability import ProbabilityResult, collision_probability
 from splatbot.collision.robot import ArmClearanceResult, ConfigurationResult, EdgeResult, RobotSpheres
 from splatbot.collision.unknown import UnknownSpace, find_unknown
-from splatbot.collision.visibility import VisibilityEvidence, gather_evidence
+from splatbot.collision.visibility import VisibilityEvidence, evidence_at, gather_evidence
 
 __all__ = [
     "ArmClearanceResult",
@@ -29,6 +29,7 @@ __all__ = [
     "capsules_in_collision",
     "collision_probability",
     "esdf",
+    "evidence_at",
     "find_moving",
     "find_unknown",
     "gather_evidence",

@@ -1,24 +1,51 @@
-"""Unknown space, which no depth image has observed; the caller treats it as free, as occupied or as a cost."""
+"""Unknown space, which no depth image has observed; the caller treats it as free, as suspect or as occupied."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splatbot.camera import Camera
 from splatbot.collision.inputs import rows
-from splatbot.collision.visibility import measured_depths
+from splatbot.collision.visibility import DepthView
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
+
+UnknownPolicy = Literal["free", "cautious", "occupied"]
+"""Treatment of unknown space: free; suspect voxels are obstacles; all unknown voxels are obstacles."""
+
+
+@dataclass(frozen=True)
+class UnknownConstants:
+    """Constants of the search for unknown space.
+
+    Args:
+        suspect_views: number of views whose pixels of a voxel lack depth that make it suspect.
+        suspect_share: least share of the pixels of a voxel without depth in such a view.
+        radii: [px] half the sides of the squares of pixels that are tested. A voxel that covers more pixels is too
+            close to the camera.
+        scattered: [px] groups of so few pixels without depth are noise, and take the least depth around them.
+    """
+
+    suspect_views: int = 2
+    suspect_share: float = 0.1
+    radii: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 17, 20, 24, 29, 35, 42, 50, 60)
+    scattered: int = 3
+
+
+CONSTANTS = UnknownConstants()
 
 
 @dataclass(frozen=True, eq=False)
 class UnknownSpace:
-    """Voxels of a box that no depth ray has passed.
+    """Voxels of a box that no depth image has observed to be empty.
 
     A caller ignores this class to treat unknown space as free. To treat it as occupied, append :meth:`solids` to the
     map (``GaussianModel.concatenate``) before the field is built. To treat it as a cost, query a separate field of
@@ -26,11 +53,14 @@ class UnknownSpace:
 
     Args:
         unknown: (X, Y, Z), True where unknown.
+        suspect: (X, Y, Z), True where unknown and two views looked there without measuring depth, as at dark, thin,
+            shiny or transparent objects. Space behind surfaces and outside of all images is not suspect.
         origin: (3,) corner of the first voxel [m, world].
         voxel: edge length [m].
     """
 
     unknown: NDArray[np.bool_]
+    suspect: NDArray[np.bool_]
     origin: Array
     voxel: float
 
@@ -43,19 +73,20 @@ class UnknownSpace:
         found[inside] = self.unknown[tuple(cell[inside].T)]
         return found
 
-    def solids(self, n_sigma: float = 2.0, *, rim: bool = True) -> GaussianModel:
-        """Return spheres that enclose the unknown voxels, as Gaussians whose surface is at ``n_sigma``.
+    def solids(self, n_sigma: float = 2.0, *, rim: bool = True, policy: UnknownPolicy = "occupied") -> GaussianModel:
+        """Return spheres that enclose the voxels of a policy, as Gaussians whose surface is at ``n_sigma``.
 
-        With ``rim`` only voxels with a known neighbour are returned. A motion that starts in known space cannot reach
-        the interior without passing the rim.
+        With ``rim`` only voxels with a neighbour of another kind are returned. A motion that starts outside cannot
+        reach the interior without passing the rim.
         """
-        known = np.pad(~self.unknown, 1, constant_values=False)
-        has_known_neighbour = np.zeros_like(self.unknown)
+        chosen = {"free": np.zeros_like(self.unknown), "cautious": self.suspect, "occupied": self.unknown}[policy]
+        outside = np.pad(~chosen, 1, constant_values=False)
+        has_outside_neighbour = np.zeros_like(chosen)
         for shift in np.ndindex(3, 3, 3):
             i, j, k = shift
-            x, y, z = self.unknown.shape
-            has_known_neighbour |= known[i : i + x, j : j + y, k : k + z]
-        cells = np.argwhere(self.unknown & has_known_neighbour if rim else self.unknown)
+            x, y, z = chosen.shape
+            has_outside_neighbour |= outside[i : i + x, j : j + y, k : k + z]
+        cells = np.argwhere(chosen & has_outside_neighbour if rim else chosen)
         n = len(cells)
         return GaussianModel.from_activated(
             means=self.origin + (cells + 0.5) * self.voxel,
@@ -66,13 +97,13 @@ class UnknownSpace:
         )
 
 
-def find_unknown(
-    aabb: ArrayLike, voxel: float, views: Iterable[tuple[NDArray[np.float32], Camera, Array]]
-) -> UnknownSpace:
-    """Find the voxels of a box that no measured ray is known to have passed.
+def find_unknown(aabb: ArrayLike, voxel: float, views: Iterable[DepthView]) -> UnknownSpace:
+    """Find the voxels of a box that no view has observed to be empty.
 
-    A voxel is free if the depth at the pixel of its centre lies behind the whole voxel. A voxel that rays cross only
-    away from its centre stays unknown, which is conservative.
+    A voxel is empty if one view has depth at all pixels onto which its sphere may project, all of it behind the
+    sphere. The test of a single pixel would see past a rod that is thinner than the voxel. The pixels are those of
+    the smallest square around the centre that covers the image of the sphere, which is conservative. Up to three
+    adjacent pixels without depth are noise of the sensor and take the least depth around them.
 
     Args:
         aabb: (2, 3) = (low, high), corners of the box [m, world].
@@ -89,9 +120,54 @@ def find_unknown(
         )
     size = np.ceil((high - low) / voxel - 1e-9).astype(np.int64)
     centers = np.moveaxis(np.indices(tuple(size.tolist())), 0, -1).reshape(-1, 3) * voxel + low + voxel / 2
-    unknown = np.ones(len(centers), np.bool_)
-    for depth, camera, T_world_camera in views:
+    unknown, missing = np.ones(len(centers), np.bool_), np.zeros(len(centers), np.int32)
+    for view in views:
         left = np.flatnonzero(unknown)
-        hit, measured, z = measured_depths(centers[left], depth, camera, T_world_camera)
-        unknown[left[hit[measured > z + np.sqrt(3) / 2 * voxel]]] = False
-    return UnknownSpace(unknown.reshape(*size), low, float(voxel))
+        empty, lacks_depth = _observed(centers[left], np.sqrt(3) / 2 * voxel, view)
+        unknown[left[empty]] = False
+        missing[left[lacks_depth]] += 1
+    suspect = unknown & (missing >= CONSTANTS.suspect_views)
+    return UnknownSpace(unknown.reshape(*size), suspect.reshape(*size), low, float(voxel))
+
+
+def _observed(centers: Array, radius: float, view: DepthView) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which spheres (P,) of a radius [m] a view shows to be empty, and at which it lacks depth."""
+    depth, camera, T_world_camera = view
+    p = transform_points(inverse(T_world_camera), centers)
+    z = p[:, 2]
+    empty, lacks_depth = np.zeros(len(p), np.bool_), np.zeros(len(p), np.bool_)
+    near = np.maximum(z - radius, 1e-6)
+    # The image of a sphere extends beyond f r / (z - r) off the axis, by at most the length of the ray with z = 1.
+    stretch = np.sqrt(1.0 + (p[:, 0] / near) ** 2 + (p[:, 1] / near) ** 2)
+    reach = np.ceil(max(camera.fx, camera.fy) * radius / near * stretch + 0.5)
+    u = np.rint(camera.fx * p[:, 0] / np.maximum(z, 1e-6) + camera.cx)
+    v = np.rint(camera.fy * p[:, 1] / np.maximum(z, 1e-6) + camera.cy)
+    seen = (z > 2 * radius) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    measured = _without_scattered_holes(depth)
+    known = measured > 0
+    holes = (~known).astype(np.float32)
+    for smaller, width in pairwise((0, *CONSTANTS.radii)):
+        chosen = np.flatnonzero(seen & (reach > smaller) & (reach <= width))
+        if len(chosen):
+            row, column = v[chosen].astype(np.int64), u[chosen].astype(np.int64)
+            square = np.ones((2 * width + 1,) * 2, np.uint8)
+            nearest = cv2.erode(measured, square, borderType=cv2.BORDER_CONSTANT, borderValue=0.0)[row, column]
+            farthest = cv2.dilate(measured, square)[row, column]
+            share = cv2.blur(holes, square.shape)[row, column]
+            empty[chosen] = nearest > z[chosen] + radius
+            hidden = (farthest > 0) & (farthest < z[chosen] - radius)
+            lacks_depth[chosen] = (share >= CONSTANTS.suspect_share) & ~hidden
+    return empty, lacks_depth
+
+
+def _without_scattered_holes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return depth (H, W) [m], 0 where missing, with small groups of missing pixels filled by the least around them."""
+    known = np.isfinite(depth) & (depth > 0)
+    _, label, stats, _ = cv2.connectedComponentsWithStats((~known).astype(np.uint8), connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] <= CONSTANTS.scattered
+    small[0] = False  # the pixels with depth
+    around = np.where(known, depth, np.float32(np.inf)).astype(np.float32)
+    for _ in range(CONSTANTS.scattered):
+        around = np.where(known, around, cv2.erode(around, np.ones((3, 3), np.uint8)))
+    filled = np.where(small[label], around, np.where(known, depth, np.float32(0)))
+    return np.asarray(np.where(np.isfinite(filled), filled, 0.0), dtype=np.float32)

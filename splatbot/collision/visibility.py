@@ -80,10 +80,15 @@ def evidence_at(points: Array, views: Iterable[DepthView]) -> VisibilityEvidence
         if depth.shape != (camera.height, camera.width):
             raise InputError(f"is {depth.shape}.", field="depth", hint=f"give ({camera.height}, {camera.width})")
         rows, measured, z = measured_depths(points, depth, camera, T_world_camera)
-        tolerance = CONSTANTS.depth_tolerance + CONSTANTS.depth_tolerance_per_z2 * z**2
+        tolerance = passing_distance(z)
         hits[rows[np.abs(measured - z) <= tolerance]] += 1
         passes[rows[measured - z > tolerance]] += 1
     return VisibilityEvidence(hits, passes)
+
+
+def passing_distance(z: Array) -> Array:
+    """Return how far behind depths z (P,) [m] a measured depth must lie so that its ray passed them [m]."""
+    return np.asarray(CONSTANTS.depth_tolerance + CONSTANTS.depth_tolerance_per_z2 * z**2)
 
 
 def measured_depths(

@@ -1,9 +1,10 @@
 """Configuration of a run: sections of settings, their layout in YAML files, and where values come from."""
 
-from splatbot.config.load import config_from_yaml, load_config, read_yaml
-from splatbot.config.sections import Config, LoopsConfig, MappingConfig, SensorConfig, TrackingConfig
+from splatbot.config.load import config_from_yaml, load_config, read_yaml, with_sensor
+from splatbot.config.sections import BundleConfig, Config, LoopsConfig, MappingConfig, SensorConfig, TrackingConfig
 
 __all__ = [
+    "BundleConfig",
     "Config",
     "LoopsConfig",
     "MappingConfig",
@@ -12,4 +13,5 @@ __all__ = [
     "config_from_yaml",
     "load_config",
     "read_yaml",
+    "with_sensor",
 ]

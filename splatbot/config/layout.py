@@ -5,7 +5,15 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
-from splatbot.config.sections import Config, LoopsConfig, MappingConfig, SensorConfig, TrackingConfig, _Section
+from splatbot.config.sections import (
+    BundleConfig,
+    Config,
+    LoopsConfig,
+    MappingConfig,
+    SensorConfig,
+    TrackingConfig,
+    _Section,
+)
 from splatbot.errors import ConfigError, DeprecatedNameWarning
 
 SECTIONS: dict[str, type[_Section]] = {
@@ -13,6 +21,7 @@ SECTIONS: dict[str, type[_Section]] = {
     "tracking": TrackingConfig,
     "mapping": MappingConfig,
     "loops": LoopsConfig,
+    "bundle": BundleConfig,
 }
 EXPERT = "expert"
 

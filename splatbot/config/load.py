@@ -55,6 +55,24 @@ def config_from_yaml(text: str) -> Config:
     return validate(from_layout(yaml.safe_load(text) or {}))
 
 
+def with_sensor(config: Config, values: Mapping[str, Any], *, file: str | None = None) -> Config:
+    """Return a configuration with the values of a calibrated sensor for the keys of ``sensor:`` that it does not set.
+
+    Args:
+        config: configuration.
+        values: values by key, such as those of a camera file.
+        file: camera file, for error messages.
+
+    Raises:
+        ConfigError: a key is unknown, or a value is out of range.
+    """
+    given = config.sensor.model_dump(include=config.sensor.model_fields_set)
+    sensor = validate({"sensor": {**values, **given}}, file=file).sensor
+    tracking = config.tracking.model_copy()
+    tracking.__dict__["sensor"] = sensor
+    return config.model_copy(update={"sensor": sensor, "tracking": tracking})
+
+
 def validate(values: dict[str, Any], *, file: str | Path | None = None) -> Config:
     """Return the configuration of values in the layout of :class:`Config`.
 

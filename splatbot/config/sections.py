@@ -22,7 +22,14 @@ class SensorConfig(_Section):
     """
 
     PUBLIC: ClassVar[frozenset[str]] = frozenset(
-        {"min_depth", "max_depth", "sigma_gray", "sigma_depth_floor", "sigma_depth_quad"}
+        {
+            "min_depth",
+            "max_depth",
+            "sigma_gray",
+            "sigma_depth_floor",
+            "sigma_depth_quad",
+            "readout",
+        }
     )
 
     min_depth: float = Field(default=0.2, gt=0, description="smaller depth is ignored, such as that of a gripper [m]")
@@ -30,6 +37,23 @@ class SensorConfig(_Section):
     sigma_gray: float = Field(default=0.02, gt=0, description="standard deviation of a grey value in 0..1")
     sigma_depth_floor: float = Field(default=1e-3, gt=0, description="constant part of the depth's σ [m]")
     sigma_depth_quad: float = Field(default=2e-3, ge=0, description="part of the depth's σ that grows with z² [1/m]")
+    readout: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.2,
+        description="rolling shutter: time from the first row of an image to the last, whose middle is the stamp; 0 is "
+        "a global shutter [s]",
+    )
+    depth_delay: float = Field(
+        default=0.0, ge=-0.2, le=0.2, description="time by which the depth image is later than the colour image [s]"
+    )
+    depth_to_color: tuple[float, float, float, float, float, float] = Field(
+        default=(0.0,) * 6,
+        description="T_color_depth if depth is not registered to colour: translation [m] and rotation vector [rad]",
+    )
+    depth_scale: float = Field(default=1.0, gt=0, description="factor on the measured depth")
+    depth_bias: float = Field(default=0.0, description="added to the measured depth, after the factor [m]")
+    exposure: float = Field(default=0.0, ge=0, le=0.2, description="exposure time of colour: motion blur [s]")
     depth_sigma_scale: float = Field(
         default=10.0,
         ge=1,
@@ -178,6 +202,9 @@ class MappingConfig(_Section):
     keyframe_rotation: float = Field(
         default=0.07, gt=0, description="rotation to every keyframe from which a frame is a new keyframe [rad]"
     )
+    replace_poor: bool = Field(
+        default=False, description="a blurred or degraded keyframe is replaced by a better view of the same place"
+    )
     max_keyframes: int = Field(
         default=300, ge=10, description="hard cap on keyframes, 3 MB each; the most redundant are dropped: memory"
     )
@@ -247,6 +274,22 @@ class LoopsConfig(_Section):
     )
 
 
+class BundleConfig(_Section):
+    """Bundle adjustment: joint poses of the keyframes that see the same place. It needs ``loops.enabled``."""
+
+    PUBLIC: ClassVar[frozenset[str]] = frozenset({"enabled"})
+
+    enabled: bool = Field(default=False, description="adjust the poses of keyframes to each other")
+    window: int = Field(
+        default=8, ge=2, description="latest keyframes that move without a revisited place: accuracy for time"
+    )
+    pairs: int = Field(
+        default=6, ge=1, description="earlier keyframes that each new one is matched with: accuracy for time"
+    )
+    min_translation: float = Field(default=0.002, gt=0, description="smaller corrections do not move the map [m]")
+    min_rotation: float = Field(default=0.001, gt=0, description="smaller corrections do not move the map [rad]")
+
+
 class Config(_Section):
     """All settings of a run.
 
@@ -257,6 +300,7 @@ class Config(_Section):
     tracking: TrackingConfig = Field(default_factory=lambda: TrackingConfig())
     mapping: MappingConfig = Field(default_factory=lambda: MappingConfig())
     loops: LoopsConfig = Field(default_factory=LoopsConfig)
+    bundle: BundleConfig = Field(default_factory=BundleConfig)
     seed: int = Field(default=0, description="seed of every random choice")
 
     @model_validator(mode="after")

@@ -53,9 +53,8 @@ def depth_offset(frames: Iterable[Frame]) -> tuple[int, int] | None:
     radius, edges, halves = 0, 0, [np.zeros(0), np.zeros(0)]
     for k, frame in enumerate(frames):
         radius = radius or _search_radius(frame)
-        near = _near_sides(frame, radius)
-        edges += int(near.sum())
-        part = _correlation(near, _gradient_magnitude(frame.rgb), radius)
+        part, count = edge_correlation(frame, radius)
+        edges += count
         halves[k % 2] = halves[k % 2] + part if k > 1 else part
     if edges < CONSTANTS.min_edges or not halves[1].size:
         return None
@@ -67,6 +66,20 @@ def depth_offset(frames: Iterable[Frame]) -> tuple[int, int] | None:
     others = total[np.hypot(rows - peak[0], columns - peak[1]) > CONSTANTS.peak_radius * radius]
     v, u = (peak - radius).tolist()
     return (u, v) if total.max() > CONSTANTS.peak_ratio * max(float(others.max()), 0.0) else None
+
+
+def edge_correlation(frame: Frame, radius: int) -> tuple[NDArray[np.float64], int]:
+    """Correlate near sides of depth edges, shifted by -R..R rows and columns, with the gradient magnitude of grey.
+
+    Args:
+        frame: the frame.
+        radius: largest shift R [px].
+
+    Returns:
+        The correlation (2R + 1, 2R + 1), and the number of edge pixels.
+    """
+    near = _near_sides(frame, radius)
+    return _correlation(near, _gradient_magnitude(frame.rgb), radius), int(near.sum())
 
 
 def _search_radius(frame: Frame) -> int:

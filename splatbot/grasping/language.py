@@ -37,6 +37,23 @@ SHAPES = {
     "sphere": ("sphere", "ball", "orb", "fruit"),
 }
 SIZES = ("largest", "biggest", "smallest", "tallest", "lowest", "widest", "thinnest", "nearest", "closest", "farthest")
+EXTENTS = {
+    "cup": ((0.04, 0.16), (0.04, 0.16)),
+    "mug": ((0.06, 0.16), (0.05, 0.18)),
+    "can": ((0.05, 0.25), (0.04, 0.16)),
+    "tin": ((0.02, 0.25), (0.04, 0.25)),
+    "jar": ((0.05, 0.30), (0.03, 0.20)),
+    "bottle": ((0.08, 0.45), (0.03, 0.20)),
+    "tube": ((0.01, 0.60), (0.01, 0.60)),
+    "ball": ((0.02, 0.35), (0.02, 0.35)),
+    "fruit": ((0.02, 0.30), (0.02, 0.35)),
+    "cube": ((0.01, 0.35), (0.01, 0.35)),
+    "box": ((0.012, 0.50), (0.01, 0.60)),
+    "carton": ((0.02, 0.50), (0.02, 0.60)),
+    "block": ((0.012, 0.35), (0.01, 0.35)),
+    "brick": ((0.012, 0.35), (0.01, 0.35)),
+}
+"""Usual heights and horizontal extents [m] by noun; a flat patch has those of no cup."""
 RELATIONS = ("left of", "right of", "in front of", "behind", "next to", "near")
 _GENERIC = ("thing", "object", "one", "item", "something")
 _STOP_WORDS = (
@@ -67,6 +84,10 @@ class QueryConstants:
     shape_scale: float = 2.5e-3
     """Excess error [m] of a fit at which the shape score falls to exp(-1). A larger one separates similar shapes less
     strictly."""
+    flat_height: float = 0.012
+    """Height [m] below which an object is a flat patch. A larger one takes thin objects for patches."""
+    extent_scale: float = 0.01
+    """Excess [m] of an extent at which the score of a noun falls to exp(-1). A larger one accepts other sizes."""
     min_score: float = 0.3
     """Smallest score [1] of a match. A larger one refuses more queries as unknown."""
     tie_ratio: float = 0.75
@@ -121,6 +142,10 @@ class LanguageAffordance:
 def _named(scene: SegmentedMap, text: str) -> Target | None:
     """Return the object with this name or alias in the scene file; None if no entry has it."""
     plain = " ".join(word for word in text.split() if word not in _STOP_WORDS)
+    listed = re.fullmatch(r"object (\d+)", plain)
+    if listed and int(listed[1]) < len(scene.objects):
+        item = scene.objects[int(listed[1])]
+        return Target(item.rows, None, item.name or plain, "list", 1.0, (), item.number)
     for entry in scene.names:
         if plain in (other.lower() for other in (entry.name, *entry.aliases)):
             found = next((o for o in scene.objects if o.name == entry.name), None)
@@ -142,7 +167,11 @@ def _decided(scene: SegmentedMap, text: str, scores: Array, notes: tuple[str, ..
             candidates=tuple(described),
         )
     like = [k for k in order if scores[k] > CONSTANTS.tie_ratio * scores[best]]
-    if len(like) > 1:
+    superlative = any(word in SIZES for word in text.split())
+    if superlative and len(like) > 1:  # "largest" takes the largest, with a note on others of nearly that size
+        rivals = "; ".join(_described(scene.objects[k]) for k in like[1:])
+        notes = (*notes, f"took {_described(scene.objects[best])}; nearly equal: {rivals}")
+    elif len(like) > 1:
         raise AffordanceError(
             f"fits {len(like)} objects about equally: {'; '.join(described[: len(like)])}.",
             field=text,
@@ -153,9 +182,21 @@ def _decided(scene: SegmentedMap, text: str, scores: Array, notes: tuple[str, ..
     return Target(found.rows, None, found.name or text, "rules", float(scores[best]), (*notes, *described), best)
 
 
+def color_name(item: MapObject) -> str:
+    """Return the name of the colour nearest to that of an object."""
+    return min(COLORS, key=lambda name: float(np.linalg.norm(_lab(item.color[None]) - _lab(np.array([COLORS[name]])))))
+
+
+def shape_name(scene: SegmentedMap, item: MapObject) -> str:
+    """Return "patch" for a flat object, else the name of the primitive that fits it best."""
+    if item.size[2] < CONSTANTS.flat_height:
+        return "patch"
+    return max(SHAPES, key=lambda kind: _shape_score(scene, item, kind))
+
+
 def _described(item: MapObject) -> str:
     """Describe an object by its name, the nearest colour name and its size."""
-    color = min(COLORS, key=lambda name: float(np.linalg.norm(_lab(item.color[None]) - _lab(np.array([COLORS[name]])))))
+    color = color_name(item)
     size = " x ".join(f"{100 * x:.0f}" for x in item.size)
     return f"{item.name or f'object {item.number}'} ({color}, {size} cm)"
 
@@ -203,8 +244,9 @@ def _rule(word: str) -> Callable[[_ObjectAttributes], Array] | None:
         return lambda attributes: _color_scores(attributes, word)
     for kind, words in SHAPES.items():
         if word in words or word.removesuffix("s") in words:
+            thing = word if word in words else word.removesuffix("s")
             return lambda attributes: np.array(
-                [_shape_score(attributes.scene, o, kind) for o in attributes.scene.objects]
+                [_shape_score(attributes.scene, o, kind) * _extent_score(o, thing) for o in attributes.scene.objects]
             )
     if word in ("large", "small", "tall", "flat"):
         return lambda attributes: _size_scores(attributes, word)
@@ -231,6 +273,16 @@ def _shape_score(scene: SegmentedMap, item: MapObject, kind: str) -> float:
         f.shape["kind"]: f.error for f in primitive_fits(points, support.offset if support is not None else -np.inf)
     }
     return float(np.exp(-(fits[kind] - min(fits.values())) / CONSTANTS.shape_scale))
+
+
+def _extent_score(item: MapObject, thing: str) -> float:
+    """Return 1 for an object with the usual extents of a noun; the score falls with the excess."""
+    if thing not in EXTENTS:
+        return 1.0
+    (low, high), (narrow, wide) = EXTENTS[thing]
+    long, short, height = item.size
+    excess = max(low - height, height - high, narrow - short, long - wide, 0.0)
+    return float(np.exp(-excess / CONSTANTS.extent_scale))
 
 
 def _size_scores(attributes: _ObjectAttributes, word: str) -> Array:

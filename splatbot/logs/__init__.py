@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatbot.errors import LogError
+from splatbot.layouts import log_kind
 from splatbot.logs.base import Log
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.record import record
@@ -12,12 +13,6 @@ from splatbot.logs.replica import ReplicaLog
 from splatbot.logs.tum import Missing, TumLog
 
 __all__ = ["Calibration", "Log", "open_log", "record"]
-
-_LAYOUTS_HINT = (
-    "known layouts: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), "
-    "a .mcap or .bag file; "
-    "`synthetic:tabletop` needs no files"
-)
 
 
 def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None, missing: Missing = "auto") -> Log:
@@ -35,19 +30,14 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
         LogError: the log does not exist, has an unknown layout, or is damaged.
         CameraError: there are no usable intrinsics.
     """
-    if str(uri).startswith("synthetic:"):
+    kind = log_kind(uri)
+    if kind == "synthetic":
         return _open_synthetic(str(uri), camera)
-    if _is_bag(Path(str(uri).partition("?")[0])):
+    if kind == "bag":
         return _open_bag(str(uri), camera)
-    folder = Path(uri)
-    if not folder.is_dir():
-        problem = "is a file of no known kind" if folder.exists() else "does not exist"
-        raise LogError(f"{problem}.", file=folder, field="log", hint=f"check the path; {_LAYOUTS_HINT}")
-    if any((folder / name).exists() for name in ("rgb.txt", "depth.txt")):
-        return TumLog(folder, camera=camera, missing=missing)
-    if (folder / "results").is_dir() and (folder / "traj.txt").exists():
-        return ReplicaLog(folder, camera=camera)
-    raise LogError("holds no log of a known layout.", file=folder, field="log", hint=_LAYOUTS_HINT)
+    if kind == "tum":
+        return TumLog(Path(uri), camera=camera, missing=missing)
+    return ReplicaLog(Path(uri), camera=camera)
 
 
 def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:
@@ -56,10 +46,6 @@ def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:
     if camera is not None:
         raise LogError("a synthetic log has its own camera.", file=uri, field="camera", hint="leave --camera out")
     return SyntheticLog(uri)
-
-
-def _is_bag(path: Path) -> bool:
-    return path.suffix in (".mcap", ".bag") or (path.is_dir() and (path / "metadata.yaml").exists())
 
 
 def _open_bag(uri: str, camera: str | Path | Calibration | None) -> Log:

@@ -18,7 +18,7 @@ from rosbags.interfaces import Connection
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import StampedLog
+from splatbot.logs.base import MILLIMETRES, StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
 from splatbot.logs.joints import interpolate_joints
@@ -87,7 +87,10 @@ class BagLog(StampedLog):
         self._pairs = self._pair()
         self.stamps = [color.stamp for color, _ in self._pairs]
         self.unpaired = len(self._index[self._color]) - len(self._pairs)
-        found = find_calibration(camera).camera if camera is not None else self._recorded_camera()
+        self._calibration = (
+            find_calibration(camera) if camera is not None else Calibration(self._recorded_camera(), MILLIMETRES)
+        )
+        found = self._calibration.camera
         self._undistort = Undistorter(found) if found.distortion else None
         self._camera = self._undistort.camera if self._undistort else found
 
@@ -95,6 +98,11 @@ class BagLog(StampedLog):
     def camera(self) -> Camera:
         """Camera of the delivered frames: undistorted."""
         return self._camera
+
+    @property
+    def calibration(self) -> Calibration:
+        """The given calibration, or the recorded intrinsics."""
+        return self._calibration
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from splatbot.camera import Camera
 from splatbot.frame import Frame
+from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
+
+MILLIMETRES = 1000.0  # [units/m] of integer depth images without a unit of their own
 
 
 class Log(Protocol):
@@ -46,6 +49,11 @@ class Log(Protocol):
         """Records of the simulated sensor effects that are applied to the frames; empty for a real sensor."""
         ...
 
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the recorded images, with the sensor's values of the configuration if they are known."""
+        ...
+
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
@@ -69,6 +77,11 @@ class LogBase:
     def effects(self) -> list[dict[str, Any]]:
         """Empty list; see :class:`Log`."""
         return []
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera of the delivered frames, and millimetres; see :class:`Log`."""
+        return Calibration(cast(Log, self).camera, MILLIMETRES)
 
     def __len__(self) -> int:
         raise NotImplementedError

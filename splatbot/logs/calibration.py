@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from splatbot.atomic import atomic_write
 from splatbot.camera import Camera
 from splatbot.errors import CameraError
 
@@ -20,6 +22,8 @@ class Calibration:
         camera: recorded camera, possibly with distortion.
         depth_scale: units per metre.
         file: source file, for error messages.
+        sensor: values of the section `sensor` of the configuration, such as those that `splatbot calibrate sensor`
+            estimates.
 
     Raises:
         CameraError: the depth scale is not a positive number.
@@ -28,6 +32,7 @@ class Calibration:
     camera: Camera
     depth_scale: float
     file: str | None = None
+    sensor: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
@@ -42,7 +47,7 @@ class Calibration:
 def read_calibration(path: str | Path) -> Calibration:
     """Read `intrinsics.json`: fx, fy, cx, cy [px], width, height [px], depth_scale [units/m], optional distortion.
 
-    Other keys are ignored.
+    The optional object "sensor" holds values of the section `sensor` of the configuration. Other keys are ignored.
 
     Raises:
         CameraError: the file is missing or not a JSON object, or a value is missing or invalid.
@@ -52,9 +57,29 @@ def read_calibration(path: str | Path) -> Calibration:
     if not isinstance(distortion, list):
         raise CameraError("is no list.", file=path, field="distortion", hint="OpenCV's [k1, k2, p1, p2, k3]")
     named = {str(i): value for i, value in enumerate(distortion)}
-    return make_calibration(
+    calibration = make_calibration(
         path, values, scale_key="depth_scale", distortion=tuple(number(path, named, key) for key in named)
     )
+    sensor = values.get("sensor", {})
+    if not isinstance(sensor, dict):
+        raise CameraError("is no JSON object.", file=path, field="sensor", hint='write {"readout": 0.03, ...}')
+    return replace(calibration, sensor=sensor)
+
+
+def save_calibration(calibration: Calibration, path: str | Path) -> None:
+    """Write a calibration that :func:`read_calibration` reads.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    c = calibration.camera
+    values: dict[str, Any] = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "width": c.width, "height": c.height}
+    values["depth_scale"] = calibration.depth_scale
+    if c.distortion:
+        values["distortion"] = list(c.distortion)
+    values["sensor"] = dict(calibration.sensor)
+    with atomic_write(Path(path)) as file:
+        file.write(json.dumps(values, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def make_calibration(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,8 @@ def record(
     if truth is not None:
         truth.save(out / "groundtruth.txt")
     camera = None
-    with (out / "depth.txt").open("w") as depths, (out / "rgb.txt").open("w") as colors:
+    (out / "depth.txt").unlink(missing_ok=True)  # of a recording that was cut off before its first colour image
+    with _LineFile(out / "depth.txt") as depths, _LineFile(out / "rgb.txt") as colors:
         for number, frame in enumerate(frames):
             if camera is None:
                 camera = frame.camera
@@ -69,17 +71,44 @@ def record(
                 raise LogError("the camera changed.", file=frame.source, field="camera", hint="record two logs")
             name = f"{number:06d}.png"
             if frame.joints is not None:
-                with (out / JOINTS).open("a") as lines:
-                    lines.write(" ".join(repr(float(v)) for v in (frame.stamp, *frame.joints)) + "\n")
+                with _LineFile(out / JOINTS) as lines:
+                    lines.append(" ".join(repr(float(v)) for v in (frame.stamp, *frame.joints)))
             _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
             _write_png(out / "depth" / name, _to_units(frame, depth_scale))
             # Depth first: a depth image without colour is harmless, but colour without depth is an error.
             for lines, part in ((depths, "depth"), (colors, "rgb")):
-                lines.write(f"{float(frame.stamp)!r} {part}/{name}\n")
-                lines.flush()
+                lines.append(f"{float(frame.stamp)!r} {part}/{name}")
             if progress is not None:
                 progress(number + 1)
     return out
+
+
+class _LineFile:
+    """A text file that only ever holds whole lines, also after an error of the disk."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = path.open("ab", buffering=0)
+
+    def append(self, line: str) -> None:
+        """Append a line.
+
+        Raises:
+            OSError: the disk is full or not available; the file ends with the line before.
+        """
+        data, size = f"{line}\n".encode(), os.fstat(self._file.fileno()).st_size
+        try:
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError as error:
+            self._file.truncate(size)
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
+
+    def __enter__(self) -> _LineFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
 
 
 def _to_units(frame: Frame, depth_scale: float) -> NDArray[np.uint16]:

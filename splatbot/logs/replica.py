@@ -58,6 +58,11 @@ class ReplicaLog(LogBase):
         poses = [_parse_pose(path, i, line) for i, line in enumerate(lines, 1) if line.strip()]
         return Trajectory(np.arange(len(poses)) / _RATE, np.array(poses).reshape(-1, 4, 4))
 
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the recorded images."""
+        return self._reader.calibration
+
     def __len__(self) -> int:
         return len(self._colors)
 

@@ -20,6 +20,8 @@ from splatbot.trajectory import Trajectory
 
 PREFIX = "synthetic:"
 
+_EFFECT_SAMPLES = 16  # poses per frame for effects of the motion within a frame, which is not uniform
+
 
 @dataclass(frozen=True)
 class SyntheticOptions:
@@ -144,18 +146,19 @@ class SyntheticLog(LogBase):
         """The scene's entry in the list of scenes."""
         return SCENES[self.name]
 
-    def _path(self) -> Trajectory:
+    def _path(self, samples: int = 1) -> Trajectory:
+        """Sample the camera path at the frames, and at ``samples - 1`` equally spaced times between two of them."""
         o = self.options
         motion = MotionOptions((o.frames - 1) / o.rate, o.rate, np.radians(o.arc), o.seed)
         path = make_path(o.trajectory or self.kind.trajectory, self.kind.stage, motion)
-        stamps = np.arange(o.frames) / o.rate
+        stamps = np.arange((o.frames - 1) * samples + 1) / (o.rate * samples)
         return Trajectory(stamps, np.array([path(float(t)) for t in stamps]))
 
     def _make_effects(self) -> FrameEffects | None:
         specs = [spec.strip() for spec in self.options.effects.split(";") if spec.strip()]
         if not specs:
             return None
-        return make_effects(specs, seed=self.options.seed).along(self.ground_truth)
+        return make_effects(specs, seed=self.options.seed).along(self._path(_EFFECT_SAMPLES))
 
 
 def read_options(uri: str) -> SyntheticOptions:

@@ -163,6 +163,27 @@ def rotation(stage: Stage, _: MotionOptions) -> Path:
     return pose
 
 
+_TURN_RATE_DEG, _TURN_S = 120.0, 1.0
+
+
+def turns(stage: Stage, _: MotionOptions) -> Path:
+    """Turn away and back about the vertical, horizontal and optical axis in turn, 1 s each, at up to 120 °/s.
+
+    The camera sways by 2 cm. The rates are those of a hand that turns a camera fast, as in TUM's fr1_rpy.
+    """
+    w = 2 * np.pi / _TURN_S
+    amplitude = np.radians(_TURN_RATE_DEG) / w
+
+    def pose(t: float) -> Array:
+        turn, since = divmod(t, _TURN_S)
+        angles = np.zeros(3)
+        angles[(1, 0, 2)[int(turn) % 3]] = (-1) ** int(turn) * amplitude * (1.0 - np.cos(w * since))
+        sway = [0.02 * np.sin(2.1 * t), 0.02 * np.sin(1.7 * t + 0.5) - 0.01, 0.02 * np.sin(1.3 * t)]
+        return _moved(stage.home, sway, angles)
+
+    return pose
+
+
 def forward(stage: Stage, _: MotionOptions) -> Path:
     """Move straight towards the target over the free distance at up to 0.5 m/s, and backwards to the start."""
     half = np.pi * stage.ahead  # [s] one direction; the maximum slope of (1 - cos)/2 is π/2 over it
@@ -220,7 +241,7 @@ def _circuit(stage: Stage, angle: float) -> Array:
 
 
 TRAJECTORIES: dict[str, Callable[[Stage, MotionOptions], Path]] = {
-    path.__name__: path for path in (orbit, arm, arm_stops, handheld, rotation, forward, steps, loop, laps)
+    path.__name__: path for path in (orbit, arm, arm_stops, handheld, rotation, turns, forward, steps, loop, laps)
 }
 
 

@@ -83,6 +83,11 @@ class TumLog(StampedLog):
         """The account in `effects.json`, which `splatbot simulate` writes; empty for a real sensor."""
         return self._effects
 
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the recorded images."""
+        return self._reader.calibration
+
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """Poses of groundtruth.txt as recorded, T_world_camera; None where there is no such file.

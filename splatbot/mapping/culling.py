@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.mapping.keyframes import Keyframe
+from splatbot.config import MappingConfig
+from splatbot.mapping.keyframes import Keyframe, is_same_view
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,27 @@ def without_redundant(keyframes: Sequence[Keyframe], limit: int) -> list[Keyfram
     """
     kept = list(keyframes)
     while len(kept) > max(limit, CONSTANTS.latest_kept + 2):
-        nearest = _distances(kept).min(axis=1)[1 : -CONSTANTS.latest_kept]
+        nearest = view_distances(kept).min(axis=1)[1 : -CONSTANTS.latest_kept]
         del kept[1 + int(np.argmin(nearest))]
     return kept
 
 
-def _distances(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
+def without_replaced(keyframes: Sequence[Keyframe], new: Keyframe, config: MappingConfig) -> list[Keyframe]:
+    """Return the keyframes without the poor ones that a new and better view of the same place replaces.
+
+    The first keyframe stays because it defines the world frame. Nothing is replaced by a poor view.
+    """
+    if not config.replace_poor or new.is_poor:
+        return list(keyframes)
+    T = new.T_world_camera
+    return [
+        k
+        for index, k in enumerate(keyframes)
+        if index == 0 or not k.is_poor or k.number >= new.number or not is_same_view(k.T_world_camera, T, config)
+    ]
+
+
+def view_distances(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
     """Compute the distances (K, K) [m] between views, with a radian as half a meter; the diagonal is infinite."""
     T = np.stack([keyframe.T_world_camera for keyframe in keyframes])
     moved = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)

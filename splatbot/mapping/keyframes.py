@@ -65,6 +65,7 @@ class Keyframe:
         reference: pixels that later frames are aligned to; their depth is the map's once the keyframe is in the map.
         static_mask: (H, W) bool, pixels that are neither masked nor show a dynamic object; elsewhere, depth is 0. If
             None, all pixels are static.
+        is_poor: whether it is blurred or degraded, so that a better view of the place replaces it.
     """
 
     number: int
@@ -75,6 +76,7 @@ class Keyframe:
     features: Features
     reference: Reference
     static_mask: Tensor | None = None
+    is_poor: bool = False
 
     @property
     def viewmat(self) -> Tensor:
@@ -132,11 +134,13 @@ def noise_share(depth: NDArray[np.float32], tracking: TrackingConfig) -> float:
 
 def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[HasPose], config: MappingConfig) -> bool:
     """Return whether a view is new: its translation or rotation from every keyframe exceeds the configured limit."""
-    for keyframe in reversed(keyframes):
-        moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)
-        if moved < config.keyframe_translation and turned < config.keyframe_rotation:
-            return False
-    return True
+    return not any(is_same_view(k.T_world_camera, T_world_camera, config) for k in reversed(keyframes))
+
+
+def is_same_view(T_world_a: NDArray[np.float64], T_world_b: NDArray[np.float64], config: MappingConfig) -> bool:
+    """Return whether two poses (4, 4) differ by less than the distance between keyframes."""
+    moved, turned = pose_distance(T_world_a, T_world_b)
+    return moved < config.keyframe_translation and turned < config.keyframe_rotation
 
 
 def resized(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:

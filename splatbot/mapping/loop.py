@@ -7,15 +7,23 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from splatbot.config import Config
-from splatbot.gaussians import GaussianModel
-from splatbot.geometry import inverse, quat_multiply, rotation_to_quat
+from splatbot.geometry import inverse
+from splatbot.mapping.bundle import adjust
+from splatbot.mapping.covisibility import covisible_candidates
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.observation import GraphLocation, Observation
-from splatbot.mapping.posegraph import Adjacency, Edge, PoseGraph, max_residual, within_hops
+from splatbot.mapping.posegraph import (
+    Adjacency,
+    Edge,
+    PoseGraph,
+    drift_covariance,
+    max_residual,
+    orthonormal,
+    within_hops,
+)
 from splatbot.tracking.align import align
 from splatbot.tracking.features import match_pose
 from splatbot.tracking.health import measure
@@ -42,9 +50,6 @@ class LoopConstants:
     """Number of loop candidates [1] by appearance that are verified for each keyframe. Each takes an alignment."""
     unknown_sigma: float = 0.5
     """Standard deviation [m], [rad] of a motion that the images could not measure."""
-    drift_sigma: float = 5e-3
-    """Standard deviation [m/m], [rad/rad] of the odometry error, relative to the motion. Errors of lens and depth
-    calibration add up over the path."""
     open_translation: float = 1e-2
     """Distance [m] by which the optimized graph leaves a wrong loop open. A smaller one rejects inaccurate loops."""
     open_rotation: float = 2e-2
@@ -62,6 +67,8 @@ class LoopConstants:
     """Angle [rad] between the corrections of loops that confirm each other."""
     unconfirmed_kept: int = 4
     """Number of loops [1] that wait for a confirming one. More of them confirm loops that are farther apart in time."""
+    ratios_kept: int = 10
+    """Number of latest keyframes [1] whose pairs measure the consistency of images. More of them react more slowly."""
 
 
 CONSTANTS = LoopConstants()
@@ -111,6 +118,9 @@ class LoopCloser:
         """T_new_old (4, 4) by keyframe number once a loop is closed; None otherwise."""
         self.closed = 0
         self.rejected = 0
+        self.inconsistency = 1.0
+        """Ratio of the observed to the stated variance of measured motions, at least 1."""
+        self._ratios: list[float] = []
         self._unconfirmed: list[Edge] = []
 
     def locate(self, T_world_camera: Array, keyframes: Sequence[Keyframe], previous: GraphLocation) -> GraphLocation:
@@ -150,8 +160,11 @@ class LoopCloser:
         self.adjacency = self.graph.adjacency()
 
     def apply_correction(self, correction: Mapping[int, Array]) -> None:
-        """Move the poses of the graph after the keyframes were moved."""
-        self.graph.poses = {number: correction[number] @ T for number, T in self.graph.poses.items()}
+        """Move the poses of the graph after the keyframes were moved.
+
+        The rotations stay exact: the rounding errors of many corrections would otherwise grow exponentially.
+        """
+        self.graph.poses = {number: orthonormal(correction[number] @ T) for number, T in self.graph.poses.items()}
         self.correction = None
 
     def state(self) -> dict[str, Any]:
@@ -173,7 +186,10 @@ class LoopCloser:
             self.correction[keyframe.number] = self.correction[reference.number]
         prepared = observation.prepared
         odometry = self._odometry_edge(reference, keyframe, prepared)
-        self.graph.edges.append(odometry)
+        covisible = self._covisible_edges(keyframe, others, prepared)
+        if covisible:
+            odometry = replace(odometry, covisible=True)
+        self.graph.edges += [odometry, *covisible]
         edge = None if others[-1] is reference else self._covisibility_edge(others[-1], keyframe, prepared)
         if edge is not None:
             self.graph.edges.append(edge)
@@ -184,6 +200,34 @@ class LoopCloser:
         self._unconfirmed = [*self._unconfirmed[-CONSTANTS.unconfirmed_kept :], *loops]
         if confirmed:
             self._close(confirmed)
+        if self.correction is None and covisible:
+            self._adjust(keyframe.number)
+
+    def _covisible_edges(self, keyframe: Keyframe, others: Sequence[Keyframe], prepared: PreparedFrame) -> list[Edge]:
+        """Return the motions from covisible keyframes, each measured from the images of the two alone."""
+        if not self.config.bundle.enabled:
+            return []
+        edges = []
+        for other in covisible_candidates(keyframe, others, self.config.bundle.pairs):
+            measured = self._measure(other, keyframe, prepared)
+            if measured is not None and self._is_reliable(measured) and measured.matches > 0:
+                T = measured.T_keyframe_camera
+                moved, turned = pose_distance(inverse(other.T_world_camera) @ keyframe.T_world_camera, T)
+                if max(moved, turned) > CONSTANTS.drift_offset:  # repeated texture, or a loop to be confirmed
+                    self.rejected += 1
+                    continue
+                edges.append(
+                    Edge(other.number, keyframe.number, T, measured.covariance + drift_covariance(T), covisible=True)
+                )
+        return edges
+
+    def _adjust(self, number: int) -> None:
+        """Adjust the poses to all covisible pairs, see :func:`splatbot.mapping.bundle.adjust`."""
+        adjustment = adjust(self.graph, number, self.config.bundle)
+        self.correction = adjustment.correction
+        if adjustment.variance_ratio is not None:
+            self._ratios = [*self._ratios, adjustment.variance_ratio][-CONSTANTS.ratios_kept :]
+            self.inconsistency = max(1.0, float(np.median(self._ratios)))
 
     def _odometry_edge(self, reference: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> Edge:
         """Return the motion from the reference keyframe: as tracked, or as measured where other keyframes biased it."""
@@ -192,10 +236,10 @@ class LoopCloser:
         if measured is None or not self._is_reliable(measured):
             moved, turned = pose_distance(np.eye(4), T_tracked)
             near = moved < 2 * CONSTANTS.near_translation and turned < 2 * CONSTANTS.near_rotation
-            covariance = _drift(T_tracked) if near else CONSTANTS.unknown_sigma**2 * np.eye(6)
+            covariance = drift_covariance(T_tracked) if near else CONSTANTS.unknown_sigma**2 * np.eye(6)
             return Edge(reference.number, keyframe.number, T_tracked, covariance)
         T = T_tracked if measured.agrees(T_tracked) else measured.T_keyframe_camera
-        return Edge(reference.number, keyframe.number, T, measured.covariance + _drift(T))
+        return Edge(reference.number, keyframe.number, T, measured.covariance + drift_covariance(T))
 
     def _covisibility_edge(self, latest: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> Edge | None:
         """Return the motion from the previous keyframe, if that is not the reference and the images confirm the motion.
@@ -206,7 +250,7 @@ class LoopCloser:
         measured = self._measure(latest, keyframe, prepared)
         if measured is None or not self._is_reliable(measured) or not measured.agrees(T_tracked):
             return None
-        return Edge(latest.number, keyframe.number, T_tracked, measured.covariance + _drift(T_tracked))
+        return Edge(latest.number, keyframe.number, T_tracked, measured.covariance + drift_covariance(T_tracked))
 
     def _loop_candidates(
         self, reference: Keyframe, keyframe: Keyframe, keyframes: Sequence[Keyframe]
@@ -246,7 +290,7 @@ class LoopCloser:
             self.rejected += 1
             return None
         T = measured.T_keyframe_camera
-        return Edge(candidate.number, keyframe.number, T, measured.covariance + _drift(T), loop=True)
+        return Edge(candidate.number, keyframe.number, T, measured.covariance + drift_covariance(T), loop=True)
 
     def _is_confirmed(self, edge: Edge) -> bool:
         """Return whether a loop agrees with the tracked poses, or another loop implies the same correction."""
@@ -274,14 +318,15 @@ class LoopCloser:
             return
         poses = self.graph.optimize()
         moved, turned = max_residual(edge.residual(poses) for edge in loops)
-        sigma = max(_mahalanobis(edge, poses) for edge in self.graph.edges if not edge.loop)
+        measured = (edge for edge in self.graph.edges if not (edge.loop or edge.covisible))
+        sigma = max((_mahalanobis(edge, poses) for edge in measured), default=0.0)
         is_open = moved > CONSTANTS.open_translation or turned > CONSTANTS.open_rotation
         if is_open or sigma > limits.max_edge_sigma:
             self.graph.edges = [edge for edge in self.graph.edges if all(edge is not loop for loop in loops)]
             self.rejected += len(loops)
             return
         self.closed += 1
-        self.correction = {number: poses[number] @ inverse(T) for number, T in self.graph.poses.items()}
+        self.correction = {k: orthonormal(poses[k] @ inverse(T)) for k, T in self.graph.poses.items()}
 
     def _measure(self, other: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> MeasuredMotion | None:
         """Align the frame of a keyframe to one other keyframe; return None if the alignment does not converge."""
@@ -331,45 +376,6 @@ class LoopCloser:
 def _shallow_copy(value: Any) -> Any:
     """Return a shallow copy of a list or dict, other values as they are."""
     return value.copy() if isinstance(value, list | dict) else value
-
-
-def move_gaussians(model: GaussianModel, correction: Mapping[int, Array]) -> GaussianModel:
-    """Return the model with each Gaussian moved rigidly with the keyframe that it is anchored to.
-
-    For an anchor with the correction ``(R, t)``, the mean becomes ``μ' = R μ + t`` and the covariance ``Σ' = R Σ Rᵀ``.
-    Spherical harmonics above degree 0 are not rotated: the online map has none.
-
-    Args:
-        correction: T_new_old (4, 4) by keyframe number.
-    """
-    anchors = model.anchors.numpy()
-    means, quats = model.means.numpy().astype(np.float64), model.quats.numpy().astype(np.float64)
-    for number in np.unique(anchors):
-        T = correction.get(int(number))
-        if T is None:
-            continue
-        rows = anchors == number
-        means[rows] = means[rows] @ T[:3, :3].T + T[:3, 3]
-        quats[rows] = quat_multiply(rotation_to_quat(T[:3, :3][None]), quats[rows])
-    return replace(
-        model, means=torch.from_numpy(means.astype(np.float32)), quats=torch.from_numpy(quats.astype(np.float32))
-    )
-
-
-def move_keyframe(keyframe: Keyframe, correction: Mapping[int, Array]) -> Keyframe:
-    """Return a keyframe and its reference at the corrected pose."""
-    T = correction[keyframe.number] @ keyframe.T_world_camera
-    return replace(keyframe, T_world_camera=T, reference=replace(keyframe.reference, T_world_camera=T))
-
-
-def _drift(T: Array) -> Array:
-    """Compute the covariance (6, 6) of the odometry error, which grows with the motion (4, 4).
-
-    σ_t = s (‖t‖ + θ · 1 m) and σ_ω = s θ, with s = ``drift_sigma``.
-    """
-    moved, turned = pose_distance(np.eye(4), T)
-    sigma = CONSTANTS.drift_sigma
-    return np.diag([(sigma * (moved + turned)) ** 2] * 3 + [(sigma * turned) ** 2] * 3)
 
 
 def _mahalanobis(edge: Edge, poses: Mapping[int, Array]) -> float:

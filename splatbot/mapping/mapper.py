@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
-from splatbot.mapping.culling import without_redundant
+from splatbot.mapping.completion import missing_gaussians
+from splatbot.mapping.culling import without_redundant, without_replaced
 from splatbot.mapping.densify import PositionGradients, split
 from splatbot.mapping.depth_fusion import (
     DepthNoiseModel,
@@ -32,12 +33,14 @@ from splatbot.mapping.dynamic_objects import DynamicObjectFilter
 from splatbot.mapping.exposure import in_exposure_of_map
 from splatbot.mapping.insertion import ModelView, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
 from splatbot.mapping.keyframes import Keyframe, is_keyframe, mapping_images, resized
-from splatbot.mapping.loop import LoopCloser, move_gaussians, move_keyframe
+from splatbot.mapping.loop import LoopCloser
 from splatbot.mapping.memory import memory_of
 from splatbot.mapping.merge import merge_similar
 from splatbot.mapping.observation import GraphLocation, Observation
 from splatbot.mapping.prune import best_supported, keep_mask
 from splatbot.mapping.refine import Refiner, Stop, never
+from splatbot.mapping.rigid_motion import move_gaussians, move_keyframe
+from splatbot.tracking.nearby_keyframes import pose_distance
 from splatbot.tracking.prepare import valid_share, with_depth
 from splatbot.tracking.reference import make_reference
 
@@ -52,11 +55,13 @@ class MapperConstants:
         backlog: keyframes that may wait for depth fusion; while as many wait, no further one is inserted.
         densify_after: share of the final iterations that run before densification; they measure the gradients.
         unmapped_share: share of an image without any map behind it that makes the next frame a keyframe.
+        refined_correction: [m] a correction of the poses that moves a keyframe by more has the map refined again.
     """
 
     backlog: int = 3
     densify_after: float = 1 / 3
     unmapped_share: float = 0.03
+    refined_correction: float = 0.01
 
 
 CONSTANTS = MapperConstants()
@@ -123,6 +128,11 @@ class Mapper:
         return {"closed": self.loops.closed, "rejected": self.loops.rejected}
 
     @property
+    def inconsistency(self) -> float:
+        """Ratio of the observed to the stated variance of motions between keyframes, at least 1."""
+        return self.loops.inconsistency
+
+    @property
     def skipped_gradients(self) -> int:
         """Number of gradients that were not finite and did not change the map."""
         return self._refiner.adam.skipped
@@ -178,7 +188,10 @@ class Mapper:
             return False
         if observation.location.revisits or (self._unmapped_seen and not waiting):
             return True
-        return is_keyframe(observation.T_world_camera, [*self.keyframes, *waiting], self.config.mapping)
+        replaces = self.config.mapping.replace_poor and not observation.is_poor
+        views: list[Keyframe | Observation] = [*self.keyframes, *waiting]
+        views = [view for view in views if not (replaces and view.is_poor)]
+        return is_keyframe(observation.T_world_camera, views, self.config.mapping)
 
     def submit(self, observation: Observation) -> GraphLocation:
         """Queue a frame as the next keyframe; return its own location in the pose graph."""
@@ -250,7 +263,8 @@ class Mapper:
     def insert_keyframe(self) -> None:
         """Insert the first added keyframe into the map, update its reference and search for loop closures."""
         observation, keyframe = self._added[0]
-        self.keyframes = without_redundant(self.keyframes, self.config.mapping.max_keyframes)
+        kept = without_replaced(self.keyframes, keyframe, self.config.mapping)
+        self.keyframes = without_redundant(kept, self.config.mapping.max_keyframes)
         self.fuse(observation, keyframe)
         self.make_reference(observation, keyframe)
         self.loops.add(keyframe, observation, self.keyframes)
@@ -312,7 +326,8 @@ class Mapper:
         self.keyframes = [move_keyframe(keyframe, correction) for keyframe in self.keyframes]
         self.model = move_gaussians(self.model, correction)
         self.loops.apply_correction(correction)
-        self.pending_iterations += self.config.mapping.refine_iterations
+        if max(pose_distance(np.eye(4), T)[0] for T in correction.values()) > CONSTANTS.refined_correction:
+            self.pending_iterations += self.config.mapping.refine_iterations
         self.version += 1
         return correction
 
@@ -324,10 +339,14 @@ class Mapper:
     def finish(self, stop: Stop = never) -> None:
         """Refine over all keyframes at the end of a log, and densify where the loss gradients are large.
 
+        Confirmed depth that the map misses becomes Gaussians before and after. Refinement adapts the first ones; it may
+        move or remove Gaussians that depth supports.
+
         Args:
             stop: called before each iteration. Once it returns True, no iteration and no densification follows.
         """
         self.refine(self.pending_iterations, stop)
+        self._complete()
         final, gradients = self.config.mapping.final_iterations, PositionGradients(len(self.model))
         first = int(final * CONSTANTS.densify_after)
         self._refiner.refine_all(self.model, self.keyframes, first, gradients, stop)
@@ -335,6 +354,7 @@ class Mapper:
             self._densify(gradients)
             self._refiner.refine_all(self.model, self.keyframes, final - first, stop=stop)
         self._prune()
+        self._complete()
         self.version += 1
 
     # --- implementation ---
@@ -382,6 +402,7 @@ class Mapper:
             features=observation.features(),
             reference=make_reference(prepared.levels, T_world_camera, self.config.tracking.n_pixels),
             static_mask=None if mask is None else torch.from_numpy(resized(mask, depth.shape)),
+            is_poor=observation.is_poor,
         )
 
     def _compare_latest(self) -> None:
@@ -433,6 +454,14 @@ class Mapper:
             new.uncertainty = initial_uncertainty(new, keyframe.T_world_camera, self._depth_noise)
         self.model = GaussianModel.concatenate([self.model, measured, guessed])
         self._refiner.adam.extend(self.model)
+
+    def _complete(self) -> None:
+        if self._frozen or not len(self.model):
+            return
+        missing = missing_gaussians(self.model, self.keyframes, self.config.mapping, self._depth_noise)
+        self.model = GaussianModel.concatenate([self.model, missing])
+        self._refiner.adam.extend(self.model)
+        self._prune()
 
     def _densify(self, gradients: PositionGradients) -> None:
         free = self.config.mapping.max_gaussians - len(self.model)

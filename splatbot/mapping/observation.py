@@ -41,6 +41,7 @@ class Observation:
         location: the frame in the pose graph.
         verdict: of tracking.
         held_out: whether the map must not use the frame.
+        is_poor: whether a better frame of the same place is likely to come.
     """
 
     prepared: PreparedFrame
@@ -49,6 +50,7 @@ class Observation:
     location: GraphLocation = _NOWHERE
     verdict: Verdict = "ok"
     held_out: bool = False
+    is_poor: bool = False
 
     @property
     def stamp(self) -> float:

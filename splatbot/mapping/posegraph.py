@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.geometry import inverse, se3_log
+from splatbot.tracking.nearby_keyframes import pose_distance
 
 Array = NDArray[np.float64]
 Adjacency = Mapping[int, tuple[int, ...]]
 
 _CAUCHY_SIGMA = 1.0  # scale of the Cauchy loss of loop edges [σ]
+_COVISIBLE_CAUCHY_SIGMA = 3.0  # the same of covisible pairs; six residuals of 1 σ have the norm 2.4
+_DRIFT_SIGMA = 5e-3  # standard deviation of the odometry error, relative to the motion [m/m], [rad/rad]
 # Least covariance of an edge: standard deviations of 1 mm and 0.5 mrad, however small the residuals of its alignment.
 _LEAST_COVARIANCE = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
 
@@ -30,6 +33,7 @@ class Edge:
         T_first_second: (4, 4).
         covariance: (6, 6) of the twist (t [m], ω [rad]) in the second camera's frame.
         loop: whether it is a loop closure, which may be wrong.
+        covisible: whether it is one of many measurements of the same keyframes, so that a wrong one shows.
     """
 
     first: int
@@ -37,6 +41,7 @@ class Edge:
     T_first_second: Array
     covariance: Array
     loop: bool = False
+    covisible: bool = False
 
     def residual(self, poses: Mapping[int, Array]) -> Array:
         """Compute the twist (6,) from the measured to the estimated motion, in the second camera's frame.
@@ -77,26 +82,38 @@ class PoseGraph:
             float(sum(np.linalg.norm(step[3:]) for step in steps)),
         )
 
-    def optimize(self) -> dict[int, Array]:
+    def optimize(self, free: Set[int] | None = None) -> dict[int, Array]:
         """Compute the poses that minimize the cost of all edges; the first keyframe is fixed.
 
-        min Σ_odometry ½ ‖r_ij‖²_Σij + Σ_loop ρ(‖r_ij‖_Σij), with the residual r of :meth:`Edge.residual`. The squared
-        Mahalanobis norm is ‖r‖²_Σ = rᵀ Σ⁻¹ r. The Cauchy loss is ρ(x) = c² / 2 · log(1 + x² / c²). GTSAM solves it by
-        Levenberg-Marquardt on SE(3) (Dellaert & Kaess 2017, Factor Graphs for Robot Perception).
+        min Σ_odometry ½ ‖r_ij‖²_Σij + Σ_robust ρ(‖r_ij‖_Σij), with the residual r of :meth:`Edge.residual`. The squared
+        Mahalanobis norm is ‖r‖²_Σ = rᵀ Σ⁻¹ r. Loops and covisible pairs have the Cauchy loss
+        ρ(x) = c² / 2 · log(1 + x² / c²). GTSAM solves it by Levenberg-Marquardt on SE(3) (Dellaert & Kaess 2017,
+        Factor Graphs for Robot Perception).
+
+        Args:
+            free: keyframes that may move; the others are fixed. If None, all but the first may move.
+
+        Returns:
+            T_world_camera (4, 4) of all keyframes, or of the free ones and their neighbors.
         """
+        first = min(self.poses)
+        edges = [e for e in self.edges if free is None or e.first in free or e.second in free]
+        numbers = {first, *self.poses} if free is None else {n for e in edges for n in (e.first, e.second)}
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        fixed = min(self.poses)
-        for number, T in self.poses.items():
+        fixed = _noise_model(1e-8 * np.eye(6))
+        for number in sorted(numbers):
+            T = self.poses[number]
             values.insert(number, gtsam.Pose3(T))
-        graph.add(gtsam.PriorFactorPose3(fixed, gtsam.Pose3(self.poses[fixed]), _noise_model(1e-8 * np.eye(6))))
-        for edge in self.edges:
+            if number == first or (free is not None and number not in free):
+                graph.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(T), fixed))
+        for edge in edges:
             noise = _noise_model(edge.covariance + _LEAST_COVARIANCE)
-            if edge.loop:
-                robust = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY_SIGMA)
-                noise = gtsam.noiseModel.Robust.Create(robust, noise)
+            if edge.loop or edge.covisible:
+                sigma = _CAUCHY_SIGMA if edge.loop else _COVISIBLE_CAUCHY_SIGMA
+                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(sigma), noise)
             graph.add(gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise))
         found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-        return {number: _orthonormal(found.atPose3(number).matrix()) for number in self.poses}
+        return {number: orthonormal(found.atPose3(number).matrix()) for number in sorted(numbers)}
 
     def _path(self, first: int, second: int) -> list[int] | None:
         """Find the path with the fewest odometry edges by breadth-first search."""
@@ -136,14 +153,23 @@ def max_residual(residuals: Iterable[Array]) -> tuple[float, float]:
     return moved, max((float(np.linalg.norm(r[3:])) for r in found), default=0.0)
 
 
+def drift_covariance(T: Array) -> Array:
+    """Compute the covariance (6, 6) of the odometry error, which grows with the motion (4, 4).
+
+    σ_t = s (‖t‖ + θ · 1 m) and σ_ω = s θ, with s = 0.5 %: errors of lens and depth calibration add up over the path.
+    """
+    moved, turned = pose_distance(np.eye(4), T)
+    return np.diag([(_DRIFT_SIGMA * (moved + turned)) ** 2] * 3 + [(_DRIFT_SIGMA * turned) ** 2] * 3)
+
+
 def _noise_model(covariance: Array) -> gtsam.noiseModel.Base:
     """Convert a covariance (6, 6); GTSAM's twists begin with the rotation."""
     order = [3, 4, 5, 0, 1, 2]
     return gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(order, order)])
 
 
-def _orthonormal(T: Array) -> Array:
-    """Return the nearest pose with an exact rotation, by polar decomposition."""
+def orthonormal(T: Array) -> Array:
+    """Return the nearest pose (4, 4) with an exact rotation, by polar decomposition."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = U @ Vt, T[:3, 3]

@@ -53,6 +53,9 @@ class TimingConstants:
 
 CONSTANTS = TimingConstants()
 
+DEFAULT_SPEED = 0.2
+"""Fraction of the limits of velocity and acceleration at which commands and services move an arm."""
+
 
 def time_path(
     path: Path,

@@ -10,9 +10,11 @@ from importlib import metadata
 from typing import Any
 
 from splatbot.config import Config
+from splatbot.report.audit import audit_section
 from splatbot.report.figures import error_plot, gaussians_plot, stages_plot, trajectory_plot
 from splatbot.report.images import CaptionedView, comparison
 from splatbot.report.parts import details, document, image, note, pictures, section, table, tiles
+from splatbot.results.audit import RunAudit
 from splatbot.results.folder import FrameRow
 from splatbot.results.scoring import ShownView, TrajectoryScore, ViewScores
 from splatbot.results.units import count, decibels, megabytes, metres, milliseconds, percent
@@ -30,6 +32,7 @@ def report_html(
     track: TrajectoryScore | None,
     views: ViewScores,
     map_page: str | None = None,
+    audit: RunAudit | None = None,
 ) -> str:
     """Return the HTML page of one run.
 
@@ -41,6 +44,7 @@ def report_html(
         track: score of the trajectory. If None, there is no reference.
         views: the held-out views.
         map_page: file next to the report with the interactive map. If None, there is no such file.
+        audit: the map against measured depth. If None, it was not audited.
     """
     name = str(metrics["log"]["name"])
     parts = [
@@ -50,6 +54,7 @@ def report_html(
         section("Error over time", image(error_plot(rows, track), "position error over time")),
         section("Degraded and lost frames", _verdicts(rows)),
         section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
+        audit_section(audit),
         section("Time per frame", image(stages_plot(rows), "milliseconds per stage"), _stages(metrics), _pace(metrics)),
         section("Map", _map_frame(map_page), image(gaussians_plot(rows), "Gaussians over frames")),
         section("Simulated sensor effects", _effects(metrics["effects"])),

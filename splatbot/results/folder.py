@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.atomic import atomic_write
+from splatbot.atomic import replace_files, write_text
 from splatbot.checksums import NAME as SUMS
 from splatbot.checksums import check_file, read_sums, write_sums
 from splatbot.config import Config, load_config
@@ -82,6 +82,8 @@ class RunFolder:
         self.map = self.path / "map.ply"
         self.report = self.path / "report.html"
         self.map_page = self.path / "map.html"
+        self.audit = self.path / "audit.json"
+        self.is_new = False
 
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
@@ -91,6 +93,7 @@ class RunFolder:
             InputError: the folder cannot be made or written to.
         """
         folder = cls(path)
+        folder.is_new = not folder.path.exists()
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
             probe = folder.path / ".writable"
@@ -111,21 +114,38 @@ class RunFolder:
         model: GaussianModel,
         metrics: Mapping[str, Any],
     ) -> None:
-        """Write all files but the report. An older report is deleted because it describes another map."""
-        self.report.unlink(missing_ok=True)
-        self.map_page.unlink(missing_ok=True)
-        (self.path / SUMS).unlink(missing_ok=True)  # a run that is killed from here on has no checksums
-        save_ply(model, self.map, bookkeeping=True)  # unobserved Gaussians must stay marked for collision checks
-        self._save_trajectory(trajectory)
-        lines = [json.dumps(asdict(row)) for row in rows]
-        _write_text(self.frames, "\n".join([*lines, ""]))
-        _write_text(self.config, config.to_yaml())
-        self.save_metrics(metrics)
+        """Write all files but report and audit. Older ones are deleted because they describe another map.
+
+        The files are replaced once all are written: a full disk leaves those of the last save as they were.
+        """
+        rows_text = "\n".join([*(json.dumps(asdict(row)) for row in rows), ""])
+        replace_files(
+            self.path,
+            {
+                # unobserved Gaussians must stay marked for collision checks
+                self.map.name: lambda path: save_ply(model, path, bookkeeping=True),
+                self.trajectory.name: lambda path: _save_trajectory(trajectory, path),
+                self.frames.name: write_text(rows_text),
+                self.config.name: write_text(config.to_yaml()),
+                self.metrics.name: write_text(_metrics_text(metrics)),
+            },
+            # a run that is killed from here on has no checksums
+            remove=(self.report.name, self.map_page.name, self.audit.name, SUMS),
+        )
         write_sums(self.path, self._files())
+
+    def remove_if_new(self) -> None:
+        """Remove the folder if :meth:`create` made it and it is still empty."""
+        if self.is_new and self.path.is_dir() and not any(self.path.iterdir()):
+            self.path.rmdir()
 
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write ``metrics.json``."""
-        self._replace(self.metrics, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+        self._replace(self.metrics, _metrics_text(metrics))
+
+    def save_audit(self, summary: Mapping[str, Any]) -> None:
+        """Write ``audit.json``."""
+        self._replace(self.audit, json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def save_report(self, html: str) -> None:
         """Write ``report.html``."""
@@ -220,7 +240,8 @@ class RunFolder:
         return sums is not None
 
     def _files(self) -> list[str]:
-        paths = (self.config, self.trajectory, self.frames, self.metrics, self.map, self.report, self.map_page)
+        paths = [self.config, self.trajectory, self.frames, self.metrics, self.map]
+        paths += [self.report, self.map_page, self.audit]
         return [path.name for path in paths]
 
     def _replace(self, path: Path, text: str) -> None:
@@ -228,19 +249,13 @@ class RunFolder:
         listed = self.check()
         if listed:
             (self.path / SUMS).unlink()
-        _write_text(path, text)
+        write_text(text)(path)
         if listed:
             write_sums(self.path, self._files())
 
     def _was_killed(self) -> bool:
         """Return whether the run neither ended nor was interrupted."""
         return self.metrics.is_file() and not self.load_metrics().get("finished", True)
-
-    def _save_trajectory(self, trajectory: Trajectory) -> None:
-        if len(trajectory):
-            trajectory.save(self.trajectory)
-        else:
-            _write_text(self.trajectory, "# no frame was tracked\n")
 
     def _require(self, path: Path) -> Path:
         if not path.is_file():
@@ -249,6 +264,12 @@ class RunFolder:
         return path
 
 
-def _write_text(path: Path, text: str) -> None:
-    with atomic_write(path) as file:
-        file.write(text.encode())
+def _save_trajectory(trajectory: Trajectory, path: Path) -> None:
+    if len(trajectory):
+        trajectory.save(path)
+    else:
+        write_text("# no frame was tracked\n")(path)
+
+
+def _metrics_text(metrics: Mapping[str, Any]) -> str:
+    return json.dumps(metrics, indent=2, allow_nan=False) + "\n"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +26,7 @@ from splatbot.logs import Log
 from splatbot.rasterize.views import colorize, render_view
 from splatbot.trajectory import Trajectory
 
+MIN_EXTENT = 0.05  # [m] extent of the shortest paths whose sizes are compared
 N_SHOWN = 3  # views whose images are kept; keeping all would make memory grow with the log
 
 
@@ -46,6 +47,12 @@ class TrajectoryScore:
     consistency: Consistency | None
     estimate: NDArray[np.float64]
     reference: NDArray[np.float64]
+
+    @property
+    def reference_scale(self) -> float | None:
+        """Size of the reference path relative to the estimate; None for paths too short to compare."""
+        sizes = [float(np.sqrt(path.var(axis=0).sum())) for path in (self.reference, self.estimate)]
+        return sizes[0] / sizes[1] if min(sizes) > MIN_EXTENT / 4 else None
 
 
 def score_trajectory(
@@ -87,6 +94,7 @@ def trajectory_metrics(score: TrajectoryScore | None) -> dict[str, float | None]
         "ate_mean_m": score.absolute.mean if score else None,
         "ate_median_m": score.absolute.median if score else None,
         "ate_max_m": score.absolute.max if score else None,
+        "reference_scale": score.reference_scale if score else None,
         "ate_frames": len(score.absolute.errors) if score else 0,
         "rpe_trans_rmse_m": relative.trans_rmse if relative else None,
         "nees": score.consistency.mean if score and score.consistency else None,
@@ -142,10 +150,19 @@ class ViewScores:
         }
 
 
-def score_views(log: Log, model: GaussianModel, poses: Mapping[int, NDArray[np.float64]]) -> ViewScores:
+def score_views(
+    log: Log,
+    model: GaussianModel,
+    poses: Mapping[int, NDArray[np.float64]],
+    on_view: Callable[[int], None] | None = None,
+) -> ViewScores:
     """Render the map at ``poses`` (T_world_camera (4, 4) by position in the log) and compare with the frames there.
 
     Frames are read again one by one, so memory does not grow with the log.
+
+    Args:
+        log, model, poses: recording, map and poses.
+        on_view: called with the number of scored views before each view.
 
     Raises:
         LogError: a frame can no longer be read.
@@ -153,7 +170,9 @@ def score_views(log: Log, model: GaussianModel, poses: Mapping[int, NDArray[np.f
     result = ViewScores()
     indices = sorted(poses)
     chosen = {indices[round(i)] for i in np.linspace(0, len(indices) - 1, min(N_SHOWN, len(indices)))}
-    for index in indices:
+    for number, index in enumerate(indices):
+        if on_view is not None:
+            on_view(number)
         view = _score_view(log, model, index, poses[index])
         result.scores.append(view.score)
         if index in chosen:

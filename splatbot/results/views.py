@@ -13,6 +13,7 @@ from splatbot.logs import Log
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.tracking.prepare import usable_depth
+from splatbot.tracking.rectify import RectifiedLog
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,29 @@ def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    indices = sorted(poses)
-    spread = np.linspace(0, len(indices) - 1, min(CONSTANTS.max_frames_in_memory, len(indices))).round().astype(int)
-    return tuple(subsampled(view) for view in _views(run, log, poses, [indices[k] for k in spread]))
+    return tuple(subsampled(view) for view in _views(run, log, poses, _spread(sorted(poses))))
+
+
+def raw_views(run: RunFolder, log: Log) -> tuple[list[int], tuple[DepthView, ...]]:
+    """Return the frames of :func:`subsampled_views` with all depth that the sensor gave outside of masks.
+
+    An audit must not use the filters of mapping: they remove thin objects as noise.
+
+    Returns:
+        Positions in the log, and views.
+
+    Raises:
+        FormatError: the folder is damaged.
+        LogError: the log is damaged.
+    """
+    poses = run.load_poses()
+    indices = _spread(sorted(poses))
+    views = []
+    for index in indices:
+        frame = log[index]
+        known = frame.valid if frame.mask is None else frame.valid & frame.mask
+        views.append(subsampled((np.where(known, frame.depth, np.float32(0)), frame.camera, poses[index])))
+    return indices, tuple(views)
 
 
 def subsampled(view: DepthView) -> DepthView:
@@ -77,8 +98,15 @@ def subsampled(view: DepthView) -> DepthView:
     return kept, small, T
 
 
+def _spread(indices: Sequence[int]) -> list[int]:
+    """Return at most 40 evenly spaced ones of ``indices``."""
+    count = min(CONSTANTS.max_frames_in_memory, len(indices))
+    return [indices[k] for k in np.linspace(0, len(indices) - 1, count).round().astype(int)]
+
+
 def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequence[int]) -> Iterator[DepthView]:
     config = run.load_config().tracking
+    rectified = RectifiedLog(log, config.sensor, run.load_trajectory())
     for index in indices:
-        frame = log[index]
+        frame = rectified[index]
         yield usable_depth(frame, config), frame.camera, poses[index]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from splatbot.config import Config
+from splatbot.config import Config, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
 from splatbot.results.folder import RunFolder
@@ -96,6 +96,8 @@ def map_log(
         config, slam = localise.config, localise.slam
         slam.localise_only()
     config = config or (slam.config if slam else Config())
+    if slam is None:
+        config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
     realtime = realtime or rate is not None
     if rate is not None and not 0 < rate < 1e4:
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")
@@ -141,6 +143,7 @@ def map_log(
             )
         loop.run(interrupts)
         if not loop.slam.results:
+            folder.remove_if_new()
             raise loop.crash or loop.error or loop.first_bad or KeyboardInterrupt()
         ended = outcome()
         ended.finished = True

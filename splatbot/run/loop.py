@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, Protocol
 
 import numpy as np
@@ -79,17 +80,29 @@ class FrameLoop:
             if self.saver is not None:
                 with interrupts.noted():
                     self.progress("saving")
-                self.saver.save(self)  # before the last refinement: a resumed run goes on as if it had not ended
+                with interrupts.noted():  # before the last refinement: a resumed run goes on as if it had not ended
+                    self.saver.save(self)
             if through:
                 with interrupts.noted():
                     self.progress("refining")
-                self.slam.finish(stop=lambda: interrupts.requested is not None)
+                self.slam.finish(stop=self._stop_of_refinement(interrupts))
             else:
                 self.slam.close_loops()
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash
         finally:
             self.slam.close()
+
+    def _stop_of_refinement(self, interrupts: Interrupts) -> Callable[[], bool]:
+        """Return the stop condition of the refinement, which is called before each iteration and reports it."""
+        steps, done = self.slam.iterations_left, count()
+
+        def stop() -> bool:
+            with interrupts.noted():
+                self.progress("refining", step=min(next(done), steps), steps=steps)
+            return interrupts.requested is not None
+
+        return stop
 
     def _all_frames(self, interrupts: Interrupts) -> bool:
         """Process all frames; return False if a signal or an unreadable frame ended the run.
@@ -141,7 +154,15 @@ class FrameLoop:
         return result
 
     def progress(
-        self, phase: Phase, *, done: int | None = None, result: FrameResult | None = None, skipped: str = ""
+        self,
+        phase: Phase,
+        *,
+        done: int | None = None,
+        result: FrameResult | None = None,
+        skipped: str = "",
+        warning: str = "",
+        step: int = 0,
+        steps: int = 0,
     ) -> None:
         """Report the progress to the caller."""
         results = self.slam.results
@@ -153,6 +174,9 @@ class FrameLoop:
                 elapsed_s=time.perf_counter() - self.started,
                 result=result,
                 skipped=skipped,
+                warning=warning,
+                step=step,
+                steps=steps,
                 keyframes=self.keyframes,
                 lost=self.lost,
                 late=len(self.source.late),

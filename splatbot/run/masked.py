@@ -9,6 +9,7 @@ from splatbot.camera import Camera
 from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.logs.base import LogBase
+from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
 
 
@@ -38,6 +39,11 @@ class MaskedLog(LogBase):
     def effects(self) -> list[dict[str, Any]]:
         """As of the log."""
         return self._log.effects
+
+    @property
+    def calibration(self) -> Calibration:
+        """As of the log."""
+        return self._log.calibration
 
     def __len__(self) -> int:
         return len(self._log)

@@ -12,11 +12,13 @@ from splatbot import __version__
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
 from splatbot.report import report_html
+from splatbot.results.audit import RunAudit, audit_metrics, audit_run
 from splatbot.results.folder import FrameRow, RunFolder
 from splatbot.results.metrics import without_nan
 from splatbot.results.scoring import TrajectoryScore, ViewScores, score_views, trajectory_metrics
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.loop import FrameLoop
+from splatbot.tracking.rectify import RectifiedLog
 from splatbot.trajectory import Trajectory
 
 MapPage = Callable[[GaussianModel, Trajectory], str]
@@ -42,6 +44,7 @@ class RunOutcome:
     finished: bool = False
     localised_in: str | None = None
     map_page: MapPage | None = None
+    audit: RunAudit | None = None
 
     def save(self, folder: RunFolder) -> None:
         """Save the results, then score and report; a signal after the end of the mapping skips both."""
@@ -69,8 +72,17 @@ class RunOutcome:
         self.loop.progress("scoring")
         poses = {r.index: r.T_world_camera for r in self.loop.slam.results if r.T_world_camera is not None}
         held_out = {i: poses[i] for i in sorted(self.loop.held_out) if i in poses}
-        self.views = score_views(self.loop.source.log, self.model, held_out)
+        log = RectifiedLog(self.loop.source.log, self.loop.config.sensor, self.trajectory)
+        self.views = score_views(
+            log,
+            self.model,
+            held_out,
+            lambda number: self.loop.progress("scoring", step=number, steps=len(held_out)),
+        )
+        self.audit = audit_run(folder, self.loop.source.log) if poses else None
         folder.save_metrics(self.metrics())
+        if self.audit is not None:
+            folder.save_audit(self.audit.summary())
         self.loop.progress("reporting")
         map_page = self._save_map_page(folder)
         folder.save_report(
@@ -82,6 +94,7 @@ class RunOutcome:
                 track=self.track,
                 views=self.views,
                 map_page=map_page,
+                audit=self.audit,
             )
         )
 
@@ -103,6 +116,7 @@ class RunOutcome:
             **self.costs,
             **trajectory_metrics(self.track),
             **self.views.metrics(),
+            **audit_metrics(self.audit),
             "gaussians": len(self.model),
             "map_bytes": self.model.nbytes,
             "paced": self.loop.source.pace,

@@ -53,17 +53,37 @@ class Saver:
         self._index: int | None = None
 
     def processed(self, loop: FrameLoop, frame: Frame, index: int) -> None:
-        """Save the run if the interval has passed since the last save; called after each processed frame."""
+        """Save the run if the interval has passed since the last save; called after each processed frame.
+
+        A save that the disk does not take is reported and tried again after the interval: mapping goes on.
+        """
         self._last, self._index = frame, index
-        if self.checkpoint.due:
+        if not self.checkpoint.due:
+            return
+        try:
             self.save(loop)
             if self.write_results is not None:
                 self.write_results()
+        except OSError as error:
+            loop.progress("saving", warning=f"not saved, mapping goes on: {error}")
 
     def save(self, loop: FrameLoop) -> None:
-        """Save the run between two frames."""
+        """Save the run between two frames.
+
+        Raises:
+            OSError: the disk is full or not available.
+            KeyboardInterrupt: the progress callback raised it. The save is complete.
+        """
         if self._last is None:
             return
+        interrupts: list[KeyboardInterrupt] = []
+
+        def report(step: int, steps: int) -> None:
+            try:
+                loop.progress("saving", step=step, steps=steps)
+            except KeyboardInterrupt as interrupt:
+                interrupts.append(interrupt)
+
         place = LogPlace(
             name=self._log.name,
             uri=self._log.uri,
@@ -75,7 +95,15 @@ class Saver:
             last_checksum=checksum(self._last),
             robot=self._robot,
         )
-        self.checkpoint.save(loop.slam, loop_state(loop), place, loop.config)
+        self.checkpoint.save(
+            loop.slam,
+            loop_state(loop),
+            place,
+            loop.config,
+            report,
+        )
+        if interrupts:
+            raise interrupts[0]
 
     @property
     def cost(self) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 # so their total weight is that of this number.
 _CALIBRATED_PIXELS = 4800
 
+_SHARP = np.zeros(6)
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -35,6 +37,8 @@ class Alignment:
         spread: (6, 6) sum of g gᵀ over the image cells, where g is the gradient of the residuals in one cell.
         cells: number of image cells with residuals.
         focal: focal length [px] of the finest level.
+        band_information: (B, 6, 6) Gauss-Newton matrices of the residuals in B bands of image rows, top to bottom.
+        band_gradient: (B, 6) their gradients.
     """
 
     T_world_camera: Array
@@ -43,6 +47,8 @@ class Alignment:
     spread: Array
     cells: int
     focal: float
+    band_information: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    band_gradient: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     @classmethod
     def unconstrained(cls, T_world_camera: Array) -> Alignment:
@@ -68,7 +74,7 @@ class SoftPrior:
 
 
 def settings_of(
-    config: TrackingConfig, *, photometric: bool, gate: float, depth_sigma_scale: float = 1.0
+    config: TrackingConfig, *, photometric: bool, gate: float, depth_sigma_scale: float = 1.0, blur: Array = _SHARP
 ) -> _native.AlignSettings:
     """Return the noise model of the native kernels; ``depth_sigma_scale`` multiplies the σ of depth."""
     sensor = config.sensor
@@ -79,6 +85,7 @@ def settings_of(
         sigma_depth_floor=depth_sigma_scale * sensor.sigma_depth_floor,
         sigma_depth_quad=depth_sigma_scale * sensor.sigma_depth_quad,
         gate=gate,
+        blur=blur.tolist(),
     )
 
 
@@ -118,6 +125,7 @@ def align(
     features: FeaturePose | None = None,
     camera: Camera | None = None,
     prior: SoftPrior | None = None,
+    blur: Array = _SHARP,
 ) -> Alignment:
     """Align a frame to references from the coarsest level to the finest.
 
@@ -152,24 +160,29 @@ def align(
         features: matches of features. If None, no reprojection residuals are used.
         camera: camera of the features' pixels.
         prior: Gaussian prior of the pose. If None, the pose is not constrained by one.
+        blur: (6,) standard deviation β (translation [m], rotation [rad]) of the motion by which a blurred image may be
+            displaced. The variance of a residual with the Jacobian J becomes σ² + (J β)².
     """
     matches = None
     if features is not None and camera is not None:
         matches = (features.points, features.pixels, features.sigmas, _intrinsics(camera))
     scale = config.sensor.depth_sigma_scale if photometric else 1.0
-    T_camera_world, information, curvature, spread, cells, *_ = _native.align(
+    T_camera_world, information, curvature, spread, cells, _, _, band_information, band_gradient = _native.align(
         [_level_arrays(level) for level in levels],
         [(r.T_world_camera, [_point_arrays(points) for points in r.levels]) for r in references],
         matches,
         None if prior is None else (inverse(prior.T_world_camera), prior.information),
         inverse(T_world_camera),
-        settings_of(config, photometric=photometric, gate=gate, depth_sigma_scale=scale),
+        settings_of(config, photometric=photometric, gate=gate, depth_sigma_scale=scale, blur=blur),
         config.dense_weight * _CALIBRATED_PIXELS / config.n_pixels,
         config.iterations,
         finest,
         config.dense_share if photometric else 0.0,
     )
-    return Alignment(inverse(T_camera_world), information, curvature, spread, cells, levels[finest].camera.fx)
+    focal = levels[finest].camera.fx
+    return Alignment(
+        inverse(T_camera_world), information, curvature, spread, cells, focal, band_information, band_gradient
+    )
 
 
 def _level_arrays(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float, float, float]]:

@@ -11,6 +11,8 @@ from splatbot.tracking.budget import Budget
 from splatbot.tracking.features import Features
 from splatbot.tracking.health import Health, Verdict
 from splatbot.tracking.hypothesis import ScoredHypothesis
+from splatbot.tracking.prepare import PreparedFrame
+from splatbot.tracking.stage import TrackingProblem
 from splatbot.tracking.uncertainty import Uncertainty
 
 Array = NDArray[np.float64]
@@ -28,6 +30,7 @@ class PoseEstimate:
         uncertainty: uncertainty of the pose, see :attr:`covariance`.
         health: agreement of the pose with the frame.
         features: keypoints of the frame. If None, no stage has detected them.
+        prepared: the images that the pose belongs to. If None, they are those that tracking was given.
         stage_ms: milliseconds by stage.
         skipped: stages that did not fit the remaining time.
     """
@@ -39,12 +42,13 @@ class PoseEstimate:
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     health: Health | None = None
     features: Features | None = None
+    prepared: PreparedFrame | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
     skipped: tuple[str, ...] = ()
 
     @classmethod
     def create(
-        cls, pose: ScoredHypothesis, uncertainty: Uncertainty, features: Features | None, budget: Budget
+        cls, pose: ScoredHypothesis, uncertainty: Uncertainty, problem: TrackingProblem, budget: Budget
     ) -> PoseEstimate:
         """Create the estimate from the best hypothesis and the time that was spent."""
         return cls(
@@ -54,7 +58,8 @@ class PoseEstimate:
             stage=pose.hypothesis.stage,
             uncertainty=uncertainty,
             health=pose.health,
-            features=features,
+            features=problem.features,
+            prepared=problem.prepared,
             stage_ms=budget.ms,
             skipped=tuple(budget.skipped),
         )

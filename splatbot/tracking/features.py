@@ -255,7 +255,7 @@ def _matches(
             ahead = seen[:, 2] > 1e-3
             anchored, world = anchored[ahead], world[ahead]
             places, radius = camera.project(seen[ahead]).astype(np.float32), expected.radius
-        query, train = _match(current, features.descriptors[anchored], places, radius)
+        query, train = match(current, features.descriptors[anchored], places, radius)
         pixels.append(current.pixels[query])
         points.append(world[train])
         sigmas.append(np.maximum(current.scales[query], features.scales[anchored[train]]))
@@ -270,7 +270,7 @@ def _confirms(found: FeaturePose, camera: Camera, expected: Expectation) -> bool
     return bool(inside and narrowest > CONSTANTS.min_spread * camera.width)
 
 
-def _match(
+def match(
     current: Features, descriptors: NDArray[np.uint8], expected: NDArray[np.float32], radius: float
 ) -> tuple[Index, Index]:
     """Match descriptors (M, 32) expected at pixels (M, 2), and return indices of keypoints and of descriptors."""

@@ -53,7 +53,8 @@ class Hypothesis:
 
     def refined(self, alignment: Alignment) -> Hypothesis:
         """Return the hypothesis with the pose of the direct stage."""
-        return replace(self, stage=self.stage + _REFINED, alignment=alignment)
+        stage = self.stage if self.is_refined else self.stage + _REFINED
+        return replace(self, stage=stage, alignment=alignment)
 
 
 @dataclass(frozen=True, eq=False)

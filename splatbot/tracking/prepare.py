@@ -14,8 +14,11 @@ from splatbot import _native
 from splatbot.camera import Camera
 from splatbot.config import TrackingConfig
 from splatbot.frame import Frame
+from splatbot.tracking.rectify import rectify
 
 Image = NDArray[np.float32]
+
+_AT_REST = np.zeros(6)
 
 
 @dataclass(frozen=True)
@@ -55,25 +58,36 @@ class PreparedFrame:
     """A frame with its plausible depth and its pyramid; masked pixels have no depth, and their grey is NaN.
 
     Args:
-        frame: the frame.
+        frame: the frame, of one instant.
         depth: (H, W) [m] plausible depth at full size, 0 if missing.
         levels: the pyramid, finest level first.
+        recorded: the frame as the sensor delivered it.
+        twist: (6,) [m/s, rad/s] velocity of the camera with which the frame was rectified, in its own frame.
         started: :func:`time.perf_counter` when work on the frame began.
     """
 
     frame: Frame
     depth: Image
     levels: tuple[Level, ...]
+    recorded: Frame
+    twist: NDArray[np.float64]
     started: float = field(default_factory=time.perf_counter, compare=False)
 
 
-def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
-    """Compute the pyramid of a frame, whose finest level is at most ``config.max_width`` pixels wide.
+def prepare(recorded: Frame, config: TrackingConfig, twist: NDArray[np.float64] = _AT_REST) -> PreparedFrame:
+    """Compute the pyramid of the rectified frame, whose finest level is at most ``config.max_width`` pixels wide.
 
     It has ``config.n_levels`` levels, or fewer if the next would be smaller than 12 pixels. The finest level determines
     the pose, and has no grey along occluding edges.
+
+    Args:
+        recorded: the frame as the sensor delivers it.
+        config: settings of tracking.
+        twist: (6,) [m/s, rad/s] velocity of the camera in its own frame, see
+            :func:`splatbot.tracking.rectify.rectify`.
     """
     started = time.perf_counter()
+    frame = rectify(recorded, twist, config.sensor)
     depth = usable_depth(frame, config)
     gray = np.multiply(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.float32(1 / 255), dtype=np.float32)
     if frame.mask is not None:
@@ -85,7 +99,7 @@ def prepare(frame: Frame, config: TrackingConfig) -> PreparedFrame:
     while len(levels) < config.n_levels and min(levels[-1].gray.shape) >= 2 * CONSTANTS.min_side:
         levels.append(halve(levels[-1]))
     levels[0] = Level(gray_of_one_surface(levels[0], config), levels[0].depth, levels[0].camera)
-    return PreparedFrame(frame, depth, tuple(levels), started)
+    return PreparedFrame(frame, depth, tuple(levels), recorded, twist, started)
 
 
 def gray_of_one_surface(level: Level, config: TrackingConfig) -> Image:

@@ -15,6 +15,7 @@ from splatbot.tracking.health import verdict_of
 from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis, measure_hypothesis, select_best
 from splatbot.tracking.motion_model import Prediction
 from splatbot.tracking.nearby_keyframes import pose_distance
+from splatbot.tracking.prepare import PreparedFrame
 from splatbot.tracking.stage import StageCost, TrackingProblem, TrackingStage, Work
 from splatbot.tracking.stages import StageSet
 
@@ -62,6 +63,18 @@ class StageScheduler:
         if not best.hypothesis.is_refined:
             best = best.degraded("not aligned on fine levels: no time was left for them")
         return best
+
+    def align_again(self, prepared: PreparedFrame, pose: ScoredHypothesis) -> ScoredHypothesis:
+        """Align a pose to the same frame after it has been rectified by another velocity, if time remains."""
+        problem, stage = self._problem, self._stages.refinement
+        effort, cost = self._choose_effort(stage, pose.hypothesis, 1)
+        if effort is None:
+            self.budget.skip("shutter")
+            return pose
+        problem.replace_images(prepared, pose.T_world_camera)
+        with self._charged(stage, cost):
+            hypothesis = stage.run(problem, pose.hypothesis, effort) or pose.hypothesis
+        return self._score([hypothesis])
 
     def _start(self) -> Hypothesis:
         """Run the initial stages one after the other, and check the pose that they lead to."""

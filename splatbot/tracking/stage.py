@@ -8,19 +8,21 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.config import TrackingConfig
+from splatbot.geometry import inverse, transform_points
 from splatbot.tracking.align import Alignment
 from splatbot.tracking.features import FeaturePose, Features
 from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis
 from splatbot.tracking.motion_model import Prediction
 from splatbot.tracking.nearby_keyframes import TrackedKeyframe, nearest, order_by_distance
 from splatbot.tracking.prepare import PreparedFrame
+from splatbot.tracking.rectify import moved_pixels
 from splatbot.tracking.relocalization import PlaceSearch
 
 Array = NDArray[np.float64]
@@ -101,6 +103,15 @@ class TrackingProblem:
         self.matches = None
         self.keypoints_ready = False
         self.votes = []
+
+    def replace_images(self, prepared: PreparedFrame, T_world_camera: Array) -> None:
+        """Replace the pyramid by that of another velocity; matches move with their pixels, keypoints are discarded."""
+        if self.matches is not None:
+            points = transform_points(inverse(T_world_camera), self.matches.points)
+            change, readout = prepared.twist - self.prepared.twist, self.config.sensor.readout
+            pixels = moved_pixels(self.matches.pixels, points, prepared.frame.camera, change, readout)
+            self.matches = replace(self.matches, pixels=pixels)
+        self.prepared, self.features = prepared, None
 
     def hypothesis(self, stage: str, T_world_camera: Array) -> Hypothesis:
         """Return a hypothesis at a pose (4, 4), to be aligned to the keyframes nearest to it."""

@@ -17,13 +17,15 @@ from splatbot.tracking.features import Features, detect
 from splatbot.tracking.hypothesis import ScoredHypothesis
 from splatbot.tracking.motion_model import ConstantVelocity, Prediction
 from splatbot.tracking.nearby_keyframes import TrackedKeyframe, order_by_distance, pose_distance
-from splatbot.tracking.prepare import PreparedFrame, valid_share
+from splatbot.tracking.prepare import PreparedFrame, prepare, typical_depth, valid_share
 from splatbot.tracking.priors import fill_weak_directions, fuse, is_consistent, mahalanobis_distance
+from splatbot.tracking.rectify import row_displacement
 from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidate, is_confident
 from splatbot.tracking.scheduler import StageScheduler
 from splatbot.tracking.stage import TrackingProblem
 from splatbot.tracking.stages import StageSet
 from splatbot.tracking.uncertainty import Uncertainty, world_uncertainty
+from splatbot.tracking.velocity import CameraVelocity, twist_of_rows
 
 __all__ = ["PoseEstimate", "TrackedKeyframe", "Tracker", "order_by_distance", "pose_distance"]
 
@@ -31,6 +33,9 @@ Array = NDArray[np.float64]
 
 # Standard deviation of grey (0..1) below which a first image is blank: a covered lens, or a sensor that starts up.
 _MIN_GRAY_STD = 0.005
+
+_MAX_ROW_DISPLACEMENT = 0.3  # [px] of the first and last row, below which a frame is not rectified again
+_MAX_RECTIFICATIONS = 2  # by the velocity that the pose implies; each halves the error of the velocity at least
 
 
 class Tracker:
@@ -43,8 +48,11 @@ class Tracker:
     def __init__(self, config: TrackingConfig) -> None:
         self.config = config
         self.motion = ConstantVelocity()
+        self._velocity = CameraVelocity()
         self._lost = False
         self._keyframe_uncertainty: WeakKeyDictionary[Features, Uncertainty] = WeakKeyDictionary()
+        self.variance_scale = 1.0
+        """Factor on the covariance of poses against keyframes: how much the keyframes contradict each other."""
         self._last_covariance: Array = np.zeros((6, 6))  # of the last pose against its keyframes
         self._costs = None if config.deterministic else CostModel()
         self._stages = StageSet.create()
@@ -60,6 +68,7 @@ class Tracker:
         if not float(np.nanstd(prepared.levels[0].gray)) >= _MIN_GRAY_STD:
             return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")
         self.motion.update(prepared.frame.stamp, np.eye(4))
+        self._velocity.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
 
     def track(self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe]) -> PoseEstimate:
@@ -70,10 +79,11 @@ class Tracker:
         scheduler = StageScheduler(problem, self._stages, self._costs)
         best = scheduler.best_hypothesis(robot_prior or motion_prior)
         best, trusted_prior = self._check_robot_prior(best, robot_prior, motion_prior, scheduler)
+        best = self._rectify_again(best, problem, scheduler)
         pose, uncertainty = self._fuse_prior(best, trusted_prior, motion_prior)
         pose = self._confirm_relocalization(prepared.frame.stamp, pose)
         self._update(prepared.frame.stamp, pose, robot_prior)
-        return PoseEstimate.create(pose, uncertainty, problem.features, scheduler.budget)
+        return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget)
 
     @property
     def is_lost(self) -> bool:
@@ -88,11 +98,17 @@ class Tracker:
     def forget(self) -> None:
         """Discard the motion: the next frame may be anywhere in the map."""
         self.motion = ConstantVelocity()
+        self._velocity.forget()
         self._lost = True
 
     def move(self, T_new_old: Array) -> None:
         """Move the last pose with a correction (4, 4) of the map at the camera; the velocity stays."""
         self.motion.move(T_new_old)
+        self._velocity.move(T_new_old)
+
+    def expected_twist(self, stamp: float) -> Array:
+        """Return the expected twist (6,) [m/s, rad/s] of the camera at a time [s], to rectify the frame."""
+        return self._velocity.at(stamp)
 
     def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
         """Return a function that detects the keypoints of a frame that becomes a keyframe, in the calling thread.
@@ -140,6 +156,25 @@ class Tracker:
             best = best.with_reasons(f"the prior is {amount} off: left out")
         return best, None
 
+    def _rectify_again(
+        self, best: ScoredHypothesis, problem: TrackingProblem, scheduler: StageScheduler
+    ) -> ScoredHypothesis:
+        """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
+        readout, depth = self.config.sensor.readout, typical_depth(problem.prepared)
+        if not readout:
+            return best
+        for _ in range(_MAX_RECTIFICATIONS):
+            prepared = problem.prepared
+            frame = prepared.recorded
+            expected = self._velocity.at(frame.stamp, best.T_world_camera)
+            sigma, alignment = self._velocity.sigma(frame.stamp), best.hypothesis.alignment
+            twist = twist_of_rows(alignment, prepared.twist, expected, sigma, readout)
+            moved = row_displacement(twist - prepared.twist, depth, frame.camera, readout)
+            if best.verdict == "lost" or moved < _MAX_ROW_DISPLACEMENT:
+                break
+            best = scheduler.align_again(prepare(frame, self.config, twist), best)
+        return best
+
     def _fuse_prior(
         self, best: ScoredHypothesis, robot_prior: Prediction | None, motion_prior: Prediction
     ) -> tuple[ScoredHypothesis, Uncertainty]:
@@ -158,7 +193,7 @@ class Tracker:
         """Compute the uncertainty of a pose in the world from its own and that of its keyframes."""
         exact, known = Uncertainty(), self._keyframe_uncertainty
         keyframes = [(k.reference.T_world_camera, known.get(k.features, exact)) for k in pose.hypothesis.keyframes]
-        return world_uncertainty(pose.T_world_camera, pose.covariance, keyframes)
+        return world_uncertainty(pose.T_world_camera, self.variance_scale * pose.covariance, keyframes)
 
     def _confirm_relocalization(self, stamp: float, pose: ScoredHypothesis) -> ScoredHypothesis:
         """Accept a pose found while lost only if it agrees with that of the previous frame."""
@@ -180,7 +215,9 @@ class Tracker:
         self._lost = pose.verdict == "lost"
         if self._lost:
             self.motion.forget_velocity(robot_prior)
+            self._velocity.forget()
         else:
             self._search.restart()
             self.motion.update(stamp, pose.T_world_camera)
+            self._velocity.update(stamp, pose.T_world_camera)
             self._last_covariance = pose.covariance

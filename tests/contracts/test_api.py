@@ -101,14 +101,14 @@ def test_points_travel_as_npy_and_msgpack_and_mean_the_same(api: Service) -> Non
     expected = api.store.get("default").field.mahalanobis(points)
     np.testing.assert_array_equal(distance, expected.distance)
     assert by_npy.headers["x-map-version"] == "1"
-    np.testing.assert_allclose(by_json["distance"], expected.distance, rtol=1e-6)
+    np.testing.assert_allclose(by_json["distance_sigma"], expected.distance, rtol=1e-6)
     assert by_msgpack == by_json
 
 
 def test_the_client_s_distances_are_the_field_s(api: Service, robot: Client) -> None:
     points = np.random.default_rng(4).uniform(-1, 1, (200, 3))
     found, expected = robot.distance("default", points), api.store.get("default").field.mahalanobis(points)
-    np.testing.assert_array_equal(found.distance, expected.distance)
+    np.testing.assert_array_equal(found.distance_sigma, expected.distance)
     np.testing.assert_array_equal(found.index, expected.index)
     assert (found.map_version, found.inside.dtype) == (1, np.bool_)
 

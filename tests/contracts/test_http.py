@@ -55,14 +55,14 @@ def test_distances_are_those_of_the_field_and_name_the_version(service: Service)
     expected = service.store.get("wall").field.mahalanobis(np.array(POINTS))
     assert answer["map_version"] == 1
     assert answer["inside"] == [True, False, True]
-    np.testing.assert_allclose(answer["distance"], expected.distance, rtol=1e-6)
+    np.testing.assert_allclose(answer["distance_sigma"], expected.distance, rtol=1e-6)
     assert answer["index"] == expected.index.tolist()
-    assert answer["distance"][1] == pytest.approx(500.0, rel=1e-3)  # 0.5 m in front of a wall of 1 mm
+    assert answer["distance_sigma"][1] == pytest.approx(500.0, rel=1e-3)  # 0.5 m in front of a wall of 1 mm
 
 
 def test_no_points_are_a_question_with_an_empty_answer(service: Service) -> None:
     answer = service.client.post("/v1/maps/wall/distance", json={"points": []})
-    assert (answer.status_code, answer.json()["distance"]) == (200, [])
+    assert (answer.status_code, answer.json()["distance_sigma"]) == (200, [])
 
 
 def test_an_empty_map_answers_null_because_json_has_no_infinity(service: Service) -> None:
@@ -70,7 +70,7 @@ def test_an_empty_map_answers_null_because_json_has_no_infinity(service: Service
     model = empty.model.select((empty.model.means[:, 0] > 9).nonzero()[:, 0])
     service.store.add("void", source="nothing", state="static", snapshot=type(empty)(model, 1))
     answer = service.client.post("/v1/maps/void/distance", json={"points": [[0, 0, 0]]}).json()
-    assert (answer["distance"], answer["index"], answer["inside"]) == ([None], [-1], [False])
+    assert (answer["distance_sigma"], answer["index"], answer["inside"]) == ([None], [-1], [False])
 
 
 def test_the_version_grows_with_the_map_and_answers_follow(service: Service) -> None:

@@ -20,7 +20,7 @@ from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot
 
 BAD = 6  # the frame that is damaged
 NAMES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "map.html", "state"}
-FILES = NAMES | {"SHA256SUMS"}
+FILES = NAMES | {"SHA256SUMS", "audit.json"}
 
 
 def truncated_png(log: Path) -> None:
@@ -183,7 +183,7 @@ def test_impatient_interrupts_lose_no_more_than_scores_and_report(sound_log: Pat
     assert process.returncode in (130, -signal.SIGINT)
     present = {path.name for path in (tmp_path / "run").iterdir() if not path.name.startswith(".")}
     assert present <= FILES
-    assert present >= FILES - {"report.html", "map.html"}  # which the second gives up
+    assert present >= FILES - {"report.html", "map.html", "audit.json"}  # which the second gives up
     metrics = metrics_of(tmp_path / "run")
     assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == metrics["tracked"] > 0
     assert len(GaussianModel.load(tmp_path / "run" / "map.ply")) == metrics["gaussians"]

@@ -42,6 +42,11 @@ class OracleSlam(Slam):
         self._colors: list[NDArray[np.float64]] = []
 
     @property
+    def iterations_left(self) -> int:
+        """Nothing is refined."""
+        return 0
+
+    @property
     def memory(self) -> dict[str, int]:
         """Not counted."""
         return {}

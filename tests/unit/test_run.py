@@ -34,7 +34,16 @@ DESIGN_NAMES = {
     "frames", "tracked", "lost", "ate_rmse_m", "rpe_trans_rmse_m", "psnr_holdout_db", "depth_l1_m", "gaussians",
     "map_bytes", "peak_rss_bytes", "ms_per_frame", "stages", "effects",
 }  # fmt: skip
-FILES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "SHA256SUMS"}
+FILES = {
+    "config.yaml",
+    "trajectory.tum",
+    "frames.jsonl",
+    "metrics.json",
+    "map.ply",
+    "audit.json",
+    "report.html",
+    "SHA256SUMS",
+}
 
 
 @pytest.fixture
@@ -174,7 +183,7 @@ def test_when_every_frame_is_bad_skipping_does_not_make_an_empty_run(make_log: M
     log = open_log(folder)
     with pytest.raises(LogError, match=r"000000\.png"):
         map_log(log, out=tmp_path / "run", slam=oracle(log), on_bad_frame="skip")
-    assert not list((tmp_path / "run").iterdir())
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_damaged_reference_is_found_before_the_run_not_after(make_log: MakeLog, tmp_path: Path) -> None:
@@ -213,7 +222,7 @@ def test_a_second_ctrl_c_at_once_still_saves_the_map(log: Log, tmp_path: Path) -
 
 def test_a_second_ctrl_c_gives_up_scoring_and_report_only(log: Log, tmp_path: Path) -> None:
     map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=interrupt_at(10, times=2))
-    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES - {"report.html"}
+    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES - {"report.html", "audit.json"}
     assert read(tmp_path / "run")["psnr_holdout_db"] is None
 
 
@@ -232,9 +241,12 @@ def test_many_ctrl_c_in_a_frame_or_while_saving_lose_no_state(phase: str, log: L
 
 @pytest.mark.parametrize("threaded", [False, True])
 def test_ctrl_c_while_refining_ends_that_only(threaded: bool, log: Log, tmp_path: Path) -> None:
+    timers: list[threading.Timer] = []
+
     def on_progress(progress: Progress) -> None:
-        if progress.phase == "refining":
-            threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+        if progress.phase == "refining" and not timers:
+            timers.append(threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)))
+            timers[0].start()
 
     endless = Config()
     endless.mapping.final_iterations, endless.mapping.holdout_every = 1_000_000, 2
@@ -254,7 +266,7 @@ def test_ctrl_c_while_scoring_keeps_the_map(log: Log, tmp_path: Path) -> None:
     result = map_log(log, out=tmp_path / "run", slam=oracle(log), on_progress=on_progress)
     assert result.exit_code == 130
     assert read(tmp_path / "run")["interrupted"] is True
-    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES - {"report.html"}
+    assert {p.name for p in (tmp_path / "run").iterdir()} == FILES - {"report.html", "audit.json"}
     assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 16
 
 

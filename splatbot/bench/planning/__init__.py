@@ -41,6 +41,7 @@ class PlanningSettings(Settings):
         mapped: Plan on the map that SLAM builds from a noisy film of the table top instead (minutes).
         run: Run folders of splatbot map: plan ten problems in each map instead, or in addition with --mapped. The
             scene.yaml of the log places the arm.
+        margins: Also sweep the margin on each run: missed surface, false hits and solved problems, with a plot.
         gaussians: Gaussians of the map.
         peer_budgets: Time budgets [ms] of peers that improve a path until the time is over.
         film: Frames of the noisy film, and the width of its images [px].
@@ -64,6 +65,7 @@ class PlanningSettings(Settings):
     seeds: int = 10
     mapped: bool = False
     run: Annotated[tuple[Path, ...], arg(metavar="DIR ...")] = ()
+    margins: bool = False
     gaussians: Suppress[int] = 50_000
     peer_budgets: Suppress[tuple[float, ...]] = (28.0, 100.0, 1000.0)
     film: Suppress[tuple[int, int]] = (120, 320)
@@ -73,6 +75,8 @@ class PlanningSettings(Settings):
         """Raise an InputError for options that exclude each other, and for numbers that are not positive."""
         if self.peers and self.on_maps:
             raise InputError("has no effect with --mapped or --run.", field="--peers", hint="run it separately")
+        if self.margins and not self.run:
+            raise InputError("needs a run.", field="--margins", hint="give --run DIR")
         if not self.budgets or not min(self.budgets) > 0 or self.problems < 1 or self.seeds < 1:
             raise InputError(
                 "is empty or has a number that is not above 0.",
@@ -103,8 +107,11 @@ def _measure(settings: PlanningSettings, report_progress: ReportProgress) -> Res
 
 
 def _plot(results: Results, folder: Path) -> None:
+    from splatbot.bench.planning.margin_sweep import plot_margins
     from splatbot.bench.planning.plots import plot_cost
 
+    for name, (curve, marks) in results.curves.get("margins", {}).items():
+        plot_margins(name, curve, marks, folder)
     if "histories" in results.curves:
         plot_cost(results.curves["histories"], results.curves["peers"], folder)
 

@@ -110,7 +110,9 @@ def run_mapped(settings: PlanningSettings, report_progress: ReportProgress = ign
                 settings.save(results)
         for run in settings.run:
             report_progress(f"planning in {run}")
-            plan_in_run(results, run, problems=settings.run_problems, budget_ms=CONSTANTS.fast_ms)
+            plan_in_run(
+                results, run, problems=settings.run_problems, budget_ms=CONSTANTS.fast_ms, margins=settings.margins
+            )
             settings.save(results)
     return results
 

@@ -43,7 +43,9 @@ def add_map(results: Results, mapped: FilmedMap) -> float:
     """Add size and errors of the map, and return its surface error [m], which serves as a margin."""
     case = "mapped noisy log"
     field = GaussianCollisionField(mapped.snapshot)
-    own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], MARGIN.radius]).share(MARGIN.share)
+    own = surface_error(field, mapped.views(), around=[*mapped.T_map_scene[:3, 3], MARGIN.radius]).share(
+        MARGIN.confidence
+    )
     drift = mapped.drift()
     results.add(case, "frames", float(len(drift)), "")
     results.add(case, "lost", float(np.isnan(drift).sum()), f"of {len(drift)}")
@@ -51,7 +53,10 @@ def add_map(results: Results, mapped: FilmedMap) -> float:
     results.add(case, "camera position error, most", 1e3 * float(np.nanmax(drift)), "mm")
     results.add(case, "Gaussians", float(len(field)), "")
     results.add(
-        case, f"surface error within {MARGIN.radius:g} m against its own depth, {MARGIN.share:.1%}", 1e3 * own, "mm"
+        case,
+        f"surface error within {MARGIN.radius:g} m against its own depth, {MARGIN.confidence:.1%}",
+        1e3 * own,
+        "mm",
     )
     return own
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from splatbot.bench.collision.recorded_run import lifted
 from splatbot.bench.planning.audit import configurations
+from splatbot.bench.planning.margin_sweep import sweep_margins
 from splatbot.bench.planning_problems import map_problems
 from splatbot.bench.results import Results
 from splatbot.collision import GaussianCollisionField, RobotSpheres
@@ -19,6 +20,7 @@ from splatbot.geometry import so3_exp
 from splatbot.logs import Log
 from splatbot.planning import GaussianRRTStar, PlanResult
 from splatbot.protocols import Array
+from splatbot.results.audit import audit_run
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import own_margin
 from splatbot.robots.in_view import reopen_log
@@ -54,8 +56,12 @@ _TURNS = (0, *(sign * angle for angle in range(30, 181, 30) for sign in (1, -1))
 _BOX = ((0.2, -0.5, 0.0), (0.9, 0.5, 0.8))  # [m]
 
 
-def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float, seed: int = 0) -> None:
+def plan_in_run(
+    results: Results, run: Path, *, problems: int, budget_ms: float, seed: int = 0, margins: bool = False
+) -> None:
     """Plan seeded problems in the map of a run, with margin 0 and with the surface error of the map.
+
+    With ``margins``, also sweep the margin on the problems of margin 0 (:mod:`splatbot.bench.planning.margin_sweep`).
 
     The scene.yaml of the run defines the pose of the base. Without a scene.yaml,
     :func:`splatbot.workspace.fit_workspace` proposes it, and :func:`free_place` turns it until the arm can move.
@@ -86,6 +92,9 @@ def plan_in_run(results: Results, run: Path, *, problems: int, budget_ms: float,
         runs = [planner.plan(p.start, p.goal, budget_ms=budget_ms, seed=k) for k, p in enumerate(wanted)]
         if runs:
             _add(results, case, runs, planner, measured)
+        if margins and margin == 0.0:
+            name, audit = run.resolve().name, audit_run(folder, log).audit
+            sweep_margins(results, name, audit, field, place.T_world_base, wanted, budget_ms=budget_ms)
 
 
 def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:

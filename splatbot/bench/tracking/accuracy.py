@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.machine import describe_machine
@@ -15,6 +16,7 @@ from splatbot.bench.timing import memory_peak
 from splatbot.bench.tracking import (
     ATE,
     FRAME_MS,
+    JUMPS,
     LOST,
     NEES,
     PERCENTILES,
@@ -26,13 +28,19 @@ from splatbot.bench.tracking import (
 )
 from splatbot.bench.tracking.peers import Odometry, tracking_peers
 from splatbot.bench.tracking.stress import run_stress
-from splatbot.config import Config, load_config
+from splatbot.config import Config, load_config, with_sensor
 from splatbot.evaluation import absolute_error, nees, relative_error
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
 from splatbot.protocols import Array
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
+
+# Changes of an ablation: name, section, key and value of the setting.
+ABLATIONS = (
+    ("with bundle adjustment", "bundle", "enabled", True),
+    ("with replaced keyframes", "mapping", "replace_poor", True),
+)
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,8 @@ class TrackingOutcome:
     resident: int | None
     with_mapping_ms: list[float]
     covariances: Array | None
+    accepted: NDArray[np.bool_] | None = None
+    """(N,) whether the verdict of each pose is "ok"; None of a tracker without verdicts."""
 
 
 class SlamOdometry:
@@ -86,6 +96,10 @@ class SlamOdometry:
         known = [covariance for covariance in found if covariance is not None]
         return np.array(known) if len(known) == len(found) > 0 else None
 
+    def accepted(self) -> NDArray[np.bool_]:
+        """Return (N,) whether the verdict of each of these poses is "ok"."""
+        return np.array([r.verdict == "ok" for r in self.slam.results if r.T_world_camera is not None])
+
 
 def run_tracking(settings: TrackingSettings, report_progress: ReportProgress = ignore_progress) -> Results:
     """Run every contender on every log, and score it."""
@@ -93,7 +107,8 @@ def run_tracking(settings: TrackingSettings, report_progress: ReportProgress = i
     logs = [open_log(address, camera=settings.camera) for address in settings.addresses]
     results = Results(describe_machine((1,), peak_ms=20))
     for name, log in zip(distinct([log.name for log in logs]), logs, strict=True):
-        for contender in contenders(settings, config):
+        calibrated = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
+        for contender in contenders(settings, calibrated):
             report_progress(f"{name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
             add_rows(results, log, contender, run_log(log, contender.make(), settings.max_frames), name)
     if settings.stress:
@@ -108,10 +123,14 @@ def distinct(names: Sequence[str]) -> list[str]:
 
 
 def contenders(settings: TrackingSettings, config: Config) -> Iterator[Contender]:
-    """Yield splatbot with each budget, then its peers."""
+    """Yield splatbot with each budget, then the changes of an ablation if requested, then its peers."""
     for budget in settings.budgets:
         limited = _with_budget(config, budget)
         yield Contender(None, f"{budget:g} ms", "", lambda limited=limited: SlamOdometry(limited))  # type: ignore[misc]
+    for change, section, key, value in ABLATIONS if settings.ablation else ():
+        changed = _with_value(_with_budget(config, settings.budgets[0]), section, key, value)
+        name = f"{settings.budgets[0]:g} ms {change}"
+        yield Contender(None, name, "", lambda changed=changed: SlamOdometry(changed))  # type: ignore[misc]
     for peer in tracking_peers() if not settings.no_peers else ():
         yield Contender(peer.name, "", peer.note, peer.make)
 
@@ -131,7 +150,9 @@ def run_log(log: Log, odometry: Odometry, max_frames: int | None = None) -> Trac
                 stamps.append(frame.stamp)
                 poses.append(T_world_camera)
     if isinstance(odometry, SlamOdometry):
-        return TrackingOutcome(ms, odometry.refined(), count, peak(), whole, odometry.covariances())
+        return TrackingOutcome(
+            ms, odometry.refined(), count, peak(), whole, odometry.covariances(), odometry.accepted()
+        )
     return TrackingOutcome(ms, _trajectory(stamps, poses), count, peak(), whole, None)
 
 
@@ -154,6 +175,8 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Tracking
         add(RPE_ROT, float(np.degrees(relative.rot_rmse)), "°")
         if outcome.covariances is not None:
             add(NEES, nees(truth, tracked, outcome.covariances).mean, "")
+        if outcome.covariances is not None and outcome.accepted is not None:
+            add(JUMPS, 100.0 * jumps_reported_ok(truth, tracked, outcome.covariances, outcome.accepted), "%")
     add(TRACKED, 100.0 * len(tracked) / outcome.frames, "%")
     add(LOST, outcome.frames - len(tracked), "")
     for p in PERCENTILES:
@@ -163,9 +186,31 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Tracking
     add(RESIDENT, None if outcome.resident is None else outcome.resident / 1e6, "MB")
 
 
+def jumps_reported_ok(truth: Trajectory, tracked: Trajectory, covariances: Array, accepted: NDArray[np.bool_]) -> float:
+    """Compute the share of frames reported as ok whose motion since the last frame is wrong by more than three sigma.
+
+    Sigma is √(trace of the translation's covariance), of the one of the two frames where it is larger.
+
+    Args:
+        truth: reference poses.
+        tracked: N estimated poses.
+        covariances: (N, 6, 6) of the estimate, by which a pose is uncertain.
+        accepted: (N,) whether the verdict of a pose is "ok".
+    """
+    relative = relative_error(truth, tracked)
+    rows = np.searchsorted(tracked.stamps, relative.stamps)
+    sigma = np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2))
+    jumps = relative.trans > 3 * np.maximum(sigma[rows], sigma[rows - 1])
+    return float(np.mean(jumps & accepted[rows]))
+
+
 def _with_budget(config: Config, budget_ms: float) -> Config:
+    return _with_value(config, "tracking", "budget_ms", budget_ms)
+
+
+def _with_value(config: Config, section: str, key: str, value: float | bool) -> Config:
     values = config.model_dump(mode="json")  # null marks a value that depends on the budget
-    values["tracking"]["budget_ms"] = budget_ms
+    values[section][key] = value
     return Config.model_validate(values)
 
 

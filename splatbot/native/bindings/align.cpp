@@ -67,15 +67,16 @@ void define_align(nb::module_& m) {
       .def(
           "__init__",
           [](splatbot::AlignSettings* self, bool photometric, bool geometric, double sigma_gray,
-             double sigma_depth_floor, double sigma_depth_quad, double gate) {
+             double sigma_depth_floor, double sigma_depth_quad, double gate, const std::array<double, 6>& blur) {
             new (self) splatbot::AlignSettings{.use_photometric = photometric,
                                                .use_geometric = geometric,
                                                .sigma_gray = sigma_gray,
                                                .sigma_depth_floor = sigma_depth_floor,
                                                .sigma_depth_quad = sigma_depth_quad,
-                                               .gate = gate};
+                                               .gate = gate,
+                                               .blur = blur};
           },
-          "photometric"_a, "geometric"_a, "sigma_gray"_a, "sigma_depth_floor"_a, "sigma_depth_quad"_a, "gate"_a);
+          "photometric"_a, "geometric"_a, "sigma_gray"_a, "sigma_depth_floor"_a, "sigma_depth_quad"_a, "gate"_a, "blur"_a = std::array<double, 6>{});
   m.def(
       "linearize_alignment",
       [](Image gray, Image depth, Intrinsics intrinsics, Rows3 points, Rows3 normals, Vector gray_reference,
@@ -149,11 +150,12 @@ void define_align(nb::module_& m) {
           result = splatbot::align(images, known, match, prior ? &known_before : nullptr, fixed<16>(T_camera_world), plan);
         }
         return nb::make_tuple(copy(result.T_camera_world, {4, 4}), copy(result.H, {6, 6}), copy(result.curvature, {6, 6}), copy(result.spread, {6, 6}),
-                              result.cells, result.dense_weight, result.match_weight);
+                              result.cells, result.dense_weight, result.match_weight,
+                              copy(result.band_H, {splatbot::kAlignCellRows, 6, 6}), copy(result.band_g, {splatbot::kAlignCellRows, 6}));
       },
       "levels"_a, "references"_a, "matches"_a.none(), "prior"_a.none(), "T_camera_world"_a.noconvert(), "settings"_a, "dense_weight"_a,
       "iterations"_a, "finest"_a, "dense_share"_a,
       "Gauss-Newton over the levels (gray, depth, (fx, fy, cx, cy)), fine to coarse, against references (T_world_reference, "
       "[(points, normals, gray)] per level) matches (points, pixels, sigmas, (fx, fy, cx, cy)) and a prior (T_camera_world, information (6, 6)). Returns "
-      "(T_camera_world, H (6, 6), curvature (6, 6), spread (6, 6), cells, dense_weight, match_weight).");
+      "(T_camera_world, H (6, 6), curvature (6, 6), spread (6, 6), cells, dense_weight, match_weight, band_H (6, 6, 6), band_g (6, 6) of the rows of cells).");
 }

@@ -4,6 +4,8 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <algorithm>
+
 #include "arrays.hpp"
 #include "bindings.hpp"
 
@@ -93,7 +95,11 @@ void define_arm(nb::module_& m) {
           [](const Arm& self) {
             const splatbot::ArmView& view = self.view();
             const auto spheres = static_cast<std::size_t>(view.spheres), joints = static_cast<std::size_t>(view.joints);
-            return owned(std::vector<float>(view.reach, view.reach + spheres * joints), {spheres, joints});
+            std::vector<float> reach(spheres * joints);
+            for (std::size_t i = 0; i < spheres; ++i) {
+              std::copy_n(view.reach + i * joints, joints, &reach[static_cast<std::size_t>(view.name[i]) * joints]);
+            }
+            return owned(std::move(reach), {spheres, joints});
           },
           "The farthest that each sphere's centre can be from each joint's axis (S, J) [m]; 1 for joints that slide")
       .def(

@@ -1,19 +1,24 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 
+#include <array>
 #include <stdexcept>
 #include <vector>
 
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "splatbot/depth.hpp"
+#include "splatbot/rectify.hpp"
 
 using namespace nb::literals;
 
 namespace {
 
 using Image = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+using Intrinsics = std::array<double, 4>;
 using Pixels = nb::ndarray<const float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 
 splatbot::DepthImage view(const Image& depth) {
@@ -75,4 +80,24 @@ void define_depth(nb::module_& m) {
         });
       },
       "depth"_a.noconvert(), "fx"_a, "fy"_a, "cx"_a, "cy"_a, "Normals by central differences; zero where there is none.");
+  m.def(
+      "rectify_depth",
+      [](Image depth, const Intrinsics& k, const std::array<double, 6>& twist, double readout, double delay,
+         Pose T_color_depth) {
+        return like(depth, [&](std::span<float> out) {
+          splatbot::rectify_depth(view(depth), {k[0], k[1], k[2], k[3]}, {twist, readout, delay},
+                                  std::span<const double, 16>(T_color_depth.data(), 16), out);
+        });
+      },
+      "depth"_a.noconvert(), "intrinsics"_a, "twist"_a, "readout"_a, "delay"_a, "T_color_depth"_a.noconvert(),
+      "Depth that the colour camera has at the stamp of a frame; 0 where it is missing.");
+  m.def(
+      "rectify_map",
+      [](Image depth, const Intrinsics& k, const std::array<double, 6>& twist, double readout, double delay) {
+        return filled<float>({depth.shape(0), depth.shape(1), 2}, [&](std::span<float> out) {
+          splatbot::rectify_map(view(depth), {k[0], k[1], k[2], k[3]}, {twist, readout, delay}, out);
+        });
+      },
+      "depth"_a.noconvert(), "intrinsics"_a, "twist"_a, "readout"_a, "delay"_a,
+      "Pixels (H, W, 2) of the rolling-shutter image for those of the image at the stamp.");
 }

@@ -88,13 +88,16 @@ class CellSums {
     return ratio * n / (n - 6);
   }
 
-  // The number of cells that have residuals, and Σ g gᵀ over them.
+  // The number of cells that have residuals, Σ g gᵀ over them, and the normal equations of each row of cells.
   void report(AlignResult& result) const {
     Matrix6 spread = Matrix6::Zero();
     for (int c = 0; c < kCount; ++c) {
       if (!used_[c]) continue;
       ++result.cells;
       spread += g_[c] * g_[c].transpose();
+      const int band = c / kAlignCellColumns;
+      Eigen::Map<Matrix6>(&result.band_H[36 * band]) += H_[c];
+      Eigen::Map<Vector6>(&result.band_g[6 * band]) += g_[c];
     }
     result.spread = array_from<6>(spread);
   }
@@ -227,11 +230,25 @@ using Jacobian = Eigen::Matrix<double, 2, 6, Eigen::RowMajor>;
 
 constexpr double kMatchNu = 4.0;  // degrees of freedom of the Student-t noise of matches
 
+// Scale residual and Jacobian of a match in a blurred image along its displacement b = J β [σ]. Their variance there is
+// 1 + |b|², so both are multiplied by I - (1 - 1/√(1 + |b|²)) b bᵀ / |b|².
+void whiten(const Eigen::Map<const Vector6>& blur, Jacobian& J, Eigen::Vector2d& r) {
+  const Eigen::Vector2d b = J * blur;
+  const double length2 = b.squaredNorm();
+  if (!(length2 > 0.0)) return;
+  const double share = (1.0 - 1.0 / std::sqrt(1.0 + length2)) / length2;
+  const Eigen::Matrix<double, 1, 6> along = b.transpose() * J;
+  r -= share * b.dot(r) * b;
+  J -= share * b * along;
+}
+
 // Call visit(index, w, J, r) for each match in front of the camera. The residual is r = (π(T p) - pixel)/σ with the pinhole
 // projection π, and w = (ν + 1)/(ν + |r|²) its Student-t weight. With q = T p, the left perturbation exp(δ) T gives
-// dq = [I, -[q]x] δ, hence J = dπ/dq [I, -[q]x] / σ.
+// dq = [I, -[q]x] δ, hence J = dπ/dq [I, -[q]x] / σ. Blur reduces the weight along its direction.
 template <typename Visit>
-void for_each_match(const AlignMatches& m, const Pose& T, Visit visit) {
+void for_each_match(const AlignMatches& m, const Pose& T, const AlignSettings& settings, Visit visit) {
+  const Eigen::Map<const Vector6> blur(settings.blur.data());
+  const bool blurred = !blur.isZero(0.0);
   for (std::size_t i = 0; i < m.points.size() / 3; ++i) {
     const Eigen::Vector3d q = T * Eigen::Vector3d::Map(&m.points[3 * i]);
     const double x = q.x(), y = q.y(), z = q.z();
@@ -239,11 +256,12 @@ void for_each_match(const AlignMatches& m, const Pose& T, Visit visit) {
     const double* pixel = &m.pixels[2 * i];
     const double iz = 1.0 / z;
     const double fx = m.fx / m.sigmas[i], fy = m.fy / m.sigmas[i];
-    const Eigen::Vector2d r(fx * x * iz + (m.cx - pixel[0]) / m.sigmas[i], fy * y * iz + (m.cy - pixel[1]) / m.sigmas[i]);
+    Eigen::Vector2d r(fx * x * iz + (m.cx - pixel[0]) / m.sigmas[i], fy * y * iz + (m.cy - pixel[1]) / m.sigmas[i]);
     const double ux = fx * iz, uz = -fx * x * iz * iz, vy = fy * iz, vz = -fy * y * iz * iz;
     Jacobian J;
     J << ux, 0.0, uz, uz * y, ux * z - uz * x, -ux * y,  //
         0.0, vy, vz, vz * y - vy * z, -vz * x, vy * x;
+    if (blurred) whiten(blur, J, r);
     visit(i, (kMatchNu + 1.0) / (kMatchNu + r.squaredNorm()), J, r);
   }
 }
@@ -258,19 +276,20 @@ void accumulate(double w, const Jacobian& J, const Eigen::Vector2d& r, NormalEqu
   }
 }
 
-void add_matches(const AlignMatches& m, const Pose& T, double weight, NormalEquations& total) {
-  for_each_match(m, T, [&](std::size_t, double robust, const Jacobian& J, const Eigen::Vector2d& r) {
+void add_matches(const AlignMatches& m, const Pose& T, const AlignSettings& settings, double weight,
+                 NormalEquations& total) {
+  for_each_match(m, T, settings, [&](std::size_t, double robust, const Jacobian& J, const Eigen::Vector2d& r) {
     accumulate(weight * robust, J, r, total);
   });
 }
 
 // The pixels of matches belong to the full image. Its width is that of the finest level, or a multiple of it.
-void add_cells_of_matches(const AlignMatches& m, const Pose& T, const AlignImage& finest, double weight, CellSums& cells,
-                          Matrix6& curvature) {
+void add_cells_of_matches(const AlignMatches& m, const Pose& T, const AlignSettings& settings, const AlignImage& finest,
+                          double weight, CellSums& cells, Matrix6& curvature) {
   const double scale = m.fx / finest.fx;
   Matrix6 H = Matrix6::Zero();
   RobustCurvature robust_curvature;
-  for_each_match(m, T, [&](std::size_t i, double robust, const Jacobian& J, const Eigen::Vector2d& r) {
+  for_each_match(m, T, settings, [&](std::size_t i, double robust, const Jacobian& J, const Eigen::Vector2d& r) {
     const int cell = CellSums::index_of(m.pixels[2 * i], m.pixels[2 * i + 1], scale * finest.width, scale * finest.height);
     NormalEquations match;
     accumulate(weight * robust, J, r, match);
@@ -302,7 +321,7 @@ void minimize(std::vector<DenseTerm>& terms, const AlignMatches& matches, const 
   for (int iteration = 0; iteration < plan.iterations; ++iteration) {
     NormalEquations total;
     for (DenseTerm& term : terms) term.add(estimate.T_camera_world, plan, weights.dense, total);
-    add_matches(matches, estimate.T_camera_world, weights.matches, total);
+    add_matches(matches, estimate.T_camera_world, plan.settings, weights.matches, total);
     estimate.H = total.H;
     if (prior != nullptr) add_prior(*prior, estimate.T_camera_world, total);
     const Vector6 step = total.solve();
@@ -321,7 +340,7 @@ Weights adapted_weights(const std::vector<DenseTerm>& terms, const AlignMatches&
   CellSums dense, sparse;
   Matrix6 unused = Matrix6::Zero();
   for (const DenseTerm& term : terms) term.add_cells(T_camera_world, plan, 1.0, dense, unused);
-  add_cells_of_matches(matches, T_camera_world, finest, 1.0, sparse, unused);
+  add_cells_of_matches(matches, T_camera_world, plan.settings, finest, 1.0, sparse, unused);
   const double of_dense = dense.variance_ratio(), of_sparse = sparse.variance_ratio();
   return {.dense = of_dense > 0.0 ? plan.dense_share / std::max(of_dense, kMinVarianceRatio) : current.dense,
           .matches = of_sparse > 0.0 ? 1.0 / std::max(of_sparse, kMinVarianceRatio) : current.matches};
@@ -361,7 +380,7 @@ AlignResult align(std::span<const AlignImage> levels, std::span<const AlignRefer
     CellSums cells;
     const Pose& T = estimate.T_camera_world;
     for (const DenseTerm& term : terms) term.add_cells(T, plan, weights.dense, cells, estimate.curvature);
-    add_cells_of_matches(matches, T, levels[level], weights.matches, cells, estimate.curvature);
+    add_cells_of_matches(matches, T, plan.settings, levels[level], weights.matches, cells, estimate.curvature);
     cells.report(result);
   }
   result.T_camera_world = array_from(estimate.T_camera_world);

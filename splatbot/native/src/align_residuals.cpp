@@ -40,9 +40,12 @@ AlignSums linearize_alignment(const AlignImage& image, const AlignPoints& refere
                      .sigma_depth_quad = f(settings.sigma_depth_quad),
                      .gate = f(settings.gate),
                      .nu = f(settings.nu),
+                     .blurred = std::ranges::any_of(settings.blur, [](double value) { return value != 0.0; }),
+                     .blur = {},
                      .residual_photometric = nullptr,
                      .residual_geometric = nullptr};
   std::transform(T.begin(), T.begin() + 12, args.T, f);
+  std::ranges::transform(settings.blur, args.blur, f);
   std::fill(residual_photometric.begin(), residual_photometric.end(), std::nanf(""));
   std::fill(residual_geometric.begin(), residual_geometric.end(), std::nanf(""));
   const std::size_t n = reference.gray.size();

@@ -7,6 +7,7 @@
 #include <numeric>
 #include <stdexcept>
 
+#include "splatbot/arm_groups.hpp"
 #include "splatbot/kernels.hpp"
 #include "splatbot/threads.hpp"
 
@@ -43,7 +44,7 @@ double norm(const double* v) { return std::hypot(v[0], v[1], v[2]); }
 Arm::Arm(const ArmSpec& spec) {
   const std::size_t joints = spec.prismatic.size(), spheres = spec.link.size(), pairs = spec.pairs.size() / 2;
   require(joints >= 1 && joints <= kMostJoints, "an arm has 1 to 16 joints");
-  require(spheres <= kMostSpheres, "an arm has at most 256 spheres");
+  require(spheres <= kMostSpheres, "an arm has at most 512 spheres");
   require(pairs <= kMostPairs, "an arm has at most 256 pairs of links that may not touch");
   require(spec.joints.size() == 12 * joints && spec.travel.size() == joints, "joints, kinds and travel differ in number");
   require(spec.centers.size() == 3 * spheres && spec.radii.size() == spheres, "links, centres and radii differ in number");
@@ -68,34 +69,38 @@ Arm::Arm(const ArmSpec& spec) {
   link_.assign(spec.link.begin(), spec.link.end());
   exact_centers_.assign(spec.centers.begin(), spec.centers.end());
   exact_radii_.assign(spec.radii.begin(), spec.radii.end());
-  begin_.assign(joints + 2, 0);
-  for (std::size_t s = 0; s < spheres; ++s) {
-    require(link_[s] >= 0 && link_[s] <= static_cast<std::int32_t>(joints), "a sphere is on a link that is not there");
-    require(s == 0 || link_[s - 1] <= link_[s], "spheres are not sorted by link");
-    require(spec.radii[s] >= 0.0, "a radius is negative");
-    ++begin_[static_cast<std::size_t>(link_[s]) + 1];
+  for (std::size_t i = 0; i < spheres; ++i) {
+    require(link_[i] >= 0 && link_[i] <= static_cast<std::int32_t>(joints), "a sphere is on a link that is not there");
+    require(i == 0 || link_[i - 1] <= link_[i], "spheres are not sorted by link");
+    require(spec.radii[i] >= 0.0, "a radius is negative");
   }
-  std::partial_sum(begin_.begin(), begin_.end(), begin_.begin());
-  radius_.resize(spheres);
+  groups_ = group_spheres(spec.link, spec.centers, spec.radii, joints);
+  const std::size_t balls = spheres + groups_.link.size();
+  radius_.resize(balls + kPadding);
   for (auto& axis : center_) {
-    axis.resize(spheres);
+    axis.resize(balls + kPadding);
   }
-  reach_.assign(spheres * joints, 0.0F);
+  reach_.assign(balls * joints, 0.0F);
   link_reach_.assign((joints + 1) * joints, 0.0F);
-  for (std::size_t s = 0; s < spheres; ++s) {
-    radius_[s] = rounded_up(spec.radii[s] + kArmRounding);
+  for (std::size_t i = 0; i < balls; ++i) {
+    const bool small = i < spheres;
+    const std::size_t own = small ? static_cast<std::size_t>(groups_.name[i]) : i - spheres;
+    const double* center = small ? &spec.centers[3 * own] : &groups_.centers[3 * own];
+    radius_[i] = rounded_up((small ? spec.radii[own] : groups_.radii[own]) + kArmRounding);
     for (std::size_t k = 0; k < 3; ++k) {
-      center_[k][s] = static_cast<float>(spec.centers[3 * s + k]);
+      center_[k][i] = static_cast<float>(center[k]);
     }
     // Largest distance from each axis: the sum of the following offsets' lengths, the first one only across the axis.
-    const auto link = static_cast<std::size_t>(link_[s]);
-    double beyond = norm(&spec.centers[3 * s]);
-    double across = std::hypot(spec.centers[3 * s], spec.centers[3 * s + 1]);
+    const auto link = static_cast<std::size_t>(small ? link_[own] : groups_.link[own]);
+    double beyond = norm(center);
+    double across = std::hypot(center[0], center[1]);
     for (std::size_t j = link; j-- > 0;) {
       const double reach = exact_[j].prismatic ? 1.0 : across;
-      reach_[s * joints + j] = rounded_up(reach * (1.0 + 1e-6));
-      float& most = link_reach_[link * joints + j];
-      most = std::max(most, reach_[s * joints + j]);
+      reach_[i * joints + j] = rounded_up(reach * (1.0 + 1e-6));
+      if (small) {
+        float& most = link_reach_[link * joints + j];
+        most = std::max(most, reach_[i * joints + j]);
+      }
       const double travel = exact_[j].prismatic ? spec.travel[j] : 0.0;
       across = std::hypot(exact_[j].t[0], exact_[j].t[1]) + beyond + travel;
       beyond += norm(exact_[j].t) + travel;
@@ -103,36 +108,25 @@ Arm::Arm(const ArmSpec& spec) {
   }
   enclosing_.assign(4 * (joints + 1), -1.0F);
   for (std::size_t l = 0; l <= joints; ++l) {
-    const auto first = static_cast<std::size_t>(begin_[l]), last = static_cast<std::size_t>(begin_[l + 1]);
+    const auto first = static_cast<std::size_t>(groups_.link_begin[l]);
+    const auto last = static_cast<std::size_t>(groups_.link_begin[l + 1]);
     if (first == last) {
       continue;
     }
+    const std::span<const std::int32_t> own(groups_.name.data() + groups_.begin[first],
+                                            static_cast<std::size_t>(groups_.begin[last] - groups_.begin[first]));
     double middle[3];
-    for (std::size_t k = 0; k < 3; ++k) {
-      double low = 1e30, high = -1e30;
-      for (std::size_t s = first; s < last; ++s) {
-        low = std::min(low, spec.centers[3 * s + k] - spec.radii[s]);
-        high = std::max(high, spec.centers[3 * s + k] + spec.radii[s]);
-      }
-      middle[k] = 0.5 * (low + high);
-    }
-    double radius = 0.0;
-    for (std::size_t s = first; s < last; ++s) {
-      const double d[3] = {spec.centers[3 * s] - middle[0], spec.centers[3 * s + 1] - middle[1],
-                           spec.centers[3 * s + 2] - middle[2]};
-      radius = std::max(radius, norm(d) + static_cast<double>(radius_[s]));
-    }
+    const double radius = enclosing_ball(own, spec.centers, spec.radii, middle);
     for (std::size_t k = 0; k < 3; ++k) {
       enclosing_[4 * l + k] = static_cast<float>(middle[k]);
     }
-    enclosing_[4 * l + 3] = rounded_up(radius + 2.0 * kArmRounding);
+    enclosing_[4 * l + 3] = rounded_up(radius + 3.0 * kArmRounding);
   }
   for (std::size_t p = 0; p < pairs; ++p) {
     const std::int32_t a = std::min(spec.pairs[2 * p], spec.pairs[2 * p + 1]);
     const std::int32_t b = std::max(spec.pairs[2 * p], spec.pairs[2 * p + 1]);
     require(a >= 0 && a < b && b <= static_cast<std::int32_t>(joints), "a pair names a link that is not there, or one twice");
-    if (begin_[static_cast<std::size_t>(a)] < begin_[static_cast<std::size_t>(a) + 1] &&
-        begin_[static_cast<std::size_t>(b)] < begin_[static_cast<std::size_t>(b) + 1]) {
+    if (enclosing_[4 * static_cast<std::size_t>(a) + 3] >= 0.0F && enclosing_[4 * static_cast<std::size_t>(b) + 3] >= 0.0F) {
       pairs_.insert(pairs_.end(), {a, b});
     } else {
       throw std::invalid_argument("a pair names a link without spheres");
@@ -140,7 +134,8 @@ Arm::Arm(const ArmSpec& spec) {
   }
   view_.joints = static_cast<int>(joints);
   view_.spheres = static_cast<int>(spheres);
-  view_.first_sphere = spec.base_in_map ? 0 : begin_[1];
+  view_.groups = static_cast<int>(groups_.link.size());
+  view_.first_group = spec.base_in_map ? 0 : groups_.link_begin[1];
   view_.joint = joint_.data();
   for (int i = 0; i < 3; ++i) {
     for (int k = 0; k < 3; ++k) {
@@ -151,7 +146,10 @@ Arm::Arm(const ArmSpec& spec) {
   }
   view_.radius = radius_.data();
   view_.margin = rounded_up(spec.margin);
-  view_.link_begin = begin_.data();
+  view_.name = groups_.name.data();
+  view_.group_begin = groups_.begin.data();
+  view_.group_link = groups_.link.data();
+  view_.link_begin = groups_.link_begin.data();
   view_.enclosing = enclosing_.data();
   view_.pairs = static_cast<int>(pairs);
   view_.pair = pairs_.data();
@@ -194,13 +192,10 @@ void Arm::forward(std::span<const double> q, std::span<double> poses) const {
   });
 }
 
-void Arm::place_spheres(const double* poses, double* centers) const {
-  for (std::size_t s = 0; s < link_.size(); ++s) {
-    const double* T = poses + 16 * static_cast<std::size_t>(link_[s]);
-    const double* c = &exact_centers_[3 * s];
-    for (std::size_t k = 0; k < 3; ++k) {
-      centers[3 * s + k] = T[4 * k] * c[0] + T[4 * k + 1] * c[1] + T[4 * k + 2] * c[2] + T[4 * k + 3];
-    }
+void Arm::place(const double* poses, std::int32_t link, const double* center, double* at) {
+  const double* T = poses + 16 * static_cast<std::size_t>(link);
+  for (std::size_t k = 0; k < 3; ++k) {
+    at[k] = T[4 * k] * center[0] + T[4 * k + 1] * center[1] + T[4 * k + 2] * center[2] + T[4 * k + 3];
   }
 }
 
@@ -210,7 +205,9 @@ void Arm::centers(std::span<const double> q, std::span<double> out) const {
     double poses[16 * (kMostJoints + 1)];
     for (std::size_t i = begin; i < end; ++i) {
       forward_one(q.data() + i * n, poses);
-      place_spheres(poses, out.data() + 3 * i * spheres);
+      for (std::size_t s = 0; s < spheres; ++s) {
+        place(poses, link_[s], &exact_centers_[3 * s], out.data() + 3 * (i * spheres + s));
+      }
     }
   });
 }
@@ -247,47 +244,63 @@ void Arm::sample(const CollisionField* field, std::span<const double> from, std:
 
 void Arm::clearance(const CollisionField& field, std::span<const double> q, double cut,
                     std::span<ArmClearance> out) const {
-  const FieldKernels& k = *kernels().field;
-  const std::size_t n = exact_.size(), spheres = link_.size();
   in_parts(out.size(), kFewest, [&](std::size_t begin, std::size_t end) {
-    std::vector<double> at(3 * spheres);
-    std::vector<float> bound(spheres);
-    std::vector<std::size_t> order(spheres);
     double poses[16 * (kMostJoints + 1)];
     for (std::size_t i = begin; i < end; ++i) {
-      forward_one(q.data() + i * n, poses);
-      place_spheres(poses, at.data());
-      k.grid_bounds(field.view(), at.data(), 0, spheres, bound.data());
-      std::iota(order.begin(), order.end(), std::size_t{0});
-      std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
-        return static_cast<double>(bound[a]) - exact_radii_[a] < static_cast<double>(bound[b]) - exact_radii_[b];
-      });
-      ArmClearance& best = out[i];
-      best = {std::numeric_limits<double>::infinity(), {0, 0, 0}, {0, 0, 0}, -1, -1};
-      for (const std::size_t s : order) {  // nearest first, as the grid sees it: later ones need look less far
-        if (s < static_cast<std::size_t>(view_.first_sphere)) {
-          continue;
-        }
-        const double limit = std::min(cut, best.distance);
-        const double radius = exact_radii_[s] + static_cast<double>(view_.margin);
-        const double reach = limit + radius;
-        if (reach < 0.0 || static_cast<double>(bound[s]) > reach) {
-          if (reach >= 0.0) {
-            continue;
-          }
-        }
-        NearestSolid found;
-        k.nearest(field.view(), {at.data() + 3 * s, nullptr}, rounded_up(std::max(reach, 0.0)), 0, 1, &found);
-        if (found.id >= 0 && found.distance - radius < best.distance && found.distance - radius <= cut) {
-          best.distance = found.distance - radius;
-          std::copy(std::begin(found.normal), std::end(found.normal), best.normal);
-          std::copy_n(at.data() + 3 * s, 3, best.center);
-          best.sphere = static_cast<std::int32_t>(s);
-          best.id = found.id;
-        }
-      }
+      forward_one(q.data() + i * exact_.size(), poses);
+      out[i] = clearance_at(field, poses, cut);
     }
   });
+}
+
+ArmClearance Arm::clearance_at(const CollisionField& field, const double* poses, double cut) const {
+  const FieldKernels& k = *kernels().field;
+  const std::size_t groups = groups_.link.size();
+  double at[3 * std::max(kMostGroups, kGroupSize)];
+  double least[kMostGroups];  // no sphere of a group has less clearance, as the grid sees it
+  float bound[std::max(kMostGroups, kGroupSize)];
+  std::size_t order[kMostGroups];
+  for (std::size_t g = 0; g < groups; ++g) {
+    place(poses, groups_.link[g], &groups_.centers[3 * g], at + 3 * g);
+  }
+  k.grid_bounds(field.view(), at, 0, groups, bound);
+  for (std::size_t g = 0; g < groups; ++g) {
+    least[g] = static_cast<double>(bound[g]) - groups_.radii[g];
+  }
+  const auto first = static_cast<std::size_t>(view_.first_group);
+  std::iota(order + first, order + groups, first);
+  std::sort(order + first, order + groups, [&](std::size_t a, std::size_t b) { return least[a] < least[b]; });
+  ArmClearance best = {std::numeric_limits<double>::infinity(), {0, 0, 0}, {0, 0, 0}, -1, -1};
+  const auto margin = static_cast<double>(view_.margin);
+  for (std::size_t o = first; o < groups; ++o) {  // nearest first: later ones need look less far
+    const std::size_t g = order[o];
+    if (least[g] - margin > std::min(cut, best.distance)) {
+      break;
+    }
+    const auto from = static_cast<std::size_t>(groups_.begin[g]), to = static_cast<std::size_t>(groups_.begin[g + 1]);
+    for (std::size_t s = from; s < to; ++s) {
+      place(poses, groups_.link[g], &exact_centers_[3 * static_cast<std::size_t>(groups_.name[s])], at + 3 * (s - from));
+    }
+    k.grid_bounds(field.view(), at, 0, to - from, bound);
+    for (std::size_t s = from; s < to; ++s) {
+      const double* center = at + 3 * (s - from);
+      const double radius = exact_radii_[static_cast<std::size_t>(groups_.name[s])] + margin;
+      const double reach = std::min(cut, best.distance) + radius;
+      if (reach >= 0.0 && static_cast<double>(bound[s - from]) > reach) {
+        continue;
+      }
+      NearestSolid found;
+      k.nearest(field.view(), {center, nullptr}, rounded_up(std::max(reach, 0.0)), 0, 1, &found);
+      if (found.id >= 0 && found.distance - radius < best.distance && found.distance - radius <= cut) {
+        best.distance = found.distance - radius;
+        std::copy(std::begin(found.normal), std::end(found.normal), best.normal);
+        std::copy_n(center, 3, best.center);
+        best.sphere = groups_.name[s];
+        best.id = found.id;
+      }
+    }
+  }
+  return best;
 }
 
 }  // namespace splatbot

@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -107,22 +108,50 @@ class Checkpoint:
         """True once the interval has passed since the last save."""
         return time.perf_counter() - self._saved_at >= self.every_s
 
-    def save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
-        """Save a run between two frames."""
+    def save(
+        self,
+        slam: Slam,
+        loop: Mapping[str, Any],
+        place: LogPlace,
+        config: Config,
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Save a run between two frames.
+
+        Args:
+            slam, loop, place, config: state of the run.
+            on_progress: called with the number of arrays of keyframes that are saved, and of all.
+
+        Raises:
+            OSError: the disk is full or not available; the previous save remains, and the next one may succeed.
+        """
         start = time.perf_counter()
+        self._saved_at = start
         with slam.paused():
-            self._save(slam, loop, place, config)
+            self._save(slam, loop, place, config, on_progress or (lambda _done, _total: None))
         self._saved_at = time.perf_counter()
         self.saves += 1
         self.seconds += self._saved_at - start
 
-    def _save(self, slam: Slam, loop: Mapping[str, Any], place: LogPlace, config: Config) -> None:
+    def _save(
+        self,
+        slam: Slam,
+        loop: Mapping[str, Any],
+        place: LogPlace,
+        config: Config,
+        on_progress: Callable[[int, int], None],
+    ) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._journal.begin()
         constant = {id(owner) for owner in _constant_arrays(slam)}
 
+        kept = count(1)
+
         def keep(owner: object, array: NDArray[Any]) -> Entry | None:
-            return self._journal.put(owner, array) if id(owner) in constant else None
+            if id(owner) not in constant:
+                return None
+            on_progress(next(kept), len(constant))
+            return self._journal.put(owner, array)
 
         encoder = Encoder(config, keep)
         header = {

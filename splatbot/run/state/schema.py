@@ -7,7 +7,7 @@ transient. A changed meaning needs a higher :data:`FORMAT_VERSION` and a convers
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from typing import Any
 
@@ -17,6 +17,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.mapping.depth_fusion import DepthNoiseModel
 from splatbot.mapping.dynamic_objects import DynamicObjectFilter
 from splatbot.mapping.joint_motion import JointMotionMonitor
+from splatbot.mapping.keyframe_choice import FrameQuality
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.loop import LoopCloser
 from splatbot.mapping.mapper import Mapper
@@ -32,6 +33,7 @@ from splatbot.tracking.reference import Reference, ReferencePoints
 from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidate
 from splatbot.tracking.tracker import Tracker
 from splatbot.tracking.uncertainty import Uncertainty
+from splatbot.tracking.velocity import CameraVelocity
 
 FORMAT_VERSION = 2
 """Version of the saved state. Version 1 names modules, classes and attributes of splatbot 0.1."""
@@ -46,17 +48,25 @@ class SavedType:
         fields: attribute by stable field name.
         transient: attributes that are not saved; ``create`` sets them.
         create: makes an object without saved fields. If None, the fields are all of its attributes.
+        added: fields that earlier states of this format version lack. They keep the value of a new object.
     """
 
     cls: type
     fields: Mapping[str, str]
     transient: frozenset[str] = frozenset()
     create: Callable[[Config], object] | None = None
+    added: frozenset[str] = frozenset()
+
+    def defaults(self) -> dict[str, Any]:
+        """Return the default value of each added field of a dataclass."""
+        if not is_dataclass(self.cls):
+            return {}
+        return {f.name: f.default for f in fields(self.cls) if f.name in self.added}
 
 
-def _dataclass(cls: type) -> SavedType:
+def _dataclass(cls: type, *added: str) -> SavedType:
     """Describe a dataclass whose field names are stable."""
-    return SavedType(cls, {field.name: field.name for field in fields(cls)})
+    return SavedType(cls, {field.name: field.name for field in fields(cls)}, added=frozenset(added))
 
 
 def _fields(*attributes: str) -> dict[str, str]:
@@ -77,16 +87,18 @@ TYPES: Mapping[str, SavedType] = {
             "_image_size",
             "_localization_only",
             "_joint_motion",
+            "_quality",
         ),
         transient=frozenset({"_executor"}),
         create=Slam,
+        added=frozenset({"quality"}),
     ),
     "frame_result": _dataclass(FrameResult),
     "graph_location": _dataclass(GraphLocation),
     "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", "_last")),
     "camera": _dataclass(Camera),
     "gaussians": _dataclass(GaussianModel),
-    "keyframe": _dataclass(Keyframe),
+    "keyframe": _dataclass(Keyframe, "is_poor"),
     "mapper": SavedType(
         Mapper,
         _fields(
@@ -110,11 +122,22 @@ TYPES: Mapping[str, SavedType] = {
     ),
     "loop_closer": SavedType(
         LoopCloser,
-        _fields("config", "graph", "adjacency", "correction", "closed", "rejected", "_unconfirmed"),
+        _fields(
+            "config",
+            "graph",
+            "adjacency",
+            "correction",
+            "closed",
+            "rejected",
+            "inconsistency",
+            "_ratios",
+            "_unconfirmed",
+        ),
         create=LoopCloser,
+        added=frozenset({"inconsistency", "ratios"}),
     ),
     "pose_graph": _dataclass(PoseGraph),
-    "edge": _dataclass(Edge),
+    "edge": _dataclass(Edge, "covisible"),
     "refiner": SavedType(Refiner, _fields("config", "adam", "_random", "_latest_refined")),
     "adam": SavedType(GaussianAdam, _fields("rates", "steps", "skipped", "first", "second")),
     "dynamic_objects": SavedType(DynamicObjectFilter, _fields("timeout=timeout_s", "_cells", "_since", "_seen")),
@@ -124,6 +147,8 @@ TYPES: Mapping[str, SavedType] = {
         _fields(
             "config",
             "motion",
+            "_velocity",
+            "variance_scale",
             "_lost",
             "uncertainties=_keyframe_uncertainty",
             "_last_covariance",
@@ -133,12 +158,15 @@ TYPES: Mapping[str, SavedType] = {
         ),
         transient=frozenset({"_stages"}),
         create=lambda config: Tracker(config.tracking),
+        added=frozenset({"velocity", "variance_scale"}),
     ),
     "motion_model": SavedType(
         ConstantVelocity,
         _fields("_last", "_twist", "_interval", "_dead_reckoning"),
         create=lambda _: ConstantVelocity(),
     ),
+    "camera_velocity": SavedType(CameraVelocity, _fields("_poses"), create=lambda _: CameraVelocity()),
+    "frame_quality": SavedType(FrameQuality, _fields("_recent"), create=lambda _: FrameQuality()),
     "stage_costs": SavedType(CostModel, _fields("_frame", "_runs"), create=lambda _: CostModel()),
     "place_search": SavedType(PlaceSearch, _fields("_next"), create=lambda _: PlaceSearch()),
     "relocalization_candidate": _dataclass(RelocalizationCandidate),

@@ -170,7 +170,7 @@ class Decoder:
         name, inner = tree["type"], tree["is"]
         if name not in TYPES:
             raise ValueError(f"{name} is not a type of a saved run")
-        different = inner.keys() ^ TYPES[name].fields.keys()
+        different = (inner.keys() ^ TYPES[name].fields.keys()) - TYPES[name].added
         if different:
             raise ValueError(f"{name} has other fields: {', '.join(sorted(different))}")
         value = self._known[index] = self._blank(name)
@@ -185,7 +185,7 @@ class Decoder:
             value = self._known[index] = fields.pop("mapper")
         known = TYPES[name].fields if name in TYPES else {}
         self.unused.setdefault(name, {}).update({f: fields.pop(f) for f in [*fields] if f not in known})
-        missing = known.keys() - fields.keys()
+        missing = known.keys() - fields.keys() - TYPES[name].added if known else set()
         if missing and TYPES[name].create is None:
             raise ValueError(f"{name} has no {min(missing)}")
         if known:
@@ -194,7 +194,11 @@ class Decoder:
 
     def _blank(self, name: str) -> Any:
         saved = TYPES[name]
-        return object.__new__(saved.cls) if saved.create is None else saved.create(self._config)
+        if saved.create is not None:
+            return saved.create(self._config)
+        value: Any = object.__new__(saved.cls)
+        self._set(value, name, saved.defaults())
+        return value
 
     @staticmethod
     def _set(value: Any, name: str, fields: Mapping[str, Any]) -> None:

@@ -8,6 +8,10 @@ from splatbot.tracking.align import align
 from splatbot.tracking.hypothesis import Hypothesis
 from splatbot.tracking.stage import EFFORT_SHARES, StageCost, TrackingProblem, TrackingStage
 
+# Standard deviation of the displacement of a blurred corner over the length of the blur: that of a uniform
+# distribution. Corners that are visible at one end of the blur alone lie that far from its middle.
+_BLUR_SHARE = 1 / 12**0.5
+
 _FIXED_STEPS = 3  # cost of an alignment in addition to its Gauss-Newton steps, in steps
 
 
@@ -46,5 +50,6 @@ class DirectStage(TrackingStage):
             gate=problem.config.sensor.max_depth_difference,
             features=problem.matches,
             camera=problem.prepared.frame.camera,
+            blur=_BLUR_SHARE * problem.config.sensor.exposure * problem.prepared.twist,
         )
         return hypothesis.refined(alignment)

@@ -54,7 +54,7 @@ def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path
         (("--scene", "kitchen"), "there is no scene 'kitchen'"),
         (("--scene", "empty", "--force", "magic"), "there is no 'magic'"),
         (("--scene", "empty", "--timestep", "1"), "give seconds in 0..0.05"),
-        (("--scene", "empty", "--trajectory", "nowhere.json"), "nowhere.json: cannot be read"),
+        (("--scene", "empty", "--trajectory", "nowhere.json"), "nowhere.json: --trajectory: does not exist"),
     ],
 )
 def test_wrong_input_is_named_and_ends_with_2(run: RunCommand, words: tuple[str, ...], message: str) -> None:

@@ -14,10 +14,10 @@ from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_multiply, quat_to_rotation, se3_exp
 from splatbot.logs import open_log
-from splatbot.mapping.loop import move_gaussians
 from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.observation import GraphLocation, Observation
 from splatbot.mapping.posegraph import Edge, PoseGraph, max_residual, within_hops
+from splatbot.mapping.rigid_motion import move_gaussians
 from splatbot.slam import Slam
 from splatbot.tracking.features import detect
 from splatbot.tracking.prepare import prepare

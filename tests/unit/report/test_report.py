@@ -89,7 +89,7 @@ def test_nothing_is_fetched_and_every_picture_is_inside(log: Log, tmp_path: Path
     assert "link" not in page.tags
     assert "url(" not in (tmp_path / "run" / "report.html").read_text()
     assert page.open == []
-    assert len(page.images) == 2 + 3 * 5 + 2  # trajectory and error, three views of five pictures, stages and map
+    assert len(page.images) == 2 + 3 * 5 + 3  # trajectory and error, three views of five pictures, stages, map, audit
     for uri in page.images:
         assert decode(uri).std() > 0
 

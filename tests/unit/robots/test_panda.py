@@ -9,7 +9,8 @@ import pytest
 
 from splatbot.errors import InputError
 from splatbot.protocols import RobotKinematics
-from splatbot.robots.cover import cover, uncovered
+from splatbot.robots.containment import uncovered
+from splatbot.robots.cover import cover
 from splatbot.robots.panda import panda
 from splatbot.robots.shapes import Capsule
 
@@ -57,13 +58,10 @@ def test_links_have_the_masses_that_the_toolbox_has() -> None:
         assert np.linalg.eigvalsh(inertial.inertia).min() > 0
 
 
-@pytest.mark.parametrize("opening", [0.0, 0.03, None])
-def test_spheres_cover_the_shapes_within_the_slack(opening: float | None) -> None:
-    robot = panda()
-    spheres = robot.spheres(opening)
-    assert uncovered(robot.shapes, spheres, 0.002) <= 1e-9
-    assert len(spheres) < 64
-    assert {shape.link for shape in robot.shapes} == set(spheres.link.tolist())
+def test_every_link_has_spheres_and_few_enough_for_a_plan_with_an_object_in_the_hand() -> None:
+    spheres = panda().spheres()
+    assert len(spheres) < 256
+    assert set(spheres.link.tolist()) == set(range(8))
 
 
 def test_no_sphere_reaches_farther_than_the_slack_beyond_its_capsule() -> None:
@@ -73,7 +71,7 @@ def test_no_sphere_reaches_farther_than_the_slack_beyond_its_capsule() -> None:
     t = np.clip((spheres.centers - start) @ (end - start) / capsule.length**2, 0, 1)
     beyond = np.linalg.norm(spheres.centers - start - t[:, None] * (end - start), axis=1) + spheres.radii - 0.04
     assert beyond.max() <= 0.006 + 1e-12
-    assert uncovered([capsule], spheres, 0.001) <= 1e-12
+    assert uncovered([capsule], spheres, 0.001) <= 0
 
 
 def test_fingers_move_apart_with_the_opening() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import HasHand
-from splatbot.robots.cover import uncovered
+from splatbot.robots.containment import uncovered
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
@@ -64,6 +64,6 @@ def test_its_spheres_cover_its_shapes_and_home_is_free_of_itself(robot: RobotMod
     from splatbot.collision import RobotSpheres
 
     links = robot.spheres(0.0)
-    assert uncovered(robot.shapes, links, 0.004) < 1e-6
+    assert uncovered(robot.shapes, links) <= 0
     assert not RobotSpheres(robot).check(None, robot.home[None]).in_collision[0]
     assert len(robot.self_collision_pairs) >= 15

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from splatbot.collision import RobotSpheres
 from splatbot.errors import FormatError, InputError
 from splatbot.protocols import Array
-from splatbot.robots.cover import uncovered
+from splatbot.robots.containment import uncovered
 from splatbot.robots.store import load_robot, read_robot, robot_names, save_robot
 from splatbot.robots.urdf import read_urdf
 
@@ -90,7 +90,7 @@ def test_a_six_axis_arm_of_the_toolbox_with_meshes_is_read_covered_and_queried(r
     expected = np.array([_chained(_puma(), row) for row in q])
     np.testing.assert_allclose(robot.tcp(q), expected, atol=1e-9)
     spheres = robot.spheres()
-    assert uncovered(robot.shapes, spheres, 0.012) <= 0
+    assert uncovered(robot.shapes, spheres) <= 0
     arm = RobotSpheres(robot)
     np.testing.assert_allclose(arm.forward(q), robot.fk(q), atol=1e-12)
     assert arm.check(None, q).in_collision.shape == (20,)

@@ -18,6 +18,7 @@ from splatbot.logs.synthetic import SyntheticLog
 from splatbot.logs.undistort import Undistorter
 from splatbot.rasterize import rasterization
 from splatbot.sim.effects.color_noise import ColorNoise
+from splatbot.sim.effects.depth_camera import DepthCamera
 from splatbot.sim.effects.latency import Latency
 from splatbot.sim.effects.lens_distortion import LensDistortion, _undistorted
 from splatbot.sim.effects.registry import EFFECTS, effect_class, make_effect
@@ -28,7 +29,11 @@ from splatbot.trajectory import Trajectory
 from tests.unit.sim.frames import frame_at
 
 RNG = np.random.default_rng(0)
-SPEC_WITH_EFFECT = {"blackout": "blackout:at=2,n=2", "frame_drops": "frame_drops:rate=0.5"}
+SPEC_WITH_EFFECT = {
+    "blackout": "blackout:at=2,n=2",
+    "depth_camera": "depth_camera:delay=0.01",
+    "frame_drops": "frame_drops:rate=0.5",
+}
 LENS = LensDistortion(k1=-0.2, k2=0.05, p1=0.002, p2=-0.001)
 
 
@@ -156,6 +161,20 @@ def test_a_sideways_motion_shears_by_its_speed_times_the_readout() -> None:
     edges = [int(np.argmax(read.rgb[line, :, 0] > 100)) for line in (0, 74, 149)]
     assert edges == pytest.approx([110, 100, 90], abs=1)
     np.testing.assert_allclose(read.depth[read.depth > 0], 1.0, atol=1e-4)
+
+
+def test_a_late_depth_camera_sees_the_scene_of_the_later_pose_shifted_and_too_near() -> None:
+    log = open_log("synthetic:room?trajectory=turns&frames=31&width=160&height=120")
+    assert isinstance(log, SyntheticLog)
+    frame = log[6]
+    effect = DepthCamera(delay=1 / 30, right=3, down=-2, bias=0.02).along(log.ground_truth)
+    late = effect.apply(frame, RNG)
+    exact = np.roll(log[7].depth, (-2, 3), (0, 1)) - 0.02
+    inner = (slice(20, -20), slice(20, -20))
+    error, still = (np.abs(image - exact)[inner] for image in (late.depth, frame.depth))
+    assert np.median(error) < 2e-3
+    assert np.mean(error > 0.05) < 0.5 * np.mean(still > 0.05)
+    assert np.array_equal(late.rgb, frame.rgb)
 
 
 def test_a_late_frame_keeps_its_images_and_is_stamped_when_it_arrives() -> None:

@@ -11,6 +11,8 @@
 
 namespace splatbot {
 
+constexpr int kAlignCellColumns = 8, kAlignCellRows = 6;
+
 // A keyframe to align to: its points on each level, and where it stands.
 struct AlignReference {
   std::array<double, 16> T_world_reference;
@@ -48,6 +50,8 @@ struct AlignResult {
   std::array<double, 36> spread{};  // (6, 6) Σ g gᵀ over the cells of the image, g the gradient of a cell's residuals
   double dense_weight = 0, match_weight = 0;  // of one residual, at the end
   std::size_t cells = 0;            // cells that have residuals
+  std::array<double, 36 * kAlignCellRows> band_H{};  // (6, 6) normal equations of the residuals in each row of cells
+  std::array<double, 6 * kAlignCellRows> band_g{};   // (6,) and their gradients
 };
 
 // Gauss-Newton over the levels, coarse to fine: H δ = -g with H = Σ w JᵀJ and g = Σ w Jᵀr, then T <- exp(δ) T. Each reference
@@ -57,7 +61,6 @@ struct AlignResult {
 // The spread is evaluated at the result over kAlignCellColumns x kAlignCellRows cells. It includes errors common to the
 // residuals of a cell (blur, a wrong depth of a surface). The noise model does not cover them. With the curvature C,
 // C⁻¹ spread C⁻¹ is the cluster-robust covariance (Huber 1967; Liang and Zeger 1986).
-constexpr int kAlignCellColumns = 8, kAlignCellRows = 6;
 AlignResult align(std::span<const AlignImage> levels, std::span<const AlignReference> references,
                   const AlignMatches& matches, const AlignPrior* prior, std::span<const double, 16> T_camera_world,
                   const AlignPlan& plan);

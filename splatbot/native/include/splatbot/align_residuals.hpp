@@ -30,6 +30,9 @@ struct AlignSettings {
   double sigma_depth_floor = 1e-3;  // [m]
   double sigma_depth_quad = 2e-3;   // [1/m]: σ_z = floor + quad z²
   double gate = 0.1;                // [m] depths that differ by more, beyond 3 σ_z, are of another surface
+  // Standard deviation β (t, ω) of the motion by which a blurred image may be displaced. A residual with the Jacobian J
+  // has the variance σ² + (J β)². Zero for a sharp image.
+  std::array<double, 6> blur{};
   double nu = 4.0;                  // weight w = (ν + 1) / (ν + r²/σ²) (Student t; Kerl et al. 2013)
 };
 

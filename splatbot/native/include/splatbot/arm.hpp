@@ -7,6 +7,7 @@
 #include <span>
 #include <vector>
 
+#include "splatbot/arm_groups.hpp"
 #include "splatbot/arm_kernels.hpp"
 #include "splatbot/field.hpp"
 
@@ -58,7 +59,8 @@ class Arm {
 
  private:
   void forward_one(const double* q, double* poses) const;
-  void place_spheres(const double* poses, double* centers) const;
+  ArmClearance clearance_at(const CollisionField& field, const double* poses, double cut) const;
+  static void place(const double* poses, std::int32_t link, const double* center, double* at);
 
   struct Joint {
     double R[9], t[3];
@@ -67,7 +69,8 @@ class Arm {
   std::vector<Joint> exact_;
   double base_[12];
   std::vector<double> exact_centers_, exact_radii_;
-  std::vector<std::int32_t> link_, begin_, pairs_;
+  std::vector<std::int32_t> link_, pairs_;
+  SphereGroups groups_;
   std::vector<ArmJoint> joint_;
   std::vector<float> center_[3], radius_, enclosing_, reach_, link_reach_;
   ArmView view_{};

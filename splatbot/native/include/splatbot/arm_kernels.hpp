@@ -9,7 +9,11 @@
 
 namespace splatbot {
 
-inline constexpr int kMostJoints = 16, kMostSpheres = 256, kMostPairs = 256;
+inline constexpr int kMostJoints = 16, kMostSpheres = 512, kMostPairs = 256;
+inline constexpr int kGroupSize = 6;  // spheres in a group at most
+inline constexpr int kMostGroups = kMostSpheres / 3 + kMostJoints + 1;  // halves of 7 have 3 or more
+inline constexpr int kMostBalls = kMostSpheres + kMostGroups;
+inline constexpr int kPadding = 32;  // numbers behind the last sphere that a vector may read
 
 // From the frame of the link before to that of the joint at 0; the joint then turns about z, or moves along it.
 struct ArmJoint {
@@ -17,20 +21,25 @@ struct ArmJoint {
   std::int32_t prismatic;
 };
 
-// An arm as the kernels see it. Spheres are sorted by link; link 0 is the base, link k moves with joint k - 1.
+// An arm as the kernels see it, on two levels. Small spheres decide. Balls around groups of neighbouring spheres spare
+// most of the tests. The balls are numbered after the spheres: that of group g is spheres + g. Spheres and groups
+// are sorted by link; link 0 is the base, link k moves with joint k - 1.
 struct ArmView {
-  int joints, spheres, first_sphere;  // spheres before the first are not tested against the map
+  int joints, spheres, groups, first_group;  // groups before the first are not tested against the map
   const ArmJoint* joint;
   float base_R[9];
   double base_t[3];  // of T_world_base
-  const float* center[3];
-  const float* radius;              // with the error of float32 in it
+  const float* center[3];           // (balls + kPadding,)
+  const float* radius;              // (balls + kPadding,) with the error of float32 in it
+  const std::int32_t* name;         // (spheres,) the number of each by its caller
   float margin;                     // [m] more against the map
-  const std::int32_t* link_begin;   // (joints + 2,)
+  const std::int32_t* group_begin;  // (groups + 1,) spheres of each group
+  const std::int32_t* group_link;   // (groups,)
+  const std::int32_t* link_begin;   // (joints + 2,) groups of each link
   const float* enclosing;           // (joints + 1, 4): a ball around each link's spheres; radius < 0: none
   int pairs;
   const std::int32_t* pair;  // (pairs, 2): links a < b that may not touch
-  const float* reach;        // (spheres, joints): farthest from each joint's axis; 1 for prismatic joints
+  const float* reach;        // (balls, joints): farthest of its centre from each joint's axis; 1 for prismatic joints
   const float* link_reach;   // (joints + 1, joints): the farthest of each link's spheres
 };
 

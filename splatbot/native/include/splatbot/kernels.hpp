@@ -128,6 +128,8 @@ struct LinearizeArgs {
   float gain, offset;
   bool use_photometric, use_geometric;
   float sigma_gray, sigma_depth_floor, sigma_depth_quad, gate, nu;
+  bool blurred;
+  float blur[6];  // see AlignSettings
   float *residual_photometric, *residual_geometric;  // or null
 };
 

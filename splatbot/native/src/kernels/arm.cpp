@@ -54,38 +54,105 @@ SB_INLINE std::uint32_t not_proven(const ArmView& arm, const BoundGridView& g, c
   return open;
 }
 
-// Verdicts of the lanes: those still free are in the answer.
-SB_INLINE std::uint32_t check_self(const ArmView& arm, const Placed& placed, std::uint32_t alive,
-                                   std::int32_t* verdict) {
-  for (int k = 0; k < arm.pairs && alive != 0; ++k) {
-    const int a = arm.pair[2 * k], b = arm.pair[2 * k + 1];
-    const float near = arm.enclosing[4 * a + 3] + arm.enclosing[4 * b + 3];
-    std::uint32_t close = alive & bits(squared_between(placed.ball[a], placed.ball[b]) <= set1(near * near));
-    for (int s = arm.link_begin[a]; s < arm.link_begin[a + 1] && close != 0; ++s) {
-      for (int t = arm.link_begin[b]; t < arm.link_begin[b + 1]; ++t) {
-        const float reach = arm.radius[s] + arm.radius[t];
-        std::uint32_t met = close & bits(squared_between(placed.at[s], placed.at[t]) <= set1(reach * reach));
-        alive &= ~met;
-        close &= ~met;
-        for (; met != 0; met &= met - 1) {
-          verdict[__builtin_ctz(met)] = kArmSelf + k;
-        }
+// The lanes in `lanes` where two balls of the same arm, grown by `more`, meet.
+SB_INLINE std::uint32_t meeting(const ArmView& arm, const Placed& placed, int a, int b, F more, std::uint32_t lanes) {
+  const F reach = set1(arm.radius[a] + arm.radius[b]) + more;
+  return lanes & bits(squared_between(placed.at[a], placed.at[b]) <= reach * reach);
+}
+
+// Calls visit(group, group, lanes) for each two groups of a pair of links that may meet. It returns the lanes that
+// remain.
+template <class Visit>
+SB_INLINE void meeting_groups(const ArmView& arm, const Pose* link, Placed& placed, int pair, F more,
+                              std::uint32_t lanes, Visit&& visit) {
+  const int a = arm.pair[2 * pair], b = arm.pair[2 * pair + 1];
+  const F near = set1(arm.enclosing[4 * a + 3] + arm.enclosing[4 * b + 3]) + more;
+  std::uint32_t close = lanes & bits(squared_between(placed.ball[a], placed.ball[b]) <= near * near);
+  for (int g = arm.link_begin[a]; g < arm.link_begin[a + 1] && close != 0; ++g) {
+    const F wide = set1(arm.radius[arm.spheres + g] + arm.enclosing[4 * b + 3]) + more;
+    if ((close & bits(squared_between(placed.at[arm.spheres + g], placed.ball[b]) <= wide * wide)) == 0) {
+      continue;
+    }
+    for (int h = arm.link_begin[b]; h < arm.link_begin[b + 1] && close != 0; ++h) {
+      const std::uint32_t met = meeting(arm, placed, arm.spheres + g, arm.spheres + h, more, close);
+      if (met != 0) {
+        place_spheres(arm, link, g, placed);
+        place_spheres(arm, link, h, placed);
+        close &= visit(g, h, met) | ~met;
       }
     }
+  }
+}
+
+// Verdicts of the lanes: those still free are in the answer.
+SB_INLINE std::uint32_t check_self(const ArmView& arm, const Pose* link, Placed& placed, std::uint32_t alive,
+                                   std::int32_t* verdict) {
+  const F zero = set1(0.0F);
+  for (int k = 0; k < arm.pairs && alive != 0; ++k) {
+    meeting_groups(arm, link, placed, k, zero, alive, [&](int g, int h, std::uint32_t lanes) {
+      for (int s = arm.group_begin[g]; s < arm.group_begin[g + 1] && lanes != 0; ++s) {
+        if (meeting(arm, placed, s, arm.spheres + h, zero, lanes) == 0) {
+          continue;
+        }
+        for (int t = arm.group_begin[h]; t < arm.group_begin[h + 1]; ++t) {
+          std::uint32_t met = meeting(arm, placed, s, t, zero, lanes);
+          alive &= ~met;
+          lanes &= ~met;
+          for (; met != 0; met &= met - 1) {
+            verdict[__builtin_ctz(met)] = kArmSelf + k;
+          }
+        }
+      }
+      return lanes;
+    });
   }
   return alive;
 }
 
-SB_INLINE std::uint32_t check_field(const ArmView& arm, const SolidsView& field, const Placed& placed,
-                                    std::uint32_t alive, std::int32_t* verdict) {
-  for (int s = arm.spheres - 1; s >= arm.first_sphere && alive != 0; --s) {  // the hand first
-    const float radius = arm.radius[s] + arm.margin;
-    std::uint32_t open = not_proven(arm, field.grid, placed.at[s], set1(radius), alive);
-    for (; open != 0; open &= open - 1) {
-      const int lane = __builtin_ctz(open);
-      if (tree_hit(field, split_of(arm, placed.at[s], lane), radius)) {
+// Calls visit(first sphere, number, their places) for the spheres of a group in one lane, up to W at a time.
+template <class Visit>
+SB_INLINE void in_lane(const ArmView& arm, const Placed& placed, int group, int lane, Visit&& visit) {
+  alignas(64) float at[3][W];
+  for (int first = arm.group_begin[group], end = arm.group_begin[group + 1]; first < end; first += W) {
+    const int count = end - first < W ? end - first : W;
+    place_in_lane(arm, placed, arm.group_link[group], lane, first, at);
+    visit(first, count == W ? kAllLanes : (1U << count) - 1U, at);
+  }
+}
+
+// A sphere of a group that may touch the map in one lane; -1: none.
+SB_INLINE int touching(const ArmView& arm, const SolidsView& field, const Placed& placed, int group, int lane) {
+  int found = -1;
+  in_lane(arm, placed, group, lane, [&](int first, std::uint32_t all, const float(&at)[3][W]) {
+    const F radius = load(arm.radius + first) + set1(arm.margin);
+    for (std::uint32_t open = found < 0 ? not_proven(arm, field.grid, at, radius, all) : 0; open != 0; open &= open - 1) {
+      const int i = __builtin_ctz(open);
+      if (tree_hit(field, split_of(arm, at, i), arm.radius[first + i] + arm.margin)) {
+        found = first + i;
+        return;
+      }
+    }
+  });
+  return found;
+}
+
+SB_INLINE std::uint32_t check_field(const ArmView& arm, const SolidsView& field, const Placed& placed, std::uint32_t alive,
+                                    std::int32_t* verdict) {
+  for (int g = arm.groups - 1; g >= arm.first_group && alive != 0; --g) {  // the hand first
+    const int ball = arm.spheres + g;
+    const std::uint32_t near = not_proven(arm, field.grid, placed.at[ball], set1(arm.radius[ball] + arm.margin), alive);
+    if (near == 0) {
+      continue;
+    }
+    for (std::uint32_t m = near; m != 0; m &= m - 1) {
+      const int lane = __builtin_ctz(m);
+      if (!tree_hit(field, split_of(arm, placed.at[ball], lane), arm.radius[ball] + arm.margin)) {
+        continue;
+      }
+      const int hit = touching(arm, field, placed, g, lane);
+      if (hit >= 0) {
         alive &= ~(1U << lane);
-        verdict[lane] = s;
+        verdict[lane] = arm.name[hit];
       }
     }
   }
@@ -98,11 +165,11 @@ std::uint32_t check_lanes(const ArmView& arm, const SolidsView* field, const Joi
   Pose link[kMostJoints + 1];
   Placed placed;
   forward(arm, q, link);
-  place_all(arm, link, placed);
+  place_groups(arm, link, placed);
   for (int i = 0; i < W; ++i) {
     verdict[i] = kArmFree;
   }
-  alive = check_self(arm, placed, alive, verdict);
+  alive = check_self(arm, link, placed, alive, verdict);
   return field == nullptr ? alive : check_field(arm, *field, placed, alive, verdict);
 }
 
@@ -114,6 +181,14 @@ struct Stretch {
 };
 
 SB_INLINE bool has(const std::uint64_t* set, int i) { return ((set[i / 64] >> (i % 64)) & 1U) != 0; }
+SB_INLINE std::uint32_t some(const std::uint64_t* set, int first, int count) {  // a bit each, 32 at most
+  const int word = first / 64, bit = first % 64;
+  std::uint64_t found = set[word] >> bit;
+  if (bit > 32 && word + 1 < kMostSpheres / 64) {
+    found |= set[word + 1] << (64 - bit);
+  }
+  return static_cast<std::uint32_t>(found & ((std::uint64_t{1} << count) - 1U));
+}
 SB_INLINE void add(std::uint64_t* set, int i) { set[i / 64] |= std::uint64_t{1} << (i % 64); }
 
 constexpr int kFirst = 16;       // stretches that an edge is cut into at once
@@ -122,7 +197,7 @@ constexpr int kWaiting = 16384;  // stretches that may wait; an edge that needs 
 // Bounds of how the arm moves along an edge q(t) = q0 + t d.
 struct Motion {
   float speed[kMostJoints];            // |d_j|
-  float bend[kMostSpheres];            // of c''(t): sum_k reach_k |d_k| (|d_k| + 2 sum_{j<k} |d_j|)
+  float bend[kMostBalls + kPadding];   // of c''(t): sum_k reach_k |d_k| (|d_k| + 2 sum_{j<k} |d_j|)
   float apart[kMostPairs];             // of the relative speed of two links
 };
 
@@ -131,7 +206,7 @@ void bound_motion(const ArmView& arm, const double* from, const double* to, Moti
     const double d = to[j] - from[j];
     motion.speed[j] = static_cast<float>(d < 0.0 ? -d : d) * (1.0F + 1e-6F);
   }
-  for (int s = 0; s < arm.spheres; ++s) {
+  for (int s = 0; s < arm.spheres + arm.groups; ++s) {
     float sum = 0.0F, before = 0.0F;
     for (int k = 0; k < arm.joints; ++k) {
       sum += arm.reach[s * arm.joints + k] * motion.speed[k] * (motion.speed[k] + 2.0F * before);
@@ -186,11 +261,11 @@ SB_INLINE F speed_of(const Twist& w, const float (&at)[3][W]) {
   return sqrt(sum);
 }
 
-struct Round {
-  Stretch* stretch[W];
-  int count;
-  float half[W];
-};
+SB_INLINE float lane_of(F v, int lane) {
+  alignas(64) float all[W];
+  store(all, v);
+  return all[lane];
+}
 
 class Certifier {
  public:
@@ -224,7 +299,7 @@ class Certifier {
       s.middle = (static_cast<float>(i) + 0.5F) / kFirst;
       std::memset(s.spheres, 0, sizeof(s.spheres));
       std::memset(s.pairs, 0, sizeof(s.pairs));
-      for (int k = arm_.first_sphere; field_ != nullptr && k < arm_.spheres; ++k) {
+      for (int k = arm_.group_begin[arm_.first_group]; field_ != nullptr && k < arm_.spheres; ++k) {
         add(s.spheres, k);
       }
       for (int k = 0; k < arm_.pairs; ++k) {
@@ -251,11 +326,10 @@ class Certifier {
       }
     }
     edge_.checked += n;
-    Pose link[kMostJoints + 1];
     Twist twist[kMostJoints + 1];
-    forward(arm_, q, link);
-    place_all(arm_, link, placed_);
-    twists(arm_, link, rate_, twist);
+    forward(arm_, q, link_);
+    place_groups(arm_, link_, placed_);
+    twists(arm_, link_, rate_, twist);
     Stretch left[W];
     std::uint32_t open = 0;
     for (int i = 0; i < n; ++i) {
@@ -265,10 +339,8 @@ class Certifier {
     for (int k = 0; k < arm_.pairs; ++k) {
       open |= pair(k, head, lanes, half, left);
     }
-    for (int l = arm_.joints; l >= 0 && field_ != nullptr; --l) {
-      for (int s = arm_.link_begin[l + 1] - 1; s >= arm_.link_begin[l] && edge_.verdict == kArmFree; --s) {
-        open |= sphere(s, twist[l], head, lanes, half, left);
-      }
+    for (int g = arm_.groups - 1; g >= arm_.first_group && field_ != nullptr && edge_.verdict == kArmFree; --g) {
+      open |= group(g, twist, head, lanes, half, left);
     }
     for (int i = 0; i < n && edge_.verdict == kArmFree; ++i) {
       if (((open >> i) & 1U) != 0) {
@@ -277,69 +349,106 @@ class Certifier {
     }
   }
 
-  std::uint32_t wanted(int head, std::uint32_t lanes, int i, bool pairs) const {
+  std::uint32_t wanted(int head, std::uint32_t lanes, int pair) const {
     std::uint32_t w = 0;
     for (std::uint32_t m = lanes; m != 0; m &= m - 1) {
       const int lane = __builtin_ctz(m);
-      const Stretch& s = waiting_[head + lane];
-      w |= static_cast<std::uint32_t>(has(pairs ? s.pairs : s.spheres, i)) << lane;
+      w |= static_cast<std::uint32_t>(has(waiting_[head + lane].pairs, pair)) << lane;
     }
     return w;
   }
 
-  // The lanes in which sphere s is not yet known to be free all along.
-  std::uint32_t sphere(int s, const Twist& twist, int head, std::uint32_t lanes, const float (&half)[W], Stretch* left) {
-    const std::uint32_t mine = wanted(head, lanes, s, false);
+  // The lanes in which a sphere of group g is not yet known to be free all along.
+  std::uint32_t group(int g, const Twist* twist, int head, std::uint32_t lanes, const float (&half)[W], Stretch* left) {
+    std::uint32_t mine = 0, found = 0;
+    const int begin = arm_.group_begin[g], count = arm_.group_begin[g + 1] - begin;
+    for (std::uint32_t m = lanes; m != 0; m &= m - 1) {
+      const int lane = __builtin_ctz(m);
+      mine |= static_cast<std::uint32_t>(some(waiting_[head + lane].spheres, begin, count) != 0) << lane;
+    }
     if (mine == 0) {
       return 0;
     }
-    const F w = load(half);
-    // 2 um: rounding of the speed, and of where in float32 the middle is.
-    const F moves = fma(speed_of(twist, placed_.at[s]) * set1(1.0F + 1e-5F), w, set1(0.5F * motion_.bend[s]) * w * w) + set1(2e-6F);
-    alignas(64) float room[W];
-    store(room, moves);
-    const float radius = arm_.radius[s] + arm_.margin;
-    std::uint32_t open = not_proven(arm_, field_->grid, placed_.at[s], set1(radius) + moves, mine), found = 0;
-    for (; open != 0; open &= open - 1) {
-      const int lane = __builtin_ctz(open);
-      const Split p = split_of(arm_, placed_.at[s], lane);
-      if (!tree_hit(*field_, p, radius + room[lane])) {
+    const int ball = arm_.spheres + g, link = arm_.group_link[g];
+    const F speed = speed_of(twist[link], placed_.at[ball]);
+    const F reach = set1(arm_.radius[ball] + arm_.margin) + motion(speed, set1(motion_.bend[ball]), load(half));
+    mine = not_proven(arm_, field_->grid, placed_.at[ball], reach, mine);
+    alignas(64) float wide[W];
+    store(wide, reach);
+    for (; mine != 0 && edge_.verdict == kArmFree; mine &= mine - 1) {
+      const int lane = __builtin_ctz(mine);
+      if (!tree_hit(*field_, split_of(arm_, placed_.at[ball], lane), wide[lane])) {
         continue;
       }
-      if (room[lane] <= eps_ || tree_hit(*field_, p, radius)) {
-        reject(s, lane, head);
-        return 0;
-      }
-      add(left[lane].spheres, s);
-      found |= 1U << lane;
+      found |= static_cast<std::uint32_t>(in_stretch(g, twist[link], head, lane, half[lane], left[lane])) << lane;
     }
     return found;
   }
 
+  // Adds the spheres of group g that are not yet known to be free along one stretch to `left`; returns whether there are
+  // any.
+  bool in_stretch(int g, const Twist& twist, int head, int lane, float half, Stretch& left) {
+    bool found = false;
+    Twist own;
+    for (int i = 0; i < 3; ++i) {
+      own.omega[i] = set1(lane_of(twist.omega[i], lane));
+      own.u[i] = set1(lane_of(twist.u[i], lane));
+    }
+    in_lane(arm_, placed_, g, lane, [&](int first, std::uint32_t all, const float(&at)[3][W]) {
+      const F moves = motion(speed_of(own, at), load(motion_.bend + first), set1(half));
+      const F radius = load(arm_.radius + first) + set1(arm_.margin);
+      alignas(64) float room[W];
+      store(room, moves);
+      const std::uint32_t mine = all & some(waiting_[head + lane].spheres, first, W);
+      std::uint32_t open = mine == 0 ? 0 : not_proven(arm_, field_->grid, at, radius + moves, mine);
+      for (; open != 0 && edge_.verdict == kArmFree; open &= open - 1) {
+        const int i = __builtin_ctz(open), s = first + i;
+        const Split p = split_of(arm_, at, i);
+        const float own_radius = arm_.radius[s] + arm_.margin;
+        if (!tree_hit(*field_, p, own_radius + room[i])) {
+          continue;
+        }
+        if (room[i] <= eps_ || tree_hit(*field_, p, own_radius)) {
+          reject(arm_.name[s], lane, head);
+          return;
+        }
+        add(left.spheres, s);
+        found = true;
+      }
+    });
+    return found;
+  }
+
+  // Bounds the motion of balls from the middle of a stretch: v h + a h² / 2. 2 um cover the rounding of the speed and
+  // of the middle in float32.
+  static F motion(F speed, F bend, F half) {
+    return fma(speed * set1(1.0F + 1e-5F), half, set1(0.5F) * bend * half * half) + set1(2e-6F);
+  }
+
   // The same of a pair of links.
   std::uint32_t pair(int k, int head, std::uint32_t lanes, const float (&half)[W], Stretch* left) {
-    const std::uint32_t mine = wanted(head, lanes, k, true);
-    const int a = arm_.pair[2 * k], b = arm_.pair[2 * k + 1];
+    const std::uint32_t mine = wanted(head, lanes, k);
     const F moves = fma(set1(motion_.apart[k]), load(half), set1(4e-6F));
-    const F near = set1(arm_.enclosing[4 * a + 3] + arm_.enclosing[4 * b + 3]) + moves;
-    std::uint32_t close = mine & bits(squared_between(placed_.ball[a], placed_.ball[b]) <= near * near);
     std::uint32_t found = 0;
-    for (int s = arm_.link_begin[a]; s < arm_.link_begin[a + 1] && close != 0; ++s) {
-      for (int t = arm_.link_begin[b]; t < arm_.link_begin[b + 1]; ++t) {
-        const F squared = squared_between(placed_.at[s], placed_.at[t]);
-        const float reach = arm_.radius[s] + arm_.radius[t];
-        const F wide = set1(reach) + moves;
-        const std::uint32_t hit = close & bits(squared <= set1(reach * reach));
-        const std::uint32_t doubtful = close & bits(squared <= wide * wide);
-        const std::uint32_t small = doubtful & bits(moves <= set1(eps_));
-        if ((hit | small) != 0) {
-          reject(kArmSelf + k, __builtin_ctz(hit | small), head);
-          return 0;
+    meeting_groups(arm_, link_, placed_, k, moves, mine, [&](int g, int h, std::uint32_t near) -> std::uint32_t {
+      for (int s = arm_.group_begin[g]; s < arm_.group_begin[g + 1]; ++s) {
+        if (meeting(arm_, placed_, s, arm_.spheres + h, moves, near) == 0) {
+          continue;
         }
-        found |= doubtful;
+        for (int t = arm_.group_begin[h]; t < arm_.group_begin[h + 1]; ++t) {
+          const std::uint32_t doubtful = meeting(arm_, placed_, s, t, moves, near);
+          const std::uint32_t hit = doubtful == 0 ? 0 : meeting(arm_, placed_, s, t, set1(0.0F), doubtful);
+          const std::uint32_t small = doubtful & bits(moves <= set1(eps_));
+          if ((hit | small) != 0) {
+            reject(kArmSelf + k, __builtin_ctz(hit | small), head);
+            return 0;
+          }
+          found |= doubtful;
+        }
       }
-    }
-    for (std::uint32_t m = found; m != 0; m &= m - 1) {
+      return near;
+    });
+    for (std::uint32_t m = edge_.verdict == kArmFree ? found : 0; m != 0; m &= m - 1) {
       add(left[__builtin_ctz(m)].pairs, k);
     }
     return found;
@@ -363,7 +472,7 @@ class Certifier {
   std::int32_t has_sphere(const Stretch& left) const {
     for (int s = 0; s < arm_.spheres; ++s) {
       if (has(left.spheres, s)) {
-        return s;
+        return arm_.name[s];
       }
     }
     for (int k = 0; k < arm_.pairs; ++k) {
@@ -383,6 +492,7 @@ class Certifier {
   double delta_[kMostJoints] = {};
   float rate_[kMostJoints] = {};
   Motion motion_;
+  Pose link_[kMostJoints + 1];
   Placed placed_;
   ArmEdge edge_{};
 };
@@ -484,12 +594,15 @@ void arm_centers(const ArmView& arm, const double* q, std::size_t begin, std::si
   for (std::size_t first = begin; first < end; first += W) {
     const int n = load_joints(arm, q, first, end, joints);
     forward(arm, joints, link);
-    place_all(arm, link, placed);
+    place_groups(arm, link, placed);
+    for (int g = 0; g < arm.groups; ++g) {
+      place_spheres(arm, link, g, placed);
+    }
     for (int i = 0; i < n; ++i) {
       float* to = out + (first + static_cast<std::size_t>(i)) * 3 * static_cast<std::size_t>(arm.spheres);
       for (int s = 0; s < arm.spheres; ++s) {
         for (int k = 0; k < 3; ++k) {
-          to[3 * s + k] = static_cast<float>(arm.base_t[k] + static_cast<double>(placed.at[s][k][i]));
+          to[3 * arm.name[s] + k] = static_cast<float>(arm.base_t[k] + static_cast<double>(placed.at[s][k][i]));
         }
       }
     }

@@ -94,26 +94,59 @@ SB_INLINE void place(const Pose& pose, float x, float y, float z, F (&at)[3]) {
   }
 }
 
-// Centres of all spheres and of the balls around the links.
+// Centres of the balls around groups and links, and of the spheres of the placed groups.
 struct Placed {
-  alignas(64) float at[kMostSpheres][3][W];
+  alignas(64) float at[kMostBalls][3][W];
   alignas(64) float ball[kMostJoints + 1][3][W];
+  alignas(64) float pose[kMostJoints + 1][12][W];  // R and t of each link
+  bool has[kMostGroups];
 };
 
-SB_INLINE void place_all(const ArmView& arm, const Pose* link, Placed& placed) {
+SB_INLINE void place_ball(const ArmView& arm, const Pose& pose, int i, Placed& placed) {
+  F at[3];
+  place(pose, arm.center[0][i], arm.center[1][i], arm.center[2][i], at);
+  for (int k = 0; k < 3; ++k) {
+    store(placed.at[i][k], at[k]);
+  }
+}
+
+SB_INLINE void place_groups(const ArmView& arm, const Pose* link, Placed& placed) {
   F at[3];
   for (int l = 0; l <= arm.joints; ++l) {
     const float* ball = arm.enclosing + 4 * l;
     place(link[l], ball[0], ball[1], ball[2], at);
     for (int i = 0; i < 3; ++i) {
       store(placed.ball[l][i], at[i]);
+      store(placed.pose[l][9 + i], link[l].t[i]);
     }
-    for (int s = arm.link_begin[l]; s < arm.link_begin[l + 1]; ++s) {
-      place(link[l], arm.center[0][s], arm.center[1][s], arm.center[2][s], at);
-      for (int i = 0; i < 3; ++i) {
-        store(placed.at[s][i], at[i]);
-      }
+    for (int i = 0; i < 9; ++i) {
+      store(placed.pose[l][i], link[l].R[i]);
     }
+    for (int g = arm.link_begin[l]; g < arm.link_begin[l + 1]; ++g) {
+      place_ball(arm, link[l], arm.spheres + g, placed);
+      placed.has[g] = false;
+    }
+  }
+}
+
+// Places the spheres of a group in all lanes.
+SB_INLINE void place_spheres(const ArmView& arm, const Pose* link, int group, Placed& placed) {
+  if (placed.has[group]) {
+    return;
+  }
+  placed.has[group] = true;
+  for (int s = arm.group_begin[group]; s < arm.group_begin[group + 1]; ++s) {
+    place_ball(arm, link[arm.group_link[group]], s, placed);
+  }
+}
+
+// Places W spheres of a link from `first` on in one lane: here a lane of the answer is a sphere.
+SB_INLINE void place_in_lane(const ArmView& arm, const Placed& placed, int link, int lane, int first, float (&at)[3][W]) {
+  const F x = load(arm.center[0] + first), y = load(arm.center[1] + first), z = load(arm.center[2] + first);
+  const auto& pose = placed.pose[link];
+  for (int i = 0; i < 3; ++i) {
+    const F shift = set1(pose[9 + i][lane]);
+    store(at[i], fma(set1(pose[3 * i][lane]), x, fma(set1(pose[3 * i + 1][lane]), y, fma(set1(pose[3 * i + 2][lane]), z, shift))));
   }
 }
 

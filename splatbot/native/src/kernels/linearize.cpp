@@ -178,7 +178,15 @@ void linearize(const LinearizeArgs& args, LinearizeSums& sums) {
         store(photo.J[i].values + k, zero_unless(seen, rows_of_J[i]));
       }
       store(photo.r.values + k, zero_unless(seen, r));
-      weigh(args, seen, r, set1(args.sigma_gray), photo.weight.values + k, ratio.values + k, cost);
+      F sigma = set1(args.sigma_gray);
+      if (args.blurred) {
+        F moved = set1(args.blur[0]) * rows_of_J[0];
+        for (int i = 1; i < 6; ++i) {
+          moved = fma(set1(args.blur[i]), rows_of_J[i], moved);
+        }
+        sigma = sqrt(select(seen, fma(moved, moved, sigma * sigma), one));
+      }
+      weigh(args, seen, r, sigma, photo.weight.values + k, ratio.values + k, cost);
       if (args.residual_photometric != nullptr) {
         for (int i = k; i < k + W && i < args.count; ++i) {
           args.residual_photometric[i] = ratio.values[i];

@@ -1,0 +1,133 @@
+"""`splatbot info --fit-plane`: the support plane and a robot's base, decided or estimated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatbot.cli.tables import print_table
+
+if TYPE_CHECKING:
+    from splatbot.gaussians import GaussianModel
+    from splatbot.up_direction import WorkspaceEstimate
+    from splatbot.workspace import Workspace
+
+Up = tuple[float, float, float]
+
+
+def fit_plane(map_file: Path, up: Up | None) -> int:
+    """Describe the workspace next to a map, or estimate and write it with a picture; return the exit code.
+
+    ``up`` overrides an existing scene.yaml. An estimate with doubts is not written.
+
+    Raises:
+        InputError: the map has no upward surface.
+        FormatError: the map or a scene.yaml is damaged.
+    """
+    from splatbot.gaussians import GaussianModel
+    from splatbot.workspace import NAME, find_workspace
+
+    target = map_file.with_name(NAME)
+    known = find_workspace(map_file)
+    model = GaussianModel.load(map_file)
+    if known is not None and up is None:
+        print_table([("from", "the file"), *_rows(known)], title=str(target))
+        _draw(model, known, map_file)
+        return 0
+    found = _estimate(map_file, model, up)
+    if found.doubts and up is None:
+        _ask(found, map_file)
+        _draw(model, found.workspace, map_file)
+        return 1
+    place = found.workspace
+    if known is not None:
+        place = replace(
+            known,
+            T_world_base=place.T_world_base,
+            gravity=place.gravity,
+            support_plane=place.support_plane,
+            box=place.box,
+        )
+    place.save(target)
+    notes = [("note", doubt) for doubt in found.doubts]
+    how = f"{found.decided_by}, {'replaced' if known is not None else 'written'}"
+    print_table([("from", how), *_rows(place), *notes], title=str(target))
+    _draw(model, place, map_file)
+    return 0
+
+
+def _estimate(map_file: Path, model: GaussianModel, up: Up | None) -> WorkspaceEstimate:
+    from splatbot.up_direction import estimate_workspace
+
+    if up is not None:
+        return estimate_workspace(model, up)
+    measured = _measured_up(map_file)
+    if measured is not None:
+        return estimate_workspace(model, measured, decided_by="accelerometer of the log")
+    return estimate_workspace(model)
+
+
+def _measured_up(map_file: Path) -> Up | None:
+    """Return the up direction that the log's accelerometer measured, or None without one."""
+    from splatbot.errors import SplatbotError
+    from splatbot.logs.gravity import measured_up
+    from splatbot.results.folder import RunFolder
+
+    run = RunFolder(map_file.parent)
+    try:
+        uri = run.load_metrics().get("log", {}).get("uri")
+        return None if uri is None else measured_up(str(uri), run.load_trajectory())
+    except SplatbotError:  # a map without a run, or a run whose log is gone
+        return None
+
+
+def _ask(found: WorkspaceEstimate, map_file: Path) -> None:
+    rows = [("doubt", doubt) for doubt in found.doubts]
+    places = (found.workspace, *found.others)
+    rows += [(f"candidate {number}", _candidate(place)) for number, place in enumerate(places, 1)]
+    print_table(rows, title="the up direction is doubtful; nothing is written")
+    print("say which is up in the first camera (x right, y down, z ahead), for example one of:")
+    for place in places:
+        assert place.support_plane is not None
+        x, y, z = place.support_plane[:3]
+        print(f"  splatbot info {map_file.parent} --fit-plane --up {x:.3f} {y:.3f} {z:.3f}")
+
+
+def _candidate(place: Workspace) -> str:
+    import numpy as np
+
+    assert place.support_plane is not None
+    pitch = float(np.degrees(np.arcsin(np.clip(-place.support_plane[2], -1.0, 1.0))))
+    return f"{place.support_plane[3]:.3f} m below the first camera, which looks down by {pitch:.0f}°"
+
+
+def _rows(found: Workspace) -> list[tuple[str, str]]:
+    import numpy as np
+
+    def text(values: np.ndarray | None) -> str:
+        return "not known" if values is None else " ".join(f"{x:.3f}" for x in np.ravel(values))
+
+    T = found.T_world_base
+    return [
+        ("gravity", text(found.gravity)),
+        ("support plane n, d [m]", text(found.support_plane)),
+        ("base at [m]", text(None if T is None else T[:3, 3])),
+        ("base's x, z", text(None if T is None else T[:3, [0, 2]].T)),
+        ("workspace, from the base [m]", text(found.box)),
+    ]
+
+
+def _draw(model: GaussianModel, place: Workspace, map_file: Path) -> None:
+    from splatbot.atomic import atomic_write
+    from splatbot.report.workspace_view import workspace_png
+    from splatbot.trajectory import Trajectory
+
+    if place.T_world_base is None:
+        return
+    trajectory = map_file.with_name("trajectory.tum")
+    path = Trajectory.load(trajectory).positions if trajectory.is_file() else None
+    picture = map_file.with_name("scene.png")
+    with atomic_write(picture) as file:
+        file.write(workspace_png(model, place, path))
+    print(f"picture: {picture}")

@@ -1,0 +1,83 @@
+"""`splatbot objects`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from splatbot.cli.paths import check_output
+from splatbot.cli.placing import Pose
+from splatbot.cli.tables import print_columns, print_table
+from splatbot.layouts import map_file
+
+if TYPE_CHECKING:
+    from splatbot.grasping.object_list import ListedObject
+
+
+def objects(
+    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|MAP")],
+    /,
+    *,
+    robot: str = "panda",
+    base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
+) -> int:
+    """List the supports and objects of a map with labels and sizes, so that a target can be named.
+
+    Writes a picture with the number of each object. `splatbot grasp --target "object 3"` takes an object of the list.
+
+    Examples:
+        splatbot objects runs/desk
+        splatbot objects runs/desk --robot panda-2f140 --json
+        splatbot objects map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --out objects.png
+
+    Args:
+        map: a run folder, or a map file.
+        robot: robot whose hand must enclose an object.
+        base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
+            `splatbot info --fit-plane`).
+        as_json: print JSON, in which each length names its unit.
+        out: the picture; by default objects.png next to the map.
+    """
+    file = map_file(map)
+    picture = out if out is not None else file.with_name("objects.png")
+    check_output(picture, folder=False)
+
+    from splatbot.atomic import atomic_write
+    from splatbot.cli.grasp import graspable_objects, stroke_of
+    from splatbot.grasping.object_list import list_objects, list_planes
+    from splatbot.report.objects_view import objects_png
+    from splatbot.robots.store import load_robot
+
+    stroke = stroke_of(load_robot(robot))
+    scene = graspable_objects(map, base).scene
+    found, planes = list_objects(scene, stroke), list_planes(scene)
+    with atomic_write(picture) as handle:
+        handle.write(objects_png(scene, found))
+    if as_json:
+        values = {"planes": planes, "objects": [item.to_dict() for item in found], "hand_opens_m": stroke}
+        print(json.dumps(values, indent=2))
+        return 0
+    _print(found, planes)
+    print(f"picture: {picture}")
+    return 0
+
+
+def _print(found: tuple[ListedObject, ...], planes: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    rows = []
+    for plane in planes:
+        size = " x ".join(f"{x:.2f}" for x in plane["size_m"])
+        rows.append((plane["label"], f"{size} m, {plane['height_base_m']:+.3f} m above the base"))
+    print_table(rows, title="planes")
+    table = Table("target", "label", "size, mm", "at, m from the base", "hand")
+    for item in found:
+        size = " x ".join(f"{1e3 * x:.0f}" for x in item.size)
+        at = " ".join(f"{x:.2f}" for x in item.at_base)
+        table.add_row(f"object {item.number}", item.label, size, at, item.obstacle or "fits")
+    print_columns(table)

@@ -1,0 +1,114 @@
+"""Checks of paths before a command loads its libraries, and errors of disks in plain words."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from splatbot.errors import FormatError, InputError
+
+_FIXES = {
+    errno.ENOSPC: "free some space, or write to another disk",
+    errno.EDQUOT: "free some of your quota, or write to another disk",
+    errno.EFBIG: "raise the limit of file sizes (ulimit -f), or write to another disk",
+    errno.EROFS: "mount the disk for writing, or write to another one",
+    errno.EACCES: "change the permissions, or name another place",
+    errno.EPERM: "change the permissions, or name another place",
+    errno.EIO: "check the disk, or name another one",
+    errno.ESTALE: "mount the network folder again",
+    errno.ENOTCONN: "mount the folder again",
+    errno.ENODEV: "connect the device or mount the folder again",
+    errno.ENXIO: "connect the device or mount the folder again",
+    errno.ENOENT: "check whether the folder was removed or unmounted",
+    errno.ENOTDIR: "name a folder, not a file in it",
+    errno.EISDIR: "name a file, not a folder",
+    errno.ENAMETOOLONG: "use a shorter name",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+}
+
+
+def system_error(error: OSError) -> str | None:
+    """Return an error of the disk or the file system as one sentence with a fix, or None for other errors."""
+    fix = _FIXES.get(error.errno or 0)
+    if fix is None or isinstance(error, ConnectionError):
+        return None
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{(error.strerror or 'failed').lower()}. Fix: {fix}"
+
+
+def check_output(path: Path | None, flag: str = "--out", *, folder: bool = True) -> None:
+    """Check that a file or a folder can be written at a path, without creating it.
+
+    Raises:
+        InputError: the path names something else.
+        OSError: the folder or its disk is not for writing.
+    """
+    if path is None:
+        return
+    if path.exists() and path.is_dir() != folder:
+        raise InputError(
+            f"is a {'file' if folder else 'folder'}.",
+            file=path,
+            field=flag,
+            hint=f"name a {'folder' if folder else 'file'}",
+        )
+    place = path.absolute()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir() and (folder or place != path.absolute()):
+        raise InputError(f"is below {place}, which is a file.", file=path, field=flag, hint="name another place")
+    if not os.access(place, os.W_OK):
+        code = errno.EROFS if os.statvfs(place).f_flag & os.ST_RDONLY else errno.EACCES
+        raise OSError(code, os.strerror(code), str(path))
+
+
+def check_run(run: Path) -> None:
+    """Check that a path is a folder of a run.
+
+    Raises:
+        FormatError: it is not.
+    """
+    hint = "give a folder that `splatbot map` wrote"
+    if not run.is_dir():
+        raise FormatError("is a file." if run.exists() else "does not exist.", file=run, field="run", hint=hint)
+    if not (run / "metrics.json").is_file():
+        raise FormatError("is no folder of a run: it has no metrics.json.", file=run, field="run", hint=hint)
+
+
+def check_state(run: Path) -> None:
+    """Check that a run has a saved state, to continue it or to localise in it.
+
+    Raises:
+        FormatError: it has none.
+    """
+    state = run / "state" / "run.state"
+    if state.is_file():
+        return
+    if not run.is_dir():
+        why, hint = "the folder does not exist", "give a folder that `splatbot map` wrote"
+    else:
+        why = "the run ended before its first save (--save-every, 30 s), or was mapped with --save-every 0"
+        hint = f"map the log again: splatbot map LOG --out {run} --overwrite --save-every 10"
+    raise FormatError(f"there is no saved state: {why}.", file=state, hint=hint)
+
+
+def check_camera(camera: str | None) -> None:
+    """Check that a camera that is named like a file exists; presets are names.
+
+    Raises:
+        InputError: it does not.
+    """
+    if camera is not None and ("/" in camera or camera.endswith(".json")):
+        check_file(Path(camera), "--camera")
+
+
+def check_file(path: Path | None, flag: str) -> None:
+    """Check that a file exists.
+
+    Raises:
+        InputError: it does not.
+    """
+    if path is not None and not path.is_file():
+        problem = "is a folder." if path.is_dir() else "does not exist."
+        raise InputError(problem, file=path, field=flag, hint="check the path")

@@ -1,0 +1,155 @@
+"""Confirmed space: surface points that several depth images agree on, and free points that several rays passed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.collision.visibility import DepthView, measured_depths, passing_distance
+from splatbot.errors import InputError
+from splatbot.geometry import transform_points
+from splatbot.protocols import Array
+
+
+@dataclass(frozen=True)
+class ConfirmedConstants:
+    """Constants of confirmed space.
+
+    Args:
+        points_per_view: largest number of surface points, and of free points, that one view proposes. The work is this
+            times the square of the number of views.
+        agreement_sigma: [σ of depth] largest difference of two measurements of one surface point.
+        agreeing_views: number of other views that confirm a surface point.
+        through_share: largest share of the views of a surface point whose ray passes it.
+        passing_views: number of other views whose rays confirm a free point.
+        free_range: range of the position of a free point along its ray [share of depth].
+    """
+
+    points_per_view: int = 5000
+    agreement_sigma: float = 3.0
+    agreeing_views: int = 2
+    through_share: float = 0.1
+    passing_views: int = 3
+    free_range: tuple[float, float] = (0.2, 0.97)
+
+
+CONSTANTS = ConfirmedConstants()
+
+
+@dataclass(frozen=True, eq=False)
+class ConfirmedSpace:
+    """Points that several depth images agree on.
+
+    Args:
+        surface: (S, 3) surface points [m, world].
+        depth: (S,) depth of each of them in the view that proposed it [m].
+        view: (S,) int64, index of that view.
+        pixel: (S, 2) int64, column and row of the point in that view.
+        free: (F, 3) points in free space [m, world].
+        proposed: number of surface points before confirmation.
+    """
+
+    surface: Array
+    depth: Array
+    view: NDArray[np.int64]
+    pixel: NDArray[np.int64]
+    free: Array
+    proposed: int
+
+    def select(self, chosen: NDArray[np.bool_]) -> ConfirmedSpace:
+        """Return the chosen (S,) surface points, with all free points."""
+        kept = (self.surface[chosen], self.depth[chosen], self.view[chosen], self.pixel[chosen])
+        return ConfirmedSpace(*kept, self.free, self.proposed)
+
+
+def find_confirmed(
+    views: Sequence[DepthView], *, floor: float, quad: float, agreeing_views: int = CONSTANTS.agreeing_views
+) -> ConfirmedSpace:
+    """Find confirmed space by comparing points of every view with all other views.
+
+    A pixel of a view proposes a surface point. It is confirmed if two other views measure the same depth there within
+    3 σ, with σ = ``floor`` + ``quad`` z². At most a tenth of the views that measure depth there may see through it.
+    A ray proposes a free point in front of its surface. It is confirmed if three other views see through it and none
+    measures a surface there. The pixels are evenly spaced and the result is deterministic.
+
+    Args:
+        views: depth (H, W) [m], 0 or NaN where invalid, camera, and T_world_camera (4, 4) of each view.
+        floor: constant part of the standard deviation σ of depth [m].
+        quad: part of σ that grows with z² [1/m].
+        agreeing_views: number of other views that confirm a surface point.
+
+    Raises:
+        InputError: the size of a depth image differs from its camera's.
+    """
+    surfaces, frees, depths, owners, pixels, counts = [], [], [], [], [], []
+    for number, (depth, camera, T_world_camera) in enumerate(views):
+        if depth.shape != (camera.height, camera.width):
+            raise InputError(f"is {depth.shape}.", field="depth", hint=f"give ({camera.height}, {camera.width})")
+        column, row, z = _spread_pixels(depth, number)
+        shares = _shares(len(z))
+        surfaces.append(_lifted(column, row, z, camera, T_world_camera))
+        frees.append(_lifted(column, row, z * shares, camera, T_world_camera))
+        depths.append(z)
+        owners.append(np.full(len(z), number))
+        pixels.append(np.stack([column, row], axis=1))
+        counts.append(len(z))
+    if not sum(counts):
+        return ConfirmedSpace(
+            np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 3)), 0
+        )
+    surface, free, z, owner = (np.concatenate(parts) for parts in (surfaces, frees, depths, owners))
+    pixel = np.concatenate(pixels)
+    agreeing, clear = _agreeing(surface, owner, views, floor, quad)
+    solid = clear & (agreeing >= agreeing_views)
+    empty = _passed(free, owner, views)
+    return ConfirmedSpace(surface[solid], z[solid], owner[solid], pixel[solid], free[empty], len(surface))
+
+
+def _spread_pixels(
+    depth: NDArray[np.float32], number: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return columns, rows and depths (P,) [m] of evenly spaced pixels with depth; views differ in their offset."""
+    row, column = np.nonzero(np.isfinite(depth) & (depth > 0))
+    count = min(len(row), CONSTANTS.points_per_view)
+    offset = (number * 0.618034) % 1.0  # golden ratio: neighbouring views sample other pixels
+    some = ((np.arange(count) + offset) * (len(row) / max(count, 1))).astype(np.int64)
+    return column[some], row[some], depth[row[some], column[some]].astype(np.float64)
+
+
+def _shares(count: int) -> Array:
+    low, high = CONSTANTS.free_range
+    return np.asarray(low + (high - low) * ((np.arange(count) * 0.618034) % 1.0), dtype=np.float64)
+
+
+def _lifted(column: NDArray[np.int64], row: NDArray[np.int64], z: Array, camera: Camera, T: Array) -> Array:
+    ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(z))], axis=1)
+    return transform_points(T, ray * z[:, None])
+
+
+def _agreeing(
+    points: Array, owner: NDArray[np.int64], views: Sequence[DepthView], floor: float, quad: float
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Return how many other views measure each point (P,), and whether hardly any sees through it (P,)."""
+    agreeing, passing, measuring = (np.zeros(len(points), np.int32) for _ in range(3))
+    for number, view in enumerate(views):
+        rows, measured, own = measured_depths(points, *view)
+        other = owner[rows] != number
+        rows, measured, own = rows[other], measured[other], own[other]
+        agreeing[rows[np.abs(measured - own) <= CONSTANTS.agreement_sigma * (floor + quad * own**2)]] += 1
+        passing[rows[measured - own > passing_distance(own)]] += 1
+        measuring[rows] += 1
+    return agreeing, passing <= CONSTANTS.through_share * measuring
+
+
+def _passed(points: Array, owner: NDArray[np.int64], views: Sequence[DepthView]) -> NDArray[np.bool_]:
+    passing, stopped = np.zeros(len(points), np.int32), np.zeros(len(points), np.bool_)
+    for number, view in enumerate(views):
+        rows, measured, own = measured_depths(points, *view)
+        distance = passing_distance(own)
+        stopped[rows[np.abs(measured - own) <= distance]] = True
+        passing[rows[(measured - own > distance) & (owner[rows] != number)]] += 1
+    return (passing >= CONSTANTS.passing_views) & ~stopped

@@ -1,0 +1,67 @@
+"""The one change that most likely makes a failed grasp search succeed."""
+
+from __future__ import annotations
+
+from splatbot.grasping.object_list import obstacle
+from splatbot.grasping.types import GraspResult
+from splatbot.segmentation import SegmentedMap
+
+_CHANGES = (
+    (
+        "farther apart than the hand opens",
+        "its faces are farther apart than the hand opens",
+        "take a hand that opens wider (`splatbot robot list`), or another target",
+    ),
+    (
+        "meet nothing on the other side",
+        "the map shows no opposite faces of it",
+        "map it again from more sides",
+    ),
+    (
+        "friction cone",
+        "its faces are not parallel enough for this friction",
+        "give the friction of your pads (--friction 0.8 for rubber)",
+    ),
+    (
+        "touch the surroundings",
+        "the hand touches the objects around it",
+        "move its neighbours away, or give a smaller --margin",
+    ),
+    (
+        "in the target on their way",
+        "the hand meets the target on its way",
+        "try the other direction: --approach top or --approach side",
+    ),
+    (
+        "no posture reaches",
+        "the arm does not reach it",
+        "correct the base in scene.yaml, or move the target nearer to the arm",
+    ),
+    (
+        "the arm is in the way",
+        "the arm collides on its way to it",
+        "correct the base in scene.yaml, or check --hand-only",
+    ),
+    ("blocked approach", "its approach is blocked", "give a shorter approach: --pregrasp 0.05"),
+)
+
+
+def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tuple[str, str]:
+    """Return the main reason of a search without grasps, and the change to try first.
+
+    Args:
+        result: the result without grasps.
+        scene: the segmented map.
+        stroke: widest opening of the hand [m].
+    """
+    number = result.target.number
+    if 0 <= number < len(scene.objects):
+        size = obstacle(scene.objects[number], stroke)
+        if size:
+            return size, "take a hand that opens wider (`splatbot robot list`), or another target"
+    ranked = sorted(result.rejected.items(), key=lambda pair: -pair[1])
+    for reason, count in ranked:
+        for words, why, change in _CHANGES:
+            if count and words in reason:
+                return why, change
+    return "no pair of opposite faces was found", "map it again from more sides, or take another hand"

@@ -1,0 +1,116 @@
+"""Labelled list of the supports and objects of a map, so that a target can be named."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from splatbot.geometry import inverse, transform_points
+from splatbot.grasping.language import color_name, shape_name
+from splatbot.protocols import Array
+from splatbot.segmentation import MapObject, SegmentedMap
+from splatbot.segmentation.plane import NEAR
+
+
+@dataclass(frozen=True)
+class ObjectListConstants:
+    """Constants of the list.
+
+    Args:
+        min_height: [m] height below which an object is a flat patch, which a hand cannot enclose.
+    """
+
+    min_height: float = 0.012
+
+
+CONSTANTS = ObjectListConstants()
+
+
+@dataclass(frozen=True, eq=False)
+class ListedObject:
+    """One object of a map.
+
+    Args:
+        number: index; ``object NUMBER`` names it as a target.
+        label: name of the scene file, or colour and shape; followed by a number if several have it.
+        size: (3,) long side, short side and height [m].
+        at_world, at_base: (3,) centre of the bounding box [m].
+        gaussians: number of Gaussians.
+        obstacle: reason why the hand cannot enclose it, or "".
+    """
+
+    number: int
+    label: str
+    size: Array = field(repr=False)
+    at_world: Array = field(repr=False)
+    at_base: Array = field(repr=False)
+    gaussians: int = 0
+    obstacle: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the values as JSON, each length with its unit in the name."""
+        return {
+            "number": self.number,
+            "label": self.label,
+            "target": f"object {self.number}",
+            "size_m": self.size.round(4).tolist(),
+            "center_world_m": self.at_world.round(4).tolist(),
+            "center_base_m": self.at_base.round(4).tolist(),
+            "gaussians": self.gaussians,
+            "graspable_by_size": not self.obstacle,
+            "obstacle": self.obstacle or None,
+        }
+
+
+def list_objects(scene: SegmentedMap, stroke: float) -> tuple[ListedObject, ...]:
+    """Return the objects of a map, those with most Gaussians first.
+
+    Args:
+        scene: the segmented map.
+        stroke: widest opening of the hand [m].
+    """
+    T_base_world = inverse(scene.T_world_base)
+    found = [
+        ListedObject(
+            item.number,
+            item.name or f"{color_name(item)} {shape_name(scene, item)}",
+            item.size,
+            item.center,
+            transform_points(T_base_world, item.center),
+            len(item.rows),
+            obstacle(item, stroke),
+        )
+        for item in scene.objects
+    ]
+    several = {label for label, count in Counter(o.label for o in found).items() if count > 1}
+    return tuple(replace(o, label=f"{o.label} {o.number}") if o.label in several else o for o in found)
+
+
+def list_planes(scene: SegmentedMap) -> list[dict[str, Any]]:
+    """Return the supports of a map: height above the base, area of their bounding rectangle and points, as JSON."""
+    planes = []
+    for number, support in enumerate(scene.supports):
+        on = scene.points[np.abs(support.height(scene.points)) < NEAR]
+        low, high = np.percentile(on[:, :2], [1, 99], axis=0) if len(on) else np.zeros((2, 2))
+        planes.append(
+            {
+                "label": "support" if number == 0 else f"support {number}",
+                "normal_base": support.normal.round(4).tolist(),
+                "height_base_m": round(float(support.offset), 4),
+                "size_m": (high - low).round(4).tolist(),
+                "gaussians": len(on),
+            }
+        )
+    return planes
+
+
+def obstacle(item: MapObject, stroke: float) -> str:
+    """Return the reason why a hand that opens ``stroke`` [m] cannot enclose an object, or ""."""
+    if item.size[2] < CONSTANTS.min_height:
+        return f"it is flat, {1e3 * item.size[2]:.0f} mm high"
+    if item.size[1] > stroke:
+        return f"its faces are {1e3 * item.size[1]:.0f} mm apart, and the hand opens {1e3 * stroke:.0f} mm"
+    return ""

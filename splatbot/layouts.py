@@ -1,0 +1,162 @@
+"""Kinds of recordings and maps, recognized by their names before any library is loaded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from splatbot.errors import FormatError, LogError
+
+LogKind = Literal["synthetic", "bag", "tum", "replica"]
+
+MAP_NAME = "map.ply"
+_LAYOUTS_HINT = (
+    "known layouts: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), "
+    "a .mcap or .bag file; "
+    "`synthetic:tabletop` needs no files"
+)
+_AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
+_AS_PLY = "open it in https://superspl.at/editor and export it as an uncompressed PLY"
+
+_PACKED = {
+    ".zip": ("a ZIP archive", "unzip"),
+    ".tar": ("a tar archive", "tar xf"),
+    ".tgz": ("a tar archive", "tar xf"),
+    ".gz": ("a gzip file", "tar xf (.tar.gz) or gunzip"),
+    ".bz2": ("a bzip2 file", "tar xf (.tar.bz2) or bunzip2"),
+    ".xz": ("an xz file", "tar xf (.tar.xz) or unxz"),
+    ".zst": ("a zstd file", "tar xf (.tar.zst) or unzstd"),
+    ".7z": ("a 7-Zip archive", "7z x"),
+    ".rar": ("a RAR archive", "unrar x"),
+}
+_FOREIGN_LOGS = {
+    ".db3": ("one file of a rosbag2 recording", "name the folder that holds it and metadata.yaml"),
+    ".mkv": (
+        "an Azure Kinect recording",
+        f"extract it with Open3D's AzureKinectMKVReader, then {_AS_TUM}",
+    ),
+    ".oni": ("an OpenNI recording", f"extract its frames with OpenNI2, then {_AS_TUM}"),
+    ".svo": ("a ZED recording", f"export it with ZED_SVO_Export of the ZED SDK, then {_AS_TUM}"),
+    ".svo2": ("a ZED recording", f"export it with ZED_SVO_Export of the ZED SDK, then {_AS_TUM}"),
+    ".klg": ("an ElasticFusion recording", f"extract its frames, then {_AS_TUM}"),
+    ".sens": ("a ScanNet recording", f"extract it with ScanNet's SensReader, then {_AS_TUM}"),
+    ".r3d": ("a Record3D recording", f"export it in Record3D as EXR and RGB, then {_AS_TUM}"),
+    ".rrd": ("a Rerun recording", f"export its images with the Rerun SDK, then {_AS_TUM}"),
+    ".mp4": ("a video without depth", "record colour and depth of an RGB-D camera"),
+    ".mov": ("a video without depth", "record colour and depth of an RGB-D camera"),
+    ".avi": ("a video without depth", "record colour and depth of an RGB-D camera"),
+    ".ply": ("a map or a point cloud", "give the recording; `splatbot info FILE` describes a map"),
+}
+_FOREIGN_MAPS = {
+    ".spz": ("a Niantic SPZ file", _AS_PLY),
+    ".splat": ("a .splat file", _AS_PLY),
+    ".ksplat": ("a .ksplat file", _AS_PLY),
+    ".sog": ("a SOG file", _AS_PLY),
+    ".pcd": ("a point cloud", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+    ".las": ("a point cloud", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+    ".e57": ("a point cloud", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+    ".obj": ("a mesh", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+    ".stl": ("a mesh", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+    ".glb": ("a mesh", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+    ".bt": ("an OctoMap", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+}
+
+
+def log_kind(uri: str | Path) -> LogKind:
+    """Return the kind of a recording by the names of its files.
+
+    Raises:
+        LogError: it does not exist, or is of no supported kind.
+    """
+    text = str(uri)
+    if text.startswith("synthetic:"):
+        return "synthetic"
+    bag = Path(text.partition("?")[0])
+    if bag.suffix in (".mcap", ".bag") or (bag.is_dir() and (bag / "metadata.yaml").exists()):
+        if not bag.exists():
+            raise LogError("does not exist.", file=bag, field="log", hint="check the path")
+        return "bag"
+    folder = Path(uri)
+    if not folder.exists():
+        raise LogError("does not exist.", file=folder, field="log", hint=f"check the path; {_LAYOUTS_HINT}")
+    if not folder.is_dir():
+        what, hint = _foreign(folder, _FOREIGN_LOGS) or ("a file of no known kind", f"check the path; {_LAYOUTS_HINT}")
+        raise LogError(f"is {what}.", file=folder, field="log", hint=hint)
+    if any((folder / name).exists() for name in ("rgb.txt", "depth.txt")):
+        return "tum"
+    if (folder / "results").is_dir() and (folder / "traj.txt").exists():
+        return "replica"
+    what, hint = _foreign_folder(folder)
+    raise LogError(f"{what}.", file=folder, field="log", hint=hint)
+
+
+def map_file(path: str | Path) -> Path:
+    """Return the map file that a path names: itself, or map.ply in the folder of a run.
+
+    Raises:
+        FormatError: it does not exist, or is of a format that is not supported.
+    """
+    place = Path(path)
+    if place.is_dir():
+        if (place / MAP_NAME).is_file():
+            return place / MAP_NAME
+        raise FormatError(f"has no {MAP_NAME}.", file=place, field="map", hint=_map_hint(place))
+    if not place.exists():
+        hint = "check the path; give a map file, or a folder that `splatbot map` wrote"
+        raise FormatError("does not exist.", file=place, field="map", hint=hint)
+    found = _foreign(place, _FOREIGN_MAPS)
+    if found is not None:
+        raise FormatError(f"is {found[0]}.", file=place, field="map", hint=found[1])
+    return place
+
+
+def is_map(path: str | Path) -> bool:
+    """Return whether a path names a map or the folder of a run rather than a recording."""
+    place = Path(path)
+    if place.is_dir():
+        return (place / MAP_NAME).is_file()
+    return place.is_file() and (place.suffix.lower() == ".ply" or place.suffix.lower() in _FOREIGN_MAPS)
+
+
+def _foreign(file: Path, kinds: dict[str, tuple[str, str]]) -> tuple[str, str] | None:
+    """Return the kind of a file that is not supported, and a fix; or None."""
+    suffix = file.suffix.lower()
+    if suffix in _PACKED:
+        what, command = _PACKED[suffix]
+        return what, f"unpack it ({command}) and name the folder or file in it"
+    return kinds.get(suffix)
+
+
+def _foreign_folder(folder: Path) -> tuple[str, str]:
+    """Return the kind of a folder that is no supported log, and a fix."""
+    if (folder / MAP_NAME).is_file():
+        return "is the folder of a run", "give the recording; `splatbot info RUN` describes the map"
+    if any((folder / name).exists() for name in ("transforms.json", "transforms_train.json")):
+        return "is a Nerfstudio or NeRF scene, which has no depth", f"add depth: {_AS_TUM}"
+    if any((folder / name).exists() for name in ("sparse", "database.db", "cameras.bin", "cameras.txt")):
+        return "is a COLMAP scene, which has no depth", f"add depth: {_AS_TUM}"
+    if any(folder.glob("*.color.*")) or any(folder.glob("frame-*.depth.*")):
+        return "is a 7-Scenes sequence", f"rename its images: {_AS_TUM}"
+    if (folder / "color").is_dir() and (folder / "depth").is_dir():
+        return "is an Open3D or ScanNet export", f"list its images: {_AS_TUM}"
+    if any(folder.glob("*.db3")) or any(folder.glob("*.mcap")):
+        return "holds a rosbag2 without metadata.yaml", "run `ros2 bag reindex`, or name the .mcap file itself"
+    inside = sorted(path.name for path in folder.iterdir() if log_layout(path)) if folder.is_dir() else []
+    if inside:
+        return "holds no log of a known layout itself", f"name one of the logs in it: {', '.join(inside[:4])}"
+    return "holds no log of a known layout", _LAYOUTS_HINT
+
+
+def log_layout(path: Path) -> bool:
+    """Return whether a path has the names of a log in one of the supported layouts."""
+    if path.suffix in (".mcap", ".bag") or (path / "metadata.yaml").exists() or (path / "rgb.txt").exists():
+        return True
+    return (path / "results").is_dir() and (path / "traj.txt").exists()
+
+
+def _map_hint(folder: Path) -> str:
+    if log_layout(folder):
+        return f"it is a recording; map it first: splatbot map {folder}"
+    if (folder / "state").is_dir():
+        return f"its run was cut off before it wrote one; continue it: splatbot map --resume {folder}"
+    return "give a map file, or a folder that `splatbot map` wrote"

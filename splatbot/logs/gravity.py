@@ -1,0 +1,105 @@
+"""Up direction from the accelerometer of a log (`accelerometer.txt` of TUM recordings: stamp ax ay az)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.errors import LogError
+from splatbot.trajectory import Trajectory
+
+NAME = "accelerometer.txt"
+
+
+@dataclass(frozen=True)
+class GravityConstants:
+    """Constants of the measured up direction.
+
+    Args:
+        window: [s] time around a pose in which the accelerometer is averaged.
+        gravity: [m/s²] range of the mean acceleration of a camera that hardly accelerates.
+        min_poses: least number of poses with such a mean.
+        max_spread: [deg] largest spread of the directions in the world for the best axes.
+        min_ratio: least spread of the second-best axes relative to the best; below it the axes are ambiguous.
+    """
+
+    window: float = 0.05
+    gravity: tuple[float, float] = (9.0, 10.6)
+    min_poses: int = 10
+    max_spread: float = 6.0
+    min_ratio: float = 2.0
+
+
+CONSTANTS = GravityConstants()
+
+
+def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] | None:
+    """Return the upward unit vector in the world of a trajectory, or None if the log does not determine it.
+
+    The axes of the accelerometer on the camera are not recorded. The function chooses the rotation by right angles for
+    which gravity has the same direction in the world at all poses. If the motion does not distinguish the 24 rotations,
+    the answer is None.
+
+    Args:
+        uri: folder of the log.
+        trajectory: poses T_world_camera of the log's frames.
+
+    Raises:
+        LogError: the file is damaged.
+    """
+    path = Path(uri) / NAME
+    if not path.is_file() or len(trajectory) < CONSTANTS.min_poses:
+        return None
+    try:
+        rows = np.loadtxt(path, comments="#", ndmin=2)
+    except ValueError as error:
+        raise LogError(f"is no list of numbers ({error}).", file=path, hint="write: stamp ax ay az") from error
+    if rows.shape[1] < 4:
+        raise LogError(f"has {rows.shape[1]} columns.", file=path, hint="write: stamp ax ay az")
+    steady = [(T[:3, :3], mean) for stamp, T in _poses(trajectory) if (mean := _mean_around(rows, stamp)) is not None]
+    if len(steady) < CONSTANTS.min_poses:
+        return None
+    R = np.stack([rotation for rotation, _ in steady])
+    a = np.stack([mean / np.linalg.norm(mean) for _, mean in steady])
+    found = sorted((_spread(R @ axes, a) for axes in _right_angles()), key=lambda pair: pair[0])
+    best, second = found[0], found[1]
+    if best[0] > CONSTANTS.max_spread or second[0] < CONSTANTS.min_ratio * best[0]:
+        return None
+    x, y, z = best[1].tolist()
+    return (x, y, z)
+
+
+def _poses(trajectory: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:
+    return list(zip(trajectory.stamps.tolist(), trajectory.T_world_camera, strict=True))
+
+
+def _mean_around(rows: NDArray[np.float64], stamp: float) -> NDArray[np.float64] | None:
+    near = np.abs(rows[:, 0] - stamp) < CONSTANTS.window
+    if not near.any():
+        return None
+    mean: NDArray[np.float64] = rows[near, 1:4].mean(axis=0)
+    low, high = CONSTANTS.gravity
+    return mean if low < np.linalg.norm(mean) < high else None
+
+
+def _spread(R: NDArray[np.float64], a: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Return the median angle [deg] between the directions in the world and their mean, and the mean (3,)."""
+    directions = np.einsum("nij,nj->ni", R, a)
+    mean = np.median(directions, axis=0)
+    mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return float(np.degrees(np.median(np.arccos(np.clip(directions @ mean, -1.0, 1.0))))), mean
+
+
+def _right_angles() -> list[NDArray[np.float64]]:
+    """Return the 24 rotations (3, 3) by right angles."""
+    found = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        axes = np.zeros((3, 3))
+        axes[range(3), order] = signs
+        if np.linalg.det(axes) > 0:
+            found.append(axes)
+    return found

@@ -1,0 +1,107 @@
+"""Planning with the margin that the audit of a map requires in the region of the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatbot.collision import RobotSpheres
+from splatbot.errors import InputError
+from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult, time_path
+from splatbot.protocols import Array
+from splatbot.results.margin import CONSTANTS as MARGIN
+from splatbot.results.margin import AuditedError
+
+
+@dataclass(frozen=True)
+class RegionPlanConstants:
+    """Constants of planning with the margin of a region.
+
+    Args:
+        rounds: largest number of plans; each has the margin that the path before required.
+        samples: number of configurations of a trajectory that define its region.
+    """
+
+    rounds: int = 5
+    samples: int = 200
+
+
+CONSTANTS = RegionPlanConstants()
+
+
+@dataclass(frozen=True, eq=False)
+class RegionPlan:
+    """A plan and the audit of the region of its motion.
+
+    Args:
+        planner: the planner with the margin of the plan.
+        result: of the last plan.
+        trajectory: the timed path; None without a path.
+        points: number of confirmed surface points that the margin is from. None if it was given, not audited.
+        error: their error [m] at the confidence; the margin is not smaller. None with ``points``.
+    """
+
+    planner: GaussianRRTStar
+    result: PlanResult
+    trajectory: JointTrajectory | None
+    points: int | None
+    error: float | None
+
+
+def plan_in_region(
+    make_planner: Callable[[float], GaussianRRTStar],
+    plan: Callable[[GaussianRRTStar], PlanResult],
+    ends: Array,
+    error: AuditedError,
+    *,
+    confidence: float,
+    speed: float = 1.0,
+) -> RegionPlan:
+    """Plan with the audited error of the region of the motion as the margin.
+
+    1. The first margin is the error within 20 cm of the arm at ``ends``. If fewer than 1 / (1 - confidence) points are
+       there, the error of all points counts.
+    2. A plan with this margin gives a trajectory, and its region the error that it requires.
+    3. If that is larger than the margin, plan again with it.
+
+    The margins increase, so that the last margin covers the region of the last trajectory.
+
+    Args:
+        make_planner: makes the planner with a margin [m].
+        plan: plans with it.
+        ends: (E, J) known configurations of the motion, as start and goal [rad or m].
+        error: audited error of the map.
+        confidence: share of the confirmed surface points that the margin covers, 0..1.
+        speed: fraction of the limits of velocity and acceleration, 0..1.
+
+    Raises:
+        InputError: the margins still increase after five plans, or the confidence is not in 0..1.
+    """
+    if not 0.0 <= confidence <= 1.0:
+        raise InputError(f"is {confidence}.", field="confidence", hint="give a value in 0..1, as 0.999")
+    margin = _around(make_planner(0.0).arm, ends, error, confidence).quantile(confidence)
+    for _ in range(CONSTANTS.rounds):
+        planner = make_planner(margin)
+        result = plan(planner)
+        if result.path is None:
+            return RegionPlan(planner, result, None, 0, margin)
+        trajectory = time_path(result.path, planner.arm, planner.field, velocity_scale=speed, acceleration_scale=speed)
+        moments = np.linspace(0.0, trajectory.duration, CONSTANTS.samples)
+        region = _around(planner.arm, trajectory.at(moments).position, error, confidence)
+        required = region.quantile(confidence)
+        if required <= margin:
+            return RegionPlan(planner, result, trajectory, len(region), required)
+        margin = required
+    raise InputError(
+        f"is at least {1e3 * margin:.1f} mm, and each path through it requires more.",
+        field="margin",
+        hint="give the margin in metres, or a lower confidence",
+    )
+
+
+def _around(arm: RobotSpheres, q: Array, error: AuditedError, confidence: float) -> AuditedError:
+    """Return the points near the arm; if too few are there for the confidence, return all points."""
+    near = error.near(arm.centers(np.atleast_2d(q)).reshape(-1, 3), MARGIN.region)
+    return near if len(near) * (1.0 - confidence) >= 1.0 else error

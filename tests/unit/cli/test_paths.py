@@ -1,0 +1,184 @@
+"""Wrong paths: refused in words before the libraries load and before anything is written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from splatbot.cli import main
+from splatbot.cli.paths import system_error
+from splatbot.errors import FormatError, LogError
+from splatbot.layouts import is_map, log_kind, map_file
+from tests.unit.cli.conftest import RunCommand, assert_refused
+
+HEAVY = ("torch", "open3d", "cv2", "matplotlib", "mujoco", "fastapi", "numpy", "rosbags")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["map", "{no}", "--out", "{out}"],
+        ["map", "{no}.mcap", "--out", "{out}"],
+        ["map", "{zip}", "--out", "{out}"],
+        ["map", "{log}", "--out", "{file}"],
+        ["map", "{log}", "--camera", "{no}.json", "--out", "{out}"],
+        ["map", "--resume", "{no}", "--out", "{out}"],
+        ["map", "{log}", "--localise", "{no}", "--out", "{out}"],
+        ["map", "{log}", "--config", "{no}", "--out", "{out}"],
+        ["eval", "{no}"],
+        ["render", "{no}", "--out", "{out}"],
+        ["render", "{log}", "--out", "{out}"],
+        ["info", "{no}"],
+        ["simulate", "tabletop", "--out", "{file}/in/it"],
+        ["record", "{no}", "--out", "{out}"],
+        ["record", "{log}", "--out", "{file}"],
+        ["serve", "--map", "{no}"],
+        ["serve", "--log", "{no}"],
+        ["view", "{no}"],
+        ["plan", "--map", "{no}", "--start", "home", "--goal", "home", "--out", "{out}"],
+        ["grasp", "--map", "{no}", "--target", "box", "--out", "{out}"],
+        ["twin", "--map", "{no}", "--json", "{out}"],
+        ["sim2real", "{no}", "--map", "{no}", "--out", "{out}"],
+    ],
+)
+def test_a_wrong_path_is_refused_before_libraries_load_and_folders_appear(
+    tmp_path: Path, make_names: dict[str, str], words: list[str]
+) -> None:
+    given = [word.format(**make_names) for word in words]
+    program = (
+        "import sys\nfrom splatbot.cli import main\n"
+        f"code = main({given!r})\n"
+        f"print('HEAVY', code, [m for m in {HEAVY!r} if m in sys.modules])"
+    )
+    before = sorted(tmp_path.rglob("*"))
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert answer.stdout.splitlines()[-1] == "HEAVY 2 []"
+    assert answer.stderr.startswith("error: ")
+    assert " Fix: " in answer.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.fixture
+def make_names(tmp_path: Path) -> dict[str, str]:
+    """Paths that are wrong in one way each, next to the names of a log."""
+    log = tmp_path / "log"
+    log.mkdir()
+    (log / "rgb.txt").touch()
+    for name in ("recording.zip", "file"):
+        (tmp_path / name).touch()
+    names = {"no": "missing", "log": "log", "zip": "recording.zip", "file": "file", "out": "out"}
+    return {key: str(tmp_path / name) for key, name in names.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "what", "fix"),
+    [
+        ("a.zip", "ZIP archive", "unzip"),
+        ("a.tar.gz", "gzip file", "tar xf"),
+        ("a.tgz", "tar archive", "tar xf"),
+        ("a.7z", "7-Zip", "7z x"),
+        ("a.mkv", "Azure Kinect", "AzureKinectMKVReader"),
+        ("a.svo", "ZED", "ZED_SVO_Export"),
+        ("a.klg", "ElasticFusion", "16-bit PNG"),
+        ("a.sens", "ScanNet", "SensReader"),
+        ("a.oni", "OpenNI", "OpenNI2"),
+        ("a.db3", "rosbag2", "metadata.yaml"),
+        ("a.mp4", "without depth", "RGB-D"),
+        ("a.ply", "map or a point cloud", "splatbot info"),
+        ("a.xyz", "no known kind", "known layouts"),
+    ],
+)
+def test_a_file_that_is_no_log_is_named_with_the_way_to_convert_it(
+    tmp_path: Path, name: str, what: str, fix: str
+) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(LogError, match=what) as refused:
+        log_kind(tmp_path / name)
+    assert fix in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("inside", "what"),
+    [
+        ("transforms.json", "Nerfstudio"),
+        ("sparse/0/", "COLMAP"),
+        ("frame-000000.color.png", "7-Scenes"),
+        ("a_0.mcap", "rosbag2 without metadata"),
+        ("map.ply", "folder of a run"),
+        ("desk/rgb.txt", "desk"),
+    ],
+)
+def test_a_folder_that_is_no_log_is_named(tmp_path: Path, inside: str, what: str) -> None:
+    path = tmp_path / inside
+    if inside.endswith("/"):
+        path.mkdir(parents=True)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    with pytest.raises(LogError) as refused:
+        log_kind(tmp_path)
+    assert what in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.ksplat", "a.sog"])
+def test_a_map_of_another_format_is_named_with_the_way_to_convert_it(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    assert is_map(tmp_path / name)
+    with pytest.raises(FormatError, match="superspl"):
+        map_file(tmp_path / name)
+
+
+def test_a_recording_given_as_a_map_says_how_to_map_it(tmp_path: Path) -> None:
+    (tmp_path / "rgb.txt").touch()
+    with pytest.raises(FormatError, match="splatbot map"):
+        map_file(tmp_path)
+
+
+def test_map_refuses_a_finished_run_without_overwrite(run: RunCommand, run_folder: Path, log_folder: Path) -> None:
+    before = {path: path.read_bytes() for path in run_folder.rglob("*") if path.is_file()}
+    answer = run("map", log_folder, "--out", run_folder, "--quiet")
+    assert_refused(answer, "holds a run already")
+    assert "--overwrite" in answer.err
+    assert {path: path.read_bytes() for path in run_folder.rglob("*") if path.is_file()} == before
+    assert run("map", log_folder, "--out", run_folder, "--quiet", "--overwrite").code == 0
+
+
+def test_resume_before_the_first_save_says_what_happened(run: RunCommand, tmp_path: Path) -> None:
+    (tmp_path / "killed").mkdir()
+    answer = run("map", "--resume", tmp_path / "killed")
+    assert_refused(answer, "ended before its first save")
+    assert "splatbot map LOG" in answer.err
+
+
+def test_info_opens_a_recording_in_one_file(run: RunCommand, log_folder: Path, tmp_path: Path) -> None:
+    assert run("record", log_folder, "--out", tmp_path / "a.mcap").code == 0
+    answer = run("info", tmp_path / "a.mcap")
+    assert answer.code == 0, answer.err
+    assert "frames" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(28, "no space left"), (30, "read-only"), (13, "permission denied"), (116, "stale")]
+)
+def test_an_error_of_the_disk_is_a_sentence_and_exit_1(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, code: int, words: str
+) -> None:
+    import os
+
+    def broken() -> None:
+        raise OSError(code, os.strerror(code), "/data/map.ply")
+
+    monkeypatch.setattr("splatbot.cli.checks.all_checks", broken)
+    assert main(["doctor"]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("error: /data/map.ply: ")
+    assert words in told
+    assert "Fix: " in told
+
+
+def test_an_error_that_is_none_of_the_disk_is_a_bug() -> None:
+    assert system_error(OSError(11, "busy")) is None
+    assert system_error(ConnectionResetError(104, "reset")) is None

@@ -1,0 +1,66 @@
+"""The list of objects, names that a flat patch does not get, and the first change after a failed search."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.grasping.advice import first_change
+from splatbot.grasping.affordance import NameHint, Target
+from splatbot.grasping.language import LanguageAffordance
+from splatbot.grasping.object_list import list_objects, list_planes, obstacle
+from splatbot.grasping.types import GraspResult
+from tests.unit.grasping.objects import BOX, OBJECTS, scene, target_of
+
+
+def test_each_object_of_the_list_can_be_named_as_a_target() -> None:
+    found = list_objects(scene(), 0.08)
+    assert len({item.label for item in found}) == len(found) == len(scene().objects)
+    for item in found:
+        target = LanguageAffordance().locate(NameHint(f"object {item.number}"), scene())
+        assert target.number == item.number
+        assert item.to_dict()["target"] == f"object {item.number}"
+    red = target_of(scene(), BOX, "box").number
+    assert found[red].label.startswith("red box")
+    np.testing.assert_allclose(sorted(found[red].size), sorted(BOX.size), atol=0.01)
+
+
+def test_planes_name_height_and_size() -> None:
+    (plane, *_) = list_planes(scene())
+    assert plane["label"] == "support"
+    assert abs(plane["height_base_m"]) < 0.01
+    assert min(plane["size_m"]) > 0.1
+
+
+def test_what_is_wider_than_the_hand_or_flat_is_not_offered() -> None:
+    item = scene().objects[0]
+    cube = replace(item, size=np.array([0.086, 0.085, 0.085]))
+    assert "85 mm apart, and the hand opens 80 mm" in obstacle(cube, 0.08)
+    assert obstacle(cube, 0.14) == ""
+    assert "flat" in obstacle(replace(item, size=np.array([0.2, 0.05, 0.004])), 0.08)
+
+
+def test_flat_patches_are_no_mugs() -> None:
+    patches = tuple(replace(o, size=np.array([0.09, 0.08, 0.005]), name="") for o in scene().objects)
+    flat = replace(scene(), objects=patches, names=())
+    with pytest.raises(Exception, match="fits none"):
+        LanguageAffordance().locate(NameHint("mug"), flat)
+
+
+@pytest.mark.parametrize(
+    ("rejected", "why"),
+    [
+        ({"no posture reaches": 5, "hands touch the surroundings of the target": 2}, "does not reach"),
+        ({"hands touch the surroundings of the target": 9}, "around it"),
+        ({"closing directions meet nothing on the other side": 9}, "opposite faces"),
+    ],
+)
+def test_a_failed_search_names_one_change(rejected: dict[str, int], why: str) -> None:
+    small = target_of(scene(), OBJECTS["box"], "box").number
+    target = Target(scene().objects[small].rows, None, "box", "rules", 1.0, (), small)
+    result = GraspResult(target, (), rejected, None, 9, {}, 1)
+    reason, change = first_change(result, scene(), 0.08)
+    assert why in reason
+    assert change
