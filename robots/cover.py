@@ -17,7 +17,7 @@ from splatbot.robots.shapes import Capsule, Shape, depth_of
 
 
 @dataclass(frozen=True)
-class FitConstants:
+class SphereFitConstants:
     """Constants of the fit of spheres.
 
     Args:
@@ -47,8 +47,8 @@ class FitConstants:
     seed: int = 0
 
 
-QUICK = FitConstants()  # of robots that users add: seconds a link
-FINE = FitConstants(points=1200, candidates=6000, rounds=5, seconds=20.0, gap=0.04)  # of shipped bodies: minutes
+QUICK = SphereFitConstants()  # of robots that users add: seconds a link
+FINE = SphereFitConstants(points=1200, candidates=6000, rounds=5, seconds=20.0, gap=0.04)  # of shipped bodies: minutes
 
 
 def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
@@ -92,7 +92,7 @@ def _cover_capsule(shape: Capsule, slack: float) -> tuple[Array, Array]:
     return middle + at[:, None] * shape.along(), np.full(count, radius)
 
 
-def cover_solids(shapes: Sequence[Shape], slack: float, fit: FitConstants = QUICK) -> tuple[Array, Array]:
+def cover_solids(shapes: Sequence[Shape], slack: float, fit: SphereFitConstants = QUICK) -> tuple[Array, Array]:
     """Cover boxes and meshes of one link by the fewest spheres found, and prove that they contain every triangle.
 
     Candidates are spheres inscribed in a closed shape and enlarged by ``slack``, and spheres of radius ``slack`` on the
@@ -126,7 +126,7 @@ def cover_solids(shapes: Sequence[Shape], slack: float, fit: FitConstants = QUIC
 
 
 def _candidates(
-    shapes: Sequence[Shape], triangles: Array, slack: float, fit: FitConstants, rng: np.random.Generator
+    shapes: Sequence[Shape], triangles: Array, slack: float, fit: SphereFitConstants, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return spheres (C, 3), (C,) that extend at most the slack beyond the shapes."""
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
@@ -152,18 +152,18 @@ def _sampled(triangles: Array, count: int, rng: np.random.Generator) -> tuple[Ar
     return a + u * (b - a) + v * (c - a), normals[rows] / area[rows, None]
 
 
-def _corners(shapes: Sequence[Shape], fit: FitConstants) -> list[Array]:
+def _corners(shapes: Sequence[Shape], fit: SphereFitConstants) -> list[Array]:
     """Return the corners of shapes of few triangles; they are the hardest points to contain."""
     meshes = [shape.triangles() for shape in shapes]
     return [np.unique(t.reshape(-1, 3), axis=0) for t in meshes if len(t) <= fit.points // 2]
 
 
-def _contains(centers: Array, radii: Array, points: Array, fit: FitConstants) -> NDArray[np.bool_]:
+def _contains(centers: Array, radii: Array, points: Array, fit: SphereFitConstants) -> NDArray[np.bool_]:
     """Return which spheres contain which points with a margin, (C, P)."""
     return np.stack([np.linalg.norm(points - c, axis=1) <= r - fit.size for c, r in zip(centers, radii, strict=True)])
 
 
-def _fewest(contains: NDArray[np.bool_], fit: FitConstants) -> NDArray[np.int64]:
+def _fewest(contains: NDArray[np.bool_], fit: SphereFitConstants) -> NDArray[np.int64]:
     """Select few rows of (C, P) that contain every column."""
     greedy = _greedy(contains)
     _, columns = np.unique(np.packbits(contains, axis=0), axis=1, return_index=True)
@@ -197,7 +197,7 @@ def _greedy(contains: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array(chosen, dtype=np.int64)
 
 
-def _spread(points: Array, lacking: Array, fit: FitConstants) -> Array:
+def _spread(points: Array, lacking: Array, fit: SphereFitConstants) -> Array:
     """Return the points that lack most, apart from each other."""
     found = np.zeros((0, 3))
     for point in points[np.argsort(-lacking)][: 40 * fit.added]:
@@ -207,7 +207,7 @@ def _spread(points: Array, lacking: Array, fit: FitConstants) -> Array:
 
 
 def _completed(
-    triangles: Array, centers: Array, radii: Array, inner: float, growth: float, fit: FitConstants
+    triangles: Array, centers: Array, radii: Array, inner: float, growth: float, fit: SphereFitConstants
 ) -> tuple[Array, Array]:
     """Cover the pieces that are left: by spheres of radius ``inner`` on those that lack more than ``growth``.
 

@@ -93,8 +93,7 @@ class Slam:
         clock = StageClock()
         prepared = clock.time("prepare", self._prepare, frame)
         self._apply_loop_closure()
-        estimate = clock.time("tracking", self._track, prepared, hold_out)
-        prepared = estimate.prepared or prepared
+        prepared, estimate = clock.time("tracking", self._track, prepared, hold_out)
         observation = self._observation(prepared, estimate, hold_out)
         keyframe = self._mapper.should_insert(observation)
         with self._location_restored_on_error():
@@ -233,14 +232,16 @@ class Slam:
         if self._mapper.has_loop:
             self.close_loops()
 
-    def _track(self, prepared: PreparedFrame, hold_out: bool) -> PoseEstimate:
+    def _track(self, prepared: PreparedFrame, hold_out: bool) -> tuple[PreparedFrame, PoseEstimate]:
+        """Return the pose of a frame and the images that it belongs to, which tracking may have rectified."""
         keyframes = self._mapper.keyframes
         if keyframes:
             self._tracker.variance_scale = self._mapper.inconsistency
-            return self._tracker.track(prepared, keyframes)
+            estimate = self._tracker.track(prepared, keyframes)
+            return estimate.prepared or prepared, estimate
         if hold_out:
-            return PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
-        return self._tracker.start(prepared)
+            return prepared, PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
+        return prepared, self._tracker.start(prepared)
 
     def _observation(self, prepared: PreparedFrame, estimate: PoseEstimate, hold_out: bool) -> Observation:
         """Collect a tracked frame for the mapper, and note whether the robot moves."""

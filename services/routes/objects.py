@@ -36,7 +36,9 @@ _ANSWER = {
 }
 
 
-def _robot(robot: Annotated[str, Query(description="robot whose hand must enclose an object")] = "panda") -> str:
+def _robot(
+    robot: Annotated[str, Query(description="robot whose hand must enclose an object", examples=["panda"])] = "panda",
+) -> str:
     return robot
 
 

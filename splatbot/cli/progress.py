@@ -161,6 +161,7 @@ def _live() -> Iterator[Callable[[Progress], None]]:
                 rate.add(progress)
             total, done = (progress.total, progress.done) if mapping else (progress.steps or None, progress.step)
             if bars.tasks[task].description != progress.phase:
+                bars.refresh()  # the last state of the phase before, which may be younger than the last redraw
                 bars.reset(task)  # the time left is that of this phase
                 bars.tasks[task].total = total  # reset and update take None as "as before"
             verdict = progress.result.verdict if progress.result and mapping else ""

@@ -216,8 +216,14 @@ class RobotSpheres:
 
     @cached_property
     def reach(self) -> Array:
-        """Largest motion (S, J) of each sphere's centre per unit of each joint [m per rad or m]."""
-        return np.asarray(self.native.reach(), dtype=np.float64)
+        """Largest motions (K, J) of spheres per unit of each joint [m per rad or m].
+
+        A row belongs to one sphere. Spheres that another one exceeds in every joint have none, so that
+        ``(abs(dq) @ reach.T).max()`` bounds the motion of every sphere at the cost of few.
+        """
+        rows = np.unique(np.asarray(self.native.reach(), dtype=np.float64), axis=0)
+        exceeded = [(np.delete(rows, k, axis=0) >= row).all(axis=1).any() for k, row in enumerate(rows)]
+        return np.ascontiguousarray(rows[~np.array(exceeded)])
 
     @cached_property
     def without_pairs(self) -> RobotSpheres:

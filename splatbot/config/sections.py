@@ -277,8 +277,6 @@ class LoopsConfig(_Section):
 class BundleConfig(_Section):
     """Bundle adjustment: joint poses of the keyframes that see the same place. It needs ``loops.enabled``."""
 
-    PUBLIC: ClassVar[frozenset[str]] = frozenset({"enabled"})
-
     enabled: bool = Field(default=False, description="adjust the poses of keyframes to each other")
     window: int = Field(
         default=8, ge=2, description="latest keyframes that move without a revisited place: accuracy for time"

@@ -261,9 +261,9 @@ class Search:
     def _reached(
         self, scored: _Scored, reach: ReachabilityCheck | None, avoid_moving: ReachabilityCheck | None
     ) -> tuple[Grasp, ...]:
-        """Return the grasps that the arm reaches, best first.
+        """Return the grasps that the arm reaches: those that avoid observed motion first, each group best first.
 
-        Grasps that avoid the regions where motion was observed are checked first, with these regions as obstacles.
+        Grasps that avoid the regions where motion was observed are also checked first, with these regions as obstacles.
         """
         left = [self._grasp(scored, k) for k in range(len(scored.hands))]
         found: list[Grasp] = []
@@ -280,7 +280,7 @@ class Search:
         if blocked:
             self.log.best = blocked[0][0]
         found += [grasp for grasp, _ in checked if not grasp.rejected]
-        return tuple(sorted(found, key=lambda g: -g.total))
+        return tuple(sorted(found, key=lambda g: (not g.avoids_moving, -g.total)))
 
     def _checked(
         self, grasps: Sequence[Grasp], reach: ReachabilityCheck | None, wanted: int

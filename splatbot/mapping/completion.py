@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class CompletionConstants:
+class DepthCompletionConstants:
     """Constants of completion.
 
     Args:
@@ -42,7 +42,7 @@ class CompletionConstants:
     neighbours: int = 16
 
 
-CONSTANTS = CompletionConstants()
+CONSTANTS = DepthCompletionConstants()
 
 
 def missing_gaussians(

@@ -124,7 +124,7 @@ class CubicPieces:
         deviates by at most ``f²/8 h² max |q''|``. Adjacent pieces on the same line become one chord without deviation.
 
         Args:
-            reach: (S, J), see :attr:`splatbot.collision.RobotSpheres.reach`.
+            reach: (K, J), see :attr:`splatbot.collision.RobotSpheres.reach`.
         """
         h = np.diff(self.time)[:, None]
         bend = h**2 * np.maximum(np.abs(self.acceleration[:-1]), np.abs(self.acceleration[1:]))

@@ -258,9 +258,9 @@ def min_clearance(arm: RobotSpheres, field: GaussianCollisionField, control: Arr
     The clearance on an interval is at least that at its midpoint less the largest motion of a sphere from there. The
     search bisects the intervals whose bound is the smallest, until the bound is tight to 2 % and 0.1 mm.
     """
-    from_knot = np.abs(np.diff(control, axis=0)) @ arm.reach.T  # (M - 1, S) bound of a sphere's motion between knots
-    largest = np.maximum(np.maximum(from_knot[:-2], from_knot[1:-1]), from_knot[2:])  # (M - 3, S) by span
-    path_length = np.concatenate([[0.0], np.cumsum(largest.max(axis=1))])  # of the fastest sphere, up to each knot
+    from_knot = (np.abs(np.diff(control, axis=0)) @ arm.reach.T).max(axis=1)  # (M - 1,) bound on motion between knots
+    largest = np.maximum(np.maximum(from_knot[:-2], from_knot[1:-1]), from_knot[2:])  # (M - 3,) by span
+    path_length = np.concatenate([[0.0], np.cumsum(largest)])  # of the fastest sphere, up to each knot
     spans = len(control) - 3
     middle, half = (
         np.arange(0, spans, CONSTANTS.max_interval) + CONSTANTS.max_interval / 2,

@@ -99,7 +99,7 @@ def test_a_finger_that_is_a_box_is_flat_to_its_tip() -> None:
     robot, T = panda(), np.eye(4)
     T[:3, 3] = [0.0, 0.006, 0.027]
     assert robot.gripper is not None
-    gripper = GripperGeometry(robot.gripper.T_link_finger, 0.04, (Box(0, T, (0.02, 0.012, 0.054)),))
+    gripper = GripperGeometry(robot.gripper.T_link_finger, 0.04, (Box(0, T, (0.02, 0.012, 0.054)),), hand=None)
     hand = replace(robot, gripper=gripper).hand
     assert hand is not None
     assert hand.pad == hand.tip

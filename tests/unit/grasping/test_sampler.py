@@ -144,7 +144,8 @@ def test_grasps_that_avoid_moving_regions_come_first_and_a_note_reports_the_othe
         )
         clearance = np.linalg.norm(arm.centers(between)[:, :, None] - moving[:, :3], axis=-1) - moving[:, 3]
         assert (clearance - arm.spheres.radii[:, None]).min() > 0.0 or not g.avoids_moving
-    assert result.grasps[0].avoids_moving
+    order = [(not g.avoids_moving, -g.total) for g in result.grasps]
+    assert order == sorted(order)
     assert not any("clear" in g.terms for g in grasped("box").grasps)
     alone = GraspSampler(scene(), panda(), moving=moving, hand_only=True).sample(target).grasps
     assert all(g.avoids_moving == bool(g.terms["clear"]) for g in alone)
@@ -237,7 +238,8 @@ def test_a_low_ring_is_pinched_at_its_wall_by_slim_fingers_above_the_table() -> 
     target = Target(ring.rows, None, "tape", "test", 1.0, (), 0)
     thick = GraspSampler(low, panda()).sample(target, GraspOptions(friction=0.7))
     slim = GraspSampler(low, panda_2f85()).sample(target, GraspOptions(friction=0.7))
-    assert not thick  # 25 mm
+    walls = [g for g in thick.grasps if np.ptp(g.contacts, axis=0).max() < OUTER - INNER]
+    assert not walls  # the fingers are 26 mm thick; around the whole ring they may close
     assert slim
     hand = panda_2f85().hand
     assert hand is not None

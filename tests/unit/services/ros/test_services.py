@@ -201,8 +201,10 @@ def test_empty_parts_and_the_scales_of_a_planning_request_are_heeded() -> None:
         stamp = points[-1]["time_from_start"]
         return float(stamp["sec"] + 1e-9 * stamp["nanosec"])
 
-    assert last(max_velocity_scaling_factor=0.1) > 4.0 * last()
-    assert last(max_acceleration_scaling_factor=0.01) > 2.0 * last()
+    full = {"max_velocity_scaling_factor": 1.0, "max_acceleration_scaling_factor": 1.0}
+    assert last() > 2.0 * last(**full)  # the default is a fifth of the limits
+    assert last(**full | {"max_velocity_scaling_factor": 0.1}) > 4.0 * last(**full)
+    assert last(**full | {"max_acceleration_scaling_factor": 0.01}) > 2.0 * last(**full)
 
 
 def test_a_planned_trajectory_of_moveit_is_certified_as_a_goal_of_the_arm() -> None:
