@@ -64,6 +64,8 @@ class Frame:
             arm) are neither tracked nor mapped.
         prior: robot prior of the pose.
         source: origin of the frame, for messages.
+        depth_delay: time [s] by which the depth image is later than ``stamp``, by the stamps of a sensor whose streams
+            are not synchronized.
 
     Raises:
         InputError: sizes differ, a type is wrong or depth is negative.
@@ -78,6 +80,7 @@ class Frame:
     mask: NDArray[np.bool_] | None = None
     prior: PosePrior | None = None
     source: str = field(default="", compare=False)
+    depth_delay: float = 0.0
 
     def __post_init__(self) -> None:
         where = self.source or f"frame {self.index}"

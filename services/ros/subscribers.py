@@ -145,4 +145,5 @@ class FramePairs:
         if self._undistort is not None and rgb.shape[:2] == z.shape == (camera.height, camera.width):
             rgb, z, camera = self._undistort.color(rgb), self._undistort.depth(z), self._undistort.camera
         self._count += 1
-        return Frame(stamp, rgb, z, camera, self._count - 1, source=FROM_ROS)
+        delay = seconds_of(depth.header.stamp) - stamp
+        return Frame(stamp, rgb, z, camera, self._count - 1, source=FROM_ROS, depth_delay=delay)

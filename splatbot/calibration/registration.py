@@ -66,9 +66,9 @@ def estimate_depth_timing(frames: Sequence[Frame], twists: Mapping[int, Array]) 
     """Estimate shift and delay of depth from frames and the twists (6,) [m/s, rad/s] of some of them.
 
     Depth that is τ seconds late is displaced by τ c_k, where c_k is the image velocity of its edges. A shift of
-    d_k = (right, down) - τ c_k aligns the depth of frame k. The estimate maximises the sum over all frames of the
-    correlation of depth edges, shifted by d_k, with the gradient magnitude of colour. A jackknife over blocks of
-    frames gives the covariance (Efron and Stein 1981).
+    d_k = (right, down) - (τ + τ_k) c_k aligns the depth of frame k, where τ_k is the difference of its two stamps. The
+    estimate maximises the sum over all frames of the correlation of depth edges, shifted by d_k, with the gradient
+    magnitude of colour. A jackknife over blocks of frames gives the covariance (Efron and Stein 1981).
     """
     p = CONSTANTS
     chosen = [k for k in sorted(twists) if k < len(frames)]
@@ -130,7 +130,9 @@ def _scores(frame: Frame, twist: Array) -> tuple[Array, int]:
     size = 2 * radius + 1
     layers = []
     for delay in _delays():
-        at = np.array([reach - radius, reach - radius]) - delay * velocity  # corner (u, v) in the surface
+        at = (
+            np.array([reach - radius, reach - radius]) - (delay + frame.depth_delay) * velocity
+        )  # corner (u, v) in the surface
         M = np.array([[1.0, 0.0, at[0]], [0.0, 1.0, at[1]]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         layers.append(cv2.warpAffine(surface, M, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT))

@@ -130,8 +130,9 @@ def _registered(view: View, frame: Frame, twist: Array | None, timing: DepthTimi
     shift = np.zeros(2)
     if not timing.right.refusal and not timing.down.refusal:
         shift += [timing.right.value, timing.down.value]
-    if not timing.delay.refusal and twist is not None:
-        shift -= timing.delay.value * image_velocity(frame, twist)
+    if twist is not None:
+        delay = frame.depth_delay + (0.0 if timing.delay.refusal else timing.delay.value)
+        shift -= delay * image_velocity(frame, twist)
     found, c = view.features, frame.camera
     z = np.asarray(_native.depth_around(frame.depth, (found.pixels - shift).astype(np.float32)))
     x, y = (found.pixels[:, 0] - c.cx) / c.fx, (found.pixels[:, 1] - c.cy) / c.fy

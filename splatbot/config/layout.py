@@ -73,7 +73,8 @@ def to_layout(values: dict[str, Any]) -> dict[str, Any]:
         keys = SECTIONS[name].PUBLIC
         public[name] = {key: item for key, item in value.items() if key in keys}
         expert[name] = {key: item for key, item in value.items() if key not in keys}
-    return public | {EXPERT: {name: keys for name, keys in expert.items() if keys}}
+    given = {name: value for name, value in public.items() if value != {}}
+    return given | {EXPERT: {name: keys for name, keys in expert.items() if keys}}
 
 
 def from_layout(values: dict[str, Any]) -> dict[str, Any]:

@@ -277,12 +277,12 @@ class LoopsConfig(_Section):
 class BundleConfig(_Section):
     """Bundle adjustment: joint poses of the keyframes that see the same place. It needs ``loops.enabled``."""
 
-    enabled: bool = Field(default=False, description="adjust the poses of keyframes to each other")
+    enabled: bool = Field(default=True, description="adjust the poses of keyframes to each other")
     window: int = Field(
         default=8, ge=2, description="latest keyframes that move without a revisited place: accuracy for time"
     )
     pairs: int = Field(
-        default=6, ge=1, description="earlier keyframes that each new one is matched with: accuracy for time"
+        default=10, ge=1, description="earlier keyframes that each new one is matched with: accuracy for time"
     )
     min_translation: float = Field(default=0.002, gt=0, description="smaller corrections do not move the map [m]")
     min_rotation: float = Field(default=0.001, gt=0, description="smaller corrections do not move the map [rad]")

@@ -127,7 +127,17 @@ class BagLog(StampedLog):
             mask = None if mask is None else self._undistort.mask(mask)
         joints = None if self._joints is None else interpolate_joints(*self._joints, color.stamp)
         try:
-            return Frame(color.stamp, rgb, z, self._camera, index, joints=joints, mask=mask, source=where)
+            return Frame(
+                color.stamp,
+                rgb,
+                z,
+                self._camera,
+                index,
+                joints=joints,
+                mask=mask,
+                source=where,
+                depth_delay=depth.stamp - color.stamp,
+            )
         except InputError as error:
             raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error
 

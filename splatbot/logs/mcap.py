@@ -101,7 +101,7 @@ def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None)
             at = _nanoseconds(frame.stamp)
             out.write(INFO, camera_info_message(frame.stamp, frame.camera), at)
             out.write(COLOR, image_message(frame.stamp, frame.rgb), at)
-            out.write(DEPTH, image_message(frame.stamp, frame.depth), at)
+            out.write(DEPTH, image_message(frame.stamp + frame.depth_delay, frame.depth), at)
             if frame.mask is not None:
                 out.write(MASK, image_message(frame.stamp, frame.mask), at)
             if frame.joints is not None:

@@ -76,8 +76,8 @@ def record(
             _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
             _write_png(out / "depth" / name, _to_units(frame, depth_scale))
             # Depth first: a depth image without colour is harmless, but colour without depth is an error.
-            for lines, part in ((depths, "depth"), (colors, "rgb")):
-                lines.append(f"{float(frame.stamp)!r} {part}/{name}")
+            for lines, part, delay in ((depths, "depth", frame.depth_delay), (colors, "rgb", 0.0)):
+                lines.append(f"{float(frame.stamp + delay)!r} {part}/{name}")
             if progress is not None:
                 progress(number + 1)
     return out

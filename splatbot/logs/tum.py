@@ -104,6 +104,7 @@ class TumLog(StampedLog):
             raise self._no_partner(color)
         mask = None if self._masks is None else self._masks.at(color.stamp)
         frame = self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path, mask)
+        frame = replace(frame, depth_delay=depth.stamp - color.stamp)
         return frame if self._joints is None else replace(frame, joints=self._joints.at(color.stamp))
 
     def _pair(self, colors: list[IndexEntry]) -> dict[int, IndexEntry]:

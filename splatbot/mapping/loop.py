@@ -16,6 +16,7 @@ from splatbot.mapping.covisibility import covisible_candidates
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.observation import GraphLocation, Observation
 from splatbot.mapping.posegraph import (
+    NEIGHBOR_HOPS,
     Adjacency,
     Edge,
     PoseGraph,
@@ -39,9 +40,6 @@ Array = NDArray[np.float64]
 class LoopConstants:
     """Constants of loop closing."""
 
-    neighbor_hops: int = 10
-    """Number of edges of the pose graph [1], or difference of keyframe numbers. A keyframe within it is a neighbor of
-    the odometry and not a revisited place."""
     near_translation: float = 0.25
     """Distance [m] below which a keyframe is a loop candidate, even with another appearance."""
     near_rotation: float = 0.35
@@ -50,10 +48,6 @@ class LoopConstants:
     """Number of loop candidates [1] by appearance that are verified for each keyframe. Each takes an alignment."""
     unknown_sigma: float = 0.5
     """Standard deviation [m], [rad] of a motion that the images could not measure."""
-    open_translation: float = 1e-2
-    """Distance [m] by which the optimized graph leaves a wrong loop open. A smaller one rejects inaccurate loops."""
-    open_rotation: float = 2e-2
-    """Angle [rad] by which the optimized graph leaves a wrong loop open."""
     tracking_translation: float = 5e-3
     """Distance [m] up to which the images confirm the tracked motion between two keyframes. Beyond it, other keyframes
     biased tracking."""
@@ -136,12 +130,12 @@ class LoopCloser:
         if not self.config.loops.enabled or not keyframes:
             return GraphLocation()
         nearest = keyframes[order_by_distance(keyframes, T_world_camera)[0]].number
-        if previous.keyframe is None or abs(nearest - previous.keyframe) <= CONSTANTS.neighbor_hops:
+        if previous.keyframe is None or abs(nearest - previous.keyframe) <= NEIGHBOR_HOPS:
             return GraphLocation(nearest)
         adjacency = self.adjacency
         if previous.keyframe not in adjacency:  # submitted, and not in the graph yet
             return GraphLocation(previous.keyframe)
-        revisits = nearest not in within_hops(adjacency, previous.keyframe, CONSTANTS.neighbor_hops)
+        revisits = nearest not in within_hops(adjacency, previous.keyframe, NEIGHBOR_HOPS)
         if revisits and nearest in adjacency:
             return GraphLocation(previous.keyframe, revisits=True)
         return GraphLocation(nearest)
@@ -187,8 +181,10 @@ class LoopCloser:
         prepared = observation.prepared
         odometry = self._odometry_edge(reference, keyframe, prepared)
         covisible = self._covisible_edges(keyframe, others, prepared)
-        if covisible:
-            odometry = replace(odometry, covisible=True)
+        if not self.graph.is_closed(odometry):  # tracking went over to a place seen before: a loop to be closed
+            covisible = [pair for pair in covisible if keyframe.number - pair.first <= NEIGHBOR_HOPS]
+        if any(keyframe.number - pair.first <= NEIGHBOR_HOPS for pair in covisible):
+            odometry = replace(odometry, covisible=True)  # its neighbors show whether it is wrong
         self.graph.edges += [odometry, *covisible]
         edge = None if others[-1] is reference else self._covisibility_edge(others[-1], keyframe, prepared)
         if edge is not None:
@@ -216,9 +212,8 @@ class LoopCloser:
                 if max(moved, turned) > CONSTANTS.drift_offset:  # repeated texture, or a loop to be confirmed
                     self.rejected += 1
                     continue
-                edges.append(
-                    Edge(other.number, keyframe.number, T, measured.covariance + drift_covariance(T), covisible=True)
-                )
+                covariance = measured.covariance + drift_covariance(T)
+                edges.append(Edge(other.number, keyframe.number, T, covariance, covisible=True, pair=True))
         return edges
 
     def _adjust(self, number: int) -> None:
@@ -256,7 +251,7 @@ class LoopCloser:
         self, reference: Keyframe, keyframe: Keyframe, keyframes: Sequence[Keyframe]
     ) -> list[Keyframe]:
         """Return keyframes that may show the same place although no short chain of edges leads there."""
-        hops = CONSTANTS.neighbor_hops
+        hops = NEIGHBOR_HOPS
         neighbors = within_hops(self.graph.adjacency(), reference.number, hops)
         others = [k for k in keyframes if k.number not in neighbors and abs(k.number - keyframe.number) > hops]
         if not others:
@@ -316,16 +311,16 @@ class LoopCloser:
         if moved < limits.min_translation and turned < limits.min_rotation:
             self.closed += 1
             return
-        poses = self.graph.optimize()
-        moved, turned = max_residual(edge.residual(poses) for edge in loops)
-        measured = (edge for edge in self.graph.edges if not (edge.loop or edge.covisible))
+        poses = self.graph.optimize(pairs=False)
+        is_open = not all(PoseGraph(poses).is_closed(edge) for edge in loops)
+        measured = (edge for edge in self.graph.edges if not (edge.loop or edge.pair))
         sigma = max((_mahalanobis(edge, poses) for edge in measured), default=0.0)
-        is_open = moved > CONSTANTS.open_translation or turned > CONSTANTS.open_rotation
         if is_open or sigma > limits.max_edge_sigma:
             self.graph.edges = [edge for edge in self.graph.edges if all(edge is not loop for loop in loops)]
             self.rejected += len(loops)
             return
         self.closed += 1
+        self.graph.edges = [edge for edge in self.graph.edges if not edge.pair]  # they share the error that it reveals
         self.correction = {k: orthonormal(poses[k] @ inverse(T)) for k, T in self.graph.poses.items()}
 
     def _measure(self, other: Keyframe, keyframe: Keyframe, prepared: PreparedFrame) -> MeasuredMotion | None:

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -19,6 +20,8 @@ Adjacency = Mapping[int, tuple[int, ...]]
 
 _CAUCHY_SIGMA = 1.0  # scale of the Cauchy loss of loop edges [σ]
 _COVISIBLE_CAUCHY_SIGMA = 3.0  # the same of covisible pairs; six residuals of 1 σ have the norm 2.4
+NEIGHBOR_HOPS = 10  # keyframes along the path within which places are neighbors, and not revisited
+_OPEN_TRANSLATION, _OPEN_ROTATION = 1e-2, 2e-2  # [m], [rad] residual above which a revisited place is not closed
 _DRIFT_SIGMA = 5e-3  # standard deviation of the odometry error, relative to the motion [m/m], [rad/rad]
 # Least covariance of an edge: standard deviations of 1 mm and 0.5 mrad, however small the residuals of its alignment.
 _LEAST_COVARIANCE = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
@@ -34,6 +37,7 @@ class Edge:
         covariance: (6, 6) of the twist (t [m], ω [rad]) in the second camera's frame.
         loop: whether it is a loop closure, which may be wrong.
         covisible: whether it is one of many measurements of the same keyframes, so that a wrong one shows.
+        pair: whether it is one of the covisible pairs of bundle adjustment, and not of the path that was tracked.
     """
 
     first: int
@@ -42,6 +46,7 @@ class Edge:
     covariance: Array
     loop: bool = False
     covisible: bool = False
+    pair: bool = False
 
     def residual(self, poses: Mapping[int, Array]) -> Array:
         """Compute the twist (6,) from the measured to the estimated motion, in the second camera's frame.
@@ -59,11 +64,16 @@ class PoseGraph:
     poses: dict[int, Array] = field(default_factory=dict)
     edges: list[Edge] = field(default_factory=list)
 
-    def adjacency(self, *, loops: bool = True) -> Adjacency:
-        """Return the neighbors of each keyframe; without loop closures if ``loops`` is False."""
+    def adjacency(self, *, revisits: bool = True) -> Adjacency:
+        """Return the neighbors of each keyframe along the tracked path and, with ``revisits``, by revisited places.
+
+        Loop closures connect a revisited place, and so do pairs of keyframes far apart in time that the poses agree
+        with. Pairs of keyframes near in time would only shorten the path along which drift adds up.
+        """
         found: dict[int, list[int]] = {number: [] for number in self.poses}
         for edge in self.edges:
-            if loops or not edge.loop:
+            far = edge.loop or (edge.pair and abs(edge.second - edge.first) > NEIGHBOR_HOPS and self.is_closed(edge))
+            if (revisits and far) or not (edge.loop or edge.pair):
                 found.setdefault(edge.first, []).append(edge.second)
                 found.setdefault(edge.second, []).append(edge.first)
         return {number: tuple(others) for number, others in found.items()}
@@ -82,7 +92,12 @@ class PoseGraph:
             float(sum(np.linalg.norm(step[3:]) for step in steps)),
         )
 
-    def optimize(self, free: Set[int] | None = None) -> dict[int, Array]:
+    def is_closed(self, edge: Edge) -> bool:
+        """Return whether the poses agree with an edge, within the accuracy of a closed loop."""
+        moved, turned = max_residual([edge.residual(self.poses)])
+        return moved < _OPEN_TRANSLATION and turned < _OPEN_ROTATION
+
+    def optimize(self, free: Set[int] | None = None, *, pairs: bool = True) -> dict[int, Array]:
         """Compute the poses that minimize the cost of all edges; the first keyframe is fixed.
 
         min Σ_odometry ½ ‖r_ij‖²_Σij + Σ_robust ρ(‖r_ij‖_Σij), with the residual r of :meth:`Edge.residual`. The squared
@@ -92,32 +107,41 @@ class PoseGraph:
 
         Args:
             free: keyframes that may move; the others are fixed. If None, all but the first may move.
+            pairs: with the covisible pairs of bundle adjustment. Without them, the tracked path alone takes up the
+                error of a loop: pairs share the errors of lens and shutter, so that many of them are too stiff.
 
         Returns:
             T_world_camera (4, 4) of all keyframes, or of the free ones and their neighbors.
         """
         first = min(self.poses)
-        edges = [e for e in self.edges if free is None or e.first in free or e.second in free]
+        edges = [e for e in self.edges if pairs or not e.pair]
+        edges = [e for e in edges if free is None or e.first in free or e.second in free]
         numbers = {first, *self.poses} if free is None else {n for e in edges for n in (e.first, e.second)}
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        fixed = _noise_model(1e-8 * np.eye(6))
+        values = gtsam.Values()
         for number in sorted(numbers):
-            T = self.poses[number]
-            values.insert(number, gtsam.Pose3(T))
-            if number == first or (free is not None and number not in free):
-                graph.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(T), fixed))
+            values.insert(number, gtsam.Pose3(self.poses[number]))
+        fixed = {n for n in numbers if n == first or (free is not None and n not in free)}
+        graph = self._factors(edges, fixed, robust_path=pairs)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        return {number: orthonormal(values.atPose3(number).matrix()) for number in sorted(numbers)}
+
+    def _factors(self, edges: list[Edge], fixed: set[int], *, robust_path: bool) -> Any:
+        """Return the factors of edges and of fixed keyframes."""
+        graph, cauchy = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.mEstimator.Cauchy
+        for number in sorted(fixed):
+            noise = _noise_model(1e-8 * np.eye(6))
+            graph.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(self.poses[number]), noise))
         for edge in edges:
             noise = _noise_model(edge.covariance + _LEAST_COVARIANCE)
-            if edge.loop or edge.covisible:
+            if edge.loop or (edge.covisible and robust_path):
                 sigma = _CAUCHY_SIGMA if edge.loop else _COVISIBLE_CAUCHY_SIGMA
-                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(sigma), noise)
+                noise = gtsam.noiseModel.Robust.Create(cauchy.Create(sigma), noise)
             graph.add(gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise))
-        found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-        return {number: orthonormal(found.atPose3(number).matrix()) for number in sorted(numbers)}
+        return graph
 
     def _path(self, first: int, second: int) -> list[int] | None:
         """Find the path with the fewest odometry edges by breadth-first search."""
-        adjacency = self.adjacency(loops=False)
+        adjacency = self.adjacency(revisits=False)
         parent: dict[int, int] = {first: first}
         queue = deque([first])
         while queue and second not in parent:

@@ -42,24 +42,26 @@ def rectify(frame: Frame, twist: Array, sensor: SensorConfig) -> Frame:
     Args:
         frame: the frame; its stamp is the time of the middle row of colour.
         twist: (6,) velocity of the camera (translation [m/s], rotation [rad/s]) in its own frame.
-        sensor: readout time, and time, place and scale of depth.
+        sensor: readout time, and time, place and scale of depth. Its delay adds to that of the frame's stamps.
     """
     camera, velocity = frame.camera, twist.tolist()
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     moves, depth, T_color_depth = bool(np.any(twist)), frame.depth, np.array(sensor.depth_to_color)
+    delay = sensor.depth_delay + frame.depth_delay
     if sensor.depth_scale != 1 or sensor.depth_bias:
         scaled = np.float32(sensor.depth_scale) * depth + np.float32(sensor.depth_bias)
         depth = np.where(depth > 0, np.maximum(scaled, 0), np.float32(0))
-    if (moves and (sensor.readout or sensor.depth_delay)) or np.any(T_color_depth):
-        timing = (velocity, sensor.readout, sensor.depth_delay)
+    if (moves and (sensor.readout or delay)) or np.any(T_color_depth):
+        timing = (velocity, sensor.readout, delay)
         depth = np.asarray(_native.rectify_depth(depth, intrinsics, *timing, se3_exp(T_color_depth)))
     if not (moves and sensor.readout):
-        return frame if depth is frame.depth else replace(frame, depth=depth)
+        return frame if depth is frame.depth else replace(frame, depth=depth, depth_delay=0.0 if moves else delay)
     u, v = np.moveaxis(_native.rectify_map(depth, intrinsics, velocity, sensor.readout, 0.0), -1, 0)
     rgb = cv2.remap(frame.rgb, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     mask = np.ones(depth.shape, np.uint8) if frame.mask is None else frame.mask.astype(np.uint8)
     seen = cv2.remap(mask, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    return replace(frame, rgb=np.asarray(rgb, np.uint8), depth=np.where(seen, depth, np.float32(0)), mask=seen)
+    depth = np.where(seen, depth, np.float32(0))
+    return replace(frame, rgb=np.asarray(rgb, np.uint8), depth=depth, mask=seen, depth_delay=0.0)
 
 
 class RectifiedLog(LogBase):

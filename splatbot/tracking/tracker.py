@@ -160,8 +160,9 @@ class Tracker:
         self, best: ScoredHypothesis, problem: TrackingProblem, scheduler: StageScheduler
     ) -> ScoredHypothesis:
         """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
-        readout, depth = self.config.sensor.readout, typical_depth(problem.prepared)
-        if not readout:
+        sensor, depth = self.config.sensor, typical_depth(problem.prepared)
+        readout, delay = sensor.readout, sensor.depth_delay + problem.prepared.recorded.depth_delay
+        if not readout and not delay:
             return best
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
@@ -169,10 +170,14 @@ class Tracker:
             expected = self._velocity.at(frame.stamp, best.T_world_camera)
             sigma, alignment = self._velocity.sigma(frame.stamp), best.hypothesis.alignment
             twist = twist_of_rows(alignment, prepared.twist, expected, sigma, readout)
-            moved = row_displacement(twist - prepared.twist, depth, frame.camera, readout)
-            if best.verdict == "lost" or moved < _MAX_ROW_DISPLACEMENT:
+            moved = row_displacement(twist - prepared.twist, depth, frame.camera, readout + 2 * abs(delay))
+            if moved < _MAX_ROW_DISPLACEMENT:
                 break
-            best = scheduler.align_again(prepare(frame, self.config, twist), best)
+            again = scheduler.align_again(prepare(frame, self.config, twist), best)
+            if again.verdict == "lost" and best.verdict != "lost":  # the velocity is wrong
+                problem.replace_images(prepared, best.T_world_camera)
+                break
+            best = again
         return best
 
     def _fuse_prior(

@@ -35,7 +35,7 @@ class TrackingSettings(Settings):
     frames after rigid alignment) and the RPE. Times end when the pose is known; decoding and mapping do not count.
     NEES / 6 is 1 for consistent covariances; it includes the error of the reference.
 
-    --ablation also runs splatbot with bundle adjustment, and with replaced keyframes, with the first budget.
+    --ablation also runs splatbot without bundle adjustment, and with replaced keyframes, with the first budget.
     "Jumps reported as ok" counts frames with the verdict "ok" whose motion since the last frame is wrong by more than
     three sigma.
 
@@ -54,7 +54,7 @@ class TrackingSettings(Settings):
         budgets: Time budgets per frame [ms].
         no_peers: Leave out the other trackers.
         max_frames: Read only the first N frames of each log.
-        ablation: Also run with bundle adjustment, and with better views that replace poor keyframes.
+        ablation: Also run without bundle adjustment, and with better views that replace poor keyframes.
         stress: Run the hard synthetic logs. LOG and --budgets are not needed.
         config: YAML file with settings that all runs share.
         camera: Intrinsics that replace those of the logs: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.

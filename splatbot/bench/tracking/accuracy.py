@@ -38,7 +38,7 @@ from splatbot.trajectory import Trajectory
 
 # Changes of an ablation: name, section, key and value of the setting.
 ABLATIONS = (
-    ("with bundle adjustment", "bundle", "enabled", True),
+    ("without bundle adjustment", "bundle", "enabled", False),
     ("with replaced keyframes", "mapping", "replace_poor", True),
 )
 

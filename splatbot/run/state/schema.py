@@ -137,7 +137,7 @@ TYPES: Mapping[str, SavedType] = {
         added=frozenset({"inconsistency", "ratios"}),
     ),
     "pose_graph": _dataclass(PoseGraph),
-    "edge": _dataclass(Edge, "covisible"),
+    "edge": _dataclass(Edge, "covisible", "pair"),
     "refiner": SavedType(Refiner, _fields("config", "adam", "_random", "_latest_refined")),
     "adam": SavedType(GaussianAdam, _fields("rates", "steps", "skipped", "first", "second")),
     "dynamic_objects": SavedType(DynamicObjectFilter, _fields("timeout=timeout_s", "_cells", "_since", "_seen")),

@@ -13,6 +13,8 @@ import pytest
 from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.logs import open_log, record
+from splatbot.logs.bag import BagLog
+from splatbot.logs.mcap import record_mcap
 from splatbot.logs.record import Progress
 from splatbot.trajectory import Trajectory
 
@@ -114,3 +116,11 @@ def test_depth_beyond_the_range_is_missing_and_logged(tmp_path: Path, caplog: py
     assert "160 pixels beyond 13.1 m" in caplog.text
     assert not back[0].valid[:2].any()
     assert back[0].valid[2:].all()
+
+
+def test_the_delay_of_depth_is_kept_by_its_stamps(tmp_path: Path) -> None:
+    delays = [0.004 * k for k in range(5)]
+    frames = [replace(frame, depth_delay=delay) for frame, delay in zip(open_log(SMALL), delays, strict=True)]
+    first = open_log(record(frames, tmp_path / "log"))
+    for log in (first, BagLog(record_mcap(first, tmp_path / "log.mcap"))):
+        assert [frame.depth_delay for frame in log] == pytest.approx(delays, abs=1e-6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -115,3 +117,12 @@ def test_the_twist_of_a_trajectory_is_the_mean_of_both_sides_and_zero_beyond_a_g
     assert not twist_at(path, 0.6).any()
     assert not twist_at(Trajectory(stamps[:1], path.T_world_camera[:1]), 0.0).any()
     assert se3_log(path.T_world_camera[1]) == pytest.approx(0.1 * TWIST)
+
+
+def test_a_delay_of_the_stamps_counts_as_one_of_the_sensor_and_is_gone_afterwards() -> None:
+    frame = frame_of(np.random.default_rng(1).uniform(1.0, 2.0, (120, 160)))
+    stamped = rectify(replace(frame, depth_delay=0.012), TWIST, SensorConfig(readout=READOUT, depth_delay=-0.002))
+    by_sensor = rectify(frame, TWIST, SensorConfig(readout=READOUT, depth_delay=0.010))
+    np.testing.assert_array_equal(stamped.depth, by_sensor.depth)
+    assert stamped.depth_delay == 0.0
+    assert rectify(stamped, TWIST, SensorConfig()) is stamped
