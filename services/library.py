@@ -183,7 +183,7 @@ class MapLibrary:
                 _log.error("map %s: %s is damaged and set aside: %s", home.name, state.name, error)
                 _set_aside(state)
                 continue
-            served = store.add(home.name, state="ended", **saved)
+            served = store.add(home.name, state="ended", counted=False, **saved)
             self._kept[home.name] = served.generation, served.map_version
             if named != state.name:
                 _log.error("map %s: %s names %s, %s is served", home.name, _CURRENT, named, state.name)

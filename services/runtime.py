@@ -52,7 +52,7 @@ class Runtime:
         self, settings: ServiceSettings, store: MapStore | None = None, *, config: Config | None = None
     ) -> None:
         self.settings = settings
-        self.store = store or MapStore()
+        self.store = store or MapStore(most=settings.max_maps)
         self.bus = self.store.bus
         self.config = config or Config()
         self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None

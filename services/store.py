@@ -21,6 +21,12 @@ from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 
 
+class TooManyMapsError(InputError):
+    """As many maps are served as clients may add."""
+
+    http_status = 409
+
+
 class MapExistsError(InputError):
     """A map of that name is served already."""
 
@@ -93,10 +99,12 @@ class MapStore:
 
     Args:
         bus: receives each new version. If None, a bus is created.
+        most: maps that clients may add. If None, any number.
     """
 
-    def __init__(self, bus: Bus | None = None) -> None:
+    def __init__(self, bus: Bus | None = None, *, most: int | None = None) -> None:
         self.bus = bus or Bus()
+        self._most = most
         self.frames_first = FramesFirst()
         self._lock = threading.Lock()
         self._maps: dict[str, ServedMap] = {}
@@ -113,15 +121,20 @@ class MapStore:
         workspace: Workspace | None = None,
         awaited: bool = True,
         run: RunFolder | None = None,
+        counted: bool = True,
     ) -> ServedMap:
-        """Serve a map under a new name.
+        """Serve a map under a new name. Saved maps that return at a start are not ``counted``: all of them return.
 
         Raises:
             MapExistsError: the name is taken.
+            TooManyMapsError: there are as many maps as clients may add.
         """
         with self._lock:
             if map_id in self._maps:
                 raise MapExistsError(f"map {map_id!r} exists.", field="id", hint="delete it, or choose another id")
+            if counted and self._most is not None and len(self._maps) >= self._most:
+                hint = "delete a map, or raise SPLATBOT_MAX_MAPS"
+                raise TooManyMapsError(f"{len(self._maps)} maps are served already.", field="id", hint=hint)
             number = next(self._generations)
             served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited, run, number)
             self._put(served)

@@ -47,10 +47,12 @@ class Door:
 
     Args:
         access: names, origins and keys of the service.
+        most: viewers at once.
     """
 
-    def __init__(self, access: Access) -> None:
+    def __init__(self, access: Access, most: int = 32) -> None:
         self._access = access
+        self._most = most
         self._ticket = secrets.token_urlsafe(32)
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -60,6 +62,8 @@ class Door:
             return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, "This is no name of the viewer: use localhost.\n")
         if len(origins) > 1 or (origins and not self._access.origin_allowed(origins[0], "http", hosts[0])):
             return connection.respond(HTTPStatus.FORBIDDEN, "Pages of other sites may not connect.\n")
+        if len(connection.server.connections) >= self._most:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{self._most} viewers are open: close one.\n")
         cookie = f"splatbot_viewer_{connection.local_address[1]}"  # cookies of all ports of a host are shared
         if self._access.is_open or self._has_ticket(request, cookie):
             return None

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -418,6 +419,27 @@ def test_the_viewer_refuses_pages_of_other_sites_and_rebound_names(viewer: Viewe
         assert caught.value.response.status_code == 403
     rebound = httpx.get(f"{url}/?key={key}", headers={"Host": f"evil.example:{viewer.port}", "Cookie": ticket})
     assert rebound.status_code == 421
+
+
+def test_the_viewer_refuses_more_viewers_than_it_can_draw_for() -> None:
+    viewer = Viewer(wall_store(), Access(ServiceSettings(insecure_no_auth=True)), port=0)
+    viewer.start()
+    try:
+        with ExitStack() as open_:
+            sockets = [open_.enter_context(_viser(viewer)) for _ in range(32)]
+            for socket in sockets:
+                assert len(socket.recv(timeout=20)) > 0
+            with pytest.raises(InvalidStatus) as caught, _viser(viewer):
+                pass
+            assert caught.value.response.status_code == 503
+        deadline = time.monotonic() + 30
+        while time.monotonic() < deadline:  # the closed ones make room
+            with suppress(InvalidStatus), _viser(viewer) as again:
+                assert len(again.recv(timeout=20)) > 0
+                return
+        pytest.fail("no viewer was let in after all had gone")
+    finally:
+        viewer.stop()
 
 
 def test_a_server_that_only_draws_a_page_serves_nobody() -> None:

@@ -10,7 +10,7 @@ import torch
 from splatbot.errors import MapNotFoundError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.services.problems import MapNotReadyError
-from splatbot.services.store import MapExistsError, MapStore
+from splatbot.services.store import MapExistsError, MapStore, TooManyMapsError
 
 
 def _snapshot(version: int, x: float = 0.0) -> Snapshot:
@@ -105,3 +105,14 @@ def test_readers_among_a_thousand_writes_see_whole_states_with_growing_versions(
         reader.join()
     assert torn == []
     assert store.get("desk").map_version == 999
+
+
+def test_clients_add_a_bounded_number_of_maps_and_saved_ones_always_return() -> None:
+    store = MapStore(most=2)
+    for number in range(3):
+        store.add(f"saved{number}", source="disk", state="ended", counted=False)
+    with pytest.raises(TooManyMapsError, match="3 maps are served already"):
+        store.add("one more", source="x", state="mapping")
+    store.remove("saved0")
+    store.remove("saved1")
+    store.add("one more", source="x", state="mapping")
