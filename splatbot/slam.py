@@ -24,8 +24,9 @@ from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.observation import GraphLocation, Observation
 from splatbot.mapping.refine import Stop, never
 from splatbot.tracking.health import Verdict
-from splatbot.tracking.prepare import PreparedFrame, prepare
+from splatbot.tracking.prepare import MIN_DISPLACEMENT, PreparedFrame, displacement, prepare
 from splatbot.tracking.tracker import PoseEstimate, Tracker
+from splatbot.tracking.velocity import mean_twist
 from splatbot.trajectory import Trajectory
 
 P = ParamSpec("P")
@@ -81,6 +82,8 @@ class Slam:
         self._joint_motion = JointMotionMonitor(self.config.mapping.still_joint_speed)
         self._image_size: tuple[int, int] | None = None
         self._localization_only = False
+        self._first: PreparedFrame | None = None
+        """The first frame, until the velocity of the camera during it is known."""
 
     def process(self, frame: Frame, *, hold_out: bool = False) -> FrameResult:
         """Track a frame and, unless ``hold_out``, map it; a frame that cannot be tracked does not raise.
@@ -238,10 +241,36 @@ class Slam:
         if keyframes:
             self._tracker.variance_scale = self._mapper.inconsistency
             estimate = self._tracker.track(prepared, keyframes)
+            if self._starts_again(estimate, prepared.frame.stamp):
+                return self._track(self._prepare(prepared.recorded), hold_out)
             return estimate.prepared or prepared, estimate
         if hold_out:
             return prepared, PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
+        self._first = prepared
         return prepared, self._tracker.start(prepared)
+
+    def _starts_again(self, estimate: PoseEstimate, stamp: float) -> bool:
+        """Map the first frame again if the second one reveals that the camera moved during it; return whether so.
+
+        The first frame is rectified as if at rest. Its rows, and depth of another instant, then contradict all frames
+        that come back to its view.
+        """
+        first, self._first = self._first, None
+        if first is None or estimate.verdict == "lost":
+            return False
+        twist = mean_twist(estimate.T_world_camera, stamp - first.frame.stamp)
+        if displacement(first, twist, self.config.sensor) < MIN_DISPLACEMENT:
+            return False
+        self._executor.close()
+        del self._executor
+        version = self._mapper.version
+        self._mapper, self._tracker = Mapper(self.config), Tracker(self.config.tracking)
+        self._mapper.version, self._location = version, GraphLocation()
+        first = prepare(first.recorded, self.config.tracking, twist)
+        observation = self._observation(first, self._tracker.start(first), hold_out=False)
+        self._location = self._mapper.submit(observation)
+        self._executor.run()
+        return True
 
     def _observation(self, prepared: PreparedFrame, estimate: PoseEstimate, hold_out: bool) -> Observation:
         """Collect a tracked frame for the mapper, and note whether the robot moves."""

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from splatbot import _native
 from splatbot.camera import Camera
-from splatbot.config import TrackingConfig
+from splatbot.config import SensorConfig, TrackingConfig
 from splatbot.frame import Frame
-from splatbot.tracking.rectify import rectify
+from splatbot.tracking.rectify import rectify, row_displacement
 
 Image = NDArray[np.float32]
 
 _AT_REST = np.zeros(6)
+MIN_DISPLACEMENT = 0.3  # [px] by which another velocity moves pixels, below which a frame is not rectified again
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,14 @@ def prepare(recorded: Frame, config: TrackingConfig, twist: NDArray[np.float64] 
         levels.append(halve(levels[-1]))
     levels[0] = Level(gray_of_one_surface(levels[0], config), levels[0].depth, levels[0].camera)
     return PreparedFrame(frame, depth, tuple(levels), recorded, twist, started)
+
+
+def displacement(prepared: PreparedFrame, twist: NDArray[np.float64], sensor: SensorConfig) -> float:
+    """Compute by how much [px] rectification with another twist (6,) moves pixels of colour or depth at most."""
+    seconds = sensor.readout + 2 * abs(sensor.depth_delay + prepared.recorded.depth_delay)
+    if not seconds:
+        return 0.0
+    return row_displacement(twist - prepared.twist, typical_depth(prepared), prepared.frame.camera, seconds)
 
 
 def gray_of_one_surface(level: Level, config: TrackingConfig) -> Image:

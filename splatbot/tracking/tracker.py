@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from splatbot.config import TrackingConfig
 from splatbot.frame import Frame
+from splatbot.geometry import se3_exp
 from splatbot.tracking.budget import CostModel
 from splatbot.tracking.estimate import PoseEstimate
 from splatbot.tracking.features import Features, detect
 from splatbot.tracking.hypothesis import ScoredHypothesis
 from splatbot.tracking.motion_model import ConstantVelocity, Prediction
 from splatbot.tracking.nearby_keyframes import TrackedKeyframe, order_by_distance, pose_distance
-from splatbot.tracking.prepare import PreparedFrame, prepare, typical_depth, valid_share
+from splatbot.tracking.prepare import MIN_DISPLACEMENT, PreparedFrame, displacement, prepare, valid_share
 from splatbot.tracking.priors import fill_weak_directions, fuse, is_consistent, mahalanobis_distance
-from splatbot.tracking.rectify import row_displacement
 from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidate, is_confident
 from splatbot.tracking.scheduler import StageScheduler
 from splatbot.tracking.stage import TrackingProblem
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 # Standard deviation of grey (0..1) below which a first image is blank: a covered lens, or a sensor that starts up.
 _MIN_GRAY_STD = 0.005
 
-_MAX_ROW_DISPLACEMENT = 0.3  # [px] of the first and last row, below which a frame is not rectified again
+_BEFORE_START = 0.03  # [s] from the pose by which a first frame in motion has its velocity, to this frame
 _MAX_RECTIFICATIONS = 2  # by the velocity that the pose implies; each halves the error of the velocity at least
 
 
@@ -60,13 +60,20 @@ class Tracker:
         self._candidate: RelocalizationCandidate | None = None
 
     def start(self, prepared: PreparedFrame) -> PoseEstimate:
-        """Return the pose of the first frame, which defines the world, or "lost" if it is blank or has no depth."""
+        """Return the pose of the first frame, which defines the world, or "lost" if it is blank or has no depth.
+
+        If the frame has been rectified, the camera moves on with that velocity.
+        """
         coverage = valid_share(prepared)
         if coverage < self.config.min_depth_coverage:
             reason = f"only {coverage:.1%} of the pixels have a usable depth"
             return PoseEstimate(np.eye(4), "lost", (reason,), "start")
         if not float(np.nanstd(prepared.levels[0].gray)) >= _MIN_GRAY_STD:
             return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")
+        if np.any(prepared.twist):
+            before, T_before = prepared.frame.stamp - _BEFORE_START, se3_exp(-_BEFORE_START * prepared.twist)
+            self.motion.update(before, T_before)
+            self._velocity.update(before, T_before)
         self.motion.update(prepared.frame.stamp, np.eye(4))
         self._velocity.update(prepared.frame.stamp, np.eye(4))
         return PoseEstimate(np.eye(4), "ok", (), "start")
@@ -160,18 +167,14 @@ class Tracker:
         self, best: ScoredHypothesis, problem: TrackingProblem, scheduler: StageScheduler
     ) -> ScoredHypothesis:
         """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
-        sensor, depth = self.config.sensor, typical_depth(problem.prepared)
-        readout, delay = sensor.readout, sensor.depth_delay + problem.prepared.recorded.depth_delay
-        if not readout and not delay:
-            return best
+        sensor = self.config.sensor
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
             frame = prepared.recorded
             expected = self._velocity.at(frame.stamp, best.T_world_camera)
             sigma, alignment = self._velocity.sigma(frame.stamp), best.hypothesis.alignment
-            twist = twist_of_rows(alignment, prepared.twist, expected, sigma, readout)
-            moved = row_displacement(twist - prepared.twist, depth, frame.camera, readout + 2 * abs(delay))
-            if moved < _MAX_ROW_DISPLACEMENT:
+            twist = twist_of_rows(alignment, prepared.twist, expected, sigma, sensor.readout)
+            if displacement(prepared, twist, sensor) < MIN_DISPLACEMENT:
                 break
             again = scheduler.align_again(prepare(frame, self.config, twist), best)
             if again.verdict == "lost" and best.verdict != "lost":  # the velocity is wrong

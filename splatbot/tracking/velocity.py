@@ -83,6 +83,11 @@ class CameraVelocity:
         return np.asarray(twists[1] + (stamp - times[1]) * acceleration)
 
 
+def mean_twist(T_first_second: Array, seconds: float) -> Array:
+    """Return the mean twist (6,) [m/s, rad/s] of a motion (4, 4); zero over more than ``CONSTANTS.max_gap``."""
+    return se3_log(T_first_second) / seconds if 0 < seconds <= CONSTANTS.max_gap else np.zeros(6)
+
+
 def twist_of_rows(alignment: Alignment, used: Array, prior: Array, sigma: Array, readout: float) -> Array:
     """Estimate the twist (6,) of the camera during a frame from its residuals and a prior.
 

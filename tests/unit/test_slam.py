@@ -7,6 +7,7 @@ import inspect
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,9 +17,11 @@ from splatbot.errors import InputError
 from splatbot.evaluation import absolute_error
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
+from splatbot.geometry import inverse
 from splatbot.logs import open_log
 from splatbot.rasterize.native import native
 from splatbot.sim.effects.depth_camera import DepthCamera
+from splatbot.sim.effects.rolling_shutter import RollingShutter
 from splatbot.slam import FrameResult, Slam
 from splatbot.tracking.tracker import pose_distance
 from splatbot.trajectory import Trajectory
@@ -232,3 +235,22 @@ def test_depth_of_another_instant_is_moved_to_that_of_colour_by_its_stamp() -> N
         errors.append(absolute_error(log.ground_truth, Trajectory(np.array(stamps), np.array(poses))).rmse)
     assert len(found) == len(log)
     assert errors[1] < 0.5 * errors[0]  # 1.1 of 3.0 mm; 1.2 mm without a delay
+
+
+def test_a_first_frame_in_motion_is_mapped_again_once_its_velocity_is_known() -> None:
+    """The camera turns by 100 degrees a second from the first frame on; each frame is read in 30 ms."""
+    log = open_log("synthetic:room?trajectory=turns&frames=45&width=160&height=120")
+    truth = log.ground_truth
+    assert truth is not None
+    fastest = int(np.argmax([pose_distance(a, b)[1] for a, b in pairwise(truth.T_world_camera[:31])]))
+    shutter, rng = RollingShutter(readout=0.03).along(truth), np.random.default_rng(0)
+    frames = [shutter.apply(log[k], rng) for k in range(fastest, fastest + 12)]
+    slam = run(frames, sensor__readout=0.03, mapping__refine_iterations=1)
+    exact = inverse(truth.T_world_camera[fastest])
+    errors = []
+    for k, result in enumerate(slam.results):
+        assert result.T_world_camera is not None
+        errors.append(pose_distance(exact @ truth.T_world_camera[fastest + k], result.T_world_camera)[0])
+    assert np.median(errors) < 0.02  # 11 mm; 69 mm with a first frame as if at rest
+    versions = slam.snapshot().map_version
+    assert versions > len(slam._mapper.keyframes)

@@ -89,7 +89,7 @@ TYPES: Mapping[str, SavedType] = {
             "_joint_motion",
             "_quality",
         ),
-        transient=frozenset({"_executor"}),
+        transient=frozenset({"_executor", "_first"}),
         create=Slam,
         added=frozenset({"quality"}),
     ),
