@@ -89,8 +89,8 @@ def test_the_help_of_a_command_fits_the_terminal(name: str) -> None:
 @pytest.mark.parametrize("name", ["simulate", "record", "export"])
 def test_ctrl_c_ends_a_command_without_a_traceback(run_folder: Path, tmp_path: Path, name: str) -> None:
     words = {
-        "simulate": ["simulate", "tabletop", "--frames", "500", "--out", str(tmp_path / "log")],
-        "record": ["record", LOG.replace("frames=10", "frames=500"), "--out", str(tmp_path / "a.mcap")],
+        "simulate": ["simulate", "tabletop", "--frames", "20000", "--out", str(tmp_path / "log")],
+        "record": ["record", LOG.replace("frames=10", "frames=20000"), "--out", str(tmp_path / "a.mcap")],
         "export": ["export", str(run_folder), "--voxel", "0.004", "--out", str(tmp_path / "export")],
     }
     shown = at_a_terminal(*words[name], columns=80, interrupt_after_s=8.0)
