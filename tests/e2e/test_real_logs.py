@@ -19,7 +19,7 @@ from tests.e2e.real_grasps import check_lying_box, check_shelf_box, check_tape_r
 # name, frames, ATE RMSE [m]; the references are accurate to a few mm, 5 to 29 mm, 2 cm and about 3 cm. Bundle
 # adjustment and held-out views check the third (docs/experiments/tracking.md, "Keypoints from the whole image").
 LOGS = [
-    pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48"),
+    pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48", marks=pytest.mark.long),
     pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot"),
     pytest.param("visp_tabletop", 99, 0.025, id="visp_tabletop", marks=pytest.mark.long),
     pytest.param("redkitchen_000_199", 200, 0.015, id="redkitchen_000_199", marks=pytest.mark.long),

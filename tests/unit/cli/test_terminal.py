@@ -11,7 +11,7 @@ from tests.terminal import at_a_terminal
 LOG = "synthetic:tabletop?frames=12&width=160&height=120"
 
 
-@pytest.mark.parametrize("columns", [80, 200])
+@pytest.mark.parametrize("columns", [80, pytest.param(200, marks=pytest.mark.long)])
 def test_map_shows_progress_and_ends_with_its_summary(tmp_path: Path, columns: int) -> None:
     shown = at_a_terminal("map", LOG, "--out", str(tmp_path / "run"), columns=columns)
     assert shown.code == 0, shown.text
@@ -26,6 +26,7 @@ def test_map_shows_progress_and_ends_with_its_summary(tmp_path: Path, columns: i
     assert (tmp_path / "run" / "report.html").exists()
 
 
+@pytest.mark.long
 def test_without_colour_and_with_a_terminal_that_changes_its_width_map_goes_on(tmp_path: Path) -> None:
     shown = at_a_terminal(
         "map",

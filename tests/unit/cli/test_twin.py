@@ -70,6 +70,7 @@ def test_the_list_names_scenes_and_physics(run: RunCommand) -> None:
         assert word in answer.out
 
 
+@pytest.mark.long
 def test_a_film_shows_the_arm_move_or_it_is_said_why_there_is_none(tmp_path: Path) -> None:
     """In a process of its own: MUJOCO_GL must be set before mujoco is imported."""
     import cv2

@@ -81,6 +81,7 @@ def test_a_ur5_is_where_the_toolboxs_dh_model_has_it(tmp_path: Path, rng: np.ran
     np.testing.assert_allclose(ours[:, :3, 3], theirs[:, :3, 3] @ turn, atol=5e-4)  # its base is 0.3 mm higher
 
 
+@pytest.mark.long
 def test_a_six_axis_arm_of_the_toolbox_with_meshes_is_read_covered_and_queried(rng: np.random.Generator) -> None:
     reading = read_urdf(_puma(), slack=0.05)
     robot = reading.robot
