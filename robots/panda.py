@@ -2,8 +2,7 @@
 
 DH parameters and limits come from Franka's documentation (robot and interface specifications). Inertias are those of
 Gaz et al. (Dynamic Identification of the Franka Emika Panda Robot, RA-L 2019). The spheres contain Franka's visual and
-collision meshes; see :mod:`splatbot.robots.bodies`. The capsules of the twin follow Franka's coarse self-collision
-model.
+collision meshes; see :mod:`splatbot.robots.bodies`. The capsules of the twin lie in these meshes.
 """
 
 from __future__ import annotations

@@ -45,6 +45,12 @@ def so3_log(R: ArrayLike) -> Array:
     return times * v * (math.atan2(sine, cosine) / sine if sine > _SMALL_ANGLE else 1.0 + sine**2 / 6.0)
 
 
+def rotation_angles(R: Array) -> Array:
+    """Return the angles (N,) [rad] in [0, π] of rotation matrices (N, 3, 3)."""
+    sine = np.linalg.norm(R - R.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8)
+    return np.asarray(np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1)))
+
+
 def se3_exp(xi: ArrayLike) -> Array:
     """Return the pose (4, 4) of a twist (6,) = (translation [m], rotation [rad]) (Barfoot 2017, eq. 7.85)."""
     x = np.asarray(xi, dtype=np.float64)

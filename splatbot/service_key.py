@@ -62,7 +62,7 @@ def make_key(path: Path, key: str) -> str:
         finally:
             draft.unlink(missing_ok=True)
     except FileExistsError:
-        pass
+        pass  # the key of the file counts: it is returned below
     except OSError as error:
         hint = "set XDG_STATE_HOME to a folder that can be written, or SPLATBOT_API_KEYS"
         raise ConfigError(f"the key cannot be written ({error.strerror}).", file=path, hint=hint) from error

@@ -241,7 +241,9 @@ class Slam:
         if keyframes:
             self._tracker.variance_scale = self._mapper.inconsistency
             estimate = self._tracker.track(prepared, keyframes)
-            if self._starts_again(estimate, prepared.frame.stamp):
+            first = self._rectified_first(estimate, prepared.frame.stamp)
+            if first is not None:
+                self._start_again(first)
                 return self._track(self._prepare(prepared.recorded), hold_out)
             return estimate.prepared or prepared, estimate
         if hold_out:
@@ -249,28 +251,30 @@ class Slam:
         self._first = prepared
         return prepared, self._tracker.start(prepared)
 
-    def _starts_again(self, estimate: PoseEstimate, stamp: float) -> bool:
-        """Map the first frame again if the second one reveals that the camera moved during it; return whether so.
+    def _rectified_first(self, estimate: PoseEstimate, stamp: float) -> PreparedFrame | None:
+        """Return the first frame rectified by its velocity, if the second one reveals that the camera moved during it.
 
         The first frame is rectified as if at rest. Its rows, and depth of another instant, then contradict all frames
         that come back to its view.
         """
         first, self._first = self._first, None
         if first is None or estimate.verdict == "lost":
-            return False
+            return None
         twist = mean_twist(estimate.T_world_camera, stamp - first.frame.stamp)
         if displacement(first, twist, self.config.sensor) < MIN_DISPLACEMENT:
-            return False
+            return None
+        return prepare(first.recorded, self.config.tracking, twist)
+
+    def _start_again(self, first: PreparedFrame) -> None:
+        """Replace the map and the motion by those of the first frame alone; versions of the map go on."""
         self._executor.close()
         del self._executor
-        version = self._mapper.version
-        self._mapper, self._tracker = Mapper(self.config), Tracker(self.config.tracking)
-        self._mapper.version, self._location = version, GraphLocation()
-        first = prepare(first.recorded, self.config.tracking, twist)
-        observation = self._observation(first, self._tracker.start(first), hold_out=False)
-        self._location = self._mapper.submit(observation)
+        version, self._mapper = self._mapper.version, Mapper(self.config)
+        self._mapper.version = version
+        self._tracker, self._quality = Tracker(self.config.tracking), FrameQuality()
+        self._location = GraphLocation()
+        self._location = self._mapper.submit(self._observation(first, self._tracker.start(first), hold_out=False))
         self._executor.run()
-        return True
 
     def _observation(self, prepared: PreparedFrame, estimate: PoseEstimate, hold_out: bool) -> Observation:
         """Collect a tracked frame for the mapper, and note whether the robot moves."""

@@ -108,3 +108,38 @@ class StampedLog(LogBase):
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+
+class DerivedLog(LogBase):
+    """A log whose frames are those of another one, changed by the ``_decode`` of a subclass.
+
+    Args:
+        log: the other log.
+    """
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self.name, self.uri = log.name, log.uri
+
+    @property
+    def camera(self) -> Camera:
+        """As of the other log."""
+        return self._log.camera
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """As of the other log."""
+        return self._log.ground_truth
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        """As of the other log."""
+        return self._log.effects
+
+    @property
+    def calibration(self) -> Calibration:
+        """As of the other log."""
+        return self._log.calibration
+
+    def __len__(self) -> int:
+        return len(self._log)

@@ -46,11 +46,11 @@ class Adjustment:
 def adjust(graph: PoseGraph, number: int, config: BundleConfig) -> Adjustment:
     """Adjust the poses of the latest keyframes to all pairs that see the same place.
 
-    Each edge of the graph holds the alignment of a pair in condensed form: a motion and its covariance.
-    The motion minimizes the reprojection, photometric and depth residuals of the two images.
-    So the problem has six unknowns for each
-    keyframe and no landmarks, as in BundleFusion (Dai et al. 2017) and DVO-SLAM (Kerl et al. 2013). Keyframes before
-    the window are fixed. If the new keyframe sees a place from before the window, all keyframes but the first move.
+    Each edge of the graph holds the alignment of a pair in condensed form: a motion and its covariance. The motion
+    minimizes the reprojection, photometric and depth residuals of the two images. So the problem has six unknowns for
+    each keyframe and no landmarks, as in BundleFusion (Dai et al. 2017) and DVO-SLAM (Kerl et al. 2013). Keyframes
+    before the window are fixed. If the new keyframe sees a place from before the window, all keyframes but the first
+    move.
 
     Args:
         graph: poses and edges; not changed.

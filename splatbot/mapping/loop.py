@@ -181,7 +181,7 @@ class LoopCloser:
         prepared = observation.prepared
         odometry = self._odometry_edge(reference, keyframe, prepared)
         covisible = self._covisible_edges(keyframe, others, prepared)
-        if not self.graph.is_closed(odometry):  # tracking went over to a place seen before: a loop to be closed
+        if not self.graph.closed([odometry]).all():  # tracking went over to a place seen before: a loop to be closed
             covisible = [pair for pair in covisible if keyframe.number - pair.first <= NEIGHBOR_HOPS]
         if any(keyframe.number - pair.first <= NEIGHBOR_HOPS for pair in covisible):
             odometry = replace(odometry, covisible=True)  # its neighbors show whether it is wrong
@@ -312,7 +312,7 @@ class LoopCloser:
             self.closed += 1
             return
         poses = self.graph.optimize(pairs=False)
-        is_open = not all(PoseGraph(poses).is_closed(edge) for edge in loops)
+        is_open = not PoseGraph(poses).closed(loops).all()
         measured = (edge for edge in self.graph.edges if not (edge.loop or edge.pair))
         sigma = max((_mahalanobis(edge, poses) for edge in measured), default=0.0)
         if is_open or sigma > limits.max_edge_sigma:

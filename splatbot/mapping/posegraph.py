@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.geometry import inverse, se3_log
+from splatbot.geometry import inverse, rotation_angles, se3_log
 from splatbot.tracking.nearby_keyframes import pose_distance
 
 Array = NDArray[np.float64]
@@ -70,12 +70,15 @@ class PoseGraph:
         Loop closures connect a revisited place, and so do pairs of keyframes far apart in time that the poses agree
         with. Pairs of keyframes near in time would only shorten the path along which drift adds up.
         """
+        counted = [edge for edge in self.edges if not (edge.loop or edge.pair)]
+        if revisits:
+            far = [edge for edge in self.edges if edge.pair and abs(edge.second - edge.first) > NEIGHBOR_HOPS]
+            counted += [edge for edge in self.edges if edge.loop]
+            counted += [edge for edge, closed in zip(far, self.closed(far), strict=True) if closed]
         found: dict[int, list[int]] = {number: [] for number in self.poses}
-        for edge in self.edges:
-            far = edge.loop or (edge.pair and abs(edge.second - edge.first) > NEIGHBOR_HOPS and self.is_closed(edge))
-            if (revisits and far) or not (edge.loop or edge.pair):
-                found.setdefault(edge.first, []).append(edge.second)
-                found.setdefault(edge.second, []).append(edge.first)
+        for edge in counted:
+            found.setdefault(edge.first, []).append(edge.second)
+            found.setdefault(edge.second, []).append(edge.first)
         return {number: tuple(others) for number, others in found.items()}
 
     def path_length(self, first: int, second: int) -> tuple[float, float]:
@@ -92,10 +95,14 @@ class PoseGraph:
             float(sum(np.linalg.norm(step[3:]) for step in steps)),
         )
 
-    def is_closed(self, edge: Edge) -> bool:
-        """Return whether the poses agree with an edge, within the accuracy of a closed loop."""
-        moved, turned = max_residual([edge.residual(self.poses)])
-        return moved < _OPEN_TRANSLATION and turned < _OPEN_ROTATION
+    def closed(self, edges: Sequence[Edge]) -> NDArray[np.bool_]:
+        """Return with which edges (E,) the poses agree, within the accuracy of a closed loop."""
+        if not edges:
+            return np.zeros(0, np.bool_)
+        first, second = (np.stack([self.poses[getattr(e, end)] for e in edges]) for end in ("first", "second"))
+        T = np.asarray(np.linalg.solve(first @ np.stack([e.T_first_second for e in edges]), second), np.float64)
+        moved = np.linalg.norm(T[:, :3, 3], axis=1)
+        return np.asarray((moved < _OPEN_TRANSLATION) & (rotation_angles(T[:, :3, :3]) < _OPEN_ROTATION))
 
     def optimize(self, free: Set[int] | None = None, *, pairs: bool = True) -> dict[int, Array]:
         """Compute the poses that minimize the cost of all edges; the first keyframe is fixed.

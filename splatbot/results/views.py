@@ -64,9 +64,10 @@ def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
 
 
 def raw_views(run: RunFolder, log: Log) -> tuple[list[int], tuple[DepthView, ...]]:
-    """Return the frames of :func:`subsampled_views` with all depth that the sensor gave outside of masks.
+    """Return the frames of :func:`subsampled_views` with all depth that the sensor gave outside of masks, rectified.
 
-    An audit must not use the filters of mapping: they remove thin objects as noise.
+    An audit must not use the filters of mapping: they remove thin objects as noise. Depth of another time than the pose
+    would show errors that the map does not have.
 
     Returns:
         Positions in the log, and views.
@@ -76,10 +77,10 @@ def raw_views(run: RunFolder, log: Log) -> tuple[list[int], tuple[DepthView, ...
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    indices = _spread(sorted(poses))
+    indices, rectified = _spread(sorted(poses)), _rectified(run, log)
     views = []
     for index in indices:
-        frame = log[index]
+        frame = rectified[index]
         known = frame.valid if frame.mask is None else frame.valid & frame.mask
         views.append(subsampled((np.where(known, frame.depth, np.float32(0)), frame.camera, poses[index])))
     return indices, tuple(views)
@@ -105,8 +106,12 @@ def _spread(indices: Sequence[int]) -> list[int]:
 
 
 def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequence[int]) -> Iterator[DepthView]:
-    config = run.load_config().tracking
-    rectified = RectifiedLog(log, config.sensor, run.load_trajectory())
+    config, rectified = run.load_config().tracking, _rectified(run, log)
     for index in indices:
         frame = rectified[index]
         yield usable_depth(frame, config), frame.camera, poses[index]
+
+
+def _rectified(run: RunFolder, log: Log) -> RectifiedLog:
+    """Return the frames as the run mapped them: moved to their stamps by its trajectory."""
+    return RectifiedLog(log, run.load_config().sensor, run.load_trajectory())

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.geometry import inverse, so3_log
+from splatbot.geometry import inverse, rotation_angles, so3_log
 from splatbot.tracking.features import Features
 from splatbot.tracking.reference import Reference
 
@@ -37,9 +37,7 @@ def order_by_distance(keyframes: Sequence[TrackedKeyframe], T_world_camera: Arra
         return []
     poses = np.stack([keyframe.reference.T_world_camera for keyframe in keyframes])
     moved = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
-    R = poses[:, :3, :3].transpose(0, 2, 1) @ T_world_camera[:3, :3]
-    sine = np.linalg.norm(R - R.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8)
-    turned = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1))
+    turned = rotation_angles(poses[:, :3, :3].transpose(0, 2, 1) @ T_world_camera[:3, :3])
     return [int(k) for k in np.argsort(moved + 0.5 * turned, kind="stable")]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,8 +13,7 @@ from splatbot.camera import Camera
 from splatbot.config import SensorConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, se3_exp, se3_log
-from splatbot.logs.base import Log, LogBase
-from splatbot.logs.calibration import Calibration
+from splatbot.logs.base import DerivedLog, Log
 from splatbot.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -64,7 +62,7 @@ def rectify(frame: Frame, twist: Array, sensor: SensorConfig) -> Frame:
     return replace(frame, rgb=np.asarray(rgb, np.uint8), depth=depth, mask=seen, depth_delay=0.0)
 
 
-class RectifiedLog(LogBase):
+class RectifiedLog(DerivedLog):
     """A log with rectified frames, by the velocities of an estimated trajectory.
 
     Args:
@@ -74,21 +72,8 @@ class RectifiedLog(LogBase):
     """
 
     def __init__(self, log: Log, sensor: SensorConfig, trajectory: Trajectory) -> None:
-        self.name, self.uri, self.camera, self.ground_truth = log.name, log.uri, log.camera, log.ground_truth
-        self._log, self._sensor, self._trajectory = log, sensor, trajectory
-
-    @property
-    def effects(self) -> list[dict[str, Any]]:
-        """As of the log."""
-        return self._log.effects
-
-    @property
-    def calibration(self) -> Calibration:
-        """As of the log."""
-        return self._log.calibration
-
-    def __len__(self) -> int:
-        return len(self._log)
+        super().__init__(log)
+        self._sensor, self._trajectory = sensor, trajectory
 
     def _decode(self, index: int) -> Frame:
         frame = self._log[index]

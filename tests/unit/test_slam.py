@@ -237,7 +237,8 @@ def test_depth_of_another_instant_is_moved_to_that_of_colour_by_its_stamp() -> N
     assert errors[1] < 0.5 * errors[0]  # 1.1 of 3.0 mm; 1.2 mm without a delay
 
 
-def test_a_first_frame_in_motion_is_mapped_again_once_its_velocity_is_known() -> None:
+@pytest.mark.parametrize("threaded", [False, True])
+def test_a_first_frame_in_motion_is_mapped_again_once_its_velocity_is_known(threaded: bool) -> None:
     """The camera turns by 100 degrees a second from the first frame on; each frame is read in 30 ms."""
     log = open_log("synthetic:room?trajectory=turns&frames=45&width=160&height=120")
     truth = log.ground_truth
@@ -245,7 +246,8 @@ def test_a_first_frame_in_motion_is_mapped_again_once_its_velocity_is_known() ->
     fastest = int(np.argmax([pose_distance(a, b)[1] for a, b in pairwise(truth.T_world_camera[:31])]))
     shutter, rng = RollingShutter(readout=0.03).along(truth), np.random.default_rng(0)
     frames = [shutter.apply(log[k], rng) for k in range(fastest, fastest + 12)]
-    slam = run(frames, sensor__readout=0.03, mapping__refine_iterations=1)
+    slam = run(frames, sensor__readout=0.03, mapping__refine_iterations=1, mapping__threaded=threaded)
+    slam.close()
     exact = inverse(truth.T_world_camera[fastest])
     errors = []
     for k, result in enumerate(slam.results):
