@@ -80,6 +80,7 @@ def export(
 
     from splatbot.atomic import replace_files
     from splatbot.map_export import MapExport
+    from splatbot.results.units import megabytes
 
     exported = MapExport.open(file, voxel=voxel, n_sigma=n_sigma)
     writers: dict[str, Callable[[Path], None]] = {}
@@ -94,7 +95,7 @@ def export(
     for note in exported.notes:
         print(f"note: {note}")
     for written in writers:
-        print(f"{folder / written}: {(folder / written).stat().st_size / 1e6:.2f} MB")
+        print(f"{folder / written}: {megabytes((folder / written).stat().st_size)}")
     return 0
 
 

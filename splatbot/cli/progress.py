@@ -136,13 +136,13 @@ def mishaps(progress: Progress) -> str:
 @contextmanager
 def _live() -> Iterator[Callable[[Progress], None]]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
     bars = Bars(
         TextColumn("[bold]{task.description}"),
         BarColumn(bar_width=CONSTANTS.bar_width),
-        MofNCompleteColumn(),
+        TextColumn("{task.fields[counts]}"),
         TextColumn("{task.fields[numbers]}", table_column=_one_line()),
         TextColumn("[{task.fields[colour]}]{task.fields[verdict]}"),
         TimeRemainingColumn(compact=True),
@@ -151,7 +151,7 @@ def _live() -> Iterator[Callable[[Progress], None]]:
     )
     rate = FrameRate()
     with bars:
-        task = bars.add_task("reading", total=None, numbers="", verdict="", colour="white")
+        task = bars.add_task("reading", total=None, counts="", numbers="", verdict="", colour="white")
 
         def show(progress: Progress) -> None:
             for notice in notices(progress):
@@ -170,6 +170,7 @@ def _live() -> Iterator[Callable[[Progress], None]]:
                 description=progress.phase,
                 total=total,
                 completed=done,
+                counts="" if total is None else f"{done}/{total}",
                 numbers=_numbers(progress, rate.value, bars.console.width) if mapping else "",
                 verdict=verdict,
                 colour=_COLOURS.get(verdict, "white"),

@@ -90,7 +90,10 @@ def audit_section(audit: RunAudit | None) -> str:
 
 @styled
 def audit_png(audit: RunAudit) -> bytes:
-    """Plot the missed points in the frame that shows the largest hole, and the distances of the surface."""
+    """Plot the missed points in the frame that shows most of the largest hole, and the distances of the surface.
+
+    Without a hole, it is the frame that shows most missed points.
+    """
     fig, (left, right) = figure(2, height=3.4)
     left.imshow(audit.picture)
     left.plot(*audit.marks.T, ".", color=RED, markersize=2)

@@ -120,7 +120,8 @@ def audit_run(run: RunFolder, log: Log, *, n_sigma: float = 2.0) -> RunAudit:
     audit = audit_surfaces(GaussianCollisionField(model, n_sigma), space)
     near = audit.within()
     holes = near.holes()
-    shown = int(np.bincount(near.space.view[holes[0].rows]).argmax()) if holes else 0
+    marked = holes[0].rows if holes else np.flatnonzero(near.missed)
+    shown = int(np.bincount(near.space.view[marked]).argmax()) if len(marked) else 0
     frame = log[indices[shown]]
     marks = near.space.pixel[near.missed & (near.space.view == shown)]
     step = frame.camera.width / views[shown][1].width

@@ -39,9 +39,11 @@ def count(value: int | None) -> str:
 
 
 def megabytes(value: float | None) -> str:
-    """Format bytes in MB (10⁶ bytes), or in GB from 1000 MB on."""
+    """Format bytes in MB (10⁶ bytes), in GB from 1000 MB on, or in kB below 0.1 MB."""
     if value is None:
         return NONE
+    if value < 1e5:
+        return f"{value / 1e3:.1f} kB"
     return f"{value / 1e9:.2f} GB" if value >= 1e9 else f"{value / 1e6:.1f} MB"
 
 

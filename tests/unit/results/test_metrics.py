@@ -63,6 +63,7 @@ def test_numbers_that_json_lacks_become_null() -> None:
         (percent(0.714), "71 %"),
         (count(1234567), "1,234,567"),
         (megabytes(12_345_678), "12.3 MB"),
+        (megabytes(1_234), "1.2 kB"),
         (megabytes(2_500_000_000), "2.50 GB"),
         (number(0.12345, 3), "0.123"),
         (number(None, 3), "-"),
