@@ -71,6 +71,18 @@ def beyond(pieces: Array, centers: Array, radii: Array) -> Array:
     return far - radii
 
 
+def lacking(pieces: Array, centers: Array, radii: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Compute by how much (P,) [m] the best sphere of each piece has to grow, and the row of that sphere (P,)."""
+    found = [
+        (missing.min(axis=1), missing.argmin(axis=1))
+        for k in range(0, len(pieces), CONSTANTS.chunk)
+        for missing in (beyond(pieces[k : k + CONSTANTS.chunk], centers, radii),)
+    ]
+    if not found:
+        return np.zeros(0), np.zeros(0, np.int64)
+    return np.concatenate([least for least, _ in found]), np.concatenate([row for _, row in found])
+
+
 def _halves(pieces: Array, edges: Array) -> Array:
     """Halve triangles (P, 3, 3) across their longest edge."""
     rows, first = np.arange(len(pieces)), edges.argmax(axis=1)
@@ -93,10 +105,8 @@ def uncovered_by_link(shapes: Sequence[Shape], spheres: LinkSpheres, size: float
     for shape in shapes:
         own = spheres.link == shape.link
         centers, radii = spheres.centers[own], spheres.radii[own] + NANOMETRE
-        worst = 0.0
         left = open_pieces(shape.triangles(), centers, radii, size)
-        for k in range(0, len(left), CONSTANTS.chunk):
-            worst = max(worst, float(beyond(left[k : k + CONSTANTS.chunk], centers, radii).min(axis=1).max()))
+        worst = float(lacking(left, centers, radii)[0].max(initial=0.0))
         found[shape.link] = max(found.get(shape.link, 0.0), worst)
     return found
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 
 from splatbot.errors import InputError
 from splatbot.protocols import Array, LinkSpheres
-from splatbot.robots.containment import NANOMETRE, beyond, open_pieces
+from splatbot.robots.containment import NANOMETRE, lacking, open_pieces
 from splatbot.robots.shapes import Capsule, Shape, depth_of
 
 
@@ -23,12 +23,17 @@ class SphereFitConstants:
     Args:
         points: points of the surface that the selected spheres must contain; more are added where the proof fails.
         candidates: spheres to select from, a third of them in the volume and the others below the surface.
-        deepest: [m] largest depth of a candidate that is placed below the surface.
+        deepest: [m] largest depth of a candidate that is placed below the surface, at least.
+        deepest_of_slack: the same relative to the slack.
         rounds: selections at most.
-        size: [m] edge of the pieces in the proof; every selected sphere contains its points with this margin.
-        growth: [m] growth of a radius that ends the selection.
+        size: [m] edge of the pieces in the proof, but a quarter of a small slack. Every selected sphere contains its
+            points with this margin.
+        size_of_slack: the edge relative to the slack, which bounds the pieces of large arms.
+        growth: [m] growth of a radius that ends the selection, at least.
+        growth_of_slack: the same relative to the slack.
         added: points that are added in a round, at most.
-        apart: [m] distance between added points.
+        apart: [m] distance between added points, at least.
+        apart_of_slack: the same relative to the slack.
         seconds: [s] time limit of a selection; the greedy one is taken if it is smaller.
         gap: relative gap to the fewest spheres at which a selection ends.
         seed: of the samples.
@@ -37,11 +42,15 @@ class SphereFitConstants:
     points: int = 600
     candidates: int = 3000
     deepest: float = 0.05
+    deepest_of_slack: float = 4.0
     rounds: int = 3
     size: float = 1e-3
+    size_of_slack: float = 0.05
     growth: float = 1e-3
+    growth_of_slack: float = 0.05
     added: int = 150
     apart: float = 4e-3
+    apart_of_slack: float = 0.3
     seconds: float = 3.0
     gap: float = 0.1
     seed: int = 0
@@ -104,6 +113,13 @@ def cover_solids(shapes: Sequence[Shape], slack: float, fit: SphereFitConstants 
     Returns:
         centres (S, 3) [m, link frame] and radii (S,) [m].
     """
+    fit = replace(
+        fit,
+        size=proof_size(slack, fit),
+        deepest=max(fit.deepest, fit.deepest_of_slack * slack),
+        growth=max(fit.growth, fit.growth_of_slack * slack),
+        apart=max(fit.apart, fit.apart_of_slack * slack),
+    )
     rng = np.random.default_rng(fit.seed)
     growth = min(fit.growth, slack / 4)
     inner = slack - growth
@@ -118,11 +134,16 @@ def cover_solids(shapes: Sequence[Shape], slack: float, fit: SphereFitConstants 
         left = open_pieces(triangles, centers[chosen], radii[chosen], fit.size * (2 if turn == 0 else 1))
         if not len(left):
             break
-        lacking = beyond(left, centers[chosen], radii[chosen]).min(axis=1)
-        if lacking.max() <= growth:
+        missing, _ = lacking(left, centers[chosen], radii[chosen])
+        if missing.max() <= growth:
             break
-        points = np.concatenate([points, _spread(left.mean(axis=1), lacking, fit)])
+        points = np.concatenate([points, _spread(left.mean(axis=1), missing, fit)])
     return _completed(triangles, centers[chosen], radii[chosen], inner, growth, fit)
+
+
+def proof_size(slack: float, fit: SphereFitConstants = QUICK) -> float:
+    """Return the edge [m] of the pieces in the proof of spheres with a slack [m]."""
+    return max(min(fit.size, slack / 4), fit.size_of_slack * slack)
 
 
 def _candidates(
@@ -197,10 +218,10 @@ def _greedy(contains: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array(chosen, dtype=np.int64)
 
 
-def _spread(points: Array, lacking: Array, fit: SphereFitConstants) -> Array:
+def _spread(points: Array, missing: Array, fit: SphereFitConstants) -> Array:
     """Return the points that lack most, apart from each other."""
     found = np.zeros((0, 3))
-    for point in points[np.argsort(-lacking)][: 40 * fit.added]:
+    for point in points[np.argsort(-missing)][: 40 * fit.added]:
         if len(found) < fit.added and (np.linalg.norm(found - point, axis=1) > fit.apart).all():
             found = np.concatenate([found, point[None]])
     return found
@@ -214,14 +235,13 @@ def _completed(
     Other pieces make the sphere grow that needs to grow least.
     """
     left = open_pieces(triangles, centers, radii, fit.size)
-    lacking = beyond(left, centers, radii).min(axis=1)
-    while len(lacking) and lacking.max() > growth:
-        middle = left[int(lacking.argmax())].mean(axis=0)
+    missing, nearest = lacking(left, centers, radii)
+    while len(missing) and missing.max() > growth:
+        middle = left[int(missing.argmax())].mean(axis=0)
+        by_new = lacking(left, middle[None], np.array([inner]))[0]
+        nearest[by_new < missing] = len(centers)
+        np.minimum(missing, by_new, out=missing)
         centers, radii = np.concatenate([centers, middle[None]]), np.append(radii, inner)
-        np.minimum(lacking, beyond(left, middle[None], radii[-1:])[:, 0], out=lacking)
     grown = radii.copy()
-    for k in range(0, len(left), 20_000):
-        missing = beyond(left[k : k + 20_000], centers, radii)
-        nearest = missing.argmin(axis=1)
-        np.maximum.at(grown, nearest, radii[nearest] + missing[np.arange(len(nearest)), nearest] + NANOMETRE)
+    np.maximum.at(grown, nearest, radii[nearest] + missing + NANOMETRE)
     return centers, grown

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError
+from splatbot.protocols import Array
 from splatbot.robots.shapes import Mesh, Shape
 
 
@@ -75,14 +77,28 @@ class Source:
         return [shape for file in self.parts[part] for shape in read_shapes(self.path(file), link)]
 
 
-def read_shapes(path: Path, link: int, scale: float = 1.0) -> list[Shape]:
-    """Read a mesh file [m].
+_PART = 0.25  # size of a part relative to its mesh, above which it is a solid of its own
+_CRACKS = 0.002  # share of the edges that may have one face only in a closed mesh
+_CHUNK = 1000  # triangles that are compared with a hull at once
+_MOST_BYTES = 256 << 20  # of a mesh file; it bounds memory
+
+
+def read_shapes(path: Path, link: int, scale: ArrayLike = 1.0) -> list[Mesh]:
+    """Read a mesh file.
 
     A mesh that is closed, or convex but for rounding (then its hull is added), has an inside; others are surfaces.
+
+    Args:
+        path: STL, OBJ, PLY or Collada file.
+        link: index of its link.
+        scale: metres per unit of the file, a number or (3,).
 
     Raises:
         InputError: the file cannot be read.
     """
+    if path.stat().st_size > _MOST_BYTES:
+        size = f"has {path.stat().st_size >> 20} MB."
+        raise InputError(size, field=path.name, hint=f"simplify the mesh to {_MOST_BYTES >> 20} MB or less")
     try:
         pieces = trimesh.load_scene(path, process=False).dump()
     except (ImportError, ValueError, OSError) as error:
@@ -93,22 +109,63 @@ def read_shapes(path: Path, link: int, scale: float = 1.0) -> list[Shape]:
     loaded = trimesh.util.concatenate(meshes)
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise InputError("holds no triangles.", field=path.name, hint="give an STL, OBJ or Collada file")
-    mesh = trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces, process=True)
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    if mesh.is_watertight:
-        return [Mesh(link, vertices, faces)]
-    hull = mesh.convex_hull
-    found: list[Shape] = [Mesh(link, vertices, faces, closed=False)]
-    if _is_nearly_hull(mesh, hull):
-        found.append(Mesh(link, np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int64)))
+    factors = np.broadcast_to(np.asarray(scale, dtype=np.float64), 3)
+    around = loaded.faces if factors.prod() > 0 else loaded.faces[:, ::-1]  # a mirror turns faces inside out
+    return as_shapes(np.asarray(loaded.vertices) * factors, np.asarray(around, dtype=np.int64), link)
+
+
+def as_shapes(vertices: Array, faces: NDArray[np.int64], link: int) -> list[Mesh]:
+    """Return the connected parts of a triangle mesh as shapes.
+
+    A part that is closed has an inside. The hull of a part that is convex but for rounding is added, as that of a tube
+    without lids. All other parts are one surface.
+
+    Args:
+        vertices: (V, 3) [m, link frame].
+        faces: (T, 3) rows of the vertices.
+        link: index of the link.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=True)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    if _is_closed(mesh):
+        return [_shape(mesh, link)]
+    found: list[Mesh] = []
+    surfaces: list[trimesh.Trimesh] = []
+    for part in mesh.split(only_watertight=False):
+        large = part.extents.max() > _PART * mesh.extents.max()
+        if large and _is_closed(part):
+            found.append(_shape(part, link))
+            continue
+        surfaces.append(part)
+        if large and _is_nearly_hull(part, hull := part.convex_hull):
+            found.append(_shape(hull, link))
+    if surfaces:
+        joined = trimesh.util.concatenate(surfaces)
+        assert isinstance(joined, trimesh.Trimesh)
+        found.append(_shape(joined, link, closed=False))
     return found
+
+
+def _shape(mesh: trimesh.Trimesh, link: int, closed: bool = True) -> Mesh:
+    return Mesh(link, np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64), closed)
+
+
+def _is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Return whether every edge has two faces, but for a few at cracks: rays of several directions outvote those."""
+    if mesh.is_watertight:
+        return True
+    _, faces = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+    return float((faces == 1).mean()) <= _CRACKS
 
 
 def _is_nearly_hull(mesh: trimesh.Trimesh, hull: trimesh.Trimesh) -> bool:
     """Return whether every face lies within 1 % of the mesh's size of its hull's surface."""
     planes = np.c_[hull.face_normals, -np.einsum("ij,ij->i", hull.face_normals, hull.triangles_center)]
-    inside = -(mesh.triangles_center @ planes[:, :3].T + planes[:, 3]).max(axis=1)
-    return bool(inside.max() <= 0.01 * float(mesh.extents.max()))
+    centers, allowed = mesh.triangles_center, 0.01 * float(mesh.extents.max())
+    return all(
+        -(centers[k : k + _CHUNK] @ planes[:, :3].T + planes[:, 3]).max(axis=1).min() <= allowed
+        for k in range(0, len(centers), _CHUNK)
+    )
 
 
 _LINKS = tuple(f"link{k}" for k in range(8))

@@ -43,6 +43,22 @@ class Inertial:
     center: tuple[float, float, float]
     inertia: Array
 
+    @classmethod
+    def summed(cls, parts: Sequence[tuple[float, Array, Array]]) -> Inertial:
+        """Sum the mass, its centre (3,) and the inertia about it (3, 3) of bodies that are fixed to each other.
+
+        By the parallel axis theorem, I = sum_i I_i + m_i (|r_i|² E - r_i r_iᵀ) with r_i the offset of the centres.
+        """
+        mass = sum(m for m, _, _ in parts)
+        if mass <= 0:
+            return cls(0.0, (0.0, 0.0, 0.0), np.zeros((3, 3)))
+        c = np.sum([m * center for m, center, _ in parts], axis=0) / mass
+        total = np.zeros((3, 3))
+        for m, center, inertia in parts:
+            r = center - c
+            total += inertia + m * (r @ r * np.eye(3) - np.outer(r, r))
+        return cls(float(mass), (float(c[0]), float(c[1]), float(c[2])), total)
+
 
 @dataclass(frozen=True, eq=False)
 class GripperGeometry:

@@ -37,7 +37,7 @@ def robot_file(name: str) -> Path:
         InputError: the name is that of a built-in robot or cannot be that of a file.
     """
     if name in _BUILT_IN or not _NAME.fullmatch(name):
-        hint = "rename the <robot> in the URDF: letters, digits, - _ . after a letter or digit, at most 80"
+        hint = "give another --name: letters, digits, - _ . after a letter or digit, at most 80"
         raise InputError(f"{name[:80]!r} is no name of an added robot.", field="name", hint=hint)
     return robots_folder() / f"{name}.json"
 

@@ -4,77 +4,75 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 
 from splatbot.errors import FormatError, InputError
 from splatbot.geometry import so3_exp, transform_points
 from splatbot.protocols import Array
 from splatbot.robots.joints import Joint
-from splatbot.robots.robot import CONSTANTS as COVER
+from splatbot.robots.maker_meshes import read_shapes
+from splatbot.robots.reading import CONSTANTS, NamedShape, Reading, checked_slack, default_tip, distinct, joint, z_to
 from splatbot.robots.robot import Inertial, RobotModel
-from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
+from splatbot.robots.shapes import Box, Capsule, Shape
 
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
-@dataclass(frozen=True)
-class DefaultLimits:
-    """Limits that a URDF lacks: always those of acceleration and jerk, often that of velocity."""
-
-    velocity: float = 1.0
-    """Limit [rad/s or m/s] of the velocity of a joint without one. A larger one makes motions faster than the arm may
-    bear."""
-    acceleration_per_velocity: float = 5.0
-    """Ratio [1/s] of the limits of acceleration and velocity. The joint reaches its velocity within a fifth of a
-    second."""
-    jerk_per_velocity: float = 50.0
-    """Ratio [1/s²] of the limits of jerk and velocity. The joint reaches its acceleration within a tenth of a
-    second."""
-
-
-CONSTANTS = DefaultLimits()
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Robot of a URDF file, and the assumptions that replace missing values."""
-
-    robot: RobotModel
-    notes: tuple[str, ...]
-
-
-def read_urdf(path: str | Path, *, tip: str | None = None, slack: float = COVER.slack) -> Reading:
+def read_urdf(path: str | Path, *, tip: str | None = None, slack: float | None = None) -> Reading:
     """Read the serial arm from the root to ``tip``.
 
     Fixed links belong to the link of the arm that carries them. Moving joints outside the arm (fingers) are fixed at
-    the value in their limits that is nearest to 0. Links without collision geometry use their visual geometry.
+    the value in their limits that is nearest to 0. The shapes of a link are its collision and its visual geometry.
 
     Args:
-        path: URDF file.
-        tip: last link of the arm. If None, the link with most moving joints between the root and it.
-        slack: see :class:`splatbot.robots.robot.RobotModel` [m].
+        path: URDF file, or a xacro file if the package xacro is installed.
+        tip: last link of the arm. If None, see :func:`splatbot.robots.reading.default_tip`.
+        slack: see :class:`splatbot.robots.robot.RobotModel` [m]. If None, 2 % of the reach.
 
     Raises:
         FormatError: the file is no URDF, has no moving joint, or contains an invalid element, which the error names.
     """
     file = Path(path)
-    try:
-        root = ElementTree.parse(file).getroot()
-    except (OSError, ElementTree.ParseError) as error:
-        raise FormatError(
-            f"cannot be read ({error}).", file=file, hint="give a URDF file; expand a xacro first"
-        ) from error
+    root = parse(file)
     if root.tag != "robot":
-        raise FormatError(f"its root is <{root.tag}>.", file=file, hint="give a URDF file, whose root is <robot>")
+        hint = "give a URDF, xacro or MJCF file, whose root is <robot> or <mujoco>"
+        raise FormatError(f"its root is <{root.tag}>.", file=file, hint=hint)
     return _UrdfReader(file, root, slack).read(tip)
 
 
+def parse(file: Path) -> ElementTree.Element:
+    """Parse an XML file, and expand the macros of xacro.
+
+    Raises:
+        FormatError: the file cannot be read, is no XML, or has macros that cannot be expanded.
+    """
+    try:
+        text = file.read_bytes()
+        root = ElementTree.fromstring(text)
+    except (OSError, ElementTree.ParseError) as error:
+        hint = "give a URDF, xacro or MJCF file"
+        raise FormatError(f"cannot be read ({error}).", file=file, hint=hint) from error
+    return _expanded(file) if b"/xacro" in text else root
+
+
+def _expanded(file: Path) -> ElementTree.Element:
+    try:
+        import xacro  # type: ignore[import-untyped]
+    except ImportError as error:
+        hint = f"pip install xacro, or expand it: xacro {file.name} > robot.urdf"
+        raise FormatError("has macros of xacro.", file=file, hint=hint) from error
+    try:
+        return ElementTree.fromstring(xacro.process_file(str(file)).toxml())
+    except Exception as error:  # xacro raises its own errors, those of expressions, and those of ROS packages
+        hint = f"expand it where its ROS packages are: xacro {file.name} > robot.urdf"
+        raise FormatError(f"cannot be expanded ({error}).", file=file, hint=hint) from error
+
+
 class _UrdfReader:
-    def __init__(self, file: Path, root: ElementTree.Element, slack: float) -> None:
+    def __init__(self, file: Path, root: ElementTree.Element, slack: float | None) -> None:
         self.file, self.root, self.slack = file, root, slack
         self.links = {self._name(e): e for e in root.findall("link")}
         self.joint_to = {self._link(e, "child"): e for e in root.findall("joint")}
@@ -83,7 +81,7 @@ class _UrdfReader:
     def read(self, tip: str | None) -> Reading:
         if tip is not None and tip not in self.links:
             raise FormatError(f"there is no link {tip!r}.", file=self.file, hint=f"links: {', '.join(self.links)}")
-        end = tip or max(self.links, key=lambda link: (self._moving_before(link), -len(self._path(link))))
+        end = tip or self._default_tip()
         arm = [e for e in self._path(end) if e.get("type") in _MOVING]
         if not arm:
             raise FormatError("has no moving joint.", file=self.file, field=end, hint="name another link with tip")
@@ -103,21 +101,22 @@ class _UrdfReader:
                     placed[child] = (k, T @ self._fixed(joint))
                     continue
                 turn = np.eye(4)
-                turn[:3, :3] = _z_to(self._axis(joint))
+                turn[:3, :3] = z_to(self._axis(joint))
                 joints.append(self._joint(joint, T @ turn))
                 placed[child] = (k + 1, turn.T)
         if left:
             raise FormatError("has links in a circle.", file=self.file, field=next(iter(left)), hint="a URDF is a tree")
-        shapes = [shape for link, (k, T) in placed.items() for shape in self._shapes(link, k, T)]
+        shapes = distinct(shape for link, (k, T) in placed.items() for shape in self._shapes(link, k, T))
+        slack = checked_slack(shapes, joints, placed[end][1], self.slack, self.file)
         lower, upper = np.array([j.lower for j in joints]), np.array([j.upper for j in joints])
         robot = RobotModel(
             name=self.root.get("name") or self.file.stem,
             joints=tuple(joints),
-            shapes=tuple(shapes),
+            shapes=tuple(named.shape for named in shapes),
             T_link_tcp=placed[end][1],
             home=np.clip(np.zeros(len(joints)), lower, upper),
             inertials=self._inertials(len(joints), placed),
-            slack=self.slack,
+            slack=slack,
         )
         return Reading(robot, tuple(self.notes))
 
@@ -128,8 +127,13 @@ class _UrdfReader:
             link = self._link(found[-1], "parent")
         return found[::-1]
 
-    def _moving_before(self, link: str) -> int:
-        return sum(e.get("type") in _MOVING for e in self._path(link))
+    def _default_tip(self) -> str:
+        carried: dict[str, list[str]] = {}
+        for child, e in self.joint_to.items():
+            carried.setdefault(self._link(e, "parent"), []).append(child)
+        moving = [child for child, e in self.joint_to.items() if e.get("type") in _MOVING]
+        root = next((link for link in self.links if link not in self.joint_to), "")
+        return default_tip(carried, moving, root, self.file)
 
     def _joint(self, e: ElementTree.Element, T: Array) -> Joint:
         name, limit = self._name(e), e.find("limit")
@@ -145,17 +149,8 @@ class _UrdfReader:
             velocity = CONSTANTS.velocity
             self.notes.append(f"{name} has no limit of velocity: {CONSTANTS.velocity:g} per second is assumed")
         try:
-            return Joint(
-                name=name,
-                T_before_joint=T,
-                lower=low,
-                upper=high,
-                velocity=velocity,
-                acceleration=CONSTANTS.acceleration_per_velocity * velocity,
-                jerk=CONSTANTS.jerk_per_velocity * velocity,
-                effort=values["effort"] or 0.0,
-                prismatic=e.get("type") == "prismatic",
-            )
+            prismatic = e.get("type") == "prismatic"
+            return joint(name, T, (low, high), velocity, values["effort"] or 0.0, prismatic=prismatic)
         except InputError as error:
             raise FormatError(error.message, file=self.file, field=name, hint=error.hint) from error
 
@@ -181,39 +176,47 @@ class _UrdfReader:
             raise FormatError("has an axis of no length.", file=self.file, field=self._name(e), hint="give a direction")
         return np.asarray(axis / np.linalg.norm(axis))
 
-    def _shapes(self, link: str, k: int, T: Array) -> list[Shape]:
-        elements = self.links[link].findall("collision") or self.links[link].findall("visual")
-        return [self._shape(e, link, k, T @ _origin(e)) for e in elements]
+    def _shapes(self, link: str, k: int, T: Array) -> list[NamedShape]:
+        """Return the collision and the visual geometry of a link; the same geometry in both counts once."""
+        found: dict[str, list[NamedShape]] = {}
+        for kind in ("collision", "visual"):
+            for e in self.links[link].findall(kind):
+                key = " ".join(str(part.attrib) for part in e.iter() if part.tag not in (kind, "material", "color"))
+                try:
+                    found.setdefault(key, self._shape(e, link, k, T @ _origin(e)))
+                except FormatError as error:
+                    if kind == "collision" or not self.links[link].findall("collision"):
+                        raise
+                    self.notes.append(f"{link}: its visual geometry is not covered ({error.message} {error.hint})")
+        return [shape for shapes in found.values() for shape in shapes]
 
-    def _shape(self, e: ElementTree.Element, link: str, k: int, T: Array) -> Shape:
+    def _shape(self, e: ElementTree.Element, link: str, k: int, T: Array) -> list[NamedShape]:
         kind = next(iter(e.find("geometry") or []), None)
         if kind is None:
             raise FormatError("has no geometry.", file=self.file, field=link, hint="remove the element, or fill it")
         if kind.tag == "sphere":
             at = (float(T[0, 3]), float(T[1, 3]), float(T[2, 3]))
-            return Capsule(k, at, at, self._size(kind, "radius", link))
+            return [NamedShape(link, Capsule(k, at, at, self._size(kind, "radius", link)))]
         if kind.tag == "cylinder":
-            return _cylinder(k, T, self._size(kind, "radius", link), self._size(kind, "length", link))
+            cylinder = _cylinder(k, T, self._size(kind, "radius", link), self._size(kind, "length", link))
+            return [NamedShape(link, cylinder)]
         if kind.tag == "box":
             x, y, z = _vector(kind.get("size"), (0.0, 0.0, 0.0))
-            return Box(k, T, (float(x), float(y), float(z)))
+            return [NamedShape(link, Box(k, T, (float(x), float(y), float(z))))]
         if kind.tag == "mesh":
             return self._mesh(kind, link, k, T)
         raise FormatError(
             f"has a <{kind.tag}>.", file=self.file, field=link, hint="use spheres, cylinders, boxes, meshes"
         )
 
-    def _mesh(self, e: ElementTree.Element, link: str, k: int, T: Array) -> Mesh:
+    def _mesh(self, e: ElementTree.Element, link: str, k: int, T: Array) -> list[NamedShape]:
         path = self._resolve(e.get("filename") or "", link)
-        mesh = o3d.io.read_triangle_mesh(path)
-        if not len(mesh.triangles):
-            raise FormatError("holds no triangles that can be read.", file=path, hint="give an STL or OBJ file")
-        mesh.merge_close_vertices(1e-9)
-        if not mesh.is_watertight():
-            mesh, _ = mesh.compute_convex_hull()
-            self.notes.append(f"{link}: {path.name} is not closed, its convex hull is taken")
-        scale = _vector(e.get("scale"), (1.0, 1.0, 1.0))
-        return Mesh(k, transform_points(T, np.asarray(mesh.vertices) * scale), np.asarray(mesh.triangles, np.int64))
+        try:
+            meshes = read_shapes(path, k, _vector(e.get("scale"), (1.0, 1.0, 1.0)))
+        except InputError as error:
+            raise FormatError(error.message, file=path, field=link, hint=error.hint) from error
+        moved = [replace(mesh, vertices=transform_points(T, mesh.vertices)) for mesh in meshes]
+        return [NamedShape(f"{link} ({path.name})", mesh) for mesh in moved]
 
     def _resolve(self, name: str, link: str) -> Path:
         """Find a mesh relative to the URDF, or in the folder of its package:// above the URDF."""
@@ -233,7 +236,7 @@ class _UrdfReader:
 
     def _inertials(self, joints: int, placed: dict[str, tuple[int, Array]]) -> tuple[Inertial, ...]:
         """Sum the inertias of each link of the arm and its fixed links; empty if a moving link has no mass."""
-        mass, first, second = np.zeros(joints + 1), np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3, 3))
+        parts: list[list[tuple[float, Array, Array]]] = [[] for _ in range(joints + 1)]
         for link, (k, T_link) in placed.items():
             e = self.links[link].find("inertial")
             m = _number(e.find("mass").get("value")) if e is not None and e.find("mass") is not None else None  # type: ignore[union-attr]
@@ -245,19 +248,11 @@ class _UrdfReader:
                 for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
             )
             own = T[:3, :3] @ np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ T[:3, :3].T
-            c = T[:3, 3]
-            mass[k] += m
-            first[k] += m * c
-            second[k] += own + m * (c @ c * np.eye(3) - np.outer(c, c))
-        if (mass[1:] <= 0).any():
+            parts[k].append((m, T[:3, 3], own))
+        if any(sum(m for m, _, _ in own) <= 0 for own in parts[1:]):
             self.notes.append("some moving links have no mass: the twin cannot be built from it")
             return ()
-        found = []
-        for m, moment, inertia in zip(mass, first, second, strict=True):
-            c = moment / m if m > 0 else np.zeros(3)
-            about = inertia - m * (c @ c * np.eye(3) - np.outer(c, c))
-            found.append(Inertial(float(m), (float(c[0]), float(c[1]), float(c[2])), about))
-        return tuple(found)
+        return tuple(Inertial.summed(own) for own in parts)
 
     def _size(self, e: ElementTree.Element, key: str, link: str) -> float:
         value = _number(e.get(key))
@@ -299,16 +294,6 @@ def _origin(e: ElementTree.Element) -> Array:
         T[:3, :3] = so3_exp([0, 0, yaw]) @ so3_exp([0, pitch, 0]) @ so3_exp([roll, 0, 0])
         T[:3, 3] = _vector(found.get("xyz"), (0.0, 0.0, 0.0))
     return T
-
-
-def _z_to(axis: Array) -> Array:
-    """Return the rotation (3, 3) of smallest angle that maps z to a unit vector."""
-    c = float(axis[2])
-    if c < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    v = np.cross([0.0, 0.0, 1.0], axis)
-    s = float(np.linalg.norm(v))
-    return so3_exp(v / s * np.arctan2(s, c)) if s > 0 else np.eye(3)
 
 
 def _vector(text: str | None, default: Sequence[float]) -> Array:

@@ -20,17 +20,20 @@ def robot(
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     tip: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None,
     slack: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None,
+    rename: Annotated[str | None, tyro.conf.arg(metavar="NAME", name="name")] = None,
+    overwrite: bool = False,
     check_meshes: bool = False,
 ) -> int:
     """Add a robot arm, or describe a stored one.
 
-    The action `add` reads a URDF, covers its collision geometry with spheres, checks the cover, and stores it under its
-    name. The action `list` prints the names of the robots. The action `info` prints joints, limits and spheres. The
-    action `fit` fits the certified body of a shipped arm to the meshes of its maker. The action `mjcf` writes a MuJoCo
-    model.
+    The action `add` reads a URDF, xacro or MJCF file. It covers collision and visual geometry with spheres, proves that
+    they contain it, and stores the arm under its name. The action `list` prints the names of the robots. The action
+    `info` prints joints, limits and spheres. The action `fit` fits the certified body of a shipped arm to the meshes of
+    its maker. The action `mjcf` writes a MuJoCo model.
 
     Examples:
         splatbot robot add ur5.urdf --tip tool0
+        splatbot robot add menagerie/ufactory_xarm7/xarm7.xml --name lab-xarm
         splatbot robot info panda
         splatbot robot info panda --check-meshes --out panda-body.png
         splatbot robot fit panda --slack 0.011 --out panda.json
@@ -38,15 +41,18 @@ def robot(
 
     Args:
         action: the action.
-        name: a robot's name; for add, the URDF file.
+        name: a robot's name; for add, the file.
         out: the file to write; mjcf prints without one. info --check-meshes draws NAME-body.png by default, and fit
             writes NAME.json.
-        tip: add: the link at the arm's end; by default that with most moving joints before it.
-        slack: largest distance of the spheres beyond the geometry [m]; for add 0.02, for fit 0.011 by default.
+        tip: add: the link at the arm's end (MJCF: a body or site); by default the last one before fingers.
+        slack: largest distance of the spheres beyond the geometry [m]; for fit 0.011 by default. By default add takes
+            2 % of the reach. It takes more if that needs too many spheres.
+        rename: add: the name to store the arm under; by default that in the file.
+        overwrite: add: replace a robot of that name.
         check_meshes: info: prove that the spheres contain the meshes of the maker, which a package must provide.
     """
     if action == "add":
-        return _add(Path(name), out, tip, 0.02 if slack is None else slack)
+        return _add(Path(name), out, rename, tip, slack, overwrite)
     if action == "list":
         from splatbot.robots.store import robot_names
 
@@ -117,22 +123,30 @@ def _check_meshes(name: str, out: Path | None) -> int:
     return 0 if max(p.uncovered for p in parts) <= 0 else 1
 
 
-def _add(path: Path, out: Path | None, tip: str | None, slack: float) -> int:
-    from splatbot.robots.containment import uncovered
-    from splatbot.robots.store import robot_file, save_robot
-    from splatbot.robots.urdf import read_urdf
+def _add(path: Path, out: Path | None, rename: str | None, tip: str | None, slack: float | None, new: bool) -> int:
+    from dataclasses import replace
 
-    reading = read_urdf(path, tip=tip, slack=slack)
+    from splatbot.errors import InputError
+    from splatbot.robots.containment import uncovered
+    from splatbot.robots.description import read_description
+    from splatbot.robots.reading import simplified
+    from splatbot.robots.store import robot_file, save_robot
+
+    reading = read_description(path, tip=tip, slack=slack)
+    arm = replace(reading.robot, name=rename or reading.robot.name)
     for note in reading.notes:
         print(f"note: {note}")
-    file = out if out is not None else robot_file(reading.robot.name)
-    spheres = reading.robot.spheres()
-    beyond = uncovered(reading.robot.shapes, spheres)
-    save_robot(reading.robot, file)
+    file = out if out is not None else robot_file(arm.name)
+    if file.exists() and not new:
+        raise InputError("exists.", file=file, hint="give another --name, or replace it with --overwrite")
+    print(f"{arm.name}: {len(arm)} joints; fitting spheres within {1e3 * arm.slack:.0f} mm of its geometry ...")
+    arm = simplified(arm, slack is None)
+    beyond = uncovered(arm.shapes, arm.spheres())
+    save_robot(arm, file)
     inside = beyond <= 1e-9
     state = "all of it is inside" if inside else f"{1e3 * beyond:.2f} mm of it sticks out"
-    print(f"{reading.robot.name}: {len(reading.robot)} joints, {len(spheres)} spheres within {1e3 * slack:g} mm of the")
-    print(f"geometry; {state}. Kept in {file}")
+    print(f"{len(arm.spheres())} spheres within {1e3 * arm.slack:.0f} mm of the geometry; {state}")
+    print(f"stored in {file}")
     return 0 if inside else 1
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import SplatbotError
@@ -114,9 +115,9 @@ class World:
                 return ("velocity", "acceleration", "jerk")[order - 1]
         arm = RobotSpheres(panda(), T_world_base=_BASE)
         first = arm.spheres.link > 0  # the spheres of the base are not checked against the map
-        at = arm.centers(q)[:, first].reshape(-1, 1, 3)
+        at = arm.centers(q)[:, first].reshape(-1, 3)
         radii = np.tile(arm.spheres.radii[first], len(q))
-        gap = np.linalg.norm(at - self.centers[None], axis=-1).min(axis=1) - radii - _RADIUS
+        gap = cdist(at, self.centers).min(axis=1) - radii - _RADIUS
         return "collision" if gap.min() < -1e-6 else ""
 
 
