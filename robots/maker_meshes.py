@@ -91,7 +91,7 @@ def read_shapes(path: Path, link: int, scale: ArrayLike = 1.0) -> list[Mesh]:
     Args:
         path: STL, OBJ, PLY or Collada file.
         link: index of its link.
-        scale: metres per unit of the file, a number or (3,).
+        scale: factor of the mesh, a number or (3,). The unit of a Collada file counts, too.
 
     Raises:
         InputError: the file cannot be read.
@@ -100,7 +100,8 @@ def read_shapes(path: Path, link: int, scale: ArrayLike = 1.0) -> list[Mesh]:
         size = f"has {path.stat().st_size >> 20} MB."
         raise InputError(size, field=path.name, hint=f"simplify the mesh to {_MOST_BYTES >> 20} MB or less")
     try:
-        pieces = trimesh.load_scene(path, process=False).dump()
+        scene = trimesh.load_scene(path, process=False)
+        pieces = scene.dump()
     except (ImportError, ValueError, OSError) as error:
         raise InputError(
             f"cannot be read ({error}).", field=path.name, hint="pip install pycollada for .dae"
@@ -109,7 +110,9 @@ def read_shapes(path: Path, link: int, scale: ArrayLike = 1.0) -> list[Mesh]:
     loaded = trimesh.util.concatenate(meshes)
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise InputError("holds no triangles.", field=path.name, hint="give an STL, OBJ or Collada file")
-    factors = np.broadcast_to(np.asarray(scale, dtype=np.float64), 3)
+    # A Collada file names its unit; other formats have none, and URDF takes metres.
+    unit = trimesh.units.unit_conversion(scene.units, "meters") if scene.units and path.suffix == ".dae" else 1.0
+    factors = unit * np.broadcast_to(np.asarray(scale, dtype=np.float64), 3)
     around = loaded.faces if factors.prod() > 0 else loaded.faces[:, ::-1]  # a mirror turns faces inside out
     return as_shapes(np.asarray(loaded.vertices) * factors, np.asarray(around, dtype=np.int64), link)
 
