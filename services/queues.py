@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from contextlib import AbstractAsyncContextManager
@@ -16,8 +17,19 @@ from splatbot.services.problems import problem
 URGENT = frozenset({"/healthz", "/readyz", "/metrics", "/v1/stop"})
 """Paths that are answered on the event loop, or in a thread of their own."""
 
-AT_ONCE = {"motions": 4, "plans": 4, "views": 4, "exports": 4, "queries": 8, "frames": 8, "uploads": 4, "others": 8}
-"""Requests of each kind that are worked on at once."""
+_SHARE = max(1, (os.cpu_count() or 1) // 2)  # of the cores, for kinds whose requests compute for long
+
+AT_ONCE = {
+    "motions": 4,
+    "plans": max(2, _SHARE),  # a long plan leaves a place for a short one
+    "views": _SHARE,
+    "exports": _SHARE,
+    "queries": max(2, _SHARE),
+    "frames": 8,
+    "uploads": 4,
+    "others": 4,
+}
+"""Requests of each kind that are worked on at once. More than the cores would only slow down mapping."""
 
 THREADS = sum(AT_ONCE.values()) + 24
 """Threads that answer: no kind can take the last one."""
