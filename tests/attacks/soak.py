@@ -20,7 +20,7 @@ from splatbot.serving import serving
 
 LOG = "synthetic:tabletop?frames=4&width=80&height=60"
 NAMES = ("RSS [MB]", "threads", "file descriptors", "metric series")
-SETTLED = 0.3  # share of the run that caches and pools may take to fill
+SETTLED = 0.45  # share of the run that caches and pools may take to fill; 200 finished jobs are kept
 
 
 def one_round(url: str, key: str, number: int) -> None:
