@@ -206,9 +206,9 @@ class RobotModel:
     @cached_property
     def hand(self) -> HandShape | None:
         """Boxes around the shapes of the gripper, whose fingers open along the tool's y axis; None without one."""
-        if self.gripper is None or not self.gripper.shapes:
+        if self.gripper is None:
             return None
-        if self.gripper.hand is not None:
+        if self.gripper.hand is not None or not self.gripper.shapes:
             return self.gripper.hand
         T_tcp_link = inverse(self.T_link_tcp)
         T_tcp_finger = T_tcp_link @ self.gripper.T_link_finger[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,13 @@ import numpy as np
 
 from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError, InputError
-from splatbot.protocols import LinkSpheres
+from splatbot.geometry import inverse, transform_points
+from splatbot.protocols import HandShape, LinkSpheres
+from splatbot.robots.hands import panda_2f85, panda_2f140
 from splatbot.robots.joints import Joint
 from splatbot.robots.panda import panda
-from splatbot.robots.robot import Inertial, RobotModel
-from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
+from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
+from splatbot.robots.shapes import Capsule
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 _FORMAT = "splatbot robot 1"
@@ -69,8 +72,8 @@ def load_robot(name: str | Path) -> RobotModel:
 
 
 def save_robot(robot: RobotModel, path: Path) -> None:
-    """Write joints, spheres and other inputs of collision checks and planning; the shapes are not saved."""
-    spheres = robot.spheres()
+    """Write joints, spheres, gripper and other inputs of checks and planning; the shapes of links are not saved."""
+    spheres = replace(robot, gripper=None).spheres()
     document = {
         "format": _FORMAT,
         "name": robot.name,
@@ -89,6 +92,7 @@ def save_robot(robot: RobotModel, path: Path) -> None:
         "inertials": [[i.mass, list(i.center), i.inertia.tolist()] for i in robot.inertials],
         "pairs": robot.self_collision_pairs.tolist(),
         "spheres": np.c_[spheres.link, spheres.centers, spheres.radii].tolist(),
+        "gripper": _gripper_document(robot),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
@@ -116,6 +120,7 @@ def read_robot(path: Path) -> RobotModel:
             slack=float(d["slack"]),
             covering=LinkSpheres(spheres[:, 0].astype(np.int32), np.ascontiguousarray(spheres[:, 1:4]), spheres[:, 4]),
             pairs=np.array(d["pairs"], dtype=np.int32).reshape(-1, 2),
+            gripper=None if d.get("gripper") is None else _gripper(d["gripper"]),
         )
     except (OSError, ValueError, KeyError, TypeError, InputError) as error:
         raise FormatError(f"is no robot ({error}).", file=path, hint="add it again: splatbot robot add") from error
@@ -125,3 +130,35 @@ def _joint(j: dict[str, Any]) -> Joint:
     lower, upper, velocity, acceleration, jerk, effort = (float(x) for x in j["limits"])
     T = np.array(j["T_before_joint"], dtype=np.float64).reshape(4, 4)
     return Joint(str(j["name"]), T, lower, upper, velocity, acceleration, jerk, effort, bool(j["prismatic"]))
+
+
+def _gripper_document(robot: RobotModel) -> dict[str, Any] | None:
+    gripper = robot.gripper
+    if gripper is None:
+        return None
+    width = robot.spheres(0.0)
+    fingers = len(width) - len(replace(robot, gripper=None).spheres())
+    one, T = slice(len(width) - fingers, len(width) - fingers // 2), inverse(gripper.T_link_finger[0])
+    return {
+        "T_link_finger": gripper.T_link_finger.tolist(),
+        "stroke": gripper.stroke,
+        "speed": gripper.speed,
+        "force": gripper.force,
+        "capsules": [[s.start, s.end, s.radius] for s in gripper.shapes if isinstance(s, Capsule)],
+        "spheres": np.c_[transform_points(T, width.centers[one]), width.radii[one]].tolist(),
+        "hand": None if robot.hand is None else asdict(robot.hand),
+    }
+
+
+def _gripper(d: dict[str, Any]) -> GripperGeometry:
+    spheres = np.array(d["spheres"], dtype=np.float64).reshape(-1, 4)
+    hand = d["hand"]
+    return GripperGeometry(
+        np.array(d["T_link_finger"], dtype=np.float64).reshape(2, 4, 4),
+        float(d["stroke"]),
+        tuple(Capsule(0, tuple(a), tuple(b), float(radius)) for a, b, radius in d["capsules"]),
+        speed=float(d["speed"]),
+        force=float(d["force"]),
+        covering=LinkSpheres(np.zeros(len(spheres), np.int32), np.ascontiguousarray(spheres[:, :3]), spheres[:, 3]),
+        hand=None if hand is None else HandShape(**(hand | {"palm_size": tuple(hand["palm_size"])})),
+    )

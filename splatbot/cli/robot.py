@@ -21,6 +21,7 @@ def robot(
     tip: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None,
     slack: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None,
     rename: Annotated[str | None, tyro.conf.arg(metavar="NAME", name="name")] = None,
+    gripper: Annotated[str | None, tyro.conf.arg(metavar="HAND")] = None,
     overwrite: bool = False,
     check_meshes: bool = False,
 ) -> int:
@@ -33,6 +34,7 @@ def robot(
 
     Examples:
         splatbot robot add ur5.urdf --tip tool0
+        splatbot robot add ur5.urdf --tip tool0 --gripper 2f85
         splatbot robot add menagerie/ufactory_xarm7/xarm7.xml --name lab-xarm
         splatbot robot info panda
         splatbot robot info panda --check-meshes --out panda-body.png
@@ -48,11 +50,12 @@ def robot(
         slack: largest distance of the spheres beyond the geometry [m]; for fit 0.011 by default. By default add takes
             2 % of the reach. It takes more if that needs too many spheres.
         rename: add: the name to store the arm under; by default that in the file.
+        gripper: add: attach a hand to the tool frame, whose z axis points outwards: 2f85 or 2f140.
         overwrite: add: replace a robot of that name.
         check_meshes: info: prove that the spheres contain the meshes of the maker, which a package must provide.
     """
     if action == "add":
-        return _add(Path(name), out, rename, tip, slack, overwrite)
+        return _add(Path(name), out, rename, tip, slack, gripper, overwrite)
     if action == "list":
         from splatbot.robots.store import robot_names
 
@@ -123,24 +126,38 @@ def _check_meshes(name: str, out: Path | None) -> int:
     return 0 if max(p.uncovered for p in parts) <= 0 else 1
 
 
-def _add(path: Path, out: Path | None, rename: str | None, tip: str | None, slack: float | None, new: bool) -> int:
+def _add(
+    path: Path,
+    out: Path | None,
+    rename: str | None,
+    tip: str | None,
+    slack: float | None,
+    gripper: str | None,
+    overwrite: bool,
+) -> int:
     from dataclasses import replace
 
     from splatbot.errors import InputError
     from splatbot.robots.containment import uncovered
     from splatbot.robots.description import read_description
+    from splatbot.robots.hands import attach, find_hand
     from splatbot.robots.reading import simplified
     from splatbot.robots.store import robot_file, save_robot
 
+    if gripper is not None:
+        find_hand(gripper)  # an error before the work
     reading = read_description(path, tip=tip, slack=slack)
-    arm = replace(reading.robot, name=rename or reading.robot.name)
+    suffix = "" if gripper is None else f"-{gripper}"
+    arm = replace(reading.robot, name=rename or f"{reading.robot.name}{suffix}")
     for note in reading.notes:
         print(f"note: {note}")
     file = out if out is not None else robot_file(arm.name)
-    if file.exists() and not new:
+    if file.exists() and not overwrite:
         raise InputError("exists.", file=file, hint="give another --name, or replace it with --overwrite")
     print(f"{arm.name}: {len(arm)} joints; fitting spheres within {1e3 * arm.slack:.0f} mm of its geometry ...")
     arm = simplified(arm, slack is None)
+    if gripper is not None:
+        arm = replace(attach(arm, gripper), name=arm.name)
     beyond = uncovered(arm.shapes, arm.spheres())
     save_robot(arm, file)
     inside = beyond <= 1e-9

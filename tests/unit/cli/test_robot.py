@@ -34,3 +34,25 @@ def test_a_robot_that_is_not_there_is_named(run: RunCommand) -> None:
     answer = run("robot", "info", "nobody")
     assert answer.code == 2
     assert "there is no robot 'nobody'" in answer.err
+
+
+def test_a_name_is_replaced_only_on_purpose_and_a_hand_is_attached(
+    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPLATBOT_ROBOTS", str(tmp_path / "robots"))
+    file = ur5(tmp_path)
+    assert run("robot", "add", file, "--tip", "tool0", "--gripper", "2f85").code == 0
+    assert run("robot", "list").out.split()[-1] == "ur5-2f85"
+    assert "opens 0.085 m" in run("robot", "info", "ur5-2f85").out
+    again = run("robot", "add", file, "--tip", "tool0", "--gripper", "2f85")
+    assert again.code == 2
+    assert "exists" in again.err
+    assert "--overwrite" in again.err
+    assert run("robot", "add", file, "--name", "ur5-2f85", "--overwrite").code == 0
+    assert "gripper                            none" in run("robot", "info", "ur5-2f85").out
+    refused = run("robot", "add", file, "--name", "panda")
+    assert refused.code == 2
+    assert "no name of an added robot" in refused.err
+    claw = run("robot", "add", file, "--gripper", "claw")
+    assert claw.code == 2
+    assert "grippers: 2f85, 2f140" in claw.err

@@ -27,8 +27,8 @@ from splatbot.grasping.types import GraspResult, NoGraspError
 from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
+from splatbot.robots.hands import panda_2f85, panda_2f140
 from splatbot.robots.panda import panda
-from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
 from splatbot.segmentation import SegmentedMap, segment
 from tests.unit.grasping.objects import (
     BALL,

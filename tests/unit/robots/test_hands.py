@@ -1,17 +1,25 @@
-"""Hands as boxes, and the Panda's wide one."""
+"""Hands as boxes, the Panda's wide one, and hands on arms that users add."""
 
 from __future__ import annotations
 
+from dataclasses import astuple, replace
+from pathlib import Path
+
+import mujoco
 import numpy as np
 import pytest
 
+from splatbot.errors import InputError
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import HasHand
 from splatbot.robots.containment import uncovered
+from splatbot.robots.hands import HANDS, attach, panda_2f85, panda_2f140
+from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.panda import panda
-from splatbot.robots.robot import RobotModel
-from splatbot.robots.robotiq_hands import panda_2f85, panda_2f140
-from splatbot.robots.store import load_robot
+from splatbot.robots.robot import Inertial, RobotModel
+from splatbot.robots.store import load_robot, read_robot, save_robot
+from splatbot.robots.urdf import read_urdf
+from tests.unit.robots.test_urdf import ur5
 
 
 def test_the_pandas_hand_is_as_published() -> None:
@@ -67,3 +75,44 @@ def test_its_spheres_cover_its_shapes_and_home_is_free_of_itself(robot: RobotMod
     assert uncovered(robot.shapes, links) <= 0
     assert not RobotSpheres(robot).check(None, robot.home[None]).in_collision[0]
     assert len(robot.self_collision_pairs) >= 15
+
+
+@pytest.mark.parametrize("name", ["2f85", "2f140"])
+def test_a_hand_on_an_added_arm_is_stored_with_it(tmp_path: Path, name: str) -> None:
+    arm = read_urdf(ur5(tmp_path), tip="tool0").robot
+    robot = attach(arm, name)
+    panda_with = load_robot(f"panda-{name}")
+    assert robot.hand is not None
+    assert panda_with.hand is not None
+    assert astuple(robot.hand)[:6] == pytest.approx(astuple(panda_with.hand)[:6], abs=1e-9)
+    assert robot.hand.palm_size == pytest.approx(panda_with.hand.palm_size, abs=1e-3)
+    along = inverse(arm.T_link_tcp) @ robot.T_link_tcp
+    np.testing.assert_allclose(along[:3, 3], [0, 0, HANDS[name].tcp], atol=1e-12)
+    assert uncovered(robot.shapes, robot.spheres(0.0)) <= 0
+    save_robot(robot, tmp_path / "arm.json")
+    again = read_robot(tmp_path / "arm.json")
+    assert again.hand == robot.hand
+    for opening in (0.0, 0.03, None):
+        ours, theirs = robot.spheres(opening), again.spheres(opening)
+        np.testing.assert_array_equal(ours.link, theirs.link)
+        np.testing.assert_allclose(ours.centers, theirs.centers, atol=1e-12)
+        np.testing.assert_allclose(ours.radii, theirs.radii, atol=1e-12)
+    np.testing.assert_array_equal(again.self_collision_pairs, robot.self_collision_pairs)
+    with pytest.raises(InputError, match=r"ur5-2f.*: has a gripper"):
+        attach(robot, name)
+    with pytest.raises(InputError, match=r"gripper: is 'claw'.*grippers: 2f85, 2f140"):
+        attach(arm, "claw")
+
+
+def test_the_mass_of_a_hand_counts_in_the_twin(tmp_path: Path) -> None:
+    inertials = tuple(Inertial(2.0, (0.0, 0.0, 0.05), 0.01 * np.eye(3)) for _ in range(7))
+    arm = replace(read_urdf(ur5(tmp_path), tip="tool0").robot, inertials=inertials)
+    robot = attach(arm, "2f85")
+    assert robot.inertials[-1].mass == pytest.approx(2.925)
+    model = mujoco.MjModel.from_xml_string(to_mjcf(robot))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_kinematics(model, data)
+    T = robot.tcp(robot.home)
+    np.testing.assert_allclose(data.site("tcp").xpos, T[:3, 3], atol=1e-9)
+    assert model.joint("finger1").range[1] == pytest.approx(0.0425)
