@@ -27,6 +27,7 @@ from splatbot.robots.shapes import Capsule
 
 _FLANGE = 0.107  # [m] of the Panda's last link
 _Along = tuple[tuple[float, float, float], tuple[float, float, float], float]  # ends and radius of a capsule [m]
+_WRIST = 3  # links before the last one that a hand may touch at home
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -102,6 +103,8 @@ def find_hand(name: str) -> Hand:
 def attach(arm: RobotModel, name: str) -> RobotModel:
     """Attach a hand to the tool frame of an arm, whose z axis points away from the arm.
 
+    The hand is a point mass in the twin. Links of the wrist that it touches at home are not checked against it.
+
     Args:
         arm: an arm without a gripper.
         name: of :data:`HANDS`.
@@ -109,28 +112,35 @@ def attach(arm: RobotModel, name: str) -> RobotModel:
     Raises:
         InputError: there is no such hand, or the arm has a gripper.
     """
+    hand, last, flange = find_hand(name), len(arm), arm.T_link_tcp
     if arm.gripper is not None:
         raise InputError("has a gripper.", field=arm.name, hint="attach a hand to an arm without one")
-    hand, last = find_hand(name), len(arm)
-    flange = arm.T_link_tcp
-    shapes = _moved(hand.body, flange, last)
-    carried = Inertial(
-        hand.mass, _point(transform_points(flange, np.array([0.0, 0.0, hand.tcp / 2]))), np.zeros((3, 3))
-    )
-    parts = [(i.mass, np.asarray(i.center), i.inertia) for i in (*arm.inertials[-1:], carried)]
+    body = _moved(hand.body, flange, last)
+    finger = tuple(Capsule(0, *along) for along in hand.finger)
+    middle = transform_points(flange, np.array([0.0, 0.0, hand.tcp / 2]))
+    parts = [(i.mass, np.asarray(i.center), i.inertia) for i in arm.inertials[-1:]]
     robot = replace(
         arm,
         name=f"{arm.name}-{hand.name}",
-        shapes=(*arm.shapes, *shapes),
-        covering=joined(arm.spheres(), cover(shapes, COVER.slack)),
+        shapes=(*arm.shapes, *body),
+        covering=joined(arm.spheres(), cover(body, COVER.slack)),
         T_link_tcp=flange @ _along_z(hand.tcp),
-        gripper=_gripper(hand, flange),
-        inertials=(*arm.inertials[:-1], Inertial.summed(parts)) if arm.inertials else (),
+        gripper=GripperGeometry(
+            np.stack([flange @ _along_z(hand.root) @ turn for turn in (np.eye(4), _TURNED)]),
+            hand.stroke,
+            finger,
+            speed=hand.speed,
+            force=hand.force,
+            covering=cover(finger, COVER.slack / 2),
+        ),
+        inertials=(*arm.inertials[:-1], Inertial.summed([*parts, (hand.mass, middle, np.zeros((3, 3)))]))
+        if arm.inertials
+        else (),
         pairs=None,
     )
-    # Pairs that the hand touches at home are those of links that it always touches.
-    kept = set(map(tuple, robot.self_collision_pairs.tolist())) & set(map(tuple, arm.self_collision_pairs.tolist()))
-    return replace(robot, pairs=np.array(sorted(kept), dtype=np.int32).reshape(-1, 2))
+    apart = set(map(tuple, robot.self_collision_pairs.tolist()))
+    pairs = [(a, b) for a, b in arm.self_collision_pairs.tolist() if (a, b) in apart or a < last - _WRIST]
+    return replace(robot, pairs=np.array(pairs, dtype=np.int32).reshape(-1, 2))
 
 
 @cache
@@ -147,30 +157,17 @@ def panda_2f140() -> RobotModel:
 
 def _panda_with(hand: Hand) -> RobotModel:
     """Build the Panda with another hand; the twin keeps the inertia of the Panda's own."""
-    arm, flange = panda(), _along_z(_FLANGE)
-    own = tuple(shape for shape in arm.shapes if shape.link < 7)
-    last = tuple(shape for shape in arm.shapes if shape.link == 7)[:2]
-    shapes = _moved(hand.body, flange, 7)
-    return replace(
+    arm = panda()
+    own = [shape for shape in arm.shapes if shape.link < 7]
+    flange = [shape for shape in arm.shapes if shape.link == 7][:2]
+    bare = replace(
         arm,
-        name=f"panda-{hand.name}",
-        shapes=(*own, *last, *shapes),
-        covering=joined(*arm_spheres(), cover(shapes, COVER.slack)),
-        T_link_tcp=flange @ _along_z(hand.tcp),
-        gripper=_gripper(hand, flange),
+        shapes=(*own, *flange),
+        covering=joined(*arm_spheres()),
+        T_link_tcp=_along_z(_FLANGE),
+        gripper=None,
     )
-
-
-def _gripper(hand: Hand, T_link_flange: Array) -> GripperGeometry:
-    finger = tuple(Capsule(0, *along) for along in hand.finger)
-    return GripperGeometry(
-        np.stack([T_link_flange @ _along_z(hand.root) @ turn for turn in (np.eye(4), _TURNED)]),
-        hand.stroke,
-        finger,
-        speed=hand.speed,
-        force=hand.force,
-        covering=cover(finger, COVER.slack / 2),
-    )
+    return replace(attach(bare, hand.name), inertials=arm.inertials)
 
 
 def _moved(capsules: Sequence[_Along], T_link_flange: Array, link: int) -> tuple[Capsule, ...]:

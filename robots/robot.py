@@ -188,19 +188,19 @@ class RobotModel:
             InputError: the opening is out of range.
         """
         if self.gripper is None:
-            return self._link_spheres
+            return self.link_spheres
         widest = 2 * self.gripper.stroke
         width = widest if opening is None else opening
         if not 0 <= width <= widest:
             raise InputError(f"is {width}.", field="opening", hint=f"give 0..{widest:g} m")
-        centers, radii = [self._link_spheres.centers], [self._link_spheres.radii]
+        centers, radii = [self.link_spheres.centers], [self.link_spheres.radii]
         for T in self.gripper.T_link_finger:
-            moved = self._finger_spheres.centers + np.array([0.0, width / 2, 0.0])
+            moved = self.finger_spheres.centers + np.array([0.0, width / 2, 0.0])
             centers.append(moved @ T[:3, :3].T + T[:3, 3])
-            radii.append(self._finger_spheres.radii)
-        fingers = np.full(2 * len(self._finger_spheres), len(self), np.int32)
+            radii.append(self.finger_spheres.radii)
+        fingers = np.full(2 * len(self.finger_spheres), len(self), np.int32)
         return LinkSpheres(
-            np.concatenate([self._link_spheres.link, fingers]), np.concatenate(centers), np.concatenate(radii)
+            np.concatenate([self.link_spheres.link, fingers]), np.concatenate(centers), np.concatenate(radii)
         )
 
     @cached_property
@@ -276,11 +276,13 @@ class RobotModel:
         return values
 
     @cached_property
-    def _link_spheres(self) -> LinkSpheres:
+    def link_spheres(self) -> LinkSpheres:
+        """Spheres that cover the shapes of the links, without fingers."""
         return _covered(self.shapes, self.slack) if self.covering is None else self.covering
 
     @cached_property
-    def _finger_spheres(self) -> LinkSpheres:
+    def finger_spheres(self) -> LinkSpheres:
+        """Spheres of one finger in its own frame; none without a gripper."""
         if self.gripper is not None and self.gripper.covering is not None:
             return self.gripper.covering
         return _covered(self.gripper.shapes if self.gripper else (), self.slack / 2)

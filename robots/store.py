@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import numpy as np
 
 from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError, InputError
-from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import HandShape, LinkSpheres
 from splatbot.robots.hands import panda_2f85, panda_2f140
 from splatbot.robots.joints import Joint
@@ -73,7 +72,7 @@ def load_robot(name: str | Path) -> RobotModel:
 
 def save_robot(robot: RobotModel, path: Path) -> None:
     """Write joints, spheres, gripper and other inputs of checks and planning; the shapes of links are not saved."""
-    spheres = replace(robot, gripper=None).spheres()
+    spheres = robot.link_spheres
     document = {
         "format": _FORMAT,
         "name": robot.name,
@@ -136,16 +135,13 @@ def _gripper_document(robot: RobotModel) -> dict[str, Any] | None:
     gripper = robot.gripper
     if gripper is None:
         return None
-    width = robot.spheres(0.0)
-    fingers = len(width) - len(replace(robot, gripper=None).spheres())
-    one, T = slice(len(width) - fingers, len(width) - fingers // 2), inverse(gripper.T_link_finger[0])
     return {
         "T_link_finger": gripper.T_link_finger.tolist(),
         "stroke": gripper.stroke,
         "speed": gripper.speed,
         "force": gripper.force,
         "capsules": [[s.start, s.end, s.radius] for s in gripper.shapes if isinstance(s, Capsule)],
-        "spheres": np.c_[transform_points(T, width.centers[one]), width.radii[one]].tolist(),
+        "spheres": np.c_[robot.finger_spheres.centers, robot.finger_spheres.radii].tolist(),
         "hand": None if robot.hand is None else asdict(robot.hand),
     }
 

@@ -19,13 +19,13 @@ def random_model(n: int, rng: np.random.Generator, *, least: float = 0.01) -> Ga
     )
 
 
-def uniform_model(means: NDArray[np.float64]) -> GaussianModel:
-    """Return grey spheres of 0.1 m with opacity 0.9 at the given means (N, 3) [m]."""
+def uniform_model(means: NDArray[np.float64], scale: float = 0.1) -> GaussianModel:
+    """Return grey spheres of a scale [m] with opacity 0.9 at the given means (N, 3) [m]."""
     n = len(means)
     return GaussianModel.from_activated(
         means=means,
         quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        scales=np.full((n, 3), 0.1),
+        scales=np.full((n, 3), scale),
         opacities=np.full(n, 0.9),
         colors=np.full((n, 3), 0.5),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import xml.etree.ElementTree as ElementTree
 from functools import cache
@@ -13,13 +12,14 @@ import numpy as np
 import pytest
 
 from splatbot.collision import GaussianCollisionField
-from splatbot.gaussians import GaussianModel
 from splatbot.planning import GaussianRRTStar
 from splatbot.robots.containment import uncovered
 from splatbot.robots.description import read_description
+from splatbot.robots.maker_meshes import Source
 from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.reading import Reading, simplified
 from splatbot.robots.robot import RobotModel
+from tests.models import uniform_model
 
 _FILES = {
     "ur5": "ur_description/urdf/ur5_robot.urdf",
@@ -31,13 +31,7 @@ _FILES = {
 
 
 def _file(name: str) -> Path:
-    found = importlib.util.find_spec("cmeel.prefix") or importlib.util.find_spec("cmeel")
-    roots = [Path(p).parent for p in (found.submodule_search_locations or [])] if found is not None else []
-    for root in (*roots, *(Path(np.__file__).parents[1],)):
-        path = root / "cmeel.prefix/share/example-robot-data/robots" / _FILES[name]
-        if path.is_file():
-            return path
-    pytest.skip("the package example-robot-data is not installed")
+    return Source("example-robot-data", "robots", "", "", {}).path(_FILES[name])
 
 
 @cache
@@ -79,15 +73,7 @@ def _ball_field() -> GaussianCollisionField:
     """Return a field of balls around the arm."""
     rng = np.random.default_rng(0)
     means = rng.uniform([0.15, -0.6, 0.5], [0.6, 0.6, 0.9], (30, 3))
-    return GaussianCollisionField(
-        GaussianModel.from_activated(
-            means=means,
-            quats=np.tile([1.0, 0, 0, 0], (30, 1)),
-            scales=np.full((30, 3), 0.01),
-            opacities=np.full(30, 0.9),
-            colors=np.full((30, 3), 0.5),
-        )
-    )
+    return GaussianCollisionField(uniform_model(means, 0.01))
 
 
 def _certified(robot: RobotModel, rng: np.random.Generator) -> int:
