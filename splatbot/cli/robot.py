@@ -184,7 +184,7 @@ def _info(name: str) -> None:
     print_table(
         [
             ("spheres", f"{len(spheres)}, radius {spheres.radii.min():.3f} .. {spheres.radii.max():.3f} m"),
-            ("slack", f"{1e3 * model.slack:g} mm"),
+            ("slack", f"{1e3 * model.slack:.3g} mm"),
             ("pairs of links that may not touch", str(len(model.self_collision_pairs))),
             ("gripper", f"opens {2 * model.gripper.stroke:g} m" if model.gripper else "none"),
         ]
