@@ -34,7 +34,9 @@ class SphereFitConstants:
         added: points that are added in a round, at most.
         apart: [m] distance between added points, at least.
         apart_of_slack: the same relative to the slack.
-        seconds: [s] time limit of a selection; the greedy one is taken if it is smaller.
+        nodes: of the branch-and-bound tree of a selection, at most. The greedy selection is taken if it is smaller.
+        seconds: [s] time limit of a selection, above the usual time, so that the spheres do not depend on the load of
+            the machine.
         gap: relative gap to the fewest spheres at which a selection ends.
         seed: of the samples.
     """
@@ -51,13 +53,14 @@ class SphereFitConstants:
     added: int = 150
     apart: float = 4e-3
     apart_of_slack: float = 0.3
-    seconds: float = 3.0
+    nodes: int = 10
+    seconds: float = 20.0
     gap: float = 0.1
     seed: int = 0
 
 
 QUICK = SphereFitConstants()  # of robots that users add: seconds a link
-FINE = SphereFitConstants(points=1200, candidates=6000, rounds=5, seconds=20.0, gap=0.04)  # of shipped bodies: minutes
+FINE = SphereFitConstants(points=1200, candidates=6000, rounds=5, nodes=1_000_000, gap=0.04)  # of shipped bodies: minutes
 
 
 def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
@@ -194,7 +197,7 @@ def _fewest(contains: NDArray[np.bool_], fit: SphereFitConstants) -> NDArray[np.
         constraints=LinearConstraint(matrix, 1, np.inf),
         integrality=np.ones(len(contains)),
         bounds=Bounds(0, 1),
-        options={"time_limit": fit.seconds, "mip_rel_gap": fit.gap},
+        options={"node_limit": fit.nodes, "time_limit": fit.seconds, "mip_rel_gap": fit.gap},
     )
     if answer.x is None:
         return greedy
