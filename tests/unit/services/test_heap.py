@@ -1,0 +1,27 @@
+"""Freed memory returns to the operating system."""
+
+from __future__ import annotations
+
+import ctypes
+
+import psutil  # type: ignore[import-untyped]
+import pytest
+
+from splatbot.services.heap import trim_heap
+
+_C = ctypes.CDLL(None)
+
+
+@pytest.mark.skipif(not hasattr(_C, "malloc_trim"), reason="this C library returns memory by itself, or not at all")
+def test_freed_fragments_below_a_used_one_are_returned() -> None:
+    _C.malloc.restype, _C.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+    blocks = [_C.malloc(50_000) for _ in range(4000)]  # 200 MB, below the threshold of mmap
+    for block in blocks:
+        ctypes.memset(block, 1, 50_000)
+    for block in blocks[:-1]:
+        _C.free(block)
+    before = psutil.Process().memory_info().rss
+    trim_heap()
+    assert psutil.Process().memory_info().rss < before - 150e6
+    _C.free(blocks[-1])
+    trim_heap()  # nothing to return is no error
