@@ -60,10 +60,12 @@ class SphereFitConstants:
 
 
 QUICK = SphereFitConstants()  # of robots that users add: seconds a link
-FINE = SphereFitConstants(points=1200, candidates=6000, rounds=5, nodes=1_000_000, gap=0.04)  # of shipped bodies: minutes
+FINE = SphereFitConstants(
+    points=1200, candidates=6000, rounds=5, nodes=1_000_000, gap=0.04
+)  # of shipped bodies: minutes
 
 
-def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
+def cover(shapes: Sequence[Shape], slack: float, fit: SphereFitConstants = QUICK) -> LinkSpheres:
     """Cover the shapes of each link with spheres that extend about ``slack`` [m] beyond them.
 
     The spheres of a capsule of radius R have the radius r = R + slack. Their distance along the segment is at most
@@ -79,7 +81,7 @@ def cover(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
         own = [shape for shape in shapes if shape.link == link]
         found += [(link, *_cover_capsule(shape, slack)) for shape in own if isinstance(shape, Capsule)]
         if solids := [shape for shape in own if not isinstance(shape, Capsule)]:
-            found.append((link, *cover_solids(solids, slack)))
+            found.append((link, *cover_solids(solids, slack, fit)))
     return LinkSpheres(
         np.concatenate([np.full(len(radii), link, np.int32) for link, _, radii in found]),
         np.concatenate([centers for _, centers, _ in found]),

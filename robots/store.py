@@ -1,11 +1,13 @@
-"""Robots by name: built-in ones, and those added from URDF files."""
+"""Robots by name: shipped ones, and those added from their descriptions."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ import numpy as np
 from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError, InputError
 from splatbot.protocols import HandShape, LinkSpheres
-from splatbot.robots.hands import panda_2f85, panda_2f140
+from splatbot.robots.arms import ARMS, arm_file
+from splatbot.robots.hands import attach, panda_2f85, panda_2f140
 from splatbot.robots.joints import Joint
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
@@ -22,7 +25,28 @@ from splatbot.robots.shapes import Capsule
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 _FORMAT = "splatbot robot 1"
-_BUILT_IN = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140}
+
+
+@cache
+def _shipped() -> dict[str, Callable[[], RobotModel]]:
+    """Return the robots that splatbot ships, by name: each arm, and each with the hands that it can carry."""
+    found: dict[str, Callable[[], RobotModel]] = {
+        "panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140,
+    }  # fmt: skip
+    for name, arm in ARMS.items():
+        found[name] = partial(_shipped_arm, name)
+        found |= {f"{name}-{hand}": partial(_with_hand, name, hand) for hand in arm.hands}
+    return found
+
+
+@cache
+def _shipped_arm(name: str) -> RobotModel:
+    return read_robot(arm_file(name))
+
+
+@cache
+def _with_hand(name: str, hand: str) -> RobotModel:
+    return attach(_shipped_arm(name), hand)
 
 
 def robots_folder() -> Path:
@@ -36,9 +60,9 @@ def robot_file(name: str) -> Path:
     """Return the file that an added robot is kept in, which is in :func:`robots_folder`.
 
     Raises:
-        InputError: the name is that of a built-in robot or cannot be that of a file.
+        InputError: the name is that of a shipped robot or cannot be that of a file.
     """
-    if name in _BUILT_IN or not _NAME.fullmatch(name):
+    if name in _shipped() or not _NAME.fullmatch(name):
         hint = "give another --name: letters, digits, - _ . after a letter or digit, at most 80"
         raise InputError(f"{name[:80]!r} is no name of an added robot.", field="name", hint=hint)
     return robots_folder() / f"{name}.json"
@@ -48,19 +72,22 @@ def robot_names() -> list[str]:
     """Return the names of all robots."""
     folder = robots_folder()
     added = sorted(path.stem for path in folder.glob("*.json")) if folder.is_dir() else []
-    return [*_BUILT_IN, *(name for name in added if name not in _BUILT_IN)]
+    return [*_shipped(), *(name for name in added if name not in _shipped())]
 
 
 def load_robot(name: str | Path) -> RobotModel:
     """Load a robot by name, or from a file of :func:`save_robot`.
 
     Raises:
-        InputError: no robot has that name.
+        InputError: no robot has that name, or a shipped and an added one have it.
         FormatError: the file is damaged.
     """
-    if str(name) in _BUILT_IN:
-        return _BUILT_IN[str(name)]()
     path = Path(name) if str(name).endswith(".json") else robots_folder() / f"{name}.json"
+    if (shipped := _shipped().get(str(name))) is not None:
+        if path.is_file():
+            hint = "rename the file, and use its new name, or delete it"
+            raise InputError(f"{str(name)!r} is a shipped robot too.", field="robot", file=path, hint=hint)
+        return shipped()
     if not path.is_file():
         raise InputError(
             f"there is no robot {str(name)!r}.",

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from xml.parsers.expat import ExpatError, ParserCreate
 
 import numpy as np
 
@@ -46,16 +47,27 @@ def read_urdf(path: str | Path, *, tip: str | None = None, slack: float | None =
 def parse(file: Path) -> ElementTree.Element:
     """Parse an XML file, and expand the macros of xacro.
 
+    Prefixes of namespaces need no declaration, as in ROS (``drake:acceleration`` in files of Drake's users).
+
     Raises:
         FormatError: the file cannot be read, is no XML, or has macros that cannot be expanded.
     """
     try:
         text = file.read_bytes()
-        root = ElementTree.fromstring(text)
-    except (OSError, ElementTree.ParseError) as error:
+        root = _elements(text)
+    except (OSError, ExpatError) as error:
         hint = "give a URDF, xacro or MJCF file"
         raise FormatError(f"cannot be read ({error}).", file=file, hint=hint) from error
     return _expanded(file) if b"/xacro" in text else root
+
+
+def _elements(text: bytes) -> ElementTree.Element:
+    """Parse XML; names keep their prefixes as they stand."""
+    builder, parser = ElementTree.TreeBuilder(), ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end  # type: ignore[assignment]
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(text, True)
+    return builder.close()
 
 
 def _expanded(file: Path) -> ElementTree.Element:

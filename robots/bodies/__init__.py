@@ -80,8 +80,7 @@ def fit_body(source: Source, slack: float, report_progress: ReportProgress) -> B
     parts = {}
     for part in source.parts:
         shapes = source.shapes(part)
-        centers, radii = cover_solids(shapes, slack, FINE)
-        spheres = np.c_[np.round(centers, 5), np.ceil((radii + 1e-5) * 1e5) / 1e5]
+        spheres = np.c_[rounded(*cover_solids(shapes, slack, FINE))]
         triangles = np.concatenate([shape.triangles() for shape in shapes])
         if len(open_pieces(triangles, spheres[:, :3], spheres[:, 3])):
             raise InputError("is not contained after rounding.", field=part, hint="fit with another slack")
@@ -98,6 +97,11 @@ def fit_body(source: Source, slack: float, report_progress: ReportProgress) -> B
         "sha256": source.digest(),
     }
     return Body(found, slack, parts)
+
+
+def rounded(centers: Array, radii: Array) -> tuple[Array, Array]:
+    """Round spheres (S, 3), (S,) to 10 µm, such that the new ones contain the old ones."""
+    return np.round(centers, 5), np.ceil((radii + 1e-5) * 1e5) / 1e5
 
 
 def save_body(body: Body, path: Path) -> None:

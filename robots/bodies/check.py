@@ -2,14 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from splatbot.protocols import Array, LinkSpheres
 from splatbot.robots.bodies import Body
 from splatbot.robots.containment import Slack, slack_of, uncovered_by_link
 from splatbot.robots.maker_meshes import Source
+from splatbot.robots.robot import RobotModel
+from splatbot.robots.shapes import Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Shapes of a part (link 0), and the spheres (S, 4) that shall contain them: x, y, z, radius [m]."""
+
+    shapes: Sequence[Shape]
+    spheres: Array
+
+
+def parts_of_body(body: Body, source: Source) -> dict[str, Part]:
+    """Return the parts of a body with the installed meshes.
+
+    Raises:
+        InputError: the meshes are not installed.
+    """
+    return {name: Part(source.shapes(name), spheres) for name, spheres in body.parts.items()}
+
+
+def parts_of_arm(shapes: Sequence[Shape], covering: LinkSpheres, robot: RobotModel) -> dict[str, Part]:
+    """Return the links of an arm that have shapes; each is named after the joint that moves it."""
+    names = ["base", *(joint.name for joint in robot.joints)]
+    rows = np.c_[covering.centers, covering.radii]
+    return {
+        names[link]: Part(
+            [replace(shape, link=0) for shape in shapes if shape.link == link], rows[covering.link == link]
+        )
+        for link in sorted({shape.link for shape in shapes})
+    }
 
 
 @dataclass(frozen=True)
@@ -29,35 +62,29 @@ class PartCheck:
     slack: Slack
 
 
-def check_body(body: Body, source: Source) -> list[PartCheck]:
-    """Prove containment of every triangle of the installed meshes, and measure the slack.
-
-    Raises:
-        InputError: the meshes are not installed.
-    """
+def check_parts(parts: Mapping[str, Part]) -> list[PartCheck]:
+    """Prove containment of every triangle of the meshes, and measure the slack."""
     found = []
-    for part, spheres in body.parts.items():
-        shapes = source.shapes(part)
-        bound = max(uncovered_by_link(shapes, body.on(part, 0)).values())
-        found.append(PartCheck(part, len(spheres), bound, slack_of(shapes, spheres[:, :3], spheres[:, 3])))
+    for name, part in parts.items():
+        centers, radii = part.spheres[:, :3], part.spheres[:, 3]
+        spheres = LinkSpheres(np.zeros(len(radii), np.int32), centers, radii)
+        bound = max(uncovered_by_link(part.shapes, spheres).values())
+        found.append(PartCheck(name, len(radii), bound, slack_of(part.shapes, centers, radii)))
     return found
 
 
-def draw_body(body: Body, source: Source, path: Path) -> None:
-    """Write a picture: the corners of each part's meshes from two sides, with the outlines of its spheres [mm].
-
-    Raises:
-        InputError: the meshes are not installed.
-    """
+def draw_parts(parts: Mapping[str, Part], path: Path) -> None:
+    """Write a picture: the corners of each part's meshes from two sides, with the outlines of its spheres [mm]."""
     from matplotlib.collections import PatchCollection
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    figure = Figure(figsize=(2.2 * len(body.parts), 5), layout="constrained")
-    axes = figure.subplots(2, len(body.parts), squeeze=False)
-    for column, (part, spheres) in enumerate(body.parts.items()):
-        corners = 1e3 * np.concatenate([shape.triangles().reshape(-1, 3) for shape in source.shapes(part)])
-        for row, (across, name) in enumerate(((0, "x"), (1, "y"))):
+    figure = Figure(figsize=(2.2 * len(parts), 5), layout="constrained")
+    axes = figure.subplots(2, len(parts), squeeze=False)
+    for column, (name, part) in enumerate(parts.items()):
+        spheres = part.spheres
+        corners = 1e3 * np.concatenate([shape.triangles().reshape(-1, 3) for shape in part.shapes])
+        for row, (across, direction) in enumerate(((0, "x"), (1, "y"))):
             axis = axes[row, column]
             axis.plot(corners[:, across], corners[:, 2], ",", color="0.35")
             outlines = [Circle((1e3 * s[across], 1e3 * s[2]), 1e3 * s[3]) for s in spheres]
@@ -67,7 +94,7 @@ def draw_body(body: Body, source: Source, path: Path) -> None:
             axis.set_aspect("equal")
             axis.autoscale_view()
             axis.tick_params(labelsize=6)
-            axis.set_xlabel(f"{name} [mm]", fontsize=7)
-            axis.set_title(f"{part}: {len(spheres)}" if row == 0 else "", fontsize=8)
+            axis.set_xlabel(f"{direction} [mm]", fontsize=7)
+            axis.set_title(f"{name}: {len(spheres)}" if row == 0 else "", fontsize=8)
         axes[0, 0].set_ylabel("z [mm]", fontsize=7)
     figure.savefig(path, dpi=110)

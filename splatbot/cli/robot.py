@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
-
-if TYPE_CHECKING:
-    from splatbot.robots.maker_meshes import Source
 
 
 def robot(
@@ -47,8 +44,8 @@ def robot(
         out: the file to write; mjcf prints without one. info --check-meshes draws NAME-body.png by default, and fit
             writes NAME.json.
         tip: add: the link at the arm's end (MJCF: a body or site); by default the last one before fingers.
-        slack: largest distance of the spheres beyond the geometry [m]; for fit 0.011 by default. By default add takes
-            2 % of the reach. It takes more if that needs too many spheres.
+        slack: largest distance of the spheres beyond the geometry [m]; for fit panda 0.011 by default. By default add
+            takes 2 % of the reach. It takes more if that needs too many spheres.
         rename: add: the name to store the arm under; by default that in the file.
         gripper: add: attach a hand to the tool frame, whose z axis points outwards: 2f85 or 2f140.
         overwrite: add: replace a robot of that name.
@@ -62,7 +59,7 @@ def robot(
         print("\n".join(robot_names()))
         return 0
     if action == "fit":
-        return _fit(name, out, 0.011 if slack is None else slack)
+        return _fit(name, out, slack)
     from splatbot.robots.store import load_robot
 
     model = load_robot(name)
@@ -80,20 +77,36 @@ def robot(
     return 0
 
 
-def _source(name: str) -> Source:
+def _check_known(name: str) -> None:
+    """Refuse a robot whose maker's meshes are not known.
+
+    Raises:
+        InputError: they are not.
+    """
     from splatbot.errors import InputError
+    from splatbot.robots.arms import ARMS
     from splatbot.robots.maker_meshes import SOURCES
 
-    if name not in SOURCES:
-        raise InputError(f"has no known meshes: {name!r}.", field="robot", hint=f"arms: {', '.join(SOURCES)}")
-    return SOURCES[name]
+    if name not in SOURCES and name not in ARMS:
+        raise InputError(f"has no known meshes: {name!r}.", field="robot", hint=f"arms: {', '.join([*SOURCES, *ARMS])}")
 
 
-def _fit(name: str, out: Path | None, slack: float) -> int:
+def _fit(name: str, out: Path | None, slack: float | None) -> int:
+    from splatbot.errors import InputError
+    from splatbot.robots.arms import ARMS
+    from splatbot.robots.arms.fit import fit_arm
     from splatbot.robots.bodies import fit_body, save_body
+    from splatbot.robots.maker_meshes import SOURCES
+    from splatbot.robots.store import save_robot
 
+    _check_known(name)
     file = out if out is not None else Path(f"{name}.json")
-    save_body(fit_body(_source(name), slack, print), file)
+    if name in ARMS:
+        if slack is not None:
+            raise InputError("is that of the arm's entry.", field="slack", hint="leave --slack out")
+        save_robot(fit_arm(name), file)
+    else:
+        save_body(fit_body(SOURCES[name], 0.011 if slack is None else slack, print), file)
     print(f"written to {file}")
     return 0
 
@@ -101,12 +114,23 @@ def _fit(name: str, out: Path | None, slack: float) -> int:
 def _check_meshes(name: str, out: Path | None) -> int:
     """Print containment and slack of each part; return 1 if a part is not contained."""
     from splatbot.cli.tables import print_table
+    from splatbot.robots.arms import ARMS
+    from splatbot.robots.arms.fit import described
     from splatbot.robots.bodies import load_body
-    from splatbot.robots.bodies.check import check_body, draw_body
+    from splatbot.robots.bodies.check import check_parts, draw_parts, parts_of_arm, parts_of_body
+    from splatbot.robots.maker_meshes import SOURCES
+    from splatbot.robots.store import load_robot
 
-    source = _source(name)
-    body = load_body(name)
-    parts = check_body(body, source)
+    _check_known(name)
+    if name in ARMS:
+        source, robot = ARMS[name].source, load_robot(name)
+        parts = parts_of_arm(described(name).shapes, robot.spheres(), robot)
+    else:
+        source, body = SOURCES[name], load_body(name)
+        parts = parts_of_body(body, source)
+        if body.source["sha256"] != source.digest():
+            print("note: the body was fitted to other meshes than those that are installed")
+    checks = check_parts(parts)
     print_table(
         [
             (
@@ -114,16 +138,14 @@ def _check_meshes(name: str, out: Path | None) -> int:
                 f"{p.spheres} spheres, largest uncovered distance {1e3 * p.uncovered:.2f} mm, slack "
                 f"{1e3 * p.slack.median:.1f} mm (median), {1e3 * p.slack.most99:.1f} mm (99 %)",
             )
-            for p in parts
+            for p in checks
         ],
         title=f"{source.package} {source.version()} ({source.origin}, {source.licence})",
     )
-    if body.source["sha256"] != source.digest():
-        print("note: the body was fitted to other meshes than those that are installed")
     picture = out if out is not None else Path(f"{name}-body.png")
-    draw_body(body, source, picture)
+    draw_parts(parts, picture)
     print(f"picture: {picture}")
-    return 0 if max(p.uncovered for p in parts) <= 0 else 1
+    return 0 if max(p.uncovered for p in checks) <= 0 else 1
 
 
 def _add(

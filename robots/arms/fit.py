@@ -1,0 +1,61 @@
+"""The fit of a shipped arm to the description of its maker."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.protocols import LinkSpheres
+from splatbot.robots.arms import ARMS, ShippedArm
+from splatbot.robots.bodies import rounded
+from splatbot.robots.containment import uncovered
+from splatbot.robots.cover import FINE, cover
+from splatbot.robots.description import read_description
+from splatbot.robots.robot import Inertial, RobotModel
+
+
+def described(name: str) -> RobotModel:
+    """Return a shipped arm as its installed description has it, with shapes, and spheres that are not fitted yet.
+
+    Raises:
+        InputError: the package of the description is not installed.
+    """
+    arm = ARMS[name]
+    robot = read_description(arm.path(), tip=arm.tip, slack=arm.slack).robot
+    joints = robot.joints
+    if arm.efforts:
+        joints = tuple(replace(j, effort=effort) for j, effort in zip(joints, arm.efforts, strict=True))
+    return replace(robot, name=name, joints=joints, home=np.array(arm.home))
+
+
+def fit_arm(name: str) -> RobotModel:
+    """Cover the geometry of a shipped arm, and prove that the rounded spheres contain it.
+
+    Raises:
+        InputError: a package is not installed, or the proof fails.
+    """
+    robot = described(name)
+    fitted = cover(robot.shapes, robot.slack, FINE)
+    covering = LinkSpheres(fitted.link, *rounded(fitted.centers, fitted.radii))
+    if uncovered(robot.shapes, covering) > 0:
+        raise InputError("is not contained after rounding.", field=name, hint="fit with another slack")
+    return replace(robot, covering=covering, inertials=_inertials(ARMS[name], robot))
+
+
+def _inertials(arm: ShippedArm, robot: RobotModel) -> tuple[Inertial, ...]:
+    """Return the inertias of an arm; those of another description are moved into its frames.
+
+    The links of both descriptions coincide when all joints are at 0.
+    """
+    path = arm.path_of_masses()
+    if path is None:
+        return robot.inertials
+    other = read_description(path).robot
+    zero = np.zeros(len(robot))
+    T_link_other = np.linalg.inv(robot.fk(zero)) @ other.fk(zero)
+    return tuple(
+        Inertial.summed([(i.mass, T[:3, :3] @ np.asarray(i.center) + T[:3, 3], T[:3, :3] @ i.inertia @ T[:3, :3].T)])
+        for T, i in zip(T_link_other, other.inertials, strict=True)
+    )
