@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,9 @@ from splatbot.planning import GaussianRRTStar, PlanResult
 from splatbot.protocols import Array
 from splatbot.results.audit import audit_run
 from splatbot.results.folder import RunFolder
-from splatbot.results.margin import own_margin
+from splatbot.results.margin import CONSTANTS as MARGIN
+from splatbot.results.margin import audited_error
+from splatbot.results.region_plan import plan_in_region
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
 from splatbot.tracking.prepare import usable_depth
@@ -59,7 +63,10 @@ _BOX = ((0.2, -0.5, 0.0), (0.9, 0.5, 0.8))  # [m]
 def plan_in_run(
     results: Results, run: Path, *, problems: int, budget_ms: float, seed: int = 0, margins: bool = False
 ) -> None:
-    """Plan seeded problems in the map of a run, with margin 0 and with the surface error of the map.
+    """Plan seeded problems in the map of a run, with three margins.
+
+    They are 0, the surface error of the map within 1 m of the base, and that in the region of each motion, which is the
+    default of `splatbot plan`.
 
     With ``margins``, also sweep the margin on the problems of margin 0 (:mod:`splatbot.bench.planning.margin_sweep`).
 
@@ -81,20 +88,43 @@ def plan_in_run(
         )
     folder = RunFolder(run)
     log = reopen_log(folder)
-    own = own_margin(run, log, field, place.T_world_base)
-    measured = cKDTree(_measured(folder, log))
+    error = audited_error(run, log, field)
+    own = error.near(place.T_world_base[:3, 3], MARGIN.radius).quantile(MARGIN.confidence)
+    known = {
+        "a measured point": cKDTree(_measured(folder, log)),
+        "a point that two frames measured": cKDTree(error.points),
+    }
+    name = run.resolve().name
     for margin in (0.0, own):
-        case = f"{run.resolve().name}, margin {1e3 * margin:.1f} mm"
+        case = f"{name}, margin {1e3 * margin:.1f} mm"
         planner = GaussianRRTStar(field, panda(), T_world_base=place.T_world_base, margin=margin)
         wanted = map_problems(panda(), planner.arm, field, place.box, problems, seed)
         results.add(case, "Gaussians", float(len(field)), "")
         results.add(case, "problems found", float(len(wanted)), f"of {problems}")
         runs = [planner.plan(p.start, p.goal, budget_ms=budget_ms, seed=k) for k, p in enumerate(wanted)]
-        if runs:
-            _add(results, case, runs, planner, measured)
+        _add(results, case, runs, planner.arm, known)
         if margins and margin == 0.0:
-            name, audit = run.resolve().name, audit_run(folder, log).audit
+            audit = audit_run(folder, log).audit
             sweep_margins(results, name, audit, field, place.T_world_base, wanted, budget_ms=budget_ms)
+    case = f"{name}, margin of the region"
+    found = [
+        plan_in_region(
+            partial(_planner, field, place.T_world_base),
+            lambda planner, k=k, p=p: planner.plan(p.start, p.goal, budget_ms=budget_ms, seed=k),  # type: ignore[misc]
+            np.stack([p.start, p.goal]),
+            error,
+            confidence=MARGIN.confidence,
+        )
+        for k, p in enumerate(wanted)
+    ]
+    results.add(case, "problems found", float(len(wanted)), f"of {problems}")
+    if found:
+        results.add(case, "margin, median", 1e3 * float(np.median([one.planner.margin for one in found])), "mm")
+    _add(results, case, [one.result for one in found], planner.arm, known)
+
+
+def _planner(field: GaussianCollisionField, T_world_base: Array, margin: float) -> GaussianRRTStar:
+    return GaussianRRTStar(field, panda(), T_world_base=T_world_base, margin=margin)
 
 
 def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
@@ -115,7 +145,9 @@ def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:
     return place
 
 
-def _add(results: Results, case: str, runs: list[PlanResult], planner: GaussianRRTStar, measured: cKDTree) -> None:
+def _add(results: Results, case: str, runs: list[PlanResult], arm: RobotSpheres, known: Mapping[str, cKDTree]) -> None:
+    if not runs:
+        return
     paths = [run.path for run in runs if run.path is not None]
     results.add(case, "solved", float(len(paths)), f"of {len(runs)}")
     results.add(case, "planning time, median", 1e3 * float(np.median([run.seconds for run in runs])), "ms")
@@ -129,9 +161,10 @@ def _add(results: Results, case: str, runs: list[PlanResult], planner: GaussianR
     promised = [1e3 * path.certificate.clearance for path in paths]
     results.add(case, "certified clearance beyond the margin, least", min(promised), "mm")
     results.add(case, "certified clearance beyond the margin, median", float(np.median(promised)), "mm")
-    clearances = np.array([_clearance(planner.arm, path.waypoints, measured) for path in paths])
-    results.add(case, "in contact with a measured point", float((clearances <= 0).sum()), f"of {len(paths)}")
-    results.add(case, "deepest", 1e3 * max(0.0, -float(clearances.min())), "mm")
+    for name, points in known.items():
+        clearances = np.array([_clearance(arm, path.waypoints, points) for path in paths])
+        results.add(case, f"in contact with {name}", float((clearances <= 0).sum()), f"of {len(paths)}")
+        results.add(case, f"deepest in {name}", 1e3 * max(0.0, -float(clearances.min())), "mm")
 
 
 def _measured(folder: RunFolder, log: Log) -> Array:

@@ -31,12 +31,13 @@ def test_problems_in_a_run_are_solved_certified_and_off_what_was_measured(record
     assert main(["bench", "planning", "--quick", "--run", str(recorded), "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "planning-mapped.json").read_text())["rows"]
     cases = sorted({row["case"] for row in rows})
-    assert len(cases) == 2
+    assert len(cases) == 3
     for case in cases:
         found = {row["metric"]: row["value"] for row in rows if row["case"] == case}
         assert found["solved"] == found["certified"] == found["problems found"] == 2
         assert found["certified clearance beyond the margin, least"] >= 0
         assert found["in contact with a measured point"] == 0 or "margin 0.0" in case
+        assert found["in contact with a point that two frames measured"] == 0 or "margin 0.0" in case
 
 
 def test_a_scene_without_a_place_to_work_at_is_named(recorded: Path) -> None:
