@@ -1,0 +1,131 @@
+"""The Python snippets of README and guides run as they are printed."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatbot.bench.tabletop import tabletop
+from splatbot.cli import main
+from splatbot.frame import PosePrior
+from splatbot.gaussians import GaussianModel
+from splatbot.grasping.affordance import NameHint, find_target
+from splatbot.grasping.language import LanguageAffordance
+from splatbot.grasping.pick import Picker
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.logs import open_log
+from splatbot.robots.controllers import FakeController
+from splatbot.robots.grippers import FakeGripper
+from splatbot.robots.panda import panda
+from splatbot.segmentation import segment
+from splatbot.serving import serving
+from splatbot.slam import Slam
+from tests.unit.grasping.objects import CAN, OBJECTS, colored
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs" / "guide").glob("*.md")))]
+LOG = "synthetic:tabletop?frames=4&width=160&height=120"
+Names = dict[str, Any]
+
+
+def snippets(document: str) -> list[str]:
+    """Return the Python blocks of a document."""
+    return re.findall(r"^```python\n(.*?)^```", (ROOT / document).read_text("utf-8"), flags=re.S | re.M)
+
+
+WITH_SNIPPETS = [name for name in DOCUMENTS if snippets(name)]
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the run ``runs/desk``, and its map as ``map.ply``."""
+    folder = tmp_path_factory.mktemp("snippets")
+    assert main(["map", LOG, "--out", str(folder / "runs" / "desk"), "--quiet"]) == 0
+    (folder / "map.ply").write_bytes((folder / "runs" / "desk" / "map.ply").read_bytes())
+    return folder
+
+
+def _table() -> GaussianModel:
+    return colored(OBJECTS | {"can": CAN}, 24_000, {"can": (0.8, 0.1, 0.1)})
+
+
+def _grasping(desk: Path) -> Names:
+    return {"snapshot": _table(), "T_world_base": np.eye(4), "panda": panda, "observers": None}
+
+
+def _mapping(desk: Path) -> Names:
+    frame = replace(open_log(LOG)[0], joints=panda().home)
+    return {"panda": panda, "T_link_camera": np.eye(4), "slam": Slam(), "frame": frame}
+
+
+def _picking(desk: Path) -> Names:
+    controller = FakeController(panda().home)
+    names = {
+        "scene": segment(_table(), np.eye(4)),
+        "robot": panda(),
+        "controller": controller,
+        "gripper": FakeGripper(),
+    }
+    return names | {x.__name__: x for x in (Picker, GraspSampler, find_target, NameHint, LanguageAffordance)}
+
+
+def _planning(desk: Path) -> Names:
+    tabletop().gaussians(10_000).save(desk / "map.ply")  # the snippet's arm needs a map around its base
+    goal = np.array([-0.7, 0.3, 0.0, -2.0, 0.0, 2.4, 0.8])
+    later = tabletop().gaussians(10_000)
+    names = {"T_world_base": np.eye(4), "start": panda().home, "goal": goal, "later": later}
+    names["changed"] = np.zeros(len(later), bool)
+    return names | {"here": panda().home, "controller": FakeController(panda().home)}
+
+
+def _tracking(desk: Path) -> Names:
+    return {"replace": replace, "PosePrior": PosePrior, "covariance": 1e-4 * np.eye(6), "T": np.eye(4)}
+
+
+CONTEXTS: dict[str, Callable[[Path], Names]] = {
+    "docs/guide/grasping.md": _grasping,
+    "docs/guide/mapping.md": _mapping,
+    "docs/guide/picking.md": _picking,
+    "docs/guide/planning.md": _planning,
+    "docs/guide/tracking.md": _tracking,
+}
+OF_A_SERVICE = ["docs/guide/ros.md", "docs/guide/service.md"]
+
+
+@pytest.mark.parametrize("name", [name for name in WITH_SNIPPETS if name not in OF_A_SERVICE])
+def test_the_snippets_of_a_document_run_in_turn(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(desk)
+    names = CONTEXTS.get(name, lambda _: {})(desk)
+    for text in snippets(name):
+        exec(compile(text, name, "exec"), names)
+
+
+@pytest.fixture(scope="module")
+def served(desk: Path) -> Iterator[str]:
+    """Address of a service of the map."""
+    with serving("--map", str(desk / "runs" / "desk"), log=desk / "log.txt") as service:
+        yield service.url
+
+
+@pytest.mark.parametrize("name", OF_A_SERVICE)
+def test_the_snippets_of_a_client_run_against_a_service(name: str, served: str) -> None:
+    address = served.split("//")[1]
+    for text in snippets(name):
+        assert re.search(r"(localhost|127\.0\.0\.1):8000", text)
+        here = re.sub(r"(localhost|127\.0\.0\.1):8000", address, text)
+        if "ros.run()" in here:
+            here += "ros.terminate()\n"
+        done = subprocess.run([sys.executable, "-c", here], capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+def test_every_document_with_snippets_is_run() -> None:
+    assert set(CONTEXTS) | set(OF_A_SERVICE) <= set(WITH_SNIPPETS)
