@@ -65,6 +65,8 @@ def to_mjcf(robot: RobotModel) -> str:
         )  # fmt: skip
         bodies.append(body)
     for body, inertial in zip(bodies, robot.inertials, strict=True):
+        if inertial.mass <= 0:  # a base, which does not move
+            continue
         xx, yy, zz = np.diag(inertial.inertia)
         xy, xz, yz = inertial.inertia[0, 1], inertial.inertia[0, 2], inertial.inertia[1, 2]
         ElementTree.SubElement(

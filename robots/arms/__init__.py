@@ -20,6 +20,7 @@ class ShippedArm:
         tip: link at the end of the arm.
         home: (J,) posture without self-collision [rad].
         slack: largest distance of the spheres beyond the geometry [m].
+        base_slack: the same of the base, which is checked against other links alone. If 0, it is ``slack``.
         hands: of :data:`splatbot.robots.hands.HANDS` that it can carry.
         efforts: (J,) largest torques [Nm] from the data sheet. If empty, the description has them.
         masses: description of the same arm with inertias. If None, they are in the first one.
@@ -29,6 +30,7 @@ class ShippedArm:
     tip: str
     home: tuple[float, ...]
     slack: float
+    base_slack: float = 0.0
     hands: tuple[str, ...] = ("2f85", "2f140")
     efforts: tuple[float, ...] = ()
     masses: Source | None = None
@@ -63,16 +65,8 @@ ARMS = {
         _source("airo-models", "airo_models/arms/ur5e", "ur5e.urdf", "ur_description by Universal Robots", "MIT"),
         tip="wrist_3_link",
         home=(0.0, -1.57, 1.57, -1.57, -1.57, 0.0),
-        slack=0.011,
-    ),
-    "ur10": ShippedArm(
-        _source(
-            "example-robot-data", "robots/ur_description/urdf", "ur10_robot.urdf", "ur_description of ROS-Industrial",
-            "BSD-3-Clause",
-        ),
-        tip="tool0",
-        home=(0.0, -1.57, 1.57, -1.57, -1.57, 0.0),
-        slack=0.014,
+        slack=0.013,
+        base_slack=0.03,
     ),
     "xarm7": ShippedArm(
         _source(
@@ -90,7 +84,7 @@ ARMS = {
         ),
         tip="tool0",
         home=(0.0, 0.5, 0.0, -1.3, 0.0, 1.0, 0.0),
-        slack=0.012,
+        slack=0.0135,
         efforts=(320.0, 320.0, 176.0, 176.0, 110.0, 40.0, 40.0),  # data sheet of the LBR iiwa 14 R820
         masses=_source("pybullet", "pybullet_data/kuka_iiwa", "model.urdf", "iiwa_stack", "BSD-2-Clause"),
     ),

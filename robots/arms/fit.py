@@ -9,7 +9,7 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.protocols import LinkSpheres
 from splatbot.robots.arms import ARMS, ShippedArm
-from splatbot.robots.bodies import rounded
+from splatbot.robots.bodies import joined, rounded
 from splatbot.robots.containment import uncovered
 from splatbot.robots.cover import FINE, cover
 from splatbot.robots.description import read_description
@@ -37,7 +37,9 @@ def fit_arm(name: str) -> RobotModel:
         InputError: a package is not installed, or the proof fails.
     """
     robot = described(name)
-    fitted = cover(robot.shapes, robot.slack, FINE)
+    base = [shape for shape in robot.shapes if shape.link == 0]
+    moving = [shape for shape in robot.shapes if shape.link > 0]
+    fitted = joined(cover(base, ARMS[name].base_slack or robot.slack, FINE), cover(moving, robot.slack, FINE))
     covering = LinkSpheres(fitted.link, *rounded(fitted.centers, fitted.radii))
     if uncovered(robot.shapes, covering) > 0:
         raise InputError("is not contained after rounding.", field=name, hint="fit with another slack")

@@ -21,7 +21,7 @@ def test_a_robot_is_added_checked_listed_and_described(
     names = run("robot", "list").out.split()
     assert names[:3] == ["panda", "panda-2f85", "panda-2f140"]
     assert names[-1] == "ur5"
-    assert {"ur5e", "ur5e-2f85", "xarm7", "iiwa14", "so100", "ur10"} <= set(names)
+    assert {"ur5e", "ur5e-2f85", "xarm7", "iiwa14", "so100"} <= set(names)
     assert "shoulder_pan" in run("robot", "info", "ur5").out
     refused = run("robot", "mjcf", "ur5")
     assert refused.code == 2

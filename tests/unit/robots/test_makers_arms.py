@@ -16,6 +16,7 @@ from tests.unit.robots.makers import assert_held_at_home, assert_moves_as_mujoco
 
 _FILES = {
     "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "ur10": "ur_description/urdf/ur10_robot.urdf",
     "so100": "so_arm_description/urdf/so100.urdf",
     "z1": "z1_description/urdf/z1.urdf",
 }
