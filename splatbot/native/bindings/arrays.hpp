@@ -9,8 +9,10 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <initializer_list>
 #include <memory>
+#include <numeric>
 #include <optional>
 #include <span>
 #include <stdexcept>
@@ -181,14 +183,39 @@ nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<s
   return nb::ndarray<nb::numpy, T>(data, shape, owner);
 }
 
+inline std::size_t size_of(std::initializer_list<std::size_t> shape) {
+  return std::accumulate(shape.begin(), shape.end(), std::size_t{1}, std::multiplies<>());
+}
+
+// A dict of new arrays.
+class ArrayDict {
+ public:
+  // Adds zeros, to be written by fill().
+  template <class T>
+  std::span<T> add(const char* name, std::initializer_list<std::size_t> shape) {
+    const nb::ndarray<nb::numpy, T> array = owned(std::vector<T>(size_of(shape)), shape);
+    arrays_[name] = array;
+    return {array.data(), array.size()};
+  }
+
+  // The dict after fill(), which runs without the GIL.
+  template <class Fill>
+  nb::dict filled(Fill&& fill) const {
+    {
+      const nb::gil_scoped_release release;
+      fill();
+    }
+    return arrays_;
+  }
+
+ private:
+  nb::dict arrays_;
+};
+
 // An array whose values fill() writes, without the GIL.
 template <class T, class Fill>
 nb::ndarray<nb::numpy, T> filled(std::initializer_list<std::size_t> shape, Fill&& fill) {
-  std::size_t size = 1;
-  for (const std::size_t length : shape) {
-    size *= length;
-  }
-  std::vector<T> values(size);
+  std::vector<T> values(size_of(shape));
   {
     const nb::gil_scoped_release release;
     fill(std::span<T>(values));

@@ -73,19 +73,11 @@ void backward(const State& state, const InN3& means, const std::optional<InN4>& 
 
 nb::dict describe(const State& state) {
   const std::size_t n = splatbot::gaussian_count(*state.state);
-  std::vector<float> means2d(2 * n), depths(n), conics(3 * n), opacities(n);
-  std::vector<std::int32_t> radii(2 * n);
-  {
-    const nb::gil_scoped_release release;
-    splatbot::describe_projections(*state.state, {means2d, depths, conics, radii, opacities});
-  }
-  nb::dict d;
-  d["means2d"] = owned(std::move(means2d), {n, 2});
-  d["depths"] = owned(std::move(depths), {n});
-  d["conics"] = owned(std::move(conics), {n, 3});
-  d["radii"] = owned(std::move(radii), {n, 2});
-  d["opacities"] = owned(std::move(opacities), {n});
-  return d;
+  ArrayDict d;
+  const splatbot::Projections out = {d.add<float>("means2d", {n, 2}), d.add<float>("depths", {n}),
+                                     d.add<float>("conics", {n, 3}), d.add<std::int32_t>("radii", {n, 2}),
+                                     d.add<float>("opacities", {n})};
+  return d.filled([&] { splatbot::describe_projections(*state.state, out); });
 }
 
 nb::ndarray<nb::numpy, std::int32_t> contributions(const State& state) {

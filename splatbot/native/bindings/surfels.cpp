@@ -64,19 +64,11 @@ void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, c
 
 nb::dict describe(const SurfelHandle& state) {
   const std::size_t n = splatbot::surfel_count(*state.state);
-  std::vector<float> means2d(2 * n), depths(n), normals(3 * n);
-  std::vector<std::int32_t> radii(2 * n), tiles(n);
-  {
-    const nb::gil_scoped_release release;
-    splatbot::describe_surfels(*state.state, {means2d, depths, normals, radii, tiles});
-  }
-  nb::dict d;
-  d["means2d"] = owned(std::move(means2d), {n, 2});
-  d["depths"] = owned(std::move(depths), {n});
-  d["normals"] = owned(std::move(normals), {n, 3});
-  d["radii"] = owned(std::move(radii), {n, 2});
-  d["tiles_per_gauss"] = owned(std::move(tiles), {n});
-  return d;
+  ArrayDict d;
+  const splatbot::SurfelProjections out = {d.add<float>("means2d", {n, 2}), d.add<float>("depths", {n}),
+                                           d.add<float>("normals", {n, 3}), d.add<std::int32_t>("radii", {n, 2}),
+                                           d.add<std::int32_t>("tiles_per_gauss", {n})};
+  return d.filled([&] { splatbot::describe_surfels(*state.state, out); });
 }
 
 }  // namespace
