@@ -30,18 +30,16 @@ nb::ndarray<nb::numpy, float> like(const Image& image, Fill&& fill) {
   return filled<float>({image.shape(0), image.shape(1)}, fill);
 }
 
-// A function that writes an image of the same size, given depth and numbers.
-template <class... Numbers>
-auto on_depth(void (*write)(const splatbot::DepthImage&, Numbers..., std::span<float>)) {
-  return [write](Image depth, Numbers... numbers) {
-    return like(depth, [&](std::span<float> out) { write(view(depth), numbers..., out); });
-  };
+// What write() makes of an image and three numbers: an image of the same size.
+template <void (*write)(const splatbot::DepthImage&, float, float, float, std::span<float>)>
+nb::ndarray<nb::numpy, float> filtered(Image depth, float a, float b, float c) {
+  return like(depth, [&](std::span<float> out) { write(view(depth), a, b, c, out); });
 }
 
 }  // namespace
 
 void define_depth(nb::module_& m) {
-  m.def("valid_depth", on_depth<float, float, float>(&splatbot::valid_depth), "depth"_a.noconvert(), "near"_a, "far"_a,
+  m.def("valid_depth", &filtered<splatbot::valid_depth>, "depth"_a.noconvert(), "near"_a, "far"_a,
         "step"_a, "Depth without implausible and flying pixels.");
   m.def(
       "halve_depth",
@@ -70,7 +68,7 @@ void define_depth(nb::module_& m) {
       },
       "depth"_a.noconvert(), "gray"_a.noconvert(), "step"_a, "floor"_a, "quad"_a,
       "Grey, NaN where surfaces of different depth meet.");
-  m.def("smooth_depth", on_depth<float, float, float>(&splatbot::smooth_depth), "depth"_a.noconvert(), "step"_a,
+  m.def("smooth_depth", &filtered<splatbot::smooth_depth>, "depth"_a.noconvert(), "step"_a,
         "floor"_a, "quad"_a, "Depth averaged over the 3x3 pixels of each one's surface.");
   m.def(
       "normals_of",
