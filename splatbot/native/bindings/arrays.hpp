@@ -43,6 +43,12 @@ using Matrix3 = Array<const double, nb::shape<3, 3>>;
 using Matrix4 = Array<const double, nb::shape<4, 4>>;
 
 template <class A>
+using OrNone = const std::optional<A>&;
+
+// An argument that takes an array as it is, or None.
+inline auto or_none(const char* name) { return nb::arg(name).noconvert().none(); }
+
+template <class A>
 auto span_of(const A& array) {
   return std::span(array.data(), array.size());
 }
@@ -53,9 +59,9 @@ std::span<T> span_of(const std::optional<A>& array) {
 }
 
 // Flat arrays and how to read them, as Python hands them over for both passes.
-inline splatbot::Gaussians gaussians_of(const InN3& means, const std::optional<InN4>& quats,
-                                        const std::optional<InN3>& scales, const std::optional<InN33>& covars,
-                                        const In1& opacities, const InAny& colors, int sh_degree) {
+inline splatbot::Gaussians gaussians_of(const InN3& means, OrNone<InN4> quats, OrNone<InN3> scales,
+                                        OrNone<InN33> covars, const In1& opacities, const InAny& colors,
+                                        int sh_degree) {
   splatbot::Gaussians g = {.count = means.shape(0),
                            .channels = 3,
                            .means = span_of(means),
@@ -135,11 +141,9 @@ inline splatbot::DepthMode depth_mode(const std::string& name) {
 }
 
 // Destinations of the gradients that both kinds of splats have.
-inline splatbot::Gradients gradients_of(const std::optional<OutAny>& means, const std::optional<OutAny>& quats,
-                                        const std::optional<OutAny>& scales, const std::optional<OutAny>& opacities,
-                                        const std::optional<OutAny>& colors, const std::optional<OutCamera>& camera,
-                                        const std::optional<OutDoubles>& background,
-                                        const std::optional<OutAny>& means2d, bool accumulate) {
+inline splatbot::Gradients gradients_of(OrNone<OutAny> means, OrNone<OutAny> quats, OrNone<OutAny> scales,
+                                        OrNone<OutAny> opacities, OrNone<OutAny> colors, OrNone<OutCamera> camera,
+                                        OrNone<OutDoubles> background, OrNone<OutAny> means2d, bool accumulate) {
   return {.means = span_of<float>(means),
           .quats = span_of<float>(quats),
           .scales = span_of<float>(scales),
@@ -172,6 +176,13 @@ template <class Pointer>
 struct StateHandle {
   Pointer state;
 };
+
+// The state that render(pointer) leaves, or (field, row) of an input that is not finite.
+template <class State, class Render>
+nb::object state_after(Render&& render) {
+  State state;
+  return unless_faulty([&] { return render(state.state); }, [&] { return std::move(state); });
+}
 
 template <class T>
 nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
