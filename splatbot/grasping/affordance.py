@@ -164,7 +164,7 @@ class OneKindAffordance(ABC, Generic[H]):
 
     kind: type[H]
     wanted: str
-    """What to give instead of another hint."""
+    """The hint to give, in words, for the error about another kind."""
 
     def understands(self, hint: Hint) -> bool:
         """Return whether the hint is of the kind."""

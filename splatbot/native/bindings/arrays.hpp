@@ -42,10 +42,9 @@ using OutCamera = Array<double, nb::shape<splatbot::kCameraSums>>;
 using Matrix3 = Array<const double, nb::shape<3, 3>>;
 using Matrix4 = Array<const double, nb::shape<4, 4>>;
 
+// The type of a parameter that may be None, and its name in Python; arrays are not converted.
 template <class A>
 using OrNone = const std::optional<A>&;
-
-// An argument that takes an array as it is, or None.
 inline auto or_none(const char* name) { return nb::arg(name).noconvert().none(); }
 
 template <class A>

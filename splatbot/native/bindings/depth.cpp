@@ -30,7 +30,7 @@ nb::ndarray<nb::numpy, float> like(const Image& image, Fill&& fill) {
   return filled<float>({image.shape(0), image.shape(1)}, fill);
 }
 
-// What write() makes of an image and three numbers: an image of the same size.
+// Returns an image of the same size, which write() makes of an image and three numbers.
 template <void (*write)(const splatbot::DepthImage&, float, float, float, std::span<float>)>
 nb::ndarray<nb::numpy, float> filtered(Image depth, float a, float b, float c) {
   return like(depth, [&](std::span<float> out) { write(view(depth), a, b, c, out); });
