@@ -13,6 +13,7 @@ from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
 from splatbot.protocols import FrameSource
 from splatbot.services.store import MapStore, ServedMap, State
+from splatbot.services.threads import join_started
 from splatbot.services.topics import FRAME, RESULT
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
@@ -96,8 +97,7 @@ class LiveMapping:
         self._stop.set()
         if isinstance(self._source, FrameSource):
             self._source.close()  # the thread may be waiting for a frame
-        if self._thread.is_alive():
-            self._thread.join(timeout_s)
+        join_started([self._thread], timeout_s)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait for the end of the frames up to ``timeout_s`` [s]; whether it has come."""

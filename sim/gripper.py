@@ -67,10 +67,9 @@ class TwinGripper:
         return self._force
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Move to an opening [m], by default with the gripper's own force [N] (70 N for the Panda) at 0.1 m/s.
+        """Move to an opening [m]; see :class:`splatbot.protocols.Gripper`.
 
-        Raises:
-            InputError: a value is out of range.
+        The default is the gripper's own force (70 N for the Panda) and 0.1 m/s.
         """
         check_move(self.stroke, opening, force, speed)
         self._goal = opening

@@ -16,6 +16,7 @@ _LAYOUTS_HINT = (
     "`synthetic:tabletop` needs no files"
 )
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
+_FROM_A_LOG = "map a recording; splatbot reads Gaussians (3DGS PLY)"
 _AS_PLY = "open it in https://superspl.at/editor and export it as an uncompressed PLY"
 
 _PACKED = {
@@ -42,9 +43,7 @@ _FOREIGN_LOGS = {
     ".sens": ("a ScanNet recording", f"extract it with ScanNet's SensReader, then {_AS_TUM}"),
     ".r3d": ("a Record3D recording", f"export it in Record3D as EXR and RGB, then {_AS_TUM}"),
     ".rrd": ("a Rerun recording", f"export its images with the Rerun SDK, then {_AS_TUM}"),
-    ".mp4": ("a video without depth", "record colour and depth of an RGB-D camera"),
-    ".mov": ("a video without depth", "record colour and depth of an RGB-D camera"),
-    ".avi": ("a video without depth", "record colour and depth of an RGB-D camera"),
+    **dict.fromkeys((".mp4", ".mov", ".avi"), ("a video without depth", "record colour and depth of an RGB-D camera")),
     ".ply": ("a map or a point cloud", "give the recording; `splatbot info FILE` describes a map"),
 }
 _FOREIGN_MAPS = {
@@ -52,13 +51,9 @@ _FOREIGN_MAPS = {
     ".splat": ("a .splat file", _AS_PLY),
     ".ksplat": ("a .ksplat file", _AS_PLY),
     ".sog": ("a SOG file", _AS_PLY),
-    ".pcd": ("a point cloud", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
-    ".las": ("a point cloud", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
-    ".e57": ("a point cloud", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
-    ".obj": ("a mesh", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
-    ".stl": ("a mesh", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
-    ".glb": ("a mesh", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
-    ".bt": ("an OctoMap", "map a recording; splatbot reads Gaussians (3DGS PLY)"),
+    **dict.fromkeys((".pcd", ".las", ".e57"), ("a point cloud", _FROM_A_LOG)),
+    **dict.fromkeys((".obj", ".stl", ".glb"), ("a mesh", _FROM_A_LOG)),
+    ".bt": ("an OctoMap", _FROM_A_LOG),
 }
 
 

@@ -223,7 +223,11 @@ class Gripper(Protocol):
         ...
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Move towards an opening [m], with at most a force [N] and a speed [m/s] of the opening."""
+        """Move towards an opening [m], with at most a force [N] and a speed [m/s] of the opening.
+
+        Raises:
+            InputError: a value is out of range.
+        """
         ...
 
     def moving(self) -> bool:

@@ -20,21 +20,12 @@ class FakeGripper:
     def __init__(self, stroke: float = 0.08, *, width: float = 0.0) -> None:
         if not 0.0 <= width <= stroke:
             raise InputError(f"is {width}.", field="width", hint=f"give 0..{stroke:g} m")
-        self._stroke, self.width = stroke, width
+        self.stroke, self.width = stroke, width
         self._opening = self._target = stroke
 
-    @property
-    def stroke(self) -> float:
-        """Widest opening [m]."""
-        return self._stroke
-
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Move to an opening [m], or to contact with the object.
-
-        Raises:
-            InputError: a value is out of range.
-        """
-        check_move(self._stroke, opening, force, speed)
+        """Move to an opening [m], or to contact with the object; see :class:`splatbot.protocols.Gripper`."""
+        check_move(self.stroke, opening, force, speed)
         self._target = opening
         self._opening = max(opening, self.width)
 

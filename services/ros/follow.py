@@ -23,6 +23,7 @@ from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import waypoints_of
 from splatbot.services.ros.moveit import main_map
 from splatbot.services.store import MapStore
+from splatbot.services.threads import join_started
 
 _TYPE = "control_msgs/msg/FollowJointTrajectoryAction"
 _ACTIVE, _PREEMPTED, _SUCCEEDED, _ABORTED, _REJECTED = 1, 2, 3, 4, 5  # of actionlib_msgs/GoalStatus
@@ -96,9 +97,7 @@ class FollowJointTrajectory:
         if self._requests is not None:
             self._requests.close()
         self._news.close()
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join(timeout_s)
+        join_started(self._threads, timeout_s)
 
     def _take_all(self) -> None:
         for news in self._requests or ():

@@ -45,25 +45,23 @@ class RosNode:
         MoveItServices(self.graph, store, robot=robot)
         NvbloxServices(self.graph, store)
         GraspServices(self.graph, store, robot=robot)
-        self._follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
+        follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
         if arms is not None:
             EmergencyStopTopic(self.graph, arms)
-        self._tf = TfRepublisher(self.graph)
-        self._outlets = RosPublishers(store.bus, self.graph)
-        self._inlets = RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame, max_pixels=max_pixels)
+        self._parts: list[TfRepublisher | RosPublishers | RosSubscribers | FollowJointTrajectory] = [
+            TfRepublisher(self.graph),
+            RosPublishers(store.bus, self.graph),
+            RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame, max_pixels=max_pixels),
+        ]
+        if follow is not None:
+            self._parts.append(follow)
 
     def start(self) -> None:
         """Begin."""
-        self._tf.start()
-        self._outlets.start()
-        self._inlets.start()
-        if self._follow is not None:
-            self._follow.start()
+        for part in self._parts:
+            part.start()
 
     def stop(self) -> None:
         """End."""
-        self._tf.stop()
-        self._outlets.stop()
-        self._inlets.stop()
-        if self._follow is not None:
-            self._follow.stop()
+        for part in self._parts:
+            part.stop()

@@ -29,6 +29,7 @@ from splatbot.services.ros.messages import (
     transform_message,
 )
 from splatbot.services.store import ServedMap
+from splatbot.services.threads import join_started
 from splatbot.services.topics import FRAME, GRASPS, PLAN, REMOVED, RESULT, STATE, TRAJECTORY, JointState, arm_topic
 from splatbot.services.topics import JOINTS as ARM_JOINTS
 from splatbot.slam import FrameResult
@@ -102,8 +103,7 @@ class RosPublishers:
         """End."""
         logging.getLogger("splatbot").removeHandler(self._rosout)
         self._news.close()
-        if self._thread.is_alive():
-            self._thread.join(timeout_s)
+        join_started([self._thread], timeout_s)
 
     def _run(self) -> None:
         for news in self._news:

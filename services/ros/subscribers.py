@@ -21,6 +21,7 @@ from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import joints_of
 from splatbot.services.ros.publishers import FROM_ROS
 from splatbot.services.ros.wire import RosMessage
+from splatbot.services.threads import join_started
 from splatbot.services.topics import JOINTS as ROBOT_JOINTS
 from splatbot.services.topics import robot_topic
 
@@ -66,8 +67,7 @@ class RosSubscribers:
     def stop(self, timeout_s: float = 5.0) -> None:
         """End."""
         self._news.close()
-        if self._thread.is_alive():
-            self._thread.join(timeout_s)
+        join_started([self._thread], timeout_s)
 
     def _run(self) -> None:
         for news in self._news:

@@ -17,6 +17,7 @@ from splatbot.logs.ros_types import Message, build
 from splatbot.protocols import Array
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.requests import entries, entry, number, seconds
+from splatbot.services.threads import join_started
 
 REPUBLISH = "/republish_tfs"
 
@@ -88,9 +89,7 @@ class TfRepublisher:
         """End."""
         self._ended.set()
         self._transforms.close()
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join(timeout_s)
+        join_started(self._threads, timeout_s)
 
     def republish(self, args: Mapping[str, Any]) -> dict[str, Any]:
         """Answer RepublishTFs: the name of a topic of TFArrays with the requested transforms.

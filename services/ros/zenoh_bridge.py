@@ -16,6 +16,7 @@ from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_types import from_cdr, full_name, typestore
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.wire import RosMessage
+from splatbot.services.threads import join_started
 
 HEARD = (COLOR, DEPTH, INFO, JOINTS)  # of the topics that others publish
 _CLIENT = -1  # identity in the graph
@@ -79,8 +80,7 @@ class ZenohBridge:
     def stop(self, timeout_s: float = 5.0) -> None:
         """End, and leave the nodes' graph."""
         self._news.close()
-        if self._thread.is_alive():
-            self._thread.join(timeout_s)
+        join_started([self._thread], timeout_s)
         self._session.close()
 
     def _run(self) -> None:

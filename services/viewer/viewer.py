@@ -20,6 +20,7 @@ from splatbot.services.access import Access
 from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
 from splatbot.services.store import MapStore, ServedMap
+from splatbot.services.threads import join_started
 from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
 from splatbot.services.viewer.door import Door
 from splatbot.services.viewer.scene import ViewerScene, close_server, open_server
@@ -112,9 +113,7 @@ class Viewer:
         """End, and close the page's connections."""
         self._stopping.set()
         self._reader.close()
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join(timeout_s)
+        join_started(self._threads, timeout_s)
         close_server(self.server)
 
     def html(self) -> str:

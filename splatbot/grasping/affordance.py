@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import SplatbotError
+from splatbot.errors import InputError, SplatbotError
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
@@ -88,6 +89,7 @@ class TagHint:
 
 
 Hint = NameHint | PixelHint | PointHint | MaskHint | BoxHint | TagHint
+H = TypeVar("H", NameHint, TagHint)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +157,27 @@ class Affordance(Protocol):
             InputError: the hint is invalid, for example a pixel outside of its view.
         """
         ...
+
+
+class OneKindAffordance(ABC, Generic[H]):
+    """The common part of backends that resolve one kind of hint; see :class:`Affordance`."""
+
+    kind: type[H]
+    wanted: str
+    """The hint to give, in words, for the error about another kind."""
+
+    def understands(self, hint: Hint) -> bool:
+        """Return whether the hint is of the kind."""
+        return isinstance(hint, self.kind)
+
+    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
+        """Find the target of a hint; see :meth:`Affordance.locate`."""
+        if not isinstance(hint, self.kind):
+            raise InputError(f"is a {type(hint).__name__}.", field="hint", hint=f"give {self.wanted}")
+        return self._find(hint, scene)
+
+    @abstractmethod
+    def _find(self, hint: H, scene: SegmentedMap) -> Target: ...
 
 
 def find_target(hint: Hint, scene: SegmentedMap, backends: Sequence[Affordance]) -> Target:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, transform_points
-from splatbot.grasping.affordance import AffordanceError, Hint, NameHint, Target
+from splatbot.grasping.affordance import AffordanceError, NameHint, OneKindAffordance, Target
 from splatbot.grasping.spatial import at_point
 from splatbot.protocols import Array
 from splatbot.segmentation import MapObject, SegmentedMap, primitive_fits
@@ -111,22 +111,13 @@ class _ObjectAttributes:
         return cls(scene, transform_points(inverse(scene.T_world_base), centers))
 
 
-class LanguageAffordance:
+class LanguageAffordance(OneKindAffordance[NameHint]):
     """Finds objects by names and aliases of the scene file, else by rules on colour, shape, size and relation."""
 
-    @property
-    def name(self) -> str:
-        """Name of the backend in results."""
-        return "rules"
+    name = "rules"
+    kind, wanted = NameHint, "words"
 
-    def understands(self, hint: Hint) -> bool:
-        """Return whether the hint is a text."""
-        return isinstance(hint, NameHint)
-
-    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
-        """Find the object of a query; see :class:`splatbot.grasping.affordance.Affordance`."""
-        if not isinstance(hint, NameHint):
-            raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give words")
+    def _find(self, hint: NameHint, scene: SegmentedMap) -> Target:
         text = " ".join(re.findall(r"[a-z0-9_-]+", hint.text.lower()))
         if not text:
             raise InputError("is empty.", field="target", hint='give a name, or "red box"')

@@ -55,10 +55,7 @@ _UNSEGMENTED = "it is not a segmented object; the target is the marked part of i
 class SpatialAffordance:
     """Finds the segmented object at a position in an image or in the world."""
 
-    @property
-    def name(self) -> str:
-        """Name of the backend in results."""
-        return "place"
+    name = "place"
 
     def understands(self, hint: Hint) -> bool:
         """Return whether the hint is a pixel, point, mask or rectangle."""

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.grasping.affordance import AffordanceError, Hint, ObservedView, TagHint, Target
+from splatbot.grasping.affordance import AffordanceError, ObservedView, OneKindAffordance, TagHint, Target
 from splatbot.grasping.spatial import at_point, point_at
 from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
@@ -19,22 +19,13 @@ FAMILIES = {
 }
 
 
-class TagAffordance:
+class TagAffordance(OneKindAffordance[TagHint]):
     """Finds the object with an AprilTag (Olson 2011): tag detection in images, depth from the map."""
 
-    @property
-    def name(self) -> str:
-        """Name of the backend in results."""
-        return "apriltag"
+    name = "apriltag"
+    kind, wanted = TagHint, "a tag"
 
-    def understands(self, hint: Hint) -> bool:
-        """Return whether the hint is a tag."""
-        return isinstance(hint, TagHint)
-
-    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
-        """Find the object with the tag; see :class:`splatbot.grasping.affordance.Affordance`."""
-        if not isinstance(hint, TagHint):
-            raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a tag")
+    def _find(self, hint: TagHint, scene: SegmentedMap) -> Target:
         seen: set[int] = set()
         for view in hint.views:
             corners = find_tags(view, hint.family)

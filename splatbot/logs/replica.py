@@ -7,19 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from splatbot.camera import Camera
 from splatbot.errors import CameraError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration, make_calibration, read_object
 from splatbot.logs.presets import find_calibration
-from splatbot.logs.rgbd import RgbdReader
+from splatbot.logs.rgbd import FolderLog, RgbdReader
 from splatbot.trajectory import Trajectory
 
 _RATE = 30.0  # [Hz]; the layout has no stamps
 
 
-class ReplicaLog(LogBase):
+class ReplicaLog(FolderLog):
     """A rendered sequence; frame i has the stamp i / 30 s and the pose of line i of traj.txt.
 
     Raises:
@@ -28,9 +26,7 @@ class ReplicaLog(LogBase):
     """
 
     def __init__(self, folder: str | Path, *, camera: str | Path | Calibration | None = None) -> None:
-        self.folder = Path(folder)
-        self.uri = str(folder)
-        self.name = self.folder.resolve().name
+        super().__init__(folder)
         results = self.folder / "results"
         self._colors = sorted(p for p in results.glob("frame*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
         if not self._colors:
@@ -38,11 +34,6 @@ class ReplicaLog(LogBase):
                 "the log is empty: there is no frame*.jpg.", file=results, hint="render frame000000.jpg, ... there"
             )
         self._reader = RgbdReader(find_calibration(camera) if camera is not None else self._calibration())
-
-    @property
-    def camera(self) -> Camera:
-        """Camera of the delivered frames."""
-        return self._reader.camera
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
@@ -57,11 +48,6 @@ class ReplicaLog(LogBase):
         lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
         poses = [_parse_pose(path, i, line) for i, line in enumerate(lines, 1) if line.strip()]
         return Trajectory(np.arange(len(poses)) / _RATE, np.array(poses).reshape(-1, 4, 4))
-
-    @property
-    def calibration(self) -> Calibration:
-        """Calibration of the recorded images."""
-        return self._reader.calibration
 
     def __len__(self) -> int:
         return len(self._colors)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
+from splatbot.logs.base import LogBase
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.images import read_color, read_depth
 from splatbot.logs.undistort import Undistorter
@@ -107,3 +108,28 @@ class RgbdReader:
             field="depth_scale",
             hint=f"depth_scale is units per metre; {likely:g} would make it {units / likely:.3g} m",
         )
+
+
+class FolderLog(LogBase):
+    """The common part of logs whose images lie in a folder; ``_reader`` reads them.
+
+    Args:
+        folder: of the log.
+    """
+
+    _reader: RgbdReader
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.uri = str(folder)
+        self.name = self.folder.resolve().name
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the delivered frames: undistorted."""
+        return self._reader.camera
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the recorded images."""
+        return self._reader.calibration

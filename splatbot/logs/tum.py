@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from splatbot.camera import Camera
 from splatbot.errors import CameraError, LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import StampedLog
@@ -20,7 +19,7 @@ from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, IndexEntry, associate, r
 from splatbot.logs.joints import find_joints
 from splatbot.logs.masks import find_masks
 from splatbot.logs.presets import PRESETS, find_calibration
-from splatbot.logs.rgbd import RgbdReader
+from splatbot.logs.rgbd import FolderLog, RgbdReader
 from splatbot.trajectory import Trajectory
 
 Missing = Literal["auto", "error", "skip"]
@@ -30,7 +29,7 @@ _SYNCHRONIZED_S = 1e-3  # maximum difference of stamps between synchronized stre
 _log = logging.getLogger(__name__)
 
 
-class TumLog(StampedLog):
+class TumLog(FolderLog, StampedLog):
     """A recording in TUM layout; frames are the colour images, each with the depth image nearest in time.
 
     ``missing`` defines the treatment of a colour image without a depth image within 0.02 s:
@@ -55,9 +54,7 @@ class TumLog(StampedLog):
     def __init__(
         self, folder: str | Path, *, camera: str | Path | Calibration | None = None, missing: Missing = "auto"
     ) -> None:
-        self.folder = Path(folder)
-        self.uri = str(folder)
-        self.name = self.folder.resolve().name
+        super().__init__(folder)
         colors, self._depths = read_index(self.folder / "rgb.txt"), read_index(self.folder / "depth.txt")
         pairs = self._pair(colors)
         self.unpaired = len(colors) - len(pairs)
@@ -74,19 +71,9 @@ class TumLog(StampedLog):
         self._report(len(colors), len(pairs))
 
     @property
-    def camera(self) -> Camera:
-        """Camera of the delivered frames: undistorted."""
-        return self._reader.camera
-
-    @property
     def effects(self) -> list[dict[str, Any]]:
         """The account in `effects.json`, which `splatbot simulate` writes; empty for a real sensor."""
         return self._effects
-
-    @property
-    def calibration(self) -> Calibration:
-        """Calibration of the recorded images."""
-        return self._reader.calibration
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatbot.mapping.keyframes import Keyframe
-from splatbot.tracking.nearby_keyframes import order_by_distance, pose_distance
+from splatbot.tracking.nearby_keyframes import is_within, order_by_distance, pose_distance
 
 
 @dataclass(frozen=True)
@@ -16,12 +16,11 @@ class CovisibilityConstants:
     """Constants of the search for covisible keyframes.
 
     Args:
-        max_translation, max_rotation: [m], [rad] keyframes farther apart see a place too differently to be aligned.
+        reach: [m], [rad] keyframes farther apart see a place too differently to be aligned.
         nearest_share: share of the candidates that are the nearest ones.
     """
 
-    max_translation: float = 1.0
-    max_rotation: float = 0.6
+    reach: tuple[float, float] = (1.0, 0.6)
     nearest_share: float = 0.5
 
 
@@ -36,8 +35,7 @@ def covisible_candidates(keyframe: Keyframe, others: Sequence[Keyframe], count: 
     """
     inside = []
     for index in order_by_distance(others, keyframe.T_world_camera):
-        moved, turned = pose_distance(others[index].T_world_camera, keyframe.T_world_camera)
-        if moved < CONSTANTS.max_translation and turned < CONSTANTS.max_rotation:
+        if is_within(pose_distance(others[index].T_world_camera, keyframe.T_world_camera), CONSTANTS.reach):
             inside.append(others[index])
     near = min(len(inside), int(np.ceil(CONSTANTS.nearest_share * count)))
     rest = sorted(inside[near:], key=lambda other: other.number)

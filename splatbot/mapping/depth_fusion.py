@@ -16,6 +16,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.geometry import inverse, quat_multiply
 from splatbot.mapping.normals import smooth_normals
+from splatbot.mapping.pixels import pixels_of
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,6 @@ class DepthFusionConstants:
         stable_sigma_share: [share of width] largest standard deviation of the mean of a stable Gaussian.
         removal_misses, unstable_removal_misses: misses, net of support, that remove a stable or another Gaussian.
         removed_logit: opacity logit that lets pruning remove a Gaussian.
-        least_z: [m] points nearer to the camera are outside the image.
     """
 
     gate_sigma: float = 3.0
@@ -54,7 +54,6 @@ class DepthFusionConstants:
     removal_misses: int = 3
     unstable_removal_misses: int = 2
     removed_logit: float = -10.0
-    least_z: float = 0.05
 
 
 CONSTANTS = DepthFusionConstants()
@@ -204,11 +203,7 @@ def initial_uncertainty(model: GaussianModel, T_world_camera: NDArray[np.float64
 
 def _rays(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Project points (N, 3) of the camera frame: rays (N, 3) of z = 1 of their pixels, rows, columns, if inside."""
-    z = points[:, 2].clamp_min(1e-6)
-    u = torch.round(camera.fx * points[:, 0] / z + camera.cx)
-    v = torch.round(camera.fy * points[:, 1] / z + camera.cy)
-    inside = (points[:, 2] > CONSTANTS.least_z) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    u, v = torch.where(inside, u, 0.0), torch.where(inside, v, 0.0)
+    u, v, inside = pixels_of(camera, points)
     rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], 1)
     return rays, v.long(), u.long(), inside
 

@@ -15,6 +15,7 @@ from splatbot.camera import Camera
 from splatbot.geometry import inverse, transform_points
 from splatbot.mapping.insertion import ModelView
 from splatbot.mapping.keyframes import Keyframe
+from splatbot.mapping.pixels import pixels_of
 
 Mask = NDArray[np.bool_]
 
@@ -32,7 +33,6 @@ class DynamicObjectConstants:
         checked_keyframes: number of nearest keyframes that may have observed free space.
         cell_size: [m] an object that stays within cells of this size is static.
         forget_after_s: [s] a cell that is not observed for longer starts again.
-        least_z: [m] points nearer to a camera are outside its image.
     """
 
     depth_share: float = 0.06
@@ -43,7 +43,6 @@ class DynamicObjectConstants:
     checked_keyframes: int = 6
     cell_size: float = 0.03
     forget_after_s: float = 0.6
-    least_z: float = 0.05
 
 
 CONSTANTS = DynamicObjectConstants()
@@ -128,11 +127,7 @@ def _was_free(points: NDArray[np.float64], keyframes: Sequence[Keyframe], T_worl
     free = np.zeros(len(points), dtype=np.bool_)
     for keyframe in near[: CONSTANTS.checked_keyframes]:
         camera, local = keyframe.camera, transform_points(inverse(keyframe.T_world_camera), points)
-        z = np.maximum(local[:, 2], 1e-6)
-        u = np.rint(camera.fx * local[:, 0] / z + camera.cx)
-        v = np.rint(camera.fy * local[:, 1] / z + camera.cy)
-        in_image = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        inside = (local[:, 2] > CONSTANTS.least_z) & in_image
-        measured = keyframe.depth.numpy()[np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)]
+        u, v, inside = (values.numpy() for values in pixels_of(camera, torch.from_numpy(local)))
+        measured = keyframe.depth.numpy()[v.astype(int), u.astype(int)]
         free |= inside & (measured * (1 - CONSTANTS.depth_share) > local[:, 2])
     return free

@@ -29,20 +29,16 @@ class ExposureConstants:
     depth_share: float = 0.05
     """Relative difference of depth [1] up to which map and image show the same surface. A larger one compares colors of
     different surfaces."""
-    black: int = 2
-    """Value [0..255] below which a channel is clipped."""
-    white: int = 253
-    """Value [0..255] above which a channel is clipped."""
+    unclipped: tuple[int, int] = (2, 253)
+    """Range [0..255] of a channel that is not clipped to black or white."""
     fit_iterations: int = 10
     """Number of iterations [1] of the robust fit."""
     fit_scale: float = 0.02
     """Residual [0..1] that has half the weight. A larger one lets surfaces that changed bias the fit."""
     offset_prior: float = 1e-3
     """Relative weight [1] of the prior that draws the offset to 0. A uniform gray determines only the gain."""
-    least_gain: float = 0.1
-    """Gain [1] below which a fit is implausible; the exposure then counts as unchanged."""
-    most_gain: float = 10.0
-    """Gain [1] above which a fit is implausible; the exposure then counts as unchanged."""
+    gains: tuple[float, float] = (0.1, 10.0)
+    """Range of the gain [1] of a plausible fit; outside of it, the exposure counts as unchanged."""
     correction_threshold: float = 0.2
     """Change of black or white [0..1] up to which differences remain. Automatic exposure changes by up to 0.16 between
     keyframes of recorded logs. Corrections of such differences would accumulate the map's own errors."""
@@ -74,8 +70,8 @@ def exposure_of(rgb: Tensor, depth: Tensor, view: ModelView) -> ExposureFit:
         depth: (H, W) [m], 0 missing; pixels where the map shows another surface are excluded.
         view: the map rendered from the same pose, at the same size.
     """
-    seen = rgb.numpy()
-    inside = cv2.inRange(seen, (CONSTANTS.black + 1,) * 3, (CONSTANTS.white - 1,) * 3) > 0
+    seen, (black, white) = rgb.numpy(), CONSTANTS.unclipped
+    inside = cv2.inRange(seen, (black + 1,) * 3, (white - 1,) * 3) > 0
     measured = depth.numpy() > 0
     same = np.abs(view.depth.numpy() - depth.numpy()) < CONSTANTS.depth_share * depth.numpy()
     used = inside & measured & same & (view.alpha.numpy() > CONSTANTS.opaque_alpha)
@@ -84,7 +80,8 @@ def exposure_of(rgb: Tensor, depth: Tensor, view: ModelView) -> ExposureFit:
     if full.sum() < CONSTANTS.least_blocks:
         return ExposureFit()
     gain, offset = _robust_line(of_map[full], of_image[full])
-    return ExposureFit(gain, offset) if CONSTANTS.least_gain < gain < CONSTANTS.most_gain else ExposureFit()
+    least, most = CONSTANTS.gains
+    return ExposureFit(gain, offset) if least < gain < most else ExposureFit()
 
 
 def in_exposure_of_map(rgb: Tensor, depth: Tensor, view: ModelView) -> Tensor:
@@ -95,11 +92,11 @@ def in_exposure_of_map(rgb: Tensor, depth: Tensor, view: ModelView) -> Tensor:
     exposure = exposure_of(rgb, depth, view)
     if not exposure.is_jump:
         return rgb
-    seen = rgb.numpy()
+    seen, (black, white) = rgb.numpy(), CONSTANTS.unclipped
     corrected = (seen / 255.0 - exposure.offset) / exposure.gain
     shown, solid = view.rgb.numpy(), (view.alpha.numpy() > CONSTANTS.opaque_alpha)[..., None]
-    corrected = np.where(solid & (seen > CONSTANTS.white), np.maximum(corrected, shown), corrected)
-    corrected = np.where(solid & (seen < CONSTANTS.black), np.minimum(corrected, shown), corrected)
+    corrected = np.where(solid & (seen > white), np.maximum(corrected, shown), corrected)
+    corrected = np.where(solid & (seen < black), np.minimum(corrected, shown), corrected)
     return torch.from_numpy(np.rint(255.0 * corrected.clip(0, 1)).astype(np.uint8))
 
 

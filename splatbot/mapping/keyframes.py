@@ -18,9 +18,9 @@ from splatbot.config import MappingConfig, TrackingConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse
 from splatbot.tracking.features import Features
+from splatbot.tracking.nearby_keyframes import is_within, pose_distance
 from splatbot.tracking.prepare import Level, halve, usable_depth
 from splatbot.tracking.reference import Reference
-from splatbot.tracking.tracker import pose_distance
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,7 @@ def is_keyframe(T_world_camera: NDArray[np.float64], keyframes: Sequence[HasPose
 
 def is_same_view(T_world_a: NDArray[np.float64], T_world_b: NDArray[np.float64], config: MappingConfig) -> bool:
     """Return whether two poses (4, 4) differ by less than the distance between keyframes."""
-    moved, turned = pose_distance(T_world_a, T_world_b)
-    return moved < config.keyframe_translation and turned < config.keyframe_rotation
+    return is_within(pose_distance(T_world_a, T_world_b), (config.keyframe_translation, config.keyframe_rotation))
 
 
 def resized(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:

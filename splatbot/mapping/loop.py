@@ -28,7 +28,7 @@ from splatbot.mapping.posegraph import (
 from splatbot.tracking.align import align
 from splatbot.tracking.features import match_pose
 from splatbot.tracking.health import measure
-from splatbot.tracking.nearby_keyframes import order_by_distance, pose_distance
+from splatbot.tracking.nearby_keyframes import is_within, order_by_distance, pose_distance
 from splatbot.tracking.place_recognition import votes
 from splatbot.tracking.prepare import PreparedFrame
 from splatbot.tracking.uncertainty import alignment_covariance
@@ -40,25 +40,19 @@ Array = NDArray[np.float64]
 class LoopConstants:
     """Constants of loop closing."""
 
-    near_translation: float = 0.25
-    """Distance [m] below which a keyframe is a loop candidate, even with another appearance."""
-    near_rotation: float = 0.35
-    """Angle [rad] below which such a keyframe is a loop candidate."""
+    near: tuple[float, float] = (0.25, 0.35)
+    """Distance [m] and angle [rad] within which a keyframe is a loop candidate, even with another appearance."""
     appearance_candidates: int = 2
     """Number of loop candidates [1] by appearance that are verified for each keyframe. Each takes an alignment."""
     unknown_sigma: float = 0.5
     """Standard deviation [m], [rad] of a motion that the images could not measure."""
-    tracking_translation: float = 5e-3
-    """Distance [m] up to which the images confirm the tracked motion between two keyframes. Beyond it, other keyframes
-    biased tracking."""
-    tracking_rotation: float = 5e-3
-    """Angle [rad] of the same confirmation."""
+    tracking: tuple[float, float] = (5e-3, 5e-3)
+    """Distance [m] and angle [rad] up to which the images confirm the tracked motion between two keyframes. Beyond it,
+    other keyframes biased tracking."""
     drift_offset: float = 0.05
     """Drift [m], [rad] that a loop may correct for a path of any length."""
-    same_translation: float = 0.02
-    """Distance [m] between the corrections that two loops imply, below which they confirm each other."""
-    same_rotation: float = 0.02
-    """Angle [rad] between the corrections of loops that confirm each other."""
+    same: tuple[float, float] = (0.02, 0.02)
+    """Distance [m] and angle [rad] between the corrections of two loops, within which they confirm each other."""
     unconfirmed_kept: int = 4
     """Number of loops [1] that wait for a confirming one. More of them confirm loops that are farther apart in time."""
     ratios_kept: int = 10
@@ -87,7 +81,7 @@ class MeasuredMotion:
     def agrees(self, T_tracked: Array) -> bool:
         """Return whether it equals the tracked motion (4, 4) within the accuracy of an alignment."""
         moved, turned = pose_distance(T_tracked, self.T_keyframe_camera)
-        return moved <= CONSTANTS.tracking_translation and turned <= CONSTANTS.tracking_rotation
+        return moved <= CONSTANTS.tracking[0] and turned <= CONSTANTS.tracking[1]
 
 
 class LoopCloser:
@@ -229,8 +223,7 @@ class LoopCloser:
         T_tracked = inverse(reference.T_world_camera) @ keyframe.T_world_camera
         measured = self._measure(reference, keyframe, prepared)
         if measured is None or not self._is_reliable(measured):
-            moved, turned = pose_distance(np.eye(4), T_tracked)
-            near = moved < 2 * CONSTANTS.near_translation and turned < 2 * CONSTANTS.near_rotation
+            near = is_within(pose_distance(np.eye(4), T_tracked), CONSTANTS.near, times=2)
             covariance = drift_covariance(T_tracked) if near else CONSTANTS.unknown_sigma**2 * np.eye(6)
             return Edge(reference.number, keyframe.number, T_tracked, covariance)
         T = T_tracked if measured.agrees(T_tracked) else measured.T_keyframe_camera
@@ -257,8 +250,8 @@ class LoopCloser:
         if not others:
             return []
         nearest = others[order_by_distance(others, keyframe.T_world_camera)[0]]
-        moved, turned = pose_distance(nearest.T_world_camera, keyframe.T_world_camera)
-        found = [nearest] if moved < CONSTANTS.near_translation and turned < CONSTANTS.near_rotation else []
+        near = is_within(pose_distance(nearest.T_world_camera, keyframe.T_world_camera), CONSTANTS.near)
+        found = [nearest] if near else []
         count = votes(keyframe.features, others)
         for index in np.argsort(-count, kind="stable")[: CONSTANTS.appearance_candidates]:
             if count[index] >= self.config.loops.min_votes and others[index] not in found:
@@ -290,15 +283,13 @@ class LoopCloser:
     def _is_confirmed(self, edge: Edge) -> bool:
         """Return whether a loop agrees with the tracked poses, or another loop implies the same correction."""
         poses = self.graph.poses
-        moved, turned = max_residual([edge.residual(poses)])
-        if moved < 2 * CONSTANTS.tracking_translation and turned < 2 * CONSTANTS.tracking_rotation:
+        if is_within(max_residual([edge.residual(poses)]), CONSTANTS.tracking, times=2):
             return True
         T_world_camera = poses[edge.second]
         expected = poses[edge.first] @ edge.T_first_second
         for other in self._unconfirmed:
             correction = poses[other.first] @ other.T_first_second @ inverse(poses[other.second])
-            moved, turned = pose_distance(expected, correction @ T_world_camera)
-            same = moved < CONSTANTS.same_translation and turned < CONSTANTS.same_rotation
+            same = is_within(pose_distance(expected, correction @ T_world_camera), CONSTANTS.same)
             if other.second != edge.second and same:
                 return True
         return False

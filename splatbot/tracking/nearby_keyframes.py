@@ -31,6 +31,11 @@ def pose_distance(T_world_a: Array, T_world_b: Array) -> tuple[float, float]:
     return float(np.linalg.norm(T_a_b[:3, 3])), float(np.linalg.norm(so3_log(T_a_b[:3, :3])))
 
 
+def is_within(distance: tuple[float, float], limits: tuple[float, float], *, times: float = 1.0) -> bool:
+    """Return whether a distance [m] and an angle [rad] are both below their limits, or below ``times`` these."""
+    return distance[0] < times * limits[0] and distance[1] < times * limits[1]
+
+
 def order_by_distance(keyframes: Sequence[TrackedKeyframe], T_world_camera: Array) -> list[int]:
     """Order keyframes by their distance to a pose (4, 4), and return their indices; one radian counts as 0.5 m."""
     if not keyframes:

@@ -19,14 +19,10 @@ class RelocalizationConstants:
 
     min_inliers: float = 0.45
     """Share of inlier residuals [1], photometric and geometric: stricter than for a frame after a tracked one."""
-    position_slack: float = 0.03
-    """Distance [m] between the two poses in addition to the motion of the camera."""
-    max_speed: float = 2.0
-    """Largest speed [m/s] of the camera between the two frames."""
-    rotation_slack: float = 0.05
-    """Angle [rad] between the two poses in addition to the motion of the camera."""
-    max_angular_speed: float = 4.0
-    """Largest angular speed [rad/s] of the camera between the two frames."""
+    slack: tuple[float, float] = (0.03, 0.05)
+    """Distance [m] and angle [rad] between the two poses in addition to the motion of the camera."""
+    max_speed: tuple[float, float] = (2.0, 4.0)
+    """Largest speed [m/s] and angular speed [rad/s] of the camera between the two frames."""
 
 
 CONSTANTS = RelocalizationConstants()
@@ -46,9 +42,8 @@ class RelocalizationCandidate:
 
     def agrees(self, stamp: float, T_world_camera: Array) -> bool:
         """Return True if a camera can move from this pose to another (4, 4) in the time between them."""
-        moved, turned = pose_distance(self.T_world_camera, T_world_camera)
-        dt, p = abs(stamp - self.stamp), CONSTANTS
-        return moved <= p.position_slack + p.max_speed * dt and turned <= p.rotation_slack + p.max_angular_speed * dt
+        limits = np.add(CONSTANTS.slack, np.multiply(CONSTANTS.max_speed, abs(stamp - self.stamp)))
+        return bool(np.all(pose_distance(self.T_world_camera, T_world_camera) <= limits))
 
 
 class PlaceSearch:

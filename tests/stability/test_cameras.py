@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any
 
 import pytest
@@ -13,13 +12,8 @@ from torch import Tensor
 from splatbot.geometry import se3_exp
 from splatbot.rasterize.cameras import pinhole_limit
 from splatbot.rasterize.reference import Projector, ReferenceView
-from splatbot.rasterize.reference_cameras import (
-    affine_projector,
-    fisheye_points,
-    ortho_points,
-    pinhole_points,
-    unscented_projector,
-)
+from splatbot.rasterize.reference_cameras import fisheye_points, pinhole_points, unscented_projector
+from tests.cameras import AFFINE, before, distorted_pinhole
 from tests.scenes import (
     FORWARD_BOUND,
     GRADIENT_BOUND,
@@ -32,17 +26,9 @@ from tests.scenes import (
     two_roundings,
 )
 
-NEAR = 0.01
-
-
-def before(points: Tensor) -> Tensor:
-    """Return True for points in front of the near plane."""
-    return points[..., 2] >= NEAR
-
-
 CAMERAS: dict[str, tuple[Projector, dict[str, Any]]] = {
-    "ortho": (affine_projector(ortho_points), {"camera_model": "ortho"}),
-    "fisheye": (affine_projector(fisheye_points), {"camera_model": "fisheye"}),
+    "ortho": (AFFINE["ortho"], {"camera_model": "ortho"}),
+    "fisheye": (AFFINE["fisheye"], {"camera_model": "fisheye"}),
     "unscented pinhole": (unscented_projector(pinhole_points, seen=before), {"with_ut": True}),
     "unscented fisheye": (unscented_projector(fisheye_points), {"camera_model": "fisheye", "with_ut": True}),
 }
@@ -134,13 +120,7 @@ def test_beyond_the_range_of_its_distortion_a_lens_sees_nothing() -> None:
     assert bool(visible[(tangent < 0.99 * limit) & (scene.opacities > 0.01)].all())
     got = gradients(scene, **options)
     assert float(got["means"][tangent > limit].abs().max()) == 0.0
-    exact = torch.tensor([*radial, *[0.0] * 6], dtype=torch.float64)
-
-    def seen(p: Tensor) -> Tensor:
-        return before(p) & (p[..., :2].norm(dim=-1) < limit * p[..., 2])
-
-    project = unscented_projector(partial(pinhole_points, coefficients=exact), seen=seen)
-    result = compare(scene, "RGB", project=project, **options)
+    result = compare(scene, "RGB", project=distorted_pinhole([*radial, *[0.0] * 6]), **options)
     assert result.forward <= FORWARD_BOUND
     assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
 

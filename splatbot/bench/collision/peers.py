@@ -144,17 +144,12 @@ def _coal_spheres(coal: Any, world: Any) -> SphereCheck:
     def check(centers: Array, radii: Array) -> list[bool]:
         balls = [coal.Sphere(float(r)) for r in radii]
         poses = [coal.Transform3s() for _ in radii]
-        hits = []
-        for row in centers:
-            hit = False
-            for ball, pose, center in zip(balls, poses, row, strict=True):
-                pose.setTranslation(center)
-                answer = coal.CollisionResult()
-                if coal.collide(world, fixed, ball, pose, request, answer):
-                    hit = True
-                    break
-            hits.append(hit)
-        return hits
+
+        def hit(ball: Any, pose: Any, center: Array) -> bool:
+            pose.setTranslation(center)
+            return bool(coal.collide(world, fixed, ball, pose, request, coal.CollisionResult()))
+
+        return [any(map(hit, balls, poses, row)) for row in centers]
 
     return check
 
@@ -172,16 +167,12 @@ def _fcl_spheres(fcl: Any, model: Any) -> SphereCheck:
 
     def check(centers: Array, radii: Array) -> list[bool]:
         balls = [fcl.CollisionObject(fcl.Sphere(float(r)), fcl.Transform()) for r in radii]
-        hits = []
-        for row in centers:
-            hit = False
-            for ball, center in zip(balls, row, strict=True):
-                ball.setTranslation(center)
-                if fcl.collide(world, ball, fcl.CollisionRequest(), fcl.CollisionResult()):
-                    hit = True
-                    break
-            hits.append(hit)
-        return hits
+
+        def hit(ball: Any, center: Array) -> bool:
+            ball.setTranslation(center)
+            return bool(fcl.collide(world, ball, fcl.CollisionRequest(), fcl.CollisionResult()))
+
+        return [any(map(hit, balls, row)) for row in centers]
 
     return check
 

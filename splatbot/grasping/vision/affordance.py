@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.grasping.affordance import Affordance, AffordanceError, Hint, NameHint, ObservedView, Target
+from splatbot.grasping.affordance import Affordance, AffordanceError, NameHint, ObservedView, OneKindAffordance, Target
 from splatbot.grasping.spatial import at_point, point_at
 from splatbot.grasping.vision.answers import Answer, question_for, read_answers
 from splatbot.grasping.vision.models import Picture, VisionError, VisionModel
@@ -38,7 +38,7 @@ CONSTANTS = AffordanceConstants()
 _NAME = re.compile(r"[\w ,.'()/-]{1,80}")  # no quotes and no line breaks, against prompt injection
 
 
-class VisionAffordance:
+class VisionAffordance(OneKindAffordance[NameHint]):
     """A :class:`splatbot.grasping.affordance.Affordance` that queries a vision-language model.
 
     The model locates the object in several images and in one image of the map without objects. Each answer must be a
@@ -56,6 +56,8 @@ class VisionAffordance:
     Raises:
         InputError: ``attempts`` is not above 0, or there are no views.
     """
+
+    kind, wanted = NameHint, "a name"
 
     def __init__(
         self,
@@ -75,19 +77,13 @@ class VisionAffordance:
         """Name of the backend in results."""
         return self.model.name
 
-    def understands(self, hint: Hint) -> bool:
-        """Return whether the hint is a name."""
-        return isinstance(hint, NameHint)
-
-    def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
-        """Locate a named object; see :class:`splatbot.grasping.affordance.Affordance`.
+    def _find(self, hint: NameHint, scene: SegmentedMap) -> Target:
+        """Locate a named object.
 
         Raises:
             VisionError: the model does not answer, or its answer is invalid.
             AffordanceError: the map does not confirm the answer.
         """
-        if not isinstance(hint, NameHint):
-            raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a name")
         name = _checked_name(hint.text)
         if not scene.objects:
             raise AffordanceError("there are no objects.", field="target", hint="map a scene with objects")

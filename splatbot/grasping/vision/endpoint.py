@@ -50,6 +50,7 @@ class EndpointModel:
         self._secure, self._host, self._port = parts.scheme == "https", parts.hostname, parts.port
         self._path = parts.path.rstrip("/") + "/chat/completions"
         self._model, self._timeout = model, timeout
+        self.name = f"vlm:{model}@{self._host}"
 
     @classmethod
     def from_environment(cls, *, timeout: float = 30.0) -> EndpointModel:
@@ -62,11 +63,6 @@ class EndpointModel:
         if missing:
             raise InputError("is not set.", field=", ".join(missing), hint="name an OpenAI-compatible endpoint")
         return cls(os.environ[URL], os.environ[MODEL], timeout=timeout)
-
-    @property
-    def name(self) -> str:
-        """Name of the model in results."""
-        return f"vlm:{self._model}@{self._host}"
 
     def ask(self, question: Question) -> str:
         """Send the question; see :class:`splatbot.grasping.vision.VisionModel`.

@@ -25,6 +25,7 @@ class LocalModel:
 
     def __init__(self, folder: str | Path, *, tokens: int = 400, timeout: float = 120.0) -> None:
         self._folder = Path(folder)
+        self.name = f"vlm:{self._folder.name}"
         if not (self._folder / "config.json").is_file():
             hint = "give the folder of a model, with its config.json"
             raise InputError("is no model.", file=self._folder, field="folder", hint=hint)
@@ -32,11 +33,6 @@ class LocalModel:
             raise InputError(f"are {tokens}, {timeout}.", field="tokens, timeout", hint="give numbers above 0")
         self._tokens, self._timeout = tokens, timeout
         self._loaded: tuple[Any, Any] | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the model in results."""
-        return f"vlm:{self._folder.name}"
 
     def ask(self, question: Question) -> str:
         """Answer a question; see :class:`splatbot.grasping.vision.VisionModel`. The first call loads the model.

@@ -9,8 +9,10 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <initializer_list>
 #include <memory>
+#include <numeric>
 #include <optional>
 #include <span>
 #include <stdexcept>
@@ -40,6 +42,11 @@ using OutCamera = Array<double, nb::shape<splatbot::kCameraSums>>;
 using Matrix3 = Array<const double, nb::shape<3, 3>>;
 using Matrix4 = Array<const double, nb::shape<4, 4>>;
 
+// The type of a parameter that may be None, and its name in Python; arrays are not converted.
+template <class A>
+using OrNone = const std::optional<A>&;
+inline auto or_none(const char* name) { return nb::arg(name).noconvert().none(); }
+
 template <class A>
 auto span_of(const A& array) {
   return std::span(array.data(), array.size());
@@ -51,9 +58,9 @@ std::span<T> span_of(const std::optional<A>& array) {
 }
 
 // Flat arrays and how to read them, as Python hands them over for both passes.
-inline splatbot::Gaussians gaussians_of(const InN3& means, const std::optional<InN4>& quats,
-                                        const std::optional<InN3>& scales, const std::optional<InN33>& covars,
-                                        const In1& opacities, const InAny& colors, int sh_degree) {
+inline splatbot::Gaussians gaussians_of(const InN3& means, OrNone<InN4> quats, OrNone<InN3> scales,
+                                        OrNone<InN33> covars, const In1& opacities, const InAny& colors,
+                                        int sh_degree) {
   splatbot::Gaussians g = {.count = means.shape(0),
                            .channels = 3,
                            .means = span_of(means),
@@ -133,11 +140,9 @@ inline splatbot::DepthMode depth_mode(const std::string& name) {
 }
 
 // Destinations of the gradients that both kinds of splats have.
-inline splatbot::Gradients gradients_of(const std::optional<OutAny>& means, const std::optional<OutAny>& quats,
-                                        const std::optional<OutAny>& scales, const std::optional<OutAny>& opacities,
-                                        const std::optional<OutAny>& colors, const std::optional<OutCamera>& camera,
-                                        const std::optional<OutDoubles>& background,
-                                        const std::optional<OutAny>& means2d, bool accumulate) {
+inline splatbot::Gradients gradients_of(OrNone<OutAny> means, OrNone<OutAny> quats, OrNone<OutAny> scales,
+                                        OrNone<OutAny> opacities, OrNone<OutAny> colors, OrNone<OutCamera> camera,
+                                        OrNone<OutDoubles> background, OrNone<OutAny> means2d, bool accumulate) {
   return {.means = span_of<float>(means),
           .quats = span_of<float>(quats),
           .scales = span_of<float>(scales),
@@ -171,6 +176,13 @@ struct StateHandle {
   Pointer state;
 };
 
+// The state that render(pointer) leaves, or (field, row) of an input that is not finite.
+template <class State, class Render>
+nb::object state_after(Render&& render) {
+  State state;
+  return unless_faulty([&] { return render(state.state); }, [&] { return std::move(state); });
+}
+
 template <class T>
 nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<std::size_t> shape) {
   auto held = std::make_unique<std::vector<T>>(std::move(values));
@@ -181,14 +193,39 @@ nb::ndarray<nb::numpy, T> owned(std::vector<T>&& values, std::initializer_list<s
   return nb::ndarray<nb::numpy, T>(data, shape, owner);
 }
 
+inline std::size_t size_of(std::initializer_list<std::size_t> shape) {
+  return std::accumulate(shape.begin(), shape.end(), std::size_t{1}, std::multiplies<>());
+}
+
+// A dict of new arrays.
+class ArrayDict {
+ public:
+  // Adds zeros, to be written by fill().
+  template <class T>
+  std::span<T> add(const char* name, std::initializer_list<std::size_t> shape) {
+    const nb::ndarray<nb::numpy, T> array = owned(std::vector<T>(size_of(shape)), shape);
+    arrays_[name] = array;
+    return {array.data(), array.size()};
+  }
+
+  // The dict after fill(), which runs without the GIL.
+  template <class Fill>
+  nb::dict filled(Fill&& fill) const {
+    {
+      const nb::gil_scoped_release release;
+      fill();
+    }
+    return arrays_;
+  }
+
+ private:
+  nb::dict arrays_;
+};
+
 // An array whose values fill() writes, without the GIL.
 template <class T, class Fill>
 nb::ndarray<nb::numpy, T> filled(std::initializer_list<std::size_t> shape, Fill&& fill) {
-  std::size_t size = 1;
-  for (const std::size_t length : shape) {
-    size *= length;
-  }
-  std::vector<T> values(size);
+  std::vector<T> values(size_of(shape));
   {
     const nb::gil_scoped_release release;
     fill(std::span<T>(values));

@@ -30,15 +30,17 @@ nb::ndarray<nb::numpy, float> like(const Image& image, Fill&& fill) {
   return filled<float>({image.shape(0), image.shape(1)}, fill);
 }
 
+// Returns an image of the same size, which write() makes of an image and three numbers.
+template <void (*write)(const splatbot::DepthImage&, float, float, float, std::span<float>)>
+nb::ndarray<nb::numpy, float> filtered(Image depth, float a, float b, float c) {
+  return like(depth, [&](std::span<float> out) { write(view(depth), a, b, c, out); });
+}
+
 }  // namespace
 
 void define_depth(nb::module_& m) {
-  m.def(
-      "valid_depth",
-      [](Image depth, float near, float far, float step) {
-        return like(depth, [&](std::span<float> out) { splatbot::valid_depth(view(depth), near, far, step, out); });
-      },
-      "depth"_a.noconvert(), "near"_a, "far"_a, "step"_a, "Depth without implausible and flying pixels.");
+  m.def("valid_depth", &filtered<splatbot::valid_depth>, "depth"_a.noconvert(), "near"_a, "far"_a,
+        "step"_a, "Depth without implausible and flying pixels.");
   m.def(
       "halve_depth",
       [](Image depth) {
@@ -66,12 +68,8 @@ void define_depth(nb::module_& m) {
       },
       "depth"_a.noconvert(), "gray"_a.noconvert(), "step"_a, "floor"_a, "quad"_a,
       "Grey, NaN where surfaces of different depth meet.");
-  m.def(
-      "smooth_depth",
-      [](Image depth, float step, float floor, float quad) {
-        return like(depth, [&](std::span<float> out) { splatbot::smooth_depth(view(depth), step, floor, quad, out); });
-      },
-      "depth"_a.noconvert(), "step"_a, "floor"_a, "quad"_a, "Depth averaged over the 3x3 pixels of each one's surface.");
+  m.def("smooth_depth", &filtered<splatbot::smooth_depth>, "depth"_a.noconvert(), "step"_a,
+        "floor"_a, "quad"_a, "Depth averaged over the 3x3 pixels of each one's surface.");
   m.def(
       "normals_of",
       [](Image depth, double fx, double fy, double cx, double cy) {

@@ -24,13 +24,12 @@ namespace {
 
 using State = StateHandle<splatbot::RasterStatePtr>;
 
-nb::object forward(const InN3& means, const std::optional<InN4>& quats, const std::optional<InN3>& scales,
-                   const std::optional<InN33>& covars, const In1& opacities, const InAny& colors, int sh_degree,
-                   const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane, float far_plane,
-                   float radius_clip, float eps2d, const std::string& depth, bool plane_depth, bool antialiased,
-                   float transmittance_min,
-                   const std::optional<In1>& background, const std::optional<InMask>& mask, int mask_size,
-                   const Out3& out_colors, const Out2& out_alphas, const splatbot::Lens* lens) {
+nb::object forward(const InN3& means, OrNone<InN4> quats, OrNone<InN3> scales, OrNone<InN33> covars,
+                   const In1& opacities, const InAny& colors, int sh_degree, const Matrix4& viewmat, const Matrix3& K,
+                   int width, int height, float near_plane, float far_plane, float radius_clip, float eps2d,
+                   const std::string& depth, bool plane_depth, bool antialiased, float transmittance_min,
+                   OrNone<In1> background, OrNone<InMask> mask, int mask_size, const Out3& out_colors,
+                   const Out2& out_alphas, const splatbot::Lens* lens) {
   const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
   const splatbot::View view = view_of(viewmat, K, width, height, lens);
   const splatbot::RasterOptions options = {.near_plane = near_plane,
@@ -42,25 +41,18 @@ nb::object forward(const InN3& means, const std::optional<InN4>& quats, const st
                                            .antialiased = antialiased,
                                            .transmittance_min = transmittance_min};
   const splatbot::TileMask tiles = {.keep = span_of<const std::uint8_t>(mask), .size = mask_size};
-  State state;
-  const auto render = [&] {
+  return state_after<State>([&](auto& state) {
     return splatbot::rasterize_forward(gaussians, view, options, span_of<const float>(background), tiles,
-                                       span_of(out_colors), span_of(out_alphas), state.state);
-  };
-  return unless_faulty(render, [&] { return std::move(state); });
+                                       span_of(out_colors), span_of(out_alphas), state);
+  });
 }
 
-void backward(const State& state, const InN3& means, const std::optional<InN4>& quats,
-              const std::optional<InN3>& scales, const std::optional<InN33>& covars, const In1& opacities,
-              const InAny& colors, int sh_degree, const std::optional<In1>& background,
-              const std::optional<In3>& grad_render, const std::optional<In2>& grad_alphas,
-              const std::optional<OutAny>& grad_means, const std::optional<OutAny>& grad_quats,
-              const std::optional<OutAny>& grad_scales, const std::optional<OutAny>& grad_covars,
-              const std::optional<OutAny>& grad_opacities, const std::optional<OutAny>& grad_colors,
-              const std::optional<OutCamera>& grad_camera,
-              const std::optional<OutDoubles>& grad_background,
-              const std::optional<OutAny>& grad_means2d, const std::optional<OutAny>& absolute_means2d,
-              bool accumulate) {
+void backward(const State& state, const InN3& means, OrNone<InN4> quats, OrNone<InN3> scales, OrNone<InN33> covars,
+              const In1& opacities, const InAny& colors, int sh_degree, OrNone<In1> background, OrNone<In3> grad_render,
+              OrNone<In2> grad_alphas, OrNone<OutAny> grad_means, OrNone<OutAny> grad_quats, OrNone<OutAny> grad_scales,
+              OrNone<OutAny> grad_covars, OrNone<OutAny> grad_opacities, OrNone<OutAny> grad_colors,
+              OrNone<OutCamera> grad_camera, OrNone<OutDoubles> grad_background, OrNone<OutAny> grad_means2d,
+              OrNone<OutAny> absolute_means2d, bool accumulate) {
   const splatbot::Gaussians gaussians = gaussians_of(means, quats, scales, covars, opacities, colors, sh_degree);
   splatbot::Gradients out = gradients_of(grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_camera,
                                          grad_background, grad_means2d, accumulate);
@@ -73,19 +65,11 @@ void backward(const State& state, const InN3& means, const std::optional<InN4>& 
 
 nb::dict describe(const State& state) {
   const std::size_t n = splatbot::gaussian_count(*state.state);
-  std::vector<float> means2d(2 * n), depths(n), conics(3 * n), opacities(n);
-  std::vector<std::int32_t> radii(2 * n);
-  {
-    const nb::gil_scoped_release release;
-    splatbot::describe_projections(*state.state, {means2d, depths, conics, radii, opacities});
-  }
-  nb::dict d;
-  d["means2d"] = owned(std::move(means2d), {n, 2});
-  d["depths"] = owned(std::move(depths), {n});
-  d["conics"] = owned(std::move(conics), {n, 3});
-  d["radii"] = owned(std::move(radii), {n, 2});
-  d["opacities"] = owned(std::move(opacities), {n});
-  return d;
+  ArrayDict d;
+  const splatbot::Projections out = {d.add<float>("means2d", {n, 2}), d.add<float>("depths", {n}),
+                                     d.add<float>("conics", {n, 3}), d.add<std::int32_t>("radii", {n, 2}),
+                                     d.add<float>("opacities", {n})};
+  return d.filled([&] { splatbot::describe_projections(*state.state, out); });
 }
 
 nb::ndarray<nb::numpy, std::int32_t> contributions(const State& state) {
@@ -94,10 +78,10 @@ nb::ndarray<nb::numpy, std::int32_t> contributions(const State& state) {
   });
 }
 
-nb::object find_visible(const InN3& means, const std::optional<InN4>& quats, const std::optional<InN3>& scales,
-                        const std::optional<InN33>& covars, const In1& opacities, const Matrix4& viewmat,
-                        const Matrix3& K, int width, int height, float near_plane, float far_plane, float radius_clip,
-                        float eps2d, bool antialiased, const splatbot::Lens* lens) {
+nb::object find_visible(const InN3& means, OrNone<InN4> quats, OrNone<InN3> scales, OrNone<InN33> covars,
+                        const In1& opacities, const Matrix4& viewmat, const Matrix3& K, int width, int height,
+                        float near_plane, float far_plane, float radius_clip, float eps2d, bool antialiased,
+                        const splatbot::Lens* lens) {
   splatbot::Gaussians gaussians = {.count = means.shape(0),
                                    .means = span_of(means),
                                    .quats = span_of<const float>(quats),
@@ -152,31 +136,26 @@ void define_rasterize(nb::module_& m) {
            "Write the front K Gaussians of pixels (P,), y W + x, to ids and weights (P, K).")
       .def("work", &work, "Milliseconds by stage of the last passes, and the (Gaussian, pixel) pairs of a blend pass.");
 
-  m.def("rasterize_forward", &forward, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
-        nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
-        "colors"_a.noconvert(), "sh_degree"_a, "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a,
-        "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a, "antialiased"_a,
-        "transmittance_min"_a,
-        nb::arg("background").noconvert().none(), nb::arg("mask").noconvert().none(), "mask_size"_a,
+  m.def("rasterize_forward", &forward, "means"_a.noconvert(), or_none("quats"), or_none("scales"), or_none("covars"),
+        "opacities"_a.noconvert(), "colors"_a.noconvert(), "sh_degree"_a, "viewmat"_a.noconvert(), "K"_a.noconvert(),
+        "width"_a, "height"_a, "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "depth"_a, "plane_depth"_a,
+        "antialiased"_a, "transmittance_min"_a, or_none("background"), or_none("mask"), "mask_size"_a,
         "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(), nb::arg("lens").none() = nb::none(),
         "Render one view into out_colors (H, W, X) and out_alphas (H, W). Returns a RasterState, or (field, row) of an "
         "input that is not finite.");
 
-  m.def("visible_gaussians", &find_visible, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
-        nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
-        "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near_plane"_a, "far_plane"_a,
-        "radius_clip"_a, "eps2d"_a, "antialiased"_a, nb::arg("lens").none() = nb::none(),
+  m.def("visible_gaussians", &find_visible, "means"_a.noconvert(), or_none("quats"), or_none("scales"),
+        or_none("covars"), "opacities"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a,
+        "height"_a, "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "antialiased"_a,
+        nb::arg("lens").none() = nb::none(),
         "Indices (V,) of the Gaussians that a view may see, or (field, row) of an input that is not finite.");
 
-  m.def("rasterize_backward", &backward, "state"_a, "means"_a.noconvert(), nb::arg("quats").noconvert().none(),
-        nb::arg("scales").noconvert().none(), nb::arg("covars").noconvert().none(), "opacities"_a.noconvert(),
-        "colors"_a.noconvert(), "sh_degree"_a, nb::arg("background").noconvert().none(),
-        nb::arg("grad_render").noconvert().none(), nb::arg("grad_alphas").noconvert().none(),
-        nb::arg("grad_means").noconvert().none(), nb::arg("grad_quats").noconvert().none(),
-        nb::arg("grad_scales").noconvert().none(), nb::arg("grad_covars").noconvert().none(),
-        nb::arg("grad_opacities").noconvert().none(), nb::arg("grad_colors").noconvert().none(),
-        nb::arg("grad_camera").noconvert().none(), nb::arg("grad_background").noconvert().none(),
-        nb::arg("grad_means2d").noconvert().none(), nb::arg("absolute_means2d").noconvert().none(), "accumulate"_a,
+  m.def("rasterize_backward", &backward, "state"_a, "means"_a.noconvert(), or_none("quats"), or_none("scales"),
+        or_none("covars"), "opacities"_a.noconvert(), "colors"_a.noconvert(), "sh_degree"_a, or_none("background"),
+        or_none("grad_render"), or_none("grad_alphas"), or_none("grad_means"), or_none("grad_quats"),
+        or_none("grad_scales"), or_none("grad_covars"), or_none("grad_opacities"), or_none("grad_colors"),
+        or_none("grad_camera"), or_none("grad_background"), or_none("grad_means2d"), or_none("absolute_means2d"),
+        "accumulate"_a,
         "Write (or add) the gradients whose arrays are given.");
 
   m.attr("CAMERA_SUMS") = splatbot::kCameraSums;

@@ -18,9 +18,9 @@ using SurfelHandle = StateHandle<splatbot::SurfelStatePtr>;
 
 nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities, const InAny& colors,
                    int sh_degree, const Matrix4& viewmat, const Matrix3& K, int width, int height, float near_plane,
-                   float far_plane, float radius_clip, const std::string& depth, const std::optional<In1>& background,
+                   float far_plane, float radius_clip, const std::string& depth, OrNone<In1> background,
                    const Out3& out_colors, const Out2& out_alphas, const Out3& out_normals, const Out2& out_median,
-                   const std::optional<Out2>& out_distortion) {
+                   OrNone<Out2> out_distortion) {
   const splatbot::Gaussians surfels = gaussians_of(means, quats, scales, std::nullopt, opacities, colors, sh_degree);
   const splatbot::View view = view_of(viewmat, K, width, height);
   const splatbot::SurfelOptions options = {.near_plane = near_plane,
@@ -33,23 +33,17 @@ nb::object forward(const InN3& means, const InN4& quats, const InN3& scales, con
                                       .normals = span_of(out_normals),
                                       .median = span_of(out_median),
                                       .distortion = span_of<float>(out_distortion)};
-  SurfelHandle state;
-  const auto render = [&] {
-    return splatbot::surfels_forward(surfels, view, options, span_of<const float>(background), out, state.state);
-  };
-  return unless_faulty(render, [&] { return std::move(state); });
+  return state_after<SurfelHandle>([&](auto& state) {
+    return splatbot::surfels_forward(surfels, view, options, span_of<const float>(background), out, state);
+  });
 }
 
 void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, const InN3& scales, const In1& opacities,
-              const InAny& colors, int sh_degree, const std::optional<In1>& background,
-              const std::optional<In3>& grad_colors, const std::optional<In2>& grad_alphas,
-              const std::optional<In3>& grad_normals, const std::optional<In2>& grad_median,
-              const std::optional<In2>& grad_distortion, const std::optional<OutAny>& out_means,
-              const std::optional<OutAny>& out_quats, const std::optional<OutAny>& out_scales,
-              const std::optional<OutAny>& out_opacities, const std::optional<OutAny>& out_colors,
-              const std::optional<OutCamera>& out_camera,
-              const std::optional<OutDoubles>& out_background,
-              const std::optional<OutAny>& out_means2d, bool accumulate) {
+              const InAny& colors, int sh_degree, OrNone<In1> background, OrNone<In3> grad_colors,
+              OrNone<In2> grad_alphas, OrNone<In3> grad_normals, OrNone<In2> grad_median, OrNone<In2> grad_distortion,
+              OrNone<OutAny> out_means, OrNone<OutAny> out_quats, OrNone<OutAny> out_scales,
+              OrNone<OutAny> out_opacities, OrNone<OutAny> out_colors, OrNone<OutCamera> out_camera,
+              OrNone<OutDoubles> out_background, OrNone<OutAny> out_means2d, bool accumulate) {
   const splatbot::Gaussians surfels = gaussians_of(means, quats, scales, std::nullopt, opacities, colors, sh_degree);
   const splatbot::SurfelImageGradients grads = {.colors = span_of<const float>(grad_colors),
                                                 .alphas = span_of<const float>(grad_alphas),
@@ -64,19 +58,11 @@ void backward(const SurfelHandle& state, const InN3& means, const InN4& quats, c
 
 nb::dict describe(const SurfelHandle& state) {
   const std::size_t n = splatbot::surfel_count(*state.state);
-  std::vector<float> means2d(2 * n), depths(n), normals(3 * n);
-  std::vector<std::int32_t> radii(2 * n), tiles(n);
-  {
-    const nb::gil_scoped_release release;
-    splatbot::describe_surfels(*state.state, {means2d, depths, normals, radii, tiles});
-  }
-  nb::dict d;
-  d["means2d"] = owned(std::move(means2d), {n, 2});
-  d["depths"] = owned(std::move(depths), {n});
-  d["normals"] = owned(std::move(normals), {n, 3});
-  d["radii"] = owned(std::move(radii), {n, 2});
-  d["tiles_per_gauss"] = owned(std::move(tiles), {n});
-  return d;
+  ArrayDict d;
+  const splatbot::SurfelProjections out = {d.add<float>("means2d", {n, 2}), d.add<float>("depths", {n}),
+                                           d.add<float>("normals", {n, 3}), d.add<std::int32_t>("radii", {n, 2}),
+                                           d.add<std::int32_t>("tiles_per_gauss", {n})};
+  return d.filled([&] { splatbot::describe_surfels(*state.state, out); });
 }
 
 }  // namespace
@@ -89,18 +75,15 @@ void define_surfels(nb::module_& m) {
   m.def("surfels_forward", &forward, "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(),
         "opacities"_a.noconvert(), "colors"_a.noconvert(), "sh_degree"_a, "viewmat"_a.noconvert(),
         "K"_a.noconvert(), "width"_a, "height"_a, "near_plane"_a, "far_plane"_a, "radius_clip"_a, "depth"_a,
-        nb::arg("background").noconvert().none(), "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(),
-        "out_normals"_a.noconvert(), "out_median"_a.noconvert(), nb::arg("out_distortion").noconvert().none(),
+        or_none("background"), "out_colors"_a.noconvert(), "out_alphas"_a.noconvert(),
+        "out_normals"_a.noconvert(), "out_median"_a.noconvert(), or_none("out_distortion"),
         "Render one view of surfels. Returns a SurfelState, or (field, row) of an input that is not finite.");
 
   m.def("surfels_backward", &backward, "state"_a, "means"_a.noconvert(), "quats"_a.noconvert(),
         "scales"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(), "sh_degree"_a,
-        nb::arg("background").noconvert().none(), nb::arg("grad_colors").noconvert().none(),
-        nb::arg("grad_alphas").noconvert().none(), nb::arg("grad_normals").noconvert().none(),
-        nb::arg("grad_median").noconvert().none(), nb::arg("grad_distortion").noconvert().none(),
-        nb::arg("out_means").noconvert().none(), nb::arg("out_quats").noconvert().none(),
-        nb::arg("out_scales").noconvert().none(), nb::arg("out_opacities").noconvert().none(),
-        nb::arg("out_colors").noconvert().none(), nb::arg("out_camera").noconvert().none(),
-        nb::arg("out_background").noconvert().none(), nb::arg("out_means2d").noconvert().none(), "accumulate"_a,
+        or_none("background"), or_none("grad_colors"), or_none("grad_alphas"), or_none("grad_normals"),
+        or_none("grad_median"), or_none("grad_distortion"), or_none("out_means"), or_none("out_quats"),
+        or_none("out_scales"), or_none("out_opacities"), or_none("out_colors"), or_none("out_camera"),
+        or_none("out_background"), or_none("out_means2d"), "accumulate"_a,
         "Write (or add) the gradients whose arrays are given; that of means2d is never added to.");
 }

@@ -28,6 +28,13 @@ def assert_refused(answer: Answer, message: str) -> None:
     assert "Traceback" not in answer.err
 
 
+def assert_fix_named(answer: Answer, mistake: str) -> None:
+    """Assert that a command names a user's mistake and its fix."""
+    assert answer.code == 2
+    assert mistake in answer.err
+    assert "Fix:" in answer.err
+
+
 RunCommand = Callable[..., Answer]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from splatbot.robots.grippers import FakeRobotiq
-from tests.unit.cli.conftest import RunCommand
+from tests.unit.cli.conftest import RunCommand, assert_fix_named
 
 
 def test_it_closes_on_an_object_and_says_so(run: RunCommand) -> None:
@@ -33,9 +33,7 @@ def test_wrong_words_are_one_line_that_says_what_to_give(run: RunCommand) -> Non
         (("move", "--fake", "--opening", "0.3"), "opening"),
     ):
         answer = run("gripper", *words)
-        assert answer.code == 2
-        assert text in answer.err
-        assert "Fix:" in answer.err
+        assert_fix_named(answer, text)
     answer = run("gripper", "status", "--port", "/dev/no-such-port")
     assert answer.code == 1
     assert "cannot be opened" in answer.err

@@ -14,7 +14,7 @@ from splatbot.cli.progress import PlainLines, describe
 from splatbot.config import Config
 from splatbot.run import Progress
 from splatbot.slam import FrameResult
-from tests.unit.cli.conftest import RunCommand
+from tests.unit.cli.conftest import RunCommand, assert_fix_named
 
 
 def test_a_run_ends_with_a_summary_and_the_report(run: RunCommand, log_folder: Path, tmp_path: Path) -> None:
@@ -75,10 +75,7 @@ def test_keys_and_files_and_environment_override_in_order(
 def test_wrong_options_are_named(
     run: RunCommand, log_folder: Path, tmp_path: Path, words: list[str], field: str
 ) -> None:
-    answer = run("map", log_folder, "--out", tmp_path / "run", *words)
-    assert answer.code == 2
-    assert field in answer.err
-    assert "Fix:" in answer.err
+    assert_fix_named(run("map", log_folder, "--out", tmp_path / "run", *words), field)
     assert not (tmp_path / "run").exists()
 
 
@@ -161,7 +158,5 @@ def test_phases_after_the_frames_are_named() -> None:
 def test_a_saved_run_that_cannot_be_used_is_reported_before_anything_is_written(
     run: RunCommand, work_folder: Path, words: list[str], what: str
 ) -> None:
-    answer = run("map", *words)
-    assert answer.code == 2
-    assert what in answer.err
+    assert_fix_named(run("map", *words), what)
     assert list(work_folder.iterdir()) == []

@@ -17,7 +17,7 @@ from splatbot.evaluation import depth_offset
 from splatbot.logs import open_log
 from splatbot.logs.record import record
 from splatbot.trajectory import Trajectory
-from tests.unit.cli.conftest import RunCommand
+from tests.unit.cli.conftest import RunCommand, assert_fix_named
 
 
 def metrics_of(folder: Path) -> dict[str, Any]:
@@ -109,10 +109,7 @@ def test_render_takes_a_pose_by_hand_or_by_index(run: RunCommand, run_folder: Pa
     ],
 )
 def test_render_refuses_what_it_cannot_draw(run: RunCommand, run_folder: Path, words: list[str], field: str) -> None:
-    answer = run("render", run_folder, *words)
-    assert answer.code == 2
-    assert field in answer.err
-    assert "Fix:" in answer.err
+    assert_fix_named(run("render", run_folder, *words), field)
 
 
 @pytest.mark.parametrize("command", ["render", "info"])
@@ -120,9 +117,7 @@ def test_a_truncated_map_is_named(run: RunCommand, run_folder: Path, command: st
     path = run_folder / "map.ply"
     path.write_bytes(path.read_bytes()[:-100])
     answer = run(command, path)
-    assert answer.code == 2
-    assert "map.ply" in answer.err
-    assert "Fix:" in answer.err
+    assert_fix_named(answer, "map.ply")
     assert "Traceback" not in answer.err
 
 

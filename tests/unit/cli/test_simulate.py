@@ -14,7 +14,7 @@ from splatbot.logs import open_log
 from splatbot.logs.scenes import SCENES
 from splatbot.logs.trajectories import TRAJECTORIES
 from splatbot.sim.effects.registry import EFFECTS
-from tests.unit.cli.conftest import RunCommand
+from tests.unit.cli.conftest import RunCommand, assert_fix_named
 from tests.unit.oracle import OracleSlam
 
 SIZE = ("--size", "80x60")
@@ -110,10 +110,7 @@ def test_the_list_names_all_there_is(run: RunCommand) -> None:
 def test_wrong_words_are_named_and_nothing_is_written(
     run: RunCommand, work_folder: Path, words: list[str], named: str
 ) -> None:
-    answer = run("simulate", *words)
-    assert answer.code == 2
-    assert named in answer.err
-    assert "Fix:" in answer.err
+    assert_fix_named(run("simulate", *words), named)
     assert not list(work_folder.iterdir())
 
 

@@ -33,21 +33,15 @@ def test_the_columns_are_translation_then_xyzw(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "field"),
-    [
-        ("2 0 0 0 0 0 0", "line 3"),
-        ("2 0 0 0 0 0 0 one", "line 3"),
-        ("2 0 nan 0 0 0 0 1", "line 3"),
-        ("2 0 0 0 0 0 0 0", "line 3"),
-        ("1 0 0 0 0 0 0 1", "line 3"),
-    ],
+    "line",
+    ["2 0 0 0 0 0 0", "2 0 0 0 0 0 0 one", "2 0 nan 0 0 0 0 1", "2 0 0 0 0 0 0 0", "1 0 0 0 0 0 0 1"],
 )
-def test_a_malformed_line_is_named(tmp_path: Path, line: str, field: str) -> None:
+def test_a_malformed_line_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "t.tum"
     path.write_text(f"# heading\n1 0 0 0 0 0 0 1\n{line}\n3 0 0 0 0 0 0 1\n")
     with pytest.raises(FormatError) as caught:
         Trajectory.load(path)
-    assert (caught.value.file, caught.value.field) == (str(path), field)
+    assert (caught.value.file, caught.value.field) == (str(path), "line 3")
     assert caught.value.hint
 
 

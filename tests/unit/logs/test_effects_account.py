@@ -50,23 +50,6 @@ def test_dropped_frames_leave_a_shorter_log_with_gaps_in_its_stamps() -> None:
     assert np.array_equal(log[-1].rgb, next(f for f in plain if f.stamp == stamps[-1]).rgb)
 
 
-@pytest.mark.parametrize(
-    ("query", "field"),
-    [
-        ("effects=exposre", "effect"),
-        ("effects=exposure:step=-1", "effect exposure: step"),
-        ("trajectory=spiral", "trajectory"),
-        ("seed=-1", "seed"),
-        ("frames=1&effects=frame_drops:rate=0.999999", "effects"),
-    ],
-)
-def test_a_wrong_address_is_named(query: str, field: str) -> None:
-    with pytest.raises(LogError) as caught:
-        open_log(f"synthetic:tabletop?{query}")
-    assert caught.value.field == field
-    assert caught.value.hint
-
-
 def test_an_address_made_of_options_opens_a_log_with_those_options() -> None:
     options = SyntheticOptions("arm", 33, 64, 48, 15.0, 20.0, 0.5, 7, "exposure:step=2,at=40;depth_noise")
     log = open_log(synthetic_uri("tabletop", options))

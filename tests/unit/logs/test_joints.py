@@ -32,19 +32,19 @@ def test_joints_are_linear_in_between_and_unknown_far_from_any_line(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("text", "field", "message"),
+    ("text", "line", "message"),
     [
-        ("1.0 0.0\n1.0 0.1\n", "line 2", "not after"),
-        ("1.0 0.0 0.1\n1.1 0.0\n", "line 2", "malformed"),
-        ("1.0 nan\n", "line 1", "malformed"),
-        ("1.0\n", "line 1", "malformed"),
+        ("1.0 0.0\n1.0 0.1\n", 2, "not after"),
+        ("1.0 0.0 0.1\n1.1 0.0\n", 2, "malformed"),
+        ("1.0 nan\n", 1, "malformed"),
+        ("1.0\n", 1, "malformed"),
         ("# nothing\n", None, "empty"),
     ],
 )
-def test_a_damaged_file_is_refused_by_line(tmp_path: Path, text: str, field: str | None, message: str) -> None:
+def test_a_damaged_file_is_refused_by_line(tmp_path: Path, text: str, line: int | None, message: str) -> None:
     with pytest.raises(LogError, match=message) as caught:
         written(tmp_path, text)
-    assert caught.value.field == field
+    assert caught.value.field == (line and f"line {line}")
     assert caught.value.file is not None
 
 

@@ -83,6 +83,11 @@ def test_motion_is_smooth_and_spans_the_arc() -> None:
         ("synthetic:tabletop?frames=many", "frames"),
         ("synthetic:tabletop?width=", "width"),
         ("synthetic:tabletop?arc=nan", "arc"),
+        ("synthetic:tabletop?seed=-1", "seed"),
+        ("synthetic:tabletop?trajectory=spiral", "trajectory"),
+        ("synthetic:tabletop?effects=exposre", "effect"),
+        ("synthetic:tabletop?effects=exposure:step=-1", "effect exposure: step"),
+        ("synthetic:tabletop?frames=1&effects=frame_drops:rate=0.999999", "effects"),
     ],
 )
 def test_a_wrong_uri_is_named(uri: str, field: str) -> None:

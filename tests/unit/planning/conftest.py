@@ -11,8 +11,8 @@ from splatbot.robots.panda import panda
 
 @pytest.fixture(scope="package")
 def field() -> GaussianCollisionField:
-    """The table top as 10,000 Gaussians."""
-    return GaussianCollisionField(tabletop().gaussians(10_000))
+    """The table top as 20,000 Gaussians."""
+    return GaussianCollisionField(tabletop().gaussians(20_000))
 
 
 @pytest.fixture(scope="package")

@@ -10,7 +10,6 @@ import pytest
 
 import splatbot
 from splatbot._native import set_num_threads
-from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
 from splatbot.planning import GaussianRRTStar, GoalError, PlanningError, PlanningProblem, PlanStatus, StartError
@@ -21,12 +20,6 @@ from tests.unit.planning.toys import Slider, around_the_ball, ball_world, cause_
 # Two places of the hand close above the table, with objects between them.
 LEFT = np.array([-0.26, 0.79, 1.15, -2.5, 0.29, 3.06, -2.15])
 RIGHT = np.array([-1.95, 1.04, 0.61, -1.56, 0.78, 2.11, -0.97])
-
-
-@pytest.fixture(scope="module")
-def field() -> GaussianCollisionField:
-    """The table top as 20,000 Gaussians."""
-    return GaussianCollisionField(tabletop().gaussians(20_000))
 
 
 @pytest.fixture(scope="module")

@@ -22,14 +22,8 @@ from splatbot.rasterize.cameras import (
 )
 from splatbot.rasterize.native import native
 from splatbot.rasterize.reference import Projector, reference_rotations
-from splatbot.rasterize.reference_cameras import (
-    LINES,
-    affine_projector,
-    fisheye_points,
-    ortho_points,
-    pinhole_points,
-    unscented_projector,
-)
+from splatbot.rasterize.reference_cameras import LINES, fisheye_points, pinhole_points, unscented_projector
+from tests.cameras import AFFINE, before, distorted_pinhole
 from tests.scenes import (
     FORWARD_BOUND,
     GRADIENT_BOUND,
@@ -57,18 +51,6 @@ def distortion(views: int = 1) -> dict[str, Any]:
     }
 
 
-def before_pinhole(limit: float, points: Tensor) -> Tensor:
-    """Return True for points in a pinhole's range."""
-    inside = points[..., 0] ** 2 + points[..., 1] ** 2 < (limit * points[..., 2]) ** 2
-    return (points[..., 2] >= 0.01) & inside
-
-
-def distorted_pinhole() -> Projector:
-    exact = torch.tensor(PINHOLE).double()
-    seen = partial(before_pinhole, pinhole_limit(exact[:6].numpy()))
-    return unscented_projector(partial(pinhole_points, coefficients=exact), seen=seen)
-
-
 def assert_equal(scene: Scene, mode: str, project: Projector, **options: Any) -> None:
     result = compare(scene, mode, project=project, **options)
     assert result.near_jumps <= 0.01 * result.pixels
@@ -89,13 +71,13 @@ def wide_scene(seed: int) -> Scene:
 def test_ortho_equals_the_float64_reference(seed: int, mode: str) -> None:
     scene = hard_scene(seed)
     scene.Ks[:, :2, :2] *= 0.4
-    assert_equal(scene, mode, affine_projector(ortho_points), camera_model="ortho")
+    assert_equal(scene, mode, AFFINE["ortho"], camera_model="ortho")
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_fisheye_equals_the_float64_reference(seed: int, mode: str) -> None:
-    assert_equal(wide_scene(seed), mode, affine_projector(fisheye_points), camera_model="fisheye")
+    assert_equal(wide_scene(seed), mode, AFFINE["fisheye"], camera_model="fisheye")
 
 
 def test_a_fisheye_near_its_axis_equals_the_float64_reference() -> None:
@@ -104,21 +86,20 @@ def test_a_fisheye_near_its_axis_equals_the_float64_reference() -> None:
     scene.viewmats = torch.eye(4)[None].clone()
     scene.viewmats[:, 2, 3] = 2.5
     scene.opacities *= 0.1
-    assert_equal(scene, "RGB", affine_projector(fisheye_points), camera_model="fisheye")
+    assert_equal(scene, "RGB", AFFINE["fisheye"], camera_model="fisheye")
 
 
 @pytest.mark.parametrize("model", ["ortho", "fisheye"])
 def test_several_views_through_another_camera_equal_the_reference(model: str) -> None:
-    points = {"ortho": ortho_points, "fisheye": fisheye_points}[model]
     scene = hard_scene(3, n=200, views=3)
     scene.Ks[:, :2, :2] *= 0.45
-    assert_equal(scene, "RGB", affine_projector(points), camera_model=model)
+    assert_equal(scene, "RGB", AFFINE[model], camera_model=model)
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_unscented_transform_of_a_distorted_pinhole_equals_the_float64_reference(seed: int, mode: str) -> None:
-    assert_equal(hard_scene(seed), mode, distorted_pinhole(), **distortion())
+    assert_equal(hard_scene(seed), mode, distorted_pinhole(PINHOLE), **distortion())
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
@@ -143,8 +124,7 @@ def test_the_unscented_transform_of_an_orthographic_camera_is_its_affine_project
 
 def test_other_sigma_points_equal_the_float64_reference() -> None:
     params = UnscentedTransformParameters(alpha=0.7, beta=1.0, kappa=0.5)
-    seen = partial(before_pinhole, 1e30)
-    project = unscented_projector(pinhole_points, alpha=0.7, beta=1.0, kappa=0.5, seen=seen)
+    project = unscented_projector(pinhole_points, alpha=0.7, beta=1.0, kappa=0.5, seen=before)
     assert_equal(hard_scene(4), "RGB", project, with_ut=True, ut_params=params)
 
 
@@ -158,8 +138,7 @@ def second_pose(viewmats: Tensor) -> Tensor:
 def test_a_rolling_shutter_equals_the_float64_reference(shutter: str) -> None:
     scene = hard_scene(5, n=150)
     last = second_pose(scene.viewmats)
-    seen = partial(before_pinhole, 1e30)
-    project = unscented_projector(pinhole_points, shutter=shutter, last=last[0].double(), seen=seen)
+    project = unscented_projector(pinhole_points, shutter=shutter, last=last[0].double(), seen=before)
     options: dict[str, Any] = {"with_ut": True, "rolling_shutter": shutter, "viewmats_rs": last}
     assert_equal(scene, "RGB+ED", project, fixed=("viewmats", "Ks"), **options)
 
@@ -300,7 +279,7 @@ def test_both_poses_and_the_intrinsics_of_a_rolling_shutter_have_gradients(shutt
         last = second_pose(scene.viewmats).to(dtype).requires_grad_()
         if dtype == torch.float64:
             points = pinhole_points if model == "pinhole" else fisheye_points
-            seen = partial(before_pinhole, 1e30) if model == "pinhole" else None
+            seen = before if model == "pinhole" else None
             project = unscented_projector(points, shutter=shutter, last=last[0], seen=seen)
             image, _, meta = leaves.reference_leaves("RGB+D", project=project)
             weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -330,16 +309,13 @@ def test_a_pose_alone_may_ask_for_a_gradient_under_a_rolling_shutter() -> None:
 
 @pytest.mark.parametrize("model", ["ortho", "fisheye"])
 def test_covariances_antialiasing_and_harmonics_go_through_another_camera(model: str) -> None:
-    points = {"ortho": ortho_points, "fisheye": fisheye_points}[model]
     scene = hard_scene(10, n=150, views=2)
     scene.Ks[:, :2, :2] *= 0.45
     scene.colors = 0.5 * torch.randn(150, 9, 3, generator=torch.Generator().manual_seed(0))
     M = reference_rotations(scene.quats) * scene.scales[:, None]
     scene.covars = (M @ M.mT).contiguous()
     options: dict[str, Any] = {"sh_degree": 2, "rasterize_mode": "antialiased"}
-    result = compare(
-        scene, "RGB", project=affine_projector(points), reference_extra=options, camera_model=model, **options
-    )
+    result = compare(scene, "RGB", project=AFFINE[model], reference_extra=options, camera_model=model, **options)
     assert result.forward <= FORWARD_BOUND * 2
     assert "covars" in result.gradients
     assert max(result.gradients.values()) <= two_roundings(GRADIENT_BOUND), result.gradients
@@ -348,7 +324,7 @@ def test_covariances_antialiasing_and_harmonics_go_through_another_camera(model:
 def test_antialiasing_goes_through_the_unscented_transform() -> None:
     scene = hard_scene(11, n=150)
     extra: dict[str, Any] = {"rasterize_mode": "antialiased"}
-    result = compare(scene, "RGB", project=distorted_pinhole(), reference_extra=extra, **distortion(), **extra)
+    result = compare(scene, "RGB", project=distorted_pinhole(PINHOLE), reference_extra=extra, **distortion(), **extra)
     assert result.forward <= FORWARD_BOUND * 2
     assert max(result.gradients.values()) <= GRADIENT_BOUND, result.gradients
 
@@ -373,9 +349,9 @@ def test_every_instruction_set_equals_the_reference_through_other_cameras(model:
     native().set_isa(isa)
     try:
         if model == "affine fisheye":
-            assert_equal(wide_scene(14), "RGB", affine_projector(fisheye_points), camera_model="fisheye")
+            assert_equal(wide_scene(14), "RGB", AFFINE["fisheye"], camera_model="fisheye")
         else:
-            assert_equal(hard_scene(14), "RGB", distorted_pinhole(), **distortion())
+            assert_equal(hard_scene(14), "RGB", distorted_pinhole(PINHOLE), **distortion())
     finally:
         native().set_isa("")
 

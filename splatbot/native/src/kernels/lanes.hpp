@@ -85,19 +85,30 @@ SB_INLINE void each_visible(const Args& args, std::size_t b, Clear clear, Each e
   }
 }
 
-// Loads means, opacities and centres of n splats from `first` on; a mask of those between the planes that are not
-// too faint.
+// n splats with their means, opacities and centres. `keep` marks those between the planes that are not too faint.
+struct CenterLanes {
+  GaussianLanes g;
+  F opacity;
+  Projected o;
+  M keep;
+  std::uint32_t wanted;  // the bits of the n lanes
+
+  SB_INLINE std::uint32_t kept() const { return bits(keep) & wanted; }
+};
+
+// Loads n splats from `first` on.
 template <class Args>
-SB_INLINE M load_centers(const Args& args, const CameraLanes& cam, std::size_t first, int n, GaussianLanes& g,
-                         F& opacity, Projected& o) {
+SB_INLINE void load_centers(const Args& args, const CameraLanes& cam, std::size_t first, int n, CenterLanes& c) {
   F opacities[1];
-  load_lanes<3>(args.means, first, n, g.mean);
+  load_lanes<3>(args.means, first, n, c.g.mean);
   load_lanes<1>(args.opacities, first, n, opacities);
-  from_origin(cam, g.mean);
-  project_center(g, cam, o);
-  opacity = opacities[0];
-  return (o.p[2] >= set1(args.options.near_plane)) & (o.p[2] <= set1(args.options.far_plane)) &
-         (o.p[2] > set1(0.0F)) & (opacity >= set1(kAlphaMin));
+  from_origin(cam, c.g.mean);
+  project_center(c.g, cam, c.o);
+  c.opacity = opacities[0];
+  const F depth = c.o.p[2];
+  c.keep = (depth >= set1(args.options.near_plane)) & (depth <= set1(args.options.far_plane)) &
+           (depth > set1(0.0F)) & (c.opacity >= set1(kAlphaMin));
+  c.wanted = (1U << n) - 1U;
 }
 
 template <class Args>

@@ -66,14 +66,22 @@ SB_INLINE F sample_depth(const float* depth, int width, I index, F a, F b) {
   return zero_unless(one, mix(b, mix(a, d0, d1), mix(a, d2, d3)));
 }
 
-// Weight of Student's t over σ², and the residual's share of the cost.
-SB_INLINE void weigh(const LinearizeArgs& args, M used, F r, F sigma, float* weight, float* ratio, F& cost) {
+// Residuals of the points from k on, where `used`: r, weight of Student's t over σ², their number and their share of
+// the cost. `ratios` (may be null) gets r / σ, NaN where not used.
+SB_INLINE void weigh(const LinearizeArgs& args, int k, M used, F r, F sigma, Residuals& out, float* ratios,
+                     std::size_t& count, F& cost) {
   const F s = r / sigma, s2 = s * s;
   const F nu = set1(args.nu), more = set1(args.nu + 1.0F);
-  store(weight, zero_unless(used, more / ((nu + s2) * sigma * sigma)));
-  if (ratio != nullptr) {
+  store(out.r.values + k, zero_unless(used, r));
+  store(out.weight.values + k, zero_unless(used, more / ((nu + s2) * sigma * sigma)));
+  if (ratios != nullptr) {
+    alignas(64) float ratio[W];
     store(ratio, select(used, s, set1(std::numeric_limits<float>::quiet_NaN())));
+    for (int i = 0; i < W && k + i < args.count; ++i) {
+      ratios[k + i] = ratio[i];
+    }
   }
+  count += static_cast<std::size_t>(__builtin_popcount(bits(used)));
   cost = cost + zero_unless(used, set1(0.5F * 0.69314718F * (args.nu + 1.0F)) * log2(fma(s2, set1(1.0F / args.nu), set1(1.0F))));
 }
 
@@ -106,7 +114,7 @@ void accumulate(const Residuals& residuals, int count, LinearizeSums& sums) {
 
 void linearize(const LinearizeArgs& args, LinearizeSums& sums) {
   Residuals photo, geo;
-  Row x, y, z, nx, ny, nz, gray, ratio;
+  Row x, y, z, nx, ny, nz, gray;
   const float* T = args.T;
   const F zero = set1(0.0F), one = set1(1.0F);
   F cost = zero;
@@ -177,7 +185,6 @@ void linearize(const LinearizeArgs& args, LinearizeSums& sums) {
       for (int i = 0; i < 8; ++i) {
         store(photo.J[i].values + k, zero_unless(seen, rows_of_J[i]));
       }
-      store(photo.r.values + k, zero_unless(seen, r));
       F sigma = set1(args.sigma_gray);
       if (args.blurred) {
         F moved = set1(args.blur[0]) * rows_of_J[0];
@@ -186,13 +193,7 @@ void linearize(const LinearizeArgs& args, LinearizeSums& sums) {
         }
         sigma = sqrt(select(seen, fma(moved, moved, sigma * sigma), one));
       }
-      weigh(args, seen, r, sigma, photo.weight.values + k, ratio.values + k, cost);
-      if (args.residual_photometric != nullptr) {
-        for (int i = k; i < k + W && i < args.count; ++i) {
-          args.residual_photometric[i] = ratio.values[i];
-        }
-      }
-      sums.photometric += static_cast<std::size_t>(__builtin_popcount(bits(seen)));
+      weigh(args, k, seen, r, sigma, photo, args.residual_photometric, sums.photometric, cost);
     }
     if (args.use_geometric) {
       const F ax = load(nx.values + k), ay = load(ny.values + k), az = load(nz.values + k);
@@ -209,14 +210,7 @@ void linearize(const LinearizeArgs& args, LinearizeSums& sums) {
       for (int i = 0; i < 6; ++i) {
         store(geo.J[i].values + k, zero_unless(ranged, rows_of_J[i]));
       }
-      store(geo.r.values + k, zero_unless(ranged, r));
-      weigh(args, ranged, r, sigma, geo.weight.values + k, ratio.values + k, cost);
-      if (args.residual_geometric != nullptr) {
-        for (int i = k; i < k + W && i < args.count; ++i) {
-          args.residual_geometric[i] = ratio.values[i];
-        }
-      }
-      sums.geometric += static_cast<std::size_t>(__builtin_popcount(bits(ranged)));
+      weigh(args, k, ranged, r, sigma, geo, args.residual_geometric, sums.geometric, cost);
     }
   }
   if (args.use_photometric) {

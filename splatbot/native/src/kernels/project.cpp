@@ -185,13 +185,10 @@ struct DepthRange {
 template <Projection P>
 void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t first, int n, std::uint32_t* visible,
                    DepthRange& depths, ProjectedBlock& out) {
-  GaussianLanes g;
-  F opacity;
-  Projected o;
-  M keep = load_centers(args, cam, first, n, g, opacity, o);
-  const std::uint32_t wanted = (1U << n) - 1U;
-  std::uint32_t kept = bits(keep) & wanted;
-  if (kept != 0) {
+  CenterLanes lanes;
+  load_centers(args, cam, first, n, lanes);
+  auto& [g, opacity, o, keep, wanted] = lanes;
+  if (lanes.kept() != 0) {
     const bool of_covar = args.covars != nullptr;
     if (of_covar) {
       load_covars(args.covars, first, n, g.covar);
@@ -223,7 +220,7 @@ void project_lanes(const ProjectArgs& args, const CameraLanes& cam, std::size_t 
     keep = keep & meets_image(args.view, o.mx, o.my, radius_x, radius_y) & (o.det > set1(0.0F)) & (o.det < huge) &
            (o.c00 < huge) & (o.c11 < huge) & (max(radius_x, radius_y) > clip);
     keep = keep & (root.l11 > set1(0.0F)) & (root.l11 < huge) & (root.l22 > set1(0.0F));
-    kept = bits(keep) & wanted;
+    const std::uint32_t kept = lanes.kept();
     const F record[8] = {o.mx, o.my, root.l11, root.l21, root.l22, lo, reach_safe, reach_safe * o.c01 / (sx * root.sy)};
     for (int c = 0; c < 8; ++c) {
       w.record[c] = record[c];

@@ -31,21 +31,98 @@ struct M {
   __mmask16 v;
 };
 
-SB_INLINE F set1(float x) { return {_mm512_set1_ps(x)}; }
-SB_INLINE F load(const float* p) { return {_mm512_loadu_ps(p)}; }
+#define SB_X86(name) _mm512_##name
+#define SB_X86_BITS(name) _mm512_##name##512
+SB_INLINE F bit_cast_float(I a) { return {_mm512_castsi512_ps(a.v)}; }
+
+#elif SPLATBOT_SIMD == 256
+
+inline constexpr int W = 8;
+struct F {
+  __m256 v;
+};
+struct I {
+  __m256i v;
+};
+struct M {
+  __m256 v;
+};
+
+#define SB_X86(name) _mm256_##name
+#define SB_X86_BITS(name) _mm256_##name##256
+SB_INLINE F bit_cast_float(I a) { return {_mm256_castsi256_ps(a.v)}; }
+
+#else
+
+inline constexpr int W = 4;
+using Vf = float __attribute__((vector_size(16)));
+using Vi = std::int32_t __attribute__((vector_size(16)));
+struct F {
+  Vf v;
+};
+struct I {
+  Vi v;
+};
+struct M {
+  Vi v;
+};
+
+#endif
+
+// Intrinsics that AVX-512 and AVX2 name alike: SB_X86 completes their names, SB_X86_BITS those for untyped bits.
+#if SPLATBOT_SIMD >= 256
+
+SB_INLINE F set1(float x) { return {SB_X86(set1_ps)(x)}; }
+SB_INLINE F load(const float* p) { return {SB_X86(loadu_ps)(p)}; }
+SB_INLINE void store(float* p, F a) { SB_X86(storeu_ps)(p, a.v); }
+SB_INLINE F operator+(F a, F b) { return {SB_X86(add_ps)(a.v, b.v)}; }
+SB_INLINE F operator-(F a, F b) { return {SB_X86(sub_ps)(a.v, b.v)}; }
+SB_INLINE F operator*(F a, F b) { return {SB_X86(mul_ps)(a.v, b.v)}; }
+SB_INLINE F operator/(F a, F b) { return {SB_X86(div_ps)(a.v, b.v)}; }
+SB_INLINE F fma(F a, F b, F c) { return {SB_X86(fmadd_ps)(a.v, b.v, c.v)}; }
+SB_INLINE F fnma(F a, F b, F c) { return {SB_X86(fnmadd_ps)(a.v, b.v, c.v)}; }
+SB_INLINE F fms(F a, F b, F c) { return {SB_X86(fmsub_ps)(a.v, b.v, c.v)}; }
+SB_INLINE F min(F a, F b) { return {SB_X86(min_ps)(a.v, b.v)}; }
+SB_INLINE F max(F a, F b) { return {SB_X86(max_ps)(a.v, b.v)}; }
+SB_INLINE F sqrt(F a) { return {SB_X86(sqrt_ps)(a.v)}; }
+SB_INLINE I to_int(F a) { return {SB_X86(cvttps_epi32)(a.v)}; }
+SB_INLINE F to_float(I a) { return {SB_X86(cvtepi32_ps)(a.v)}; }
+SB_INLINE I bit_cast_int(F a) { return {SB_X86_BITS(castps_si)(a.v)}; }
+SB_INLINE I set1(int x) { return {SB_X86(set1_epi32)(x)}; }
+SB_INLINE I operator+(I a, I b) { return {SB_X86(add_epi32)(a.v, b.v)}; }
+SB_INLINE I operator-(I a, I b) { return {SB_X86(sub_epi32)(a.v, b.v)}; }
+SB_INLINE I operator&(I a, I b) { return {SB_X86_BITS(and_si)(a.v, b.v)}; }
+SB_INLINE I operator|(I a, I b) { return {SB_X86_BITS(or_si)(a.v, b.v)}; }
+SB_INLINE I shift_left(I a, I n) { return {SB_X86(sllv_epi32)(a.v, n.v)}; }
+template <int N>
+SB_INLINE I shift_left(I a) {
+  return {SB_X86(slli_epi32)(a.v, N)};
+}
+template <int N>
+SB_INLINE I shift_right(I a) {  // arithmetic
+  return {SB_X86(srai_epi32)(a.v, N)};
+}
+// Each quad of lanes of four vectors is a 4x4 matrix: transpose it.
+SB_INLINE void transpose_quads(F (&a)[4]) {
+  const auto low01 = SB_X86(castps_pd)(SB_X86(unpacklo_ps)(a[0].v, a[1].v));
+  const auto high01 = SB_X86(castps_pd)(SB_X86(unpackhi_ps)(a[0].v, a[1].v));
+  const auto low23 = SB_X86(castps_pd)(SB_X86(unpacklo_ps)(a[2].v, a[3].v));
+  const auto high23 = SB_X86(castps_pd)(SB_X86(unpackhi_ps)(a[2].v, a[3].v));
+  a[0] = {SB_X86(castpd_ps)(SB_X86(unpacklo_pd)(low01, low23))};
+  a[1] = {SB_X86(castpd_ps)(SB_X86(unpackhi_pd)(low01, low23))};
+  a[2] = {SB_X86(castpd_ps)(SB_X86(unpacklo_pd)(high01, high23))};
+  a[3] = {SB_X86(castpd_ps)(SB_X86(unpackhi_pd)(high01, high23))};
+}
+
+#undef SB_X86
+#undef SB_X86_BITS
+
+#endif
+
+#if SPLATBOT_SIMD == 512
+
 // Four floats, over and over.
 SB_INLINE F load_quad(const float* p) { return {_mm512_broadcast_f32x4(_mm_loadu_ps(p))}; }
-SB_INLINE void store(float* p, F a) { _mm512_storeu_ps(p, a.v); }
-SB_INLINE F operator+(F a, F b) { return {_mm512_add_ps(a.v, b.v)}; }
-SB_INLINE F operator-(F a, F b) { return {_mm512_sub_ps(a.v, b.v)}; }
-SB_INLINE F operator*(F a, F b) { return {_mm512_mul_ps(a.v, b.v)}; }
-SB_INLINE F operator/(F a, F b) { return {_mm512_div_ps(a.v, b.v)}; }
-SB_INLINE F fma(F a, F b, F c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
-SB_INLINE F fnma(F a, F b, F c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
-SB_INLINE F fms(F a, F b, F c) { return {_mm512_fmsub_ps(a.v, b.v, c.v)}; }
-SB_INLINE F min(F a, F b) { return {_mm512_min_ps(a.v, b.v)}; }
-SB_INLINE F max(F a, F b) { return {_mm512_max_ps(a.v, b.v)}; }
-SB_INLINE F sqrt(F a) { return {_mm512_sqrt_ps(a.v)}; }
 SB_INLINE F floor(F a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
 SB_INLINE F ceil(F a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
 SB_INLINE M operator<(F a, F b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
@@ -59,29 +136,11 @@ SB_INLINE F zero_unless(M m, F a) { return {_mm512_maskz_mov_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return {_mm512_maskz_mul_ps(m.v, a.v, b.v)}; }
 SB_INLINE std::uint32_t bits(M m) { return m.v; }
 SB_INLINE F min_zero_unless(M m, F a, F b) { return {_mm512_maskz_min_ps(m.v, a.v, b.v)}; }
-SB_INLINE I to_int(F a) { return {_mm512_cvttps_epi32(a.v)}; }
 SB_INLINE I floor_to_int(F a) { return {_mm512_cvt_roundps_epi32(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
 SB_INLINE I ceil_to_int(F a) { return {_mm512_cvt_roundps_epi32(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
-SB_INLINE F to_float(I a) { return {_mm512_cvtepi32_ps(a.v)}; }
-SB_INLINE I bit_cast_int(F a) { return {_mm512_castps_si512(a.v)}; }
-SB_INLINE F bit_cast_float(I a) { return {_mm512_castsi512_ps(a.v)}; }
-SB_INLINE I set1(int x) { return {_mm512_set1_epi32(x)}; }
 SB_INLINE void store(std::uint32_t* p, I a) { _mm512_storeu_si512(p, a.v); }
-SB_INLINE I operator+(I a, I b) { return {_mm512_add_epi32(a.v, b.v)}; }
-SB_INLINE I operator-(I a, I b) { return {_mm512_sub_epi32(a.v, b.v)}; }
-SB_INLINE I operator&(I a, I b) { return {_mm512_and_si512(a.v, b.v)}; }
 SB_INLINE M operator==(I a, I b) { return {_mm512_cmpeq_epi32_mask(a.v, b.v)}; }
 SB_INLINE M operator>(I a, I b) { return {_mm512_cmpgt_epi32_mask(a.v, b.v)}; }
-SB_INLINE I operator|(I a, I b) { return {_mm512_or_si512(a.v, b.v)}; }
-template <int N>
-SB_INLINE I shift_left(I a) {
-  return {_mm512_slli_epi32(a.v, N)};
-}
-template <int N>
-SB_INLINE I shift_right(I a) {  // arithmetic
-  return {_mm512_srai_epi32(a.v, N)};
-}
-SB_INLINE I shift_left(I a, I n) { return {_mm512_sllv_epi32(a.v, n.v)}; }
 SB_INLINE I zero_unless(M m, I a) { return {_mm512_maskz_mov_epi32(m.v, a.v)}; }
 SB_INLINE F reciprocal(F a) {  // one Newton step from 14 bits
   const __m512 r = _mm512_rcp14_ps(a.v);
@@ -91,17 +150,6 @@ SB_INLINE F reciprocal(F a) {  // one Newton step from 14 bits
 // Square roots of positive numbers with a relative error below kRootError.
 inline constexpr float kRootError = 0x1p-13F;
 SB_INLINE F rough_sqrt(F a) { return {_mm512_mul_ps(a.v, _mm512_rsqrt14_ps(a.v))}; }
-// Each quad of lanes of four vectors is a 4x4 matrix: transpose it.
-SB_INLINE void transpose_quads(F (&a)[4]) {
-  const __m512d low01 = _mm512_castps_pd(_mm512_unpacklo_ps(a[0].v, a[1].v));
-  const __m512d high01 = _mm512_castps_pd(_mm512_unpackhi_ps(a[0].v, a[1].v));
-  const __m512d low23 = _mm512_castps_pd(_mm512_unpacklo_ps(a[2].v, a[3].v));
-  const __m512d high23 = _mm512_castps_pd(_mm512_unpackhi_ps(a[2].v, a[3].v));
-  a[0] = {_mm512_castpd_ps(_mm512_unpacklo_pd(low01, low23))};
-  a[1] = {_mm512_castpd_ps(_mm512_unpackhi_pd(low01, low23))};
-  a[2] = {_mm512_castpd_ps(_mm512_unpacklo_pd(high01, high23))};
-  a[3] = {_mm512_castpd_ps(_mm512_unpackhi_pd(high01, high23))};
-}
 
 // The lanes of a matrix of quads, column by column, as four lines `stride` apart; and the way back.
 SB_INLINE void store_lines(float* to, std::size_t stride, F a) {
@@ -123,31 +171,7 @@ SB_INLINE F load_lines(const float* from, std::size_t stride) {
 
 #elif SPLATBOT_SIMD == 256
 
-inline constexpr int W = 8;
-struct F {
-  __m256 v;
-};
-struct I {
-  __m256i v;
-};
-struct M {
-  __m256 v;
-};
-
-SB_INLINE F set1(float x) { return {_mm256_set1_ps(x)}; }
-SB_INLINE F load(const float* p) { return {_mm256_loadu_ps(p)}; }
 SB_INLINE F load_quad(const float* p) { return {_mm256_broadcast_ps(reinterpret_cast<const __m128*>(p))}; }
-SB_INLINE void store(float* p, F a) { _mm256_storeu_ps(p, a.v); }
-SB_INLINE F operator+(F a, F b) { return {_mm256_add_ps(a.v, b.v)}; }
-SB_INLINE F operator-(F a, F b) { return {_mm256_sub_ps(a.v, b.v)}; }
-SB_INLINE F operator*(F a, F b) { return {_mm256_mul_ps(a.v, b.v)}; }
-SB_INLINE F operator/(F a, F b) { return {_mm256_div_ps(a.v, b.v)}; }
-SB_INLINE F fma(F a, F b, F c) { return {_mm256_fmadd_ps(a.v, b.v, c.v)}; }
-SB_INLINE F fnma(F a, F b, F c) { return {_mm256_fnmadd_ps(a.v, b.v, c.v)}; }
-SB_INLINE F fms(F a, F b, F c) { return {_mm256_fmsub_ps(a.v, b.v, c.v)}; }
-SB_INLINE F min(F a, F b) { return {_mm256_min_ps(a.v, b.v)}; }
-SB_INLINE F max(F a, F b) { return {_mm256_max_ps(a.v, b.v)}; }
-SB_INLINE F sqrt(F a) { return {_mm256_sqrt_ps(a.v)}; }
 SB_INLINE F floor(F a) { return {_mm256_floor_ps(a.v)}; }
 SB_INLINE F ceil(F a) { return {_mm256_ceil_ps(a.v)}; }
 SB_INLINE M operator<(F a, F b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_LT_OQ)}; }
@@ -161,54 +185,13 @@ SB_INLINE F zero_unless(M m, F a) { return {_mm256_and_ps(m.v, a.v)}; }
 SB_INLINE F mul_zero_unless(M m, F a, F b) { return zero_unless(m, a * b); }
 SB_INLINE std::uint32_t bits(M m) { return static_cast<std::uint32_t>(_mm256_movemask_ps(m.v)); }
 SB_INLINE F min_zero_unless(M m, F a, F b) { return zero_unless(m, min(a, b)); }
-SB_INLINE I to_int(F a) { return {_mm256_cvttps_epi32(a.v)}; }
-SB_INLINE F to_float(I a) { return {_mm256_cvtepi32_ps(a.v)}; }
-SB_INLINE I bit_cast_int(F a) { return {_mm256_castps_si256(a.v)}; }
-SB_INLINE F bit_cast_float(I a) { return {_mm256_castsi256_ps(a.v)}; }
-SB_INLINE I set1(int x) { return {_mm256_set1_epi32(x)}; }
 SB_INLINE void store(std::uint32_t* p, I a) { _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), a.v); }
-SB_INLINE I operator+(I a, I b) { return {_mm256_add_epi32(a.v, b.v)}; }
-SB_INLINE I operator-(I a, I b) { return {_mm256_sub_epi32(a.v, b.v)}; }
-SB_INLINE I operator&(I a, I b) { return {_mm256_and_si256(a.v, b.v)}; }
 SB_INLINE M operator==(I a, I b) { return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(a.v, b.v))}; }
 SB_INLINE M operator>(I a, I b) { return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(a.v, b.v))}; }
-SB_INLINE I operator|(I a, I b) { return {_mm256_or_si256(a.v, b.v)}; }
-template <int N>
-SB_INLINE I shift_left(I a) {
-  return {_mm256_slli_epi32(a.v, N)};
-}
-template <int N>
-SB_INLINE I shift_right(I a) {
-  return {_mm256_srai_epi32(a.v, N)};
-}
-SB_INLINE I shift_left(I a, I n) { return {_mm256_sllv_epi32(a.v, n.v)}; }
 SB_INLINE I zero_unless(M m, I a) { return {_mm256_and_si256(_mm256_castps_si256(m.v), a.v)}; }
 SB_INLINE F reciprocal(F a) { return set1(1.0F) / a; }
-SB_INLINE void transpose_quads(F (&a)[4]) {
-  const __m256d low01 = _mm256_castps_pd(_mm256_unpacklo_ps(a[0].v, a[1].v));
-  const __m256d high01 = _mm256_castps_pd(_mm256_unpackhi_ps(a[0].v, a[1].v));
-  const __m256d low23 = _mm256_castps_pd(_mm256_unpacklo_ps(a[2].v, a[3].v));
-  const __m256d high23 = _mm256_castps_pd(_mm256_unpackhi_ps(a[2].v, a[3].v));
-  a[0] = {_mm256_castpd_ps(_mm256_unpacklo_pd(low01, low23))};
-  a[1] = {_mm256_castpd_ps(_mm256_unpackhi_pd(low01, low23))};
-  a[2] = {_mm256_castpd_ps(_mm256_unpacklo_pd(high01, high23))};
-  a[3] = {_mm256_castpd_ps(_mm256_unpackhi_pd(high01, high23))};
-}
 
 #else
-
-inline constexpr int W = 4;
-using Vf = float __attribute__((vector_size(16)));
-using Vi = std::int32_t __attribute__((vector_size(16)));
-struct F {
-  Vf v;
-};
-struct I {
-  Vi v;
-};
-struct M {
-  Vi v;
-};
 
 SB_INLINE F set1(float x) { return {Vf{x, x, x, x}}; }
 SB_INLINE I set1(int x) { return {Vi{x, x, x, x}}; }

@@ -157,12 +157,10 @@ SB_INLINE void write_lane(const SurfelProjectArgs& args, std::size_t id, const L
 
 void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::size_t first, int n,
                    std::uint32_t* visible, ProjectedBlock& out) {
-  GaussianLanes g;
-  F opacity;
-  Projected o;
-  M keep = load_centers(args, cam, first, n, g, opacity, o);
-  const std::uint32_t wanted = (1U << n) - 1U;
-  std::uint32_t kept = bits(keep) & wanted;
+  CenterLanes center;
+  load_centers(args, cam, first, n, center);
+  auto& [g, opacity, o, keep, wanted] = center;
+  std::uint32_t kept = center.kept();
   if (kept != 0) {
     load_lanes<4>(args.quats, first, n, g.quat);
     load_lanes<3>(args.scales, first, n, g.scale);
@@ -180,7 +178,7 @@ void project_lanes(const SurfelProjectArgs& args, const CameraLanes& cam, std::s
     const F huge = set1(1e30F);
     keep = keep & cover_tiles(args, c, lanes) & (s.mx > -huge) & (s.mx < huge) & (s.my > -huge) & (s.my < huge) &
            (max(c.radius_x, c.radius_y) > set1(args.options.radius_clip));
-    kept = bits(keep) & wanted;
+    kept = center.kept();
     store_lanes(o, c, lo, lanes);
     for (std::uint32_t left = kept; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);

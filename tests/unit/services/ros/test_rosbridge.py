@@ -46,6 +46,11 @@ class Client:
             await asyncio.sleep(0.01)
         raise AssertionError(f"{len(self.sent)} messages, not {count}: {self.sent}")
 
+    async def stays_at(self, count: int) -> None:
+        """Assert that no message comes after the first ``count``."""
+        await asyncio.sleep(0.05)
+        assert len(self.sent) == count
+
 
 def play(scene: Callable[[RosGraph, Client], Awaitable[None]]) -> None:
     """Run a scene with a graph and a client."""
@@ -115,8 +120,7 @@ def test_a_new_reader_gets_the_latest_of_a_latched_topic_alone() -> None:
         await client.say(op="subscribe", topic="/passing")
         await client.say(op="subscribe", topic="/latched")
         assert [m["msg"]["data"] for m in await client.until(1)] == ["kept"]
-        await asyncio.sleep(0.05)
-        assert len(client.sent) == 1
+        await client.stays_at(1)
 
     play(scene)
 
@@ -166,8 +170,7 @@ def test_subscriptions_of_one_topic_are_merged_and_left_one_by_one() -> None:
         await client.until(3)
         await client.say(op="unsubscribe", id="fast", topic="/a")
         graph.publish("/a", _string("4"))
-        await asyncio.sleep(0.05)
-        assert len(client.sent) == 3
+        await client.stays_at(3)
 
     play(scene)
 
