@@ -188,6 +188,37 @@ class Mesh:
         return np.concatenate(points)
 
 
+def winding_number(triangles: Array, points: Array) -> Array:
+    """Compute the winding number (P,) of a mesh about points: 1 inside of a closed mesh, 0 outside.
+
+    It is the sum of the solid angles of the triangles over 4 π (Van Oosterom and Strackee 1983):
+    tan(Ω / 2) = det(a, b, c) / (|a| |b| |c| + (a·b) |c| + (b·c) |a| + (c·a) |b|).
+
+    Args:
+        triangles: (T, 3, 3) [m], counter-clockwise from outside.
+        points: (P, 3) [m].
+    """
+    x, y, z = ((triangles[None, :, :, k] - points[:, None, None, k]).astype(np.float32) for k in range(3))  # (P, T, 3)
+    size = np.sqrt(x * x + y * y + z * z)
+
+    def dot(i: int, j: int) -> NDArray[np.float32]:
+        """Return the scalar products (P, T) of the vectors to corners i and j."""
+        return np.asarray(x[..., i] * x[..., j] + y[..., i] * y[..., j] + z[..., i] * z[..., j])
+
+    volume = (
+        x[..., 0] * (y[..., 1] * z[..., 2] - z[..., 1] * y[..., 2])
+        + y[..., 0] * (z[..., 1] * x[..., 2] - x[..., 1] * z[..., 2])
+        + z[..., 0] * (x[..., 1] * y[..., 2] - y[..., 1] * x[..., 2])
+    )
+    below = (
+        size[..., 0] * size[..., 1] * size[..., 2]
+        + dot(0, 1) * size[..., 2]
+        + dot(1, 2) * size[..., 0]
+        + dot(2, 0) * size[..., 1]
+    )
+    return np.asarray(np.arctan2(volume, below).sum(axis=1, dtype=np.float64) / (2 * np.pi))
+
+
 def depth_of(shapes: Sequence[Shape], points: Array) -> Array:
     """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface of the shapes of one link.
 

@@ -64,7 +64,7 @@ def parse(file: Path) -> ElementTree.Element:
 def _elements(text: bytes) -> ElementTree.Element:
     """Parse XML; names keep their prefixes as they stand."""
     builder, parser = ElementTree.TreeBuilder(), ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end  # type: ignore[assignment]
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
     parser.Parse(text, True)
     return builder.close()

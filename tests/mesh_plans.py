@@ -100,7 +100,7 @@ class MeshedPanda:
         self.fcl: Any = importlib.import_module("fcl")
         self.robot = panda()
         source = SOURCES["panda"]
-        self.parts = []  # name, link, pose on the link, fcl object
+        self.parts: list[tuple[str, int, Array, Any]] = []  # name, link, pose on the link, fcl object
         for k in range(1, 8):
             self._add(source.shapes(f"link{k}"), f"link{k}", k, np.eye(4))
         assert self.robot.gripper is not None
@@ -140,7 +140,7 @@ class MeshedPanda:
             if isinstance(solid, Block):
                 shape, pose = self.fcl.Box(*solid.size), (_turn(solid.yaw), np.array(solid.center))
             elif isinstance(solid, Can):
-                middle = np.array(solid.foot) + [0.0, 0.0, solid.height / 2]
+                middle = np.array(solid.foot) + np.array([0.0, 0.0, solid.height / 2])
                 shape, pose = self.fcl.Cylinder(solid.radius, solid.height), (np.eye(3), middle)
             elif isinstance(solid, Ball):
                 shape, pose = self.fcl.Sphere(solid.radius), (np.eye(3), np.array(solid.center))

@@ -1,4 +1,4 @@
-"""Arms that splatbot ships besides the Panda, fitted to the descriptions of their makers by `splatbot robot fit`.
+"""Shipped arms other than the Panda, fitted to the descriptions of their makers by `splatbot robot fit`.
 
 Each file of this folder is that of :func:`splatbot.robots.store.save_robot`. The descriptions come from packages.
 """
@@ -13,7 +13,7 @@ from splatbot.robots.maker_meshes import Source
 
 @dataclass(frozen=True)
 class ShippedArm:
-    """Where an arm comes from, and what its description lacks.
+    """Source of an arm, and the values that its description lacks.
 
     Args:
         source: package, its folder and the description as the only part.

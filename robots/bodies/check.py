@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from splatbot.robots.shapes import Shape
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Shapes of a part (link 0), and the spheres (S, 4) that shall contain them: x, y, z, radius [m]."""
+    """Shapes of one link, and the spheres (S, 4) that contain them: x, y, z, radius [m]."""
 
     shapes: Sequence[Shape]
     spheres: Array
@@ -38,9 +38,7 @@ def parts_of_arm(shapes: Sequence[Shape], covering: LinkSpheres, robot: RobotMod
     names = ["base", *(joint.name for joint in robot.joints)]
     rows = np.c_[covering.centers, covering.radii]
     return {
-        names[link]: Part(
-            [replace(shape, link=0) for shape in shapes if shape.link == link], rows[covering.link == link]
-        )
+        names[link]: Part([shape for shape in shapes if shape.link == link], rows[covering.link == link])
         for link in sorted({shape.link for shape in shapes})
     }
 
@@ -67,7 +65,7 @@ def check_parts(parts: Mapping[str, Part]) -> list[PartCheck]:
     found = []
     for name, part in parts.items():
         centers, radii = part.spheres[:, :3], part.spheres[:, 3]
-        spheres = LinkSpheres(np.zeros(len(radii), np.int32), centers, radii)
+        spheres = LinkSpheres(np.full(len(radii), part.shapes[0].link, np.int32), centers, radii)
         bound = max(uncovered_by_link(part.shapes, spheres).values())
         found.append(PartCheck(name, len(radii), bound, slack_of(part.shapes, centers, radii)))
     return found

@@ -65,8 +65,8 @@ def plan_in_run(
 ) -> None:
     """Plan seeded problems in the map of a run, with three margins.
 
-    They are 0, the surface error of the map within 1 m of the base, and that in the region of each motion, which is the
-    default of `splatbot plan`.
+    They are 0, the surface error of the map within 1 m of the base, and that in the region of each motion. The last one
+    is the default of `splatbot plan`.
 
     With ``margins``, also sweep the margin on the problems of margin 0 (:mod:`splatbot.bench.planning.margin_sweep`).
 
