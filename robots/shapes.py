@@ -191,8 +191,9 @@ class Mesh:
 def winding_number(triangles: Array, points: Array) -> Array:
     """Compute the winding number (P,) of a mesh about points: 1 inside of a closed mesh, 0 outside.
 
-    It is the sum of the solid angles of the triangles over 4 π (Van Oosterom and Strackee 1983):
-    tan(Ω / 2) = det(a, b, c) / (|a| |b| |c| + (a·b) |c| + (b·c) |a| + (c·a) |b|).
+    It is the sum of the solid angles Ω of the triangles over 4 π (Van Oosterom and Strackee 1983, equation 8)::
+
+        tan(Ω / 2) = det(a, b, c) / (|a| |b| |c| + (a·b) |c| + (b·c) |a| + (c·a) |b|)
 
     Args:
         triangles: (T, 3, 3) [m], counter-clockwise from outside.
