@@ -30,6 +30,7 @@ BUDGET_MS = 28.0
 STEP = 0.01  # [rad] between checked configurations, at most
 OPEN = 0.04  # [m] of each finger
 GAUSSIANS = 20_000
+SLIVER = 1e-5  # [m] height below which a triangle is left out; its neighbours stand for it
 _TABLE = Block((0.625, 0.0, -0.02), (0.95, 1.8, 0.04))
 
 
@@ -113,8 +114,12 @@ class MeshedPanda:
             self._add(source.shapes("finger"), name, 7, T @ out)
 
     def _add(self, shapes: Any, name: str, link: int, T: Array) -> None:
+        """Add a part without slivers, for which fcl reports contacts with spheres that are centimetres away."""
         for shape in shapes:
             triangles = shape.triangles()
+            edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+            normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+            triangles = triangles[np.linalg.norm(normals, axis=1) > SLIVER * edges]  # the height, as area / edge
             corners = triangles.reshape(-1, 3)
             model = fcl_mesh(corners, np.arange(len(corners)).reshape(-1, 3))
             self.parts.append((name, link, T, self.fcl.CollisionObject(model)))
