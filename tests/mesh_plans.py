@@ -30,7 +30,7 @@ BUDGET_MS = 28.0
 STEP = 0.01  # [rad] between checked configurations, at most
 OPEN = 0.04  # [m] of each finger
 GAUSSIANS = 20_000
-SLIVER = 1e-5  # [m] height below which a triangle is left out; its neighbours stand for it
+SLIVER = 1e-5  # [m] height below which a triangle is left out; its neighbours have its corners
 _TABLE = Block((0.625, 0.0, -0.02), (0.95, 1.8, 0.04))
 
 
