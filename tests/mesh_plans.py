@@ -6,7 +6,6 @@ arm's spheres. The check sees neither: it moves Franka's visual and collision me
 
 from __future__ import annotations
 
-import argparse
 import importlib
 from collections import Counter
 from collections.abc import Callable
@@ -20,10 +19,12 @@ from splatbot.bench.tabletop import Ball, Block, Can, Solid, Tabletop
 from splatbot.bench.truth import Truth
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.collision.fcl_models import fcl_mesh
+from splatbot.geometry import so3_exp
 from splatbot.planning import GaussianRRTStar, time_path
 from splatbot.protocols import Array
 from splatbot.robots.maker_meshes import SOURCES
 from splatbot.robots.panda import panda
+from tests.attacks.command_line import exit_code, seeded_parser
 
 PER_SCENE = 25  # problems
 BUDGET_MS = 28.0
@@ -106,7 +107,7 @@ class MeshedPanda:
             self._add(source.shapes(f"link{k}"), f"link{k}", k, np.eye(4))
         assert self.robot.gripper is not None
         hand = np.eye(4)
-        hand[:3, :3], hand[2, 3] = _turn(-np.pi / 4), 0.107
+        hand[:3, :3], hand[2, 3] = so3_exp([0.0, 0.0, -np.pi / 4]), 0.107
         self._add(source.shapes("hand"), "hand", 7, hand)
         for T, name in zip(self.robot.gripper.T_link_finger, ("left finger", "right finger"), strict=True):
             out = np.eye(4)
@@ -143,7 +144,7 @@ class MeshedPanda:
         things = []
         for solid in scene.solids:
             if isinstance(solid, Block):
-                shape, pose = self.fcl.Box(*solid.size), (_turn(solid.yaw), np.array(solid.center))
+                shape, pose = self.fcl.Box(*solid.size), (so3_exp([0.0, 0.0, solid.yaw]), np.array(solid.center))
             elif isinstance(solid, Can):
                 middle = np.array(solid.foot) + np.array([0.0, 0.0, solid.height / 2])
                 shape, pose = self.fcl.Cylinder(solid.radius, solid.height), (np.eye(3), middle)
@@ -155,11 +156,6 @@ class MeshedPanda:
         manager.registerObjects(things)
         manager.setup()
         return manager
-
-
-def _turn(angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def run(count: int, seed: int) -> Tally:
@@ -188,18 +184,14 @@ def run(count: int, seed: int) -> Tally:
 
 def main() -> None:
     """Print the counts, and fail if a mesh touches a shape."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
+    arguments = seeded_parser(__doc__, 1000).parse_args()
     tally = run(arguments.count, arguments.seed)
     for name, plans in tally.plans.items():
         print(f"{name}: {plans} plans, {tally.solved[name]} solved within {BUDGET_MS:g} ms")
     total = sum(tally.plans.values())
     share = 100 * sum(tally.solved.values()) / total
     print(f"{total} plans, {share:.1f} % solved; {tally.configurations} configurations, {len(tally.contacts)} contacts")
-    print("\n".join(tally.contacts[:20]))
-    raise SystemExit(1 if tally.contacts else 0)
+    raise SystemExit(exit_code(tally.contacts))
 
 
 if __name__ == "__main__":

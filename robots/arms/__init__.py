@@ -35,24 +35,13 @@ class ShippedArm:
     efforts: tuple[float, ...] = ()
     masses: Source | None = None
 
-    def path(self) -> Path:
-        """Return the path of the installed description.
 
-        Raises:
-            InputError: the package is not installed.
-        """
-        return _description(self.source)
+def description_of(source: Source) -> Path:
+    """Return the path of an installed description.
 
-    def path_of_masses(self) -> Path | None:
-        """Return the path of the description with inertias, if that is another one.
-
-        Raises:
-            InputError: the package is not installed.
-        """
-        return None if self.masses is None else _description(self.masses)
-
-
-def _description(source: Source) -> Path:
+    Raises:
+        InputError: the package is not installed.
+    """
     return source.path(source.parts["description"][0])
 
 

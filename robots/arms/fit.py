@@ -8,11 +8,12 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.protocols import LinkSpheres
-from splatbot.robots.arms import ARMS, ShippedArm
+from splatbot.robots.arms import ARMS, ShippedArm, description_of
 from splatbot.robots.bodies import joined, rounded
 from splatbot.robots.containment import uncovered
 from splatbot.robots.cover import FINE, cover
 from splatbot.robots.description import read_description
+from splatbot.robots.maker_meshes import ReportProgress
 from splatbot.robots.robot import Inertial, RobotModel
 
 
@@ -23,27 +24,34 @@ def described(name: str) -> RobotModel:
         InputError: the package of the description is not installed.
     """
     arm = ARMS[name]
-    robot = read_description(arm.path(), tip=arm.tip, slack=arm.slack).robot
+    robot = read_description(description_of(arm.source), tip=arm.tip, slack=arm.slack).robot
     joints = robot.joints
     if arm.efforts:
         joints = tuple(replace(j, effort=effort) for j, effort in zip(joints, arm.efforts, strict=True))
     return replace(robot, name=name, joints=joints, home=np.array(arm.home))
 
 
-def fit_arm(name: str) -> RobotModel:
-    """Cover the geometry of a shipped arm, and prove that the rounded spheres contain it.
+def fit_arm(name: str, report_progress: ReportProgress) -> RobotModel:
+    """Cover the geometry of a shipped arm link by link (minutes), and prove that the rounded spheres contain it.
+
+    Args:
+        name: of :data:`splatbot.robots.arms.ARMS`.
+        report_progress: called with a line for each link.
 
     Raises:
         InputError: a package is not installed, or the proof fails.
     """
-    robot = described(name)
-    base = [shape for shape in robot.shapes if shape.link == 0]
-    moving = [shape for shape in robot.shapes if shape.link > 0]
-    fitted = joined(cover(base, ARMS[name].base_slack or robot.slack, FINE), cover(moving, robot.slack, FINE))
+    robot, arm, parts = described(name), ARMS[name], []
+    inertials = _inertials(arm, robot)  # an error before the work
+    for link in sorted({shape.link for shape in robot.shapes}):
+        slack = arm.slack if link else arm.base_slack or arm.slack
+        parts.append(cover([shape for shape in robot.shapes if shape.link == link], slack, FINE))
+        report_progress(f"{robot.joints[link - 1].name if link else 'base'}: {len(parts[-1])} spheres")
+    fitted = joined(*parts)
     covering = LinkSpheres(fitted.link, *rounded(fitted.centers, fitted.radii))
     if uncovered(robot.shapes, covering) > 0:
         raise InputError("is not contained after rounding.", field=name, hint="fit with another slack")
-    return replace(robot, covering=covering, inertials=_inertials(ARMS[name], robot))
+    return replace(robot, covering=covering, inertials=inertials)
 
 
 def _inertials(arm: ShippedArm, robot: RobotModel) -> tuple[Inertial, ...]:
@@ -51,10 +59,9 @@ def _inertials(arm: ShippedArm, robot: RobotModel) -> tuple[Inertial, ...]:
 
     The links of both descriptions coincide when all joints are at 0.
     """
-    path = arm.path_of_masses()
-    if path is None:
+    if arm.masses is None:
         return robot.inertials
-    other = read_description(path).robot
+    other = read_description(description_of(arm.masses)).robot
     zero = np.zeros(len(robot))
     T_link_other = np.linalg.inv(robot.fk(zero)) @ other.fk(zero)
     return tuple(

@@ -103,8 +103,8 @@ def _fit(name: str, out: Path | None, slack: float | None) -> int:
     file = out if out is not None else Path(f"{name}.json")
     if name in ARMS:
         if slack is not None:
-            raise InputError("is that of the arm's entry.", field="slack", hint="leave --slack out")
-        save_robot(fit_arm(name), file)
+            raise InputError("is fixed for a shipped arm.", field="--slack", hint="leave it out")
+        save_robot(fit_arm(name, print), file)
     else:
         save_body(fit_body(SOURCES[name], 0.011 if slack is None else slack, print), file)
     print(f"written to {file}")

@@ -97,6 +97,14 @@ CONTEXTS: dict[str, Callable[[Path], Names]] = {
     "docs/guide/planning.md": _planning,
     "docs/guide/tracking.md": _tracking,
 }
+RESULTS: dict[str, Callable[[Names], bool]] = {
+    "docs/guide/collision.md": lambda names: len(names["field"]) > 100,
+    "docs/guide/grasping.md": lambda names: 0.0 < names["grasp"].width < 0.08,
+    "docs/guide/picking.md": lambda names: names["result"].grasp is not None,
+    "docs/guide/planning.md": lambda names: names["followed"].state == "done",
+    "docs/guide/tracking.md": lambda names: names["result"].verdict == "ok" and names["frame"].prior is not None,
+    "docs/guide/twin.md": lambda names: names["result"].steps > 1000,
+}
 OF_A_SERVICE = ["docs/guide/ros.md", "docs/guide/service.md"]
 
 
@@ -106,6 +114,7 @@ def test_the_snippets_of_a_document_run_in_turn(name: str, desk: Path, monkeypat
     names = CONTEXTS.get(name, lambda _: {})(desk)
     for text in snippets(name):
         exec(compile(text, name, "exec"), names)
+    assert RESULTS.get(name, lambda _: True)(names)
 
 
 @pytest.fixture(scope="module")

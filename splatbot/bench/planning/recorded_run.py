@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from scipy.spatial import cKDTree
 from splatbot.bench.collision.recorded_run import lifted
 from splatbot.bench.planning.audit import configurations
 from splatbot.bench.planning.margin_sweep import sweep_margins
-from splatbot.bench.planning_problems import map_problems
+from splatbot.bench.planning_problems import Problem, map_problems
 from splatbot.bench.results import Results
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
@@ -26,7 +25,7 @@ from splatbot.results.audit import audit_run
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.results.margin import audited_error
-from splatbot.results.region_plan import plan_in_region
+from splatbot.results.region_plan import RegionPlan, plan_in_region
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
 from splatbot.tracking.prepare import usable_depth
@@ -107,24 +106,21 @@ def plan_in_run(
             audit = audit_run(folder, log).audit
             sweep_margins(results, name, audit, field, place.T_world_base, wanted, budget_ms=budget_ms)
     case = f"{name}, margin of the region"
-    found = [
-        plan_in_region(
-            partial(_planner, field, place.T_world_base),
-            lambda planner, k=k, p=p: planner.plan(p.start, p.goal, budget_ms=budget_ms, seed=k),  # type: ignore[misc]
-            np.stack([p.start, p.goal]),
+
+    def in_region(number: int, problem: Problem) -> RegionPlan:
+        return plan_in_region(
+            lambda margin: GaussianRRTStar(field, panda(), T_world_base=place.T_world_base, margin=margin),
+            lambda planner: planner.plan(problem.start, problem.goal, budget_ms=budget_ms, seed=number),
+            np.stack([problem.start, problem.goal]),
             error,
             confidence=MARGIN.confidence,
         )
-        for k, p in enumerate(wanted)
-    ]
+
+    found = [in_region(k, p) for k, p in enumerate(wanted)]
     results.add(case, "problems found", float(len(wanted)), f"of {problems}")
     if found:
         results.add(case, "margin, median", 1e3 * float(np.median([one.planner.margin for one in found])), "mm")
     _add(results, case, [one.result for one in found], planner.arm, known)
-
-
-def _planner(field: GaussianCollisionField, T_world_base: Array, margin: float) -> GaussianRRTStar:
-    return GaussianRRTStar(field, panda(), T_world_base=T_world_base, margin=margin)
 
 
 def free_place(field: GaussianCollisionField, place: Workspace) -> Workspace:

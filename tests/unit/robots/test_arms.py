@@ -7,7 +7,7 @@ import pytest
 
 from splatbot.errors import InputError
 from splatbot.grasping.sampler import GraspSampler
-from splatbot.robots.arms import ARMS
+from splatbot.robots.arms import ARMS, description_of
 from splatbot.robots.arms.fit import described
 from splatbot.robots.containment import uncovered
 from splatbot.robots.robot import RobotModel
@@ -42,7 +42,7 @@ def _installed(name: str) -> RobotModel:
 
 def test_an_arm_moves_as_mujoco_moves_its_makers_description(name: str, rng: np.random.Generator) -> None:
     _installed(name)
-    assert_moves_as_mujoco(load_robot(name), ARMS[name].path(), rng)
+    assert_moves_as_mujoco(load_robot(name), description_of(ARMS[name].source), rng)
 
 
 def test_the_ur5e_moves_as_the_parameters_of_its_maker_say(rng: np.random.Generator) -> None:
