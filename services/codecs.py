@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
@@ -16,6 +15,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 from pydantic.json_schema import models_json_schema
+from pydantic_core import to_json
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
@@ -116,7 +116,8 @@ def answer(
         return Response(encode_npy(body[array]), media_type=NPY, headers=all_headers)
     if MSGPACK in accepted:
         return Response(msgpack.packb(body, default=pack_array), media_type=MSGPACK, headers=all_headers)
-    return Response(json.dumps(plain(body), allow_nan=False), media_type=JSON, headers=all_headers)
+    text = to_json(body, inf_nan_mode="null", fallback=plain)
+    return Response(text, media_type=JSON, headers=all_headers)
 
 
 def decode_npy(body: bytes) -> NDArray[Any]:

@@ -222,8 +222,8 @@ class RobotSpheres:
         ``(abs(dq) @ reach.T).max()`` bounds the motion of every sphere at the cost of few.
         """
         rows = np.unique(np.asarray(self.native.reach(), dtype=np.float64), axis=0)
-        exceeded = [(np.delete(rows, k, axis=0) >= row).all(axis=1).any() for k, row in enumerate(rows)]
-        return np.ascontiguousarray(rows[~np.array(exceeded)])
+        exceeds = (rows[None, :] >= rows[:, None]).all(axis=2)  # [k, i]: row i exceeds row k; each exceeds itself
+        return np.ascontiguousarray(rows[exceeds.sum(axis=1) == 1])
 
     @cached_property
     def without_pairs(self) -> RobotSpheres:

@@ -125,18 +125,18 @@ class JointTrajectory:
             frame_id: frame in the header.
         """
         states = self.at_knots() if rate is None else self.sampled(rate)
-        points = []
-        for i, t in enumerate(states.time):
-            nanoseconds = round(float(t) * 1e9)
-            points.append(
-                {
-                    "positions": states.position[i].tolist(),
-                    "velocities": states.velocity[i].tolist(),
-                    "accelerations": states.acceleration[i].tolist(),
-                    "effort": [],
-                    "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
-                }
-            )
+        nanoseconds = np.rint(states.time * 1e9).astype(np.int64).tolist()
+        rows = (states.position.tolist(), states.velocity.tolist(), states.acceleration.tolist(), nanoseconds)
+        points = [
+            {
+                "positions": position,
+                "velocities": velocity,
+                "accelerations": acceleration,
+                "effort": [],
+                "time_from_start": {"sec": after // 10**9, "nanosec": after % 10**9},
+            }
+            for position, velocity, acceleration, after in zip(*rows, strict=True)
+        ]
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
         return {"header": header, "joint_names": list(self.names), "points": points}
 

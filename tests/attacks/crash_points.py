@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 from rosbags.highlevel import AnyReader
 
 from splatbot import failpoints
@@ -202,6 +203,7 @@ def _map_case(folder: Path, choice: str) -> tuple[bool, str, float]:
 
 def run(count: int, seed: int = 0, kinds: tuple[str, ...] = ("serve", "record", "map")) -> Tally:
     """Stop ``count`` processes by SIGKILL at random points and check the recovered states."""
+    torch.set_num_threads(1)  # a fork of a process with OpenMP threads waits for them forever
     rng, tally = np.random.default_rng(seed), Tally()
     for number in range(count):
         kind = kinds[number % len(kinds)]
@@ -221,6 +223,8 @@ def run(count: int, seed: int = 0, kinds: tuple[str, ...] = ("serve", "record", 
         tally.slowest_s = max(tally.slowest_s, seconds)
         if wrong:
             tally.wrong.append(f"case {number} ({kind}, {choice}): {wrong}")
+        if number % 50 == 49:
+            print(f"{number + 1} of {count}, {len(tally.wrong)} wrong", flush=True)
     return tally
 
 
