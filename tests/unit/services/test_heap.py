@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import subprocess
+import sys
 
 import psutil  # type: ignore[import-untyped]
 import pytest
@@ -25,3 +27,20 @@ def test_freed_fragments_below_a_used_one_are_returned() -> None:
     assert psutil.Process().memory_info().rss < before - 150e6
     _C.free(blocks[-1])
     trim_heap()  # nothing to return is no error
+
+
+def test_full_collections_leave_out_what_was_imported() -> None:
+    # in its own process, because frozen objects stay frozen
+    program = (
+        "import gc, time, splatbot.slam\n"
+        "from splatbot.services.heap import freeze_imports\n"
+        "gc.collect(); start = time.perf_counter(); gc.collect(); before = time.perf_counter() - start\n"
+        "freeze_imports()\n"
+        "start = time.perf_counter(); gc.collect(); after = time.perf_counter() - start\n"
+        "print(gc.get_freeze_count(), len(gc.get_objects()), before, after)\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    frozen, left, before, after = (float(word) for word in ran.stdout.split())
+    assert frozen > 100_000
+    assert left < 0.02 * frozen
+    print(f"a full collection took {1e3 * before:.1f} ms, and {1e3 * after:.2f} ms afterwards")
