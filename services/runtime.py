@@ -14,6 +14,7 @@ from typing import Any
 from splatbot.config import Config
 from splatbot.errors import ConfigError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
+from splatbot.logs.ros_types import typestore
 from splatbot.rasterize.native import native
 from splatbot.services.arms import Arms
 from splatbot.services.heap import freeze_imports
@@ -82,6 +83,7 @@ class Runtime:
     def start(self) -> None:
         """Serve the saved maps, start saving, and start to map the sources that are followed."""
         sweep_scratch()
+        typestore()  # takes 70 ms, for which the first ROS message would hold up the event loop
         freeze_imports()
         if self.library is not None:
             self.library.load_all(self.store)
