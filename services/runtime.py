@@ -14,10 +14,8 @@ from typing import Any
 from splatbot.config import Config
 from splatbot.errors import ConfigError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
-from splatbot.logs.ros_types import typestore
 from splatbot.rasterize.native import native
 from splatbot.services.arms import Arms
-from splatbot.services.heap import freeze_imports
 from splatbot.services.jobs import Job, Jobs, Work
 from splatbot.services.library import MapLibrary
 from splatbot.services.live import LiveMapper, LiveMapping
@@ -83,8 +81,6 @@ class Runtime:
     def start(self) -> None:
         """Serve the saved maps, start saving, and start to map the sources that are followed."""
         sweep_scratch()
-        typestore()  # takes 70 ms, for which the first ROS message would hold up the event loop
-        freeze_imports()
         if self.library is not None:
             self.library.load_all(self.store)
             self._keeper.start()

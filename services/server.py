@@ -13,8 +13,10 @@ import uvicorn
 from fastapi import FastAPI
 
 from splatbot.errors import InputError
+from splatbot.logs.ros_types import typestore
 from splatbot.services.app import create_app
 from splatbot.services.connections import Connections, HttpProtocol, Listener, raise_file_limit
+from splatbot.services.heap import freeze_imports
 from splatbot.services.runtime import Runtime, check_exposure
 from splatbot.services.settings import ServiceSettings
 
@@ -86,6 +88,8 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
         """End a server that has not installed its own handlers yet; after its end this has no further effect."""
         server.should_exit = True
 
+    typestore()  # takes 70 ms, for which the first ROS message would hold up the event loop
+    freeze_imports()
     previous = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         server.run(sockets=list(server.listeners))

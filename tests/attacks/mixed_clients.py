@@ -15,13 +15,14 @@ from typing import Any
 
 import httpx
 import numpy as np
+import psutil  # type: ignore[import-untyped]
 from websockets.sync.client import connect
 
 from splatbot.client import Client
 from splatbot.frame import Frame
 from splatbot.logs import open_log
 from splatbot.service_key import key_file, read_key
-from splatbot.serving import serving
+from splatbot.serving import Serving, serving
 
 FRAME_S = 0.03  # time between frames [s]
 LOG = "synthetic:tabletop?frames=60&width=160&height=120"
@@ -38,11 +39,13 @@ class LoadTimes:
         seconds: times of answers [s].
         statuses: of answers that are not 2xx, and names of errors.
         frames: times of the stages of frames [ms].
+        costs: processor time of each kind of request [ms], measured if there are no clients.
     """
 
     seconds: list[float] = field(default_factory=list)
     statuses: Counter[str] = field(default_factory=Counter)
     frames: list[float] = field(default_factory=list)
+    costs: dict[str, float] = field(default_factory=dict)
 
     def p(self, share: float) -> float:
         """Return a quantile of the answers [s]."""
@@ -53,25 +56,39 @@ class LoadTimes:
         return float(np.quantile(self.frames, 0.95)) if self.frames else 0.0
 
 
-def requests(http: httpx.Client) -> list[Any]:
-    """Return the requests of a client, which sends one after the other."""
+def requests(http: httpx.Client) -> dict[str, Any]:
+    """Return the requests of a client by name, which it sends one after the other."""
     points = np.random.default_rng(0).uniform(-1, 1, (100, 3)).tolist()
     under = "/v1/maps/default"
-    return [
-        lambda: http.post(f"{under}/distance", json={"points": points}),
-        lambda: http.post(f"{under}/collisions", json={"q": [GOAL], "base": BASE}),
-        lambda: http.get(f"{under}/render", params={"width": 160, "height": 120}),
-        lambda: http.get("/v1/maps"),
-        lambda: http.get("/healthz"),
-        lambda: http.post("/v1/ik", json={"pose": {"translation": [0.4, 0.2, 0.4], "quat_wxyz": [0, 1, 0, 0]}}),
-        lambda: http.post(f"{under}/plans", json={"goal": GOAL, "base": BASE, "budget_ms": 20}),
-    ]
+    return {
+        "distance": lambda: http.post(f"{under}/distance", json={"points": points}),
+        "collisions": lambda: http.post(f"{under}/collisions", json={"q": [GOAL], "base": BASE}),
+        "view": lambda: http.get(f"{under}/render", params={"width": 160, "height": 120}),
+        "maps": lambda: http.get("/v1/maps"),
+        "healthz": lambda: http.get("/healthz"),
+        "IK": lambda: http.post("/v1/ik", json={"pose": {"translation": [0.4, 0.2, 0.4], "quat_wxyz": [0, 1, 0, 0]}}),
+        "plan": lambda: http.post(f"{under}/plans", json={"goal": GOAL, "base": BASE, "budget_ms": 20}),
+    }
+
+
+def costs(service: Serving, key: str, count: int = 60) -> dict[str, float]:
+    """Return the processor time that the service spends on each kind of request [ms], without other load."""
+    process, found = psutil.Process(service.process.pid), {}
+    with httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
+        for name, send in requests(http).items():
+            send()  # builds the field of the map, once
+            before = process.cpu_times()
+            for _ in range(count):
+                send()
+            after = process.cpu_times()
+            found[name] = 1e3 * (after.user - before.user + after.system - before.system) / count
+    return found
 
 
 def ask(url: str, key: str, until: float, number: int, times: LoadTimes, pause_s: float) -> None:
     """Send requests until a time; repeat a 503 after its Retry-After; a plan without a path is no error."""
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
-        todo, at = requests(http), number
+        todo, at = list(requests(http).values()), number
         while time.monotonic() < until:
             begin = time.perf_counter()
             try:
@@ -138,6 +155,8 @@ def measure(seconds: float, clients: int, pause_s: float = 0.5) -> LoadTimes:
             thread.start()
         for thread in threads:
             thread.join(seconds + 60)
+        if clients == 0:
+            times.costs = costs(service, key)
     return times
 
 
@@ -152,6 +171,7 @@ def main() -> None:
     again = times.statuses.pop("503, asked again", 0)
     print(f"{len(times.seconds)} answers, {again} asked again after 503, errors: {dict(times.statuses) or 0}")
     print(f"answers: p50 {1e3 * times.p(0.5):.0f} ms, p99 {1e3 * times.p(0.99):.0f} ms")
+    print("processor time of a request:", ", ".join(f"{name} {ms:.1f} ms" for name, ms in alone.costs.items()))
     print(f"frames: p95 {alone.frame_p95():.0f} ms of {len(alone.frames)} alone, ", end="")
     print(f"{times.frame_p95():.0f} ms of {len(times.frames)} with clients")
 
