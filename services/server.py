@@ -88,14 +88,19 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
         """End a server that has not installed its own handlers yet; after its end this has no further effect."""
         server.should_exit = True
 
-    typestore()  # takes 70 ms, for which the first ROS message would hold up the event loop
-    freeze_imports()
+    warm_process()
     previous = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         server.run(sockets=list(server.listeners))
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def warm_process() -> None:
+    """Do once, before a process serves, the work that would hold up its event loop later."""
+    typestore()  # takes 70 ms, at the first ROS message otherwise
+    freeze_imports()
 
 
 def server_config(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:

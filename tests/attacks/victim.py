@@ -18,6 +18,7 @@ import httpx
 import numpy as np
 import websockets
 
+from splatbot.services.server import warm_process
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from tests.contracts.conftest import running, wall
@@ -98,6 +99,7 @@ def victim(**settings: Any) -> Iterator[Victim]:
 def _serve() -> None:
     store = MapStore()
     store.add("wall", source="wall.ply", state="static", snapshot=wall())
+    warm_process()
     with running(ServiceSettings(**json.loads(sys.argv[1])), store) as service:
         headers = {name: value for name, value in service.client.headers.items() if name in ("authorization",)}
         print(json.dumps({"url": service.url, "headers": headers}), flush=True)
