@@ -98,7 +98,7 @@ def run_service(runtime: Runtime, *, on_start: Callable[[str], None] = lambda ur
 
 
 def warm_process() -> None:
-    """Do once, before a process serves, the work that would hold up its event loop later."""
+    """Prepare a process before it serves, so that this work does not hold up its event loop later."""
     typestore()  # takes 70 ms, at the first ROS message otherwise
     freeze_imports()
 
