@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike
 from splatbot.collision.visibility import DepthView, gather_evidence
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.results.folder import RunFolder
 from splatbot.results.observers import observers
-from splatbot.results.views import subsampled_views
+from splatbot.results.views import raw_views, subsampled_views
 from splatbot.robots.in_view import reopen_log
 from splatbot.segmentation import SegmentedMap, segment
 from splatbot.workspace import Workspace
@@ -31,12 +32,14 @@ class MeasuredMap:
         state: the map without Gaussians that more frames see through than see.
         observers: (N, 3) viewpoint of each Gaussian [m, world], NaN if unknown. If None, all are unknown.
         views: thinned depth images of the recording.
+        raw: the same without the filters of mapping. If None, it is not known.
         notes: omitted checks with reasons.
     """
 
     state: Snapshot
     observers: Array | None = None
     views: tuple[DepthView, ...] = ()
+    raw: RawDepth | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -49,7 +52,10 @@ class GraspableObjects:
 
     def sampler(self, robot: RobotKinematics, **options: Any) -> GraspSampler:
         """Create a grasp sampler; for ``options`` see :class:`splatbot.grasping.sampler.GraspSampler`."""
-        return GraspSampler(self.scene, robot, observers=self.measured.observers, views=self.measured.views, **options)
+        measured = self.measured
+        return GraspSampler(
+            self.scene, robot, observers=measured.observers, views=measured.views, raw=measured.raw, **options
+        )
 
     def with_notes(self, result: GraspResult) -> GraspResult:
         """Add the notes of the map to a result."""
@@ -76,14 +82,17 @@ def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
         return MeasuredMap(state, notes=("Visibility was not checked, because the map is in no run's folder.",))
     notes: tuple[str, ...] = ()
     views: tuple[DepthView, ...] = ()
+    raw = None
     try:
-        views = subsampled_views(run, reopen_log(run))
+        log = reopen_log(run)
+        views, sensor = subsampled_views(run, log), run.load_config().sensor
+        raw = RawDepth(raw_views(run, log)[1], sensor.sigma_depth_floor, sensor.sigma_depth_quad)
     except SplatbotError as error:
         name = f"{Path(error.file).name}: " if error.file else ""  # without the private path of the folder
         reason = f"the run's log cannot be read: {name}{error.message}"
         notes = (f"Visibility was not checked, because {reason}",)
     model = _solid(state.model, views)
-    return MeasuredMap(replace(state, model=model), observers(run, model), views, notes)
+    return MeasuredMap(replace(state, model=model), observers(run, model), views, raw, notes)
 
 
 def segment_objects(

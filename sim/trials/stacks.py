@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from splatbot.collision import find_moving, gather_evidence
+from splatbot.config import SensorConfig
 from splatbot.grasping.affordance import Target, find_target
+from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
 from splatbot.grasping.pick_types import PickOptions
@@ -43,6 +45,7 @@ class StackConstants:
 CONSTANTS = StackConstants()
 
 
+SENSOR = SensorConfig()  # noise of depth that confirms a point
 OPTIONS = PickOptions(lift=CONSTANTS.lift, budget_ms=CONSTANTS.budget_ms, tries=8, grasp=GraspOptions())
 
 
@@ -96,6 +99,7 @@ class GaussianStack:
             panda(),
             observers=observers,
             views=scan.views,
+            raw=RawDepth(tuple(scan.views), SENSOR.sigma_depth_floor, SENSOR.sigma_depth_quad),
             min_observations=CONSTANTS.min_observations,
             moving=moving,
         )

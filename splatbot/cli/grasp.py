@@ -124,7 +124,7 @@ def grasp(
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
         handle.write(json.dumps(summary(result), indent=2).encode())
-    shown = result.grasps[0] if result.grasps else result.best_rejected
+    shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
     if shown is not None:
         with atomic_write(folder / "grasp.png") as handle:
             handle.write(grasp_png(scene, found.rows, arm, shown))
@@ -233,11 +233,16 @@ def _print(result: GraspResult, folder: Path) -> None:
     ]
     print_table(rows, title="grasps")
     terms = list(result.grasps[0].terms)
+    contacts = ["contacts"] if result.grasps[0].implied else []
     table = Table()
-    for name in ("", "total", "approach", "width, mm", "opens, mm", "clearance, mm", *terms):
+    for name in ("", "total", "approach", "width, mm", "opens, mm", "clearance, mm", *contacts, *terms):
         table.add_column(name, justify="left" if name == "approach" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
-        table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *(f"{g.terms[name]:.2f}" for name in terms))
+        contact = [" and ".join("implied" if each else "measured" for each in g.implied)] if contacts else []
+        values = (f"{g.terms[name]:.2f}" for name in terms)
+        table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *contact, *values)
     print_columns(table)
     print("the best total and the best value of a term is 1")
+    if contacts:
+        print("a measured contact is within 3 mm of depth that three frames agree on; an implied one is not")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.collision.visibility import DepthView, measured_depths, passing_distance
 from splatbot.errors import InputError
-from splatbot.geometry import transform_points
+from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 
 
@@ -107,6 +107,61 @@ def find_confirmed(
     solid = clear & (agreeing >= agreeing_views)
     empty = _passed(free, owner, views)
     return ConfirmedSpace(surface[solid], z[solid], owner[solid], pixel[solid], free[empty], len(surface))
+
+
+def confirmed_near(
+    views: Sequence[DepthView],
+    low: Array,
+    high: Array,
+    *,
+    floor: float,
+    quad: float,
+    spacing: float,
+    most: int,
+    agreeing_views: int = CONSTANTS.agreeing_views,
+) -> Array:
+    """Find the confirmed surface points (S, 3) [m, world] of a box, from all pixels that measure in it.
+
+    The rule of confirmation is that of :func:`find_confirmed`.
+
+    Args:
+        views: depth (H, W) [m], 0 or NaN where invalid, camera, and T_world_camera (4, 4) of each view.
+        low, high: (3,) corners of the box [m, world].
+        floor, quad: σ = ``floor`` + ``quad`` z² of depth, in [m] and [1/m].
+        spacing: edge of the voxels in which each view proposes at most one point [m].
+        most: largest number of proposed points, evenly spaced among all; it bounds the work.
+        agreeing_views: number of other views that confirm a surface point.
+    """
+    found, owners = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+    for number, (depth, camera, T_world_camera) in enumerate(views):
+        columns, rows = _pixel_window(low, high, camera, T_world_camera)
+        part = depth[rows, columns]
+        row, column = np.nonzero(np.isfinite(part) & (part > 0))
+        z = part[row, column].astype(np.float64)
+        points = _lifted(column + columns.start, row + rows.start, z, camera, T_world_camera)
+        points = points[((points > low) & (points < high)).all(axis=1)]
+        cell = np.floor((points - low) / spacing).astype(np.int64) @ [1, 1 << 20, 1 << 40]
+        first = np.unique(cell, return_index=True)[1]
+        found.append(points[np.sort(first)])
+        owners.append(np.full(len(first), number))
+    proposed, owner = np.concatenate(found), np.concatenate(owners)
+    some = np.linspace(0, len(proposed) - 1, min(most, len(proposed))).round().astype(np.int64)
+    agreeing, clear = _agreeing(proposed[some], owner[some], views, floor, quad)
+    return np.asarray(proposed[some][clear & (agreeing >= agreeing_views)])
+
+
+def _pixel_window(low: Array, high: Array, camera: Camera, T_world_camera: Array) -> tuple[slice, slice]:
+    """Return the columns and rows of an image that can show a box; all of them if the box reaches the camera."""
+    corners = np.array([[(low, high)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
+    p = transform_points(inverse(T_world_camera), corners)
+    if (p[:, 2] < 0.05).all():
+        return slice(0, 0), slice(0, 0)
+    if (p[:, 2] < 0.05).any():
+        return slice(0, camera.width), slice(0, camera.height)
+    u, v = camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy
+    left, right = np.clip([u.min() - 1, u.max() + 2], 0, camera.width).astype(int)
+    top, bottom = np.clip([v.min() - 1, v.max() + 2], 0, camera.height).astype(int)
+    return slice(left, right), slice(top, bottom)
 
 
 def _spread_pixels(

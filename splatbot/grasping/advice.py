@@ -54,6 +54,9 @@ def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tup
         scene: the segmented map.
         stroke: widest opening of the hand [m].
     """
+    if result.doubtful:
+        why = f"{len(result.doubtful)} grasps fit the map, but none has a contact at measured depth"
+        return why, "map it again from more sides"
     number = result.target.number
     if 0 <= number < len(scene.objects):
         size = obstacle(scene.objects[number], stroke)

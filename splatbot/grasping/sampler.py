@@ -12,6 +12,7 @@ from splatbot.collision.visibility import DepthView
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ArmReach, ReachabilityCheck, hand_of
 from splatbot.grasping.search import Search
@@ -36,6 +37,7 @@ class GraspSampler:
         observers: (N, 3) camera centre from which each Gaussian was observed [m, world], NaN where unknown. If None,
             all are unknown.
         views: measured depth images of the scene, which show free space.
+        raw: raw depth of the scene, against which hands and contacts are checked. If None, only the map is.
         n_sigma: size of the Gaussians in standard deviations. It is smaller than for planning, since the hand has to
             come close to the target.
         min_observations: Gaussians with fewer observing keyframes do not count as obstacles; see
@@ -57,6 +59,7 @@ class GraspSampler:
         make_reach: MakeReach | None = None,
         observers: Array | None = None,
         views: Sequence[DepthView] = (),
+        raw: RawDepth | None = None,
         n_sigma: float = 1.0,
         min_observations: int = 1,
         margin: float = 0.0,
@@ -67,6 +70,7 @@ class GraspSampler:
         if not 0.0 <= margin < np.inf:
             raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
         self.scene, self.robot, self.observers, self.views = scene, robot, observers, tuple(views)
+        self.raw = raw
         self.hand = hand_of(robot)
         self.margin, self.n_sigma = margin, n_sigma
         self.moving = None if moving is None or not len(moving) else np.asarray(moving, dtype=np.float64)

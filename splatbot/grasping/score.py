@@ -26,6 +26,7 @@ WEIGHTS: Mapping[str, float] = {
     "clear": 4.0,  # whether hand and arm avoid regions where motion was observed; absent without such regions
     "clearance": 2.0,  # clearance of the hand along the approach
     "seen": 2.0,  # observed fraction of the surface at the contacts
+    "measured": 4.0,  # fraction of the contacts at confirmed points of raw depth; absent without raw depth
     "certain": 1.0,  # standard deviation of the surface at the contacts
     "upright": 0.5,  # cosine between the approach direction and down
     "near": 2.0,  # distance of the contacts from the indicated point; absent without one

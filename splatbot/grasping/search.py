@@ -17,6 +17,8 @@ from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands
+from splatbot.grasping.measured import CONSTANTS as MEASURED
+from splatbot.grasping.measured import contact_distances, hand_penetration
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ReachabilityCheck
@@ -61,6 +63,7 @@ CONSTANTS = GraspSearchConstants()
 
 _IN_TARGET = "hands are in the target on their way"
 _IN_MAP = "hands touch the surroundings of the target"
+_IN_DEPTH = "hands are in measured depth"
 
 
 @dataclass(eq=False)
@@ -104,15 +107,23 @@ class Search:
         self.s, self.target, self.o = sampler, target, options
         self.log = _SearchLog()
         self.candidates = 0
+        self.measured: Array | None = None
 
     def run(self) -> GraspResult:
         self.model, self.around, self.own = self._split()
         self.log.stage("fields")
-        grasps, notes = self._search(self.o.samples), []
+        if self.s.raw is not None:
+            self.measured = self.s.raw.around(
+                self.s.scene.model.means.detach().double().numpy()[self.target.rows], self.s.hand
+            )
+            self.log.stage("measured depth")
+        grasps, doubtful = _by_evidence(self._search(self.o.samples))
+        notes = []
         too_large = not len(self.pairs.width) and self.found.too_wide > 0
         if not grasps and not too_large:
             few = min(self.o.samples, len(self.surface))
-            grasps = self._search(CONSTANTS.retry_factor * self.o.samples, sharp=True)
+            grasps, more_doubtful = _by_evidence(self._search(CONSTANTS.retry_factor * self.o.samples, sharp=True))
+            doubtful = more_doubtful or doubtful
             more = min(CONSTANTS.retry_factor * self.o.samples, len(self.surface))
             notes.append(f"No grasp was found with {few} samples; {more} samples with sharper edges were searched.")
         return GraspResult(
@@ -124,6 +135,7 @@ class Search:
             self.log.seconds,
             self.s.scene.map_version,
             (*notes, *self._notes(grasps)),
+            doubtful,
         )
 
     def _search(self, samples: int, *, sharp: bool = False) -> tuple[Grasp, ...]:
@@ -142,6 +154,9 @@ class Search:
             scored = self._with_moving_term(scored)
         self.log.stage("map")
         scored = self._outside_ellipsoids(scored, self.own)
+        if self.s.raw is not None:
+            scored = self._outside_measured(scored)
+            self.log.stage("measured depth")
         grasps = self._reached(scored, self.s.reach(self.around), self.s.reach_avoiding_moving(self.model))
         self.log.stage("reach")
         return grasps
@@ -258,6 +273,30 @@ class Search:
             self.log.best = self._grasp(scored, int(inside.argmax()), rejected="touches the target's ellipsoids")
         return scored.select(~inside)
 
+    def _outside_measured(self, scored: _Scored) -> _Scored:
+        """Return the hands without confirmed points of raw depth in them, with the score term of their contacts.
+
+        A hand is checked on its approach, and closed at the planned contacts: there, depth in the fingers stops them
+        before they reach the contacts.
+        """
+        assert self.measured is not None
+        hands = scored.hands
+        closed = replace(hands, opening=self.pairs.width[hands.pair])
+        deep = np.maximum(
+            hand_penetration(hands, self.measured, self.s.hand, retreat=self.o.pregrasp),
+            hand_penetration(closed, self.measured, self.s.hand, retreat=0.0),
+        )
+        away = contact_distances(self.pairs.contacts[hands.pair], self.measured)
+        supported = (away <= MEASURED.contact_distance).mean(axis=1)
+        scored = _Scored(hands, scored.clearance, {**scored.terms, "measured": supported})
+        free = deep <= MEASURED.max_penetration
+        self.log.drop(_IN_DEPTH, (~free).sum())
+        if len(free) and not free.any():
+            k = int(np.argmin(deep))
+            self.log.best = self._grasp(scored, k, rejected=f"is {1e3 * deep[k]:.1f} mm deep in measured depth")
+        kept = scored.select(free)
+        return kept.select(np.lexsort((-kept.totals, kept.terms["measured"] == 0.0)))  # without evidence last
+
     def _reached(
         self, scored: _Scored, reach: ReachabilityCheck | None, avoid_moving: ReachabilityCheck | None
     ) -> tuple[Grasp, ...]:
@@ -319,11 +358,12 @@ class Search:
 
     def _grasp(self, scored: _Scored, k: int, *, rejected: str = "") -> Grasp:
         T, pair = scored.hands.T[k], int(scored.hands.pair[k])
+        contacts = self.pairs.contacts[pair]
         return Grasp(
             T_world_tcp=T,
             width=float(self.pairs.width[pair]),
             opening=float(scored.hands.opening[k]),
-            contacts=self.pairs.contacts[pair],
+            contacts=contacts,
             normals=self.pairs.normals[pair],
             approach=self._approach(T),
             terms={name: float(values[k]) for name, values in scored.terms.items()},
@@ -331,6 +371,9 @@ class Search:
             clearance=float(scored.clearance[k]),
             T_world_pregrasp=along(T, -self.o.pregrasp),
             rejected=rejected,
+            depth_distance=None
+            if self.measured is None
+            else contact_distances(self.pairs.contacts[pair], self.measured),
         )
 
     def _approach(self, T: Array) -> str:
@@ -371,6 +414,19 @@ class Search:
                 f"{opens:.0f} mm."
             )
         return tuple(notes)
+
+
+def _by_evidence(grasps: Sequence[Grasp]) -> tuple[tuple[Grasp, ...], tuple[Grasp, ...]]:
+    """Split grasps into those with a contact at measured depth, or that were not checked, and those without."""
+    doubtful = tuple(grasp for grasp in grasps if grasp.implied and all(grasp.implied))
+    kept = tuple(grasp for grasp in grasps if not (grasp.implied and all(grasp.implied)))
+    return kept, tuple(replace(grasp, rejected=_doubt(grasp)) for grasp in doubtful)
+
+
+def _doubt(grasp: Grasp) -> str:
+    assert grasp.depth_distance is not None
+    away = " and ".join(f"{1e3 * value:.0f}" if np.isfinite(value) else "any" for value in grasp.depth_distance)
+    return f"has no contact at measured depth, which is {away} mm away"
 
 
 def _deep(clearance: float) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from splatbot.geometry import rotation_to_quat
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.protocols import Array
@@ -20,6 +22,7 @@ def summary(result: GraspResult) -> dict[str, Any]:
             "notes": list(result.target.notes),
         },
         "grasps": [_grasp_summary(grasp) for grasp in result.grasps],
+        "doubtful": [_grasp_summary(grasp) for grasp in result.doubtful],
         "best_rejected": _grasp_summary(result.best_rejected) if result.best_rejected is not None else None,
         "rejected": dict(result.rejected),
         "candidates": result.candidates,
@@ -40,6 +43,8 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "opening_m": grasp.opening,
         "contacts": grasp.contacts.tolist(),
         "normals": grasp.normals.tolist(),
+        "contact_depth_distance_m": _finite(grasp.depth_distance),
+        "contact_implied": list(grasp.implied) if grasp.depth_distance is not None else None,
         "approach": grasp.approach,
         "terms": dict(grasp.terms),
         "total": grasp.total,
@@ -49,3 +54,8 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "approach_path": grasp.approach_path.tolist() if grasp.approach_path is not None else None,
         "rejected": grasp.rejected,
     }
+
+
+def _finite(values: Array | None) -> list[float | None] | None:
+    """Return values as JSON numbers, null for infinity; None if there are none."""
+    return None if values is None else [float(value) if np.isfinite(value) else None for value in values]

@@ -9,6 +9,7 @@ import numpy as np
 
 from splatbot.errors import SplatbotError
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.measured import CONSTANTS
 from splatbot.protocols import Array
 
 
@@ -32,6 +33,8 @@ class Grasp:
         approach_path: (K, J) straight path from the pre-grasp to the grasp. It is certified against the map without
             the target.
         rejected: reason for which the grasp is rejected; empty for an accepted grasp.
+        depth_distance: (2,) distance of each contact from the nearest confirmed point of raw depth [m], inf if there is
+            none near the target. If None, it was not checked.
     """
 
     T_world_tcp: Array
@@ -48,6 +51,14 @@ class Grasp:
     q_pregrasp: Array | None = None
     approach_path: Array | None = field(default=None, repr=False)
     rejected: str = ""
+    depth_distance: Array | None = None
+
+    @property
+    def implied(self) -> tuple[bool, ...]:
+        """Return for each contact whether no measured depth supports it; empty if that was not checked."""
+        if self.depth_distance is None:
+            return ()
+        return tuple(bool(away > CONSTANTS.contact_distance) for away in self.depth_distance)
 
     @property
     def avoids_moving(self) -> bool:
@@ -72,6 +83,8 @@ class GraspResult:
         seconds: duration of each stage [s].
         map_version: version of the map that was searched.
         notes: remarks on the result, each a sentence.
+        doubtful: grasps that passed all tests, best first, but have no contact at measured depth. Nothing measured
+            shows that an object is between the fingers, so that they should not be executed.
     """
 
     target: Target
@@ -82,6 +95,7 @@ class GraspResult:
     seconds: Mapping[str, float]
     map_version: int
     notes: tuple[str, ...] = ()
+    doubtful: tuple[Grasp, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.grasps)
@@ -106,9 +120,11 @@ class NoGraspError(SplatbotError):
         self.result = result
         counts = ", ".join(f"{count} {reason}" for reason, count in result.rejected.items() if count)
         text = f"cannot be grasped: of {result.candidates} hands and their contacts {counts or 'none was found'}."
+        if result.doubtful:
+            text = f"has no grasp that should be executed: {len(result.doubtful)} have no contact at measured depth."
         if result.notes:
             text += " " + " ".join(result.notes)
-        best = result.best_rejected
+        best = result.doubtful[0] if result.doubtful else result.best_rejected
         if best is not None:
             at = ", ".join(f"{x:.3f}" for x in np.asarray(best.T_world_tcp)[:3, 3])
             text += f" The best of them, {best.approach} at ({at}), {1e3 * best.width:.0f} mm wide, {best.rejected}."

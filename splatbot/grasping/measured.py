@@ -1,0 +1,106 @@
+"""Check of grasps against the raw depth of the frames that see the place, apart from the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from splatbot.collision.confirmed import confirmed_near
+from splatbot.collision.visibility import DepthView
+from splatbot.grasping.hands import Hands
+from splatbot.protocols import Array, HandShape
+
+
+@dataclass(frozen=True)
+class MeasuredDepthConstants:
+    """Constants of the check against measured depth.
+
+    Args:
+        max_penetration: [m] accepted depth of a confirmed point in fingers or palm.
+        contact_distance: [m] largest distance of a measured contact from the nearest confirmed point.
+        spacing: [m] edge of the voxels in which each frame proposes one point.
+        max_points: largest number of points that are confirmed; it bounds the work.
+        hands_per_chunk: hands that are evaluated at once; it bounds memory.
+    """
+
+    max_penetration: float = 0.003
+    contact_distance: float = 0.003
+    spacing: float = 0.002
+    max_points: int = 60_000
+    hands_per_chunk: int = 16
+
+
+CONSTANTS = MeasuredDepthConstants()
+
+
+@dataclass(frozen=True, eq=False)
+class RawDepth:
+    """Raw depth images of a recording.
+
+    Args:
+        views: depth images without the filters of mapping, which remove thin objects.
+        floor, quad: σ = ``floor`` + ``quad`` z² of their depth, in [m] and [1/m].
+    """
+
+    views: tuple[DepthView, ...]
+    floor: float
+    quad: float
+
+    def around(self, points: Array, hand: HandShape) -> Array:
+        """Return the confirmed surface points (S, 3) [m, world] within reach of a hand that grasps a target.
+
+        A point is confirmed if two other frames measure it too.
+
+        Args:
+            points: (P, 3) points of the target [m, world].
+            hand: shape of the hand.
+        """
+        reach = max(hand.stroke / 2 + hand.thickness, *hand.palm_size)
+        return confirmed_near(
+            self.views,
+            points.min(axis=0) - reach,
+            points.max(axis=0) + reach,
+            floor=self.floor,
+            quad=self.quad,
+            spacing=CONSTANTS.spacing,
+            most=CONSTANTS.max_points,
+        )
+
+
+def hand_penetration(hands: Hands, points: Array, hand: HandShape, *, retreat: float) -> Array:
+    """Return the depth (K,) [m] of the deepest point in fingers or palm on an approach of ``retreat`` [m].
+
+    The depth of a point in a box is its distance from the nearest face. The swept box of an approach has no rear face.
+    The depth is 0 if no point is inside.
+
+    Args:
+        hands: K hands; the fingers are apart by their openings.
+        points: (S, 3) measured points [m, world].
+        hand: shape of the hand.
+        retreat: length of the straight approach [m].
+    """
+    deepest = np.zeros(len(hands))
+    near = points.astype(np.float32)
+    for k in range(0, len(hands) if len(points) else 0, CONSTANTS.hands_per_chunk):
+        T = hands.T[k : k + CONSTANTS.hands_per_chunk]
+        R, at = T[:, :3, :3].astype(np.float32), T[:, :3, 3].astype(np.float32)
+        local = R.swapaxes(1, 2) @ near.T - np.einsum("kji,kj->ki", R, at)[:, :, None]
+        x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
+        inner = hands.opening[k : k + CONSTANTS.hands_per_chunk, None].astype(np.float32) / 2
+        ahead = z > -hand.palm - retreat
+        finger = np.minimum(hand.width / 2 - x, np.minimum(y - inner, inner + hand.thickness - y))
+        finger = np.minimum(finger, hand.tip - z)
+        palm = np.minimum(hand.palm_size[0] / 2 - x, hand.palm_size[1] / 2 - y)
+        palm = np.minimum(palm, -hand.palm - z)
+        inside = np.where(ahead, np.maximum(finger, palm), 0.0)
+        deepest[k : k + CONSTANTS.hands_per_chunk] = np.maximum(inside.max(axis=1), 0.0)
+    return deepest
+
+
+def contact_distances(contacts: Array, points: Array) -> Array:
+    """Return the distance (..., ) [m] of contacts (..., 3) from the nearest of the points (S, 3), inf without any."""
+    if not len(points):
+        return np.full(contacts.shape[:-1], np.inf)
+    return np.asarray(cKDTree(points).query(contacts)[0])

@@ -1,0 +1,160 @@
+"""Hands against raw depth: penetration by closed form, contacts without depth, obstacles that only depth shows."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from splatbot.bench.collision.peers import solid_mesh
+from splatbot.bench.tabletop import Block, Solid
+from splatbot.camera import Camera
+from splatbot.collision.confirmed import confirmed_near
+from splatbot.collision.visibility import DepthView
+from splatbot.geometry import look_at, se3_exp, transform_points
+from splatbot.grasping.hands import Hands
+from splatbot.grasping.measured import CONSTANTS, RawDepth, contact_distances, hand_penetration
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.summary import summary
+from splatbot.grasping.types import GraspResult
+from splatbot.logs.raycast import RaycastScene, RaycastSurface
+from splatbot.logs.textures import Texture
+from splatbot.protocols import Array, HandShape
+from splatbot.robots.panda import panda
+from tests.unit.grasping.objects import BOX, OBJECTS, TABLE, scene, target_of
+
+FLOOR, QUAD = 1e-3, 1.4e-3
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
+HAND = panda().hand
+
+
+def hands_at(T: Array, opening: float) -> Hands:
+    zero = np.zeros(1)
+    return Hands(T[None], np.zeros(1, np.int64), np.array([opening]), zero, zero, zero, zero)
+
+
+def views(*solids: Solid, turns: Array | None = None) -> list[DepthView]:
+    """Render exact depth images of solids from a ring around the box."""
+    stage = RaycastScene([RaycastSurface(solid_mesh(solid), Texture((0.5,) * 3, (0.5,) * 3)) for solid in solids])
+    angles = np.arange(12) * np.pi / 6 if turns is None else turns
+    eyes = [np.array([0.45 + 0.4 * np.cos(turn), 0.1 + 0.4 * np.sin(turn), 0.35]) for turn in angles]
+    poses = [look_at(eye, np.array([0.45, 0.1, 0.05])) for eye in eyes]
+    return [(stage.render(CAMERA, T)[1], CAMERA, T) for T in poses]
+
+
+def raw(*solids: Solid, turns: Array | None = None) -> RawDepth:
+    return RawDepth(tuple(views(*solids, turns=turns)), FLOOR, QUAD)
+
+
+@cache
+def everything() -> RawDepth:
+    return raw(TABLE, *OBJECTS.values())
+
+
+@cache
+def grasps_with(depth: RawDepth | None) -> GraspResult:
+    return GraspSampler(scene(), panda(), raw=depth, hand_only=True).sample(target_of(scene(), BOX, "box"))
+
+
+def by_boxes(points: Array, opening: float, hand: HandShape, retreat: float) -> float:
+    """Compute the penetration (float64) of each point: its distance from the nearest face, without the rear."""
+    deepest = 0.0
+    rear = -hand.palm - retreat
+    for x, y, z in points:
+        for low, high in ((opening / 2, opening / 2 + hand.thickness), (-opening / 2 - hand.thickness, -opening / 2)):
+            faces = (hand.width / 2 - x, x + hand.width / 2, y - low, high - y, hand.tip - z)
+            if min(*faces, z - rear) > 0:
+                deepest = max(deepest, min(faces))
+        w, d = hand.palm_size
+        faces = (w / 2 - x, x + w / 2, y + d / 2, d / 2 - y, -hand.palm - z)
+        if min(*faces, z - rear) > 0:
+            deepest = max(deepest, min(faces))
+    return deepest
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("retreat", [0.0, 0.1])
+def test_penetration_equals_the_distance_from_the_nearest_face_in_float64(seed: int, retreat: float) -> None:
+    assert HAND is not None
+    rng = np.random.default_rng(seed)
+    T = se3_exp(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-1.5, 1.5, 3)])
+    local = rng.uniform((-0.06, -0.1, -0.25), (0.06, 0.1, 0.05), (60, 3))
+    opening = float(rng.uniform(0.0, 0.08))
+    got = hand_penetration(hands_at(T, opening), transform_points(T, local), HAND, retreat=retreat)
+    assert got[0] == pytest.approx(by_boxes(local, opening, HAND, retreat), abs=2e-6)  # float32 at 2 m
+
+
+def test_depth_between_the_pads_and_no_depth_at_all_are_no_penetration() -> None:
+    assert HAND is not None
+    T = np.eye(4)
+    between = np.array([[0.0, 0.0, 0.0], [0.004, 0.019, 0.003]])
+    assert hand_penetration(hands_at(T, 0.04), between, HAND, retreat=0.1)[0] == 0.0
+    assert hand_penetration(hands_at(T, 0.04), np.zeros((0, 3)), HAND, retreat=0.1)[0] == 0.0
+    assert np.isinf(contact_distances(np.zeros((2, 3)), np.zeros((0, 3)))).all()
+
+
+def test_confirmed_points_are_on_the_surface_and_dense() -> None:
+    low, high = np.array([0.36, 0.0, -0.01]), np.array([0.56, 0.2, 0.14])
+    options = {"floor": FLOOR, "quad": QUAD, "spacing": 0.002}
+    points = confirmed_near(views(TABLE, BOX), low, high, most=60_000, **options)
+    assert ((points > low) & (points < high)).all()
+    away = np.minimum(np.abs(BOX.distance(points)), np.abs(TABLE.distance(points)))
+    assert away.max() < 3 * (FLOOR + QUAD)
+    u, v = np.meshgrid(np.linspace(-0.045, 0.045, 10), np.linspace(-0.025, 0.025, 6))
+    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    top = np.c_[np.stack([u.ravel(), v.ravel()], axis=1) @ turn.T + [0.45, 0.10], np.full(u.size, 0.12)]
+    assert np.abs(BOX.distance(top)).max() < 1e-9
+    assert contact_distances(top, points).max() < 0.003
+    assert len(confirmed_near(views(TABLE, BOX), low, high, most=500, **options)) <= 500
+
+
+def test_two_frames_confirm_nothing() -> None:
+    pair = raw(TABLE, BOX, turns=np.array([0.0, 0.3]))
+    assert HAND is not None
+    assert len(pair.around(np.array([[0.45, 0.1, 0.06]]), HAND)) == 0
+
+
+def test_no_hand_is_offered_in_an_obstacle_that_only_depth_shows() -> None:
+    assert HAND is not None
+    blocked = raw(TABLE, *OBJECTS.values(), Block((0.45, 0.10, 0.09), (0.02, 0.16, 0.02), 0.4))  # across the box
+    before, after = grasps_with(None), grasps_with(blocked)
+    measured = blocked.around(box_points(), HAND)
+
+    def deep(result: GraspResult) -> list[float]:
+        return [
+            float(hand_penetration(hands_at(g.T_world_tcp, g.opening), measured, HAND, retreat=0.1)[0])
+            for g in result.grasps
+        ]
+
+    assert max(deep(before)) > 2 * CONSTANTS.max_penetration  # the map does not show it
+    assert max(deep(after), default=0.0) <= CONSTANTS.max_penetration
+    assert after.rejected["hands are in measured depth"] > 0
+
+
+def box_points() -> Array:
+    return scene().model.means.double().numpy()[target_of(scene(), BOX, "box").rows]
+
+
+def test_contacts_on_a_side_that_no_frame_saw_are_implied() -> None:
+    full, half = grasps_with(everything()), grasps_with(raw(TABLE, *OBJECTS.values(), turns=np.linspace(-1.2, 0.0, 8)))
+    assert full.grasps
+    assert half.grasps
+    assert not any(any(g.implied) for g in full.grasps)
+    assert any(any(g.implied) for g in half.grasps)
+    for g in half.grasps:
+        assert g.depth_distance is not None
+        assert g.implied == tuple(g.depth_distance > CONSTANTS.contact_distance)
+        assert g.terms["measured"] == pytest.approx(1.0 - np.mean(g.implied))
+
+
+def test_results_state_the_support_of_each_contact_and_null_where_it_was_not_checked() -> None:
+    known = summary(grasps_with(everything()))["grasps"][0]
+    assert known["contact_implied"] == [False, False]
+    assert all(0.0 <= away <= CONSTANTS.contact_distance for away in known["contact_depth_distance_m"])
+    unknown = summary(grasps_with(None))["grasps"][0]
+    assert unknown["contact_implied"] is None
+    assert unknown["contact_depth_distance_m"] is None
+    nothing = summary(grasps_with(RawDepth((), FLOOR, QUAD)))["grasps"][0]
+    assert nothing["contact_implied"] == [True, True]
+    assert nothing["contact_depth_distance_m"] == [None, None]
